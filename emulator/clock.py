@@ -1,0 +1,74 @@
+"""Time of the emulator: real, accelerated, or stepped by whoever holds the clock.
+
+The cores of the emulator own no clock; they are told how much time has passed. A clock is
+only for loops that talk to the outside, such as `Robot.run`.
+"""
+
+import asyncio
+import time
+from typing import Protocol
+
+NS = 1_000_000_000
+
+
+class Clock(Protocol):
+    """Emulated time in nanoseconds since the clock was made, and how to wait for it."""
+
+    def now_ns(self) -> int:
+        """Emulated time that has passed."""
+        ...
+
+    async def sleep_until_ns(self, t_ns: int) -> None:
+        """Come back when `t_ns` has been reached; other tasks run meanwhile."""
+        ...
+
+
+class RealClock:
+    """Emulated time goes as the machine's own monotonic time, or `speed` times as fast."""
+
+    def __init__(self, speed: float = 1.0) -> None:
+        if not speed > 0:
+            raise ValueError(f"speed {speed}: wanted a number above 0")
+        self._speed = speed
+        self._start_ns = time.monotonic_ns()
+
+    def now_ns(self) -> int:
+        """Emulated time that has passed."""
+        return int((time.monotonic_ns() - self._start_ns) * self._speed)
+
+    async def sleep_until_ns(self, t_ns: int) -> None:
+        """Sleep until `t_ns`; a time that has passed still lets other tasks run once."""
+        await asyncio.sleep(max(0, t_ns - self.now_ns()) / (NS * self._speed))
+
+
+class SteppedClock:
+    """Time moves only when somebody moves it: `advance`, or a sleeper where it runs freely.
+
+    With `free` every sleep jumps straight to its end, so a loop runs as fast as the machine
+    can. Otherwise sleepers wait until `advance` has carried the time past their end.
+    """
+
+    def __init__(self, *, free: bool = False) -> None:
+        self._t_ns = 0
+        self._free = free
+        self._moved = asyncio.Condition()
+
+    def now_ns(self) -> int:
+        """Emulated time that has passed."""
+        return self._t_ns
+
+    async def advance(self, dt_s: float) -> None:
+        """Move the time on and wake those whose time has come."""
+        async with self._moved:
+            self._t_ns += round(dt_s * NS)
+            self._moved.notify_all()
+        await asyncio.sleep(0)
+
+    async def sleep_until_ns(self, t_ns: int) -> None:
+        """Wait for `advance` to reach `t_ns`, or jump there where the clock runs freely."""
+        if self._free:
+            self._t_ns = max(self._t_ns, t_ns)
+            await asyncio.sleep(0)
+            return
+        async with self._moved:
+            await self._moved.wait_for(lambda: self._t_ns >= t_ns)

@@ -1,0 +1,1 @@
+"""The firmware of the MTB boards: arithmetic, access to the chips, personalities."""

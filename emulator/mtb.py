@@ -1,0 +1,38 @@
+"""MTB boards by name: `make_board("mtb4", ...)` gives the firmware of that model.
+
+The models differ in commands, arithmetic, order of frames and pitfalls; see
+`emulator.firmware`.
+"""
+
+import numpy as np
+
+from emulator.firmware.board import Burst, Frame, Mtb, join
+from emulator.firmware.chips import Chips, I2cChips
+from emulator.firmware.mtb3 import Mtb3
+from emulator.firmware.mtb4 import Mtb4, Mtb4c
+
+__all__ = ["Burst", "Chips", "Frame", "I2cChips", "Mtb", "join", "make_board"]
+
+
+def make_board(
+    model: str, address: int, chips: Chips, random: np.random.Generator | None = None
+) -> Mtb:
+    """A board as it comes out of power-up.
+
+    Args:
+        model: "mtb3", "mtb4" or "mtb4c".
+        address: its stored CAN address, 1..14.
+        chips: how it reaches its chips: `I2cChips` over smbus2 buses, or an emulator's own.
+        random: where command 32 FF of the MTB4 takes a random address from.
+
+    Raises:
+        ValueError: there is no such model.
+    """
+    match model:
+        case "mtb3":
+            return Mtb3(address, chips)
+        case "mtb4" | "mtb4c":
+            kind = Mtb4 if model == "mtb4" else Mtb4c
+            return kind(address, chips, random or np.random.default_rng(0))
+        case _:
+            raise ValueError(f'no board "{model}"; there are: mtb3, mtb4, mtb4c')

@@ -1,0 +1,400 @@
+"""A whole robot below its PC: boards, chips, foam and scene from the host's own settings.
+
+`step` moves the robot on in time and gives the frames that its boards sent; `receive` takes
+commands. Nothing here knows the time of day; `run` is the only door to the outside.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from heapq import heappop, heappush
+from itertools import count, groupby
+from pathlib import Path
+
+import can
+import numpy as np
+from msgspec import structs
+from numpy.typing import NDArray
+
+from emulator import faults
+from emulator.bring_up import bring_up
+from emulator.clock import Clock, RealClock
+from emulator.converters import Converters, fidelities, read_rows
+from emulator.firmware.arithmetic import TAXELS
+from emulator.link import Link
+from emulator.mtb import Burst, Mtb, make_board
+from emulator.recording import load_recordings
+from emulator.scene import Fault, Probe, Scene, check
+from emulator.skin import NEVER_NS, Skin
+from emulator.wire import Wire
+from skin_host.bus.protocol import FrameBatch
+from skin_host.errors import ConfigurationError
+from skin_host.layout import Layout
+from skin_host.settings import Settings
+
+NS = 1_000_000_000
+#: Boards that are due within the same millisecond are worked out together.
+TICK_NS = 1_000_000
+#: How often `run` looks at buses and boards.
+POLL_NS = 2_000_000
+#: A process that was held up for longer lets the time slip instead of catching up.
+LONGEST_CATCH_UP_NS = 250_000_000
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+
+
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """A burst of several boards as they were at `versions`.
+
+    Attributes:
+        chips: all chips of these boards.
+        row: intp[k], where in `chips` that of each triangle is, -1 for none.
+        frames_of: which of the frames go to which bus.
+    """
+
+    versions: list[int]
+    burst: Burst
+    chips: Ints
+    row: Ints
+    frames_of: list[tuple[str, slice]]
+
+
+class Robot:
+    """A robot that is not there.
+
+    Args:
+        settings, layout: as the host reads them from one configuration file.
+        scene: what happens to it; nothing, if not given.
+        fidelity: "signal" or "chip", for all boards or by the board's name.
+        seed: replaces the scene's.
+        recordings: logs by the board's name: these boards send what was recorded from a board
+            of their address.
+
+    Attributes:
+        t_ns: time since it was switched on.
+        boards: the boards by name.
+        skin: foam and pads under the scene, with the truth that tests compare with.
+        converters: the chips.
+        wires: the buses by name.
+        hung, late_ns, jitter_ns: faults of boards, by their index in the layout.
+
+    Raises:
+        ConfigurationError: the scene, the fidelities or the recordings name something that the
+            layout does not have.
+        LogError: a recording cannot be read.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        layout: Layout,
+        scene: Scene | None = None,
+        *,
+        fidelity: str | Mapping[str, str] = "signal",
+        seed: int | None = None,
+        recordings: Mapping[str, Path] | None = None,
+    ) -> None:
+        scene = scene or Scene()
+        if seed is not None:
+            scene = structs.replace(scene, seed=seed)
+        check(scene)
+        self.layout = layout
+        self.t_ns = 0
+        self.skin = Skin(layout, scene)
+        of_board = fidelities(layout, fidelity)
+        self._signal_boards = [of_board[number] == "signal" for number in of_board]
+        self.converters = Converters(
+            layout, self.skin.noise_ff, scene.seed, quiet=not scene.noise, fidelity=of_board
+        )
+        self._skin_due_ns = 0
+        self._felt_taxels = self._felt_chips = np.zeros(0, np.intp)
+        chips = np.arange(len(layout.triangles))
+        self.converters.set_capacitance_ff(chips, self.skin.capacitance_ff.reshape(-1, TAXELS))
+        rng = np.random.default_rng([scene.seed, 3])
+        self._boards: list[Mtb] = [
+            make_board(
+                board.settings.model, board.settings.address, self.converters.of_board(number), rng
+            )
+            for number, board in enumerate(layout.boards)
+        ]
+        self.boards = {
+            board.name: mtb for board, mtb in zip(layout.boards, self._boards, strict=True)
+        }
+        self._bus_of = [board.settings.bus for board in layout.boards]
+        self.wires = {
+            name: Wire(
+                bus.bitrate, self._stack_sizes(name), np.random.default_rng([scene.seed, 4, number])
+            )
+            for number, (name, bus) in enumerate(settings.buses.items())
+        }
+        self._recordings = load_recordings(layout, recordings or {})
+        self._in_bus_order = sorted(range(len(self._boards)), key=self._bus_of.__getitem__)
+        self._bursts: dict[tuple[int, ...], _Known] = {}
+        self._rng = np.random.default_rng([scene.seed, 5])
+        self.hung: set[int] = set()
+        self.late_ns: dict[int, int] = {}
+        self.jitter_ns: dict[int, float] = {}
+        self._plans = count()
+        self._agenda: list[tuple[int, int, Callable[[], object]]] = []
+        for number, fault in enumerate(scene.fault):
+            try:
+                faults.check_targets(self, fault)
+            except ConfigurationError as error:
+                raise ConfigurationError(f"fault[{number}].{error}") from None
+            self._plan(fault.at_s, partial(self.inject, fault))
+        self._look_ahead()
+
+    # ------------------------------------------------------------------ time
+
+    def step(self, dt_s: float) -> dict[str, FrameBatch]:
+        """Let `dt_s` pass.
+
+        Returns:
+            By bus, the frames whose transmission ended meanwhile, `t_ns` that moment.
+        """
+        end_ns = self.t_ns + round(dt_s * NS)
+        while True:
+            self._move_to(self._next_ns(end_ns))
+            while self._agenda and self._agenda[0][0] <= self.t_ns:
+                heappop(self._agenda)[2]()
+                self._look_ahead()
+            if self._boards_due_ns <= self.t_ns:
+                self._sample()
+                self._look_ahead()
+            if self.t_ns >= end_ns:
+                break
+        return {name: wire.until(self.t_ns) for name, wire in self.wires.items()}
+
+    def _next_ns(self, end_ns: int) -> int:
+        next_ns = min(end_ns, self._skin_due_ns, self._boards_due_ns)
+        if self._agenda:
+            next_ns = min(next_ns, self._agenda[0][0])
+        return max(self.t_ns, next_ns)
+
+    def _look_ahead(self) -> None:
+        """Find out when the next board is due; after anything that may have changed it."""
+        due_ns = [
+            due
+            for number, due in enumerate(board.due_ns for board in self._boards)
+            if due is not None and number not in self.hung
+        ]
+        self._boards_due_ns = _next_tick_ns(min(due_ns)) if due_ns else NEVER_NS
+
+    def _move_to(self, t_ns: int) -> None:
+        """Time up to `t_ns`; where mechanics is due, its outcome goes to the chips."""
+        self.t_ns = self.converters.t_ns = t_ns
+        if t_ns < self._skin_due_ns:
+            return
+        taxels = self.skin.step(t_ns)
+        # The mechanics has a grid of its own: the caller's steps do not change what happens.
+        self._skin_due_ns = self.skin.due_ns
+        if taxels is not self._felt_taxels:
+            self._felt_taxels = taxels
+            self._felt_chips = np.unique(self.layout.triangle_of[taxels]).astype(np.intp)
+        if len(taxels):
+            self._pass_on(self._felt_chips)
+
+    def _pass_on(self, chips: Ints) -> None:
+        """Tell chips what their pads measure."""
+        values = self.skin.capacitance_ff.reshape(-1, TAXELS)[chips]
+        held = self.skin.held_ff.reshape(-1, TAXELS)[chips]
+        self.converters.set_capacitance_ff(chips, np.where(np.isnan(held), values, held))
+
+    def _sample(self) -> None:
+        """Let every board that is due read its chips and send."""
+        together: dict[object, list[int]] = {}
+        for number in self._in_bus_order:
+            board = self._boards[number]
+            due_ns = board.due_ns
+            if due_ns is None or _next_tick_ns(due_ns) > self.t_ns or number in self.hung:
+                continue
+            bus = self._bus_of[number]
+            if board.advance(self.t_ns):
+                if board.next_ns is not None:
+                    board.next_ns += self.late_ns.get(number, 0)
+                alone = board.alone or number in self.jitter_ns or number in self._recordings
+                if self._signal_boards[number] and not alone:
+                    together.setdefault(type(board).arithmetic, []).append(number)
+                else:
+                    self.wires[bus].put(self._sample_alone(number, board))
+            self._answer(bus, board.answers())
+        for numbers in together.values():
+            known = self._burst(numbers)
+            raw = read_rows(self.converters.signal, known.chips, known.row)
+            batch = known.burst.frames(raw, self.t_ns)
+            for bus, rows in known.frames_of:
+                self.wires[bus].put(
+                    FrameBatch(batch.id[rows], batch.dlc[rows], batch.data[rows], batch.t_ns[rows])
+                )
+
+    def _sample_alone(self, number: int, board: Mtb) -> FrameBatch:
+        jitter_ns = self.jitter_ns.get(number, 0.0)
+        delay_ns = round(abs(self._rng.normal(0.0, jitter_ns))) if jitter_ns else 0
+        recording = self._recordings.get(number)
+        if recording is not None:
+            return recording.frames(board.address, self.t_ns + delay_ns)
+        return board.sample(self.t_ns + delay_ns)
+
+    def _burst(self, numbers: list[int]) -> _Known:
+        """What these boards send, gathered anew only if one of them has changed."""
+        boards = [self._boards[number] for number in numbers]
+        versions = [board.version for board in boards]
+        known = self._bursts.get(tuple(numbers))
+        if known is None or known.versions != versions:
+            burst = Burst(boards)
+            of_board = np.array(numbers, np.intp)[burst.board]
+            # A board reads all its chips, whether their triangles are enabled or not.
+            wired = np.concatenate([self.converters.chip_of_slot[number] for number in numbers])
+            chips = np.sort(wired[wired >= 0])
+            sent = [
+                self.converters.chip_of_slot[board][slot]
+                for board, slot in zip(of_board, burst.slot, strict=True)
+            ]
+            row = np.array(
+                [np.searchsorted(chips, one) if one >= 0 else -1 for one in sent], np.intp
+            )
+            frames_of: list[tuple[str, slice]] = []
+            start = 0
+            for bus, of_bus in groupby(self._bus_of[board] for board in of_board):
+                stop = start + 2 * len(list(of_bus))
+                frames_of.append((bus, slice(start, stop)))
+                start = stop
+            known = self._bursts[tuple(numbers)] = _Known(versions, burst, chips, row, frames_of)
+        return known
+
+    # ------------------------------------------------------------------ the host's side
+
+    def receive(self, bus: str, can_id: int, data: bytes) -> None:
+        """A frame from the host; the boards' answers come with the next step."""
+        if self.wires[bus].off:
+            return
+        for number, board in enumerate(self._boards):
+            if self._bus_of[number] == bus and number not in self.hung:
+                self._answer(bus, board.handle(can_id, data, self.t_ns))
+        self._look_ahead()
+
+    def _answer(self, bus: str, answers: list[tuple[int, bytes]]) -> None:
+        if answers:
+            frames = [(can_id, data, self.t_ns) for can_id, data in answers]
+            self.wires[bus].put(FrameBatch.of(frames))
+
+    def bring_up(self) -> None:
+        """Configure and start all boards as a careful host does, for use without one."""
+        bring_up(self)
+
+    async def run(self, buses: Mapping[str, can.BusABC], clock: Clock | None = None) -> None:
+        """Live on real or virtual buses until cancelled.
+
+        Args:
+            buses: an open python-can bus for each bus of the settings, by name.
+            clock: time to live in; the machine's own, if not given.
+        """
+        clock = clock or RealClock()
+        links = {name: Link(name, bus) for name, bus in buses.items()}
+        last_ns = clock.now_ns()
+        while True:
+            for name, link in links.items():
+                for can_id, data in link.received():
+                    self.receive(name, can_id, data)
+            now_ns = clock.now_ns()
+            passed_ns = min(now_ns - last_ns, LONGEST_CATCH_UP_NS)
+            last_ns = now_ns
+            for name, batch in self.step(passed_ns / NS).items():
+                links[name].send(batch)
+            await clock.sleep_until_ns(now_ns + POLL_NS)
+
+    # ------------------------------------------------------------------ by hand
+
+    def touch(self, probe: Probe) -> "LiveProbe":
+        """A probe that is moved by a program, not by the scene; its keyframes are not used.
+
+        Raises:
+            ConfigurationError: there is no such part, triangle or taxel.
+        """
+        return LiveProbe(self, self.skin.add_live(probe))
+
+    def inject(self, fault: Fault) -> Callable[[], None]:
+        """Let a fault begin now; it ends by itself after `until_s - at_s`, or by the answer.
+
+        Raises:
+            ConfigurationError: no such fault, or not a thing of this robot.
+        """
+        mend = faults.begin(self, fault)
+        self._look_ahead()
+        if fault.until_s is not None:
+            self._plan(self.t_ns / NS + fault.until_s - fault.at_s, mend)
+
+        def end() -> None:
+            mend()
+            self._look_ahead()
+
+        return end
+
+    def _plan(self, at_s: float, action: Callable[[], object]) -> None:
+        heappush(self._agenda, (round(at_s * NS), next(self._plans), action))
+
+    def rewire(self, board: int, chip_of_slot: Ints) -> None:
+        """Plug other chips into the slots of a board, intp[20]."""
+        self.converters.rewire(board, chip_of_slot)
+        self._boards[board].version += 1
+
+    def pass_on(self, taxels: slice) -> None:
+        """Tell the chips of some taxels at once that these measure something else."""
+        self._pass_on(np.unique(self.layout.triangle_of[taxels]).astype(np.intp))
+
+    def work_out_now(self) -> None:
+        """Something changed that the mechanics must take up at once."""
+        self._skin_due_ns = self.t_ns
+
+    # ------------------------------------------------------------------ truth
+
+    def true_pressure_kpa(self, part: str) -> Floats:
+        """True pressure on each taxel of a part now, float64[n], mean over the pad (kPa)."""
+        found = self.layout.part(part)
+        return self.skin.true_pressure_kpa()[found.start : found.stop]
+
+    def _stack_sizes(self, bus: str) -> "_StackSizes":
+        return _StackSizes(
+            [board for number, board in enumerate(self._boards) if self._bus_of[number] == bus]
+        )
+
+
+def _next_tick_ns(t_ns: int) -> int:
+    return -(-t_ns // TICK_NS) * TICK_NS
+
+
+class LiveProbe:
+    """A probe in a program's hand, see `Robot.touch`."""
+
+    def __init__(self, robot: Robot, number: int) -> None:
+        self._robot = robot
+        self._number = number
+
+    def press(self, drive: float, x_mm: float = 0.0, y_mm: float = 0.0) -> None:
+        """Press from now on with a force (N), or to a depth (mm) if it is driven by depth."""
+        self._robot.skin.set_live(self._number, drive, x_mm, y_mm)
+        self._robot.work_out_now()
+
+    def lift(self) -> None:
+        """Take it off the skin."""
+        self.press(0.0)
+
+    @property
+    def force_n(self) -> float:
+        """Force on it at the last step of the mechanics; 0 off the skin."""
+        return self._robot.skin.contact_force_n().get(self._number, 0.0)
+
+
+class _StackSizes:
+    """For each sender on a bus whether its transmit queue is a stack."""
+
+    def __init__(self, boards: list[Mtb]) -> None:
+        self._boards = boards
+
+    def __call__(self, address: int) -> int | None:
+        for board in self._boards:
+            if board.address == address:
+                return board.stack_size
+        return None

@@ -1,0 +1,186 @@
+"""Viscoelastic truths of the foam: what the pressure really is, given how far it is squeezed.
+
+They are what compensators are measured against, so none of them is a compensator's model. All
+have seven modes over four decades of time and lose 28 % of their pressure in the end:
+
+    L  linear: the ordinary Prony solid.
+    A  asymmetric: unloading 2.5 times slower, losses grow with amplitude, rates with overstress.
+    H  as A, and three play operators: about 3 % of hysteresis at any speed.
+    S  symmetric, but times shrink with compression: tau exp(-(C - 30 kPa) / 40 kPa). Slow
+       unloading comes out of it without being put in. The default.
+
+The numbers are chosen, not measured: no relaxation curve of the paper's foam is public.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+TruthKind = Literal["S", "A", "L", "H"]
+
+TAU_S = np.geomspace(1.5, 6000.0, 7)
+BETA = np.full(7, 0.04)
+#: Spread of the losses from taxel to taxel, when drawn.
+STRENGTH_SD = 0.1
+#: Above this, truth S gets no faster: presses of 2 s at 160 kPa must have come back after 20 s
+#: to within the scatter of the paper's repetitions (2.3-5 kPa).
+SHIFT_LIMIT_KPA = 100.0
+#: Half widths of the play operators (kPa). Each costs PLAY_SHARE of its width.
+PLAY_KPA = np.array([4.0, 12.0, 34.0])
+PLAY_SHARE = 0.03
+#: Rate-independent hysteresis fades below this pressure: foam at rest is foam at rest.
+PLAY_FADE_KPA = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Law:
+    unloading_ratio: float = 1.0
+    amplitude_per_kpa: float = 0.0
+    overstress_per_kpa: float = 0.0
+    time_shift: bool = False
+    plays: bool = False
+
+
+_LAWS: dict[str, _Law] = {
+    "L": _Law(),
+    "A": _Law(unloading_ratio=2.5, amplitude_per_kpa=0.0015, overstress_per_kpa=0.01),
+    "H": _Law(2.5, 0.0015, 0.01, plays=True),
+    "S": _Law(time_shift=True),
+}
+
+
+class FoamTruth:
+    """One of the truths under each of n taxels.
+
+    `elastic_kpa` C is what the strain alone would give, the true pressure is P = C - relaxation.
+    Drive it by C, by P, or by a robot that holds its position through a spring. Every `step`
+    takes C to run straight from its last value to the new one. `taxels` picks some of the n
+    (int[k], no repeats); time stands still for the others.
+
+    Args:
+        kind: "S", "A", "L" or "H".
+        n: number of taxels.
+        rng: if given, losses vary by 10 % from taxel to taxel.
+
+    Attributes:
+        elastic_kpa, pressure_kpa, relaxation_kpa: float64[n], after the last step.
+    """
+
+    def __init__(self, kind: TruthKind, n: int, rng: np.random.Generator | None = None) -> None:
+        self._law = _LAWS[kind]
+        self.elastic_kpa = np.zeros(n)
+        self.pressure_kpa = np.zeros(n)
+        self.relaxation_kpa = np.zeros(n)
+        self._strength = np.ones(n)
+        if rng is not None:
+            self._strength = np.exp(STRENGTH_SD * rng.standard_normal(n))
+        self._modes = np.zeros((n, len(TAU_S)))
+        self._plays = np.tile(-PLAY_KPA, (n, 1))
+
+    def __len__(self) -> int:
+        return len(self.elastic_kpa)
+
+    def reset(self, taxels: Ints | slice = slice(None)) -> None:
+        """Foam that was never touched."""
+        self._modes[taxels] = 0
+        self._plays[taxels] = -PLAY_KPA
+        for state in (self.elastic_kpa, self.pressure_kpa, self.relaxation_kpa):
+            state[taxels] = 0
+
+    def step(
+        self, elastic_kpa: ArrayLike, dt_s: float, taxels: Ints | slice = slice(None)
+    ) -> Floats:
+        """Strain-driven: go to C [k] within `dt_s`; answers the true pressure P [k].
+
+        P may come out negative, for a probe glued to the foam.
+        """
+        elastic = np.asarray(elastic_kpa, np.float64)
+        modes, plays = self._stepped(elastic, dt_s, taxels)
+        return self._store(elastic, modes, plays, taxels)
+
+    def step_pressure(
+        self, pressure_kpa: ArrayLike, dt_s: float, taxels: Ints | slice = slice(None)
+    ) -> Floats:
+        """Pressure-driven: find the C [k] that leaves P = `pressure_kpa` after `dt_s`.
+
+        With P = 0 it is free foam, and C its imprint.
+        """
+        pressure = np.asarray(pressure_kpa, np.float64)
+        return self._solve(pressure, 0.0, dt_s, taxels)
+
+    def step_held(
+        self,
+        command_kpa: ArrayLike,
+        dt_s: float,
+        taxels: Ints | slice = slice(None),
+        compliance: float = 0.08,
+    ) -> Floats:
+        """A robot commands a position and gives way by `compliance` per kPa of true pressure.
+
+        C = command - compliance P; where that would need a pull, the probe has left: P = 0.
+        Answers C [k].
+        """
+        # With P = C - relaxation: C = (command + compliance relaxation) / (1 + compliance).
+        command = np.asarray(command_kpa, np.float64)
+        return self._solve(command / (1 + compliance), 1 / (1 + compliance), dt_s, taxels)
+
+    def _solve(
+        self, offset: Floats, pressed_share: float, dt_s: float, taxels: Ints | slice
+    ) -> Floats:
+        """Find C = max(offset + (1 - pressed_share) R, R) with R at the end of the step."""
+        relaxation = self.relaxation_kpa[taxels]
+        for _ in range(50):
+            elastic = np.maximum(offset + (1 - pressed_share) * relaxation, relaxation)
+            modes, plays = self._stepped(elastic, dt_s, taxels)
+            last, relaxation = relaxation, self._relaxation(elastic, modes, plays, taxels)
+            if np.abs(relaxation - last).max(initial=0.0) < 1e-7:
+                break
+        self._store(elastic, modes, plays, taxels)
+        return elastic
+
+    def _stepped(self, elastic: Floats, dt_s: float, taxels: Ints | slice) -> tuple[Floats, Floats]:
+        """States [k, 7] and plays [k, 3] after C went to `elastic`; nothing is stored."""
+        law = self._law
+        modes = self._modes[taxels]
+        # C in the middle of a straight line stands for the line: exact to second order.
+        middle = 0.5 * (self.elastic_kpa[taxels] + elastic)[:, None]
+        away = middle - modes
+        rate = dt_s / TAU_S
+        if law.time_shift:
+            rate = rate * np.exp((np.minimum(middle, SHIFT_LIMIT_KPA) - 30.0) / 40.0)
+        if law.unloading_ratio != 1.0:
+            rate = np.where(away < 0, rate / law.unloading_ratio, rate)
+        if law.overstress_per_kpa:
+            rate = rate * (1 + law.overstress_per_kpa * np.abs(away))
+        modes = modes - np.expm1(-rate) * away
+        plays = self._plays[taxels]
+        if law.plays:
+            plays = np.clip(plays, elastic[:, None] - PLAY_KPA, elastic[:, None] + PLAY_KPA)
+        return modes, plays
+
+    def _relaxation(
+        self, elastic: Floats, modes: Floats, plays: Floats, taxels: Ints | slice
+    ) -> Floats:
+        law = self._law
+        if law.amplitude_per_kpa:
+            modes = modes * (1 + law.amplitude_per_kpa * modes)
+        relaxation: Floats = self._strength[taxels] * (modes @ BETA)
+        if law.plays:
+            # 0 while loading, twice the half width while unloading.
+            behind = (plays - elastic[:, None] + PLAY_KPA).sum(axis=1)
+            relaxation += PLAY_SHARE * behind * elastic / (np.abs(elastic) + PLAY_FADE_KPA)
+        return relaxation
+
+    def _store(self, elastic: Floats, modes: Floats, plays: Floats, taxels: Ints | slice) -> Floats:
+        relaxation = self._relaxation(elastic, modes, plays, taxels)
+        pressure = elastic - relaxation
+        self._modes[taxels] = modes
+        self._plays[taxels] = plays
+        self.elastic_kpa[taxels] = elastic
+        self.relaxation_kpa[taxels] = relaxation
+        self.pressure_kpa[taxels] = pressure
+        return pressure

@@ -1,0 +1,1 @@
+"""Bytes on CAN to sweeps of the skin, and commands back to its boards."""

@@ -1,0 +1,315 @@
+"""Frames to sweeps: one assembler a bus.
+
+A sweep is one board's values of one period. The wire has no sequence number and no
+guaranteed order, so a sweep is bounded by what can be told: a slot (triangle and half)
+that comes twice, a pause, or the age of the sweep's first frame starts a new one. It is
+handed on as soon as every triangle that is awaited has come whole. A triangle that has
+been missing for a while is no longer awaited, so that it costs no delay; when it comes
+back, it is.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.bus.protocol import (
+    HEADER_A,
+    HEADER_B,
+    MAX_STANDARD_ID,
+    NS_PER_S,
+    TAXELS,
+    TRIANGLES,
+    VALUES_A,
+    FrameBatch,
+    MessageClass,
+)
+from skin_host.layout import BoardLayout
+
+#: A board's frames follow each other within a burst; a pause of this share of the period,
+#: measured on one board, lies between two sweeps.
+PAUSE_PERIODS = 0.5
+#: A triangle is awaited until it was missing in so many sweeps in a row.
+PATIENCE_SWEEPS = 3
+_HALVES = 2 * TRIANGLES
+_FIRST_HALVES = 0x55555555
+#: Masks of groups of 2, 4, 8, 16 bits, by half their width.
+_GROUPS = {1: 0x33333333, 2: 0x0F0F0F0F, 4: 0x00FF00FF, 8: 0xFFFF}
+#: What a frame brings behind its header, and two of them together.
+_NOTHING = bytes(7)
+_TRIANGLE = np.dtype([("raw", np.uint8, TAXELS), ("status", ">u2")])
+_SMALLEST_DLC_B = 6
+#: Classes of A and of B frames: the stream, the legacy stream, and the class in which a special
+#: firmware sends B frames.
+_CLASSES = {
+    HEADER_A: (MessageClass.SKIN_STREAM, MessageClass.ANALOG_STREAM),
+    HEADER_B: (MessageClass.SKIN_STREAM, MessageClass.ANALOG_STREAM, MessageClass.BATTERY_STREAM),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """One board's values of one period.
+
+    Attributes:
+        board: index into `Layout.boards`.
+        raw: uint8[16, 12]; rows of missing triangles are 0.
+        status: uint16[16], S0 << 8 | S1; 0 where the frame had no status bytes.
+        present: mask of triangles whose two frames came.
+        t_ns: time of the sweep's last frame.
+        missed: whole periods without any frame since the sweep before.
+    """
+
+    board: int
+    raw: NDArray[np.uint8]
+    status: NDArray[np.uint16]
+    present: int
+    t_ns: int
+    missed: int
+
+
+@dataclass(slots=True)
+class AssemblerCounters:
+    """Everything that came and did not become part of a sweep, and what was missing."""
+
+    frames: int = 0
+    #: Not of the skin stream: answers, other sensors, strangers.
+    other: int = 0
+    wrong_header: int = 0
+    short: int = 0
+    #: Skin frames of a board that is not configured on this bus.
+    unknown_board: int = 0
+    #: Skin frames of a triangle that is not configured.
+    unknown_triangle: int = 0
+    #: Frames of a triangle that was no longer awaited, too late for their sweep.
+    late: int = 0
+    sweeps: int = 0
+    #: Sweeps handed on without a triangle that was awaited.
+    incomplete: int = 0
+    #: Triangles with one half only.
+    halves: int = 0
+    #: Whole periods without a frame from a board that had been sending.
+    missed: int = 0
+
+
+@dataclass(slots=True)
+class _BoardState:
+    """One board's sweep in progress; masks have bit 2 * triangle for A, the next one for B.
+
+    Attributes:
+        wanted: halves that the configured triangles send.
+        awaited: those without which a sweep is not complete.
+        missing: those of `awaited` that have not come; 0 between sweeps.
+        values: what came, by number of the bit.
+    """
+
+    index: int
+    period_ns: int
+    pause_ns: int
+    close_ns: int
+    wanted: int
+    awaited: int
+    missing: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    certain_until_ns: int = 0
+    sent: int = 0
+    sent_first_ns: int = -(1 << 62)
+    sent_last_ns: int = 0
+    values: list[bytes] = field(default_factory=lambda: [_NOTHING] * _HALVES)
+    absent_for: list[int] = field(default_factory=lambda: [0] * TRIANGLES)
+
+
+class Assembler:
+    """Pairs the frames of one bus's boards into sweeps.
+
+    Args:
+        boards: (index in `Layout.boards`, board) of the boards on this bus.
+        close_periods: a sweep is closed when its first frame is so many periods old.
+    """
+
+    def __init__(self, boards: list[tuple[int, BoardLayout]], close_periods: float) -> None:
+        self.counters = AssemblerCounters()
+        self._states: dict[int, _BoardState] = {}
+        # By identifier << 8 | header byte of each frame that a configured triangle may send:
+        # the board, the number of the frame's bit in its masks, and the bit.
+        self._slots: dict[int, tuple[_BoardState, int, int]] = {}
+        for index, board in boards:
+            period_ns = board.settings.period_ms * 1_000_000
+            wanted = 0
+            for triangle in board.triangles:
+                wanted |= 3 << 2 * triangle
+            state = _BoardState(
+                index,
+                period_ns,
+                int(PAUSE_PERIODS * period_ns),
+                int(close_periods * period_ns),
+                wanted,
+                wanted,
+            )
+            self._states[board.settings.address] = state
+            for triangle in board.triangles:
+                self._add_slots(board.settings.address, triangle, state)
+
+    def feed(self, batch: FrameBatch) -> list[Sweep]:
+        """Take the frames of a batch, hand on the sweeps that they complete.
+
+        Sweeps of one board come in order of time.
+        """
+        # One frame after the other. With the thirty to hundred frames that a read brings, this
+        # costs less than masks and scatters over arrays, and a batch may span several sweeps.
+        self.counters.frames += len(batch)
+        sweeps: list[Sweep] = []
+        slots = self._slots
+        for seconds, nanoseconds, identifier, dlc, header, payload in batch.frames():
+            slot = slots.get(identifier << 8 | header)
+            if slot is None or dlc < 8:
+                if not self._usable(identifier, dlc, header):
+                    continue
+                assert slot is not None
+                # Old firmware: no status; what lies behind the DLC is not defined.
+                payload = payload[: TAXELS - VALUES_A] + b"\0\0"  # noqa: PLW2901
+            t_ns = seconds * NS_PER_S + nanoseconds
+            state, number, bit = slot
+            if (bit & state.missing and t_ns <= state.certain_until_ns) or self._belongs(
+                state, bit, t_ns, sweeps
+            ):
+                state.values[number] = payload
+                state.last_ns = t_ns
+                state.missing ^= bit
+                if not state.missing:
+                    self._close(state, sweeps)
+        return sweeps
+
+    def expire(self, now_ns: int) -> list[Sweep]:
+        """Hand on the sweeps whose time has passed, with what has come of them.
+
+        Args:
+            now_ns: the time, on the clock of the frames' time stamps.
+        """
+        sweeps: list[Sweep] = []
+        for state in self._states.values():
+            if state.missing and now_ns - state.first_ns > state.close_ns:
+                self._close(state, sweeps)
+        return sweeps
+
+    def flush(self) -> list[Sweep]:
+        """Hand on everything, at the end of a recording."""
+        return self.expire(1 << 62)
+
+    def _add_slots(self, address: int, triangle: int, state: _BoardState) -> None:
+        for half, header in enumerate((HEADER_A, HEADER_B)):
+            for message_class in _CLASSES[header]:
+                identifier = message_class << 8 | address << 4 | triangle
+                number = 2 * triangle + half
+                self._slots[identifier << 8 | header] = state, number, 1 << number
+
+    def _usable(self, identifier: int, dlc: int, header: int) -> bool:
+        """Count a frame that is not a whole one of a configured triangle.
+
+        Returns whether it is a configured triangle's B frame that merely lacks its status.
+        """
+        counters = self.counters
+        message_class = identifier >> 8
+        if dlc == 0 or identifier > MAX_STANDARD_ID:
+            counters.other += 1
+        elif message_class == MessageClass.SKIN_STREAM:
+            if header not in _CLASSES:
+                counters.wrong_header += 1
+            elif dlc < (_SMALLEST_DLC_B if header == HEADER_B else 8):
+                counters.short += 1
+            elif identifier << 8 | header in self._slots:
+                return True
+            else:
+                self._count_stranger(identifier)
+        elif dlc == 8 and message_class in _CLASSES.get(header, ()):
+            self._count_stranger(identifier)
+        else:
+            # Other sensors use the legacy class too, with fewer bytes.
+            counters.other += 1
+        return False
+
+    def _count_stranger(self, identifier: int) -> None:
+        if identifier >> 4 & 0xF in self._states:
+            self.counters.unknown_triangle += 1
+        else:
+            self.counters.unknown_board += 1
+
+    def _belongs(self, state: _BoardState, bit: int, t_ns: int, sweeps: list[Sweep]) -> bool:
+        """Make room for a frame that is not plainly the next one of a sweep in progress.
+
+        It may begin a sweep, which ends the one before, or be of a triangle that was not
+        awaited. Returns False if it came too late for its sweep.
+        """
+        if state.missing and (
+            state.awaited & ~state.missing & bit
+            or t_ns - state.last_ns > state.pause_ns
+            or t_ns - state.first_ns > state.close_ns
+        ):
+            self._close(state, sweeps)
+        if not bit & state.awaited:
+            triangle = (bit.bit_length() - 1) // 2
+            both = 3 << 2 * triangle
+            state.awaited |= both
+            state.absent_for[triangle] = 0
+            if state.missing:
+                state.missing |= both
+        if not state.missing:
+            if not bit & state.sent and t_ns - state.sent_first_ns <= state.pause_ns:
+                # It was not awaited, so its sweep went without it.
+                self.counters.late += 1
+                return False
+            state.missing = state.awaited
+            state.first_ns = t_ns
+        state.certain_until_ns = min(t_ns + state.pause_ns, state.first_ns + state.close_ns)
+        return True
+
+    def _close(self, state: _BoardState, sweeps: list[Sweep]) -> None:
+        got = state.awaited & ~state.missing
+        pairs = got & got >> 1 & _FIRST_HALVES
+        missed = 0
+        if state.sent_last_ns:
+            apart = round((state.last_ns - state.sent_last_ns) / state.period_ns)
+            missed = max(0, apart - 1)
+        triangles = np.frombuffer(bytearray().join(state.values), _TRIANGLE)
+        if state.wanted & ~(pairs * 3):
+            absent = [triangle for triangle in range(TRIANGLES) if not pairs >> 2 * triangle & 1]
+            triangles[absent] = 0
+            self._note_absent(state, pairs)
+        elif any(state.absent_for):
+            state.absent_for = [0] * TRIANGLES
+        counters = self.counters
+        counters.sweeps += 1
+        counters.incomplete += state.missing != 0
+        counters.halves += (got ^ pairs * 3).bit_count()
+        counters.missed += missed
+        if pairs:
+            status = triangles["status"].astype(np.uint16)
+            present = _every_second_bit(pairs)
+            sweeps.append(
+                Sweep(state.index, triangles["raw"], status, present, state.last_ns, missed)
+            )
+        state.sent = got
+        state.sent_first_ns = state.first_ns
+        state.sent_last_ns = state.last_ns
+        state.missing = 0
+
+    @staticmethod
+    def _note_absent(state: _BoardState, pairs: int) -> None:
+        for triangle in range(TRIANGLES):
+            both = 3 << 2 * triangle
+            if pairs & both:
+                state.absent_for[triangle] = 0
+            elif state.wanted & both:
+                state.absent_for[triangle] += 1
+                if state.absent_for[triangle] >= PATIENCE_SWEEPS:
+                    state.awaited &= ~both
+        if not state.awaited:
+            state.awaited = state.wanted
+
+
+def _every_second_bit(bits: int) -> int:
+    """Bits 0, 2, 4, ... 30 moved together; the others must be 0."""
+    for width in (1, 2, 4, 8):
+        bits = (bits | bits >> width) & _GROUPS[width]
+    return bits

@@ -1,0 +1,424 @@
+"""The boards of one bus: found, set up, started, watched, set up again, stopped.
+
+A board that falls silent is asked who it is and how long it has been up, and is set up
+again: at once, then ever more rarely. One that sends, but not what it was set up to send
+(triangles off, another period), has lost its set-up and gets it again. Each is treated
+alone; the others go on undisturbed.
+
+Their pitfalls decide the order (reference of the wire, sections 3 and 4):
+
+- discovery comes first, because a streaming MTB3 falls silent after any class-7 frame;
+- command 4D disables all triangles, so the 50s follow it;
+- an MTB4 stops when it takes a 50, so the start comes last;
+- an MTB4 takes its baseline before the first conversion with a new CDC offset, so the
+  last 50 is sent once more after that conversion;
+- an MTB3 reads its five mailboxes newest first and blocks for two periods while it
+  calibrates, so its commands are spaced by more than that.
+"""
+
+import asyncio
+import logging
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Coroutine, Iterable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from skin_host.bus.commands import (
+    SKIN_BOARD_TYPES,
+    BoardType,
+    Discover,
+    Discovered,
+    DiscoveredBootloader,
+    GetTimeOfLife,
+    Message,
+    SetBoardConfig,
+    SetTriangleConfig,
+    SetTxMode,
+    TimeOfLife,
+    TxMode,
+    TxOverflow,
+    command_frame,
+    parse_answer,
+)
+from skin_host.bus.protocol import (
+    BROADCAST_ADDRESS,
+    FrameBatch,
+    MessageClass,
+)
+from skin_host.errors import BusError
+from skin_host.layout import BoardLayout, TriangleLayout
+
+log = logging.getLogger(__name__)
+
+DISCOVERY_S = 0.15
+#: Two conversions of twelve stages at decimation 256 (36.9 ms each), and some air.
+NEW_OFFSET_S = 0.09
+MTB3_GAP_PERIODS = 2.5
+GAP_S = 0.01
+ANSWER_S = 0.05
+#: A silent board is set up again at once, then after so long, up to the last.
+RETRY_S = (1.0, 2.0, 4.0, 8.0)
+#: A board must send something wrong for so long before it is set up again, then the pause
+#: doubles up to the last: what setting up does not mend should not be disturbed for ever.
+WRONG_S = 1.0
+WRONG_RETRY_S = (5.0, 10.0, 20.0, 60.0)
+#: A period that is off by more than this share is not the one that was set.
+WRONG_PERIOD = 0.25
+PERIOD_SWEEPS = 16
+_ANSWERS = (MessageClass.ANALOG_COMMAND, MessageClass.MANAGEMENT)
+
+
+class Sender(Protocol):
+    """What is needed of a port: paced sending."""
+
+    async def send(self, frames: Iterable[tuple[int, bytes]], gap_s: float = ...) -> None:
+        """Send (identifier, data) frames, `gap_s` apart. Raises BusError."""
+
+
+@dataclass(slots=True)
+class BoardRecord:
+    """What is known of one board; part of the health record.
+
+    Attributes:
+        started: it has been set up and told to send.
+        alive: it sends.
+        configurations: how often it was set up.
+        silences: how often it fell silent.
+        resets: how often it had started anew by itself when it was asked.
+        lost_set_ups: how often it sent something else than it was set up to.
+        tx_overflows: how often it said that it had to drop frames.
+    """
+
+    index: int
+    layout: BoardLayout
+    board_type: int | None = None
+    firmware: tuple[int, int, int] | None = None
+    in_bootloader: bool = False
+    started: bool = False
+    alive: bool = False
+    configurations: int = 0
+    configured_ns: int = 0
+    silences: int = 0
+    resets: int = 0
+    lost_set_ups: int = 0
+    tx_overflows: int = 0
+    life_s: float | None = None
+    answered_ns: int = 0
+    last_sweep_ns: int = 0
+    sweep_times_ns: deque[int] = field(default_factory=lambda: deque(maxlen=PERIOD_SWEEPS + 1))
+    missing: int = 0
+    wrong: str = ""
+    wrong_since_ns: int = 0
+    wrong_tries: int = 0
+    wrong_retry_ns: int = 0
+    retry_at_ns: int = 0
+    retries: int = 0
+    commands: list[Message] = field(default_factory=list)
+    busy: "asyncio.Task[None] | None" = None
+
+    @property
+    def interval_ns(self) -> float | None:
+        """Median of its last intervals, None until there are enough."""
+        if len(self.sweep_times_ns) < PERIOD_SWEEPS // 2:
+            return None
+        intervals = np.diff(np.array(self.sweep_times_ns, np.int64))
+        return float(np.median(intervals))
+
+    @property
+    def is_mtb3(self) -> bool:
+        """By its own answer, or by the configuration where it did not answer."""
+        if self.board_type is None:
+            return self.layout.settings.model == "mtb3"
+        return self.board_type == BoardType.SKIN
+
+    @property
+    def gap_s(self) -> float:
+        """How far apart its commands must be."""
+        if self.is_mtb3:
+            return MTB3_GAP_PERIODS * self.layout.settings.period_ms * 1e-3
+        return GAP_S
+
+
+class Boards:
+    """Bring-up and supervision of the boards of one bus.
+
+    Args:
+        bus: its name, for messages.
+        port: where commands are sent.
+        boards: (index in `Layout.boards`, board) of this bus.
+        triangles: all triangles of the skin.
+        silent_periods: a started board is silent after so many periods without a sweep.
+        zeroed: called with the board's index just before it takes a new zero.
+    """
+
+    def __init__(
+        self,
+        bus: str,
+        port: Sender,
+        boards: list[tuple[int, BoardLayout]],
+        triangles: tuple[TriangleLayout, ...],
+        silent_periods: float,
+        zeroed: Callable[[int], object] = lambda _: None,
+    ) -> None:
+        self.bus = bus
+        self._zeroed = zeroed
+        self._port = port
+        self._silent_periods = silent_periods
+        self.records = {board.settings.address: BoardRecord(i, board) for i, board in boards}
+        self._of_index = {record.index: record for record in self.records.values()}
+        self.strangers: dict[int, int] = {}
+        #: The identifier that strangers' frames have most.
+        self.stranger_id: int | None = None
+        for record in self.records.values():
+            mine = [triangle for triangle in triangles if triangle.board == record.index]
+            record.commands = configuration(record.layout, mine)
+
+    async def bring_up(self) -> None:
+        """Discover, set up and start every board of the bus.
+
+        Raises:
+            BusError: the bus does not take frames.
+        """
+        await self._port.send([command_frame(Discover(), BROADCAST_ADDRESS)])
+        await asyncio.sleep(DISCOVERY_S)
+        for address, record in self.records.items():
+            if record.board_type is None:
+                log.warning(
+                    "bus %s: board %s (address %d) did not answer discovery; is it powered?",
+                    self.bus,
+                    record.layout.name,
+                    address,
+                )
+        for address, kind in self.strangers.items():
+            log.warning(
+                "bus %s: a board of type %d at address %d is not in the configuration",
+                self.bus,
+                kind,
+                address,
+            )
+        await asyncio.gather(*(self._set_up(record) for record in self.records.values()))
+
+    async def set_up(self, address: int) -> None:
+        """Send a board its set-up and start it.
+
+        Raises:
+            BusError: the bus does not take frames.
+        """
+        record = self.records[address]
+        if record.busy is not None:
+            await asyncio.wait([record.busy])
+        await self._set_up(record)
+
+    async def _set_up(self, record: BoardRecord) -> None:
+        address = record.layout.settings.address
+        gap_s = record.gap_s
+        frames = [command_frame(command, address) for command in record.commands]
+        self._zeroed(record.index)
+        await self._port.send(frames, gap_s)
+        await asyncio.sleep(max(gap_s, NEW_OFFSET_S))
+        await self._port.send([frames[-1]])
+        await asyncio.sleep(max(gap_s, NEW_OFFSET_S))
+        await self._port.send([command_frame(SetTxMode(TxMode.START), address)])
+        record.configurations += 1
+        record.configured_ns = time.monotonic_ns()
+        record.sweep_times_ns.clear()
+        record.missing = 0
+        record.wrong = ""
+        record.started = True
+
+    def supervise(self) -> None:
+        """Look after every board; what is to be done takes place beside everything else.
+
+        No discovery of all here: it would silence the MTB3s that are well.
+        """
+        now_ns = time.monotonic_ns()
+        for record in self.records.values():
+            if not record.started or record.busy is not None:
+                continue
+            period_ns = record.layout.settings.period_ms * 1_000_000
+            since_ns = max(record.last_sweep_ns, record.configured_ns)
+            silent = now_ns - since_ns > self._silent_periods * period_ns
+            if silent:
+                self._note_silence(record, now_ns)
+            elif record.last_sweep_ns >= record.configured_ns:
+                self._note_sending(record, now_ns)
+
+    def _note_silence(self, record: BoardRecord, now_ns: int) -> None:
+        if record.alive:
+            log.debug("bus %s: board %s is silent", self.bus, record.layout.name)
+            record.alive = False
+            record.silences += 1
+            record.retries = 0
+            record.retry_at_ns = now_ns
+        if record.retry_at_ns <= now_ns:
+            wait_s = RETRY_S[min(record.retries, len(RETRY_S) - 1)]
+            record.retry_at_ns = now_ns + int(wait_s * 1e9)
+            record.retries += 1
+            self._begin(record, self._revive(record))
+
+    def _note_sending(self, record: BoardRecord, now_ns: int) -> None:
+        if not record.alive:
+            record.alive = True
+            log.debug("bus %s: board %s is sending", self.bus, record.layout.name)
+        self._judge(record, now_ns)
+        if not record.wrong or now_ns - record.wrong_since_ns < WRONG_S * 1e9:
+            if not record.wrong and now_ns - record.wrong_retry_ns > WRONG_RETRY_S[-1] * 1e9:
+                record.wrong_tries = 0
+            return
+        if now_ns < record.wrong_retry_ns:
+            return
+        wait_s = WRONG_RETRY_S[min(record.wrong_tries, len(WRONG_RETRY_S) - 1)]
+        record.wrong_retry_ns = now_ns + int(wait_s * 1e9)
+        record.wrong_tries += 1
+        record.lost_set_ups += 1
+        if record.wrong_tries == 1:
+            log.warning(
+                "bus %s: board %s %s: it is set up again",
+                self.bus,
+                record.layout.name,
+                record.wrong,
+            )
+        self._begin(record, self._set_up(record))
+
+    @staticmethod
+    def _judge(record: BoardRecord, now_ns: int) -> None:
+        wrong = ""
+        interval = record.interval_ns
+        period_ns = record.layout.settings.period_ms * 1_000_000
+        if record.missing:
+            wrong = "does not send all of its triangles"
+        elif interval and abs(interval - period_ns) > WRONG_PERIOD * period_ns:
+            wrong = f"sends every {interval / 1e6:.0f} ms, not {period_ns / 1e6:.0f} ms"
+        # What is missing from now on must be missing in every sweep.
+        record.missing = record.layout.enabled
+        if wrong and not record.wrong:
+            record.wrong_since_ns = now_ns
+        record.wrong = wrong
+
+    def _begin(self, record: BoardRecord, work: Coroutine[None, None, None]) -> None:
+        async def do() -> None:
+            try:
+                await work
+            except BusError as error:
+                log.debug("bus %s: %s", self.bus, error)
+            finally:
+                record.busy = None
+
+        record.busy = asyncio.create_task(do(), name=f"board {record.layout.name}")
+
+    async def _revive(self, record: BoardRecord) -> None:
+        """Ask a silent board who it is and how long it has been up, then set it up."""
+        address = record.layout.settings.address
+        asked_ns = time.monotonic_ns()
+        record.life_s = None
+        questions: list[Message] = [Discover()]
+        if not record.is_mtb3:
+            questions.append(GetTimeOfLife())
+        await self._port.send([command_frame(question, address) for question in questions])
+        await asyncio.sleep(ANSWER_S)
+        answered = record.answered_ns >= asked_ns
+        up_since_ns = asked_ns - int((record.life_s or 0.0) * 1e9)
+        # An MTB3 does not tell its age; one that answers and does not send was reset.
+        aged = record.is_mtb3 or record.life_s is not None
+        if answered and aged and up_since_ns > record.configured_ns:
+            record.resets += 1
+        if not record.in_bootloader:
+            await self._set_up(record)
+
+    async def stop(self) -> None:
+        """Tell every board to stop sending.
+
+        Raises:
+            BusError: the bus does not take frames.
+        """
+        busy = [record.busy for record in self.records.values() if record.busy is not None]
+        for task in busy:
+            task.cancel()
+        await asyncio.gather(*busy, return_exceptions=True)
+        for address, record in self.records.items():
+            record.started = False
+            await self._port.send([command_frame(SetTxMode(TxMode.STOP), address)])
+
+    def note_sweep(self, board: int, present: int, t_ns: int) -> None:
+        """A sweep of this board (index in `Layout.boards`) came, with these triangles.
+
+        Whether a board is silent goes by our own monotonic clock: `t_ns` may jump.
+        """
+        record = self._of_index[board]
+        record.last_sweep_ns = time.monotonic_ns()
+        record.sweep_times_ns.append(t_ns)
+        record.missing &= ~present
+
+    def feed(self, batch: FrameBatch) -> None:
+        """Take answers out of a batch."""
+        # Nearly all frames are skin; looking at each costs less than arrays of the few others.
+        strange: list[int] = []
+        for _, _, identifier, dlc, first, rest in batch.frames():
+            message_class = identifier >> 8
+            if message_class in _ANSWERS:
+                parsed = parse_answer(identifier, (bytes([first]) + rest)[:dlc])
+                if parsed is not None:
+                    self._note_answer(*parsed)
+            elif message_class < MessageClass.ANALOG_COMMAND:
+                strange.append(identifier)
+        if 2 * len(strange) > len(batch):
+            ((self.stranger_id, _),) = Counter(strange).most_common(1)
+
+    def _note_answer(self, address: int, answer: Message | TxOverflow) -> None:
+        record = self.records.get(address)
+        if record is None:
+            if isinstance(answer, Discovered):
+                self.strangers[address] = answer.board_type
+            return
+        if isinstance(answer, Discovered | DiscoveredBootloader | TimeOfLife):
+            record.answered_ns = time.monotonic_ns()
+        if isinstance(answer, Discovered):
+            record.board_type = answer.board_type
+            record.firmware = (
+                answer.firmware_major,
+                answer.firmware_minor,
+                answer.firmware_build,
+            )
+            record.in_bootloader = False
+            if answer.board_type not in SKIN_BOARD_TYPES:
+                log.warning(
+                    "bus %s: board %s is of type %d, which is no skin board",
+                    self.bus,
+                    record.layout.name,
+                    answer.board_type,
+                )
+        elif isinstance(answer, DiscoveredBootloader):
+            record.board_type = answer.board_type
+            record.in_bootloader = True
+            log.warning("bus %s: board %s is in its bootloader", self.bus, record.layout.name)
+        elif isinstance(answer, TimeOfLife):
+            record.life_s = answer.seconds
+        elif isinstance(answer, TxOverflow):
+            record.tx_overflows += 1
+
+
+def configuration(board: BoardLayout, triangles: list[TriangleLayout]) -> list[Message]:
+    """Commands 4D and 50 that set up a board; runs of equal triangles share one command."""
+    settings = board.settings
+    commands: list[Message] = [
+        SetBoardConfig(settings.skin_type, settings.period_ms, settings.no_load)
+    ]
+    run: SetTriangleConfig | None = None
+    for triangle in sorted(triangles, key=lambda triangle: triangle.number):
+        alike = (
+            run is not None
+            and run.last + 1 == triangle.number
+            and (run.shift, run.cdc_offset) == (triangle.shift, triangle.cdc_offset)
+        )
+        first = run.first if run is not None and alike else triangle.number
+        if run is not None and not alike:
+            commands.append(run)
+        run = SetTriangleConfig(
+            first, triangle.number, triangle.shift, cdc_offset=triangle.cdc_offset
+        )
+    if run is not None:
+        commands.append(run)
+    return commands

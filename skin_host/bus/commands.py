@@ -1,0 +1,469 @@
+"""Commands to the boards and their answers: class 2 (analog) and class 7 (management).
+
+Every command is a small record that knows its code and the shape of its payload, so one
+encoder and one parser serve all. Multi-byte numbers are little endian. None of the skin
+configuration commands is answered. Sources: the boards' protocol document TSD-ICUBUNIT
+(section 3), mtb3/can_interface.c and embot_prot_can_analog_polling.cpp.
+"""
+
+import struct
+from dataclasses import astuple, dataclass
+from enum import IntEnum, IntFlag
+from typing import ClassVar, Self
+
+from skin_host.bus.protocol import (
+    BROADCAST_ADDRESS,
+    HOST_ADDRESS,
+    MAX_STANDARD_ID,
+    MessageClass,
+    identifier,
+)
+
+
+class BoardType(IntEnum):
+    """What a board calls itself. Source: iCubCanProto_types.h."""
+
+    SKIN = 5
+    MTB4 = 11
+    STRAIN2 = 12
+    RFE = 13
+    PSC = 15
+    MTB4W = 16
+    MTB4C = 20
+    STRAIN2C = 22
+    AMCMJ1 = 25
+    UNKNOWN = 255
+
+
+SKIN_BOARD_TYPES = frozenset({BoardType.SKIN, BoardType.MTB4, BoardType.MTB4W, BoardType.MTB4C})
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One command or answer: a code byte, then the fields as `LAYOUT` packs them."""
+
+    CLASS: ClassVar[MessageClass]
+    CODE: ClassVar[int]
+    LAYOUT: ClassVar[struct.Struct] = struct.Struct("")
+
+    def encode(self) -> bytes:
+        """Payload, the code byte first.
+
+        Raises:
+            ValueError: a field does not fit its bytes.
+        """
+        try:
+            return bytes([self.CODE]) + self.LAYOUT.pack(*astuple(self))
+        except struct.error as error:
+            raise ValueError(f"{self}: {error}") from None
+
+    @classmethod
+    def decode(cls, payload: bytes) -> Self | None:
+        """The record in `payload`, or None if it is too short or of another code.
+
+        Bytes past the fields are ignored, as the boards ignore them.
+        """
+        if payload[:1] != bytes([cls.CODE]) or len(payload) < 1 + cls.LAYOUT.size:
+            return None
+        return cls(*cls.LAYOUT.unpack_from(payload, 1))
+
+
+class Analog(Message):
+    """A message of class 2."""
+
+    __slots__ = ()
+    CLASS = MessageClass.ANALOG_COMMAND
+
+
+class Management(Message):
+    """A message of class 7."""
+
+    __slots__ = ()
+    CLASS = MessageClass.MANAGEMENT
+
+
+class TxMode(IntEnum):
+    """Argument of command 07; the inverse of intuition."""
+
+    START = 0
+    STOP = 1
+
+
+@dataclass(frozen=True, slots=True)
+class SetTxMode(Analog):
+    """07: start or stop the stream."""
+
+    CODE = 0x07
+    LAYOUT = struct.Struct("B")
+    mode: int
+
+
+@dataclass(frozen=True, slots=True)
+class SetTransmissionPeriod(Analog):
+    """08: period of an analog stream in ms (force/torque boards; skin takes it from 4D)."""
+
+    CODE = 0x08
+    LAYOUT = struct.Struct("B")
+    period_ms: int
+
+
+@dataclass(frozen=True, slots=True)
+class GetFirmwareVersion(Analog):
+    """1C: ask for the firmware, naming the CAN protocol the host speaks."""
+
+    CODE = 0x1C
+    LAYOUT = struct.Struct("2B")
+    protocol_major: int
+    protocol_minor: int
+
+
+@dataclass(frozen=True, slots=True)
+class SetBoardAddress(Analog):
+    """32: a new address 1..14, stored at once, not answered."""
+
+    CODE = 0x32
+    LAYOUT = struct.Struct("B")
+    address: int
+
+
+@dataclass(frozen=True, slots=True)
+class ImuGet(Analog):
+    """33: ask for the inertial set-up (MTB4 family)."""
+
+    CODE = 0x33
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSet(Analog):
+    """34: which inertial sensors stream, a mask of 16 bits, then range and further settings."""
+
+    CODE = 0x34
+    LAYOUT = struct.Struct("<HBI")
+    sensors: int
+    fusion: int
+    ranges: int
+
+
+@dataclass(frozen=True, slots=True)
+class ImuTransmit(Analog):
+    """35: inertial period in ms, 0 stops."""
+
+    CODE = 0x35
+    LAYOUT = struct.Struct("B")
+    period_ms: int
+
+
+@dataclass(frozen=True, slots=True)
+class ThermometerGet(Analog):
+    """38: ask for the thermometer set-up."""
+
+    CODE = 0x38
+
+
+@dataclass(frozen=True, slots=True)
+class ThermometerSet(Analog):
+    """39: which thermometers stream."""
+
+    CODE = 0x39
+    LAYOUT = struct.Struct("B")
+    sensors: int
+
+
+@dataclass(frozen=True, slots=True)
+class ThermometerTransmit(Analog):
+    """3A: thermometer period in seconds, 0 stops."""
+
+    CODE = 0x3A
+    LAYOUT = struct.Struct("B")
+    period_s: int
+
+
+@dataclass(frozen=True, slots=True)
+class TactileSetup(Analog):
+    """4C, obsolete: set up, calibrate and start in class 3 (MTB3); MTB4 ignores the fields.
+
+    Low nibble of `mode`: 0 16-bit, 1 8-bit, 2 10-bit, 3 calibrate; high nibble: 0 twelve
+    values, 1 three, 2 one, 4 fingertip. `decimation` 1 is 256, 2 is 128, 3 is 64. `timer`
+    counts 3.2 us and is used where `timer_flag` is 3.
+    """
+
+    CODE = 0x4C
+    LAYOUT = struct.Struct("<3BHH")
+    mode: int = 1
+    decimation: int = 1
+    timer_flag: int = 1
+    cdc_offset: int = 0x2000
+    timer: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class SetBoardConfig(Analog):
+    """4D: skin type, period, untouched value. Side effect: all triangles are disabled."""
+
+    CODE = 0x4D
+    LAYOUT = struct.Struct("3B")
+    skin_type: int
+    period_ms: int
+    no_load: int
+
+
+@dataclass(frozen=True, slots=True)
+class TactileSetup2(Analog):
+    """4E, obsolete (MTB3): shifts, no-load, flags, enabled triangles; calibrates and starts."""
+
+    CODE = 0x4E
+    LAYOUT = struct.Struct("<4BHB")
+    shift: int = 0x02
+    shifts: int = 0x22
+    no_load: int = 0xF0
+    flags: int = 0
+    enabled: int = 0xFFFF
+    trailer: int = 0x0A
+
+
+@dataclass(frozen=True, slots=True)
+class AccGyroSetup(Analog):
+    """4F: inertial sensors of the board; period in ms, 0 stops."""
+
+    CODE = 0x4F
+    LAYOUT = struct.Struct("2B")
+    sensors: int
+    period_ms: int
+
+
+class TriangleFlags(IntFlag):
+    """Flags of command 50."""
+
+    ENABLE = 1
+
+
+@dataclass(frozen=True, slots=True)
+class SetTriangleConfig(Analog):
+    """50: set up triangles first..last. Triggers a new baseline of the whole board."""
+
+    CODE = 0x50
+    LAYOUT = struct.Struct("<4BH")
+    first: int
+    last: int
+    shift: int = 2
+    flags: int = TriangleFlags.ENABLE
+    cdc_offset: int = 0x2200
+
+
+@dataclass(frozen=True, slots=True)
+class EnterBootloader(Management):
+    """00: reset into the bootloader."""
+
+    CODE = 0x00
+
+
+@dataclass(frozen=True, slots=True)
+class Ping(Management):
+    """04: are you there (MTB3 application); ends the bootloader."""
+
+    CODE = 0x04
+
+
+@dataclass(frozen=True, slots=True)
+class GetAdditionalInfo(Management):
+    """0C: ask for the board's text of 32 characters."""
+
+    CODE = 0x0C
+
+
+@dataclass(frozen=True, slots=True)
+class SetAdditionalInfo(Management):
+    """0D: four characters of the board's text, `index` 0..7."""
+
+    CODE = 0x0D
+    LAYOUT = struct.Struct("B4s")
+    index: int
+    text: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class GetTimeOfLife(Management):
+    """0E: ask how long the board has been up."""
+
+    CODE = 0x0E
+
+
+@dataclass(frozen=True, slots=True)
+class SetCanAddress(Management):
+    """32: a new address (FF picks one at random outside `forbidden`, a mask of addresses)."""
+
+    CODE = 0x32
+    LAYOUT = struct.Struct("<BH")
+    address: int
+    forbidden: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Discover(Management):
+    """FF: who is there. An MTB3 falls silent after any frame of this class."""
+
+    CODE = 0xFF
+
+
+@dataclass(frozen=True, slots=True)
+class FirmwareVersion(Analog):
+    """Answer to 1C."""
+
+    CODE = 0x1C
+    LAYOUT = struct.Struct("7B")
+    board_type: int
+    firmware_major: int
+    firmware_minor: int
+    firmware_build: int
+    protocol_major: int
+    protocol_minor: int
+    compatible: int
+
+
+@dataclass(frozen=True, slots=True)
+class ResetAnswer(Management):
+    """Answer of an MTB3 to 00, just before it resets."""
+
+    CODE = 0x00
+    LAYOUT = struct.Struct("B")
+    ok: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class PingAnswer(Management):
+    """Answer to 04."""
+
+    CODE = 0x04
+    LAYOUT = struct.Struct("B")
+    ok: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class AdditionalInfo(Management):
+    """One of eight answers to 0C."""
+
+    CODE = 0x0C
+    LAYOUT = struct.Struct("B4s")
+    index: int
+    text: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class TimeOfLife(Management):
+    """Answer to 0E: seven bytes of microseconds, little endian (byte order inferred)."""
+
+    CODE = 0x0E
+    LAYOUT = struct.Struct("7s")
+    microseconds: bytes
+
+    @property
+    def seconds(self) -> float:
+        """Time since the board started."""
+        return int.from_bytes(self.microseconds, "little") * 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Discovered(Management):
+    """Answer of an application to FF."""
+
+    CODE = 0xFF
+    LAYOUT = struct.Struct("4B")
+    board_type: int
+    firmware_major: int
+    firmware_minor: int
+    firmware_build: int
+
+
+@dataclass(frozen=True, slots=True)
+class DiscoveredBootloader(Management):
+    """Answer of a bootloader to FF: the board runs no application."""
+
+    CODE = 0xFF
+    LAYOUT = struct.Struct("3B")
+    board_type: int
+    bootloader_major: int
+    bootloader_minor: int
+
+
+@dataclass(frozen=True, slots=True)
+class TxOverflow:
+    """Notice of an MTB3 that its transmit buffer overflowed: class 7, low nibble 5, DLC 0."""
+
+
+COMMANDS: tuple[type[Message], ...] = (
+    SetTxMode,
+    SetTransmissionPeriod,
+    GetFirmwareVersion,
+    SetBoardAddress,
+    ImuGet,
+    ImuSet,
+    ImuTransmit,
+    ThermometerGet,
+    ThermometerSet,
+    ThermometerTransmit,
+    TactileSetup,
+    SetBoardConfig,
+    TactileSetup2,
+    AccGyroSetup,
+    SetTriangleConfig,
+    EnterBootloader,
+    Ping,
+    GetAdditionalInfo,
+    SetAdditionalInfo,
+    GetTimeOfLife,
+    SetCanAddress,
+    Discover,
+)
+#: Longest first where two answers share a code, so that the longer one is tried first.
+ANSWERS: tuple[type[Message], ...] = (
+    FirmwareVersion,
+    ResetAnswer,
+    PingAnswer,
+    AdditionalInfo,
+    TimeOfLife,
+    Discovered,
+    DiscoveredBootloader,
+)
+TX_OVERFLOW_TYPE = 5
+
+
+def command_frame(command: Message, address: int) -> tuple[int, bytes]:
+    """Identifier and payload of a command from the host to `address` (15 is everyone)."""
+    return identifier(command.CLASS, HOST_ADDRESS, address), command.encode()
+
+
+def answer_frame(answer: Message, address: int) -> tuple[int, bytes]:
+    """Identifier and payload of an answer from board `address` to the host."""
+    return identifier(answer.CLASS, address, HOST_ADDRESS), answer.encode()
+
+
+def parse_command(can_id: int, payload: bytes) -> tuple[int, Message] | None:
+    """Receiver (1..15) and command of a frame from the host, or None if it is none."""
+    if can_id > MAX_STANDARD_ID or can_id >> 4 & 0xF != HOST_ADDRESS:
+        return None
+    address = can_id & 0xF
+    if address == HOST_ADDRESS:
+        return None
+    for kind in COMMANDS:
+        if can_id >> 8 == kind.CLASS:
+            command = kind.decode(payload)
+            if command is not None:
+                return address, command
+    return None
+
+
+def parse_answer(can_id: int, payload: bytes) -> tuple[int, Message | TxOverflow] | None:
+    """Sender (1..14) and answer of a frame from a board, or None if it is none."""
+    sender = can_id >> 4 & 0xF
+    if can_id > MAX_STANDARD_ID or sender in {HOST_ADDRESS, BROADCAST_ADDRESS}:
+        return None
+    if can_id >> 8 == MessageClass.MANAGEMENT and can_id & 0xF == TX_OVERFLOW_TYPE and not payload:
+        return sender, TxOverflow()
+    if can_id & 0xF != HOST_ADDRESS:
+        return None
+    for kind in ANSWERS:
+        if can_id >> 8 == kind.CLASS:
+            answer = kind.decode(payload)
+            if answer is not None:
+                return sender, answer
+    return None

@@ -1,0 +1,112 @@
+"""Recordings as the same `FrameBatch` that a bus gives.
+
+python-can's readers know the formats: candump (.log), Vector ASC and BLF, CSV, PEAK TRC,
+MF4, and the text ones compressed (.gz).
+"""
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+
+import can
+import can.io.player
+
+from skin_host.bus.adapters import identifier, nanoseconds, one_line
+from skin_host.bus.protocol import FrameBatch
+from skin_host.errors import LogError
+
+#: One batch holds at most so many frames.
+CAPACITY = 1024
+WINDOW_NS = 4_000_000
+
+
+def read_log(
+    path: Path, window_ns: int = WINDOW_NS, channel: str | None = None
+) -> Iterator[FrameBatch]:
+    """The frames of a recording at full speed, in batches as a live bus would give.
+
+    Times are exact to the microsecond. They count from the epoch where the format has a
+    date, else from the start of the recording.
+
+    Args:
+        path: file; its suffix tells the format.
+        window_ns: a batch spans at most so long.
+        channel: only the frames of this channel, as the recording names it.
+
+    Raises:
+        LogError: absent, of no known format, empty, or damaged; what came before the
+            damage has then been handed on.
+    """
+    for batch_channel, batch in read_channels(path, window_ns):
+        if channel is None or batch_channel == channel:
+            yield batch
+
+
+def read_channels(path: Path, window_ns: int = WINDOW_NS) -> Iterator[tuple[str, FrameBatch]]:
+    """As `read_log`, with the name of the channel; "" where the recording has none.
+
+    Frames of one window are handed on channel by channel.
+    """
+    windows: dict[str, list[tuple[int, bytes, int]]] = {}
+    end_ns = 0
+    for channel, frame in _frames(path):
+        if windows and (frame[2] >= end_ns or len(windows.get(channel, ())) == CAPACITY):
+            yield from ((name, FrameBatch.of(frames)) for name, frames in windows.items())
+            windows = {}
+        if not windows:
+            end_ns = frame[2] + window_ns
+        windows.setdefault(channel, []).append(frame)
+    yield from ((name, FrameBatch.of(frames)) for name, frames in windows.items())
+
+
+async def replay_log(
+    path: Path, window_ns: int = WINDOW_NS, speed: float = 1.0
+) -> AsyncIterator[tuple[str, FrameBatch]]:
+    """As `read_channels`, at the recording's own pace times `speed`."""
+    start: tuple[float, int] | None = None
+    for channel, batch in read_channels(path, window_ns):
+        last_ns = int(batch.t_ns[-1])
+        if start is None:
+            start = (time.monotonic(), int(batch.t_ns[0]))
+        due_s = start[0] + (last_ns - start[1]) * 1e-9 / speed
+        await asyncio.sleep(max(0.0, due_s - time.monotonic()))
+        yield channel, batch
+
+
+def _frames(path: Path) -> Iterator[tuple[str, tuple[int, bytes, int]]]:
+    """(channel, (identifier with flags, data, t_ns)) of each classic frame."""
+    n = 0
+    try:
+        with _reader(path) as reader:
+            for message in reader:
+                n += 1
+                if not message.is_fd:
+                    channel = "" if message.channel is None else str(message.channel)
+                    data = bytes(message.data)
+                    yield channel, (identifier(message), data, nanoseconds(message.timestamp))
+            # python-can takes a BLF that was cut off for one that ended.
+            said, there = getattr(reader, "file_size", 0), path.stat().st_size
+            if there < said:
+                raise ValueError(f"cut off, {there} of {said} bytes are there")
+    except LogError:
+        raise
+    except Exception as error:
+        # Each reader has errors of its own for a file that is not what its name says.
+        where = f"damaged after frame {n}" if n else "cannot be read as what its name says"
+        raise LogError(f"{path}: {where}: {one_line(error)}") from None
+    if not n:
+        raise LogError(f"{path}: there is no CAN frame in it; wanted a recording, e.g. of candump")
+
+
+def _reader(path: Path) -> can.io.generic.MessageReader:
+    suffixes = [suffix.lower() for suffix in path.suffixes]
+    known = sorted(can.io.player.MESSAGE_READERS)
+    if not any(suffix in known for suffix in suffixes[-2:]):
+        raise LogError(f"{path}: format not known by its name; known are {', '.join(known)}")
+    try:
+        with path.open("rb"):
+            pass
+        return can.LogReader(path)
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror or error}") from None

@@ -1,0 +1,269 @@
+"""One CAN bus as a source of `FrameBatch` and a paced way to send.
+
+Two kinds stand behind one interface: SocketCAN, read in batches (`socketcan`), and every
+other interface that python-can knows (`adapters`). A port that has been opened never
+raises on reading and never gives up: an interface that goes down, disappears or is
+bus-off is a state, counted and told in one log line per change.
+"""
+
+import asyncio
+import errno
+import logging
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import StrEnum
+
+import can
+import numpy as np
+from can.interfaces.socketcan import SocketcanBus
+
+from skin_host.bus.protocol import FrameBatch, MessageClass
+from skin_host.errors import BusError
+from skin_host.settings import Bus, Receive
+
+log = logging.getLogger(__name__)
+
+#: A port that is not up looks for its interface this often.
+CHECK_S = 0.25
+#: After bus-off the kernel may take so long to say that the carrier is gone.
+_CARRIER_S = 1.5
+#: A frame that the interface does not take within this time is given up.
+SEND_DEADLINE_S = 1.0
+_SEND_RETRY_S = 0.002
+#: A flapping link writes at most one log line in this time.
+_QUIET_S = 1.0
+
+EXTENDED_FLAG = 0x80000000
+REMOTE_FLAG = 0x40000000
+ERROR_FLAG = 0x20000000
+#: What boards of the skin and force/torque sensors send.
+SKIN_CLASSES = (
+    MessageClass.ANALOG_COMMAND,
+    MessageClass.ANALOG_STREAM,
+    MessageClass.SKIN_STREAM,
+    MessageClass.BATTERY_STREAM,
+    MessageClass.MANAGEMENT,
+)
+#: Classes and details of error frames (linux/can/error.h).
+_ERROR_CONTROLLER = 0x004
+_ERROR_BUS_OFF = 0x040
+_ERROR_RESTARTED = 0x100
+_CONTROLLER_RX_OVERFLOW = 0x01
+_CONTROLLER_PASSIVE = 0x30
+_CONTROLLER_ACTIVE = 0x40
+
+
+class LinkState(StrEnum):
+    """What is known of the interface."""
+
+    UP = "up"
+    #: Errors abound on the wire, frames still pass.
+    ERROR_PASSIVE = "error_passive"
+    #: The controller left the bus after too many errors.
+    BUS_OFF = "bus_off"
+    DOWN = "down"
+    #: The device was removed, or its driver failed; it is looked for under the same name.
+    GONE = "gone"
+
+
+@dataclass(slots=True)
+class PortCounters:
+    """What a port has seen since it was opened.
+
+    Attributes:
+        frames: frames read, error frames included.
+        dropped: frames lost because the socket's buffer was full (counted by the kernel).
+        controller_overflows: times the controller lost frames; how many, it does not say.
+        buffer_bytes: size of the socket's buffer that was granted, 0 where there is none.
+    """
+
+    frames: int = 0
+    dropped: int = 0
+    controller_overflows: int = 0
+    error_frames: int = 0
+    bus_offs: int = 0
+    link_downs: int = 0
+    removals: int = 0
+    reopened: int = 0
+    sent: int = 0
+    send_retries: int = 0
+    buffer_bytes: int = 0
+
+
+class Port(ABC):
+    """An open CAN bus.
+
+    Attributes:
+        name: of the bus in the configuration.
+        channel: of the interface, e.g. "can0".
+        state: of the link, as far as it is known.
+        counters: of everything since opening.
+    """
+
+    def __init__(self, name: str, settings: Bus, bus: can.BusABC) -> None:
+        self.name = name
+        self.channel = settings.channel
+        self.state = LinkState.UP
+        self.counters = PortCounters()
+        self._settings = settings
+        self._bus: can.BusABC | None = bus
+        self._send_lock = asyncio.Lock()
+        self._reason = ""
+        self._told = LinkState.UP
+        self._told_at_s = -_QUIET_S
+        self._check_at_s = 0.0
+
+    @abstractmethod
+    def read(self) -> FrameBatch:
+        """Everything that is waiting, at most the port's capacity. Never blocks nor raises.
+
+        The arrays are reused: they hold until the next read.
+        """
+
+    def fileno(self) -> int | None:
+        """A descriptor that is readable when frames wait, or None; it changes on reopening."""
+        try:
+            return self._bus.fileno() if self._bus is not None else None
+        except NotImplementedError:
+            return None
+
+    async def send(self, frames: Iterable[tuple[int, bytes]], gap_s: float = 0.002) -> None:
+        """Send standard data frames, with a pause after each: the boards' mailboxes are shallow.
+
+        A full transmit queue is waited for.
+
+        Raises:
+            BusError: the interface is down or gone, or its queue stayed full.
+        """
+        async with self._send_lock:
+            for identifier, data in frames:
+                message = can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
+                deadline_s = time.monotonic() + SEND_DEADLINE_S
+                while not self._try_send(message):
+                    if time.monotonic() > deadline_s:
+                        raise BusError(
+                            f'bus "{self.name}": {self.channel}: the transmit queue stayed full '
+                            f"for {SEND_DEADLINE_S:g} s; no other node acknowledges: check power, "
+                            f"wiring and termination (`ip -details -statistics link show "
+                            f"{self.channel}`)"
+                        )
+                    self.counters.send_retries += 1
+                    await asyncio.sleep(_SEND_RETRY_S)
+                self.counters.sent += 1
+                await asyncio.sleep(gap_s)
+
+    def close(self) -> None:
+        """Give the interface back."""
+        if self._bus is not None:
+            self._bus.shutdown()
+            self._bus = None
+
+    def _try_send(self, message: can.Message) -> bool:
+        if self._bus is None or self.state is LinkState.DOWN:
+            raise BusError(f'bus "{self.name}": {self.channel}: cannot send, {self.state}')
+        try:
+            self._bus.send(message)
+        except can.CanOperationError as error:
+            # Without a code, an adapter says no more than that it could not.
+            if error.error_code in {None, errno.ENOBUFS, errno.EAGAIN}:
+                return False
+            raise BusError(f'bus "{self.name}": {self.channel}: cannot send: {error}') from None
+        return True
+
+    def _enter(self, state: LinkState, reason: str = "") -> None:
+        """Note a change of state; count it."""
+        if state is self.state:
+            return
+        self.state = state
+        self._reason = f" ({reason})" if reason else ""
+        match state:
+            case LinkState.BUS_OFF:
+                self.counters.bus_offs += 1
+                # The flags of the interface follow the controller with a delay.
+                self._check_at_s = time.monotonic() + _CARRIER_S
+            case LinkState.DOWN:
+                self.counters.link_downs += 1
+            case LinkState.GONE:
+                self.counters.removals += 1
+
+    def _tell(self) -> None:
+        """Log the state if it is not the one logged last."""
+        now_s = time.monotonic()
+        if self.state is self._told or now_s - self._told_at_s < _QUIET_S:
+            return
+        log.log(
+            logging.INFO if self.state is LinkState.UP else logging.WARNING,
+            'bus "%s": %s is %s%s, was %s',
+            self.name,
+            self.channel,
+            self.state,
+            self._reason,
+            self._told,
+        )
+        self._told = self.state
+        self._told_at_s = now_s
+
+    def _time_to_check(self) -> bool:
+        now_s = time.monotonic()
+        if now_s < self._check_at_s:
+            return False
+        self._check_at_s = now_s + CHECK_S
+        return True
+
+    def _note_errors(self, batch: FrameBatch) -> None:
+        """Count a batch's error frames and take the link's state from them."""
+        # In an extended identifier this bit belongs to the number.
+        kind = batch.id & np.uint32(EXTENDED_FLAG | ERROR_FLAG)
+        for row in np.flatnonzero(kind == ERROR_FLAG).tolist():
+            self.counters.error_frames += 1
+            error, detail = int(batch.id[row]), int(batch.data[row, 1])
+            if error & _ERROR_CONTROLLER:
+                self.counters.controller_overflows += detail & _CONTROLLER_RX_OVERFLOW
+                if detail & _CONTROLLER_PASSIVE:
+                    self._enter(LinkState.ERROR_PASSIVE)
+                elif detail & _CONTROLLER_ACTIVE:
+                    self._enter(LinkState.UP)
+            if error & _ERROR_BUS_OFF:
+                self._enter(LinkState.BUS_OFF)
+            if error & _ERROR_RESTARTED:
+                self._enter(LinkState.UP)
+
+
+def open_port(name: str, bus: Bus, receive: Receive) -> Port:
+    """Open a bus by python-can.
+
+    Args:
+        name: of the bus in the configuration, for messages.
+        bus: interface and channel.
+        receive: size of the buffer.
+
+    Raises:
+        BusError: the interface is absent, down, not CAN, not permitted, or not supported.
+    """
+    from skin_host.bus import adapters, socketcan
+
+    opened = open_bus(name, bus)
+    if bus.interface == "socketcan":
+        return socketcan.SocketCanPort(
+            name, bus, receive, opened, lambda: socketcan.open_present(name, bus)
+        )
+    if isinstance(opened, SocketcanBus):
+        return socketcan.SocketCanPort(
+            name, bus, receive, opened, lambda: adapters.open_bus(name, bus)
+        )
+    return adapters.AdapterPort(name, bus, opened)
+
+
+def open_bus(name: str, bus: Bus) -> can.BusABC:
+    """Open a bus for someone who uses python-can directly, as the emulator does.
+
+    Raises:
+        BusError: as `open_port`.
+    """
+    from skin_host.bus import adapters, socketcan
+
+    if bus.interface == "socketcan":
+        return socketcan.open_checked(name, bus)
+    return adapters.open_bus(name, bus)

@@ -1,0 +1,240 @@
+"""The wire of the MTB family: identifiers, data frames, status words. Pure, both ways.
+
+Classic CAN 2.0A at 1 Mbit/s, eleven-bit identifiers of three fields:
+
+    bits 10..8 class | bits 7..4 sender | bits 3..0 receiver, or type of a stream
+
+A triangle's twelve values travel as two frames of one identifier 0x400|board<<4|triangle:
+
+    A: 40 P0 P1 P2 P3 P4 P5 P6        B: C0 P7 P8 P9 P10 P11 S0 S1
+
+The status word S0<<8|S1 is a mask of taxels far out of range (bits 15..4) and an error
+nibble. Nothing numbers the frames and their order is free: pair them by header byte.
+Sources: icub-firmware's embot_prot_can_skin_periodic.cpp and mtb3/main_V3.c. Commands
+and their answers are in `commands`.
+"""
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag
+
+import numpy as np
+from numpy.typing import NDArray
+
+Bytes = NDArray[np.uint8]
+
+HOST_ADDRESS = 0
+BROADCAST_ADDRESS = 15
+TAXELS = 12
+TRIANGLES = 16
+HEADER_A = 0x40
+HEADER_B = 0xC0
+VALUES_A = 7
+MAX_STANDARD_ID = 0x7FF
+NS_PER_S = 1_000_000_000
+
+
+class MessageClass(IntEnum):
+    """Bits 10..8 of an identifier."""
+
+    MOTOR_COMMAND = 0
+    MOTOR_STREAM = 1
+    ANALOG_COMMAND = 2
+    ANALOG_STREAM = 3
+    SKIN_STREAM = 4
+    INERTIAL_STREAM = 5
+    BATTERY_STREAM = 6
+    MANAGEMENT = 7
+
+
+class StatusError(IntFlag):
+    """The error nibble of a status word."""
+
+    NONE = 0
+    #: A taxel reads 0 although its baseline is not: the chip did not acknowledge.
+    NO_ACK = 1
+    #: All twelve values read 0xFFFF: nothing is on the line.
+    NOT_CONNECTED = 2
+
+
+_RECORD = struct.Struct("=qqIBB7s")
+_RECORD_ARRAY = np.dtype(
+    [("seconds", "=i8"), ("nanoseconds", "=i8"), ("id", "=u4"), ("dlc", "u1"), ("data", "u1", 8)]
+)
+
+
+@dataclass(slots=True)
+class FrameBatch:
+    """CAN frames as arrays, in the order they were received.
+
+    Attributes:
+        id: uint32[n], as SocketCAN writes it: flags for extended (bit 31), remote
+            (bit 30) and error frames (bit 29) included. Standard data frames are <= 0x7FF.
+        dlc: uint8[n].
+        data: uint8[n, 8]; bytes past the DLC are not defined.
+        t_ns: int64[n], kernel time of reception, nanoseconds since 1970.
+        dropped: frames that the kernel had to drop since the batch before.
+    """
+
+    id: NDArray[np.uint32]
+    dlc: Bytes
+    data: Bytes
+    t_ns: NDArray[np.int64]
+    dropped: int = 0
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def frames(self) -> Iterator[tuple[int, int, int, int, int, bytes]]:
+        """Each frame as (seconds, nanoseconds, id, DLC, first byte, the other seven).
+
+        A read of a live bus brings some dozen frames. Walking through them costs less than
+        even a few operations on arrays; see docs/receive.md.
+        """
+        records = np.empty(len(self), _RECORD_ARRAY)
+        records["seconds"], records["nanoseconds"] = np.divmod(self.t_ns, NS_PER_S)
+        records["id"], records["dlc"], records["data"] = self.id, self.dlc, self.data
+        return _RECORD.iter_unpack(records.data)
+
+    @classmethod
+    def of(cls, frames: list[tuple[int, bytes, int]]) -> "FrameBatch":
+        """A batch of (id, data, t_ns), the data at most 8 bytes long."""
+        n = len(frames)
+        batch = cls(
+            np.zeros(n, np.uint32),
+            np.zeros(n, np.uint8),
+            np.zeros((n, 8), np.uint8),
+            np.zeros(n, np.int64),
+        )
+        for row, (identifier, data, t_ns) in enumerate(frames):
+            batch.id[row] = identifier
+            batch.dlc[row] = len(data)
+            batch.data[row, : len(data)] = np.frombuffer(data, np.uint8)
+            batch.t_ns[row] = t_ns
+        return batch
+
+
+def skin_id(board: int, triangle: int) -> int:
+    """Identifier of the two frames of a triangle, e.g. 0x4EF for board 14, triangle 15."""
+    return MessageClass.SKIN_STREAM << 8 | board << 4 | triangle
+
+
+def identifier(message_class: MessageClass, sender: int, low_nibble: int) -> int:
+    """Put an eleven-bit identifier together."""
+    return message_class << 8 | sender << 4 | low_nibble
+
+
+@dataclass(slots=True)
+class SkinFrames:
+    """The frames of a batch that carry skin values.
+
+    Attributes:
+        row: intp[m], their rows in the batch.
+        board, triangle: intp[m].
+        half: intp[m], 0 for an A frame (P0..P6), 1 for a B frame (P7..P11 and status).
+        wrong_header: frames of a skin identifier whose first byte is neither 40 nor C0.
+        short: skin frames with too few bytes for their values.
+        other: frames that are not of the skin stream at all.
+    """
+
+    row: NDArray[np.intp]
+    board: NDArray[np.intp]
+    triangle: NDArray[np.intp]
+    half: NDArray[np.intp]
+    wrong_header: int
+    short: int
+    other: int
+
+
+#: What an identifier's class may carry: bit 0 an A frame, bit 1 a B frame.
+#: Class 3 is the legacy stream. A special firmware sends B frames with class 6.
+_HALVES_OF_CLASS = np.array([0, 0, 0, 3, 3, 0, 2, 0], np.uint8)
+_SMALLEST_DLC = np.array([8, 6], np.uint8)
+
+
+def find_skin_frames(batch: FrameBatch) -> SkinFrames:
+    """Pick the frames that carry a triangle's values out of a batch.
+
+    Class 4, and the legacy class 3 in its two-frame form. An analog stream of class 3
+    (force/torque: DLC 6 or 7; temperature: DLC 5) never has DLC 8, so it is not taken
+    for skin. A B frame of old firmware may lack its status bytes (DLC 6 or 7, class 4).
+    """
+    n = len(batch)
+    message_class = (batch.id >> 8).astype(np.intp)
+    standard = batch.id <= MAX_STANDARD_ID
+    message_class[~standard] = 0
+    halves = _HALVES_OF_CLASS[message_class]
+    header = batch.data[:, 0]
+    is_b = header == HEADER_B
+    headed = is_b | (header == HEADER_A)
+    of_stream = (halves != 0) & (batch.dlc > 0)
+    legacy = message_class != MessageClass.SKIN_STREAM
+    of_stream &= ~legacy | ((batch.dlc == 8) & headed & ((halves >> is_b) & 1).astype(bool))
+    long_enough = batch.dlc >= _SMALLEST_DLC[is_b.astype(np.intp)]
+    row = np.flatnonzero(of_stream & headed & long_enough)
+    n_stream = int(np.count_nonzero(of_stream))
+    n_headed = int(np.count_nonzero(of_stream & headed))
+    ids = batch.id[row].astype(np.intp)
+    return SkinFrames(
+        row=row,
+        board=(ids >> 4) & 0xF,
+        triangle=ids & 0xF,
+        half=is_b[row].astype(np.intp),
+        wrong_header=n_stream - n_headed,
+        short=n_headed - len(row),
+        other=n - n_stream,
+    )
+
+
+def encode_sweep(
+    board: int, triangles: NDArray[np.intp], values: Bytes, status: NDArray[np.uint16]
+) -> tuple[NDArray[np.uint32], Bytes]:
+    """Frames of one sweep, A then B for each triangle, as an MTB sends them.
+
+    Args:
+        board: sender, 1..14.
+        triangles: [k] numbers 0..15.
+        values: uint8[k, 12].
+        status: uint16[k], S0 << 8 | S1.
+
+    Returns:
+        Identifiers uint32[2k] and data uint8[2k, 8], all of DLC 8.
+    """
+    k = len(triangles)
+    ids = np.repeat((MessageClass.SKIN_STREAM << 8 | board << 4 | triangles).astype(np.uint32), 2)
+    data = np.empty((k, 2, 8), np.uint8)
+    data[:, 0, 0] = HEADER_A
+    data[:, 0, 1:] = values[:, :VALUES_A]
+    data[:, 1, 0] = HEADER_B
+    data[:, 1, 1:6] = values[:, VALUES_A:]
+    data[:, 1, 6] = status >> 8
+    data[:, 1, 7] = status & 0xFF
+    return ids, data.reshape(2 * k, 8)
+
+
+def status_word(out_of_range: NDArray[np.bool_], error: NDArray[np.uint8]) -> NDArray[np.uint16]:
+    """Status words uint16[k] from masks bool[k, 12] (taxel i is bit i) and error nibbles [k]."""
+    mask = out_of_range.astype(np.uint16) @ (1 << np.arange(TAXELS, dtype=np.uint16))
+    return (mask << 4 | (error & 0xF)).astype(np.uint16)
+
+
+def out_of_range(status: NDArray[np.uint16]) -> NDArray[np.bool_]:
+    """Masks bool[..., 12] of the taxels that a status word calls far out of range."""
+    return (status[..., None] >> np.arange(4, 4 + TAXELS, dtype=np.uint16) & 1).astype(np.bool_)
+
+
+def status_error(status: NDArray[np.uint16]) -> NDArray[np.uint8]:
+    """Error nibbles of status words, see `StatusError`."""
+    return (status & 0xF).astype(np.uint8)
+
+
+def legacy_values(dlc: int, data: bytes) -> tuple[int, ...] | None:
+    """Values of the reduced legacy formats (class 3, MTB3): the whole triangle or thirds.
+
+    DLC 2 is one average of all twelve pads, DLC 4 three values. None for anything else.
+    Source: mtb3/main_V3.c, CONFIG_ALL and CONFIG_THREE.
+    """
+    if data[:1] == bytes([HEADER_A]) and dlc in {2, 4}:
+        return tuple(data[1:dlc])
+    return None

@@ -1,0 +1,89 @@
+"""Take a calibration without a daemon: bring the boards up, look, stop them again."""
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+
+from skin_host.engine import Engine
+from skin_host.errors import SkinError
+from skin_host.layout import Layout
+from skin_host.link import Link
+from skin_host.processing.calibration import Calibration
+from skin_host.settings import Settings
+
+#: So long after it should have ended, a calibration without data is given up.
+GRACE_S = 5.0
+
+
+async def take_calibration(
+    settings: Settings,
+    layout: Layout,
+    parts: list[int],
+    seconds: float,
+    progress: Callable[[float], None],
+) -> Calibration:
+    """Bring up the boards of some parts and calibrate them.
+
+    Raises:
+        BusError: a bus cannot be opened.
+        SkinError: no board sent a sweep.
+    """
+    engine = Engine(settings, layout, parts)
+    link = Link(engine)
+    tasks = [
+        asyncio.create_task(link.read(lambda _: None)),
+        asyncio.create_task(_supervise(link)),
+    ]
+    try:
+        # A bus without any other node never takes the set-up; the time limit tells of it.
+        async with asyncio.timeout(GRACE_S):
+            await link.bring_up()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(GRACE_S):
+                while not link.all_alive():  # noqa: ASYNC110 (the boards tell nobody)
+                    await asyncio.sleep(0.05)
+        return await collect(engine, seconds, progress)
+    except TimeoutError:
+        raise SkinError(
+            "the boards could not be set up: nobody acknowledges on the bus; see with `skin scan` "
+            "whether they are powered and answer"
+        ) from None
+    finally:
+        await link.stop()
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        link.close()
+
+
+async def _supervise(link: Link) -> None:
+    """Boards that are late, or missed their set-up, are set up again."""
+    while True:
+        await asyncio.sleep(0.5)
+        link.supervise()
+
+
+async def collect(
+    engine: Engine, seconds: float, progress: Callable[[float], None] = lambda _: None
+) -> Calibration:
+    """Let an engine that is being fed collect a calibration.
+
+    Raises:
+        SkinError: no board sent a sweep.
+    """
+    engine.begin_calibration(seconds)
+    deadline_s = time.monotonic() + seconds + GRACE_S
+    share = 0.0
+    while share < 1.0 and time.monotonic() < deadline_s:
+        await asyncio.sleep(0.02)
+        share = engine.calibration_progress()
+        progress(share)
+    found = engine.end_calibration(datetime.now(UTC).isoformat(timespec="seconds"))
+    if share == 0.0:
+        raise SkinError(
+            "no calibration: no board sent a sweep; see with `skin scan` whether the boards are "
+            "powered and answer"
+        )
+    return found

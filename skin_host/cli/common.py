@@ -1,0 +1,103 @@
+"""What several commands share."""
+
+import argparse
+import asyncio
+import json
+import logging
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+from skin_host.layout import Layout, build_layout
+from skin_host.settings import Settings, load
+
+Commands = Any  # argparse's own type of sub-parser collections is private
+
+
+def add_command(commands: Commands, name: str, about: str, example: str) -> argparse.ArgumentParser:
+    """A sub-command with its one-line description and an example at the end of its help."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        name,
+        help=about,
+        description=about[0].upper() + about[1:] + ".",
+        epilog=f"Example: {example}",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.set_defaults(command=name)
+    return parser
+
+
+def add_config(parser: argparse.ArgumentParser) -> None:
+    """The positional argument CONFIG."""
+    parser.add_argument("config", metavar="CONFIG", type=Path, help="configuration file (TOML)")
+
+
+def add_log_level(parser: argparse.ArgumentParser) -> None:
+    """`--verbose` for commands that run for long."""
+    parser.add_argument("--verbose", "-v", action="store_true", help="log more")
+
+
+def set_up_logging(verbose: bool) -> None:
+    """Log to stderr; under systemd the journal adds time and name itself."""
+    logging.basicConfig(
+        level=logging.DEBUG if verbose else logging.INFO,
+        format="%(levelname)-7s %(message)s",
+        stream=sys.stderr,
+    )
+    for noisy in ("can", "mqtt", "asyncio"):
+        logging.getLogger(noisy).setLevel(logging.WARNING)
+
+
+def load_skin(config: Path) -> tuple[Settings, Layout]:
+    """Settings and layout of a configuration file.
+
+    Raises:
+        ConfigurationError: see `settings.load` and `layout.build_layout`.
+    """
+    from skin_host.errors import ConfigurationError
+
+    settings = load(config)
+    try:
+        layout = build_layout(settings, config.parent)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{config}: {error}") from None
+    return settings, layout
+
+
+def print_json(document: object) -> None:
+    """One JSON document on stdout."""
+    print(json.dumps(document, indent=2, ensure_ascii=False))
+
+
+class Progress:
+    """A line that tells how far long work is, on a terminal only."""
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+        self._shown = sys.stderr.isatty()
+
+    def update(self, share: float, note: str = "") -> None:
+        """Show that `share` (0 to 1) is done."""
+        if self._shown:
+            done = int(30 * min(1.0, max(0.0, share)))
+            bar = "#" * done + "." * (30 - done)
+            print(f"\r{self._what} [{bar}] {share:4.0%} {note}", end="", file=sys.stderr)
+
+    def close(self) -> None:
+        """Remove the line."""
+        if self._shown:
+            print("\r" + " " * 79 + "\r", end="", file=sys.stderr)
+
+
+def stop_on_signals(stop: asyncio.Event) -> None:
+    """End cleanly on SIGTERM and SIGINT; a second one of them ends at once."""
+    loop = asyncio.get_running_loop()
+
+    def end() -> None:
+        stop.set()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.remove_signal_handler(number)
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, end)

@@ -1,0 +1,213 @@
+"""Commands of the hardware that is not there: emulate, demo."""
+
+import argparse
+import asyncio
+import contextlib
+import sys
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from skin_host.cli.common import (
+    Commands,
+    add_command,
+    add_config,
+    add_log_level,
+    load_skin,
+    set_up_logging,
+    stop_on_signals,
+)
+from skin_host.errors import RequestError
+from skin_host.layout import Layout
+from skin_host.settings import Settings
+
+if TYPE_CHECKING:
+    import can
+
+    from emulator.robot import Robot
+
+#: Lives on open python-can buses, by name, until cancelled.
+Work = Callable[[dict[str, "can.BusABC"]], Coroutine[Any, Any, None]]
+
+
+def add_commands(commands: Commands) -> None:
+    """Add this room's commands to the parser."""
+    emulate = add_command(
+        commands,
+        "emulate",
+        "be the robot on a CAN bus; faults are taken from stdin, see docs/scenes.md",
+        "skin emulate config/demo.toml --scene config/scenes/three_presses.toml --channel vcan0",
+    )
+    add_config(emulate)
+    emulate.add_argument("--scene", type=Path, help="what happens to the skin (TOML)")
+    emulate.add_argument(
+        "--fidelity", choices=("signal", "chip"), default="signal", help="how deep the chips go"
+    )
+    emulate.add_argument("--seed", type=int, help="replaces the scene's seed")
+    emulate.add_argument("--speed", type=float, default=1.0, help="times real time")
+    emulate.add_argument("--interface", help="replaces that of every bus in CONFIG")
+    emulate.add_argument("--channel", help="replaces that of the only bus in CONFIG")
+    emulate.add_argument("--duration", type=float, metavar="S", help="end after so many seconds")
+    emulate.add_argument("--board", metavar="NAME", help="only this board; see the next two")
+    emulate.add_argument(
+        "--i2c",
+        metavar="DEVICES",
+        help="be --board on real chips: its I2C lines, such as /dev/i2c-1,/dev/i2c-2",
+    )
+    emulate.add_argument(
+        "--i2c-dev",
+        type=int,
+        metavar="N",
+        help="show the I2C lines of --board as /dev/i2c-N, N+1, ... (CUSE, root)",
+    )
+    add_log_level(emulate)
+    emulate.set_defaults(run=_emulate)
+
+    demo = add_command(
+        commands,
+        "demo",
+        "emulator, daemon, broker and live page together, on this machine alone",
+        "skin demo --duration 15",
+    )
+    demo.add_argument("--duration", type=float, metavar="S", help="end after so many seconds")
+    demo.add_argument("--page-port", type=int, default=8080, help="of the live page; 0 is any")
+    add_log_level(demo)
+    demo.set_defaults(run=_demo)
+
+
+def _emulate(arguments: argparse.Namespace) -> int:
+    from skin_host.bus.port import open_bus
+
+    set_up_logging(arguments.verbose)
+    settings, layout = load_skin(arguments.config)
+    if arguments.channel is not None and len(settings.buses) != 1:
+        raise RequestError(
+            f"--channel: {arguments.config} has the buses {', '.join(settings.buses)}; "
+            "wanted one bus"
+        )
+    if arguments.board is not None and arguments.board not in settings.boards:
+        known = ", ".join(settings.boards)
+        raise RequestError(f'--board: no board "{arguments.board}"; there are: {known}')
+    if (arguments.i2c or arguments.i2c_dev is not None) and arguments.board is None:
+        raise RequestError("--i2c and --i2c-dev need --board NAME")
+    for bus in settings.buses.values():
+        bus.interface = arguments.interface or bus.interface
+        bus.channel = arguments.channel or bus.channel
+    wanted = settings.buses
+    if arguments.i2c:
+        only = settings.boards[arguments.board].bus
+        wanted = {only: settings.buses[only]}
+    with contextlib.ExitStack() as opened:
+        work = (
+            _on_real_chips(arguments, settings, opened)
+            if arguments.i2c
+            else _on_emulated_chips(arguments, settings, layout, opened)
+        )
+        buses = {}
+        for name, bus in wanted.items():
+            buses[name] = open_bus(name, bus)
+            opened.callback(buses[name].shutdown)
+        asyncio.run(_until_stopped(lambda: work(buses), arguments.duration))
+    return 0
+
+
+def _on_real_chips(
+    arguments: argparse.Namespace, settings: Settings, opened: contextlib.ExitStack
+) -> Work:
+    from smbus2 import SMBus
+
+    from emulator import single_board
+
+    board = settings.boards[arguments.board]
+    lines = [opened.enter_context(SMBus(path.strip())) for path in arguments.i2c.split(",")]
+    return lambda buses: single_board.run(board.model, board.address, lines, buses[board.bus])
+
+
+def _on_emulated_chips(
+    arguments: argparse.Namespace,
+    settings: Settings,
+    layout: Layout,
+    opened: contextlib.ExitStack,
+) -> Work:
+    from emulator.clock import RealClock
+    from emulator.cuse import CuseBus
+    from emulator.robot import Robot
+    from emulator.scene import load as load_scene
+
+    scene = None if arguments.scene is None else load_scene(arguments.scene)
+    fidelity: str | dict[str, str] = arguments.fidelity
+    if arguments.i2c_dev is not None:
+        fidelity = dict.fromkeys(settings.boards, arguments.fidelity) | {arguments.board: "chip"}
+    robot = Robot(settings, layout, scene, fidelity=fidelity, seed=arguments.seed)
+    devices: list[CuseBus] = []
+    if arguments.i2c_dev is not None:
+        number = list(settings.boards).index(arguments.board)
+        for i, line in enumerate(robot.converters.lines[number]):
+            devices.append(opened.enter_context(CuseBus(arguments.i2c_dev + i, line)))
+
+    async def work(buses: "dict[str, can.BusABC]") -> None:
+        loop = asyncio.get_running_loop()
+        for device in devices:
+            loop.add_reader(device.fileno(), device.handle)
+        # A file or /dev/null cannot be waited for; then nobody gives commands.
+        with contextlib.suppress(PermissionError, ValueError, AttributeError):
+            loop.add_reader(sys.stdin.fileno(), take_command, robot, {})
+        await robot.run(buses, RealClock(arguments.speed))
+
+    return work
+
+
+def take_command(robot: "Robot", mends: dict[str, Callable[[], None]]) -> None:
+    """Read a line of stdin: a fault such as `chip_gone board=hand triangle=3`, or `mend` and it.
+
+    Args:
+        robot: to which it happens.
+        mends: what ends the faults that were given, by their lines.
+    """
+    from emulator import faults
+
+    line = sys.stdin.readline()
+    if not line:
+        asyncio.get_running_loop().remove_reader(sys.stdin.fileno())
+        return
+    text = " ".join(line.split())
+    verb, _, rest = text.partition(" ")
+    try:
+        if verb == "mend":
+            if rest not in mends:
+                raise RequestError(f'"{rest}": no such fault is on; there are: {", ".join(mends)}')
+            mends.pop(rest)()
+        elif text:
+            mends[text] = robot.inject(faults.parse(text))
+    except RequestError as error:
+        print(f"skin emulate: {error}", file=sys.stderr, flush=True)
+
+
+async def _until_stopped(
+    work: Callable[[], Coroutine[Any, Any, None]], duration_s: float | None
+) -> None:
+    stop = asyncio.Event()
+    stop_on_signals(stop)
+    if duration_s is not None:
+        asyncio.get_running_loop().call_later(duration_s, stop.set)
+    running = asyncio.create_task(work())
+    stopping = asyncio.create_task(stop.wait())
+    await asyncio.wait([running, stopping], return_when=asyncio.FIRST_COMPLETED)
+    for task in (running, stopping):
+        task.cancel()
+    result, _ = await asyncio.gather(running, stopping, return_exceptions=True)
+    if isinstance(result, Exception):
+        raise result
+
+
+def _demo(arguments: argparse.Namespace) -> int:
+    from skin_host import demo
+
+    set_up_logging(arguments.verbose)
+
+    async def work() -> int:
+        stop = asyncio.Event()
+        stop_on_signals(stop)
+        return await demo.run(arguments.duration, stop, arguments.page_port)
+
+    return asyncio.run(work())

@@ -1,0 +1,247 @@
+"""Commands that work on the real skin: run, calibrate, scan."""
+
+import argparse
+import asyncio
+import logging
+import signal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from skin_host import service
+from skin_host.cli import fit
+from skin_host.cli.common import (
+    Commands,
+    Progress,
+    add_command,
+    add_config,
+    add_log_level,
+    load_skin,
+    print_json,
+    set_up_logging,
+    stop_on_signals,
+)
+from skin_host.errors import RequestError, SkinError
+
+if TYPE_CHECKING:
+    from skin_host.daemon import Daemon
+
+log = logging.getLogger(__name__)
+
+
+def add_commands(commands: Commands) -> None:
+    """Add this room's commands to the parser."""
+    run = add_command(
+        commands,
+        "run",
+        "run the daemon: CAN in, pressure and touches over MQTT out",
+        "skin run config/icub.toml --calibrate",
+    )
+    add_config(run)
+    run.add_argument("--node", default="main", help="which parts are this daemon's")
+    run.add_argument("--calibrate", action="store_true", help="take a calibration first")
+    run.add_argument("--duration", type=float, metavar="S", help="end after so many seconds")
+    add_log_level(run)
+    run.set_defaults(run=_run)
+
+    calibrate = add_command(
+        commands,
+        "calibrate",
+        "calibrate the untouched skin and keep the result",
+        "skin calibrate config/icub.toml --seconds 5",
+    )
+    add_config(calibrate)
+    calibrate.add_argument("--node", default="main", help="which parts to calibrate")
+    calibrate.add_argument("--seconds", type=float, default=5.0, help="how long to look")
+    calibrate.add_argument("--output", type=Path, metavar="FILE", help="keep it here instead")
+    calibrate.add_argument("--json", action="store_true", help="one JSON document")
+    fit.add_arguments(calibrate)
+    add_log_level(calibrate)
+    calibrate.set_defaults(run=_calibrate)
+
+    scan = add_command(
+        commands,
+        "scan",
+        "ask who is on a CAN bus",
+        "skin scan --interface socketcan --channel can0",
+    )
+    scan.add_argument("--interface", default="socketcan", help="python-can interface")
+    scan.add_argument("--channel", default="can0", help="its channel")
+    scan.add_argument("--json", action="store_true", help="one JSON document")
+    scan.set_defaults(run=_scan)
+
+    command = add_command(
+        commands,
+        "command",
+        "have a running daemon do something",
+        "skin command calibrate --part left_hand",
+    )
+    about = "; ".join(f"{name}: {text}" for name, text in COMMANDS.items())
+    command.add_argument("name", choices=list(COMMANDS), metavar="NAME", help=about)
+    command.add_argument("--broker", default="mqtt://localhost", metavar="URL", help="MQTT broker")
+    command.add_argument("--robot", help="whose skin, if the broker knows several robots")
+    command.add_argument("--node", help="which daemon, if the robot has several")
+    command.add_argument("--part", help="calibrate, disable, enable: this part")
+    command.add_argument("--board", help="calibrate, configure: this board only")
+    command.add_argument("--seconds", type=float, help="calibrate, raw, record: how long")
+    command.add_argument("--file", help="record: name of the file in the state directory")
+    command.add_argument(
+        "--set", action="append", default=[], metavar="KEY=NUMBER", help="thresholds: a change"
+    )
+    command.add_argument("--reset", action="store_true", help="thresholds: as configured")
+    command.add_argument("--json", action="store_true", help="one JSON document")
+    command.set_defaults(run=_command)
+
+
+#: What a daemon can be asked for.
+COMMANDS = {
+    "calibrate": "calibrate all, a part or a board",
+    "configure": "send the boards their set-up again",
+    "disable": "publish nothing of a part",
+    "enable": "publish a part again",
+    "raw": "publish raw bytes with the frames for a while",
+    "record": "record the CAN frames",
+    "reload": "read the configuration file again",
+    "status": "health of every part",
+    "stop_recording": "end the recording",
+    "thresholds": "show or change the touch thresholds",
+}
+
+
+def reload_on_hangup(daemon: "Daemon") -> None:
+    """Read the configuration again on SIGHUP; a wrong one is told of and changes nothing."""
+    reloading: set[asyncio.Task[None]] = set()
+
+    async def reload() -> None:
+        service.notify_reloading()
+        try:
+            await daemon.reload()
+        except SkinError as error:
+            log.error("not reloaded: %s", error)
+        finally:
+            service.notify("READY=1")
+
+    def begin() -> None:
+        task = asyncio.get_running_loop().create_task(reload())
+        reloading.add(task)
+        task.add_done_callback(reloading.discard)
+
+    asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, begin)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from skin_host.daemon import Daemon, stored_calibration
+
+    set_up_logging(arguments.verbose)
+    settings, layout = load_skin(arguments.config)
+    calibration = (
+        None if arguments.calibrate else stored_calibration(settings, layout, arguments.node)
+    )
+
+    async def work() -> None:
+        stop = asyncio.Event()
+        stop_on_signals(stop)
+        daemon = Daemon(
+            settings,
+            layout,
+            arguments.node,
+            calibration,
+            arguments.config.parent,
+            configuration=arguments.config,
+        )
+        reload_on_hangup(daemon)
+        if arguments.duration is not None:
+            asyncio.get_running_loop().call_later(arguments.duration, stop.set)
+        await daemon.run(stop, calibrate=arguments.calibrate)
+
+    asyncio.run(work())
+    return 0
+
+
+def _calibrate(arguments: argparse.Namespace) -> int:
+    from skin_host.calibrate import take_calibration
+    from skin_host.daemon import calibration_path, parts_of
+    from skin_host.processing import calibration as calibrations
+
+    set_up_logging(arguments.verbose)
+    if arguments.relaxation is not None or arguments.pressure is not None:
+        return fit.run(arguments)
+    settings, layout = load_skin(arguments.config)
+    progress = Progress("calibrating, keep the skin untouched")
+    try:
+        found = asyncio.run(
+            take_calibration(
+                settings,
+                layout,
+                parts_of(layout, arguments.node),
+                arguments.seconds,
+                progress.update,
+            )
+        )
+    finally:
+        progress.close()
+    path = arguments.output or calibration_path(settings, arguments.node)
+    found = calibrations.with_gains_of(found, path, layout)
+    calibrations.save(path, found, layout)
+    verdicts = calibrations.summary(found, layout)
+    if arguments.json:
+        print_json({"file": str(path), "id": found.id, "time": found.time, "verdicts": verdicts})
+    else:
+        for part, counts in verdicts.items():
+            print(f"{part}: " + ", ".join(f"{n} {name}" for name, n in counts.items()))
+        print(f"calibration {found.id} kept in {path}")
+    return 0
+
+
+def _scan(arguments: argparse.Namespace) -> int:
+    from skin_host.scan import describe, scan
+    from skin_host.settings import Bus
+
+    bus = Bus(interface=arguments.interface, channel=arguments.channel)
+    found = asyncio.run(scan(bus))
+    if arguments.json:
+        print_json({"boards": [one.as_record() for one in found]})
+    else:
+        print(describe(found, arguments.channel))
+    return 0 if found else 1
+
+
+def _command(arguments: argparse.Namespace) -> int:
+    from skin_host.client import SkinClient
+
+    request: dict[str, Any] = {
+        key: getattr(arguments, key)
+        for key in ("part", "board", "seconds", "file")
+        if getattr(arguments, key) is not None
+    }
+    changes = dict(_pair(text) for text in arguments.set)
+    if changes:
+        request["set"] = changes
+    if arguments.reset:
+        request["reset"] = True
+
+    async def work() -> dict[str, Any]:
+        async with SkinClient(arguments.broker, robot=arguments.robot) as skin:
+            patience_s = 15.0 + (arguments.seconds or 10.0)
+            return await skin.command(
+                arguments.name, node=arguments.node, timeout_s=patience_s, **request
+            )
+
+    answer = asyncio.run(work())
+    if arguments.json:
+        print_json(answer)
+    else:
+        for key, value in answer.items():
+            print(f"{key}: {value}")
+    return 0
+
+
+def _pair(text: str) -> tuple[str, float]:
+    key, equals, value = text.partition("=")
+    try:
+        number = float(value)
+    except ValueError:
+        equals = ""
+        number = 0.0
+    if not equals:
+        raise RequestError(f"--set {text}: wanted KEY=NUMBER such as margin_units=3")
+    return key, int(number) if key == "votes_of_3" and number.is_integer() else number

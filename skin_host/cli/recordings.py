@@ -1,0 +1,327 @@
+"""Commands around recordings: record, export, plot, dbc; and replay onto a bus or a broker."""
+
+import argparse
+import asyncio
+import contextlib
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from skin_host.cli.common import (
+    Commands,
+    add_command,
+    load_skin,
+    print_json,
+    stop_on_signals,
+)
+from skin_host.errors import BrokerError, RequestError
+
+if TYPE_CHECKING:
+    from skin_host.export import Series
+    from skin_host.publish.address import Broker
+
+LOCAL = "mqtt://localhost"
+
+
+def add_commands(commands: Commands) -> None:
+    """Add this room's commands to the parser."""
+    record = add_command(
+        commands,
+        "record",
+        "record what a robot says (MCAP), what its buses bring, or both",
+        "skin record grasp.mcap --seconds 60",
+    )
+    record.add_argument(
+        "file", metavar="FILE", type=Path, help="new file: .mcap, or for CAN alone .log, .blf, .asc"
+    )
+    record.add_argument("--broker", metavar="URL", help=f"record its messages ({LOCAL})")
+    record.add_argument("--robot", help="whose, if the broker knows several")
+    record.add_argument("--config", type=Path, help="record the CAN frames of its buses")
+    record.add_argument("--seconds", type=positive, metavar="S", help="end after so long")
+    record.add_argument("--json", action="store_true", help="one JSON document at the end")
+    record.set_defaults(run=_record)
+
+    export = add_command(
+        commands,
+        "export",
+        "write a recording as arrays (.npz) or as a folder of CSV tables",
+        "skin export grasp.mcap grasp.npz",
+    )
+    _add_recording(export)
+    export.add_argument("output", metavar="OUTPUT", type=Path, help="file .npz, or a folder")
+    export.set_defaults(run=_export)
+
+    plot = add_command(
+        commands,
+        "plot",
+        "draw pressure over time, the skin at an instant, or a calibration",
+        "skin plot pressure grasp.mcap grasp.png",
+    )
+    plot.add_argument("what", choices=("pressure", "map", "calibration"), help="what to draw")
+    _add_recording(plot)
+    plot.add_argument("output", metavar="OUTPUT", type=Path, help="file .png, .svg or .pdf")
+    plot.add_argument("--part", help="which part, if there are several")
+    plot.add_argument("--taxels", type=_numbers, metavar="N,N", help="of the part; the strongest")
+    plot.add_argument("--at", type=float, metavar="S", help="instant of the map; the strongest")
+    plot.set_defaults(run=_plot)
+
+    dbc = add_command(
+        commands,
+        "dbc",
+        "write the boards' CAN frames as a DBC file for other tools",
+        "skin dbc config/demo.toml --output skin.dbc",
+    )
+    dbc.add_argument(
+        "config", metavar="CONFIG", nargs="?", type=Path, help="only its boards; all that can be"
+    )
+    dbc.add_argument("--bus", help="which bus of CONFIG")
+    dbc.add_argument("--output", type=Path, help="file to write; else standard output")
+    dbc.set_defaults(run=_dbc)
+
+
+def add_onto(parser: argparse.ArgumentParser) -> None:
+    """The options of `skin replay` that play a recording elsewhere."""
+    parser.add_argument(
+        "--onto", choices=("can", "broker"), help="play it on CONFIG's buses, or to a broker"
+    )
+    parser.add_argument("--speed", type=positive, default=1.0, help="2 is twice as fast")
+    parser.add_argument("--broker", default=LOCAL, metavar="URL", help="for --onto broker")
+    parser.add_argument("--robot", help="a name in place of the recorded one")
+
+
+def positive(text: str) -> float:
+    """A number above 0, for argparse."""
+    value = float(text)
+    if not 0 < value < 1e9:
+        raise argparse.ArgumentTypeError(f"{text}: wanted a number above 0")
+    return value
+
+
+def play(arguments: argparse.Namespace) -> int:
+    """Play a recording onto CAN, or to a broker: messages as they are, CAN frames processed.
+
+    Raises:
+        RequestError: the options do not go together.
+    """
+    from skin_host.publish.recording import SUFFIX
+
+    if arguments.onto == "can":
+        if arguments.config is None:
+            raise RequestError("--onto can needs --config, which says on which buses")
+        return asyncio.run(_play_on_buses(arguments))
+    if arguments.config is None and arguments.log.suffix != SUFFIX:
+        raise RequestError(f"{arguments.log}: CAN frames need --config to be processed")
+    if arguments.config is not None:
+        return asyncio.run(_play_processed(arguments))
+    return asyncio.run(_play_said(arguments))
+
+
+def _add_recording(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recording", metavar="FILE", type=Path, help="recording, or calibration")
+    parser.add_argument("--config", type=Path, help="process the CAN frames of FILE with it")
+    parser.add_argument("--calibration", type=Path, help="with this calibration file")
+    parser.add_argument(
+        "--calibrate-seconds",
+        type=positive,
+        default=5.0,
+        help="else calibrate on the first seconds of FILE",
+    )
+
+
+def _numbers(text: str) -> list[int]:
+    try:
+        return [int(word) for word in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text}: wanted numbers such as 3,14") from None
+
+
+def _record(arguments: argparse.Namespace) -> int:
+    from skin_host.capture import CanLog
+    from skin_host.publish.recording import SUFFIX, Recorder
+
+    file: Path = arguments.file
+    if file.exists():
+        raise RequestError(f"{file}: is there already; remove it or choose another name")
+    if file.suffix == SUFFIX:
+        with Recorder(file) as recorder:
+            told = asyncio.run(_capture(arguments, recorder))
+        told |= {"messages": recorder.messages, "unreadable": recorder.unreadable}
+    else:
+        if arguments.config is None or arguments.broker is not None:
+            raise RequestError(f"{file}: holds CAN frames alone and needs --config; or use .mcap")
+        with CanLog(file) as log:
+            told = asyncio.run(_capture(arguments, None, log))
+        told |= {"frames": log.frames}
+    if arguments.json:
+        print_json({"file": str(file)} | told)
+    else:
+        print(f"{file}: " + ", ".join(f"{key} {_plain(value)}" for key, value in told.items()))
+    return 0
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, dict):
+        return "(" + ", ".join(f"{n} {kind}" for kind, n in value.items()) + ")"
+    return str(value)
+
+
+async def _capture(arguments: argparse.Namespace, recorder: Any, log: Any = None) -> dict[str, Any]:
+    """Record until a signal comes or the time is over; say what was lost."""
+    from skin_host.capture import capture_broker, capture_buses
+
+    stop = asyncio.Event()
+    stop_on_signals(stop)
+    if arguments.seconds is not None:
+        asyncio.get_running_loop().call_later(arguments.seconds, stop.set)
+    told: dict[str, Any] = {}
+
+    async def from_broker() -> None:
+        broker, base, robot = await _robot(arguments.broker or LOCAL, arguments.robot)
+        told["gaps"] = await capture_broker(recorder, broker, base, robot, stop)
+
+    async def from_buses() -> None:
+        settings, _ = load_skin(arguments.config)
+        sink = log.put if log is not None else recorder.can
+        told["frames_lost"] = await capture_buses(settings, sink, stop)
+
+    sources = []
+    if recorder is not None and (arguments.broker is not None or arguments.config is None):
+        sources.append(from_broker())
+    if arguments.config is not None:
+        sources.append(from_buses())
+    print("recording; end with Ctrl-C", file=sys.stderr)
+    async with contextlib.AsyncExitStack() as stack:
+        stack.callback(stop.set)  # one that fails ends the other
+        await asyncio.gather(*sources)
+    return told
+
+
+async def _robot(url: str, robot: str | None) -> tuple["Broker", str, str]:
+    """The broker behind a URL, the base of its topics, and whose skin is meant."""
+    from skin_host.client import SkinClient
+    from skin_host.publish.address import Broker
+
+    broker, base = Broker.from_url(url)
+    async with SkinClient(url, robot=robot) as skin:
+        return broker, base or "skin", skin.robot
+
+
+def _series(arguments: argparse.Namespace) -> "Series":
+    from skin_host.export import read_frames, read_messages
+    from skin_host.processing import calibration
+    from skin_host.publish.recording import SUFFIX
+    from skin_host.settings import skin_hash
+
+    if arguments.config is None:
+        if arguments.recording.suffix != SUFFIX:
+            raise RequestError(f"{arguments.recording}: CAN frames need --config to be processed")
+        return read_messages(arguments.recording)
+    settings, layout = load_skin(arguments.config)
+    found = None
+    if arguments.calibration is not None:
+        found = calibration.load(arguments.calibration, layout, skin_hash(settings))
+    return read_frames(
+        arguments.recording,
+        settings,
+        layout,
+        calibration=found,
+        calibrate_seconds=arguments.calibrate_seconds,
+    )
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    from skin_host.export import export
+
+    for path in export(_series(arguments), arguments.output):
+        print(path)
+    return 0
+
+
+def _plot(arguments: argparse.Namespace) -> int:
+    from skin_host import plots
+    from skin_host.processing import calibration
+    from skin_host.settings import skin_hash
+
+    if arguments.what == "calibration":
+        if arguments.config is None:
+            raise RequestError("a calibration is drawn with --config, whose skin it is of")
+        settings, layout = load_skin(arguments.config)
+        found = calibration.load(arguments.recording, layout, skin_hash(settings))
+        plots.plot_calibration(found, layout, arguments.output)
+    else:
+        series = _series(arguments)
+        part = arguments.part or next(iter(series.parts))
+        if arguments.part is None and len(series.parts) > 1:
+            raise RequestError(f"say which --part; there are: {', '.join(series.parts)}")
+        if arguments.what == "pressure":
+            plots.plot_pressure(series, arguments.output, part, arguments.taxels)
+        else:
+            plots.plot_map(series, arguments.output, part, arguments.at)
+    print(arguments.output)
+    return 0
+
+
+def _dbc(arguments: argparse.Namespace) -> int:
+    from skin_host.dbc import dbc_text
+    from skin_host.files import write_atomic
+
+    layout = None if arguments.config is None else load_skin(arguments.config)[1]
+    text = dbc_text(layout, arguments.bus)
+    if arguments.output is None:
+        print(text, end="")
+    else:
+        write_atomic(arguments.output, text.encode())
+        print(arguments.output)
+    return 0
+
+
+async def _play_on_buses(arguments: argparse.Namespace) -> int:
+    from skin_host.bus.port import open_bus
+    from skin_host.playback import play_on_buses
+
+    settings, _ = load_skin(arguments.config)
+    with contextlib.ExitStack() as stack:
+        buses = {
+            name: stack.enter_context(open_bus(name, bus)) for name, bus in settings.buses.items()
+        }
+        n = await play_on_buses(arguments.log, settings, buses, arguments.speed)
+    print(f"{n} frames played")
+    return 0
+
+
+async def _play_processed(arguments: argparse.Namespace) -> int:
+    from skin_host.engine import Engine
+    from skin_host.playback import play_processed
+    from skin_host.processing import calibration
+    from skin_host.publish.address import Broker
+    from skin_host.replay import calibrate_from_log
+    from skin_host.settings import skin_hash
+
+    settings, layout = load_skin(arguments.config)
+    broker, base = Broker.from_url(arguments.broker)
+    settings.mqtt.host, settings.mqtt.port = broker.host, broker.port
+    settings.mqtt.base = base or settings.mqtt.base
+    if arguments.calibration is not None:
+        found = calibration.load(arguments.calibration, layout, skin_hash(settings))
+    else:
+        found = calibrate_from_log(arguments.log, settings, layout, arguments.calibrate_seconds)
+    engine = Engine(settings, layout, list(range(len(layout.parts))), found)
+    n = await play_processed(arguments.log, engine, settings, arguments.speed)
+    print(f"{n} frames played")
+    return 0
+
+
+async def _play_said(arguments: argparse.Namespace) -> int:
+    from aiomqtt import MqttError
+
+    from skin_host.playback import play_said
+    from skin_host.publish.address import Broker
+    from skin_host.publish.connection import explain
+
+    broker, _ = Broker.from_url(arguments.broker)
+    try:
+        n = await play_said(arguments.log, broker, arguments.speed, arguments.robot)
+    except MqttError as error:
+        raise BrokerError(f"broker {broker}: {explain(error)}") from None
+    print(f"{n} messages played")
+    return 0

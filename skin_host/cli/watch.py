@@ -1,0 +1,144 @@
+"""Commands that are subscribers: listen, status, view."""
+
+import argparse
+import asyncio
+import json
+from typing import Any
+
+import msgspec
+
+from skin_host.cli.common import (
+    Commands,
+    add_command,
+    add_log_level,
+    print_json,
+    set_up_logging,
+    stop_on_signals,
+)
+
+
+def add_commands(commands: Commands) -> None:
+    """Add this room's commands to the parser."""
+    listen = add_command(
+        commands,
+        "listen",
+        "print touches as they come",
+        "skin listen --part left_hand --broker mqtt://robot.local",
+    )
+    add_broker(listen)
+    listen.add_argument("--part", help="only this part")
+    listen.add_argument("--moves", action="store_true", help="also while a touch goes on")
+    listen.add_argument("--json", action="store_true", help="one JSON document a line")
+    listen.add_argument("--count", type=int, metavar="N", help="end after N lines")
+    listen.set_defaults(run=_listen)
+
+    status = add_command(commands, "status", "show how every part is", "skin status --json")
+    add_broker(status)
+    status.add_argument("--json", action="store_true", help="one JSON document")
+    status.set_defaults(run=_status)
+
+    view = add_command(commands, "view", "serve the live page", "skin view --port 8080")
+    add_broker(view)
+    view.add_argument("--host", default="127.0.0.1", help="address to listen on")
+    view.add_argument("--port", type=int, default=8080, help="port to listen on")
+    view.add_argument("--read-only", action="store_true", help="no calibrate button")
+    add_log_level(view)
+    view.set_defaults(run=_view)
+
+
+def add_broker(parser: argparse.ArgumentParser) -> None:
+    """Where to find the robot."""
+    parser.add_argument("--broker", default="mqtt://localhost", metavar="URL", help="MQTT broker")
+    parser.add_argument("--robot", help="whose skin, if the broker knows several robots")
+
+
+def touch_line(touch: Any) -> str:
+    """One readable line of a touch event (`publish.messages.Touch`)."""
+    taxels = ", ".join(map(str, touch.taxels[:8])) + (" ..." if len(touch.taxels) > 8 else "")
+    where = " " * 19
+    if touch.centroid_m is not None:
+        x_mm, y_mm = 1e3 * touch.centroid_m[0], 1e3 * touch.centroid_m[1]
+        where = f"({x_mm:6.1f},{y_mm:6.1f}) mm "
+    load = f"{touch.peak_kpa:6.1f} kPa {touch.force_n:6.2f} N"
+    if touch.event == "end":
+        load = " " * len(load)
+    return f"{touch.part:<14} {touch.event:<5} #{touch.id:<4} {where} {load}  taxels {taxels}"
+
+
+def _listen(arguments: argparse.Namespace) -> int:
+    from skin_host.client import SkinClient
+
+    async def work() -> None:
+        printed = 0
+        async with SkinClient(arguments.broker, robot=arguments.robot) as skin:
+            async for touch in skin.touches(arguments.part):
+                if touch.missed:
+                    note = f"({touch.missed} events were missed)"
+                    print(json.dumps({"missed": touch.missed}) if arguments.json else note)
+                if touch.event == "move" and not arguments.moves:
+                    continue
+                if arguments.json:
+                    print(msgspec.json.encode(touch).decode(), flush=True)
+                else:
+                    print(touch_line(touch), flush=True)
+                printed += 1
+                if printed == arguments.count:
+                    return
+
+    asyncio.run(work())
+    return 0
+
+
+async def health_of_all(broker: str, robot: str | None) -> dict[str, dict[str, Any]]:
+    """The health record of every part that the robot's nodes say they have."""
+    from skin_host.client import SkinClient
+
+    async with SkinClient(broker, robot=robot) as skin:
+        nodes = await skin.info()
+        parts = {part for node in nodes.values() for part in node.parts}
+        records: dict[str, dict[str, Any]] = {}
+        try:
+            async with asyncio.timeout(5.0):
+                async for health in skin.health():
+                    records[health.part] = health.record
+                    if parts <= set(records):
+                        break
+        except TimeoutError:
+            pass
+        for part in parts - set(records):
+            records[part] = {"state": "not heard of", "part": part}
+        return records
+
+
+def _status(arguments: argparse.Namespace) -> int:
+    records = asyncio.run(health_of_all(arguments.broker, arguments.robot))
+    if arguments.json:
+        print_json(records)
+        return 0
+    print(f"{'part':<16} {'state':<14} {'Hz':>6} {'valid':>11} {'age':>9}")
+    for part, record in sorted(records.items()):
+        valid = f"{record.get('valid_taxels', 0)}/{record.get('taxels', 0)}"
+        age_ms = record.get("age_ms")
+        age = "-" if age_ms is None else f"{age_ms:.0f} ms"
+        rate = record.get("rate_hz", 0.0)
+        print(f"{part:<16} {record.get('state', '?'):<14} {rate:>6.1f} {valid:>11} {age:>9}")
+        for sentence in record.get("sentences", ()):
+            print(f"    {sentence}")
+    return 0 if all(record.get("state") == "ok" for record in records.values()) else 1
+
+
+def _view(arguments: argparse.Namespace) -> int:
+    from skin_host.viewer.server import Viewer
+
+    set_up_logging(arguments.verbose)
+
+    async def work() -> None:
+        stop = asyncio.Event()
+        stop_on_signals(stop)
+        viewer = Viewer(arguments.broker, robot=arguments.robot, commands=not arguments.read_only)
+        await viewer.run(
+            stop, arguments.host, arguments.port, lambda url: print(f"the page: {url}", flush=True)
+        )
+
+    asyncio.run(work())
+    return 0

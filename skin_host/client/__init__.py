@@ -1,0 +1,31 @@
+"""Hear what a robot's skin publishes, from a program of one's own.
+
+    async with SkinClient("mqtt://localhost", robot="demo") as skin:
+        async for touch in skin.touches(part="left_hand"):
+            print(touch.event, touch.id, touch.peak_kpa, "kPa")
+
+The client finds the broker again by itself. What was lost meanwhile is told by the field
+`missed` of the next touch or frame. `SkinCallbacks` is the same without asyncio.
+"""
+
+from skin_host.client.callbacks import SkinCallbacks
+from skin_host.client.session import CommandError, Node, SkinClient
+from skin_host.client.streams import Contact, Health, Stream
+from skin_host.publish.address import Broker
+from skin_host.publish.info import NodeInfo, PartInfo
+from skin_host.publish.messages import Frame, Touch
+
+__all__ = [
+    "Broker",
+    "CommandError",
+    "Contact",
+    "Frame",
+    "Health",
+    "Node",
+    "NodeInfo",
+    "PartInfo",
+    "SkinCallbacks",
+    "SkinClient",
+    "Stream",
+    "Touch",
+]

@@ -1,0 +1,103 @@
+"""The client for programs without asyncio: a thread of its own listens and calls back."""
+
+import asyncio
+import logging
+import threading
+from collections.abc import Callable, Coroutine
+from concurrent.futures import Future
+from functools import partial
+from typing import Any, Self, TypeVar
+
+from skin_host.client.session import SkinClient
+from skin_host.client.streams import Contact, Health, Stream
+from skin_host.publish.info import NodeInfo
+from skin_host.publish.messages import Frame, Touch
+
+T = TypeVar("T")
+_log = logging.getLogger(__name__)
+
+
+class SkinCallbacks:
+    """Calls functions with what is heard. Takes the arguments of `SkinClient`.
+
+        with SkinCallbacks("mqtt://localhost", robot="demo") as skin:
+            skin.on_touch(lambda touch: print(touch.part, touch.event))
+            input("Enter ends it")
+
+    The functions run one after the other in one thread that is not the caller's: what they
+    share with it needs a lock, and while one of them works nothing else is heard. An
+    exception in one of them is logged and passed over.
+
+    Raises (on entering): see `SkinClient`.
+    """
+
+    def __init__(self, *arguments: Any, **keywords: Any) -> None:
+        self._make = partial(SkinClient, *arguments, **keywords)
+        self._ready: Future[tuple[SkinClient, asyncio.AbstractEventLoop]] = Future()
+        self._end = asyncio.Event()
+        self._calls: set[asyncio.Task[None]] = set()
+        self._thread = threading.Thread(
+            target=lambda: asyncio.run(self._serve()), name="skin callbacks", daemon=True
+        )
+
+    def on_touch(self, call: Callable[[Touch], object], part: str | None = None) -> None:
+        """Call with each touch event of a part, or of all."""
+        self._on(lambda: self._skin.touches(part), call)
+
+    def on_frame(self, call: Callable[[Frame], object], part: str | None = None) -> None:
+        """Call with each frame of a part, or of all."""
+        self._on(lambda: self._skin.frames(part), call)
+
+    def on_contact(self, call: Callable[[Contact], object], part: str | None = None) -> None:
+        """Call when a part is touched, or no longer; once at first, as it is now."""
+        self._on(lambda: self._skin.contacts(part), call)
+
+    def on_health(self, call: Callable[[Health], object], part: str | None = None) -> None:
+        """Call with each record of a part's health, or of all parts'."""
+        self._on(lambda: self._skin.health(part), call)
+
+    def info(self, timeout_s: float = 5.0) -> dict[str, NodeInfo]:
+        """See `SkinClient.info`."""
+        return self._wait_for(self._skin.info(timeout_s))
+
+    def command(self, name: str, **keywords: Any) -> dict[str, Any]:
+        """See `SkinClient.command`."""
+        return self._wait_for(self._skin.command(name, **keywords))
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        self._skin, self._loop = self._ready.result()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._loop.call_soon_threadsafe(self._end.set)
+        self._thread.join()
+
+    async def _serve(self) -> None:
+        try:
+            async with self._make() as skin:
+                self._ready.set_result((skin, asyncio.get_running_loop()))
+                await self._end.wait()
+        except BaseException as error:
+            if self._ready.done():
+                raise
+            self._ready.set_exception(error)
+
+    def _on(self, open_stream: Callable[[], Stream[T]], call: Callable[[T], object]) -> None:
+        async def begin() -> None:
+            # The stream is opened here, in its own thread, before `on_...` returns.
+            task = asyncio.create_task(_call_with_each(open_stream(), call))
+            self._calls.add(task)
+
+        self._wait_for(begin())
+
+    def _wait_for(self, work: Coroutine[Any, Any, T]) -> T:
+        return asyncio.run_coroutine_threadsafe(work, self._loop).result()
+
+
+async def _call_with_each(stream: Stream[T], call: Callable[[T], object]) -> None:
+    async for item in stream:
+        try:
+            call(item)
+        except Exception:
+            _log.exception("a callback failed")

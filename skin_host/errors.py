@@ -1,0 +1,50 @@
+"""One exception tree for the whole project.
+
+    SkinError                 anything this project raises on purpose
+    |- RequestError           the request itself was wrong (exit status 2)
+    |  |- ConfigurationError  a configuration or layout file
+    |  |- CalibrationError    a calibration file that is damaged or of another skin
+    |  |  |- OtherSkinError   the latter
+    |  |- LogError            a recording that cannot be read
+    |- BusError               the CAN interface: absent, down, refused
+    |- BrokerError            the MQTT broker: refused us, or answers nonsense
+
+A message is one line: what, where, what was seen, what was wanted, and the
+command that mends it. The command line prints it and exits with `exit_status`.
+"""
+
+
+class SkinError(Exception):
+    """Base of all errors raised on purpose. `exit_status` is the command line's."""
+
+    exit_status = 1
+
+
+class RequestError(SkinError):
+    """The request was wrong: arguments, configuration, files named by the user."""
+
+    exit_status = 2
+
+
+class ConfigurationError(RequestError):
+    """A configuration or layout file is wrong; the message starts with its path."""
+
+
+class CalibrationError(RequestError):
+    """A calibration file is damaged, or belongs to another configuration."""
+
+
+class OtherSkinError(CalibrationError):
+    """A whole calibration file that belongs to another configuration."""
+
+
+class LogError(RequestError):
+    """A recording cannot be read, or holds nothing of this skin."""
+
+
+class BusError(SkinError):
+    """A CAN interface cannot be used: absent, down, no permission, not CAN."""
+
+
+class BrokerError(SkinError):
+    """The MQTT broker refused us in a way that waiting will not mend."""

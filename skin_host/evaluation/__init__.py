@@ -1,0 +1,1 @@
+"""`skin bench` and `skin report`: measured on host and emulator together."""

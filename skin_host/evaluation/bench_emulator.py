@@ -1,0 +1,220 @@
+"""`skin bench emulator`: simulated seconds per second, against boards, fidelity and touch.
+
+Real time is what every row compares itself with: `times_real` is simulated time over the time
+that one core was busy, so other work on the machine does not count. The mechanics is timed
+apart, where it matters whether one taxel is touched or a thousand.
+"""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from emulator.robot import Robot
+from emulator.scene import Place, Probe, Scene
+from emulator.skin import MOVING_NS, Skin
+from skin_host.layout import Layout, build_layout
+from skin_host.settings import Settings
+
+Row = dict[str, Any]
+
+BOARDS_PER_BUS = 14
+SWEEP_S = 0.05
+REPEATS = 3
+
+
+def run(*, quick: bool = False) -> list[Row]:
+    """Measure; each row names its part of the bench, what was simulated, and how fast.
+
+    Args:
+        quick: simulate a fifth of the time.
+    """
+    share = 0.2 if quick else 1.0
+    rows = [
+        _scale(boards, triangles, fidelity, touched, seconds * share)
+        for boards, triangles, fidelity, touched, seconds in (
+            (1, 16, "chip", 0, 10.0),
+            (1, 16, "signal", 0, 20.0),
+            (3, 11, "chip", 10, 5.0),
+            (3, 11, "signal", 10, 20.0),
+            (30, 11, "chip", 0, 2.0),
+            (30, 11, "signal", 0, 20.0),
+            (30, 11, "signal", 1, 10.0),
+            (30, 11, "signal", 1000, 5.0),
+        )
+    ]
+    rows += _mechanics(share)
+    rows.append(_agreement(20.0 * share))
+    return rows
+
+
+def robot_of(boards: int, triangles: int) -> tuple[Settings, Layout]:
+    """Settings and layout of a robot with one part of so many triangles a board."""
+    names = [f"b{number}" for number in range(boards)]
+    document = {
+        "robot": "bench",
+        "buses": {f"can{number // BOARDS_PER_BUS}": {} for number in range(boards)},
+        "boards": {
+            name: {
+                "bus": f"can{number // BOARDS_PER_BUS}",
+                "address": number % BOARDS_PER_BUS + 1,
+            }
+            for number, name in enumerate(names)
+        },
+        "parts": {
+            name: {"patches": [{"board": name, "triangles": f"0-{triangles - 1}"}]}
+            for name in names
+        },
+    }
+    settings = msgspec.convert(document, Settings)
+    return settings, build_layout(settings, Path())
+
+
+def moving_presses(layout: Layout, n: int) -> list[Probe]:
+    """Probes of 4 mm on n pads of a robot of `robot_of`, pressing harder and softer for ever."""
+    return [
+        Probe(
+            part=part.name,
+            at=Place(taxel=taxel),
+            diameter_mm=4.0,
+            pressure_kpa=[(0.0, 20.0), (0.5, 60.0), (1.0, 20.0)],
+            repeat_s=1.0,
+        )
+        for part, taxel in [
+            (part, taxel) for taxel in range(layout.n_taxels) for part in layout.parts
+        ][:n]
+    ]
+
+
+def _scale(boards: int, triangles: int, fidelity: str, touched: int, seconds: float) -> Row:
+    settings, layout = robot_of(boards, triangles)
+    scene = Scene(probe=moving_presses(layout, touched))
+    robot = Robot(settings, layout, scene, fidelity=fidelity)
+    robot.bring_up()
+    robot.step(1.0)
+    frames = 0
+
+    def live() -> None:
+        nonlocal frames
+        for _ in range(round(seconds / SWEEP_S / REPEATS)):
+            frames += sum(len(batch) for batch in robot.step(SWEEP_S).values())
+
+    spent_s = sum(_seconds(live, 1) for _ in range(REPEATS))
+    return {
+        "part": "scale",
+        "boards": boards,
+        "taxels": layout.n_taxels,
+        "fidelity": fidelity,
+        "touched": touched,
+        "simulated_s": round(seconds, 1),
+        "frames": frames,
+        "times_real": round(seconds / spent_s, 1),
+    }
+
+
+def _mechanics(share: float) -> list[Row]:
+    """Cost of a step of foam and pads, with and without sliding, by touched taxels."""
+    _, layout = robot_of(30, 11)
+    rows: list[Row] = []
+    for motion, counts in (("pressing", (1, 10, 100, 1000)), ("sliding", (1, 10, 100, 1000))):
+        for touched in counts:
+            probes = moving_presses(layout, touched)
+            if motion == "sliding":
+                for probe in probes:
+                    probe.slide_mm = [(0.0, 0.0, 0.0), (0.5, 1.0, 0.0), (1.0, 0.0, 0.0)]
+            skin = Skin(layout, Scene(probe=probes))
+            steps = max(4, round(200 * share / (1 + touched * (motion == "sliding") / 10)))
+            t_ns = 0
+
+            def press(skin: Skin = skin, steps: int = steps) -> None:
+                nonlocal t_ns
+                for _ in range(steps):
+                    t_ns += MOVING_NS
+                    skin.step(t_ns)
+
+            press()
+            step_us = _seconds(press, REPEATS) / steps * 1e6
+            rows.append(
+                {
+                    "part": "mechanics",
+                    "motion": motion,
+                    "taxels": layout.n_taxels,
+                    "touched": touched,
+                    "step_us": round(step_us, 1),
+                    "us_per_touched": round(step_us / touched, 2),
+                }
+            )
+        one, thousand = (row["step_us"] for row in rows[-len(counts) :: len(counts) - 1])
+        rows.append(
+            {
+                "part": "mechanics ratio",
+                "motion": motion,
+                "one_against_thousand": round(one / thousand, 4),
+            }
+        )
+    return rows
+
+
+def _agreement(seconds: float) -> Row:
+    """The same scene and seed at both fidelities: how far the transmitted bytes differ."""
+    settings, layout = robot_of(3, 11)
+    sent = []
+    for fidelity in ("signal", "chip"):
+        robot = Robot(settings, layout, Scene(probe=moving_presses(layout, 50)), fidelity=fidelity)
+        robot.bring_up()
+        sent.append(robot.step(seconds)["can0"])
+    signal, chip = sent
+    difference = np.abs(signal.data.astype(int) - chip.data)
+    return {
+        "part": "agreement",
+        "frames": len(signal),
+        "bytes_compared": difference.size,
+        "largest_difference": int(difference.max()),
+        "same_identifiers_and_times": bool(
+            (signal.id == chip.id).all() and (signal.t_ns == chip.t_ns).all()
+        ),
+    }
+
+
+def _seconds(work: Callable[[], None], repeats: int) -> float:
+    """The shortest processor time that `work` takes."""
+    best = np.inf
+    for _ in range(repeats):
+        start = time.process_time()
+        work()
+        best = min(best, time.process_time() - start)
+    return float(best)
+
+
+def describe(rows: list[Row]) -> str:
+    """The rows as text."""
+    lines = ["Simulated seconds per second (real time is 1):"]
+    lines += [
+        f"  {row['boards']:3d} boards {row['taxels']:5d} taxels  {row['fidelity']:6s} "
+        f"{row['touched']:5d} touched  {row['times_real']:7.1f}"
+        for row in rows
+        if row["part"] == "scale"
+    ]
+    lines.append("One step of the mechanics (5 ms simulated while something moves):")
+    lines += [
+        f"  {row['motion']:8s} {row['touched']:5d} of {row['taxels']} touched "
+        f"{row['step_us']:9.1f} us"
+        for row in rows
+        if row["part"] == "mechanics"
+    ]
+    lines += [
+        f"  {row['motion']:8s} one touched taxel costs 1/{1 / row['one_against_thousand']:.1f} "
+        "of a thousand"
+        for row in rows
+        if row["part"] == "mechanics ratio"
+    ]
+    lines += [
+        f"Signal against chip: {row['bytes_compared']} bytes, "
+        f"largest difference {row['largest_difference']}"
+        for row in rows
+        if row["part"] == "agreement"
+    ]
+    return "\n".join(lines)

@@ -1,0 +1,160 @@
+"""`skin bench latency`: from the last CAN frame of a sweep to the touch in a subscriber's hands.
+
+Four processes, as on a robot: a sender that fills a bus with the frames of seven boards, one of
+which is pressed and released; the daemon at its default settings; mosquitto; a subscriber. The
+delay is the time at which the message was received less its `t_ns`, the kernel's time stamp of
+the frame that completed the sweep. All share one clock.
+"""
+
+import asyncio
+import json
+import logging
+import multiprocessing
+import tempfile
+import time
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import aiomqtt
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.bus.protocol import TAXELS, TRIANGLES
+from skin_host.daemon import Daemon
+from skin_host.errors import BrokerError, SkinError
+from skin_host.evaluation.can_stream import FULL_BUS_FRAMES_PER_S, Stream, Wire, send
+from skin_host.layout import build_layout
+from skin_host.publish.broker import find_mosquitto, mosquitto_broker
+
+#: The daemon must have set itself up and calibrated by then; the lane's processor is slow.
+_READY_S = 60.0
+_CALIBRATION_S = 1.0
+_PRESSED_BOARD, _PRESSED_TRIANGLE, _PRESSED_TAXELS = 3, 7, slice(2, 6)
+
+Document = dict[str, Any]
+
+
+def run(*, quick: bool = False) -> Document:
+    """Measure; all delays in microseconds.
+
+    Args:
+        quick: for 5 s instead of 30 s.
+
+    Raises:
+        BrokerError: mosquitto is not installed.
+        SkinError: the daemon did not come up.
+    """
+    program = find_mosquitto()
+    if program is None:
+        raise BrokerError("mosquitto is not installed; `apt install mosquitto`")
+    return asyncio.run(_run(program, 5.0 if quick else 30.0))
+
+
+def describe(document: Document) -> str:
+    """The document as text."""
+    return (
+        f"From the last CAN frame of a sweep ({document['transport']}, "
+        f"{document['frames_per_s']} frames/s) to the touch at a subscriber of mosquitto:\n"
+        f"  {document['messages']} messages   p50 {document['delay_p50_us'] / 1e3:.2f} ms   "
+        f"p99 {document['delay_p99_us'] / 1e3:.2f} ms   max {document['delay_max_us'] / 1e3:.2f} ms"
+    )
+
+
+async def _run(program: str, seconds: float) -> Document:
+    wire = Wire.here()
+    stream = Stream.of(FULL_BUS_FRAMES_PER_S)
+    context = multiprocessing.get_context("spawn")
+    async with mosquitto_broker(program) as broker:
+        sender_end, sender_child_end = context.Pipe()
+        listener_end, listener_child_end = context.Pipe()
+        processes = [
+            context.Process(target=_listen, args=(listener_child_end, broker.port), daemon=True),
+            context.Process(target=_daemon, args=(wire, stream, broker.port), daemon=True),
+            context.Process(
+                target=send,
+                args=(sender_child_end, wire, stream, _READY_S + seconds, _scenes(stream)),
+                daemon=True,
+            ),
+        ]
+        try:
+            for process in processes:
+                process.start()
+            if not await asyncio.to_thread(listener_end.poll, _READY_S):
+                raise SkinError(f"the daemon did not calibrate within {_READY_S:g} s")
+            listener_end.recv()
+            sender_end.send(1)
+            await asyncio.sleep(seconds)
+            listener_end.send("end")
+            delays_us = np.array(await asyncio.to_thread(listener_end.recv)) / 1e3
+        finally:
+            for process in processes:
+                process.terminate()
+                process.join()
+    if not len(delays_us):
+        raise SkinError("no touch was published")
+    p50, p99 = np.percentile(delays_us, [50, 99])
+    return {
+        "transport": wire.transport,
+        "broker": "mosquitto",
+        "frames_per_s": stream.frames_per_s,
+        "messages": len(delays_us),
+        "delay_p50_us": round(float(p50), 1),
+        "delay_p99_us": round(float(p99), 1),
+        "delay_max_us": round(float(delays_us.max()), 1),
+    }
+
+
+def _scenes(stream: Stream) -> list[NDArray[np.uint8]]:
+    """An untouched skin; and one that something presses and leaves, once in 40 periods."""
+    shape = (40, stream.boards, TRIANGLES, TAXELS)
+    quiet = np.random.default_rng(0).integers(239, 242, shape)
+    depth = np.zeros(40)
+    depth[:24] = 70.0 * np.sin(np.pi * (np.arange(24) + 0.5) / 24)
+    pressed = quiet.copy()
+    pressed[:, _PRESSED_BOARD, _PRESSED_TRIANGLE, _PRESSED_TAXELS] -= depth.astype(int)[:, None]
+    return [quiet.astype(np.uint8), pressed.astype(np.uint8)]
+
+
+def _daemon(wire: Wire, stream: Stream, broker_port: int) -> None:
+    """Process: `skin run`."""
+    logging.disable(logging.WARNING)  # no board of this stream answers commands
+    settings = stream.settings(wire.bus())
+    settings.mqtt.host, settings.mqtt.port = "127.0.0.1", broker_port
+    settings.processing.calibration.seconds = _CALIBRATION_S
+    with tempfile.TemporaryDirectory(prefix="skin-bench-") as state:
+        settings.service.state_directory = state
+        daemon = Daemon(settings, build_layout(settings, Path()))
+        asyncio.run(daemon.run(asyncio.Event(), calibrate=True))
+
+
+def _listen(parent: Connection, broker_port: int) -> None:
+    """Process: tell the parent that there is a calibration; then collect delays until told."""
+    asyncio.run(_collect(parent, broker_port))
+
+
+async def _collect(parent: Connection, broker_port: int) -> None:
+    delays_ns: list[int] = []
+    told = False
+    loop = asyncio.get_running_loop()
+    end = asyncio.Event()
+    loop.add_reader(parent.fileno(), end.set)
+
+    async def hear() -> None:
+        nonlocal told
+        async with aiomqtt.Client("127.0.0.1", broker_port, timeout=10.0) as client:
+            await client.subscribe("skin/bench/+/touch", qos=1)
+            await client.subscribe("skin/bench/nodes/+/info", qos=1)
+            async for message in client.messages:
+                now_ns = time.time_ns()
+                document = json.loads(message.payload)
+                if "event" in document:
+                    delays_ns.append(now_ns - document["t_ns"])
+                elif not told and document["calibration"] is not None:
+                    told = True
+                    parent.send(None)
+
+    hearing = asyncio.create_task(hear())
+    await end.wait()
+    parent.send(delays_ns)
+    hearing.cancel()

@@ -1,0 +1,105 @@
+"""A skin reduced to its numbers: activations in, bytes through the pipeline, frames out.
+
+For questions of touch and drift, where the contact's mechanics does not matter: a taxel is
+a resting level between two codes, noise, an activation in units, and a byte.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skin_host.layout import Layout, build_layout
+from skin_host.processing.calibration import Calibrator
+from skin_host.processing.pipeline import Pipeline, PressureFrame
+from skin_host.settings import Settings
+
+BOARDS_PER_BUS = 14
+
+
+def flat_skin(
+    boards: int, kind: str = "triangle", processing: dict[str, Any] | None = None
+) -> tuple[Settings, Layout]:
+    """Settings and layout of one part of `boards` full boards, 192 pads each."""
+    names = [f"b{number}" for number in range(boards)]
+    document = {
+        "robot": "rig",
+        "buses": {f"can{number // BOARDS_PER_BUS}": {} for number in range(boards)},
+        "boards": {
+            name: {
+                "bus": f"can{number // BOARDS_PER_BUS}",
+                "address": number % BOARDS_PER_BUS + 1,
+            }
+            for number, name in enumerate(names)
+        },
+        "parts": {
+            "skin": {
+                "foam_mm": 2.0,
+                "patches": [
+                    {"board": name, "triangles": "0-15", "kind": kind, "shift": 3} for name in names
+                ],
+            }
+        },
+        "processing": processing or {},
+    }
+    settings = msgspec.convert(document, Settings)
+    return settings, build_layout(settings, Path())
+
+
+class Rig:
+    """One part of skin, calibrated untouched, at a steady rate.
+
+    Args:
+        boards: of 192 pads.
+        noise_units: standard deviation of a reading before it is rounded.
+        seed: of everything random.
+        hz: sweeps a second.
+        kind: of the triangles.
+        processing: table of the configuration, as in TOML.
+        calibrate_s: length of the calibration.
+    """
+
+    def __init__(
+        self,
+        boards: int,
+        noise_units: float,
+        *,
+        seed: int = 0,
+        hz: float = 25.0,
+        kind: str = "triangle",
+        processing: dict[str, Any] | None = None,
+        calibrate_s: float = 5.0,
+    ) -> None:
+        self.settings, self.layout = flat_skin(boards, kind, processing)
+        self.n = self.layout.n_taxels
+        self.dt_s = 1.0 / hz
+        self._dt_ns = round(1e9 / hz)
+        self._noise = np.float32(noise_units)
+        self._rng = np.random.default_rng(seed)
+        self._present = np.ones(self.n, dtype=np.bool_)
+        self._resting = self._rng.uniform(200.0, 240.0, self.n).astype(np.float32)
+        self.t_ns = 0
+        calibrator = Calibrator(self.layout)
+        for _ in range(round(calibrate_s * hz)):
+            calibrator.add(0, self.read(0.0), self._present)
+        self.calibration = calibrator.finish("rig", "1970-01-01T00:00:00Z")
+        self.pipeline = Pipeline(self.layout, self.settings.processing, self.calibration)
+
+    def read(self, activation_units: ArrayLike) -> NDArray[np.uint8]:
+        """The bytes [n] that activations (a number or [n]) give now."""
+        level = self._resting - np.asarray(activation_units, dtype=np.float32)
+        if self._noise > 0.0:
+            level = level + self._noise * self._rng.standard_normal(self.n, dtype=np.float32)
+        return np.asarray(np.clip(np.rint(level), 0.0, 255.0), dtype=np.uint8)
+
+    def step(self, activation_units: ArrayLike) -> PressureFrame:
+        """Let one period pass with these activations."""
+        self.t_ns += self._dt_ns
+        return self.pipeline.step(0, self.read(activation_units), self._present, self.t_ns)
+
+    @property
+    def true_baseline(self) -> NDArray[np.float64]:
+        """Baseline [n] of a reading without activation, in the pipeline's terms."""
+        return self.layout.no_load.astype(np.float64) - self._resting

@@ -1,0 +1,165 @@
+"""Speed against error, part two: what models and pipeline cost.
+
+Everything is timed in the same run, next to a copy of the same numbers in memory, and the
+least of several repeats counts: what is above it is other programs.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.evaluation.accuracy import VARIANTS
+from skin_host.evaluation.rig import Rig
+from skin_host.processing.relaxation import make_model, stand_in
+
+Row = dict[str, Any]
+
+TAXELS = (192, 1920, 100_000)
+#: Sweeps come with some jitter, so that nothing can be kept from the last dt.
+STEPS_S = (0.02, 0.020013, 0.019988, 0.020007)
+#: Steps per repeat: a whole number of windows of 1 s, so that their end has its share.
+STEPS = 100
+HZ = 50.0
+
+
+def models(seconds: float, sizes: tuple[int, ...] = TAXELS) -> list[Row]:
+    """ns per taxel-step of every model alone, `seconds` spent on each row."""
+    rows: list[Row] = []
+    rng = np.random.default_rng(1)
+    for n in sizes:
+        for dtype in ("float32", "float64"):
+            samples = rng.uniform(0.0, 60.0, (8, n)).astype(dtype)
+            out = np.empty(n, dtype)
+
+            def copy(samples: NDArray[Any] = samples, out: NDArray[Any] = out) -> None:
+                for step in range(STEPS):
+                    np.copyto(out, samples[step % 8])
+
+            rows.append(_row("memory_copy", 0.0, dtype, n, _ns(copy, n, seconds), 0))
+            for variant in VARIANTS:
+                if variant.dtype != "float64":
+                    continue  # both types are timed anyway
+                model = make_model(
+                    variant.model,
+                    n,
+                    stand_in(variant.model, "mid"),
+                    update_s=variant.update_s,
+                    dtype=dtype,
+                )
+
+                def run(
+                    step_once: Callable[..., Any] = model.step,
+                    samples: NDArray[Any] = samples,
+                    out: NDArray[Any] = out,
+                ) -> None:
+                    for step in range(STEPS):
+                        step_once(samples[step % 8], STEPS_S[step % 4], out)
+
+                ns = _ns(run, n, seconds)
+                row = _row(variant.model, variant.update_s, dtype, n, ns, model.bytes_per_taxel)
+                rows.append(row)
+    return rows
+
+
+def pipeline(seconds: float, sizes: tuple[int, ...] = (1, 10)) -> list[Row]:
+    """ns per taxel-step from bytes to kPa, against how many taxels are touched.
+
+    Args:
+        seconds: spent on each row.
+        sizes: of the skin, in boards of 192 taxels.
+    """
+    rows: list[Row] = []
+    for boards in sizes:
+        n = 192 * boards
+        for touched in (0, 12, 96, n // 4, n):
+            for watched in (True, False):
+                if touched and not watched:
+                    continue  # what is touched is always worked out
+                rig = Rig(boards, 0.4, seed=2, hz=HZ)
+                activation = np.where(np.arange(n) < touched, 20.0, 0.0)
+                sweeps = [rig.read(activation) for _ in range(STEPS)]
+                present = np.ones(n, dtype=np.bool_)
+                times = np.cumsum(np.resize(STEPS_S, STEPS) * 1e9).astype(np.int64)
+                clock = [0]
+
+                def run(
+                    rig: Rig = rig,
+                    sweeps: list[NDArray[np.uint8]] = sweeps,
+                    present: NDArray[np.bool_] = present,
+                    times: NDArray[np.int64] = times,
+                    clock: list[int] = clock,
+                    watched: bool = watched,
+                ) -> None:
+                    for sweep, t_ns in zip(sweeps, times.tolist(), strict=True):
+                        rig.pipeline.step(0, sweep, present, clock[0] + t_ns, watched)
+                    clock[0] += int(times[-1])
+
+                rows.append(
+                    {
+                        "taxels": n,
+                        "touched": touched,
+                        "pressures_wanted": watched,
+                        "ns_per_taxel_step": _ns(run, n, seconds),
+                    }
+                )
+    return rows
+
+
+def cost_of_glancing(seconds: float) -> Row:
+    """What is lost where pressures are not wanted: the same skin watched and unwatched.
+
+    A taxel in eight is pressed now and then; frames are compared where both know pressures.
+    """
+    rng = np.random.default_rng(8)
+    watched, unwatched = (Rig(1, 0.4, seed=4, hz=HZ) for _ in range(2))
+    n = watched.n
+    activation = np.zeros(n)
+    worst, disagreements, compared, skipped, sweeps = 0.0, 0, 0, 0, round(seconds * HZ)
+    present = np.ones(n, dtype=np.bool_)
+    for sweep in range(sweeps):
+        if sweep % round(5.0 * HZ) == 0:
+            pressed = rng.uniform(size=n) < 0.125 * (sweep // round(5.0 * HZ) % 2)
+            activation = np.where(pressed, rng.uniform(5.0, 40.0, n), 0.0)
+        raw = watched.read(activation)
+        t_ns = round(sweep * 1e9 / HZ)
+        one = watched.pipeline.step(0, raw, present, t_ns)
+        other = unwatched.pipeline.step(0, raw, present, t_ns, False)
+        disagreements += int(np.count_nonzero(one.touched != other.touched))
+        if other.computed:
+            compared += 1
+            worst = max(worst, float(np.max(np.abs(one.pressure_kpa - other.pressure_kpa))))
+        else:
+            skipped += 1
+    return {
+        "sweeps": sweeps,
+        "skipped_sweeps": skipped,
+        "compared_sweeps": compared,
+        "touches_that_differ": disagreements,
+        "worst_difference_kpa": worst,
+    }
+
+
+def _ns(run: Callable[[], None], n: int, seconds: float) -> float:
+    best = np.inf
+    end = time.perf_counter() + seconds
+    while True:
+        start = time.perf_counter()
+        run()
+        now = time.perf_counter()
+        best = min(best, now - start)
+        if now > end:
+            return float(best / STEPS / n * 1e9)
+
+
+def _row(model: str, update_s: float, dtype: str, n: int, ns: float, size: int) -> Row:
+    return {
+        "model": model,
+        "update_s": update_s,
+        "dtype": dtype,
+        "taxels": n,
+        "ns_per_taxel_step": ns,
+        "bytes_per_taxel": size,
+    }

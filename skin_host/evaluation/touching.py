@@ -1,0 +1,206 @@
+"""Touch and drift in numbers: false touches, delays, lags, and what a long hold leaves."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.viscoelastic import TruthKind
+from skin_host.evaluation.accuracy import fitted_hold
+from skin_host.evaluation.histories import Holds, record
+from skin_host.evaluation.rig import Rig
+from skin_host.processing.fitting import fit
+from skin_host.processing.pressure import PressureCurve
+
+Row = dict[str, Any]
+
+NOISES = (0.2, 0.4, 0.6, 0.8, 1.0, 1.5, 2.0, 3.0)
+HEIGHTS = (2.0, 2.5, 3.0, 3.5, 4.0, 5.0, 6.0, 8.0, 12.0, 20.0)
+RATES = (0.001, 0.004, 0.01, 0.03, 0.05, 0.09, 0.11)
+HOLD_KPA = 65.0
+#: A skin of 10 boards: enough taxels for rare events, as many as a robot has.
+BOARDS = 10
+
+
+def false_touches(
+    hours: float, votes: tuple[int, ...] = (1, 2, 3), boards: int = BOARDS
+) -> list[Row]:
+    """False touches of untouched skin per taxel-hour, against noise and votes.
+
+    Args:
+        hours: simulated, at 25 Hz.
+        votes: of three samples.
+        boards: of 192 taxels each.
+    """
+    rows = []
+    for noise in NOISES:
+        for needed in votes:
+            rig = Rig(boards, noise, seed=3, processing={"touch": {"votes_of_3": needed}})
+            before = np.zeros(rig.n, dtype=np.bool_)
+            begun = samples = 0
+            for _ in range(round(hours * 3600.0 / rig.dt_s)):
+                touched = rig.step(0.0).touched
+                if touched.any():
+                    samples += int(np.count_nonzero(touched))
+                    begun += int(np.count_nonzero(touched & ~before))
+                before = touched
+            taxel_hours = hours * rig.n
+            rows.append(
+                {
+                    "noise_units": noise,
+                    "votes": needed,
+                    "taxel_hours": taxel_hours,
+                    "touches_per_taxel_hour": begun / taxel_hours,
+                    "samples_per_taxel_hour": samples / taxel_hours,
+                }
+            )
+    return rows
+
+
+def detection_delays(noise_units: float = 0.4, hz: float = 25.0, boards: int = BOARDS) -> list[Row]:
+    """How long a sudden press of so many units takes to be told, one taxel in four pressed."""
+    rows = []
+    for height in HEIGHTS:
+        rig = Rig(boards, noise_units, seed=5, hz=hz)
+        for _ in range(round(2.0 * hz)):
+            rig.step(0.0)
+        pressed = np.arange(rig.n) % 4 == 0
+        activation = np.where(pressed, height, 0.0)
+        sweeps = round(2.0 * hz)
+        first = np.full(rig.n, np.inf)
+        for sweep in range(1, sweeps + 1):
+            touched = rig.step(activation).touched
+            first = np.where(touched & np.isinf(first), sweep, first)
+        seen = first[pressed]
+        told = np.isfinite(seen)
+        rows.append(
+            {
+                "height_units": height,
+                "height_kpa": float(PressureCurve(2.88).kpa(height)[0]),
+                "noise_units": noise_units,
+                "hz": hz,
+                "told_within_2_s": float(np.mean(told)),
+                "median_sweeps": float(np.median(seen[told])) if told.any() else None,
+                "p95_sweeps": _inverted_percentile(seen[told], 0.95) if told.any() else None,
+            }
+        )
+    return rows
+
+
+def drift_lags(minutes: float) -> list[Row]:
+    """How far baselines lag behind a steady drift of all taxels, by rule and rate."""
+    rows = []
+    for rule in ("paper", "proportional"):
+        for rate in RATES:
+            rig = Rig(1, 0.4, seed=7, processing={"drift": {"rule": rule, "limit_units": 1000.0}})
+            touched = 0
+            # Never so far that the byte runs out of its scale.
+            seconds = min(60.0 * minutes, 150.0 / rate)
+            sweeps = round(seconds / rig.dt_s)
+            for sweep in range(sweeps):
+                drifted = rate * sweep * rig.dt_s
+                touched += int(np.count_nonzero(rig.step(drifted).touched))
+            lag = rig.true_baseline + drifted - rig.pipeline.baseline
+            rows.append(
+                {
+                    "rule": rule,
+                    "rate_units_per_s": rate,
+                    "seconds": seconds,
+                    "lag_units": float(np.mean(lag)),
+                    "touched_share": touched / (sweeps * rig.n),
+                }
+            )
+    return rows
+
+
+def long_holds(quick: bool) -> list[Row]:
+    """What is said during and after a long press at 65 kPa, while everything drifts.
+
+    Some taxels of many are pressed, or all of them, so that no untouched one tells of drift.
+    """
+    hz = 10.0 if quick else 25.0
+    cases: list[tuple[str, float, float, float]] = [("10 min, 0.004 units/s", 600.0, 0.004, hz)]
+    if not quick:
+        cases += [
+            ("10 min, no drift", 600.0, 0.0, 25.0),
+            ("10 min, 0.001 units/s", 600.0, 0.001, 25.0),
+            ("8 h, no drift", 28800.0, 0.0, 5.0),
+            ("8 h, 0.001 units/s", 28800.0, 0.001, 5.0),
+        ]
+    kinds: tuple[TruthKind, ...] = ("A", "S") if quick else ("A", "S", "L", "H")
+    rows = []
+    for kind in kinds:
+        relaxation = fitted_table(kind, "asymmetric_clock")
+        for name, hold_s, rate, hz in cases:
+            rows += [
+                _hold(kind, name, hold_s, rate, hz, alone, relaxation) for alone in (False, True)
+            ]
+    return rows
+
+
+def fitted_table(kind: TruthKind, model: str) -> dict[str, Any]:
+    """The configuration table `processing.relaxation` fitted to a truth's calibration hold."""
+    found = fit(model, fitted_hold(kind)).parameters
+    table: dict[str, Any] = {
+        "model": model,
+        "beta": list(found.beta),
+        "tau_s": list(found.tau_s),
+        "beta_unload": list(found.beta_unload),
+        "tau_unload_s": list(found.tau_unload_s),
+    }
+    clock_kpa = float(found.clock_kpa)
+    if np.isfinite(clock_kpa):
+        table["clock_kpa"] = clock_kpa
+    return table
+
+
+def _hold(
+    kind: TruthKind,
+    name: str,
+    hold_s: float,
+    rate: float,
+    hz: float,
+    alone: bool,
+    relaxation: dict[str, Any],
+) -> Row:
+    rest_s = 900.0
+    holds: Holds = [(0.0, 30.0), (HOLD_KPA, hold_s), (0.0, rest_s)]
+    played = record(kind, holds, hz)
+    rig = Rig(1, 0.4, seed=11, hz=hz, processing={"relaxation": relaxation})
+    pressed = np.arange(rig.n) < (rig.n if alone else 6)
+    units = PressureCurve(2.88).units(played.momentary_kpa)
+    release = round((30.0 + hold_s) * hz)
+    pressed_at = round(30.0 * hz)
+    held = ghosts = 0
+    last_ghost_s = 0.0
+    error: list[NDArray[np.float64]] = []
+    rest_error: list[NDArray[np.float64]] = []
+    for sweep, (height, true_kpa) in enumerate(zip(units, played.pressure_kpa, strict=True)):
+        frame = rig.step(np.where(pressed, height, 0.0) + rate * sweep / hz)
+        if pressed_at + 2 * hz <= sweep < release:
+            held += int(np.count_nonzero(frame.touched[pressed]))
+            error.append(frame.pressure_kpa[pressed] - true_kpa)
+        elif sweep >= release + 3:  # two samples of three need this long to say it is over
+            rest_error.append(frame.pressure_kpa[pressed].astype(np.float64))
+            still = int(np.count_nonzero(frame.touched[pressed]))
+            ghosts += still
+            if still and sweep < release + 60.0 * hz:
+                last_ghost_s = (sweep - release) / hz
+    n = int(np.count_nonzero(pressed))
+    return {
+        "truth": kind,
+        "case": name,
+        "hold_s": hold_s,
+        "drift_units_per_s": rate,
+        "all_pressed": alone,
+        "touched_share_in_hold": held / (len(error) * n),
+        "rms_in_hold_kpa": float(np.sqrt(np.mean(np.square(error)))),
+        "end_of_hold_error_kpa": float(np.mean(error[-round(10 * hz) :])),
+        "ghost_s_per_taxel": ghosts / n / hz,
+        "last_ghost_s": last_ghost_s,
+        "rest_rms_kpa": float(np.sqrt(np.mean(np.square(rest_error)))),
+    }
+
+
+def _inverted_percentile(values: NDArray[np.float64], share: float) -> float:
+    return float(np.quantile(values, share, method="inverted_cdf"))

@@ -1,0 +1,179 @@
+"""Flags of a grasping hand, and the finger speed that follows from them (Ohka et al., 3.3).
+
+SEARCH: fingers approach until something touches. MOVE: the hand manipulates. TOUCH: the
+normal force of an element is above F1, or it slips. SLIP: |dFs/dt| of an element is above
+dr. OVER: the normal force of an element is above F2 (the text says F1 in one place, a slip
+of the pen). A slip adds a re-compression along the inward normal of the element with the
+largest normal force, unless OVER.
+"""
+
+from dataclasses import dataclass
+from enum import IntFlag
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+class Flags(IntFlag):
+    """State of one finger."""
+
+    SEARCH = 1
+    MOVE = 2
+    TOUCH = 4
+    SLIP = 8
+    OVER = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Thresholds:
+    """F1, F2 and dr of Ohka et al., and the times its text leaves open."""
+
+    touch_n: float = 0.2
+    over_n: float = 2.0
+    slip_n_s: float = 5.0
+    #: SLIP stays up so long after the last crossing: a stick-slip train is one slip.
+    slip_hold_s: float = 0.03
+    #: MOVE ends so long after the last touch.
+    lost_s: float = 0.2
+
+
+def analyse(normal_n: Floats, shear_rate_n_s: Floats, thresholds: Thresholds) -> Flags:
+    """TOUCH, SLIP and OVER of one finger from its elements [n] (Fig. 15)."""
+    flags = Flags(0)
+    largest = float(normal_n.max(initial=0.0))
+    if shear_rate_n_s.max(initial=0.0) > thresholds.slip_n_s:
+        flags |= Flags.SLIP
+    if largest > thresholds.touch_n or flags & Flags.SLIP:
+        flags |= Flags.TOUCH
+    if largest > thresholds.over_n:
+        flags |= Flags.OVER
+    return flags
+
+
+def next_mode(mode: Flags, *, touch: bool, lost: bool, done: bool) -> Flags:
+    """SEARCH or MOVE, from the mode before: the truth table.
+
+    | mode   | touch | lost | done | next   |
+    |--------|-------|------|------|--------|
+    | SEARCH | no    | -    | -    | SEARCH |
+    | SEARCH | yes   | -    | -    | MOVE   |
+    | MOVE   | -     | -    | yes  | SEARCH |
+    | MOVE   | -     | yes  | no   | SEARCH |
+    | MOVE   | -     | no   | no   | MOVE   |
+
+    Args:
+        mode: `Flags.SEARCH` or `Flags.MOVE`.
+        touch: every finger of the hand touches.
+        lost: none has touched for `Thresholds.lost_s`.
+        done: the motion asked for is finished.
+    """
+    if mode == Flags.MOVE:
+        return Flags.SEARCH if done or lost else Flags.MOVE
+    return Flags.MOVE if touch else Flags.SEARCH
+
+
+@dataclass(frozen=True, slots=True)
+class GraspEvent:
+    """A finger begins or ends to slip, or to press too hard.
+
+    `value` is what crossed its threshold: N/s for `slip`, N for `over`; 0 at the end.
+    """
+
+    kind: Literal["slip", "over"]
+    event: Literal["begin", "end"]
+    t_ns: int
+    value: float
+
+
+class FingerFlags:
+    """The flags of one finger over time."""
+
+    def __init__(self, thresholds: Thresholds) -> None:
+        self.flags = Flags.SEARCH
+        self._thresholds = thresholds
+        self._slipped_ns: int | None = None
+        self._touched_ns: int | None = None
+
+    def step(
+        self,
+        normal_n: Floats,
+        shear_rate_n_s: Floats,
+        t_ns: int,
+        *,
+        others_touch: bool = True,
+        done: bool = False,
+    ) -> list[GraspEvent]:
+        """Bring the flags up to date; return what began or ended.
+
+        Args:
+            normal_n: float64[n], normal force on each element.
+            shear_rate_n_s: float64[n], see `slip.ShearRate`.
+            t_ns: time of the sample.
+            others_touch: the other fingers of the hand touch.
+            done: the motion asked for is finished.
+        """
+        seen = analyse(normal_n, shear_rate_n_s, self._thresholds)
+        if seen & Flags.SLIP:
+            self._slipped_ns = t_ns
+        elif _within(self._slipped_ns, t_ns, self._thresholds.slip_hold_s):
+            seen |= Flags.SLIP | Flags.TOUCH
+        touch = bool(seen & Flags.TOUCH)
+        if touch:
+            self._touched_ns = t_ns
+        lost = not _within(self._touched_ns, t_ns, self._thresholds.lost_s)
+        mode = next_mode(
+            self.flags & (Flags.SEARCH | Flags.MOVE),
+            touch=touch and others_touch,
+            lost=lost,
+            done=done,
+        )
+        before, self.flags = self.flags, seen | mode
+        events = []
+        for flag, kind, values in (
+            (Flags.SLIP, "slip", shear_rate_n_s),
+            (Flags.OVER, "over", normal_n),
+        ):
+            if flag & (before ^ self.flags):
+                began = bool(flag & self.flags)
+                events.append(
+                    GraspEvent(
+                        "slip" if kind == "slip" else "over",
+                        "begin" if began else "end",
+                        t_ns,
+                        float(values.max(initial=0.0)) if began else 0.0,
+                    )
+                )
+        return events
+
+
+def finger_velocity(
+    flags: Flags,
+    *,
+    search_mm_s: Floats,
+    move_mm_s: Floats,
+    squeeze_mm_s: float,
+    normal_n: Floats,
+    inward: Floats,
+) -> Floats:
+    """Velocity of the fingertip, mm/s (Fig. 16).
+
+    Args:
+        flags: of this finger.
+        search_mm_s: velocity v0 while it searches.
+        move_mm_s: velocity vm while it manipulates.
+        squeeze_mm_s: speed of re-compression at a slip.
+        normal_n: float64[n], normal force on each element.
+        inward: float64[n, d], unit vectors in which pressing harder moves the fingertip,
+            the outward normals of the elements.
+    """
+    velocity = (search_mm_s if flags & Flags.SEARCH else move_mm_s).astype(np.float64)
+    if flags & Flags.SLIP and not flags & Flags.OVER:
+        velocity = velocity + squeeze_mm_s * inward[int(normal_n.argmax())]
+    return velocity
+
+
+def _within(since_ns: int | None, t_ns: int, seconds: float) -> bool:
+    return since_ns is not None and 0 <= t_ns - since_ns <= seconds * 1e9

@@ -1,0 +1,120 @@
+"""Is it slipping? Three detectors over contacts or elements, one sample at a time.
+
+`friction_used` needs to know the friction; `RatioDrop` and `ShearRate` do not. Forces in
+N; normal forces are not negative. All arrays have one entry a contact.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+def friction_used(
+    normal_n: ArrayLike, shear_n: ArrayLike, friction: float, *, minimum_n: float = 0.1
+) -> Floats:
+    """Share of the friction limit that is used, float64[n]; slip is due at 1.
+
+    Ft / (mu Fn) (Bicchi and Dario, Fig. 6, first strategy). Contacts lighter than
+    `minimum_n` say nothing and return 0.
+
+    Args:
+        normal_n: [n].
+        shear_n: [n, 2], tangential forces.
+        friction: mu, a safe estimate of the static coefficient.
+        minimum_n: least normal force.
+    """
+    normal = np.asarray(normal_n, np.float64)
+    tangential = np.linalg.norm(np.asarray(shear_n, np.float64), axis=-1)
+    heavy = normal >= minimum_n
+    used: Floats = np.where(heavy, tangential / (friction * np.where(heavy, normal, 1.0)), 0.0)
+    return used
+
+
+class RatioDrop:
+    """Abrupt fall of the ratio Ft / Fn: static friction gave way to sliding friction.
+
+    For unknown friction (Bicchi and Dario, Fig. 6, second strategy). The ratio's mean over
+    a short window is compared with that of the window before; the fall must exceed what
+    noise makes of it. Where sliding friction is no lower than static, the ratio does not fall
+    and this detector is blind.
+
+    Args:
+        contacts: n.
+        window: samples in each of the two windows.
+        drop: least fall of the ratio.
+        force_sd_n: noise of one force reading; the fall must exceed 6 of its effect.
+        minimum_n: contacts with less normal force say nothing.
+    """
+
+    def __init__(
+        self,
+        contacts: int,
+        *,
+        window: int = 2,
+        drop: float = 0.04,
+        force_sd_n: float = 0.013,
+        minimum_n: float = 0.2,
+    ) -> None:
+        self._past = np.full((2 * window, contacts), np.nan)
+        self._window = window
+        self._drop = drop
+        self._force_sd_n = force_sd_n
+        self._minimum_n = minimum_n
+
+    def step(self, normal_n: ArrayLike, shear_n: ArrayLike) -> Mask:
+        """bool[n]: slips, from normal forces [n] and tangential forces [n, 2]."""
+        normal = np.asarray(normal_n, np.float64)
+        tangential = np.linalg.norm(np.asarray(shear_n, np.float64), axis=-1)
+        heavy = normal >= self._minimum_n
+        safe = np.where(heavy, normal, 1.0)
+        self._past[:-1] = self._past[1:]
+        self._past[-1] = np.where(heavy, tangential / safe, np.nan)
+        before = self._past[: self._window].mean(axis=0)
+        after = self._past[self._window :].mean(axis=0)
+        noise = self._force_sd_n / safe * np.sqrt((1.0 + after**2) * 2.0 / self._window)
+        slips: Mask = before - after > np.maximum(self._drop, 6.0 * noise)
+        return slips
+
+
+class ShearRate:
+    """The time derivative of the shear force, by a line through the last samples (Ohka et al.).
+
+    The line is the low-pass that the derivative needs: a plain difference has noise
+    sd sqrt(2) / dt; through w samples it is sd sqrt(12 / (w (w^2 - 1))) / dt.
+
+    Args:
+        contacts: n.
+        rate_hz: of the samples.
+        window: w, samples in the line.
+    """
+
+    def __init__(self, contacts: int, rate_hz: float, *, window: int = 6) -> None:
+        self._past = np.full((window, contacts, 2), np.nan)
+        offset = np.arange(window) - 0.5 * (window - 1)
+        self._weight = offset / (offset @ offset) * rate_hz
+
+    def step(self, shear_n: ArrayLike) -> Floats:
+        """|dFs/dt|, float64[n], N/s; 0 until the window is full.
+
+        A reading that is not a number repeats the one before.
+        """
+        shear = np.asarray(shear_n, np.float64)
+        self._past[:-1] = self._past[1:]
+        self._past[-1] = np.where(np.isfinite(shear), shear, self._past[-2])
+        rate = np.linalg.norm(np.tensordot(self._weight, self._past, axes=1), axis=-1)
+        known: Floats = np.where(np.isfinite(rate), rate, 0.0)
+        return known
+
+    def threshold(self, force_sd_n: float, false_alarms_per_hour: float, rate_hz: float) -> float:
+        """Least threshold, N/s, that noise alone crosses no more often than wished.
+
+        The two components are Gaussian, so the size of their sum crosses t with
+        probability exp(-t^2 / 2 s^2) per sample.
+        """
+        deviation = force_sd_n * float(np.linalg.norm(self._weight))
+        per_sample = false_alarms_per_hour / (3600.0 * rate_hz)
+        return deviation * math.sqrt(-2.0 * math.log(min(per_sample, 1.0)))

@@ -1,0 +1,262 @@
+"""Parameters from recordings: the foam's relaxation, and the pressure curve of each taxel.
+
+The recording begins with some seconds of untouched skin, which serve as its calibration.
+"""
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.engine import Engine
+from skin_host.errors import LogError, RequestError
+from skin_host.files import write_atomic
+from skin_host.layout import Layout
+from skin_host.processing.calibration import Calibration, with_gains
+from skin_host.processing.fitting import Fit, HoldRecord, fit, merge
+from skin_host.processing.gains import GainFit, fit_gains
+from skin_host.processing.pressure import PressureCurve
+from skin_host.processing.relaxation import make_model, parameters_of
+from skin_host.replay import calibrate_from_log, replay
+from skin_host.settings import RELAXATION_SCHEMA, Settings
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+#: A taxel takes part in a hold if it reads this share of what the strongest reads.
+TAKES_PART = 0.6
+#: What a taxel reads in its pressed time: the recording may be mostly rest.
+PRESSED_QUANTILE = 0.95
+#: Less than this is no hold.
+LEAST_KPA = 10.0
+#: A plateau of known pressure lasts at least so long, and is steady to this share of itself.
+PLATEAU_S = 1.0
+STEADY_SHARE = 0.05
+STEADY_UNITS = 0.7
+#: The first part of a plateau, in which the pressure settles, is left out.
+SETTLING_SHARE = 0.3
+
+
+@dataclass(frozen=True)
+class Samples:
+    """A recording as bytes at equal distances: t samples of the n taxels of the skin.
+
+    Attributes:
+        dt_s: distance of the samples.
+        start_s: time of the first sample, as the recording counts it.
+        raw: uint8[t, n]; the last known value where none came.
+        zero: float64[n], the untouched reading.
+        usable: bool[n], taxels that can be believed.
+        calibration: of the untouched skin at the beginning.
+    """
+
+    dt_s: float
+    start_s: float
+    raw: NDArray[np.uint8]
+    zero: Floats
+    usable: Mask
+    calibration: Calibration
+
+    def units(self, rows: slice, taxels: Mask) -> Floats:
+        """Activations above the baseline of some samples and taxels."""
+        units: Floats = self.zero[taxels] - self.raw[rows, taxels]
+        return units
+
+
+def read_samples(log: Path, settings: Settings, layout: Layout, seconds: float) -> Samples:
+    """Read a recording whose first `seconds` are untouched.
+
+    Raises:
+        LogError: unreadable, or with next to nothing of this skin in it.
+    """
+    calibration = calibrate_from_log(log, settings, layout, seconds)
+    engine = Engine(settings, layout, list(range(len(layout.parts))), calibration)
+    times_ns: list[list[int]] = [[] for _ in layout.parts]
+    raws: list[list[NDArray[np.uint8]]] = [[] for _ in layout.parts]
+    valids: list[list[Mask]] = [[] for _ in layout.parts]
+    for step in replay(log, engine):
+        times_ns[step.part].append(step.frame.t_ns)
+        raws[step.part].append(step.frame.raw)
+        valids[step.part].append(step.frame.valid)
+    heard = [part for part, times in enumerate(times_ns) if len(times) > 10]
+    if not heard:
+        raise LogError(f"{log}: ten sweeps or fewer; wanted a recording of a hold or of levels")
+    first_ns = min(times_ns[part][0] for part in heard)
+    last_ns = max(times_ns[part][-1] for part in heard)
+    step_ns = round(min(float(np.median(np.diff(times_ns[part]))) for part in heard))
+    grid_ns = np.arange(first_ns, last_ns, step_ns)
+    raw = np.zeros((len(grid_ns), layout.n_taxels), dtype=np.uint8)
+    usable = np.zeros(layout.n_taxels, dtype=np.bool_)
+    for part in heard:
+        mine = slice(layout.parts[part].start, layout.parts[part].stop)
+        valid = np.array(valids[part])
+        index = np.searchsorted(times_ns[part], grid_ns, side="right").clip(1) - 1
+        raw[:, mine] = _held(np.array(raws[part]), valid)[index]
+        usable[mine] = calibration.usable[mine] & (valid.mean(axis=0) > 0.5)
+    zero = layout.no_load - calibration.baseline
+    return Samples(step_ns * 1e-9, first_ns * 1e-9, raw, zero, usable, calibration)
+
+
+def hold_record(
+    samples: Samples,
+    curve: PressureCurve,
+    load: tuple[Floats, Floats] | None,
+    weight_kpa: float | None,
+) -> HoldRecord:
+    """Find the hold and the release in a recording.
+
+    Args:
+        samples: of the recording.
+        curve: of its taxels.
+        load: a load cell's times (s, as the recording counts them or from its start) and
+            pressures (kPa), if there was one.
+        weight_kpa: the pressure of a dead weight that was laid on and taken off again.
+
+    Raises:
+        RequestError: nothing was pressed for long, or it was not let go.
+    """
+    # Some thousand samples tell who takes part; the whole is looked at for those alone.
+    thin = slice(None, None, max(len(samples.raw) // 4000, 1))
+    everyone = np.ones_like(samples.usable)
+    strongest = np.quantile(curve.kpa(samples.units(thin, everyone)), PRESSED_QUANTILE, axis=0)
+    strongest *= samples.usable
+    chosen = strongest >= max(TAKES_PART * strongest.max(), LEAST_KPA)
+    if not chosen.any():
+        raise RequestError(
+            f"no taxel was held above {LEAST_KPA:g} kPa; wanted a hold and a release, "
+            "the first seconds untouched"
+        )
+    momentary = curve.part(chosen).kpa(samples.units(slice(None), chosen)).mean(axis=1)
+    held = momentary > 0.5 * strongest[chosen].mean()
+    start = int(np.argmax(held))
+    release = len(held) - int(np.argmax(held[::-1]))
+    if release >= len(held) - 10 / samples.dt_s:
+        raise RequestError("the recording ends before the release; wanted 10 s of rest or more")
+    pressure = np.full(len(momentary), np.nan)
+    pressure[release:] = 0.0
+    if weight_kpa is not None:
+        pressure[start:release] = weight_kpa
+    elif load is not None:
+        time_s, load_kpa = load
+        now_s = np.arange(len(momentary)) * samples.dt_s
+        if time_s[0] >= samples.start_s - 1.0:
+            now_s += samples.start_s
+        inside = (now_s >= time_s[0]) & (now_s <= time_s[-1])
+        pressure = np.where(inside, np.interp(now_s, time_s, load_kpa), pressure)
+    return merge(samples.dt_s, momentary, pressure, start, release)
+
+
+def fit_relaxation(record: HoldRecord, models: list[str]) -> list[Fit]:
+    """Fit models to a record, the best first."""
+    fits = [fit(model, record) for model in models]
+    return sorted(fits, key=_error)
+
+
+def save_relaxation(path: Path, found: Fit, settings: Settings, record: HoldRecord) -> None:
+    """Write a file for the configuration's `processing.relaxation.file`, whole or not at all."""
+    chosen = found.parameters
+    document: dict[str, Any] = {
+        "schema": RELAXATION_SCHEMA,
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "robot": settings.robot,
+        "model": found.model,
+        "beta": list(chosen.beta),
+        "tau_s": list(chosen.tau_s),
+        "beta_unload": list(chosen.beta_unload),
+        "tau_unload_s": list(chosen.tau_unload_s),
+        "clock_kpa": _finite(float(np.ravel(chosen.clock_kpa)[0])),
+        "rms_hold_kpa": _finite(found.rms_hold_kpa),
+        "rms_rest_kpa": _finite(found.rms_rest_kpa),
+        "hold_s": record.hold_s,
+        "rest_s": record.rest_s,
+        "uncertain": found.uncertain,
+        "remarks": list(found.remarks),
+    }
+    write_atomic(path, msgspec.json.format(msgspec.json.encode(document), indent=1) + b"\n")
+
+
+def fit_pressures(
+    samples: Samples, settings: Settings, layout: Layout, levels_kpa: list[float]
+) -> tuple[Calibration, GainFit]:
+    """Fit gain and bend of every taxel to plateaus of known uniform pressure, in their order.
+
+    Raises:
+        RequestError: another number of plateaus than of levels was found.
+    """
+    typical = np.median(samples.units(slice(None), samples.usable), axis=1)
+    found = plateaus(typical, samples.dt_s)
+    if len(found) != len(levels_kpa):
+        seen = ", ".join(f"{part.start * samples.dt_s:.0f} s" for part in found) or "none"
+        raise RequestError(
+            f"{len(found)} plateaus of pressure in the recording (at {seen}), "
+            f"{len(levels_kpa)} levels given; wanted one level for each, in their order"
+        )
+    pressure = settings.processing.pressure
+    unit_ff = layout.unit_ff / layout.sensitivity
+    curve = PressureCurve(unit_ff, 1.0, pressure.a_kpa_per_ff2, pressure.b_kpa_per_ff)
+    everyone = np.ones_like(samples.usable)
+    linear, square = [], []
+    for part, kept in zip(found, _kept_shares(samples, curve, settings, found), strict=True):
+        ff = samples.units(part, everyone).mean(axis=0) * unit_ff
+        linear.append(kept * pressure.b_kpa_per_ff * ff)
+        square.append(kept * pressure.a_kpa_per_ff2 * ff**2)
+    result = fit_gains(np.array(levels_kpa), np.array(linear), np.array(square), samples.usable)
+    return with_gains(samples.calibration, result.gain, result.bend), result
+
+
+def plateaus(units: Floats, dt_s: float) -> list[slice]:
+    """Where a pressed skin is steady: units [t], the median over it. What settles is left out."""
+    length = max(round(PLATEAU_S / dt_s), 2)
+    if len(units) <= length:
+        return []
+    windows = np.lib.stride_tricks.sliding_window_view(units, length)
+    spread = windows.max(axis=1) - windows.min(axis=1)
+    level = windows.mean(axis=1)
+    limit = np.maximum(2.0 * STEADY_UNITS, STEADY_SHARE * level)
+    steady = (spread <= limit) & (level > 2.0)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], steady, [False]]).astype(np.int8)))
+    found = []
+    for first, last in edges.reshape(-1, 2):
+        begin, end = int(first), int(last) + length - 1
+        found.append(slice(begin + round(SETTLING_SHARE * (end - begin)), end))
+    return found
+
+
+def _kept_shares(
+    samples: Samples, curve: PressureCurve, settings: Settings, parts: list[slice]
+) -> list[Floats]:
+    """Mean share [n] of the momentary pressure that relaxation has left, for each plateau."""
+    chosen = settings.processing.relaxation
+    n = samples.raw.shape[1]
+    model = make_model(chosen.model, n, parameters_of(chosen))
+    sums = [np.zeros(n) for _ in parts]
+    for row, raw in enumerate(samples.raw):
+        momentary = curve.kpa(samples.zero - raw)
+        relaxation = model.step(momentary, samples.dt_s)
+        for part, total in zip(parts, sums, strict=True):
+            if part.start <= row < part.stop:
+                np.add(
+                    total,
+                    np.clip(1.0 - relaxation / np.maximum(momentary, 1.0), 0.3, 1.0),
+                    out=total,
+                )
+    return [total / (part.stop - part.start) for part, total in zip(parts, sums, strict=True)]
+
+
+def _held(values: NDArray[np.uint8], valid: Mask) -> NDArray[np.uint8]:
+    """Values [t, n] with the last valid one in place of the invalid."""
+    rows = np.where(valid, np.arange(len(values))[:, np.newaxis], 0)
+    return np.take_along_axis(values, np.maximum.accumulate(rows, axis=0), axis=0)
+
+
+def _error(found: Fit) -> float:
+    known = [x for x in (found.rms_hold_kpa, found.rms_rest_kpa) if np.isfinite(x)]
+    return float(np.sqrt(np.mean(np.square(known))))
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None

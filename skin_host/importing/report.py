@@ -1,0 +1,54 @@
+"""What an import found: every oddity with its file and line, nothing passed over in silence."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+Grade = Literal["odd", "assumed", "dropped"]
+GRADES: dict[Grade, str] = {
+    "odd": "wrong or strange in the files, and what was made of it",
+    "assumed": "not in the files, filled in",
+    "dropped": "in the files, without a counterpart here",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One remark; `line` 0 means the file as a whole."""
+
+    grade: Grade
+    file: Path
+    line: int
+    text: str
+
+    def __str__(self) -> str:
+        place = f"{self.file}:{self.line}" if self.line else str(self.file)
+        return f"{place}: {self.text}"
+
+
+@dataclass(slots=True)
+class Findings:
+    """The remarks on one import, in the order in which they were made."""
+
+    items: list[Finding] = field(default_factory=list)
+
+    def odd(self, file: Path, line: int, text: str) -> None:
+        """Note something wrong or strange, and what was made of it."""
+        self.items.append(Finding("odd", file, line, text))
+
+    def assumed(self, file: Path, line: int, text: str) -> None:
+        """Note something that the files do not say."""
+        self.items.append(Finding("assumed", file, line, text))
+
+    def dropped(self, file: Path, line: int, text: str) -> None:
+        """Note something that has no counterpart."""
+        self.items.append(Finding("dropped", file, line, text))
+
+    def table(self) -> str:
+        """All remarks as text, by grade; empty where there are none."""
+        sections = []
+        for grade, title in GRADES.items():
+            lines = [f"  {item}" for item in self.items if item.grade == grade]
+            if lines:
+                sections.append("\n".join([f"{title}:", *lines]))
+        return "\n".join(sections)

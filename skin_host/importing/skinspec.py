@@ -1,0 +1,328 @@
+"""The robot descriptions' skinSpec files: boards, triangles, their set-up.
+
+Two files belong together: the device's own (`left_arm-...-skin.xml`: groups of CAN
+addresses, one a bus) and the specification that it includes (`...-skinSpec.xml`: defaults
+and sets). Either may be given; a specification that is included is found beside it.
+
+What such files are like in the wild: comments within comments, `fasle`, set names used
+twice, more sets than announced or than the robot's own hosts read (20), sets that have been
+commented out, templates with prose instead of values.
+"""
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from skin_host.importing.report import Findings
+from skin_host.importing.robot_xml import Document, Entry, integer
+
+#: The robot's own hosts drop special sets beyond these numbers with a mere warning.
+HOSTS_READ_TRIANGLE_SETS = 20
+TRIANGLES = range(16)
+ADDRESSES = range(1, 15)
+SKIN_TYPES = (0, 1, 2, 3, 7, 8)
+PERIODS_MS = range(10, 210)
+SHIFTS = range(9)
+
+
+@dataclass(slots=True)
+class BoardSpec:
+    """One board: its set-up and (shift, CDC offset) of each triangle that is on."""
+
+    address: int
+    period_ms: int = 50
+    skin_type: int = 0
+    no_load: int = 240
+    triangles: dict[int, tuple[int, int]] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class Device:
+    """What one device describes: `patches` are its buses, by number, with their boards."""
+
+    name: str
+    robot: str
+    file: Path
+    patches: dict[int, list[BoardSpec]] = field(default_factory=dict)
+
+
+def read_device(path: Path, findings: Findings) -> Device:
+    """Read a skinSpec file, or a device file with the skinSpec file that it includes.
+
+    Raises:
+        ConfigurationError: the file cannot be read at all.
+    """
+    document = Document(path, findings)
+    for line, href in document.includes:
+        included = path.parent / href
+        if not included.name.lower().endswith("skinspec.xml"):
+            findings.dropped(path, line, f'includes "{href}"; only skinSpec files are read')
+        elif not included.exists():
+            findings.odd(path, line, f'includes "{href}", which is not there')
+        else:
+            document.take(Document(included, findings))
+    device = Device(_name(path), document.robot, path)
+    for number, boards in _boards(document, findings).items():
+        if boards:
+            device.patches[number] = boards
+    return device
+
+
+def _name(path: Path) -> str:
+    """Which limb: "left_arm-eb24-j4_7-skinSpec.xml" is left_arm."""
+    stem = path.stem.lower()
+    limb = re.search(r"(left|right)_[a-z]+|torso", stem)
+    text = limb[0] if limb else stem.split("-")[0].removesuffix("skinspec")
+    return re.sub(r"[^a-z0-9_]", "_", text).strip("_")[:40] or "skin"
+
+
+def _boards(document: Document, findings: Findings) -> dict[int, list[BoardSpec]]:
+    """The boards of each patch (bus), set up."""
+    patches = _addresses(document, findings)
+    default = BoardSpec(
+        0,
+        _number(document, "defaultCfgBoard", "period", 50, PERIODS_MS, findings),
+        _number(document, "defaultCfgBoard", "skinType", 0, SKIN_TYPES, findings),
+        _number(document, "defaultCfgBoard", "noLoad", 240, range(256), findings),
+    )
+    shift = _number(document, "defaultCfgTriangle", "shift", 2, SHIFTS, findings)
+    offset = _number(document, "defaultCfgTriangle", "cdcOffset", 0x2200, range(0x10000), findings)
+    enabled = _enabled(document, findings)
+    diagnostic = document.find("defaultCfgBoard", "diagnostic")
+    if diagnostic is not None:
+        findings.dropped(
+            diagnostic.file, diagnostic.line, "diagnostic: status words are always read here"
+        )
+    triangle_sets = _sets(document, "specialCfgTriangles", "triangleSetCfg", 7, findings)
+    for entry, numbers in triangle_sets:
+        patch, address = numbers[:2]
+        on = [other for other, addresses in patches.items() if address in addresses]
+        if patch not in patches and len(on) == 1:
+            findings.odd(
+                entry.file,
+                entry.line,
+                f"{entry.name}: patch {patch}, but board {address} is on patch {on[0]}; taken as "
+                "that",
+            )
+            numbers[0] = patch = on[0]
+        known = patches.setdefault(patch, [])
+        if address in ADDRESSES and address not in known:
+            known.append(address)
+    boards = {
+        patch: [
+            BoardSpec(address, default.period_ms, default.skin_type, default.no_load)
+            for address in addresses
+        ]
+        for patch, addresses in patches.items()
+    }
+    for entry, numbers in _sets(document, "specialCfgBoards", "boardSetCfg", 6, findings):
+        _set_up_boards(entry, numbers, boards, findings)
+    for entry, numbers in triangle_sets:
+        _set_up_triangles(entry, numbers, boards, findings)
+    every = [board for boards_of in boards.values() for board in boards_of]
+    bare = [board for board in every if not board.triangles]
+    if enabled is None and bare:
+        _turn_on(bare, shift, offset)
+        findings.assumed(document.path, 0, f"boards {_list(bare)}: all 16 triangles are on")
+    elif enabled:
+        _turn_on(bare, shift, offset)
+        if bare:
+            findings.odd(
+                document.path,
+                0,
+                f"boards {_list(bare)} have no set of triangles, and all are on by default; all "
+                "16 are taken: remove those that are not fitted",
+            )
+        if named := [board for board in every if board not in bare]:
+            findings.odd(
+                document.path,
+                0,
+                f"boards {_list(named)}: triangles without a set are on by default too; only "
+                "those of the sets are taken",
+            )
+    return {
+        patch: [board for board in boards_of if board.triangles]
+        for patch, boards_of in boards.items()
+    }
+
+
+def _turn_on(boards: list[BoardSpec], shift: int, offset: int) -> None:
+    for board in boards:
+        board.triangles = dict.fromkeys(TRIANGLES, (shift, offset))
+
+
+def _list(boards: list[BoardSpec]) -> str:
+    return ", ".join(str(board.address) for board in boards)
+
+
+def _addresses(document: Document, findings: Findings) -> dict[int, list[int]]:
+    """The addresses of each patch, from skinCanAddrsPatchN, or skinCanIds of a CAN card."""
+    patches: dict[int, list[int]] = {}
+    card = document.find("", "canDeviceNum")
+    number = (integer(card.words[0]) if card and card.words else None) or 1
+    for entry in [*document.group("patches"), *document.group("")]:
+        match = re.fullmatch(r"skinCanAddrsPatch(\d{1,2})|skinCanIds", entry.name)
+        if match is None:
+            continue
+        addresses = patches.setdefault(int(match[1]) if match[1] else number, [])
+        for word in entry.words:
+            address = integer(word)
+            if address is None or address not in ADDRESSES:
+                findings.odd(entry.file, entry.line, f'{entry.name}: "{word}" is no address 1..14')
+            elif address in addresses:
+                findings.odd(entry.file, entry.line, f"{entry.name}: {address} is there twice")
+            else:
+                addresses.append(address)
+    return patches
+
+
+def _number(
+    document: Document,
+    group: str,
+    name: str,
+    default: int,
+    allowed: range | tuple[int, ...],
+    findings: Findings,
+) -> int:
+    entry = document.find(group, name)
+    if entry is None:
+        if document.group(group):
+            findings.odd(document.path, 0, f"{group}: no {name}; taken: {default}")
+        else:
+            findings.assumed(document.path, 0, f"{group}.{name}: {default}")
+        return default
+    value = integer(entry.words[0]) if entry.words else None
+    if value is None or value not in allowed or len(entry.words) > 1:
+        seen = " ".join(entry.words)[:40]
+        findings.odd(entry.file, entry.line, f'{name}: seen "{seen}"; taken: {default}')
+        return default
+    return value
+
+
+def _enabled(document: Document, findings: Findings) -> bool | None:
+    """Whether triangles are on by default; whatever is not true counts as false.
+
+    None where the file has neither defaults nor sets: the oldest form, where all are on.
+    """
+    entry = document.find("defaultCfgTriangle", "enabled")
+    if entry is None:
+        told = document.group("defaultCfgTriangle") or document.group("specialCfgTriangles")
+        return False if told else None
+    word = " ".join(entry.words).lower()
+    if word not in ("true", "false", "1", "0"):
+        findings.odd(
+            entry.file,
+            entry.line,
+            f'enabled: seen "{word[:40]}"; taken as false, as the robot\'s own host reads it',
+        )
+    return word in ("true", "1")
+
+
+def _sets(
+    document: Document, group: str, prefix: str, columns: int, findings: Findings
+) -> list[tuple[Entry, list[int]]]:
+    """The numbered sets of a group, those that can be read."""
+    announced = document.find(group, "numOfSets")
+    limit = integer(announced.words[0]) if announced and announced.words else None
+    first: dict[str, int] = {}
+    sets = []
+    for entry in document.group(group):
+        match = re.fullmatch(rf"{prefix}(\d{{1,4}})", entry.name.strip())
+        if match is None:
+            if entry.name != "numOfSets":
+                findings.odd(entry.file, entry.line, f'"{entry.name}" is no {prefix}N; not read')
+            continue
+        if entry.name in first:
+            findings.odd(
+                entry.file,
+                entry.line,
+                f"{entry.name} is there already, line {first[entry.name]}; both are taken, "
+                "the robot's own host reads the first alone",
+            )
+        first.setdefault(entry.name, entry.line)
+        if limit is not None and int(match[1]) > limit:
+            findings.odd(
+                entry.file,
+                entry.line,
+                f"{entry.name}: beyond numOfSets {limit}; taken, the robot's own host does not "
+                "read it",
+            )
+        numbers = [integer(word) for word in entry.words]
+        if len(numbers) != columns or None in numbers:
+            seen = " ".join(entry.words)[:60]
+            findings.odd(
+                entry.file,
+                entry.line,
+                f'{entry.name}: seen "{seen}", wanted {columns} numbers; not read',
+            )
+            continue
+        sets.append((entry, [number for number in numbers if number is not None]))
+    if limit is not None and announced is not None:
+        if limit > len(first):
+            findings.odd(
+                announced.file,
+                announced.line,
+                f"numOfSets {limit}, but there are {len(first)}; the robot's own host refuses that",
+            )
+        if prefix == "triangleSetCfg" and limit > HOSTS_READ_TRIANGLE_SETS:
+            findings.odd(
+                announced.file,
+                announced.line,
+                f"numOfSets {limit}: the robot's own hosts read {HOSTS_READ_TRIANGLE_SETS} at "
+                "most; all are taken",
+            )
+    return sets
+
+
+def _set_up_boards(
+    entry: Entry, numbers: list[int], boards: dict[int, list[BoardSpec]], findings: Findings
+) -> None:
+    patch, first, last, period_ms, skin_type, no_load = numbers
+    chosen = [board for board in boards.get(patch, []) if first <= board.address <= last]
+    if not chosen:
+        findings.odd(
+            entry.file,
+            entry.line,
+            f"{entry.name}: no board {first}..{last} on patch {patch}; not read",
+        )
+    for column, value, allowed in (
+        ("period", period_ms, PERIODS_MS),
+        ("skinType", skin_type, SKIN_TYPES),
+        ("noLoad", no_load, range(256)),
+    ):
+        if value not in allowed:
+            findings.odd(entry.file, entry.line, f"{entry.name}: {column} {value}; not read")
+            return
+    for board in chosen:
+        board.period_ms, board.skin_type, board.no_load = period_ms, skin_type, no_load
+
+
+def _set_up_triangles(
+    entry: Entry, numbers: list[int], boards: dict[int, list[BoardSpec]], findings: Findings
+) -> None:
+    patch, address, first, last, enabled, shift, offset = numbers
+    board = next((b for b in boards.get(patch, []) if b.address == address), None)
+    for column, good, seen in (
+        ("board", board is not None, address),
+        ("first triangle", first in TRIANGLES, first),
+        ("last triangle", last in TRIANGLES and last >= first, last),
+        ("shift", shift in SHIFTS, shift),
+        ("cdcOffset", 0 <= offset <= 0xFFFF, offset),
+    ):
+        if not good:
+            findings.odd(entry.file, entry.line, f"{entry.name}: {column} {seen}; not read")
+            return
+    assert board is not None
+    again = [number for number in range(first, last + 1) if number in board.triangles]
+    if again and enabled == 1:
+        findings.odd(
+            entry.file,
+            entry.line,
+            f"{entry.name}: triangles {again[0]} to {again[-1]} of board {address} were in an "
+            "earlier set; the later one counts",
+        )
+    for number in range(first, last + 1):
+        if enabled == 1:
+            board.triangles[number] = (shift, offset)
+        else:
+            board.triangles.pop(number, None)

@@ -1,0 +1,149 @@
+"""The buses of one node: their ports, their boards, and the loop that reads them."""
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections.abc import Callable
+
+from skin_host.bus.boards import Boards
+from skin_host.bus.port import Port, open_port
+from skin_host.bus.protocol import FrameBatch
+from skin_host.bus.wake import WakeUp
+from skin_host.engine import Engine, Step
+from skin_host.errors import BusError, SkinError
+
+log = logging.getLogger(__name__)
+
+#: Sweeps and samples that wait are looked at this often.
+EXPIRE_S = 0.02
+#: A bus that does not take the set-up of its boards is tried again after this.
+RETRY_S = 2.0
+STOP_S = 1.0
+
+
+class Link:
+    """Connects an engine to the buses that it needs.
+
+    Attributes:
+        ports, boards: by name of the bus.
+
+    Raises:
+        BusError: a bus cannot be opened; those already open are closed again.
+    """
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+        self.ports: dict[str, Port] = {}
+        self.boards: dict[str, Boards] = {}
+        settings, layout = engine.settings, engine.layout
+        try:
+            for bus in engine.assemblers:
+                port = open_port(bus, settings.buses[bus], settings.receive)
+                self.ports[bus] = port
+                mine = [
+                    (i, layout.boards[i])
+                    for i in engine.boards
+                    if layout.boards[i].settings.bus == bus
+                ]
+                self.boards[bus] = Boards(
+                    bus,
+                    port,
+                    mine,
+                    layout.triangles,
+                    settings.receive.silent_periods,
+                    engine.rezero,
+                )
+        except SkinError:
+            self.close()
+            raise
+
+    async def read(
+        self,
+        deliver: Callable[[list[Step]], None],
+        record: Callable[[str, FrameBatch], None] = lambda *_: None,
+    ) -> None:
+        """Read all buses for ever; hand what comes of it to `deliver`, often nothing.
+
+        Args:
+            deliver: called after each batch, and some times a second.
+            record: called with each batch as it came.
+        """
+        engine = self._engine
+        periods_ns = {
+            i: engine.layout.boards[i].settings.period_ms * 1_000_000 for i in engine.boards
+        }
+        wake_up = WakeUp(engine.settings.receive, periods_ns)
+        expire_at_s = 0.0
+
+        def work() -> None:
+            nonlocal expire_at_s
+            for bus, port in self.ports.items():
+                batch = port.read()
+                if not len(batch):
+                    continue
+                record(bus, batch)
+                boards = self.boards[bus]
+                boards.feed(batch)
+                steps = engine.feed(bus, batch)
+                for sweep in engine.sweeps:
+                    boards.note_sweep(sweep.board, sweep.present, sweep.t_ns)
+                    wake_up.sweep_ended(sweep.board, sweep.t_ns)
+                deliver(steps)
+            now_s = time.monotonic()
+            if now_s >= expire_at_s:
+                expire_at_s = now_s + EXPIRE_S
+                deliver(engine.expire(time.time_ns()))
+
+        await wake_up.run(work)
+
+    async def bring_up(self) -> None:
+        """Set up and start the boards of every bus; a bus that cannot is tried again for ever."""
+        await asyncio.gather(*(self._bring_up(boards) for boards in self.boards.values()))
+
+    async def set_up(self, boards: list[int]) -> None:
+        """Send boards, by index, their set-up again and start them.
+
+        Raises:
+            BusError: a bus does not take frames.
+        """
+        layout = self._engine.layout
+        chosen = [layout.boards[board].settings for board in boards]
+        await asyncio.gather(*(self.boards[one.bus].set_up(one.address) for one in chosen))
+
+    def supervise(self) -> None:
+        """Look after the boards: silent ones, and those that lost their set-up."""
+        for boards in self.boards.values():
+            boards.supervise()
+
+    def all_alive(self) -> bool:
+        """Whether every board has sent at least one sweep."""
+        return all(
+            record.last_sweep_ns
+            for boards in self.boards.values()
+            for record in boards.records.values()
+        )
+
+    async def stop(self) -> None:
+        """Tell the boards to stop, as far as their buses still work."""
+        for boards in self.boards.values():
+            with contextlib.suppress(BusError, TimeoutError):
+                await asyncio.wait_for(boards.stop(), STOP_S)
+
+    def close(self) -> None:
+        """Give the interfaces back."""
+        for port in self.ports.values():
+            port.close()
+
+    @staticmethod
+    async def _bring_up(boards: Boards) -> None:
+        told = ""
+        while True:
+            try:
+                await boards.bring_up()
+                return
+            except BusError as error:
+                if str(error) != told:
+                    log.warning("%s", error)
+                    told = str(error)
+                await asyncio.sleep(RETRY_S)

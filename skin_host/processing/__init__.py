@@ -1,0 +1,1 @@
+"""Sweeps to pressure to contacts. Pure: arrays and time in, arrays out."""

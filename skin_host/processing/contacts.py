@@ -1,0 +1,317 @@
+"""Touched taxels that lie together are one contact, and a contact has a life."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.layout import Layout, PadKind
+from skin_host.processing.localization import Localizer, make_localizer, separate
+from skin_host.processing.localization_centroid import GEOMETRY_PITCHES
+from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.pressure import PressureCurve
+from skin_host.settings import Settings
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+#: What must change before another `move` is worth a message.
+MOVED_M = 0.2e-3
+PRESSED_KPA = 2.0
+PRESSED_SHARE = 0.1
+#: A contact in which nothing changes says so this often: it is still there.
+ALIVE_NS = 1_000_000_000
+#: Below this peak a contact is all but gone, and where it is only noise would tell.
+FELT_KPA = 2.0
+#: A touched taxel of which nothing is heard for less than this is taken to be touched still.
+LOST_NS = 500_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class TouchEvent:
+    """A contact begins, moves or ends.
+
+    Taxels are numbered within their part. Positions are in the part's frame. `sigma_m` is the
+    radial standard error of `centroid_m`, in the skin; None where the place is not known. `end`
+    tells where the contact was last, and its pressures are 0.
+    """
+
+    event: Literal["begin", "move", "end"]
+    id: int
+    seq: int
+    t_ns: int
+    part: str
+    taxels: list[int]
+    centroid_m: list[float] | None
+    normal: list[float] | None
+    area_mm2: float
+    peak_kpa: float
+    mean_kpa: float
+    force_n: float
+    sigma_m: float | None = None
+
+
+@dataclass(slots=True)
+class _Contact:
+    taxels: frozenset[int]
+    said: TouchEvent
+    heard_ns: int
+
+
+class ContactTracker:
+    """Finds the contacts of one part in each frame and follows them over time.
+
+    With the part's `localization` left at `centroid`, a connected patch of touched taxels is
+    one contact at its mean weighted by force. With any other, a patch with several clear
+    maxima is several contacts, and each is located from activations. The template's table of
+    a pad is laid down when it is first the strongest, which once takes some 30 ms.
+    """
+
+    def __init__(self, layout: Layout, part_index: int, settings: Settings) -> None:
+        part = layout.parts[part_index]
+        mine = slice(part.start, part.stop)
+        self._name = part.name
+        start = layout.neighbour_start[part.start : part.stop + 1].tolist()
+        neighbour = (layout.neighbour - part.start).tolist()
+        self._neighbours = [neighbour[begin:end] for begin, end in pairwise(start)]
+        self._position_m = layout.position_m[mine]
+        self._normal = layout.normal[mine]
+        self._area_mm2 = layout.area_mm2[mine]
+        self._shortest_ns = int(1e9 / settings.processing.touch.move_hz)
+        self._pitch_m = _pitch_m(self._position_m, self._neighbours)
+        self._places: _Places | None = None
+        if settings.parts[part.name].localization != "centroid":
+            self._places = _Places(layout, part_index, settings)
+        self._contacts: dict[int, _Contact] = {}
+        self._next_id = 1
+
+    def step(self, frame: PressureFrame) -> list[TouchEvent]:
+        """Return what happened since the last frame: ends first, then moves and begins."""
+        if not self._contacts and not np.count_nonzero(frame.touched):
+            return []
+        groups = self._groups(self._touched(frame))
+        if self._places is not None:
+            groups = self._places.look(frame, groups, self._neighbours)
+        names = self._identify(groups)
+        events = [
+            self._closed(name, frame.seq, frame.t_ns)
+            for name in list(self._contacts)
+            if name not in names
+        ]
+        for name, taxels in zip(names, groups, strict=True):
+            known = self._contacts.get(name)
+            event = self._described(name, taxels, frame, None if known is None else known.said)
+            if known is None:
+                self._contacts[name] = _Contact(taxels, event, frame.t_ns)
+                events.append(event)
+                continue
+            known.taxels = taxels
+            heard = frame.valid[event.taxels]
+            if heard.all():
+                known.heard_ns = frame.t_ns
+            if heard.any() and self._worth_saying(known.said, event):
+                known.said = event
+                events.append(event)
+        return events
+
+    def end_all(self, seq: int, t_ns: int) -> list[TouchEvent]:
+        """End every contact: the part will not be heard of for a while."""
+        return [self._closed(name, seq, t_ns) for name in list(self._contacts)]
+
+    def _touched(self, frame: PressureFrame) -> list[int]:
+        """Touched taxels in order, with those of a contact of which nothing was received.
+
+        A lost frame is not the end of a touch.
+        """
+        touched: list[int] = np.flatnonzero(frame.touched).tolist()
+        silent = {
+            taxel
+            for contact in self._contacts.values()
+            if 0 <= frame.t_ns - contact.heard_ns < LOST_NS
+            for taxel in contact.taxels
+            if not frame.valid[taxel]
+        }
+        return sorted(silent.union(touched)) if silent else touched
+
+    def _groups(self, touched: list[int]) -> list[frozenset[int]]:
+        """Connected sets of touched taxels, in the order of their lowest number."""
+        left = set(touched)
+        groups = []
+        for first in touched:
+            if first not in left:
+                continue
+            left.remove(first)
+            group = [first]
+            for taxel in group:  # grows while it is walked
+                for other in self._neighbours[taxel]:
+                    if other in left:
+                        left.remove(other)
+                        group.append(other)
+            groups.append(frozenset(group))
+        return groups
+
+    def _identify(self, groups: list[frozenset[int]]) -> list[int]:
+        """Give each group the name of the contact that it continues, or a new one.
+
+        The largest overlap decides; of equal ones the older contact. A group next to
+        where a contact was continues it too, if nothing overlaps it: it slid.
+        """
+        claims = []
+        for number, group in enumerate(groups):
+            reach = group.union(*(self._neighbours[taxel] for taxel in group))
+            for name, contact in self._contacts.items():
+                overlap = len(group & contact.taxels)
+                near = overlap or len(reach & contact.taxels)
+                if near:
+                    claims.append((not overlap, -near, name, number))
+        names: dict[int, int] = {}
+        for _, _, name, number in sorted(claims):
+            if number not in names and name not in names.values():
+                names[number] = name
+        for number in range(len(groups)):
+            if number not in names:
+                names[number] = self._next_id
+                self._next_id += 1
+        return [names[number] for number in range(len(groups))]
+
+    def _described(
+        self, name: int, taxels: frozenset[int], frame: PressureFrame, before: TouchEvent | None
+    ) -> TouchEvent:
+        index = sorted(taxels)
+        pressure = frame.pressure_kpa[index].astype(np.float64)
+        area = self._area_mm2[index]
+        area_mm2 = float(area.sum())
+        weight = pressure * area
+        total = float(weight.sum())
+        peak = float(pressure.max())
+        centroid = normal = sigma = None
+        if before is not None and peak < FELT_KPA:
+            centroid, normal, sigma = before.centroid_m, before.normal, before.sigma_m
+        elif total > 0.0:
+            if self._places is not None:
+                centroid, sigma = self._places.locate(index)
+            else:
+                centroid = (weight @ self._position_m[index] / total).tolist()
+                # Noise adds little to what the coarse pads leave open.
+                sigma = GEOMETRY_PITCHES * self._pitch_m / math.sqrt(len(index))
+            direction = weight @ self._normal[index]
+            length = float(np.linalg.norm(direction))
+            normal = (direction / length).tolist() if length > 1e-9 * total else None
+        return TouchEvent(
+            "begin" if before is None else "move",
+            name,
+            frame.seq,
+            frame.t_ns,
+            self._name,
+            index,
+            centroid,
+            normal,
+            area_mm2,
+            peak,
+            total / area_mm2,
+            total * 1e-3,  # kPa mm2 is mN
+            sigma,
+        )
+
+    def _closed(self, name: int, seq: int, t_ns: int) -> TouchEvent:
+        last = self._contacts.pop(name).said
+        return TouchEvent(
+            "end",
+            name,
+            seq,
+            t_ns,
+            self._name,
+            last.taxels,
+            last.centroid_m,
+            last.normal,
+            last.area_mm2,
+            0.0,
+            0.0,
+            0.0,
+            last.sigma_m,
+        )
+
+    def _worth_saying(self, said: TouchEvent, now: TouchEvent) -> bool:
+        if 0 <= now.t_ns - said.t_ns < self._shortest_ns:
+            return False
+        if now.taxels != said.taxels or now.t_ns - said.t_ns >= ALIVE_NS:
+            return True
+        change = abs(now.peak_kpa - said.peak_kpa)
+        if change > max(PRESSED_KPA, PRESSED_SHARE * said.peak_kpa):
+            return True
+        if now.centroid_m is None or said.centroid_m is None:
+            return now.centroid_m is not said.centroid_m
+        moved = np.subtract(now.centroid_m, said.centroid_m)
+        return float(np.linalg.norm(moved)) > MOVED_M
+
+
+class _Places:
+    """Contacts of one part told apart and located by the method that it is configured with.
+
+    Pressures are turned back into activations of one and the same pad, the part's median:
+    pads of other sizes, shifts and strengths then read alike where they are covered alike.
+    """
+
+    def __init__(self, layout: Layout, part_index: int, settings: Settings) -> None:
+        part = layout.parts[part_index]
+        chosen = settings.parts[part.name]
+        mine = slice(part.start, part.stop)
+        self._localizer: Localizer = make_localizer(
+            chosen.localization,
+            layout.position_m[mine],
+            layout.normal[mine],
+            layout.radius_mm[mine],
+            probe_mm=chosen.probe_mm,
+        )
+        pads = layout.pad_kind[mine] == PadKind.PRESSURE
+        unit_ff = (layout.unit_ff[mine] / layout.sensitivity[mine])[pads]
+        pressure = settings.processing.pressure
+        self._curve = PressureCurve(
+            np.median(unit_ff) if len(unit_ff) else 1.0,
+            a=pressure.a_kpa_per_ff2,
+            b=pressure.b_kpa_per_ff,
+        )
+        self._units: Floats = np.zeros(part.n_taxels)
+        self._believed: Mask = np.zeros(part.n_taxels, np.bool_)
+        self._free: Mask = np.zeros(part.n_taxels, np.bool_)
+
+    def look(
+        self,
+        frame: PressureFrame,
+        patches: list[frozenset[int]],
+        neighbours: Sequence[Sequence[int]],
+    ) -> list[frozenset[int]]:
+        """Take in a frame and its connected patches; return its contacts."""
+        self._units = self._curve.units(frame.pressure_kpa)
+        self._free = frame.valid.copy()
+        contacts = []
+        for patch in patches:
+            taxels = sorted(patch)
+            self._free[taxels] = False
+            contacts += [frozenset(g) for g in separate(taxels, self._units, neighbours)]
+        self._believed = frame.valid
+        return contacts
+
+    def locate(self, taxels: list[int]) -> tuple[list[float] | None, float | None]:
+        """Position in the part's frame and its standard error, m, of one of the contacts."""
+        index = np.array(taxels, np.intp)
+        usable = self._free.copy()
+        usable[index] = self._believed[index]
+        location = self._localizer.locate(index, self._units, usable)
+        if location is None:
+            return None, None
+        return location.position_m.tolist(), location.sigma_m
+
+
+def _pitch_m(position_m: Floats, neighbours: Sequence[Sequence[int]]) -> float:
+    """Median distance of taxels to their nearest neighbour; 0 where none has any."""
+    nearest = [
+        float(np.linalg.norm(position_m[near] - position_m[taxel], axis=1).min())
+        for taxel, near in enumerate(neighbours)
+        if near
+    ]
+    return float(np.median(nearest)) if nearest else 0.0

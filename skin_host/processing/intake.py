@@ -1,0 +1,233 @@
+"""Sweeps of boards to samples of parts.
+
+A part may be fed by several boards, each with its own clock. A sample of the part is
+ready when every board that is alive has given a sweep, or when one gives its second: no
+board waits for a dead one. What did not come, or came with an error, is not present.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.bus.assembler import Sweep
+from skin_host.bus.protocol import TRIANGLES, out_of_range, status_error
+from skin_host.layout import Layout
+from skin_host.processing.liveness import PADS, Liveness
+
+#: A silent part says so at once and then once a second.
+SILENCE_REPEAT_NS = 1_000_000_000
+#: So many pads far below zero pressure are no accident.
+LIFTED_PADS = 2
+_NONE_ERRS = np.zeros(TRIANGLES, np.bool_)
+
+
+@dataclass(frozen=True, slots=True)
+class PartSample:
+    """One part at one instant.
+
+    Attributes:
+        part: index into `Layout.parts`.
+        raw: uint8[m], 0 where nothing came.
+        present: bool[m], the value came, and nothing speaks against it.
+        received: bool[m], the same where a veto of the host does not count: what a new
+            calibration may be taken from.
+        t_ns: time of the last CAN frame in it.
+    """
+
+    part: int
+    raw: NDArray[np.uint8]
+    present: NDArray[np.bool_]
+    received: NDArray[np.bool_]
+    t_ns: int
+
+
+@dataclass(slots=True)
+class _Feed:
+    """How one board's 192 values go into one part."""
+
+    board: int
+    source: NDArray[np.intp]
+    target: NDArray[np.intp]
+    alive_until_ns: int = 0
+    fresh: bool = False
+
+
+@dataclass(slots=True)
+class _PartState:
+    index: int
+    n: int
+    feeds: dict[int, _Feed]
+    period_ns: int
+    raw: NDArray[np.uint8]
+    present: NDArray[np.bool_]
+    received: NDArray[np.bool_]
+    first_ns: int = 0
+    last_ns: int = 0
+    said_ns: int = 0
+    pending: bool = False
+    silent_at_ns: int = field(default=1 << 62)
+
+
+class Intake:
+    """Joins sweeps into samples of parts.
+
+    Args:
+        layout: the skin.
+        parts: indices of the parts that this daemon reads.
+        silent_periods: a board is taken for dead after so many periods without a sweep.
+        liveness: who watches each board's bytes, by index of the board; may be replaced.
+
+    Attributes:
+        veto: bool[16, 12] by index of the board: taxels that are not to be believed for a
+            reason that the bytes do not show.
+        touched: bool[16] by index of the board: triangles that are touched, where any is.
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        parts: list[int],
+        silent_periods: float,
+        liveness: dict[int, Liveness],
+    ) -> None:
+        self.liveness = liveness
+        self.veto: dict[int, NDArray[np.bool_]] = {}
+        self.touched: dict[int, NDArray[np.bool_]] = {}
+        self._silent_periods = silent_periods
+        self._states: list[_PartState] = []
+        self._of_board: dict[int, list[_PartState]] = {}
+        for index in parts:
+            part = layout.parts[index]
+            feeds: dict[int, _Feed] = {}
+            for board in part.boards:
+                flat = layout.boards[board].taxel_index.ravel()
+                source = np.flatnonzero((flat >= part.start) & (flat < part.stop))
+                feeds[board] = _Feed(board, source, (flat[source] - part.start).astype(np.intp))
+            period_ms = max(layout.boards[board].settings.period_ms for board in part.boards)
+            state = _PartState(
+                index,
+                part.n_taxels,
+                feeds,
+                period_ms * 1_000_000,
+                np.zeros(part.n_taxels, np.uint8),
+                np.zeros(part.n_taxels, np.bool_),
+                np.zeros(part.n_taxels, np.bool_),
+            )
+            self._states.append(state)
+            for board in part.boards:
+                self._of_board.setdefault(board, []).append(state)
+
+    def feed(self, sweeps: list[Sweep]) -> list[PartSample]:
+        """Take sweeps in order of time, hand on the samples that they complete."""
+        samples: list[PartSample] = []
+        for sweep in sweeps:
+            states = self._of_board.get(sweep.board)
+            if states is None:
+                continue
+            touched = self.touched.get(sweep.board)
+            trusted = _trusted(sweep, self.liveness[sweep.board], touched)
+            veto = self.veto.get(sweep.board)
+            received = trusted.ravel()
+            trusted = received if veto is None else (trusted & ~veto).ravel()
+            raw = sweep.raw.ravel()
+            for state in states:
+                feed = state.feeds[sweep.board]
+                if feed.fresh:
+                    self._emit(state, samples)
+                if not state.pending:
+                    state.first_ns = sweep.t_ns
+                    state.last_ns = sweep.t_ns
+                    state.pending = True
+                feed.fresh = True
+                feed.alive_until_ns = sweep.t_ns + int(self._silent_periods * state.period_ns)
+                state.raw[feed.target] = raw[feed.source]
+                state.present[feed.target] = trusted[feed.source]
+                state.received[feed.target] = received[feed.source]
+                state.last_ns = max(state.last_ns, sweep.t_ns)
+                if all(
+                    other.fresh or other.alive_until_ns < sweep.t_ns
+                    for other in state.feeds.values()
+                ):
+                    self._emit(state, samples)
+        return samples
+
+    def expire(self, now_ns: int) -> list[PartSample]:
+        """Hand on what has waited for a whole period, and say which parts are silent."""
+        samples: list[PartSample] = []
+        for state in self._states:
+            if state.pending and now_ns - state.first_ns > state.period_ns:
+                self._emit(state, samples)
+            if state.silent_at_ns == 1 << 62:
+                state.silent_at_ns = now_ns + int(self._silent_periods * state.period_ns)
+            elif now_ns > state.silent_at_ns and not state.pending:
+                nothing = np.zeros(state.n, np.uint8)
+                none = nothing.astype(np.bool_)
+                # Stamped with the end of the wait: what comes late may still be newer.
+                state.said_ns = state.silent_at_ns
+                samples.append(PartSample(state.index, nothing, none, none, state.said_ns))
+                state.silent_at_ns = now_ns + SILENCE_REPEAT_NS
+        return samples
+
+    def flush(self) -> list[PartSample]:
+        """Hand on everything that waits, at the end of a recording."""
+        samples: list[PartSample] = []
+        for state in self._states:
+            if state.pending:
+                self._emit(state, samples)
+        return samples
+
+    def _emit(self, state: _PartState, samples: list[PartSample]) -> None:
+        for feed in state.feeds.values():
+            if not feed.fresh:
+                state.raw[feed.target] = 0
+                state.present[feed.target] = False
+                state.received[feed.target] = False
+            feed.fresh = False
+        if 0 <= state.said_ns - state.last_ns < 4 * state.period_ns:
+            # A sweep that came after the sample it belongs to. Times of a part only rise, but
+            # for a clock that is set back.
+            state.last_ns = state.said_ns + 1
+        state.said_ns = state.last_ns
+        samples.append(
+            PartSample(
+                state.index,
+                state.raw.copy(),
+                state.present.copy(),
+                state.received.copy(),
+                state.last_ns,
+            )
+        )
+        state.pending = False
+        state.silent_at_ns = state.last_ns + int(self._silent_periods * state.period_ns)
+
+
+def _trusted(
+    sweep: Sweep, liveness: Liveness, touched: NDArray[np.bool_] | None
+) -> NDArray[np.bool_]:
+    """bool[16, 12]: the triangle came, its chip answers and lives, the value is within range."""
+    here = (sweep.present >> np.arange(TRIANGLES) & 1).astype(np.bool_)
+    erring = _NONE_ERRS
+    trusted: NDArray[np.bool_]
+    if sweep.status.any():
+        erring = status_error(sweep.status) != 0
+        here &= ~erring
+        here &= ~lifted(sweep.raw, sweep.status)
+        trusted = ~out_of_range(sweep.status) & here[:, None]
+    else:
+        trusted = np.repeat(here[:, None], PADS, axis=1)
+    doubted = liveness.step(sweep.raw, here, erring, touched)
+    if doubted is not None:
+        trusted &= ~doubted
+    return trusted
+
+
+def lifted(raw: NDArray[np.uint8], status: NDArray[np.uint16]) -> NDArray[np.bool_]:
+    """Triangles bool[k] whose pads read far below zero pressure: that is not their chip.
+
+    Pressing cannot do it. Plugs of data lines that were swapped, or a chip at another one's
+    address, put the pads of one triangle on the baselines of another.
+    """
+    below = out_of_range(status) & (raw == 255)
+    found: NDArray[np.bool_] = np.count_nonzero(below, axis=-1) >= LIFTED_PADS
+    return found

@@ -1,0 +1,253 @@
+"""The template localiser: which place of a round probe would have made these readings?
+
+A pad answers in proportion to the area that is covered (foam as independent springs,
+paper Figs. 11-13), so a probe of known size at a known place makes a known pattern. The
+patterns of all places around a pad are laid down when it is first the strongest; each
+contact is then one product with that table. The mean of the places, weighted by how well
+they explain the readings, has the least expected square error, and their spread is the
+uncertainty: a small probe inside one pad is said to be anywhere in it.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.processing.localization_centroid import (
+    CentroidLocalizer,
+    Floats,
+    Indices,
+    Location,
+    Mask,
+    tangent_plane,
+)
+
+Floats32 = NDArray[np.float32]
+
+#: Distance of the places on trial, mm. Between them the pattern is taken as linear.
+STEP_MM = 0.3
+#: A place is on trial if the pad is covered there nearly as much as the most covered one.
+#: Strengths of pads differ, so the strongest reading need not be of the most covered pad.
+STRONGEST_WITHIN = 0.25
+#: Pads differ in strength by about this share even after calibration.
+GAIN_SPREAD = 0.03
+#: Error of a pattern half a step away from the nearest place on trial, in units per unit.
+STEP_SHARE = 0.01
+#: Tables kept at a time, about 0.7 MB each with four sizes of probe.
+MOST_TABLES = 128
+#: Where the places that explain the readings lie closer than this, the best is refined.
+SHARP_MM = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class _Table:
+    """Patterns around one pad: rows are places, columns the pads that any of them covers.
+
+    `moments` are 1, x, y, x^2 + y^2 of the places; `shape` [places, 3, pads] are the pattern
+    and its slopes along x and y, per mm.
+    """
+
+    pads: Indices
+    place_mm: Floats
+    moments: Floats32
+    pattern: Floats32
+    pattern_squared: Floats32
+    shape: Floats32
+    basis: Floats
+
+
+class TemplateLocalizer:
+    """Matches the readings around the strongest pad with those of a round probe.
+
+    A contact wider than the largest probe can touch is like none of the patterns: of it the
+    centroid is told.
+
+    Args:
+        position_m: float64[n, 3] of the part's taxels.
+        normal: float64[n, 3].
+        radius_mm: float64[n], of the pads.
+        probe_mm: diameter of what touches; several to leave the size open.
+        noise_units: standard deviation of an untouched reading, rounding included.
+    """
+
+    def __init__(
+        self,
+        position_m: Floats,
+        normal: Floats,
+        radius_mm: Floats,
+        probe_mm: float | Sequence[float] = 10.0,
+        *,
+        noise_units: float = 0.5,
+    ) -> None:
+        self._position_m = position_m
+        self._normal = normal
+        self._radius_mm = radius_mm
+        self._probes_mm = np.atleast_1d(np.asarray(probe_mm, np.float64))
+        self._noise_units = noise_units
+        self._widest_m = 1e-3 * float(self._probes_mm.max() + 2.0 * radius_mm.max(initial=0.0))
+        self._centroid = CentroidLocalizer(position_m, noise_units=noise_units)
+        self._tables: dict[int, _Table] = {}
+
+    def locate(self, taxels: Indices, units: Floats, usable: Mask) -> Location | None:
+        """See `Localizer.locate`."""
+        mine = taxels[usable[taxels]]
+        if len(mine) == 0:
+            return None
+        strongest = int(mine[units[mine].argmax()])
+        peak = float(units[strongest])
+        if not 0.0 < peak < np.inf:
+            return None
+        if self._is_wide(mine):
+            return self._centroid.locate(taxels, units, usable)
+        table = self._tables.get(strongest)
+        if table is None:
+            if len(self._tables) >= MOST_TABLES:
+                self._tables.pop(next(iter(self._tables)))
+            table = self._tables[strongest] = self._lay_down(strongest)
+        # float32 throughout: one float64 among these would copy the tables at each touch.
+        reading = units.take(table.pads).astype(np.float32)
+        trust = usable.take(table.pads).astype(np.float32)
+        reading *= trust
+        spread = (GAIN_SPREAD * reading) ** 2
+        coarse = trust / (spread + np.float32(self._noise_units**2 + (STEP_SHARE * peak) ** 2))
+        # The strength of the push is unknown: for each place take the one that fits best.
+        match = table.pattern @ (coarse * reading)
+        match *= match
+        match /= table.pattern_squared @ coarse
+        place = int(match.argmax())
+        # What the best pattern leaves over, beyond noise: the contact is of another shape.
+        misfit = float((coarse * reading) @ reading - match[place]) / max(len(mine) - 3, 1)
+        match -= match[place]
+        match *= np.float32(0.5)
+        likely = np.exp(match, out=match)
+        total, x, y, squared = (likely @ table.moments).tolist()
+        x, y = x / total, y / total
+        variance_mm2 = max(squared / total - x * x - y * y, 0.0)
+        if variance_mm2 < SHARP_MM**2:
+            fine = trust / (spread + np.float32(self._noise_units**2))
+            refined = _refine(table, place, reading, fine)
+            # A pattern that stands still under the probe refines nothing.
+            if refined is not None and refined[2] < variance_mm2 + STEP_MM**2:
+                x, y, variance_mm2 = refined
+        position_m = self._position_m[strongest] + (1e-3 * x) * table.basis[0]
+        position_m += (1e-3 * y) * table.basis[1]
+        return Location(position_m, 1e-3 * math.sqrt(variance_mm2 * max(1.0, misfit)))
+
+    def _is_wide(self, taxels: Indices) -> bool:
+        """Whether two of the taxels are farther apart than any probe reaches."""
+        position_m = self._position_m[taxels]
+        low, high = position_m.min(axis=0), position_m.max(axis=0)
+        if math.dist(low, high) <= self._widest_m:
+            return False
+        if (high - low).max() > self._widest_m:
+            return True
+        off = position_m[:, None] - position_m[None]
+        return bool((off * off).sum(axis=2).max() > self._widest_m**2)
+
+    def _lay_down(self, centre: int) -> _Table:
+        """Patterns of all places at which this pad would read about the most."""
+        radius = self._radius_mm
+        reach_mm = self._probes_mm.max() + 2.0 * radius.max()
+        pads, flat_m, basis = tangent_plane(self._position_m, self._normal, centre, 2e-3 * reach_mm)
+        flat_mm = 1e3 * flat_m
+        half_mm = 0.5 * self._probes_mm.max() + radius[centre]
+        axis = STEP_MM * np.arange(-np.ceil(half_mm / STEP_MM), np.ceil(half_mm / STEP_MM) + 1)
+        grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+        # Places much nearer to another pad cannot cover this one most; drop them early.
+        away = np.linalg.norm(grid[:, None] - flat_mm[None], axis=2)
+        own = int(np.flatnonzero(pads == centre)[0])
+        grid = grid[away[:, own] <= away.min(axis=1) + radius.max()]
+        near_pads = away.min(axis=0) < half_mm
+        pads, flat_mm, radius = pads[near_pads], flat_mm[near_pads], radius[pads[near_pads]]
+        own = int(np.flatnonzero(pads == centre)[0])
+        places, patterns, slopes = [], [], []
+        for probe_mm in self._probes_mm:
+            share = covered_share(grid, flat_mm, radius, probe_mm)
+            near = (share[:, own] > 0.0) & (share[:, own] >= share.max(axis=1) - STRONGEST_WITHIN)
+            places.append(grid[near])
+            patterns.append(share[near])
+            right, left, up, down = (
+                covered_share(
+                    grid[near] + 0.5 * STEP_MM * np.array(side), flat_mm, radius, probe_mm
+                )
+                for side in ((1, 0), (-1, 0), (0, 1), (0, -1))
+            )
+            slopes.append(np.stack([right - left, up - down], axis=1) / STEP_MM)
+        place_mm = np.concatenate(places)
+        pattern = np.concatenate(patterns)
+        used = pattern.max(axis=0) > 0.0
+        pattern = pattern[:, used]
+        return _Table(
+            pads[used],
+            place_mm,
+            np.column_stack([np.ones(len(place_mm)), place_mm, (place_mm**2).sum(axis=1)]).astype(
+                np.float32
+            ),
+            pattern.astype(np.float32),
+            (pattern**2).astype(np.float32),
+            np.concatenate([pattern[:, None], np.concatenate(slopes)[:, :, used]], axis=1).astype(
+                np.float32
+            ),
+            basis,
+        )
+
+
+def _refine(
+    table: _Table, place: int, reading: Floats32, weight: Floats32
+) -> tuple[float, float, float] | None:
+    """One Gauss-Newton step in strength and place, from a place on trial.
+
+    Returns:
+        The place, mm, and the sum of its two variances, mm2. None where the step leads
+        away from the place, and from where its pattern is linear.
+    """
+    shape = table.shape[place]
+    weighted = shape * weight
+    (tt, tx, ty), (_, xx, xy), (_, _, yy) = (weighted @ shape.T).tolist()
+    t, x, y = (weighted @ reading).tolist()
+    # Solve by elimination of the strength; numpy's solver costs more than all the rest.
+    xx, xy, yy = xx - tx * tx / tt, xy - tx * ty / tt, yy - ty * ty / tt
+    x, y = x - tx * t / tt, y - ty * t / tt
+    determinant = xx * yy - xy * xy
+    if not determinant > 1e-6 * (xx + yy) ** 2:
+        return None
+    move_x, move_y = (yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant
+    strength = (t - tx * move_x - ty * move_y) / tt
+    limit = STEP_MM * strength
+    if not (abs(move_x) <= limit and abs(move_y) <= limit):
+        return None
+    at_x, at_y = table.place_mm[place].tolist()
+    variance = (xx + yy) / determinant / strength**2
+    return at_x + move_x / strength, at_y + move_y / strength, variance
+
+
+def covered_share(
+    place_mm: Floats, pad_mm: Floats, pad_radius_mm: Floats, probe_mm: float
+) -> Floats:
+    """Share of each pad that a round probe covers, float64[places, pads].
+
+    The area of the lens that two circles share, over the pad's area.
+
+    Args:
+        place_mm: float64[places, 2], centres of the probe.
+        pad_mm: float64[pads, 2].
+        pad_radius_mm: float64[pads].
+        probe_mm: diameter of the probe.
+    """
+    probe_radius = 0.5 * probe_mm
+    distance = np.linalg.norm(place_mm[:, None, :] - pad_mm[None, :, :], axis=2)
+    pad = np.broadcast_to(pad_radius_mm, distance.shape)
+    share = np.where(
+        distance <= np.abs(pad - probe_radius), np.minimum(1.0, (probe_radius / pad) ** 2), 0.0
+    )
+    cut = (distance > np.abs(pad - probe_radius)) & (distance < pad + probe_radius)
+    d, a = distance[cut], pad[cut]
+    b = probe_radius
+    at_pad = np.arccos(np.clip((d**2 + a**2 - b**2) / (2.0 * d * a), -1.0, 1.0))
+    at_probe = np.arccos(np.clip((d**2 + b**2 - a**2) / (2.0 * d * b), -1.0, 1.0))
+    kite = (a + b - d) * (d + a - b) * (d - a + b) * (d + a + b)
+    lens = a**2 * at_pad + b**2 * at_probe - 0.5 * np.sqrt(np.maximum(kite, 0.0))
+    share[cut] = lens / (np.pi * a**2)
+    return share

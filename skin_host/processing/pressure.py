@@ -1,0 +1,93 @@
+"""Units of the 8-bit reading to capacitance to pressure, and back (paper, equation 1)."""
+
+from copy import copy
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+#: The paper's fit to taxel 2 with 5 and 6 mm probes.
+A_KPA_PER_FF2 = -0.001132
+B_KPA_PER_FF = 0.8141
+#: Equation (1) turns back at its vertex. From this share of the vertex's pressure on its
+#: tangent takes over, and the reading counts as beyond the calibrated range.
+TANGENT_FROM = 0.9
+
+
+class PressureCurve:
+    """C = gain (a S^2 + b S) with S = unit_ff times the activation, for each of n taxels.
+
+    Continued so that it never turns back: linear below zero activation, and by its tangent
+    from 0.9 of the vertex's pressure (131.7 kPa, 246 fF at the paper's parameters). The
+    continuation keeps the order of pressures but is no calibration: `beyond_units` tells
+    where it begins.
+
+    Attributes:
+        square, linear: coefficients [n] of the activation in units: C = square x^2 + linear x.
+        beyond_units: activation [n] where the calibrated range ends; inf where a >= 0.
+        tail_slope: kPa per unit [n] of the continuation.
+    """
+
+    def __init__(
+        self,
+        unit_ff: ArrayLike,
+        gain: ArrayLike = 1.0,
+        a: ArrayLike = A_KPA_PER_FF2,
+        b: ArrayLike = B_KPA_PER_FF,
+    ) -> None:
+        unit, factor, curve, slope = np.broadcast_arrays(
+            np.atleast_1d(np.asarray(unit_ff, dtype=np.float64)),
+            *(np.asarray(value, dtype=np.float64) for value in (gain, a, b)),
+        )
+        if np.any(unit < 0.0) or np.any(factor <= 0.0) or np.any(slope <= 0.0):
+            raise ValueError("unit_ff must not be negative; gain and b must be positive")
+        self.square: Array = factor * curve * unit**2
+        self.linear: Array = factor * slope * unit
+        bent = self.square < 0.0
+        self.beyond_units: Array = np.full(unit.shape, np.inf)
+        vertex_units = -self.linear[bent] / (2.0 * self.square[bent])
+        self.beyond_units[bent] = (1.0 - np.sqrt(1.0 - TANGENT_FROM)) * vertex_units
+        self.tail_slope: Array = self.linear.copy()
+        self.tail_slope[bent] += 2.0 * self.square[bent] * self.beyond_units[bent]
+
+    def part(self, taxels: slice | NDArray[np.bool_]) -> "PressureCurve":
+        """Return the curves of some of the taxels."""
+        chosen = copy(self)
+        chosen.square = self.square[taxels]
+        chosen.linear = self.linear[taxels]
+        chosen.beyond_units = self.beyond_units[taxels]
+        chosen.tail_slope = self.tail_slope[taxels]
+        return chosen
+
+    def kpa(self, units: ArrayLike) -> Array:
+        """Return the pressure [..., n] in kPa of activations [..., n] in units."""
+        x = np.asarray(units, dtype=np.float64)
+        inside = np.clip(x, 0.0, self.beyond_units)
+        beyond = np.where(x > self.beyond_units, x - inside, 0.0)
+        below = np.minimum(x, 0.0)
+        result: Array = (
+            (self.square * inside + self.linear) * inside
+            + self.tail_slope * beyond
+            + self.linear * below
+        )
+        return result
+
+    def units(self, kpa: ArrayLike) -> Array:
+        """Return the activation [..., n] in units that reads as these pressures; inverse of kpa."""
+        c = np.asarray(kpa, dtype=np.float64)
+        safe_linear = np.where(self.linear > 0.0, self.linear, 1.0)
+        finite_end = np.where(np.isfinite(self.beyond_units), self.beyond_units, 0.0)
+        end_kpa = np.where(
+            np.isfinite(self.beyond_units),
+            (self.square * finite_end + self.linear) * finite_end,
+            np.inf,
+        )
+        inside = np.clip(c, 0.0, end_kpa)
+        # The form without cancellation, right for square = 0 too.
+        root = np.sqrt(np.maximum(self.linear**2 + 4.0 * self.square * inside, 0.0))
+        rising = 2.0 * inside / np.where(self.linear > 0.0, self.linear + root, 1.0)
+        beyond = np.where(c > end_kpa, c - inside, 0.0)
+        tail = np.where(self.tail_slope > 0.0, self.tail_slope, 1.0)
+        result: Array = rising + beyond / tail + np.minimum(c, 0.0) / safe_linear
+        return result

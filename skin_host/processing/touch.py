@@ -1,0 +1,110 @@
+"""The touch decision (paper, section V-B), with a vote and hysteresis."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.settings import Touch
+
+Array = NDArray[np.floating]
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+#: Samples that have a vote.
+VOTERS = 3
+HALF_UNIT = 0.5
+#: Two of three samples above this happen by chance less than once in ten hours.
+NOISE_DEVIATIONS = 3.6
+
+
+def threshold_units(
+    percentile_units: Floats, baseline_units: Floats, noise_units: Floats, settings: Touch
+) -> Floats:
+    """Return the activation [n] above the baseline from which on a taxel counts as touched.
+
+    The paper: at least the 95th percentile of the calibration plus a margin of two units.
+    Readings are whole units, so half a unit less is the same rule; and it stays the same
+    when the baseline has followed drift by a fraction of a unit.
+
+    With more than about one unit of noise that margin is too small for a skin of thousands
+    of taxels: a noisy taxel keeps so many standard deviations of its noise instead.
+    """
+    above = percentile_units - baseline_units + settings.margin_units - HALF_UNIT
+    at_least = np.maximum(NOISE_DEVIATIONS * noise_units, settings.minimum_threshold_units)
+    return np.maximum(above, at_least)
+
+
+class TouchDetector:
+    """Which of n taxels are touched: enough of the last three samples at the threshold.
+
+    A touched taxel needs only the lower release threshold to stay so. The signal and the
+    thresholds may be in any unit, as long as it is the same.
+    """
+
+    def __init__(self, on: Array, off: Array, votes: int = 2) -> None:
+        if np.any(off > on):
+            raise ValueError("a release threshold lies above the threshold of touch")
+        self._on = np.array(on)
+        self._off = np.array(off)
+        self._threshold = self._on.copy()
+        self._votes = votes
+        n = self._on.shape[0]
+        self.touched: Mask = np.zeros(n, dtype=np.bool_)
+        self._over: Mask = np.zeros(n, dtype=np.bool_)
+        self._last: Mask = np.zeros(n, dtype=np.bool_)
+        self._before: Mask = np.zeros(n, dtype=np.bool_)
+        self._next: Mask = np.zeros(n, dtype=np.bool_)
+        self._scratch: Mask = np.zeros(n, dtype=np.bool_)
+        self._quiet = VOTERS
+
+    def step(self, signal: Array) -> Mask:
+        """Take one sample [n]; return which taxels are touched [n].
+
+        A sample that is not a number counts as below any threshold. The answer is the same
+        array as before as long as nothing has changed, and is never written to again.
+        """
+        np.greater_equal(signal, self._threshold, out=self._over)
+        if np.count_nonzero(self._over):
+            self._quiet = 0
+        elif self.idle:
+            return self.touched
+        else:
+            self._quiet += 1
+        self._vote()
+        return self.touched
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is touched or has a vote, so that a sample below all thresholds
+        changes nothing and need not be taken.
+        """
+        return self._quiet >= VOTERS
+
+    def reset(self, taxels: NDArray[np.intp] | Mask) -> None:
+        """Forget that some taxels, by number or mask [n], were touched."""
+        self.touched = self.touched.copy()
+        for state in (self.touched, self._last, self._before):
+            state[taxels] = False
+        self._threshold[taxels] = self._on[taxels]
+
+    def _vote(self) -> None:
+        over, last, before = self._over, self._last, self._before
+        touched, scratch = self._next, self._scratch
+        if self._votes == 1:
+            np.copyto(touched, over)
+        elif self._votes == 2:
+            np.logical_or(last, before, out=touched)
+            np.logical_and(touched, over, out=touched)
+            np.logical_and(last, before, out=scratch)
+            np.logical_or(touched, scratch, out=touched)
+        else:
+            # Letting go needs as many votes as touching.
+            np.logical_or(last, before, out=touched)
+            np.logical_or(touched, over, out=touched)
+            np.logical_and(touched, self.touched, out=touched)
+            np.logical_and(last, before, out=scratch)
+            np.logical_and(scratch, over, out=scratch)
+            np.logical_or(touched, scratch, out=touched)
+        self._before, self._last, self._over = last, over, before
+        np.not_equal(touched, self.touched, out=scratch)
+        if np.count_nonzero(scratch):
+            self.touched = touched.copy()
+            np.copyto(self._threshold, np.where(touched, self._off, self._on))

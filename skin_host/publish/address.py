@@ -1,0 +1,148 @@
+"""How to reach a broker, from settings or a URL: its address, our name to it, and TLS.
+
+The password comes from a file or from systemd's credentials and is never shown.
+"""
+
+import os
+import ssl
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+from urllib.parse import unquote, urlsplit
+
+from skin_host.errors import ConfigurationError, RequestError
+from skin_host.settings import Mqtt
+
+
+@dataclass(frozen=True)
+class Broker:
+    """How to reach a broker. The password is never shown."""
+
+    host: str = "localhost"
+    port: int = 1883
+    protocol: Literal["5", "3.1.1"] = "5"
+    username: str | None = None
+    password: str | None = field(default=None, repr=False)
+    tls: ssl.SSLContext | None = field(default=None, repr=False)
+    keepalive_s: int = 10
+
+    def __str__(self) -> str:
+        return f"{self.host}:{self.port}"
+
+    @property
+    def v5(self) -> bool:
+        """Whether messages have properties."""
+        return self.protocol == "5"
+
+    @classmethod
+    def from_settings(cls, settings: Mqtt, folder: Path = Path()) -> "Broker":
+        """Read the files that `settings` name; relative names start in `folder`.
+
+        Raises:
+            ConfigurationError: one of them cannot be used.
+        """
+        return cls(
+            settings.host,
+            settings.port,
+            settings.protocol,
+            settings.username,
+            _password(settings, folder),
+            _tls(settings, folder),
+            settings.keepalive_s,
+        )
+
+    @classmethod
+    def from_url(cls, url: str, protocol: Literal["5", "3.1.1"] = "5") -> tuple["Broker", str]:
+        """Read `mqtt://[user[:password]@]host[:port][/base]`; `mqtts` is TLS.
+
+        Returns:
+            the broker, and the base of the topics ("" if the URL has none).
+
+        Raises:
+            RequestError: it is not such a URL.
+        """
+        wanted = "wanted mqtt://[user@]host[:port][/base] or mqtts://..."
+        try:
+            parts = urlsplit(url)
+            port = parts.port
+        except ValueError as error:
+            raise RequestError(f"the URL of the broker: {error}; {wanted}") from None
+        if parts.scheme not in ("mqtt", "mqtts") or not parts.hostname:
+            # The URL may hold a password, so it is not repeated here.
+            raise RequestError(f'the URL of the broker begins "{parts.scheme}:"; {wanted}')
+        secure = parts.scheme == "mqtts"
+        broker = cls(
+            parts.hostname,
+            port or (8883 if secure else 1883),
+            protocol,
+            username=unquote(parts.username) if parts.username else None,
+            password=unquote(parts.password) if parts.password else None,
+            tls=_default_context() if secure else None,
+        )
+        return broker, unquote(parts.path).strip("/")
+
+
+def _password(settings: Mqtt, folder: Path) -> str | None:
+    if settings.password_file is not None:
+        if settings.username is None:
+            raise ConfigurationError("mqtt.password_file: needs mqtt.username too")
+        path = folder / settings.password_file
+    else:
+        credentials = os.environ.get("CREDENTIALS_DIRECTORY")
+        if credentials is None or settings.username is None:
+            return None
+        path = Path(credentials) / "mqtt-password"
+        if not path.exists():
+            return None
+    try:
+        password = path.read_text(encoding="utf-8").rstrip("\r\n")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8"
+        raise ConfigurationError(f"mqtt.password_file: {path}: {reason}") from None
+    return password or None
+
+
+class _TlsSocket(ssl.SSLSocket):
+    """A socket that paho leaves open when the handshake fails, so it closes itself."""
+
+    def do_handshake(self, block: bool = False) -> None:
+        try:
+            super().do_handshake(block)
+        except OSError:
+            self.close()
+            raise
+
+
+def _default_context(ca_file: Path | None = None) -> ssl.SSLContext:
+    context = ssl.create_default_context(cafile=ca_file)
+    context.sslsocket_class = _TlsSocket
+    return context
+
+
+def _tls(settings: Mqtt, folder: Path) -> ssl.SSLContext | None:
+    files = {
+        "ca_file": settings.ca_file,
+        "certificate_file": settings.certificate_file,
+        "key_file": settings.key_file,
+    }
+    if not settings.tls:
+        for key, name in files.items():
+            if name is not None:
+                raise ConfigurationError(f"mqtt.{key}: is given, but mqtt.tls is not true")
+        return None
+    if settings.key_file is not None and settings.certificate_file is None:
+        raise ConfigurationError("mqtt.key_file: needs mqtt.certificate_file too")
+    for key, name in files.items():
+        if name is not None and not os.access(folder / name, os.R_OK):
+            raise ConfigurationError(f"mqtt.{key}: {folder / name}: cannot be read")
+    where = "ca_file"
+    try:
+        context = _default_context(folder / settings.ca_file if settings.ca_file else None)
+        if settings.certificate_file is not None:
+            where = "certificate_file"
+            key_file = None if settings.key_file is None else folder / settings.key_file
+            # Without a password of our own OpenSSL would ask for one on the terminal.
+            context.load_cert_chain(folder / settings.certificate_file, key_file, password="")
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(f"mqtt.{where}: not usable for TLS: {error}") from None
+    return context

@@ -1,0 +1,153 @@
+"""A broker of one's own for the demo: mosquitto if it is there, else one within Python.
+
+Both listen on this machine only, on a free port, take everybody and remember nothing.
+"""
+
+import asyncio
+import logging
+import os
+import shutil
+import socket
+import subprocess
+import tempfile
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from skin_host.errors import BrokerError
+
+HOST = "127.0.0.1"
+START_S = 10.0
+#: Where Debian and others put mosquitto, which is not on everybody's PATH.
+_MORE_PLACES = ("/usr/sbin", "/usr/local/sbin")
+
+
+class LocalBroker(NamedTuple):
+    """A broker that runs: where, and which."""
+
+    host: str
+    port: int
+    kind: Literal["mosquitto", "amqtt"]
+
+    @property
+    def protocol(self) -> Literal["5", "3.1.1"]:
+        """The newest version of MQTT that it speaks."""
+        return "5" if self.kind == "mosquitto" else "3.1.1"
+
+
+@asynccontextmanager
+async def local_broker() -> AsyncIterator[LocalBroker]:
+    """Run a broker for as long as the block lasts.
+
+    Raises:
+        BrokerError: there is no mosquitto, and the embedded one is not installed.
+    """
+    program = find_mosquitto()
+    if program is None:
+        async with embedded_broker() as broker:
+            yield broker
+    else:
+        async with mosquitto_broker(program) as broker:
+            yield broker
+
+
+def find_mosquitto() -> str | None:
+    """Return the path of mosquitto, if it is installed."""
+    return shutil.which(
+        "mosquitto", path=os.pathsep.join([os.environ.get("PATH", ""), *_MORE_PLACES])
+    )
+
+
+@asynccontextmanager
+async def mosquitto_broker(program: str) -> AsyncIterator[LocalBroker]:
+    """Run mosquitto as a child process.
+
+    Raises:
+        BrokerError: it did not start.
+    """
+    port = _free_port()
+    with tempfile.TemporaryDirectory(prefix="skin-broker-") as folder:
+        process = _start_mosquitto(program, port, Path(folder))
+        try:
+            if not await _answers(process, port):
+                said = _last_line(Path(folder)) or "it does not answer"
+                raise BrokerError(f"mosquitto did not start on port {port}: {said}")
+            yield LocalBroker(HOST, port, "mosquitto")
+        finally:
+            process.kill()
+            process.wait()
+
+
+@asynccontextmanager
+async def embedded_broker() -> AsyncIterator[LocalBroker]:
+    """Run amqtt within this event loop. It speaks MQTT 3.1.1 only.
+
+    Raises:
+        BrokerError: it is not installed.
+    """
+    for noisy in ("amqtt", "transitions"):
+        logging.getLogger(noisy).setLevel(logging.CRITICAL)
+    try:
+        from amqtt.broker import Broker
+        from amqtt.contexts import BrokerConfig, ListenerConfig
+    except ImportError:
+        raise BrokerError(
+            "no MQTT broker: neither mosquitto nor the package amqtt is installed; mend it with: "
+            "apt install mosquitto, or pip install 'skin-host[demo]'"
+        ) from None
+    port = _free_port()
+    everybody = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}}
+    broker = Broker(
+        BrokerConfig(
+            listeners={"default": ListenerConfig(bind=f"{HOST}:{port}")}, plugins=everybody
+        )
+    )
+    await broker.start()
+    try:
+        yield LocalBroker(HOST, port, "amqtt")
+    finally:
+        await broker.shutdown()
+
+
+def _start_mosquitto(program: str, port: int, folder: Path) -> "subprocess.Popen[bytes]":
+    configuration = folder / "mosquitto.conf"
+    configuration.write_text(
+        f"listener {port} {HOST}\nallow_anonymous true\npersistence false\n"
+        "log_dest stderr\nlog_type error\nlog_type warning\n"
+    )
+    with (folder / "log").open("wb") as log:
+        # In a session of its own Ctrl-C does not end it before its clients say goodbye.
+        return subprocess.Popen(
+            [program, "-c", configuration],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+        )
+
+
+def _last_line(folder: Path) -> str:
+    return (folder / "log").read_text(errors="replace").strip().rpartition("\n")[2]
+
+
+async def _answers(process: "subprocess.Popen[bytes]", port: int) -> bool:
+    """Wait until the broker takes connections."""
+    deadline_s = time.monotonic() + START_S
+    while process.poll() is None and time.monotonic() < deadline_s:
+        try:
+            _, writer = await asyncio.open_connection(HOST, port)
+        except OSError:
+            await asyncio.sleep(0.01)
+        else:
+            writer.close()
+            return True
+    return False
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind((HOST, 0))
+        port: int = probe.getsockname()[1]
+        return port

@@ -1,0 +1,175 @@
+"""What a node is: its parts, the order and places of their taxels, units and rates.
+
+The payload of `nodes/<node>/info`, retained. With it a subscriber can draw the skin and
+give each entry of a frame its place without any file of the robot's.
+"""
+
+from typing import Annotated, Any, Final, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta, Struct
+from numpy.typing import NDArray
+
+from skin_host.layout import Layout, PadKind, PartLayout
+from skin_host.publish.messages import SCALE_KPA, MessageError, Vector
+
+INFO_SCHEMA: Final = "skin.info/1"
+#: 100 000 taxels and their triangles fit.
+MAX_BYTES = 32 * 1024 * 1024
+#: Positions to 0.001 mm, areas and radii to 0.01, normals to 0.0001.
+_M, _MM, _NORMAL = 6, 2, 4
+
+
+class CalibrationInfo(Struct, frozen=True):
+    """Which calibration is in use, and when it was taken (ISO 8601, UTC)."""
+
+    id: str
+    time: str
+
+
+class TriangleInfo(Struct, frozen=True):
+    """A triangle: who it is on the bus, its first taxel in the part, its outline [k, 3] (m)."""
+
+    board: str
+    number: int
+    kind: str
+    first: int
+    outline_m: list[Vector]
+
+
+class PartInfo(Struct, frozen=True):
+    """A part. Lists have one entry a taxel, in the order of the values of a frame.
+
+    Attributes:
+        period_ms: time between two frames as configured, of its slowest board.
+        pads: `pressure` or `thermal`; thermal pads are never valid in frames.
+        position_m, normal: in the part's own frame.
+        radius_mm, area_mm2: of the pad; of the skin that it answers for.
+    """
+
+    period_ms: int
+    pads: list[Literal["pressure", "thermal"]]
+    position_m: list[Vector]
+    normal: list[Vector]
+    radius_mm: list[float]
+    area_mm2: list[float]
+    triangles: list[TriangleInfo]
+
+
+class NodeInfo(Struct, frozen=True, kw_only=True):
+    """The payload of `nodes/<node>/info`.
+
+    Attributes:
+        version: of skin-host.
+        configuration: hash of what a calibration belongs to (`settings.skin_hash`).
+        scale: what one unit of the values of a frame is, in `unit`.
+        frame_hz: frames are thinned to this rate; 0 says that every one is sent.
+        calibration: None before the first.
+        commands: whether the node takes commands (`mqtt.commands`).
+    """
+
+    schema: Literal["skin.info/1"] = INFO_SCHEMA
+    robot: str
+    node: str
+    version: str
+    configuration: str
+    unit: Literal["kPa"] = "kPa"
+    scale: float = SCALE_KPA
+    encoding: Literal["json", "cbor"] = "json"
+    frame_hz: float = 0.0
+    calibration: CalibrationInfo | None = None
+    commands: bool = True
+    parts: Annotated[dict[str, PartInfo], Meta(max_length=10_000)]
+
+
+_decoder = msgspec.json.Decoder(NodeInfo)
+
+
+def node_info(
+    layout: Layout,
+    node: str,
+    *,
+    version: str,
+    configuration: str,
+    encoding: Literal["json", "cbor"] = "json",
+    frame_hz: float = 0.0,
+    calibration: CalibrationInfo | None = None,
+    commands: bool = True,
+) -> NodeInfo:
+    """Describe the parts of `layout` that belong to `node`."""
+    parts = {
+        part.name: _part_info(layout, number, part)
+        for number, part in enumerate(layout.parts)
+        if part.node == node
+    }
+    return NodeInfo(
+        robot=layout.robot,
+        node=node,
+        version=version,
+        configuration=configuration,
+        encoding=encoding,
+        frame_hz=frame_hz,
+        calibration=calibration,
+        commands=commands,
+        parts=parts,
+    )
+
+
+def encode_info(info: NodeInfo) -> bytes:
+    """Write the payload of `nodes/<node>/info`."""
+    return msgspec.json.encode(info)
+
+
+def decode_info(payload: bytes) -> NodeInfo:
+    """Read the payload of `nodes/<node>/info`.
+
+    Raises:
+        MessageError: it is not such a payload.
+    """
+    if len(payload) > MAX_BYTES:
+        raise MessageError(f"info: {len(payload)} bytes; wanted at most {MAX_BYTES}")
+    try:
+        info = _decoder.decode(payload)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise MessageError(f"info: {error}") from None
+    for name, part in info.parts.items():
+        n = len(part.pads)
+        lists: tuple[list[Any], ...] = (part.position_m, part.normal, part.radius_mm, part.area_mm2)
+        if any(len(values) != n for values in lists):
+            raise MessageError(f"info: parts.{name}: its lists differ in length")
+    return info
+
+
+def _part_info(layout: Layout, number: int, part: PartLayout) -> PartInfo:
+    mine = slice(part.start, part.stop)
+    return PartInfo(
+        period_ms=max(layout.boards[board].settings.period_ms for board in part.boards),
+        pads=[
+            "thermal" if kind == PadKind.THERMAL else "pressure" for kind in layout.pad_kind[mine]
+        ],
+        position_m=_vectors(layout.position_m[mine], _M),
+        normal=_vectors(layout.normal[mine], _NORMAL),
+        radius_mm=_rounded(layout.radius_mm[mine], _MM),
+        area_mm2=_rounded(layout.area_mm2[mine], _MM),
+        triangles=[
+            TriangleInfo(
+                layout.boards[triangle.board].name,
+                triangle.number,
+                triangle.kind,
+                triangle.first - part.start,
+                _vectors(triangle.outline_m, _M),
+            )
+            for triangle in layout.triangles
+            if triangle.part == number
+        ],
+    )
+
+
+def _rounded(values: NDArray[np.float64], decimals: int) -> Any:
+    # Adding 0 turns a rounded -0.0 into 0.0.
+    return (np.round(values, decimals) + 0.0).tolist()
+
+
+def _vectors(values: NDArray[np.float64], decimals: int) -> list[Vector]:
+    return [(x, y, z) for x, y, z in _rounded(values, decimals)]

@@ -1,0 +1,84 @@
+"""A recording through the whole pipeline: deterministic, the same bytes at every run."""
+
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+
+from skin_host.bus.logs import read_channels
+from skin_host.bus.protocol import FrameBatch
+from skin_host.engine import Engine, Step
+from skin_host.errors import LogError
+from skin_host.layout import Layout
+from skin_host.processing.calibration import Calibration
+from skin_host.publish.recording import SUFFIX, read_can
+from skin_host.settings import Settings
+
+
+def read_buses(log: Path, settings: Settings) -> Iterator[tuple[str, FrameBatch]]:
+    """Batches of a recording with the name of the configured bus they belong to.
+
+    With one bus in the configuration everything is taken for it, whatever the recording
+    calls its channel. With several, channels go by name; others are passed over.
+
+    Raises:
+        LogError: see `logs.read_channels`; or several buses, and none of their channels in it.
+    """
+    channels = read_can(log) if log.suffix == SUFFIX else read_channels(log)
+    if len(settings.buses) == 1:
+        (only,) = settings.buses
+        for _, batch in channels:
+            yield only, batch
+        return
+    bus_of = {bus.channel: name for name, bus in settings.buses.items()}
+    seen: set[str] = set()
+    for channel, batch in channels:
+        seen.add(channel)
+        name = bus_of.get(channel)
+        if name is not None:
+            yield name, batch
+    if not seen & set(bus_of):
+        raise LogError(
+            f"{log}: its channels are {', '.join(sorted(seen)) or 'unnamed'}; "
+            f"the configuration's are {', '.join(bus_of)}"
+        )
+
+
+def calibrate_from_log(
+    log: Path, settings: Settings, layout: Layout, seconds: float
+) -> Calibration:
+    """Calibrate on the first `seconds` of a recording.
+
+    Raises:
+        LogError: unreadable, or without a single sweep of this skin.
+    """
+    engine = Engine(settings, layout, list(range(len(layout.parts))))
+    engine.begin_calibration(seconds)
+    last_ns = 0
+    for bus, batch in read_buses(log, settings):
+        engine.feed(bus, batch)
+        last_ns = int(batch.t_ns[-1])
+        if engine.calibration_progress() >= 1.0:
+            break
+    else:
+        engine.flush()
+    counters = [assembler.counters for assembler in engine.assemblers.values()]
+    if not sum(one.sweeps for one in counters):
+        raise LogError(
+            f"{log}: no sweep of this skin among its {sum(one.frames for one in counters)} frames "
+            f"({sum(one.unknown_board for one in counters)} of other boards); wanted a recording "
+            "made with this CONFIG, see `skin check CONFIG`"
+        )
+    # A recording's calibration carries the recording's time, so that replays stay equal.
+    time = datetime.fromtimestamp(last_ns / 1e9, UTC).isoformat(timespec="seconds")
+    return engine.end_calibration(time)
+
+
+def replay(log: Path, engine: Engine) -> Iterator[Step]:
+    """Everything that comes of a recording, step by step.
+
+    Raises:
+        LogError: the recording cannot be read, or breaks off damaged.
+    """
+    for bus, batch in read_buses(log, engine.settings):
+        yield from engine.feed(bus, batch)
+    yield from engine.flush()

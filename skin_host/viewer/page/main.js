@@ -1,0 +1,366 @@
+// Wiring: the WebSocket, the tools, the keys, and when to draw.
+import { ramp, theme } from "./colours.js";
+import { SkinMap } from "./map.js";
+import { showContacts, showHealth, showParts } from "./panels.js";
+import { Store } from "./store.js";
+import { drawStrip, lineColour, nice } from "./strip.js";
+
+const $ = (id) => document.getElementById(id);
+const MOST_CHOSEN = 6;
+const RAW_AGAIN_MS = 20000;
+/** The scale follows the highest pressure of this time. */
+const AUTO_MS = 10000;
+
+const store = new Store();
+const map = new SkinMap($("map"), store);
+let socket = null;
+let link = "connecting";
+let dirty = true;
+let busy = false;
+let notice = null;
+let peaks = [];
+
+// --- the server -------------------------------------------------------------------------------
+
+function connect() {
+  const scheme = location.protocol === "https:" ? "wss" : "ws";
+  socket = new WebSocket(`${scheme}://${location.host}/live`);
+  socket.binaryType = "arraybuffer";
+  socket.onopen = () => { link = "open"; if (map.raw) askRaw(); };
+  socket.onmessage = ({ data }) => take(data);
+  socket.onclose = () => {
+    link = "lost";
+    dirty = true;
+    setTimeout(connect, 1000);
+  };
+}
+
+function take(data) {
+  dirty = true;
+  if (data instanceof ArrayBuffer) return store.takeBytes(data, performance.now());
+  const message = JSON.parse(data);
+  if (message.type === "layout") {
+    store.takeLayout(message);
+    if (map.shown && !store.part(map.shown)) map.shown = null;
+    map.chosen = map.chosen.filter(({ part, taxel }) => taxel < (store.part(part)?.n ?? 0));
+    map.relayout();
+    showChosen();
+    document.title = `${message.robot} skin`;
+    $("robot").textContent = message.robot;
+  } else if (message.type === "status") store.status = message;
+  else if (message.type === "contacts") {
+    const part = store.part(message.part);
+    if (part) part.contacts = message.contacts;
+  } else if (message.type === "health") store.takeHealth(message);
+  else if (message.type === "answer") answered(message);
+}
+
+function send(wish) {
+  if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(wish));
+}
+
+function answered(message) {
+  if (message.do === "raw" && message.ok) return;
+  busy = false;
+  if (!message.ok) {
+    say(message.error, 8000);
+    if (map.raw) setRaw(false);
+    return;
+  }
+  const counts = Object.entries(message.result.verdicts ?? {}).map(([part, verdicts]) => `${part}: ${Object.entries(verdicts).map(([verdict, n]) => `${n} ${verdict.replaceAll("_", " ")}`).join(", ")}`);
+  say(`Calibrated. ${counts.join("; ")}`, 6000, true);
+}
+
+function say(text, ms, good = false) {
+  notice = { text, until: performance.now() + ms, good };
+  dirty = true;
+}
+
+// --- what is shown ----------------------------------------------------------------------------
+
+function pick(name) { map.show(name); remember("part", name ?? ""); dirty = true; }
+
+function step(by) {
+  const names = [null, ...store.parts.map((part) => part.name)];
+  pick(names[(names.indexOf(map.shown) + by + names.length) % names.length]);
+}
+
+function nodesShown() { return [...new Set(map.parts.map((part) => part.node))]; }
+
+function mayCommand() {
+  return store.status.commands && nodesShown().some((node) => store.nodes[node]?.commands && store.status.nodes[node]);
+}
+
+function setRaw(on) {
+  if (on && !mayCommand()) return say("Raw values are sent on request, and commands are not allowed here.", 4000);
+  map.raw = on;
+  $("show-raw").setAttribute("aria-pressed", String(on));
+  $("show-pressure").setAttribute("aria-pressed", String(!on));
+  if (on) askRaw();
+  dirty = true;
+}
+
+function askRaw() {
+  for (const node of new Set(store.parts.map((part) => part.node))) send({ do: "raw", node });
+}
+
+setInterval(() => { if (map.raw) askRaw(); }, RAW_AGAIN_MS);
+
+async function calibrate() {
+  if (busy || !mayCommand()) return;
+  const dialog = $("confirm");
+  dialog.returnValue = "";
+  dialog.showModal();
+  await new Promise((done) => dialog.addEventListener("close", done, { once: true }));
+  if (dialog.returnValue !== "yes") return;
+  busy = true;
+  say("Calibrating: leave the skin untouched.", 120000, true);
+  for (const node of nodesShown()) send({ do: "calibrate", node });
+}
+
+function choose(found) {
+  if (!found) return;
+  const { part, taxel } = found;
+  const at = map.chosen.findIndex((one) => one.part === part && one.taxel === taxel);
+  if (at >= 0) map.chosen.splice(at, 1);
+  else map.chosen.push({ part, taxel });
+  if (map.chosen.length > MOST_CHOSEN) map.chosen.shift();
+  showChosen();
+}
+
+function showChosen() {
+  map.chosen.forEach((one, i) => { one.colour = lineColour(i); });
+  const list = $("chosen");
+  list.replaceChildren(...map.chosen.map(({ part, taxel, colour }, i) => {
+    const item = document.createElement("li");
+    const button = document.createElement("button");
+    button.title = "Forget this taxel";
+    const line = document.createElement("i");
+    line.style.background = colour;
+    const text = document.createElement("span");
+    button.append(line, text);
+    button.addEventListener("click", () => choose(map.chosen[i]));
+    item.append(button);
+    return item;
+  }));
+  if (!map.chosen.length) {
+    const hint = document.createElement("li");
+    hint.className = "hint";
+    hint.textContent = "Click taxels to see their course.";
+    list.append(hint);
+  }
+  dirty = true;
+}
+
+function value(part, taxel) {
+  if (part.stale(performance.now())) return "stale";
+  if (map.raw) return part.raw ? `raw ${part.raw[taxel]}` : "no raw value";
+  if (part.thermal[taxel]) return "feels temperature";
+  if (!part.valid(taxel)) return "not valid";
+  return `${part.pressure[taxel].toFixed(1)} kPa${part.beyond(taxel) ? ", beyond range" : ""}`;
+}
+
+function showTip() {
+  const tip = $("tip");
+  const at = map.cursor && map.find(map.cursor.part, map.cursor.taxel);
+  tip.hidden = !at;
+  if (!at) return;
+  const part = store.part(map.cursor.part);
+  const triangle = part.triangleOf(map.cursor.taxel);
+  tip.textContent = `${part.name} ${map.cursor.taxel}: ${value(part, map.cursor.taxel)}\nboard ${triangle.board}, triangle ${triangle.number}, pad ${map.cursor.taxel % 12}`;
+  const x = Math.min(at[0] + 14, $("stage").clientWidth - tip.offsetWidth - 4);
+  tip.style.left = `${Math.max(4, x)}px`;
+  tip.style.top = `${at[1] + 16 + tip.offsetHeight > $("map").clientHeight ? at[1] - tip.offsetHeight - 12 : at[1] + 14}px`;
+}
+
+function showStatus(nowMs) {
+  const status = $("status");
+  const offline = Object.entries(store.status.nodes ?? {}).filter(([, online]) => !online).map(([node]) => node);
+  const stale = store.parts.filter((part) => part.stale(nowMs));
+  let [text, level] = ["", "ok"];
+  if (link !== "open") [text, level] = [link === "lost" ? "this page has lost its server; trying again" : "connecting", link === "lost" ? "alarm" : "wait"];
+  else if (!store.status.connected) [text, level] = [`no broker: ${store.status.error || "trying again"}`, "alarm"];
+  else if (!store.parts.length) [text, level] = ["waiting for a node to say what it is", "wait"];
+  else if (offline.length) [text, level] = [`node ${offline.join(", ")} is offline`, "alarm"];
+  else if (stale.length) [text, level] = [`no data from ${stale.map((part) => part.name).join(", ")}`, "alarm"];
+  else text = `live, ${store.parts.reduce((sum, part) => sum + part.n, 0)} taxels`;
+  status.dataset.level = level;
+  if (status.textContent !== text) status.textContent = text;
+  const banner = $("banner");
+  const shown = map.parts;
+  const allStale = shown.length > 0 && shown.every((part) => part.stale(nowMs));
+  if (notice && nowMs > notice.until) notice = null;
+  const words = notice?.text ?? (link === "lost" || (store.parts.length && (!store.status.connected || allStale)) ? `Stale: ${text}` : map.raw && shown.some((part) => !part.raw && !part.stale(nowMs)) ? "Waiting for raw values" : "");
+  banner.hidden = !words;
+  banner.style.background = notice?.good ? "var(--ok)" : "";
+  if (banner.textContent !== words) banner.textContent = words;
+  document.body.dataset.stale = String(allStale || link !== "open" || !store.status.connected);
+}
+
+function showScale(nowMs) {
+  const wanted = $("scale").value;
+  if (map.raw) map.top = 255;
+  else if (wanted !== "auto") map.top = Number(wanted);
+  else {
+    let peak = 0;
+    for (const part of map.parts) {
+      if (part.stale(nowMs)) continue;
+      for (let i = 0; i < part.n; i++) if (part.valid(i) && part.pressure[i] > peak) peak = part.pressure[i];
+    }
+    peaks = [...peaks.filter(([t, p]) => nowMs - t < AUTO_MS && p > peak), [nowMs, peak]];
+    map.top = nice(Math.max(10, peaks[0][1]));
+  }
+  $("scale").disabled = map.raw;
+  const labels = [0, 0.25, 0.5, 0.75, 1].map((share) => map.raw ? `${Math.round(255 * (1 - share))}` : `${+(map.top * share).toPrecision(4)}${share === 1 ? " kPa" : ""}`);
+  if (map.raw) labels[0] = "raw 255";
+  const ticks = $("ticks");
+  if (ticks.textContent !== labels.join("")) {
+    ticks.replaceChildren(...labels.map((text, i) => {
+      const tick = document.createElement("span");
+      tick.textContent = text;
+      tick.style.left = `${25 * i}%`;
+      return tick;
+    }));
+  }
+}
+
+function showRamp() {
+  const colours = ramp();
+  const ctx = $("ramp").getContext("2d");
+  colours.forEach((colour, i) => { ctx.fillStyle = colour; ctx.fillRect(i, 0, 1, 1); });
+  document.documentElement.style.setProperty("--zero", colours[0]);
+  document.documentElement.style.setProperty("--peak", colours[255]);
+}
+
+let drawnMs = 0;
+
+function frame(nowMs) {
+  // Ages must go on when nothing comes.
+  if (dirty || nowMs - drawnMs > 250) {
+    const began = performance.now();
+    dirty = false;
+    drawnMs = nowMs;
+    showScale(nowMs);
+    map.draw(nowMs);
+    document.body.dataset.drawMs = (performance.now() - began).toFixed(1);
+    showTip();
+    showStatus(nowMs);
+    showParts($("parts"), store, map.shown, nowMs, pick);
+    showContacts($("contacts"), $("no-contacts"), store, nowMs);
+    showHealth($("health"), store, map.shown, nowMs);
+    drawStrip($("strip"), store, map.chosen, map.raw, nowMs);
+    map.chosen.forEach(({ part, taxel }, i) => {
+      const text = $("chosen").children[i]?.querySelector("span");
+      const of = store.part(part);
+      if (text && of) text.textContent = `${part} ${taxel}: ${value(of, taxel)}`;
+    });
+    $("calibrate").hidden = !store.status.commands;
+    $("calibrate").disabled = busy || !mayCommand();
+    $("show-raw").disabled = !map.raw && !mayCommand();
+    document.body.dataset.draws = String(Number(document.body.dataset.draws ?? 0) + 1);
+  }
+  requestAnimationFrame(frame);
+}
+
+// --- pointer, wheel, keys ---------------------------------------------------------------------
+
+const pointers = new Map();
+let moved = 0;
+
+$("map").addEventListener("pointerdown", (event) => {
+  $("map").setPointerCapture(event.pointerId);
+  pointers.set(event.pointerId, [event.offsetX, event.offsetY]);
+  if (pointers.size === 1) moved = 0;
+});
+$("map").addEventListener("pointermove", (event) => {
+  const before = pointers.get(event.pointerId);
+  const here = [event.offsetX, event.offsetY];
+  if (!before) {
+    map.cursor = map.pick(...here);
+  } else if (pointers.size === 2) {
+    const [other] = [...pointers].filter(([id]) => id !== event.pointerId).map(([, at]) => at);
+    const apart = (at) => Math.hypot(at[0] - other[0], at[1] - other[1]) || 1;
+    map.zoomAt(apart(here) / apart(before), (here[0] + other[0]) / 2, (here[1] + other[1]) / 2);
+    map.drag((here[0] - before[0]) / 2, (here[1] - before[1]) / 2, true);
+    pointers.set(event.pointerId, here);
+    moved = 99;
+  } else {
+    moved += Math.abs(here[0] - before[0]) + Math.abs(here[1] - before[1]);
+    if (moved > 5) map.drag(here[0] - before[0], here[1] - before[1], event.shiftKey);
+    pointers.set(event.pointerId, here);
+  }
+  dirty = true;
+});
+for (const kind of ["pointerup", "pointercancel"]) {
+  $("map").addEventListener(kind, (event) => {
+    if (pointers.delete(event.pointerId) && kind === "pointerup" && moved <= 5) choose(map.pick(event.offsetX, event.offsetY));
+  });
+}
+$("map").addEventListener("pointerleave", () => { if (!pointers.size) map.cursor = null; dirty = true; });
+$("map").addEventListener("wheel", (event) => {
+  event.preventDefault();
+  map.zoomAt(Math.exp(-event.deltaY * 0.0015), event.offsetX, event.offsetY);
+  dirty = true;
+}, { passive: false });
+
+function zoom(factor) {
+  map.zoomAt(factor, map.canvas.clientWidth / 2, map.canvas.clientHeight / 2);
+  dirty = true;
+}
+
+function walk(by) {
+  const parts = map.parts;
+  if (!parts.length) return;
+  const taxels = parts.flatMap((part) => Array.from({ length: part.n }, (_, taxel) => ({ part: part.name, taxel })));
+  const at = map.cursor ? taxels.findIndex((one) => one.part === map.cursor.part && one.taxel === map.cursor.taxel) : -Math.max(by, 0);
+  map.cursor = taxels[(at + by + taxels.length) % taxels.length];
+  dirty = true;
+}
+
+function setTheme(name) {
+  document.documentElement.dataset.theme = name;
+  remember("theme", name);
+  showRamp();
+  showChosen();
+}
+
+function remember(key, text) {
+  try { localStorage.setItem(`skin-${key}`, text); } catch { /* a browser may forbid it */ }
+}
+
+function remembered(key) {
+  try { return localStorage.getItem(`skin-${key}`); } catch { return null; }
+}
+
+const keys = {
+  ArrowLeft: () => step(-1), ArrowRight: () => step(1), 0: () => pick(null), a: () => pick(null),
+  "+": () => zoom(1.25), "=": () => zoom(1.25), "-": () => zoom(0.8), f: () => { map.fit(); dirty = true; },
+  ",": () => walk(-1), ".": () => walk(1), Enter: () => choose(map.cursor),
+  Escape: () => { map.chosen = []; map.cursor = null; showChosen(); },
+  r: () => setRaw(!map.raw), c: calibrate, t: () => setTheme(theme() === "dark" ? "light" : "dark"),
+  "?": () => $("keys").showModal(),
+};
+
+document.addEventListener("keydown", (event) => {
+  if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
+  if (event.target.matches("select") || (event.key === "Enter" && event.target !== $("map"))) return;
+  const digit = /^[1-9]$/.test(event.key) && store.parts[Number(event.key) - 1];
+  const act = digit ? () => pick(digit.name) : keys[event.key];
+  if (act) { event.preventDefault(); act(); }
+});
+
+$("show-pressure").addEventListener("click", () => setRaw(false));
+$("show-raw").addEventListener("click", () => setRaw(true));
+$("zoom-in").addEventListener("click", () => zoom(1.25));
+$("zoom-out").addEventListener("click", () => zoom(0.8));
+$("zoom-fit").addEventListener("click", keys.f);
+$("calibrate").addEventListener("click", calibrate);
+$("theme").addEventListener("click", keys.t);
+$("help").addEventListener("click", keys["?"]);
+$("scale").addEventListener("change", () => { peaks = []; dirty = true; });
+window.addEventListener("resize", () => { map.arrange(); dirty = true; });
+
+setTheme(remembered("theme") ?? (matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark"));
+map.shown = remembered("part") || null;
+connect();
+requestAnimationFrame(frame);

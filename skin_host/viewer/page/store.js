@@ -1,0 +1,130 @@
+// What the server has told: parts, their last values, and the last minute of each taxel.
+export const HISTORY_S = 60;
+const SLOTS = HISTORY_S * 26;
+const HEAD = 32;
+const VALID = 1;
+const BEYOND = 2;
+
+export class Part {
+  constructor(info) {
+    this.name = info.name;
+    this.node = info.node;
+    this.n = info.pads.length;
+    this.periodMs = info.period_ms;
+    this.thermal = info.pads.map((pad) => pad === "thermal");
+    this.position = info.position_m.map((p) => p.map((x) => x * 1e3));
+    this.normal = info.normal;
+    this.radius = info.radius_mm;
+    this.triangles = info.triangles.map((t) => ({ ...t, outline: t.outline_m.map((p) => p.map((x) => x * 1e3)) }));
+    this.faults = new Set();
+    this.pressure = new Float32Array(this.n);
+    this.bits = new Uint8Array(this.n);
+    this.raw = null;
+    this.heardMs = null;
+    this.received = 0;
+    this.missed = 0;
+    this.arrivals = [];
+    this.contacts = [];
+    this.health = null;
+    this.times = new Float64Array(SLOTS);
+    this.past = new Float32Array(SLOTS * this.n);
+    this.pastRaw = null;
+    this.at = 0;
+    this.filled = 0;
+  }
+
+  valid(i) { return (this.bits[i] & VALID) !== 0; }
+  beyond(i) { return (this.bits[i] & BEYOND) !== 0; }
+  triangleOf(i) { return this.triangles[Math.floor(i / 12)]; }
+
+  /** Whether the data have stopped: longer than five periods, at least a second. */
+  stale(nowMs) {
+    return this.heardMs === null || nowMs - this.heardMs > Math.max(1000, 5 * this.periodMs);
+  }
+
+  take(view, nowMs) {
+    const n = this.n;
+    const hasRaw = (view.getUint8(1) & 1) !== 0;
+    this.received = view.getUint32(24, true);
+    this.missed = view.getUint32(28, true);
+    const start = view.byteOffset + HEAD;
+    this.pressure.set(new Float32Array(view.buffer, start, n));
+    this.bits.set(new Uint8Array(view.buffer, start + 4 * n, n));
+    this.raw = hasRaw ? new Uint8Array(view.buffer, start + 5 * n, n).slice() : null;
+    this.heardMs = nowMs;
+    this.arrivals.push([nowMs, this.received]);
+    while (this.arrivals.length > 2 && nowMs - this.arrivals[0][0] > 2000) this.arrivals.shift();
+    this.remember(nowMs);
+  }
+
+  remember(nowMs) {
+    const row = this.at * this.n;
+    this.times[this.at] = nowMs;
+    for (let i = 0; i < this.n; i++) this.past[row + i] = this.bits[i] & VALID ? this.pressure[i] : NaN;
+    if (this.raw) {
+      this.pastRaw ??= new Float32Array(SLOTS * this.n).fill(NaN);
+      this.pastRaw.set(this.raw, row);
+    } else if (this.pastRaw) this.pastRaw.fill(NaN, row, row + this.n);
+    this.at = (this.at + 1) % SLOTS;
+    this.filled = Math.min(this.filled + 1, SLOTS);
+  }
+
+  /** [time, value] of a taxel over the last minute, oldest first; NaN where there is none. */
+  *course(taxel, raw) {
+    const past = raw ? this.pastRaw : this.past;
+    if (!past) return;
+    for (let k = 0; k < this.filled; k++) {
+      const slot = (this.at - this.filled + k + SLOTS) % SLOTS;
+      yield [this.times[slot], past[slot * this.n + taxel]];
+    }
+  }
+
+  /** Frames a second that came here over the last two seconds. */
+  rate(nowMs) {
+    if (this.arrivals.length < 2 || this.stale(nowMs)) return 0;
+    const [[t0, n0], [t1, n1]] = [this.arrivals[0], this.arrivals.at(-1)];
+    return t1 > t0 ? ((n1 - n0) * 1000) / (t1 - t0) : 0;
+  }
+}
+
+export class Store {
+  constructor() {
+    this.robot = "";
+    this.version = -1;
+    this.parts = [];
+    this.nodes = {};
+    this.status = { connected: false, error: "connecting", commands: false, nodes: {} };
+  }
+
+  part(name) { return this.parts.find((part) => part.name === name); }
+
+  takeLayout(message) {
+    this.robot = message.robot;
+    this.version = message.version;
+    this.nodes = message.nodes;
+    const old = new Map(this.parts.map((part) => [part.name, part]));
+    this.parts = message.parts.map((info) => {
+      const part = new Part(info);
+      const before = old.get(part.name);
+      // A new calibration gives a new layout of the same taxels: their past stays.
+      if (before && before.n === part.n) {
+        for (const key of ["pressure", "bits", "raw", "heardMs", "received", "missed", "arrivals", "contacts", "health", "faults", "times", "past", "pastRaw", "at", "filled"]) part[key] = before[key];
+      }
+      return part;
+    });
+  }
+
+  takeBytes(buffer, nowMs) {
+    const view = new DataView(buffer);
+    const part = this.parts[view.getUint16(2, true)];
+    if (view.getUint8(0) !== 1 || view.getUint32(8, true) !== this.version || !part) return;
+    if (view.getUint32(4, true) === part.n) part.take(view, nowMs);
+  }
+
+  takeHealth(message) {
+    const part = this.part(message.part);
+    if (!part) return;
+    part.health = message;
+    part.faults = new Set((message.triangles ?? []).map((t) => `${t.board}/${t.triangle}`));
+  }
+}

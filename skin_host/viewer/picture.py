@@ -1,0 +1,259 @@
+"""What is known of a robot's skin at this moment, in the form that pages are told it. Pure.
+
+Pages come and go and may be slow. Each holds a `Cursor`, and what it has not been told yet
+is worked out for it; frames that it was too slow for are passed over.
+
+A frame goes to a page as bytes, little endian: kind 1 (u8), flags (u8, bit 0: raw values
+follow), number of the part (u16), number of taxels n (u32), version of the layout (u32),
+sequence number (u32, its low bits), time (f64, s), frames received and missed since the
+server was started (u32 each); then pressure in kPa (f32[n]), bits (u8[n]: 1 valid, 2 beyond
+range), and raw values (u8[n]). Everything else is JSON.
+"""
+
+import struct
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+
+from skin_host.client import Contact, Frame, Health, NodeInfo, Touch
+
+FRAME = 1
+HAS_RAW = 1
+VALID, BEYOND_RANGE = 1, 2
+_HEAD = struct.Struct("<BBHIIIdII")
+_U32 = 2**32
+
+
+@dataclass(slots=True)
+class PartView:
+    """One part: what was heard last, and counters whose change tells pages what is new."""
+
+    number: int
+    node: str
+    n_taxels: int
+    frame: Frame | None = None
+    received: int = 0
+    missed: int = 0
+    contacts: dict[int, Touch] = field(default_factory=dict)
+    contacts_changed: int = 0
+    health: dict[str, Any] | None = None
+    health_changed: int = 0
+
+
+@dataclass(slots=True)
+class Cursor:
+    """What one page has been told, as the counters stood then."""
+
+    layout: int = -1
+    status: int = -1
+    frames: dict[str, int] = field(default_factory=dict)
+    contacts: dict[str, int] = field(default_factory=dict)
+    health: dict[str, int] = field(default_factory=dict)
+
+
+class Picture:
+    """All of it.
+
+    Attributes:
+        parts: by name, in the order in which they are drawn.
+        version: of the layout; it changes with the parts and what they are.
+    """
+
+    def __init__(self) -> None:
+        self.parts: dict[str, PartView] = {}
+        self.version = 0
+        self._nodes: dict[str, tuple[bool | None, NodeInfo | None]] = {}
+        self._status: dict[str, Any] = {}
+        self._status_changed = 0
+        self._layout = b""
+
+    def take_nodes(self, robot: str, nodes: dict[str, tuple[bool | None, NodeInfo | None]]) -> None:
+        """Say which nodes there are: whether each is online, and what it is."""
+        if self._nodes == nodes:
+            return
+        gone = [name for name, (online, _) in nodes.items() if not online]
+        for part in self.parts.values():
+            if part.node in gone and part.contacts:
+                part.contacts.clear()
+                part.contacts_changed += 1
+        told = {name: info for name, (_, info) in nodes.items() if info is not None}
+        if told != {name: info for name, (_, info) in self._nodes.items() if info is not None}:
+            self._lay_out(robot, told)
+        self._nodes = dict(nodes)
+
+    def take_status(self, status: dict[str, Any]) -> None:
+        """Say how the connection to the broker is; the nodes are added."""
+        status = status | {"nodes": {name: online for name, (online, _) in self._nodes.items()}}
+        if status != self._status:
+            self._status = status
+            self._status_changed += 1
+
+    def take_frame(self, frame: Frame) -> None:
+        """A frame came."""
+        part = self.parts.get(frame.part)
+        if part is not None and len(frame.pressure_kpa) == part.n_taxels:
+            part.frame = frame
+            part.received += 1
+            part.missed += frame.missed
+
+    def take_touch(self, touch: Touch) -> None:
+        """A contact began, moved or ended."""
+        part = self.parts.get(touch.part)
+        if part is None:
+            return
+        if touch.missed:
+            part.contacts.clear()  # an end may be among what was missed
+        if touch.event == "end":
+            part.contacts.pop(touch.id, None)
+        else:
+            part.contacts[touch.id] = touch
+        part.contacts_changed += 1
+
+    def take_contact(self, contact: Contact) -> None:
+        """A part is touched or not; where nothing touches, no contact is left."""
+        part = self.parts.get(contact.part)
+        if part is not None and not contact.touched and part.contacts:
+            part.contacts.clear()
+            part.contacts_changed += 1
+
+    def take_health(self, health: Health) -> None:
+        """A part's health."""
+        part = self.parts.get(health.part)
+        if part is not None:
+            part.health = health.record
+            part.health_changed += 1
+
+    def forget_contacts(self) -> None:
+        """After a broken connection no contact is certain."""
+        for part in self.parts.values():
+            if part.contacts:
+                part.contacts.clear()
+                part.contacts_changed += 1
+
+    def news(self, cursor: Cursor) -> list[bytes | str]:
+        """What a page has not been told; text is JSON. The cursor moves on."""
+        news: list[bytes | str] = []
+        if cursor.layout != self.version and self._layout:
+            news.append(self._layout.decode())
+            cursor.layout = self.version
+            cursor.frames.clear()
+            cursor.contacts.clear()
+            cursor.health.clear()
+        if cursor.status != self._status_changed:
+            news.append(_json({"type": "status"} | self._status))
+            cursor.status = self._status_changed
+        for name, part in self.parts.items():
+            if part.frame is not None and cursor.frames.get(name) != part.received:
+                news.append(self._frame_bytes(part, part.frame))
+                cursor.frames[name] = part.received
+            if cursor.contacts.get(name) != part.contacts_changed:
+                news.append(_contacts_text(name, part))
+                cursor.contacts[name] = part.contacts_changed
+            if part.health is not None and cursor.health.get(name) != part.health_changed:
+                news.append(_health_text(name, part.health))
+                cursor.health[name] = part.health_changed
+        return news
+
+    def _lay_out(self, robot: str, nodes: dict[str, NodeInfo]) -> None:
+        old = self.parts
+        self.parts = {}
+        parts: list[dict[str, Any]] = []
+        for node, info in nodes.items():
+            for name, part in info.parts.items():
+                view = old.get(name)
+                if view is None or view.n_taxels != len(part.pads):
+                    view = PartView(0, node, len(part.pads))
+                view.number, view.node = len(self.parts), node
+                self.parts[name] = view
+                parts.append({"name": name, "node": node} | msgspec.to_builtins(part))
+        self.version += 1
+        self._layout = msgspec.json.encode(
+            {
+                "type": "layout",
+                "version": self.version,
+                "robot": robot,
+                "parts": parts,
+                "nodes": {
+                    name: {
+                        "version": info.version,
+                        "configuration": info.configuration,
+                        "calibration": msgspec.to_builtins(info.calibration),
+                        "commands": info.commands,
+                    }
+                    for name, info in nodes.items()
+                },
+            }
+        )
+
+    def _frame_bytes(self, part: PartView, frame: Frame) -> bytes:
+        bits = frame.valid * np.uint8(VALID) | frame.beyond_range * np.uint8(BEYOND_RANGE)
+        head = _HEAD.pack(
+            FRAME,
+            HAS_RAW if frame.raw is not None else 0,
+            part.number,
+            part.n_taxels,
+            self.version,
+            frame.seq % _U32,
+            frame.t_ns * 1e-9,
+            part.received % _U32,
+            part.missed % _U32,
+        )
+        raw = b"" if frame.raw is None else frame.raw.tobytes()
+        pressure = frame.pressure_kpa.astype("<f4").tobytes()
+        return head + pressure + bits.astype(np.uint8).tobytes() + raw
+
+
+def _contacts_text(name: str, part: PartView) -> str:
+    contacts = [
+        {
+            "id": touch.id,
+            "taxels": touch.taxels,
+            "centroid_m": touch.centroid_m,
+            "force_n": touch.force_n,
+            "peak_kpa": touch.peak_kpa,
+            "area_mm2": touch.area_mm2,
+        }
+        for touch in part.contacts.values()
+    ]
+    return _json({"type": "contacts", "part": name, "contacts": contacts})
+
+
+#: What to say of a part's state where that is not a fault of its own.
+STATES = {
+    "not calibrated": "Not calibrated: leave the skin untouched and calibrate.",
+    "no data": "No data have come yet.",
+    "silent": "Silent: no taxel can be believed.",
+    "disabled": "Disabled.",
+}
+
+
+class _Triangle(Struct):
+    board: str
+    triangle: int
+
+
+class _Record(Struct):
+    """What pages draw of a health record; a stranger may have sent it."""
+
+    state: str = ""
+    sentences: list[str] = []
+    taxels: int | None = None
+    valid_taxels: int | None = None
+    triangles: list[_Triangle] = []
+
+
+def _health_text(name: str, record: dict[str, Any]) -> str:
+    try:
+        known = msgspec.convert(record, _Record)
+    except msgspec.ValidationError as error:
+        known = _Record(sentences=[f"This health record cannot be read: {error}."])
+    said = [STATES[known.state]] if known.state in STATES else []
+    message = msgspec.to_builtins(known) | {"sentences": said + known.sentences}
+    return _json({"type": "health", "part": name} | message)
+
+
+def _json(message: dict[str, Any]) -> str:
+    return msgspec.json.encode(message).decode()

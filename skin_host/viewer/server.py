@@ -1,0 +1,268 @@
+"""The web server of the live page: it hears the broker and tells the pages.
+
+One port serves the page's few files and a WebSocket. Pages are strangers: the server
+listens on this machine only unless told otherwise, and takes requests from its own page
+alone.
+"""
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import AsyncIterator, Callable
+from http import HTTPStatus
+from importlib import resources
+from typing import Any, Literal, TypeVar
+
+import msgspec
+from msgspec import Struct
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+from skin_host.client import SkinClient, Stream
+from skin_host.errors import BrokerError, RequestError, SkinError
+from skin_host.publish.address import Broker
+from skin_host.viewer.picture import Cursor, Picture
+
+#: Pages are told what is new so often; screens show no more.
+TICK_S = 0.04
+NODES_S = 0.25
+#: A broker that is not there is tried again after this time.
+RETRY_S = 2.0
+MAX_PAGES = 32
+MAX_REQUEST_BYTES = 4096
+#: The longest calibration that a page waits for, and the time without one.
+COMMAND_S = 120.0
+#: Raw values are asked for again before the lease ends.
+RAW_LEASE_S = 30.0
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
+SECURITY = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "connect-src 'self'; img-src 'self' data:; base-uri 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+
+T = TypeVar("T")
+_log = logging.getLogger(__name__)
+
+
+class _Wish(Struct, forbid_unknown_fields=True):
+    """What a page asks for."""
+
+    do: Literal["calibrate", "raw"]
+    node: str
+
+
+class Viewer:
+    """The page of one robot.
+
+    Args:
+        broker: URL or `Broker`, see `SkinClient`.
+        robot: its name; without one the only robot that the broker knows.
+        base: of the topics.
+        commands: whether pages may calibrate and ask for raw values.
+    """
+
+    def __init__(
+        self,
+        broker: str | Broker,
+        *,
+        robot: str | None = None,
+        base: str | None = None,
+        protocol: Literal["5", "3.1.1"] = "5",
+        commands: bool = True,
+    ) -> None:
+        self._new_client: Callable[[], SkinClient] = lambda: SkinClient(
+            broker, robot=robot, base=base, protocol=protocol
+        )
+        self._commands = commands
+        self._picture = Picture()
+        self._client: SkinClient | None = None
+        self._why = "connecting"
+        self._pages = 0
+        self._files = _page_files()
+        self._take_status(connected=False)
+
+    @contextlib.asynccontextmanager
+    async def serving(self, host: str = "127.0.0.1", port: int = 8080) -> AsyncIterator[str]:
+        """Serve for as long as the block lasts; gives the URL. Port 0 is any free one.
+
+        Raises:
+            SkinError: the port cannot be had.
+        """
+        local = host in LOOPBACK
+        # It calls every file that it serves a rejected connection.
+        logging.getLogger("websockets.server").setLevel(logging.WARNING)
+        try:
+            server = await serve(
+                self._talk,
+                host,
+                port,
+                process_request=lambda connection, request: self._answer(request, local=local),
+                max_size=MAX_REQUEST_BYTES,
+                compression=None,
+                server_header=None,
+            )
+        except OSError as error:
+            raise SkinError(
+                f"the page cannot be served on {host}:{port}: {error.strerror or error}; "
+                "choose another port with --port"
+            ) from None
+        async with server:
+            listening = asyncio.create_task(self._listen(), name="viewer")
+            try:
+                yield f"http://{_shown(host)}:{_port(server)}/"
+            finally:
+                listening.cancel()
+                await asyncio.gather(listening, return_exceptions=True)
+
+    async def run(
+        self, stop: asyncio.Event, host: str, port: int, told: Callable[[str], None]
+    ) -> None:
+        """Serve until `stop` is set; `told` is called with the URL.
+
+        Raises:
+            SkinError: the port cannot be had.
+            RequestError: it is not clear which robot is meant.
+        """
+        async with self.serving(host, port) as url:
+            told(url)
+            await stop.wait()
+
+    def _answer(self, request: Request, *, local: bool) -> Response | None:
+        """Answer a request for a file; None lets a page's WebSocket through."""
+        host = request.headers.get("Host", "")
+        if local and host.rpartition(":")[0].strip("[]") not in LOOPBACK:
+            # A page from elsewhere whose name was made to point at this machine.
+            return _response(HTTPStatus.FORBIDDEN, "text/plain", b"not served under this name\n")
+        path = request.path.partition("?")[0]
+        if path == "/live":
+            if request.headers.get("Origin") not in (f"http://{host}", f"https://{host}"):
+                return _response(HTTPStatus.FORBIDDEN, "text/plain", b"not from our own page\n")
+            if self._pages >= MAX_PAGES:
+                return _response(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", b"too many pages\n")
+            return None
+        file = self._files.get("index.html" if path == "/" else path.removeprefix("/"))
+        if file is None:
+            return _response(HTTPStatus.NOT_FOUND, "text/plain", b"no such page\n")
+        return _response(HTTPStatus.OK, *file)
+
+    async def _talk(self, page: ServerConnection) -> None:
+        """Tell one page what is new until it goes, and take its wishes."""
+        self._pages += 1
+        telling = asyncio.create_task(self._tell(page))
+        try:
+            async for message in page:
+                await self._take_wish(page, message)
+        except ConnectionClosed:
+            pass
+        finally:
+            self._pages -= 1
+            telling.cancel()
+            await asyncio.gather(telling, return_exceptions=True)
+
+    async def _tell(self, page: ServerConnection) -> None:
+        cursor = Cursor()
+        while True:
+            # Sending waits for a slow page; what comes meanwhile is passed over.
+            for message in self._picture.news(cursor):
+                await page.send(message)
+            await asyncio.sleep(TICK_S)
+
+    async def _take_wish(self, page: ServerConnection, message: str | bytes) -> None:
+        try:
+            wish = msgspec.json.decode(message, type=_Wish)
+            if not self._commands:
+                raise RequestError("commands are switched off; start the page with them allowed")
+            if self._client is None:
+                raise BrokerError(f"no connection to the broker: {self._why}")
+            arguments: dict[str, Any] = {"seconds": RAW_LEASE_S} if wish.do == "raw" else {}
+            result = await self._client.command(
+                wish.do, node=wish.node, timeout_s=COMMAND_S, **arguments
+            )
+        except (SkinError, msgspec.DecodeError) as error:
+            answer: dict[str, Any] = {"ok": False, "error": str(error)}
+        else:
+            answer = {"ok": True, "do": wish.do, "result": result}
+        await page.send(msgspec.json.encode({"type": "answer"} | answer).decode())
+
+    async def _listen(self) -> None:
+        """Hear the robot; look for the broker again whenever it cannot be found."""
+        while True:
+            try:
+                async with self._new_client() as client, asyncio.TaskGroup() as group:
+                    self._client = client
+                    picture = self._picture
+                    group.create_task(_pass_on(client.frames(), picture.take_frame))
+                    group.create_task(_pass_on(client.touches(), picture.take_touch))
+                    group.create_task(_pass_on(client.contacts(), picture.take_contact))
+                    group.create_task(_pass_on(client.health(), picture.take_health))
+                    group.create_task(self._watch(client))
+            except* SkinError as errors:
+                self._why = str(errors.exceptions[0])
+                _log.warning("%s", self._why)
+            finally:
+                self._client = None
+            self._take_status(connected=False)
+            await asyncio.sleep(RETRY_S)
+
+    async def _watch(self, client: SkinClient) -> None:
+        """Look at the nodes and at the connection again and again."""
+        connections = client.connections
+        while True:
+            if client.connections != connections:
+                connections = client.connections
+                self._picture.forget_contacts()
+            nodes = {name: (node.online, node.info) for name, node in client.nodes.items()}
+            self._picture.take_nodes(client.robot, nodes)
+            self._why = client.last_error
+            self._take_status(connected=client.connected)
+            await asyncio.sleep(NODES_S)
+
+    def _take_status(self, *, connected: bool) -> None:
+        self._picture.take_status(
+            {
+                "connected": connected,
+                "error": "" if connected else self._why,
+                "commands": self._commands,
+            }
+        )
+
+
+async def _pass_on(stream: Stream[T], take: Callable[[T], None]) -> None:
+    async for item in stream:
+        take(item)
+
+
+def _page_files() -> dict[str, tuple[str, bytes]]:
+    """The page's files by name: their type and content."""
+    folder = resources.files("skin_host.viewer").joinpath("page")
+    files = {}
+    for file in folder.iterdir():
+        kind = TYPES.get(file.name.rpartition(".")[2])
+        if kind is not None:
+            files[file.name] = f"{kind}; charset=utf-8", file.read_bytes()
+    return files
+
+
+def _response(status: HTTPStatus, kind: str, body: bytes) -> Response:
+    headers = Headers(SECURITY)
+    headers["Content-Type"] = kind
+    headers["Content-Length"] = str(len(body))
+    return Response(status, status.phrase, headers, body)
+
+
+def _shown(host: str) -> str:
+    """How a browser on this machine writes the host that we listen on."""
+    if host in ("", "0.0.0.0", "::"):  # noqa: S104  # shown, not bound
+        return "localhost"
+    return f"[{host}]" if ":" in host else host
+
+
+def _port(server: Server) -> int:
+    port: int = next(iter(server.sockets)).getsockname()[1]
+    return port

@@ -1,0 +1,168 @@
+"""Recordings: exact times, every format, and one clear line for what cannot be read."""
+
+import gc
+import gzip
+import time
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+from skin_host.bus.logs import read_channels, read_log, replay_log
+from skin_host.errors import LogError
+
+GRASP = Path(__file__).parents[2].parent / "shared/data/icub_grasp.log"
+MS = 1_000_000
+
+
+def candump(path: Path, lines: list[str]) -> Path:
+    path.write_text("".join(line + "\n" for line in lines))
+    return path
+
+
+def test_candumps_microseconds_are_exact(tmp_path):
+    stamps = [f"{1700000000 + i}.{(i * 7919) % 1_000_000:06d}" for i in range(500)]
+    path = candump(tmp_path / "a.log", [f"({stamp}) can0 4E4#40F4" for stamp in stamps])
+    times = [int(t) for batch in read_log(path) for t in batch.t_ns]
+    assert times == [int(stamp.replace(".", "")) * 1000 for stamp in stamps]
+
+
+def test_identifiers_data_and_flags_are_those_of_the_bus(tmp_path):
+    path = candump(
+        tmp_path / "a.log",
+        ["(1.0) can0 4E4#40F4F4", "(1.001) can0 1F334455#00", "(1.002) can0 123#R"],
+    )
+    (batch,) = read_log(path)
+    assert batch.id.tolist() == [0x4E4, 0x80000000 | 0x1F334455, 0x40000123]
+    assert batch.dlc.tolist() == [3, 1, 0]
+    assert batch.data[0, :3].tolist() == [0x40, 0xF4, 0xF4]
+
+
+def test_batches_span_no_more_than_the_window(tmp_path):
+    lines = [f"({10 + i * 0.001:.6f}) can0 4E0#40" for i in range(100)]
+    batches = list(read_log(candump(tmp_path / "a.log", lines), window_ns=4 * MS))
+    assert sum(len(batch) for batch in batches) == 100
+    assert all(int(batch.t_ns[-1] - batch.t_ns[0]) < 4 * MS for batch in batches)
+    assert len(batches) == 25
+
+
+def test_a_flood_within_a_window_is_cut(tmp_path):
+    path = candump(tmp_path / "a.log", ["(10.0) can0 4E0#40"] * 5000)
+    sizes = [len(batch) for batch in read_log(path)]
+    assert sum(sizes) == 5000
+    assert max(sizes) <= 1024
+
+
+def test_channels_are_kept_apart(tmp_path):
+    path = candump(
+        tmp_path / "a.log",
+        ["(1.0) can0 4E0#40", "(1.0005) can1 4E1#40", "(1.001) can0 4E2#40"],
+    )
+    assert [(name, batch.id.tolist()) for name, batch in read_channels(path)] == [
+        ("can0", [0x4E0, 0x4E2]),
+        ("can1", [0x4E1]),
+    ]
+    assert [batch.id.tolist() for batch in read_log(path, channel="can1")] == [[0x4E1]]
+
+
+@pytest.mark.parametrize("suffix", [".log", ".asc", ".blf", ".csv", ".trc", ".log.gz", ".asc.gz"])
+def test_every_format_of_python_can_gives_the_same_frames(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    sent = [(0x4E0 + i, bytes(range(i, i + 8)), 1700000000.0 + i / 100) for i in range(10)]
+    with can.Logger(path) as logger:
+        for identifier, data, timestamp in sent:
+            logger.on_message_received(
+                can.Message(timestamp, identifier, is_extended_id=False, data=data, channel=1)
+            )
+    frames = [
+        (identifier, data)
+        for batch in read_log(path)
+        for identifier, data in zip(batch.id.tolist(), batch.data, strict=True)
+    ]
+    assert [identifier for identifier, _ in frames] == [identifier for identifier, *_ in sent]
+    assert [data.tobytes() for _, data in frames] == [data for _, data, _ in sent]
+    times = np.concatenate([batch.t_ns.copy() for batch in read_log(path)])
+    assert np.all(np.abs(np.diff(times) - 10 * MS) <= MS)
+
+
+async def test_the_recordings_own_pace_can_be_kept(tmp_path):
+    lines = [f"({10 + i * 0.01:.6f}) can0 4E0#40" for i in range(11)]
+    path = candump(tmp_path / "a.log", lines)
+    began_s = time.monotonic()
+    count = 0
+    async for channel, batch in replay_log(path, speed=2.0):
+        assert channel == "can0"
+        count += len(batch)
+        recorded_s = (int(batch.t_ns[-1]) - 10 * 10**9) * 1e-9
+        assert time.monotonic() - began_s >= recorded_s / 2.0 - 1e-6
+    assert count == 11
+
+
+@pytest.mark.skipif(not GRASP.exists(), reason=f"the recording {GRASP.name} is not here")
+def test_a_real_hands_recording_is_read_whole():
+    batches = list(read_log(GRASP))
+    text = GRASP.read_text().splitlines()
+    assert sum(len(batch) for batch in batches) == len(text)
+    first = text[0].split()[0].strip("()").replace(".", "")
+    last = text[-1].split()[0].strip("()").replace(".", "")
+    assert int(batches[0].t_ns[0]) == int(first) * 1000
+    assert int(batches[-1].t_ns[-1]) == int(last) * 1000
+
+
+def whole_blf(path: Path) -> bytes:
+    with can.Logger(path) as logger:
+        for i in range(2000):
+            logger.on_message_received(can.Message(1.0 + i, 0x4E0, data=bytes(8)))
+    return path.read_bytes()
+
+
+def message_of(path: Path) -> str:
+    with pytest.raises(LogError) as caught:
+        for _ in read_log(path):
+            pass
+    text = str(caught.value)
+    assert text.startswith(f"{path}: ")
+    assert "\n" not in text
+    return text
+
+
+# python-can leaves a file open if it does not like its header.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_what_cannot_be_read_is_one_line(tmp_path):
+    assert "No such file" in message_of(tmp_path / "absent.log")
+    assert "known are .asc, " in message_of(tmp_path / "a.wav")
+    assert "known are .asc, " in message_of(tmp_path / "a")
+    directory = tmp_path / "folder.log"
+    directory.mkdir()
+    assert "directory" in message_of(directory)
+    empty = tmp_path / "empty.log"
+    empty.write_bytes(b"")
+    assert "no CAN frame" in message_of(empty)
+    noise = np.random.default_rng(0).bytes(4096)
+    for suffix in (".log", ".asc", ".blf", ".csv", ".trc", ".log.gz", ".mf4", ".db"):
+        garbage = tmp_path / f"garbage{suffix}"
+        garbage.write_bytes(noise)
+        message_of(garbage)
+    gc.collect()
+
+
+def test_what_comes_before_damage_is_handed_on(tmp_path):
+    good = [f"({10 + i}.0) can0 4E0#40" for i in range(3)]
+    path = candump(tmp_path / "cut.log", [*good, "(13.0) can0 4E"])
+    frames = 0
+    with pytest.raises(LogError, match="damaged after frame 3"):
+        for batch in read_log(path):
+            frames += len(batch)
+    assert frames == 2  # the third waited for the end of its window
+
+
+def test_cut_files_are_told(tmp_path):
+    text = "".join(f"({10 + i}.0) can0 4E0#40\n" for i in range(5000)).encode()
+    cut = tmp_path / "cut.log.gz"
+    cut.write_bytes(gzip.compress(text)[:-200])
+    assert "damaged after frame" in message_of(cut)
+    blf = tmp_path / "whole.blf"
+    cut = tmp_path / "cut.blf"
+    cut.write_bytes(whole_blf(blf)[:-1000])
+    assert "cut off" in message_of(cut)

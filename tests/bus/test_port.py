@@ -1,0 +1,259 @@
+"""Reading in batches: every frame with its time, every loss counted, no state that ends it."""
+
+import logging
+import struct
+import time
+
+import can
+import numpy as np
+import pytest
+from can.interfaces.socketcan.socketcan import build_can_frame
+
+from skin_host.bus.adapters import AdapterPort
+from skin_host.bus.port import LinkState, Port, open_port
+from skin_host.bus.protocol import FrameBatch
+from skin_host.bus.socketcan import BatchReceiver, SocketCanPort
+from skin_host.errors import BusError
+from skin_host.evaluation.stand_in import StandInBus, pair, register
+from skin_host.settings import Bus, Receive
+
+SMALL = Receive(buffer_bytes=65536)
+
+
+def can_frame(identifier: int, data: bytes) -> bytes:
+    return struct.pack("=IB3x8s", identifier, len(data), data)
+
+
+def port_on(bus: can.BusABC, receive: Receive | None = None) -> SocketCanPort:
+    return SocketCanPort("left", Bus(), receive or Receive(), bus, lambda: bus)
+
+
+def read_all(port: Port, expected: int) -> tuple[int, int]:
+    """Frames and losses of all reads until both make up what was sent."""
+    frames = dropped = 0
+    deadline = time.monotonic() + 5.0
+    while frames + dropped < expected and time.monotonic() < deadline:
+        batch = port.read()
+        frames += len(batch)
+        dropped += batch.dropped
+    return frames, dropped
+
+
+@pytest.fixture
+def ends():
+    ours, theirs = pair()
+    yield ours, theirs
+    ours.shutdown()
+    theirs.shutdown()
+
+
+def test_a_read_takes_everything_that_waits_in_order(ends):
+    ours, theirs = ends
+    port = port_on(ours)
+    sent = [(0x410 + i, bytes(range(i, i + 8))) for i in range(16)]
+    before_ns = time.time_ns()
+    for identifier, data in sent:
+        theirs.socket.send(can_frame(identifier, data))
+    batch = port.read()
+    assert batch.id.tolist() == [identifier for identifier, _ in sent]
+    assert [row.tobytes() for row in batch.data] == [data for _, data in sent]
+    assert set(batch.dlc.tolist()) == {8}
+    assert before_ns <= batch.t_ns[0] <= batch.t_ns[-1] <= time.time_ns()
+    assert np.all(np.diff(batch.t_ns) >= 0)
+    assert len(port.read()) == 0
+    assert port.counters.frames == 16
+
+
+def test_walking_through_frames_gives_what_the_arrays_hold(ends):
+    ours, theirs = ends
+    port = port_on(ours)
+    for i in range(5):
+        theirs.socket.send(can_frame(0x410 + i, bytes(range(8))[: i + 1]))
+    batch = port.read()
+    walked = list(batch.frames())
+    by_arrays = FrameBatch(batch.id, batch.dlc, batch.data, batch.t_ns).frames()
+    assert walked == list(by_arrays)
+    assert [(identifier, dlc) for _, _, identifier, dlc, _, _ in walked] == [
+        (0x410 + i, i + 1) for i in range(5)
+    ]
+
+
+def test_more_than_the_capacity_comes_with_the_next_read(ends):
+    ours, theirs = ends
+    receiver = BatchReceiver(ours.socket, 65536, capacity=4)
+    for i in range(10):
+        theirs.socket.send(can_frame(i, b""))
+    batches = [receiver.read().id.tolist() for _ in range(4)]
+    assert batches == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9], []]
+
+
+def test_an_overflow_is_counted_to_the_frame(ends):
+    ours, theirs = ends
+    port = port_on(ours, SMALL)
+    for _ in range(3000):
+        theirs.socket.send(can_frame(0x410, bytes(8)))
+    frames, dropped = read_all(port, 3000)
+    assert dropped > 0
+    assert frames + dropped == 3000
+    # The kernel also reports the loss with the frames after it; it is not counted twice.
+    theirs.socket.send(can_frame(0x410, bytes(8)))
+    assert len(port.read()) == 1
+    assert (port.counters.frames, port.counters.dropped) == (frames + 1, dropped)
+
+
+def test_a_buffer_smaller_than_wanted_is_said_once(ends, caplog):
+    ours, _ = ends
+    with caplog.at_level(logging.WARNING):
+        port = port_on(ours, Receive(buffer_bytes=2**31 - 1))
+    assert port.counters.buffer_bytes < 2**31 - 1
+    (record,) = caplog.records
+    assert "sysctl -w net.core.rmem_max=2147483647" in record.getMessage()
+
+
+def test_error_frames_are_counted_and_move_the_state(ends):
+    ours, theirs = ends
+    port = port_on(ours)
+
+    def state_after(error: int, detail: int) -> LinkState:
+        theirs.socket.send(can_frame(0x20000000 | error, bytes([0, detail, 0, 0, 0, 0, 0, 0])))
+        port.read()
+        return port.state
+
+    assert state_after(0x004, 0x20) is LinkState.ERROR_PASSIVE
+    assert state_after(0x004, 0x40) is LinkState.UP
+    assert state_after(0x040, 0) is LinkState.BUS_OFF
+    assert state_after(0x100, 0) is LinkState.UP
+    assert state_after(0x004, 0x01) is LinkState.UP
+    assert state_after(0x080, 0) is LinkState.UP
+    counters = port.counters
+    assert (counters.error_frames, counters.bus_offs, counters.controller_overflows) == (6, 1, 1)
+
+
+def test_the_error_bit_of_an_extended_identifier_is_no_error(ends):
+    ours, theirs = ends
+    port = port_on(ours)
+    theirs.socket.send(can_frame(0x80000000 | 0x20000040, bytes(8)))
+    theirs.socket.send(can_frame(0x40000000 | 0x123, b""))
+    assert len(port.read()) == 2
+    assert port.counters.error_frames == 0
+    assert port.state is LinkState.UP
+
+
+def test_one_line_is_logged_for_a_change_not_for_a_frame(ends, caplog):
+    ours, theirs = ends
+    port = port_on(ours)
+    with caplog.at_level(logging.INFO):
+        for _ in range(50):
+            theirs.socket.send(can_frame(0x20000040, bytes(8)))
+            port.read()
+    assert [record.getMessage() for record in caplog.records] == [
+        'bus "left": can0 is bus_off, was up'
+    ]
+
+
+def test_a_socket_that_fails_is_replaced():
+    # A refused datagram is a one-shot error of the socket, as a removed device is.
+    ours, theirs = pair()
+    address = theirs.port
+    opened: list[StandInBus] = []
+
+    def reopen() -> can.BusABC:
+        if len(opened) < 2:
+            opened.append(ours)
+            raise BusError("not there yet")
+        return StandInBus(f"0-{address}")
+
+    port = SocketCanPort("left", Bus(), Receive(), ours, reopen)
+    theirs.shutdown()
+    ours.socket.send(bytes(16))
+    assert len(port.read()) == 0
+    assert port.state is LinkState.GONE
+    assert port.fileno() is None
+    with StandInBus(f"{address}-0") as back:
+        deadline = time.monotonic() + 10.0
+        while port.state is LinkState.GONE and time.monotonic() < deadline:
+            port.read()
+            time.sleep(0.01)
+        assert port.counters.reopened == 1
+        back.connect(port._bus.port)
+        back.socket.send(can_frame(0x410, bytes(8)))
+        assert read_all(port, 1) == (1, 0)
+    assert port.state is LinkState.UP
+    assert port.counters.removals == 1
+    port.close()
+
+
+async def test_sent_frames_arrive_in_order_as_python_can_builds_them(ends):
+    ours, theirs = ends
+    port = port_on(ours)
+    frames = [(0x20E, b"\x07\x00"), (0x7F0, b"\xff"), (0x201, bytes(8))]
+    await port.send(frames, gap_s=0.0)
+    for identifier, data in frames:
+        message = can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
+        assert theirs.socket.recv(64) == build_can_frame(message)
+    assert port.counters.sent == 3
+    assert len(port.read()) == 0
+
+
+async def test_nothing_is_sent_while_the_interface_is_down(ends):
+    ours, _ = ends
+    port = port_on(ours)
+    port.state = LinkState.DOWN
+    with pytest.raises(BusError, match="cannot send, down"):
+        await port.send([(0x20E, b"")])
+
+
+class FullQueue(can.BusABC):
+    """An interface whose transmit queue is full for the first frames tried."""
+
+    def __init__(self, full_for: int) -> None:
+        super().__init__("full")
+        self.left = full_for
+        self.sent: list[int] = []
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        self.left -= 1
+        if self.left >= 0:
+            raise can.CanOperationError("No buffer space available", 105)
+        self.sent.append(msg.arbitration_id)
+
+    def _recv_internal(self, timeout):
+        return None, False
+
+
+async def test_a_full_transmit_queue_is_waited_for():
+    with FullQueue(3) as bus:
+        port = AdapterPort("left", Bus(interface="x"), bus)
+        await port.send([(0x20E, b"")], gap_s=0.0)
+        assert bus.sent == [0x20E]
+        assert port.counters.send_retries == 3
+
+
+async def test_a_transmit_queue_that_stays_full_is_an_error(monkeypatch):
+    monkeypatch.setattr("skin_host.bus.port.SEND_DEADLINE_S", 0.02)
+    with FullQueue(1 << 30) as bus:
+        port = AdapterPort("left", Bus(interface="x"), bus)
+        with pytest.raises(BusError, match="termination"):
+            await port.send([(0x20E, b"")])
+
+
+def test_python_cans_socketcan_under_another_name_is_read_in_batches():
+    register()
+    port = open_port("left", Bus(interface="stand-in", channel="0-0"), SMALL)
+    assert isinstance(port, SocketCanPort)
+    port.close()
+
+
+@pytest.mark.parametrize(
+    ("bus", "says"),
+    [
+        (Bus(channel="nowhere7"), "no such network interface .*ip link add dev nowhere7 type vcan"),
+        (Bus(channel="lo"), "not a CAN interface"),
+        (Bus(interface="psychic"), "python-can has no such interface; it has .*socketcan"),
+        (Bus(interface="slcan", channel="/dev/none"), "slcan /dev/none: cannot be opened"),
+    ],
+)
+def test_what_cannot_be_opened_is_one_line_with_its_name(bus, says):
+    with pytest.raises(BusError, match=f'bus "left": .*{says}') as caught:
+        open_port("left", bus, Receive())
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,135 @@
+"""Interfaces that are not SocketCAN: the same batches, by way of python-can's virtual bus."""
+
+import itertools
+import time
+
+import can
+import pytest
+
+from skin_host.bus.adapters import CAPACITY, AdapterPort, nanoseconds
+from skin_host.bus.port import LinkState, Port, open_port
+from skin_host.settings import Bus, Receive
+
+_numbers = itertools.count()
+
+
+@pytest.fixture
+def virtual():
+    channel = f"adapters-{next(_numbers)}"
+    port = open_port("left", Bus(interface="virtual", channel=channel), Receive())
+    with can.Bus(interface="virtual", channel=channel) as other:
+        yield port, other
+    port.close()
+
+
+def message(identifier: int, data: bytes = b"", **options: object) -> can.Message:
+    options.setdefault("is_extended_id", False)
+    return can.Message(arbitration_id=identifier, data=data, **options)
+
+
+def test_frames_come_as_they_were_sent(virtual):
+    port, other = virtual
+    before_ns = time.time_ns()
+    for i in range(3):
+        other.send(message(0x410 + i, bytes(range(i))))
+    batch = port.read()
+    assert batch.id.tolist() == [0x410, 0x411, 0x412]
+    assert batch.dlc.tolist() == [0, 1, 2]
+    assert batch.data[2, :2].tolist() == [0, 1]
+    assert before_ns - 1000 <= batch.t_ns[0] <= time.time_ns() + 1000
+    assert port.counters.frames == 3
+    assert port.fileno() is None
+
+
+def test_flags_are_those_of_socketcan(virtual):
+    port, other = virtual
+    other.send(message(0x123, is_extended_id=True))
+    other.send(message(0x123, is_remote_frame=True))
+    other.send(message(0x040, bytes(8), is_error_frame=True))
+    assert port.read().id.tolist() == [0x80000123, 0x40000123, 0x20000040]
+    assert port.counters.error_frames == 1
+    assert port.state is LinkState.BUS_OFF
+
+
+def test_fd_frames_are_left_out(virtual):
+    port, other = virtual
+    other.send(message(0x123, bytes(64), is_fd=True))
+    other.send(message(0x124))
+    assert port.read().id.tolist() == [0x124]
+
+
+def test_skin_only_leaves_other_classes_out():
+    channel = f"adapters-{next(_numbers)}"
+    settings = Bus(interface="virtual", channel=channel, skin_only=True)
+    port = open_port("left", settings, Receive())
+    with can.Bus(interface="virtual", channel=channel) as other:
+        for message_class in range(8):
+            other.send(message(message_class << 8 | 0x12))
+        other.send(message(0x412, is_extended_id=True))
+    assert port.read().id.tolist() == [0x212, 0x312, 0x412, 0x612, 0x712]
+    port.close()
+
+
+def test_a_flood_is_taken_in_bounded_reads(virtual):
+    port, other = virtual
+    for _ in range(CAPACITY + 5):
+        other.send(message(0x410))
+    assert [len(port.read()) for _ in range(3)] == [CAPACITY, 5, 0]
+
+
+async def test_own_frames_do_not_come_back(virtual):
+    port, other = virtual
+    await port.send([(0x20E, b"\x07\x00")], gap_s=0.0)
+    assert other.recv(1.0).arbitration_id == 0x20E
+    assert len(port.read()) == 0
+
+
+def test_time_stamps_that_count_from_power_on_are_replaced_by_the_time(virtual):
+    port, _ = virtual
+    sender = can.Bus(interface="virtual", channel=port.channel, preserve_timestamps=True)
+    sender.send(message(0x410, timestamp=12.5))
+    sender.send(message(0x410, timestamp=0.0))
+    sender.shutdown()
+    now_ns = time.time_ns()
+    assert all(abs(int(t) - now_ns) < 10**9 for t in port.read().t_ns)
+
+
+def test_microseconds_survive_pythons_floats():
+    for microseconds in range(0, 1_000_000, 997):
+        text = f"1700000000.{microseconds:06d}"
+        assert nanoseconds(float(text)) == 1700000000 * 10**9 + microseconds * 1000
+
+
+class Unplugged(can.BusABC):
+    """An adapter that is gone."""
+
+    def __init__(self) -> None:
+        super().__init__("unplugged")
+
+    def _recv_internal(self, timeout):
+        raise can.CanOperationError("read failed\nwith details")
+
+    def send(self, msg, timeout=None):
+        raise can.CanOperationError("write failed", 19)
+
+
+def read_until(port: Port, state: LinkState) -> None:
+    deadline = time.monotonic() + 10.0
+    while port.state is not state and time.monotonic() < deadline:
+        port.read()
+        time.sleep(0.01)
+    assert port.state is state
+
+
+def test_an_unplugged_adapter_is_opened_again(caplog):
+    settings = Bus(interface="virtual", channel=f"adapters-{next(_numbers)}")
+    port = AdapterPort("left", settings, Unplugged())
+    assert len(port.read()) == 0
+    assert port.state is LinkState.GONE
+    assert "is gone (read failed), was up" in caplog.text
+    read_until(port, LinkState.UP)
+    with can.Bus(interface="virtual", channel=settings.channel) as other:
+        other.send(message(0x410))
+        assert len(port.read()) == 1
+    assert port.counters.removals == port.counters.reopened == 1
+    port.close()

@@ -1,0 +1,146 @@
+"""When the ports are read: right after each sweep, seldom otherwise, never in a tight loop."""
+
+import asyncio
+import time
+
+import pytest
+
+from skin_host.bus.wake import GIVE_UP_NS, GUARD_NS, LONGEST_NS, RETRY_NS, SLIP_NS, Plan, WakeUp
+from skin_host.settings import Receive
+
+MS = 1_000_000
+PERIOD = 50 * MS
+POLL = 4 * MS
+T0 = 1_700_000_000_000_000_000
+
+
+def test_without_knowledge_it_polls():
+    plan = Plan({0: PERIOD}, POLL)
+    assert plan.next_ns(T0) == T0 + POLL
+
+
+def test_the_next_sweep_is_read_when_its_last_frame_is_due():
+    plan = Plan({0: PERIOD}, POLL)
+    plan.sweep_ended(0, T0)
+    now = T0 + PERIOD - 2 * MS
+    assert plan.next_ns(now) == T0 + PERIOD + GUARD_NS
+
+
+def test_between_sweeps_it_sleeps_long_only_if_every_board_is_known():
+    plan = Plan({0: PERIOD, 1: PERIOD}, POLL)
+    plan.sweep_ended(0, T0)
+    assert plan.next_ns(T0) == T0 + POLL
+    plan.sweep_ended(1, T0 + MS)
+    assert plan.next_ns(T0 + MS) == T0 + MS + LONGEST_NS
+
+
+def test_a_late_sweep_is_looked_for_again_ever_more_seldom_then_no_more():
+    plan = Plan({0: PERIOD}, POLL)
+    plan.sweep_ended(0, T0)
+    due = T0 + PERIOD
+    now = due + GUARD_NS
+    waits = []
+    while now - due < GIVE_UP_NS:
+        then = plan.next_ns(now)
+        waits.append(then - now)
+        now = then
+    assert waits[0] == RETRY_NS
+    assert waits == sorted(waits)
+    assert len(waits) < 8
+    assert plan.next_ns(now) == now + POLL
+
+
+def test_one_late_sweep_does_not_delay_the_next():
+    plan = Plan({0: PERIOD}, POLL)
+    plan.sweep_ended(0, T0)
+    plan.sweep_ended(0, T0 + PERIOD + 3 * MS)
+    now = T0 + 2 * PERIOD - MS
+    assert plan.next_ns(now) == T0 + 2 * PERIOD + SLIP_NS + GUARD_NS
+
+
+@pytest.mark.parametrize("ppm", [-1000, 0, 900])
+def test_a_board_with_another_clock_is_followed(ppm):
+    plan = Plan({0: PERIOD}, POLL)
+    real_period = PERIOD + PERIOD * ppm // 1_000_000
+    end = T0
+    for _ in range(200):
+        plan.sweep_ended(0, end)
+        end += real_period
+    assert abs(plan.next_ns(end - 2 * MS) - end) <= GUARD_NS + 2 * SLIP_NS
+
+
+def test_a_board_that_was_away_is_followed_from_its_return():
+    plan = Plan({0: PERIOD}, POLL)
+    plan.sweep_ended(0, T0)
+    back = T0 + 40 * PERIOD + 17 * MS
+    plan.next_ns(back)
+    plan.sweep_ended(0, back)
+    assert plan.next_ns(back + PERIOD - MS) == back + PERIOD + GUARD_NS
+
+
+def test_a_clock_that_jumps_back_costs_at_most_the_longest_wait():
+    plan = Plan({0: PERIOD}, POLL)
+    plan.sweep_ended(0, T0)
+    long_ago = T0 - 3600 * 1_000_000_000
+    assert plan.next_ns(long_ago) == long_ago + LONGEST_NS
+
+
+async def test_work_is_called_again_and_again():
+    calls = 0
+    enough = asyncio.Event()
+
+    def work() -> None:
+        nonlocal calls
+        calls += 1
+        if calls == 5:
+            enough.set()
+
+    running = asyncio.create_task(WakeUp(Receive(poll_ms=1.0), {}).run(work))
+    async with asyncio.timeout(5.0):
+        await enough.wait()
+    running.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await running
+
+
+async def test_an_idle_reader_does_not_spin():
+    calls = 0
+
+    def work() -> None:
+        nonlocal calls
+        calls += 1
+
+    receive = Receive(poll_ms=20.0)
+    running = asyncio.create_task(WakeUp(receive, {}).run(work))
+    began_s = time.monotonic()
+    await asyncio.sleep(0.2)
+    elapsed_s = time.monotonic() - began_s
+    running.cancel()
+    assert 1 <= calls <= 2 + elapsed_s / 0.02
+
+
+async def test_when_a_sweep_is_always_due_it_rests_for_a_poll_after_each_look():
+    boards = dict.fromkeys(range(14), 10 * MS)
+    wake_up = WakeUp(Receive(poll_ms=20.0), boards)
+    calls = 0
+
+    def work() -> None:
+        nonlocal calls
+        calls += 1
+        for board in boards:
+            wake_up.sweep_ended(board, time.time_ns() - 10 * MS + board * MS // 14)
+
+    running = asyncio.create_task(wake_up.run(work))
+    began_s = time.monotonic()
+    await asyncio.sleep(0.2)
+    elapsed_s = time.monotonic() - began_s
+    running.cancel()
+    assert 1 <= calls <= 2 + elapsed_s / 0.02
+
+
+async def test_an_error_in_the_work_ends_the_run_with_it():
+    def work() -> None:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        await WakeUp(Receive(), {}).run(work)

@@ -1,0 +1,307 @@
+"""A program hears the skin through a real broker, and through what happens to it."""
+
+import asyncio
+import threading
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import aiomqtt
+import numpy as np
+import pytest
+from msgspec import json
+
+from skin_host.client import CommandError, Contact, SkinCallbacks, SkinClient
+from skin_host.errors import BrokerError, RequestError
+from skin_host.layout import build_layout
+from skin_host.processing.contacts import TouchEvent
+from skin_host.processing.pipeline import PressureFrame
+from skin_host.publish.info import node_info
+from skin_host.publish.mqtt import Publisher
+from skin_host.settings import Mqtt, load
+from tests.support.broker import Mosquitto, free_port
+
+PATIENCE_S = 20.0
+CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
+
+
+def frame(seq: int, part: str = "palm") -> PressureFrame:
+    m = 12
+    valid = np.ones(m, np.bool_)
+    valid[3] = False
+    none = np.zeros(m, np.bool_)
+    kpa = np.arange(m, dtype=np.float32) * np.float32(0.5)
+    return PressureFrame(part, seq, seq, np.zeros(m, np.uint8), kpa, none, valid, none)
+
+
+def touch(number: int, part: str = "palm", event: Any = "move") -> TouchEvent:
+    return TouchEvent(event, 1, number, number, part, [1], None, None, 1.0, 2.0, 2.0, 0.1)
+
+
+async def answer(name: str, payload: bytes) -> Mapping[str, Any]:
+    if name == "refuse":
+        raise RequestError("not now")
+    if name == "sleep":
+        await asyncio.sleep(60)
+    arguments = json.decode(payload)
+    del arguments["id"]
+    return {"arguments": arguments}
+
+
+@asynccontextmanager
+async def publishing(
+    broker: Mosquitto, robot: str = "robot", node: str = "main", **keys: Any
+) -> AsyncIterator[Publisher]:
+    settings = Mqtt(host=broker.host, port=broker.port, **keys)
+    async with Publisher(settings, robot, node, handler=answer) as publisher:
+        await until(lambda: publisher.counters.connected)
+        await asyncio.sleep(0.05)  # until it listens for commands, too
+        yield publisher
+
+
+def hearing(broker: Mosquitto, robot: str | None = "robot", **keys: Any) -> SkinClient:
+    return SkinClient(f"mqtt://{broker.host}:{broker.port}", robot=robot, **keys)
+
+
+async def until(condition: Callable[[], object]) -> None:
+    async with asyncio.timeout(PATIENCE_S):
+        while not condition():  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+
+
+async def take(stream: Any, n: int) -> list[Any]:
+    async with asyncio.timeout(PATIENCE_S):
+        return [await anext(stream) for _ in range(n)]
+
+
+@pytest.mark.parametrize("encoding", ["json", "cbor"])
+async def test_frames_come_as_arrays_in_kpa(mosquitto: Mosquitto, encoding: str) -> None:
+    async with publishing(mosquitto, encoding=encoding) as publisher, hearing(mosquitto) as skin:
+        frames = skin.frames()
+        await skin.ready()
+        publisher.put_frame(frame(4))
+        (seen,) = await take(frames, 1)
+    np.testing.assert_allclose(seen.pressure_kpa, np.arange(12) * 0.5)
+    assert np.flatnonzero(~seen.valid).tolist() == [3]
+    assert not seen.beyond_range.any()
+
+
+async def test_touches_of_one_part_are_heard_alone(mosquitto: Mosquitto) -> None:
+    async with publishing(mosquitto) as publisher, hearing(mosquitto) as skin:
+        palm, everywhere = skin.touches("palm"), skin.touches()
+        await skin.ready()
+        for part in ("arm", "palm", "arm", "palm"):
+            publisher.put_touch(touch(1, part))
+        assert [(t.part, t.count) for t in await take(palm, 2)] == [("palm", 1), ("palm", 2)]
+        assert [t.part for t in await take(everywhere, 4)] == ["arm", "palm", "arm", "palm"]
+
+
+async def test_state_is_known_at_once_also_to_who_asks_later(mosquitto: Mosquitto) -> None:
+    async with publishing(mosquitto) as publisher:
+        publisher.put_contact("palm", True)
+        publisher.put_health("palm", {"rate_hz": 20.0})
+        await until(lambda: publisher.counters.retained_sent >= 3)
+        async with hearing(mosquitto) as skin:
+            first, health = skin.contacts(), skin.health()
+            assert await take(first, 1) == [Contact("palm", True)]
+            (seen,) = await take(health, 1)
+            assert (seen.part, seen.record["rate_hz"]) == ("palm", 20.0)
+            second = skin.contacts("palm")
+            assert await take(second, 1) == [Contact("palm", True)]
+
+
+async def test_a_client_hears_what_was_said_while_its_link_was_cut(
+    mosquitto: Mosquitto,
+) -> None:
+    async with hearing(mosquitto) as skin:
+        touches = skin.touches()
+        await skin.ready()
+        async with publishing(mosquitto) as publisher:
+            publisher.put_touch(touch(1))
+            assert (await take(touches, 1))[0].count == 1
+            skin._connection.cut()  # type: ignore[union-attr]  # its link alone breaks
+            await until(lambda: not skin.connected)
+            for number in (2, 3, 4):
+                publisher.put_touch(touch(number))
+            await until(lambda: publisher.counters.touches_sent == 4)
+            await until(lambda: skin.connected)
+            publisher.put_touch(touch(5))
+            seen = await take(touches, 4)
+            assert [(one.count, one.missed) for one in seen] == [(2, 0), (3, 0), (4, 0), (5, 0)]
+
+
+async def test_a_client_survives_the_broker(mosquitto: Mosquitto) -> None:
+    async with hearing(mosquitto) as skin:
+        touches = skin.touches()
+        await skin.ready()
+        async with publishing(mosquitto) as publisher:
+            publisher.put_touch(touch(1))
+            assert (await take(touches, 1))[0].count == 1
+            mosquitto.restart()
+            await until(lambda: skin.connections == 2)
+            await until(lambda: publisher.counters.connected)
+            publisher.put_touch(touch(2))
+            (seen,) = await take(touches, 1)
+            assert (seen.count, seen.missed) == (2, 0)
+
+
+async def test_a_stream_that_ended_while_the_link_was_cut_is_given_up(
+    mosquitto: Mosquitto,
+) -> None:
+    async with publishing(mosquitto) as publisher, hearing(mosquitto) as skin:
+        frames, touches = skin.frames(), skin.touches()
+        await skin.ready()
+        skin._connection.cut()  # type: ignore[union-attr]
+        del frames
+        await until(lambda: skin.connections == 2)
+        received: list[Any] = []
+        skin._take_part = lambda kind, *_: received.append(kind)  # type: ignore[method-assign]
+        publisher.put_frame(frame(1))
+        await until(lambda: publisher.counters.frames_sent)
+        publisher.put_touch(touch(1))
+        await until(lambda: received)
+        assert received == ["touch"]
+        del touches
+
+
+async def test_topics_that_nobody_reads_any_more_are_given_up(mosquitto: Mosquitto) -> None:
+    async with publishing(mosquitto) as publisher, hearing(mosquitto) as skin:
+        frames = skin.frames()
+        await skin.ready()
+        assert "skin/robot/+/frame" in skin._subscribed
+        del frames
+        publisher.put_frame(frame(1))
+        await until(lambda: "skin/robot/+/frame" not in skin._subscribed)
+
+
+async def test_streams_end_with_the_client(mosquitto: Mosquitto) -> None:
+    async with hearing(mosquitto) as skin:
+        touches = skin.touches()
+    assert [touch async for touch in touches] == []
+
+
+async def test_nodes_say_what_they_are_and_whether_they_live(mosquitto: Mosquitto) -> None:
+    layout = build_layout(load(CONFIG), CONFIG.parent)
+    async with hearing(mosquitto) as skin:
+        async with publishing(mosquitto) as publisher:
+            publisher.put_info(node_info(layout, "main", version="1", configuration="x"))
+            info = await skin.info(PATIENCE_S)
+            assert list(info["main"].parts) == ["left_hand", "left_forearm"]
+            assert skin.nodes["main"].online
+        await until(lambda: skin.nodes["main"].online is False)
+
+
+async def test_without_a_node_info_says_what_to_start(mosquitto: Mosquitto) -> None:
+    async with hearing(mosquitto) as skin:
+        with pytest.raises(BrokerError, match="is `skin run` running"):
+            await skin.info(0.1)
+
+
+@pytest.mark.parametrize("protocol", ["5", "3.1.1"])
+async def test_a_command_returns_its_result(mosquitto: Mosquitto, protocol: Any) -> None:
+    async with publishing(mosquitto, protocol=protocol):
+        async with hearing(mosquitto, protocol=protocol) as skin:
+            result = await skin.command("calibrate", seconds=2)
+            assert result == {"arguments": {"seconds": 2}}
+            both = await asyncio.gather(
+                skin.command("a", node="main", x=1), skin.command("b", node="main", x=2)
+            )
+            assert [one["arguments"]["x"] for one in both] == [1, 2]
+
+
+async def test_a_command_that_fails_says_why(mosquitto: Mosquitto) -> None:
+    async with publishing(mosquitto), hearing(mosquitto) as skin:
+        with pytest.raises(CommandError, match="not now"):
+            await skin.command("refuse")
+        with pytest.raises(CommandError, match='no answer to "sleep" from node "main"'):
+            await skin.command("sleep", node="main", timeout_s=0.2)
+        with pytest.raises(CommandError, match='node "other"'):
+            await skin.command("calibrate", node="other", timeout_s=0.2)
+
+
+async def test_a_command_to_one_of_two_nodes_names_it(mosquitto: Mosquitto) -> None:
+    async with publishing(mosquitto), publishing(mosquitto, node="arm"), hearing(mosquitto) as skin:
+        with pytest.raises(RequestError, match="arm, main"):
+            await skin.command("calibrate")
+        assert await skin.command("calibrate", node="arm") == {"arguments": {}}
+
+
+async def test_the_only_robot_of_a_broker_needs_no_name(mosquitto: Mosquitto) -> None:
+    with pytest.raises(RequestError, match="there are: none"):
+        async with hearing(mosquitto, None):
+            pass
+    async with publishing(mosquitto, "nao"):
+        async with hearing(mosquitto, None) as skin:
+            assert skin.robot == "nao"
+        async with publishing(mosquitto, "icub"):
+            with pytest.raises(RequestError, match="icub, nao"):
+                async with hearing(mosquitto, None):
+                    pass
+
+
+async def test_nonsense_on_a_topic_is_counted_and_passed_over(mosquitto: Mosquitto) -> None:
+    async with publishing(mosquitto) as publisher, hearing(mosquitto) as skin:
+        touches = skin.touches()
+        await skin.ready()
+        async with aiomqtt.Client(mosquitto.host, mosquitto.port) as stranger:
+            for topic in ("palm/touch", "nodes/main/info", "nodes/x/replies/y"):
+                await stranger.publish(f"skin/robot/{topic}", b"\xff{", qos=1)
+        publisher.put_touch(touch(1, part="arm"))
+        assert (await take(touches, 1))[0].part == "arm"
+        assert skin.unreadable == 2  # the third was for somebody else
+
+
+async def test_without_a_broker_the_error_says_so() -> None:
+    with pytest.raises(BrokerError, match="no broker listens there"):
+        async with SkinClient(f"mqtt://127.0.0.1:{free_port()}", robot="r", patience_s=0.3):
+            pass
+
+
+@pytest.mark.parametrize(
+    "url", ["http://x", "localhost", "mqtt://", "mqtt://x:y", "mqtt://u:secret@"]
+)
+def test_a_wrong_url_is_refused_and_its_password_not_repeated(url: str) -> None:
+    with pytest.raises(RequestError) as raised:
+        SkinClient(url)
+    assert "secret" not in str(raised.value)
+
+
+async def test_callbacks_hear_the_same_from_a_thread_of_their_own(mosquitto: Mosquitto) -> None:
+    heard: list[Any] = []
+
+    def fail_once(contact: Contact) -> None:
+        heard.append(contact)
+        raise ZeroDivisionError
+
+    def use(sent: threading.Event, ready: threading.Event) -> dict[str, Any]:
+        with SkinCallbacks(f"mqtt://{mosquitto.host}:{mosquitto.port}", robot="robot") as skin:
+            skin.on_touch(heard.append, part="palm")
+            skin.on_frame(heard.append)
+            skin.on_contact(fail_once)
+            result = skin.command("calibrate", seconds=1)
+            ready.set()
+            assert sent.wait(PATIENCE_S)
+            return result
+
+    async with publishing(mosquitto) as publisher:
+        publisher.put_contact("palm", True)
+        sent, ready = threading.Event(), threading.Event()
+        user = asyncio.create_task(asyncio.to_thread(use, sent, ready))
+        await asyncio.to_thread(ready.wait, PATIENCE_S)
+        publisher.put_touch(touch(1))
+        publisher.put_frame(frame(1))
+        publisher.put_contact("palm", False)
+        await until(lambda: len(heard) == 4)
+        sent.set()
+        assert (await user) == {"arguments": {"seconds": 1}}
+    assert [item for item in heard if isinstance(item, Contact)] == [
+        Contact("palm", True),
+        Contact("palm", False),
+    ]
+
+
+def test_callbacks_raise_what_entering_raises() -> None:
+    with pytest.raises(BrokerError):
+        with SkinCallbacks(f"mqtt://127.0.0.1:{free_port()}", robot="r", patience_s=0.2):
+            pass

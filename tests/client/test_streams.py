@@ -1,0 +1,115 @@
+"""A stream says what it did not hear."""
+
+import numpy as np
+from msgspec.structs import replace
+
+from skin_host.client.streams import HELD, Contact, Stream
+from skin_host.publish.messages import Frame, Touch
+
+
+def touch(count: int, t_ns: int | None = None, part: str = "palm") -> Touch:
+    return Touch(
+        event="move",
+        id=1,
+        seq=count,
+        t_ns=count if t_ns is None else t_ns,
+        count=count,
+        part=part,
+        taxels=[1],
+        centroid_m=None,
+        normal=None,
+        area_mm2=1.0,
+        peak_kpa=1.0,
+        mean_kpa=1.0,
+        force_n=0.1,
+    )
+
+
+def frame(seq: int, t_ns: int | None = None) -> Frame:
+    mask = np.zeros(1, np.bool_)
+    return Frame("palm", seq, seq if t_ns is None else t_ns, np.zeros(1), mask, mask)
+
+
+async def heard(stream: Stream[Touch]) -> list[tuple[int, int]]:
+    stream.close()
+    return [(touch.count, touch.missed) async for touch in stream]
+
+
+async def test_a_gap_is_told_by_the_next_event() -> None:
+    stream: Stream[Touch] = Stream("touch", None)
+    for count in (5, 6, 9, 10):
+        stream.put(touch(count))
+    assert await heard(stream) == [(5, 0), (6, 0), (9, 2), (10, 0)]
+
+
+async def test_parts_are_counted_apart() -> None:
+    stream: Stream[Touch] = Stream("touch", None)
+    for item in (touch(5), touch(90, part="arm"), touch(6), touch(92, part="arm")):
+        stream.put(item)
+    assert await heard(stream) == [(5, 0), (90, 0), (6, 0), (92, 1)]
+
+
+async def test_an_event_that_comes_twice_is_heard_once() -> None:
+    stream: Stream[Touch] = Stream("touch", None)
+    for count in (1, 2, 3, 1, 2, 3, 4):
+        stream.put(touch(count))
+    assert await heard(stream) == [(1, 0), (2, 0), (3, 0), (4, 0)]
+
+
+async def test_a_node_that_starts_anew_counts_anew() -> None:
+    stream: Stream[Touch] = Stream("touch", None)
+    for item in (touch(40), touch(1, t_ns=1000), touch(2, t_ns=1001)):
+        stream.put(item)
+    assert await heard(stream) == [(40, 0), (1, 0), (2, 0)]
+
+
+async def test_a_node_that_starts_anew_with_an_earlier_clock_is_heard() -> None:
+    stream: Stream[Touch] = Stream("touch", None)
+    for item in (touch(4000), touch(1, t_ns=1), touch(2, t_ns=2)):
+        stream.put(item)
+    assert await heard(stream) == [(4000, 0), (1, 0), (2, 0)]
+
+
+async def test_what_a_slow_reader_loses_is_told() -> None:
+    stream: Stream[Touch] = Stream("touch", None)
+    held = HELD["touch"]
+    stream.put(touch(1))
+    assert (await anext(stream)).missed == 0
+    for count in range(2, held + 12):
+        stream.put(touch(count))
+    first = await anext(stream)
+    assert (first.count, first.missed) == (12, 10)
+
+
+async def test_sweeps_between_two_frames_are_told() -> None:
+    stream: Stream[Frame] = Stream("frame", None)
+    for seq in (7, 8, 12):
+        stream.put(frame(seq))
+    stream.close()
+    assert [(item.seq, item.missed) async for item in stream] == [(7, 0), (8, 0), (12, 3)]
+
+
+async def test_two_streams_of_one_event_do_not_disturb_each_other() -> None:
+    early: Stream[Touch] = Stream("touch", None)
+    late: Stream[Touch] = Stream("touch", None)
+    early.put(touch(1))
+    shared = touch(5)
+    early.put(shared)
+    late.put(shared)
+    assert await heard(early) == [(1, 0), (5, 3)]
+    assert await heard(late) == [(5, 0)]
+
+
+async def test_events_that_are_not_counted_are_all_heard() -> None:
+    stream: Stream[Touch] = Stream("touch", None)
+    uncounted = replace(touch(1), count=0)
+    stream.put(uncounted)
+    stream.put(uncounted)
+    assert await heard(stream) == [(0, 0), (0, 0)]
+
+
+async def test_states_pass_as_they_are() -> None:
+    stream: Stream[Contact] = Stream("contact", "palm")
+    stream.put(Contact("palm", True))
+    stream.close()
+    assert [contact async for contact in stream] == [Contact("palm", True)]

@@ -1,0 +1,98 @@
+"""What all tests share: which CAN bus they run on, and a real broker."""
+
+import itertools
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+import hypothesis
+import pytest
+
+from skin_host.settings import Bus
+from tests.support import programs
+from tests.support.broker import Mosquitto
+from tests.support.stack import stack, subscriber  # noqa: F401  (fixtures for all)
+from tests.support.vcan import Vcan
+
+_numbers = itertools.count()
+
+# A slow machine is no failure.
+hypothesis.settings.register_profile("project", deadline=None)
+hypothesis.settings.load_profile("project")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the options that choose between a quick and a real environment."""
+    group = parser.getgroup("skin-host")
+    group.addoption(
+        "--bus",
+        choices=["virtual", "vcan"],
+        default="virtual",
+        help="CAN bus of the stack tests: within the process, or the kernel's (root)",
+    )
+    group.addoption(
+        "--require-mosquitto",
+        action="store_true",
+        help="fail instead of skip where mosquitto is not installed",
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Declare the marker that `pytest_collection_modifyitems` sets."""
+    config.addinivalue_line("markers", "mosquitto: uses a real mosquitto (set by its fixture)")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that use a broker, so that `-m mosquitto` finds them."""
+    for item in items:
+        if "mosquitto" in getattr(item, "fixturenames", ()):
+            item.add_marker("mosquitto")
+
+
+@pytest.fixture
+def bus_kind(request: pytest.FixtureRequest) -> str:
+    """The kind of CAN bus: `virtual` (one process) or `vcan` (any number of processes)."""
+    return str(request.config.getoption("--bus"))
+
+
+@pytest.fixture
+def vcan() -> Iterator[Vcan]:
+    """A fresh vcan interface of the kernel, up."""
+    with closing(Vcan()) as interface:
+        yield interface
+
+
+@pytest.fixture
+def new_can_bus(bus_kind: str) -> Iterator[Callable[[], Bus]]:
+    """Make settings of one more fresh and empty CAN bus of the chosen kind."""
+    with ExitStack() as interfaces:
+
+        def new() -> Bus:
+            if bus_kind == "virtual":
+                return Bus(interface="virtual", channel=f"test-{next(_numbers)}")
+            interface = interfaces.enter_context(closing(Vcan()))
+            return Bus(interface="socketcan", channel=interface.name)
+
+        yield new
+
+
+@pytest.fixture
+def can_bus_settings(new_can_bus: Callable[[], Bus]) -> Bus:
+    """Settings of a fresh and empty CAN bus of the chosen kind."""
+    return new_can_bus()
+
+
+@pytest.fixture
+def mosquitto(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Mosquitto]:
+    """A real broker that runs already."""
+    if request.config.getoption("--require-mosquitto"):
+        program = programs.require("mosquitto")
+    else:
+        found = programs.find("mosquitto")
+        if found is None:
+            pytest.skip("mosquitto is not installed")
+        program = found
+    broker = Mosquitto(program, tmp_path)
+    broker.start()
+    yield broker
+    broker.kill()

@@ -1,0 +1,280 @@
+"""Every fault by name, on a robot of the demo configuration, seen in the frames it sends."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from emulator.faults import KINDS, parse
+from emulator.robot import Robot
+from emulator.scene import Fault, Scene
+from skin_host import settings as configurations
+from skin_host.bus.commands import Discover, command_frame
+from skin_host.bus.protocol import FrameBatch
+from skin_host.errors import ConfigurationError
+from skin_host.layout import build_layout
+
+CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
+
+
+def make(scene: Scene | None = None, fidelity: str = "signal") -> Robot:
+    settings = configurations.load(CONFIG)
+    robot = Robot(
+        settings,
+        build_layout(settings, CONFIG.parent),
+        scene or Scene(noise=False),
+        fidelity=fidelity,
+    )
+    robot.bring_up()
+    robot.step(0.21)
+    return robot
+
+
+@pytest.fixture(params=["signal", "chip"])
+def robot(request: pytest.FixtureRequest) -> Robot:
+    return make(fidelity=request.param)
+
+
+def triangle(batch: FrameBatch, board: int, number: int) -> tuple[list[int], int]:
+    """Values and status word of the last two frames of a triangle."""
+    own = batch.data[batch.id == (0x400 | board << 4 | number)]
+    a, b = own[own[:, 0] == 0x40][-1], own[own[:, 0] == 0xC0][-1]
+    return [*a[1:].tolist(), *b[1:6].tolist()], int(b[6]) << 8 | int(b[7])
+
+
+def frames(robot: Robot, seconds: float = 0.3) -> FrameBatch:
+    return robot.step(seconds)["can0"]
+
+
+UNTOUCHED = ([240] * 12, 0)
+
+
+def test_a_chip_that_is_gone_reads_all_ones_and_comes_back(robot: Robot) -> None:
+    robot.inject(Fault(name="chip_gone", board="hand", triangle=2))
+    assert triangle(frames(robot), 14, 2) == ([0] * 12, 0xFFF2)
+    assert triangle(frames(robot), 14, 3) == UNTOUCHED
+    robot.inject(Fault(name="chip_back", board="hand", triangle=2))
+    assert triangle(frames(robot), 14, 2) == UNTOUCHED
+
+
+def test_a_chip_that_reads_zero_makes_the_board_take_a_new_baseline(robot: Robot) -> None:
+    robot.inject(Fault(name="chip_gone", board="hand", triangle=2, value=0))
+    first = frames(robot, 0.1)
+    assert triangle(first, 14, 2) == ([255] * 12, 0xFFF1)
+    assert triangle(frames(robot, 0.5), 14, 2) == UNTOUCHED
+
+
+def test_a_shorted_finger_takes_its_whole_line_with_it(robot: Robot) -> None:
+    robot.inject(Fault(name="shorted_finger", board="hand", triangle=1))
+    sent = frames(robot, 0.06)
+    for number in range(4):
+        assert triangle(sent, 14, number) == ([255] * 12, 0xFFF1)
+    assert triangle(sent, 14, 4) == UNTOUCHED
+
+
+def test_a_chip_at_a_wrong_address_leaves_its_own_place_empty(robot: Robot) -> None:
+    robot.inject(Fault(name="wrong_address", board="hand", triangle=0, value=3))
+    sent = frames(robot)
+    assert triangle(sent, 14, 0)[1] & 0xF == 2
+    values, status = triangle(sent, 14, 3)
+    assert values != UNTOUCHED[0]
+    assert status & 0xF == 0
+
+
+def test_swapped_lines_exchange_their_triangles(robot: Robot) -> None:
+    before = [robot.boards["forearm_outer"].chips.read()[slot].tolist() for slot in (0, 4)]
+    mend = robot.inject(Fault(name="swapped_lines", board="forearm_outer", triangle=0, value=1))
+    after = [robot.boards["forearm_outer"].chips.read()[slot].tolist() for slot in (4, 0)]
+    assert after == before
+    assert triangle(frames(robot), 13, 0) != UNTOUCHED
+    mend()
+    assert triangle(frames(robot), 13, 0) == UNTOUCHED
+
+
+def test_a_stuck_taxel_stays_where_it_is_told(robot: Robot) -> None:
+    mend = robot.inject(Fault(name="stuck_taxel", board="hand", triangle=0, taxel=5, value=144.0))
+    values, _ = triangle(frames(robot), 14, 0)
+    assert values == [240] * 5 + [240 - 100] + [240] * 6
+    mend()
+    assert triangle(frames(robot), 14, 0) == UNTOUCHED
+
+
+@pytest.mark.parametrize("fidelity", ["signal", "chip"])
+def test_a_noisy_taxel_moves_more_than_its_neighbours(fidelity: str) -> None:
+    robot = make(Scene(), fidelity)
+    robot.inject(Fault(name="noisy_taxel", board="hand", triangle=9, taxel=5))
+    rows = np.array([triangle(frames(robot, 0.05), 14, 9)[0] for _ in range(80)])
+    assert rows[:, 5].std() == pytest.approx(6.0, rel=0.4)
+    assert np.median(rows.std(axis=0)) < 1.5
+
+
+def test_a_reset_board_is_silent_until_it_is_started_again(robot: Robot) -> None:
+    robot.inject(Fault(name="board_reset", board="hand"))
+    assert 14 not in set(frames(robot).id >> 4 & 0xF)
+    robot.bring_up()
+    assert triangle(frames(robot), 14, 0) == UNTOUCHED
+
+
+def test_a_silent_board_neither_hears_nor_sends(robot: Robot) -> None:
+    mend = robot.inject(Fault(name="board_silent", board="hand"))
+    robot.receive("can0", *command_frame(Discover(), 15))
+    senders = set((frames(robot).id >> 4 & 0xF).tolist())
+    assert senders == {12, 13}
+    mend()
+    assert 14 in (frames(robot).id >> 4 & 0xF)
+
+
+def test_a_late_period_sends_fewer_bursts(robot: Robot) -> None:
+    robot.inject(Fault(name="late_period", board="hand", value=50))
+    sent = frames(robot, 2.0)
+    of_hand = (sent.id >> 4 & 0xF) == 14
+    assert np.count_nonzero(of_hand) / 18 == pytest.approx(20, abs=1)
+    assert np.count_nonzero(~of_hand) / 48 == pytest.approx(40, abs=1)
+
+
+def test_a_jittered_period_spreads_the_bursts_and_loses_none(robot: Robot) -> None:
+    robot.inject(Fault(name="jittered_period", board="hand", value=5))
+    sent = frames(robot, 2.0)
+    first = sent.t_ns[sent.id == 0x4E0][::2]
+    assert len(first) == pytest.approx(40, abs=1)
+    assert 1e6 < np.diff(first).std() < 15e6
+
+
+def test_lost_frames_are_missing_in_their_share(robot: Robot) -> None:
+    robot.inject(Fault(name="frame_loss", bus="can0", value=0.25))
+    expected = 20 * 2 * 33
+    assert len(frames(robot, 1.0)) == pytest.approx(0.75 * expected, rel=0.1)
+
+
+def test_bit_errors_change_one_bit_of_a_frame(robot: Robot) -> None:
+    whole = frames(robot, 1.0)
+    robot.inject(Fault(name="bit_errors", bus="can0", value=0.1))
+    spoilt = frames(robot, 1.0)
+    n = min(len(whole), len(spoilt))
+    assert (whole.id[:n] == spoilt.id[:n]).all()
+    flipped = np.unpackbits(whole.data[:n] ^ spoilt.data[:n], axis=1).sum(axis=1)
+    assert set(flipped.tolist()) == {0, 1}
+    assert np.count_nonzero(flipped) == pytest.approx(0.1 * n, rel=0.3)
+
+
+def test_nothing_passes_while_the_bus_is_off(robot: Robot) -> None:
+    mend = robot.inject(Fault(name="bus_off", bus="can0"))
+    robot.receive("can0", *command_frame(Discover(), 15))
+    assert len(frames(robot, 0.5)) == 0
+    assert robot.wires["can0"].lost > 0
+    mend()
+    assert len(frames(robot, 0.1)) > 0
+
+
+def test_a_babbling_node_delays_and_drops_what_the_boards_send(robot: Robot) -> None:
+    robot.inject(Fault(name="babbling_node", bus="can0", value=0.97))
+    sent = frames(robot, 1.0)
+    babble = sent.id == 0
+    assert np.count_nonzero(babble) > 7000
+    assert np.count_nonzero(~babble) < 20 * 2 * 33 / 2
+    assert robot.wires["can0"].lost > 0
+
+
+def test_a_temperature_step_moves_the_bytes_that_are_not_compensated(robot: Robot) -> None:
+    robot.inject(Fault(name="temperature_step", value=20.0))
+    sent = frames(robot)
+    palm, _ = triangle(sent, 14, 0)
+    forearm, _ = triangle(sent, 13, 0)
+    pressure = [0, 1, 2, 3, 4, 5, 7, 8, 9, 11]
+    assert max(palm) < 240
+    # 20 degrees are 200 codes or 50 units at the thermal pad; the firmware takes them out.
+    assert forearm[6] == pytest.approx(240 - 50, abs=1)
+    assert np.abs(np.array(forearm)[pressure] - 240).max() <= 6
+
+
+def test_faults_of_a_scene_begin_and_end_on_time() -> None:
+    scene = Scene(
+        noise=False, fault=[Fault(name="chip_gone", board="hand", triangle=0, at_s=2, until_s=3)]
+    )
+    robot = make(scene)
+    gone = []
+    while robot.t_ns < 4e9:
+        if triangle(frames(robot, 0.05), 14, 0) != UNTOUCHED:
+            gone.append(robot.t_ns * 1e-9)
+    # A burst is sampled every 50 ms and on the bus a few milliseconds later.
+    assert gone[0] == pytest.approx(2.0, abs=0.1)
+    assert gone[-1] == pytest.approx(3.0, abs=0.1)
+    assert len(gone) == pytest.approx(20, abs=1)
+
+
+def test_the_same_faults_give_the_same_bytes_at_both_fidelities() -> None:
+    scene = Scene(
+        fault=[
+            Fault(name="chip_gone", board="hand", triangle=0, at_s=1.5, until_s=2),
+            Fault(name="stuck_taxel", board="hand", triangle=1, taxel=3, at_s=1.2),
+            Fault(name="noisy_taxel", board="hand", triangle=2, taxel=3, at_s=1.2, until_s=1.7),
+            Fault(name="swapped_lines", board="forearm_inner", triangle=0, at_s=1.6, until_s=2.2),
+            Fault(name="frame_loss", bus="can0", value=0.05, at_s=1.3),
+            Fault(name="bit_errors", bus="can0", value=0.05, at_s=1.3),
+            Fault(name="jittered_period", board="forearm_outer", at_s=1.4),
+        ]
+    )
+    runs = [frames(make(scene, fidelity), 2.0) for fidelity in ("signal", "chip")]
+    assert (runs[0].id == runs[1].id).all()
+    assert (runs[0].data == runs[1].data).all()
+    assert (runs[0].t_ns == runs[1].t_ns).all()
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_every_fault_can_be_named_in_a_scene(name: str) -> None:
+    kind = KINDS[name]
+    targets = {"board": "hand", "triangle": 0, "taxel": 0, "bus": "can0"}
+    fault = Fault(name=name, **{key: targets[key] for key in kind.needs})
+    robot = make(Scene(noise=False, fault=[fault]))
+    robot.step(0.5)
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        (Fault(name="gremlins"), r'fault\[0\].name: no fault "gremlins"; there are: chip_gone, '),
+        (Fault(name="chip_gone", board="hand"), r"fault\[0\].triangle: missing"),
+        (
+            Fault(name="chip_gone", board="foot", triangle=0),
+            r'fault\[0\].board: no board "foot"; there are: hand',
+        ),
+        (
+            Fault(name="chip_gone", board="hand", triangle=6),
+            r'fault\[0\].triangle: 6 is not fitted on "hand"',
+        ),
+        (Fault(name="bus_off", bus="can7"), r'fault\[0\].bus: no bus "can7"; there are: can0'),
+        (Fault(name="bus_off", bus="can0", at_s=2, until_s=1), r"fault\[0\].until_s: wanted"),
+    ],
+)
+def test_a_fault_that_cannot_happen_is_refused(fault: Fault, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        make(Scene(fault=[fault]))
+
+
+def test_a_fault_can_be_given_as_a_line() -> None:
+    assert parse("chip_gone board=hand triangle=3 until_s=5") == Fault(
+        name="chip_gone", board="hand", triangle=3, until_s=5.0
+    )
+
+
+@pytest.mark.parametrize(
+    "text", ["", "chip_gone", "chip_gone board", "chip_gone bord=hand", "bus_off bus=a value=x"]
+)
+def test_a_line_that_is_no_fault_is_refused(text: str) -> None:
+    with pytest.raises(ConfigurationError):
+        parse(text)
+
+
+def test_a_fault_in_the_middle_of_a_run_can_be_mended_by_its_answer() -> None:
+    robot = make()
+    mend: Callable[[], None] = robot.inject(parse("chip_gone board=hand triangle=3"))
+    robot.step(0.1)
+    mend()
+    assert triangle(frames(robot), 14, 3) == UNTOUCHED
+
+
+def test_every_fault_is_explained_in_the_documentation() -> None:
+    page = (CONFIG.parents[1] / "docs" / "scenes.md").read_text()
+    for name in KINDS:
+        assert f"| `{name}` |" in page

@@ -1,0 +1,279 @@
+import asyncio
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+from smbus2 import i2c_msg
+
+from emulator import scene as scenes
+from emulator.robot import Robot
+from emulator.scene import Place, Probe, Scene
+from skin_host import settings as configurations
+from skin_host.bus.commands import Discover, Discovered, command_frame, parse_answer
+from skin_host.bus.protocol import FrameBatch, find_skin_frames
+from skin_host.errors import ConfigurationError, LogError
+from skin_host.layout import Layout, build_layout
+from skin_host.settings import Settings
+
+CONFIG = Path(__file__).parents[2] / "config"
+
+
+def load(name: str = "demo") -> tuple[Settings, Layout]:
+    path = CONFIG / f"{name}.toml"
+    settings = configurations.load(path)
+    return settings, build_layout(settings, path.parent)
+
+
+def press(part: str, taxel: int, kpa: float, diameter_mm: float = 6.0) -> Probe:
+    return Probe(
+        part=part,
+        at=Place(taxel=taxel),
+        diameter_mm=diameter_mm,
+        pressure_kpa=[(0.0, kpa), (1e6, kpa)],
+    )
+
+
+def values(batch: FrameBatch, layout: Layout) -> np.ndarray:
+    """The last byte of every taxel in a batch, int16[n]; -1 where none came."""
+    found = find_skin_frames(batch)
+    latest = np.full(layout.n_taxels, -1, np.int16)
+    of_address = {board.settings.address: board for board in layout.boards}
+    for row, address, triangle, half in zip(
+        found.row, found.board, found.triangle, found.half, strict=True
+    ):
+        first = of_address[address].taxel_index[triangle, 0]
+        if half == 0:
+            latest[first : first + 7] = batch.data[row, 1:8]
+        else:
+            latest[first + 7 : first + 12] = batch.data[row, 1:6]
+    return latest
+
+
+def bytes_of(robot: Robot, seconds: float, dt_s: float = 0.05) -> bytes:
+    sent = b""
+    for _ in range(round(seconds / dt_s)):
+        batch = robot.step(dt_s)["can0"]
+        columns = [batch.id[:, None].view(np.uint8), batch.data, batch.t_ns[:, None].view(np.uint8)]
+        sent += np.hstack(columns).tobytes()
+    return sent
+
+
+def test_boards_are_silent_until_a_host_starts_them() -> None:
+    robot = Robot(*load())
+    assert len(robot.step(1.0)["can0"]) == 0
+
+
+def test_every_fitted_triangle_is_sent_in_two_frames_a_period() -> None:
+    settings, layout = load()
+    robot = Robot(settings, layout)
+    robot.bring_up()
+    sent = robot.step(1.02)["can0"]
+    assert len(sent) == 20 * 2 * len(layout.triangles)
+    assert (values(sent, layout) >= 0).all()
+
+
+def test_an_untouched_skin_sends_its_no_load_value_within_the_noise() -> None:
+    settings, layout = load()
+    robot = Robot(settings, layout)
+    robot.bring_up()
+    sent = values(robot.step(0.2)["can0"], layout)
+    assert np.median(np.abs(sent - 240)) <= 1
+
+
+def test_a_press_lowers_the_bytes_of_the_taxels_under_it_and_no_others() -> None:
+    settings, layout = load()
+    start = layout.part("left_forearm").start
+    scene = Scene(noise=False, probe=[press("left_forearm", 27, 80.0)])
+    scene.probe[0].start_s = 1.5
+    robot = Robot(settings, layout, scene)
+    robot.bring_up()
+    robot.step(1.0)
+    sent = values(robot.step(0.2)["can0"], layout)
+    assert sent[start + 27] < 200
+    assert (np.delete(sent, start + 27) == 240).all()
+
+
+def test_the_truth_of_a_press_is_its_pressure_where_it_covers_the_pad() -> None:
+    robot = Robot(*load(), Scene(probe=[press("left_forearm", 27, 80.0)]))
+    robot.step(0.5)
+    truth = robot.true_pressure_kpa("left_forearm")
+    assert truth[27] == pytest.approx(80.0, rel=1e-2)
+    assert np.count_nonzero(truth) == 1
+
+
+def test_the_same_scene_and_seed_give_the_same_bytes() -> None:
+    scene = scenes.load(CONFIG / "scenes" / "demo.toml")
+    runs = []
+    for seed in (1, 1, 2):
+        robot = Robot(*load(), scene, seed=seed)
+        robot.bring_up()
+        runs.append(bytes_of(robot, 8.0))
+    assert runs[0] == runs[1]
+    assert runs[0] != runs[2]
+
+
+def test_signal_and_chip_fidelity_send_the_same_bytes() -> None:
+    scene = scenes.load(CONFIG / "scenes" / "demo.toml")
+    runs = []
+    for fidelity in ("signal", "chip", {"hand": "chip", "forearm_outer": "signal"}):
+        robot = Robot(*load(), scene, fidelity=fidelity)
+        robot.bring_up()
+        runs.append(bytes_of(robot, 9.0))
+    assert runs[0] == runs[1] == runs[2]
+
+
+def test_the_size_of_a_step_does_not_change_the_bytes() -> None:
+    runs = []
+    for dt_s in (0.002, 0.05, 0.25):
+        robot = Robot(*load(), scenes.load(CONFIG / "scenes" / "demo.toml"))
+        robot.bring_up()
+        runs.append(bytes_of(robot, 8.0, dt_s))
+    assert runs[0] == runs[1] == runs[2]
+
+
+def test_frames_of_one_bus_follow_each_other_as_the_bitrate_allows() -> None:
+    robot = Robot(*load())
+    robot.bring_up()
+    sent = robot.step(0.5)["can0"]
+    assert (np.diff(sent.t_ns) >= 111_000).all()
+    # Within a burst the lower address wins the bus.
+    first = sent.id[: 2 * 33] >> 4 & 0xF
+    assert (np.diff(first.astype(int)) >= 0).all()
+
+
+def test_a_place_that_is_not_there_is_named_with_its_key() -> None:
+    settings, layout = load()
+    for probe, message in (
+        (Probe(part="tail", depth_mm=[(0, 1)]), r"probe\[0\].part: no part \"tail\""),
+        (
+            Probe(part="left_hand", at=Place(triangle=9), depth_mm=[(0, 1)]),
+            r"probe\[0\].at.triangle: 9; part \"left_hand\" has triangles 0 to 8",
+        ),
+        (
+            Probe(part="left_hand", at=Place(taxel=108), depth_mm=[(0, 1)]),
+            r"probe\[0\].at.taxel: 108; part \"left_hand\" has taxels 0 to 107",
+        ),
+    ):
+        with pytest.raises(ConfigurationError, match=message):
+            Robot(settings, layout, Scene(probe=[probe]))
+
+
+def test_an_unknown_fidelity_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="there are: signal, chip"):
+        Robot(*load(), fidelity="perfect")
+
+
+async def test_a_robot_answers_and_streams_on_a_python_can_bus() -> None:
+    robot = Robot(*load())
+    robot.bring_up()
+    with (
+        can.Bus(interface="virtual", channel="test-robot") as inside,
+        can.Bus(interface="virtual", channel="test-robot") as outside,
+    ):
+        can_id, data = command_frame(Discover(), 15)
+        outside.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+        life = asyncio.create_task(robot.run({"can0": inside}))
+        answers, streamed = set(), 0
+        while len(answers) < 3 or streamed < 100:
+            message = outside.recv(0)
+            if message is None:
+                await asyncio.sleep(0.005)
+                continue
+            answer = parse_answer(message.arbitration_id, bytes(message.data))
+            if answer is not None and isinstance(answer[1], Discovered):
+                answers.add(answer[0])
+            streamed += message.arbitration_id >> 8 == 4
+        life.cancel()
+    assert answers == {12, 13, 14}
+
+
+def test_a_program_can_press_with_a_probe_of_its_own() -> None:
+    settings, layout = load()
+    robot = Robot(settings, layout, Scene(noise=False))
+    robot.bring_up()
+    start = layout.part("left_hand").start
+    probe = robot.touch(Probe(part="left_hand", at=Place(taxel=3), depth_mm=[(0, 1)]))
+    seen = []
+    for depth_mm in (0.0, 0.3, 0.6, 0.0):
+        probe.press(depth_mm)
+        seen.append(int(values(robot.step(0.12)["can0"], layout)[start + 3]))
+        assert (probe.force_n > 0) == (depth_mm > 0)
+    assert seen[0] == 240
+    assert seen[0] > seen[1] > seen[2]
+    assert seen[3] > seen[1]
+
+
+def test_a_program_can_slide_its_probe_to_another_taxel() -> None:
+    settings, layout = load()
+    robot = Robot(settings, layout, Scene(noise=False))
+    probe = robot.touch(
+        Probe(part="left_forearm", at=Place(taxel=3), diameter_mm=3, force_n=[(0, 1)])
+    )
+    for x_mm, taxel in ((0.0, 3), (6.43, 0)):
+        probe.press(0.5, x_mm)
+        robot.step(0.05)
+        assert np.flatnonzero(robot.true_pressure_kpa("left_forearm")).tolist() == [taxel]
+    probe.lift()
+    robot.step(0.05)
+    assert not robot.true_pressure_kpa("left_forearm").any()
+
+
+GRASP_LOG = CONFIG.parent / "../shared/data/icub_grasp.log"
+
+
+@pytest.mark.skipif(not GRASP_LOG.exists(), reason="the recording is not here")
+def test_a_board_can_send_what_was_recorded_from_a_real_one() -> None:
+    robot = Robot(*load("icub_hand"), recordings={"left_hand": GRASP_LOG})
+    assert len(robot.step(1.0)["can0"]) == 0
+    robot.bring_up()
+    sent = robot.step(1.02)["can0"]
+    recorded = [line.split()[2] for line in GRASP_LOG.read_text().splitlines()[:600]]
+    replayed = [
+        f"{can_id:03X}#{data.tobytes().hex().upper()}"
+        for can_id, data in zip(sent.id, sent.data, strict=True)
+    ]
+    assert len(replayed) == 20 * 10
+    assert any(replayed == recorded[at : at + 200] for at in range(0, 400, 10))
+
+
+def test_a_recording_without_the_board_is_refused(tmp_path: Path) -> None:
+    log = tmp_path / "some.log"
+    log.write_text("(1.0) can0 410#40F0F0F0F0F0F0F0\n")
+    with pytest.raises(LogError, match="no data frames of a board with address 14"):
+        Robot(*load("icub_hand"), recordings={"left_hand": log})
+    with pytest.raises(LogError, match="cannot be read"):
+        Robot(*load("icub_hand"), recordings={"left_hand": tmp_path / "none.log"})
+    with pytest.raises(ConfigurationError, match='recordings: no board "foot"'):
+        Robot(*load("icub_hand"), recordings={"foot": log})
+
+
+@pytest.mark.parametrize("model", ["mtb3", "mtb4", "mtb4c"])
+def test_all_models_of_boards_live_in_a_robot_at_both_fidelities(model: str) -> None:
+    runs = []
+    for fidelity in ("signal", "chip"):
+        settings, layout = load()
+        for board in settings.boards.values():
+            board.model = model  # type: ignore[assignment]
+        robot = Robot(
+            settings, layout, scenes.load(CONFIG / "scenes" / "demo.toml"), fidelity=fidelity
+        )
+        robot.bring_up()
+        robot.step(5.0)
+        sent = robot.step(2.0)["can0"]
+        assert len(sent) == pytest.approx(40 * 2 * len(layout.triangles), rel=0.03)
+        assert np.median(np.abs(values(sent, layout) - 240)) <= 1
+        runs.append(sent.data.tobytes() + sent.id.tobytes() + sent.t_ns.tobytes())
+    assert runs[0] == runs[1]
+
+
+def test_others_on_an_i2c_line_of_the_robot_find_its_chips_at_work() -> None:
+    robot = Robot(*load(), Scene(noise=False), fidelity={"hand": "chip"})
+    robot.step(0.1)
+    line = robot.converters.lines[0][0]
+    control = i2c_msg.write(0x2C, [0x00, 0x00, 0x00, 0xB0])
+    pointer, results = i2c_msg.write(0x2C, [0x00, 0x0B]), i2c_msg.read(0x2C, 24)
+    line.i2c_rdwr(control)
+    robot.step(0.1)
+    line.i2c_rdwr(pointer, results)
+    assert any(bytes(results))

@@ -1,0 +1,100 @@
+import numpy as np
+import pytest
+
+from skin_host.evaluation.slip_trials import DETECTORS, false_alarms_per_hour, slip_trials
+from skin_host.fingertip.slip import RatioDrop, ShearRate, friction_used
+
+
+def test_the_used_friction_is_the_ratio_over_its_limit():
+    used = friction_used([2.0, 2.0, 0.05], [[0.6, 0.8], [0.0, 0.0], [1.0, 0.0]], 0.5)
+    np.testing.assert_allclose(used, [1.0, 0.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def trials():
+    return slip_trials(np.random.default_rng(1), 100)
+
+
+@pytest.mark.parametrize("detector", ["shear rate", "ratio drop"])
+def test_every_slip_is_found_before_a_millimetre_of_motion(trials, detector):
+    row = DETECTORS.index(detector)
+    assert trials.slipped_mm[row].max() < 1.0
+    # It was found because it slipped, not by chance before.
+    assert (trials.slipped_mm[row] > 0.0).all()
+    assert trials.delay_s[row].min() >= 0.0
+
+
+def test_a_slip_that_hardly_lowers_the_friction_is_often_found_late():
+    # A limit of sensing by force alone, kept in view: known friction is the way out.
+    smooth = slip_trials(np.random.default_rng(6), 60, sliding_share=1.0).slipped_mm
+    assert (smooth[DETECTORS.index("ratio drop")] > 1.0).mean() > 0.5
+    assert (smooth[DETECTORS.index("shear rate")] > 1.0).any()
+    assert (smooth[DETECTORS.index("known friction")] == 0.0).all()
+
+
+def test_with_known_friction_the_danger_is_seen_before_anything_slips(trials):
+    row = DETECTORS.index("known friction")
+    assert (trials.slipped_mm[row] == 0.0).all()
+    assert trials.delay_s[row].max() < 0.0
+
+
+def test_quiet_holding_raises_no_alarm():
+    alarms = false_alarms_per_hour(np.random.default_rng(2), hours=0.5)
+    assert (alarms == 0.0).all()
+
+
+def test_more_noise_than_the_detectors_are_set_for_is_not_silent():
+    # The test above could not fail otherwise: the same holding in ten times the noise.
+    noisy = false_alarms_per_hour(np.random.default_rng(3), hours=0.02, noise_n=0.13)
+    assert noisy[DETECTORS.index("shear rate")] > 1.0
+
+
+def test_the_ratio_drop_is_blind_where_sliding_friction_is_no_lower():
+    detector = RatioDrop(1, force_sd_n=0.001)
+    for ratio in np.concatenate([np.linspace(0.0, 0.5, 100), np.full(50, 0.5)]):
+        assert not detector.step([5.0], [[5.0 * ratio, 0.0]]).any()
+
+
+def test_a_falling_ratio_is_a_slip_and_a_light_touch_says_nothing():
+    heavy, light = RatioDrop(1), RatioDrop(1)
+    said = []
+    for ratio in [0.5] * 10 + [0.4] * 4:
+        said.append(bool(heavy.step([5.0], [[5.0 * ratio, 0.0]])[0]))
+        assert not light.step([0.1], [[0.1 * ratio, 0.0]]).any()
+    assert said.index(True) in (10, 11)
+
+
+def test_a_steady_rise_of_shear_has_its_rate():
+    detector = ShearRate(2, 100.0)
+    for i in range(20):
+        rate = detector.step([[0.03 * i, 0.04 * i], [1.0, 1.0]])
+        if i < 5:
+            assert (rate == 0.0).all()
+    np.testing.assert_allclose(rate, [5.0, 0.0], atol=1e-9)
+
+
+def test_a_lost_reading_is_no_slip():
+    detector = ShearRate(1, 100.0)
+    for i in range(20):
+        rate = detector.step([[np.nan, np.nan]] if i == 10 else [[2.0, 0.0]])
+        assert rate[0] < 1e-9
+
+
+def test_the_line_has_the_noise_it_claims_and_less_than_a_difference():
+    rng = np.random.default_rng(4)
+    detector = ShearRate(2000, 300.0, window=6)
+    noise = 0.013
+    for _ in range(6):
+        rate = detector.step(noise * rng.normal(size=(2000, 2)))
+    claimed = noise * np.sqrt(12 / (6 * 35)) * 300.0
+    assert np.sqrt((rate**2).mean() / 2) == pytest.approx(claimed, rel=0.05)
+    assert claimed < 0.2 * noise * np.sqrt(2) * 300.0
+
+
+def test_the_threshold_for_a_wished_rate_of_false_alarms_holds():
+    rng = np.random.default_rng(5)
+    detector = ShearRate(20_000, 300.0)
+    threshold = detector.threshold(0.013, 3600.0 * 300.0 * 0.01, 300.0)  # one sample in 100
+    for _ in range(6):
+        rate = detector.step(0.013 * rng.normal(size=(20_000, 2)))
+    assert (rate > threshold).mean() == pytest.approx(0.01, rel=0.2)

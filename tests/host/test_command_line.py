@@ -1,0 +1,142 @@
+"""What a user sees who asks for the wrong thing: one clear line and the right status."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+DEMO = ROOT / "config/demo.toml"
+
+
+def skin(*arguments: str, **environment: str) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run(
+        [sys.executable, "-m", "skin_host", *arguments],
+        check=False,
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env=os.environ | environment,
+        timeout=60,
+    )
+
+
+def refused(result: "subprocess.CompletedProcess[str]", status: int, *wanted: str) -> None:
+    lines = result.stderr.strip().splitlines()
+    assert result.returncode == status, result.stderr
+    assert len(lines) == 1, result.stderr
+    assert "Traceback" not in result.stderr
+    for text in wanted:
+        assert text in lines[0]
+
+
+def changed(tmp_path: Path, old: str, new: str) -> str:
+    text = DEMO.read_text()
+    assert old in text
+    path = tmp_path / "changed.toml"
+    path.write_text(text.replace(old, new, 1))
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "path", "seen"),
+    [
+        ("address = 14", "address = 15", "boards.hand.address", "<= 14"),
+        ("address = 14", "adress = 14", "boards.hand", "adress"),
+        ("address = 14", 'address = "x"', "boards.hand.address", "str"),
+        ('triangles = "0-4"', 'triangles = "0-40"', "parts.left_hand.patches[0].triangles", "40"),
+        ('kind = "fingertip"', 'kind = "finger"', "parts.left_hand.patches[0].kind", "finger"),
+        ('bus = "can0"', 'bus = "can9"', "boards.hand.bus", "can9"),
+        ('robot = "demo"', "robot = demo", "TOML", "line"),
+    ],
+)
+def test_a_wrong_configuration_is_named_by_file_and_key(tmp_path, old, new, path, seen):
+    config = changed(tmp_path, old, new)
+    refused(skin("check", config), 2, config, path, seen)
+
+
+def test_every_configuration_of_the_project_is_right():
+    for config in sorted((ROOT / "config").glob("*.toml")):
+        result = skin("check", str(config))
+        assert result.returncode == 0, result.stderr
+
+
+def test_a_missing_interface_is_named_with_what_mends_it(tmp_path):
+    config = changed(tmp_path, 'interface = "virtual"', 'interface = "socketcan"')
+    result = skin("run", config, "--calibrate", XDG_STATE_HOME=str(tmp_path))
+    lines = result.stderr.strip().splitlines()
+    assert result.returncode == 1
+    assert "Traceback" not in result.stderr
+    assert "skin-demo" in lines[-1]
+    assert not list(tmp_path.rglob("*.json"))
+
+
+def test_an_unknown_interface_kind_is_refused(tmp_path):
+    config = changed(tmp_path, 'interface = "virtual"', 'interface = "pigeon"')
+    refused(skin("run", config, "--calibrate", XDG_STATE_HOME=str(tmp_path)), 1, "pigeon")
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("absent.log", None), ("empty.log", b""), ("noise.log", bytes(range(256))), ("x.asc", b"?")],
+)
+def test_an_unreadable_log_is_refused_and_leaves_no_output(tmp_path, name, content):
+    log = tmp_path / name
+    if content is not None:
+        log.write_bytes(content)
+    output = tmp_path / "out.jsonl"
+    result = skin("replay", str(log), "--config", str(DEMO), "--output", str(output))
+    refused(result, 2, str(log))
+    assert not output.exists()
+    assert {path.name for path in tmp_path.iterdir()} <= {name}
+
+
+def test_a_log_of_another_robot_is_refused(tmp_path):
+    log = tmp_path / "other.log"
+    log.write_text("(1700000000.000000) can0 410#40F0F0F0F0F0F0F0\n")
+    refused(skin("replay", str(log), "--config", str(DEMO)), 2, "no sweep of this skin")
+
+
+def test_a_calibration_of_another_configuration_is_refused(tmp_path):
+    calibration = tmp_path / "calibration.json"
+    log = tmp_path / "x.log"
+    log.write_text("(1700000000.000000) can0 4E0#40F0F0F0F0F0F0F0\n")
+    calibration.write_text("{}")
+    result = skin("replay", str(log), "--config", str(DEMO), "--calibration", str(calibration))
+    refused(result, 2, str(calibration), "skin calibrate")
+
+
+@pytest.mark.parametrize("arguments", [[], ["fly"], ["replay"], ["run"], ["emulate", "nope.toml"]])
+def test_a_wrong_command_is_one_line_and_status_2(arguments):
+    refused(skin(*arguments), 2)
+
+
+def test_every_command_has_help_with_an_example():
+    listing = skin("--help").stdout
+    commands = re.findall(r"^    ([a-z]+)", listing, flags=re.MULTILINE)
+    assert {"run", "calibrate", "check", "replay", "emulate", "demo", "scan"} <= set(commands)
+    for command in commands:
+        text = skin(command, "--help").stdout
+        assert f"Example: skin {command}" in text
+
+
+def test_a_reader_that_leaves_early_is_no_error():
+    check = f"{sys.executable} -m skin_host check {DEMO} | head -n 1"
+    result = subprocess.run(
+        check, shell=True, check=False, capture_output=True, text=True, cwd=ROOT
+    )
+    assert result.stderr == ""
+
+
+def test_a_kept_calibration_of_another_skin_stops_the_daemon_before_it_begins(tmp_path):
+    kept = tmp_path / "skin-host/demo-main.calibration.json"
+    kept.parent.mkdir()
+    content = '{"schema":"skin.calibration/1","id":"a","time":"b","robot":"other",'
+    content += '"configuration":"0","parts":{}}'
+    kept.write_text(content)
+    result = skin("run", str(DEMO), XDG_STATE_HOME=str(tmp_path))
+    refused(result, 2, str(kept), "skin calibrate")
+    assert kept.read_text() == content

@@ -1,0 +1,92 @@
+"""Boards that reset, come late, stop or lose their set-up are set up again, alone."""
+
+import asyncio
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from emulator.scene import Fault
+from skin_host.settings import Bus
+from tests.support.live import living
+
+LATELY = frozenset({"board_reset", "board_rezeroed", "board_lost_set_up", "board_jitter"})
+
+
+async def test_a_board_that_resets_is_set_up_again_and_the_others_notice_nothing(
+    can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    async with living(can_bus_settings, tmp_path) as live:
+        await live.until_well(but=LATELY)
+        known = live.daemon.engine.calibration
+        live.robot.inject(Fault(name="board_reset", board="hand"))
+        told = await live.until("board_reset", limit_s=5.0)
+        assert ("board_reset", "hand") in told
+        await live.until_well(but=LATELY)
+        records = live.daemon.link.boards["can0"].records
+        assert {address: record.configurations for address, record in records.items()} == {
+            14: 2,
+            13: 1,
+            12: 1,
+        }
+        assert live.daemon.engine.calibration is known
+        assert live.daemon.engine.rezeros[0] == live.daemon.engine.rezeros[1] + 1
+
+
+async def test_a_board_that_comes_back_is_found(can_bus_settings: Bus, tmp_path: Path) -> None:
+    async with living(can_bus_settings, tmp_path) as live:
+        await live.until_well(but=LATELY)
+        live.robot.inject(Fault(name="board_silent", board="hand"))
+        told = await live.until("board_silent", limit_s=5.0)
+        assert ("board_silent", "hand") in told
+        live.robot.hung.clear()
+        await live.until_well(limit_s=15.0, but=LATELY)
+
+
+async def test_what_was_touched_at_a_new_zero_is_in_doubt_until_calibrated(
+    can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    async with living(can_bus_settings, tmp_path) as live:
+        await live.until_well(but=LATELY)
+        engine = live.daemon.engine
+        # As the pipeline would say it of taxels 0 to 3, the little that matters here.
+        part = engine.layout.part("left_hand")
+        engine._touched[part.start : part.start + 4] = True
+        await live.daemon.configure([0])
+        await live.until("board_in_doubt", limit_s=10.0)
+        await asyncio.sleep(2.5)
+        record = live.daemon.records()["left_hand"]
+        assert record["invalid"] == [0, 1, 2, 3]
+        await live.daemon.calibrate(1.0, [0])
+        await live.until_well(but=LATELY)
+
+
+async def test_one_board_is_calibrated_and_the_others_keep_theirs(
+    can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    async with living(can_bus_settings, tmp_path) as live:
+        await live.until_well(but=LATELY)
+        engine = live.daemon.engine
+        before = engine.calibration
+        assert before is not None
+        await live.daemon.calibrate(1.0, [0])
+        after = engine.calibration
+        assert after is not None
+        hand = engine.taxels_of([0])
+        assert np.array_equal(after.baseline[~hand], before.baseline[~hand])
+        assert not np.array_equal(after.baseline[hand], before.baseline[hand])
+
+
+async def test_a_dead_bus_floods_no_log(
+    can_bus_settings: Bus, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with living(can_bus_settings, tmp_path) as live:
+        await live.until_well(but=LATELY)
+        await asyncio.sleep(0.3)
+        caplog.clear()
+        live.robot.inject(Fault(name="bus_off", bus="can0"))
+        await live.until("bus_silent", limit_s=5.0)
+        await asyncio.sleep(4.0)
+        assert live.faults() == {("bus_silent", "can0"), ("broker_away", "broker")}
+        lines = [record for record in caplog.records if record.levelname != "DEBUG"]
+        assert len(lines) <= 1, [record.getMessage() for record in lines]

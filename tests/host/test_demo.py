@@ -1,0 +1,32 @@
+"""The demo, as somebody runs it who has just cloned the project and has no mosquitto."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_the_demo_ends_by_itself_with_a_summary_of_touches(tmp_path):
+    script = "import sys, skin_host.publish.broker as broker; broker._MORE_PLACES = (); "
+    script += "from skin_host.cli import main; sys.exit(main())"
+    result = subprocess.run(
+        [sys.executable, "-c", script, "demo", "--duration", "9.5", "--page-port", "0"],
+        cwd=ROOT,
+        env=os.environ | {"PATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    assert "Traceback" not in result.stderr
+    summary = json.loads(result.stdout.splitlines()[-1])
+    assert summary["broker"] == "amqtt"
+    assert summary["sweeps"] > 100
+    assert summary["frames_published"] > 50
+    assert summary["frames_lost"] == 0
+    assert summary["touches_begun"] >= 1
+    assert summary["touches_ended"] == summary["touches_begun"]
+    assert summary["bus"] in {"virtual", "socketcan"}

@@ -1,0 +1,197 @@
+"""From a recording of CAN frames to parameters, and from those to better pressures."""
+
+import json
+
+import numpy as np
+import pytest
+
+from emulator.foam import Foam
+from skin_host.bus.protocol import encode_sweep
+from skin_host.cli import main
+from skin_host.errors import RequestError
+from skin_host.evaluation.histories import record
+from skin_host.fit_recording import plateaus
+from skin_host.layout import build_layout
+from skin_host.processing import calibration
+from skin_host.processing.pressure import PressureCurve
+from skin_host.settings import load, skin_hash
+
+HZ = 5.0
+TRIANGLES = np.array([0, 1])
+N = 12 * len(TRIANGLES)
+CURVE = PressureCurve(2.88)
+CONFIG = """
+robot = "bench"
+[buses.can0]
+[boards.palm]
+bus = "can0"
+address = 3
+period_ms = 200
+[parts.palm]
+foam_mm = 2.0
+patches = [{ board = "palm", triangles = "0-1", shift = 3 }]
+"""
+
+
+@pytest.fixture
+def bench(tmp_path):
+    config = tmp_path / "bench.toml"
+    config.write_text(CONFIG)
+    return config
+
+
+def write_log(path, units):
+    """A candump log of activations [t, n], with noise, a second of which lies between codes."""
+    rng = np.random.default_rng(3)
+    resting = rng.uniform(235.0, 241.0, N)
+    status = np.zeros(len(TRIANGLES), np.uint16)
+    with path.open("w") as file:
+        for sweep, activation in enumerate(units):
+            level = resting - activation + rng.normal(0.0, 0.4, N)
+            values = np.clip(np.rint(level), 0, 255).astype(np.uint8).reshape(-1, 12)
+            ids, data = encode_sweep(3, TRIANGLES, values, status)
+            for number, (can_id, payload) in enumerate(zip(ids, data, strict=True)):
+                time_s = 1.7e9 + sweep / HZ + 1e-4 * number
+                file.write(f"({time_s:.6f}) can0 {can_id:03X}#{payload.tobytes().hex().upper()}\n")
+
+
+@pytest.fixture
+def hold(tmp_path):
+    """A hold of four minutes on half a triangle, four minutes of rest, and the load cell."""
+    played = record("A", [(0.0, 10.0), (60.0, 240.0), (0.0, 240.0)], HZ)
+    units = np.zeros((len(played.momentary_kpa), N))
+    units[:, :6] = CURVE.units(played.momentary_kpa[:, np.newaxis])
+    log = tmp_path / "hold.log"
+    write_log(log, units)
+    load_cell = tmp_path / "load.csv"
+    time_s = np.arange(len(played.pressure_kpa)) / HZ
+    np.savetxt(load_cell, np.column_stack([time_s, played.pressure_kpa]), delimiter=",")
+    return log, load_cell
+
+
+def run(capsys, *arguments):
+    status = main([str(argument) for argument in arguments])
+    return status, capsys.readouterr()
+
+
+def test_a_hold_and_release_becomes_a_file_that_the_configuration_takes(bench, hold, capsys):
+    log, load_cell = hold
+    status, said = run(
+        capsys, "calibrate", bench, "--relaxation", log, "--load", load_cell, "--json"
+    )
+    assert status == 0
+    told = json.loads(said.out)
+    assert told["hold_s"] == pytest.approx(240.0, abs=2.0)
+    assert told["level_kpa"] == pytest.approx(57.0, abs=4.0)
+    by_model = {found["model"]: found for found in told["fits"]}
+    assert by_model["asymmetric_clock"]["rms_hold_kpa"] < 1.0
+    assert by_model["asymmetric_clock"]["rms_rest_kpa"] < 1.0
+    assert any("one level" in remark for remark in told["remarks"])
+
+    bench.write_text(CONFIG + '[processing.relaxation]\nfile = "bench.relaxation.json"\n')
+    relaxation = load(bench).processing.relaxation
+    assert relaxation.model == "asymmetric_clock"
+    assert 0.1 < sum(relaxation.beta) < 0.4
+
+
+def test_people_are_told_what_the_record_cannot_tell(bench, hold, capsys):
+    log, _ = hold
+    status, said = run(capsys, "calibrate", bench, "--relaxation", log, "--weight-kpa", 50)
+    assert status == 0
+    assert "> asymmetric_clock" in said.out
+    assert "not known from this record" in said.out
+    assert "bench.relaxation.json" in said.out
+
+
+def test_without_a_load_the_unloading_still_tells(bench, hold, capsys):
+    log, _ = hold
+    status, said = run(
+        capsys, "calibrate", bench, "--relaxation", log, "--model", "asymmetric", "--json"
+    )
+    assert status == 0
+    told = json.loads(said.out)
+    (found,) = [one for one in told["fits"] if one["model"] == "asymmetric"]
+    assert found["rms_hold_kpa"] is None
+    assert found["rms_rest_kpa"] < 1.0
+    assert any("unknown" in remark for remark in told["remarks"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--relaxation", "nothing.log"], "nothing.log"),
+        (["--relaxation", "{log}", "--load", "none.csv"], "none.csv"),
+        (["--relaxation", "{log}", "--load", "{log}"], "hold.log"),
+        (["--pressure", "{log}"], "--levels"),
+        (["--pressure", "{log}", "--levels", "10", "20", "30"], "plateaus"),
+    ],
+)
+def test_wrong_requests_are_one_line_and_write_nothing(bench, hold, capsys, arguments, message):
+    log, _ = hold
+    before = set(bench.parent.iterdir())
+    status, said = run(capsys, "calibrate", bench, *(text.format(log=log) for text in arguments))
+    assert status == 2
+    assert message in said.err
+    assert said.err.strip().count("\n") == 0
+    assert set(bench.parent.iterdir()) == before
+
+
+def test_a_recording_without_a_hold_is_refused(bench, tmp_path, capsys):
+    log = tmp_path / "quiet.log"
+    write_log(log, np.zeros((300, N)))
+    status, said = run(capsys, "calibrate", bench, "--relaxation", log)
+    assert status == 2
+    assert "no taxel was held" in said.err
+
+
+def test_a_relaxation_file_that_cannot_be_used_is_refused(bench, capsys):
+    bench.write_text(CONFIG + '[processing.relaxation]\nfile = "none.json"\n')
+    status, said = run(capsys, "check", bench)
+    assert status == 2
+    assert "processing.relaxation.file" in said.err
+    assert "skin calibrate CONFIG --relaxation LOG" in said.err
+
+
+def test_levels_of_air_pressure_become_gains_that_halve_the_error(bench, tmp_path, capsys):
+    levels = [10.0, 25.0, 50.0, 80.0, 110.0]
+    foam = Foam.drawn(N, np.random.default_rng(8))
+    rows = [np.zeros((100, N))]
+    for level in levels:
+        strain = foam.strain(np.full(N, level))
+        rows += [np.tile(100.0 * strain / (1.0 - strain) / 2.88, (40, 1)), np.zeros((40, N))]
+    log = tmp_path / "air.log"
+    write_log(log, np.concatenate(rows))
+    output = tmp_path / "palm.json"
+    status, said = run(
+        capsys,
+        *("calibrate", bench, "--pressure", log, "--output", output, "--json", "--levels"),
+        *levels,
+    )
+    assert status == 0
+    told = json.loads(said.out)
+    assert told["fitted"] == N
+    assert told["rms_after_kpa"] < 0.5 * told["rms_before_kpa"]
+    settings = load(bench)
+    layout = build_layout(settings, bench.parent)
+    found = calibration.load(output, layout, skin_hash(settings))
+    assert found.gain.std() > 0.01
+
+
+def test_plateaus_are_found_with_what_settles_left_out():
+    units = np.concatenate(
+        [np.zeros(50), np.full(60, 20.0), np.zeros(40), np.linspace(0, 40, 100), np.full(80, 40.0)]
+    )
+    first, second = plateaus(units, 0.05)
+    assert 50 < first.start < first.stop <= 110
+    assert 250 - 10 < second.start < second.stop <= 330
+    assert plateaus(np.zeros(100), 0.05) == []
+
+
+def test_a_hold_that_is_never_let_go_is_refused(bench, tmp_path, capsys):
+    units = np.zeros((400, N))
+    units[100:, :4] = 20.0
+    log = tmp_path / "held.log"
+    write_log(log, units)
+    status, said = run(capsys, "calibrate", bench, "--relaxation", log)
+    assert status == RequestError.exit_status
+    assert "release" in said.err

@@ -1,0 +1,122 @@
+"""Every fault of the emulator's catalogue is told within a second, by its right name."""
+
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emulator.faults import KINDS
+from tests.support.fault_bench import FaultBench
+
+HERE = {"board": "forearm_outer", "triangle": 3}
+#: A pad that the fault holds in the middle of a byte, so that the noise of the converter, which
+#: stays, hardly moves it: it is told after 1.4 s. Where the noise does move it, it is a quiet pad.
+HELD = 7
+#: What happens -> what must be told, and which taxels of the forearm must not be believed.
+FAULTS: list[tuple[str, dict[str, Any], str, range]] = [
+    ("chip_gone", HERE, "triangle_not_connected", range(36, 48)),
+    ("chip_gone", HERE | {"value": 0}, "triangle_no_ack", range(36, 48)),
+    ("chip_gone", HERE | {"value": 0x8000}, "triangle_frozen", range(36, 48)),
+    ("stuck_taxel", HERE | {"taxel": HELD}, "taxel_stuck", range(36 + HELD, 37 + HELD)),
+    ("noisy_taxel", HERE | {"taxel": 4}, "taxel_noisy", range(40, 41)),
+    ("shorted_finger", HERE, "line_shorted", range(48)),
+    ("wrong_address", HERE | {"value": 0}, "triangle_not_connected", range(36, 48)),
+    ("swapped_lines", HERE, "lines_swapped", range(96)),
+    ("board_reset", {"board": "forearm_outer"}, "board_silent", range(192)),
+    ("board_silent", {"board": "forearm_outer"}, "board_silent", range(192)),
+    ("late_period", {"board": "forearm_outer"}, "board_period", range(0)),
+    ("jittered_period", {"board": "forearm_inner"}, "board_jitter", range(0)),
+    ("frame_loss", {"bus": "can0"}, "bus_loses_frames", range(0)),
+    ("bit_errors", {"bus": "can0", "value": 0.01}, "bus_bit_errors", range(0)),
+    ("bus_off", {"bus": "can0"}, "bus_silent", range(288)),
+    ("babbling_node", {"bus": "can0"}, "bus_babbling", range(0)),
+    ("temperature_step", {}, "part_temperature", range(0)),
+]
+
+
+def test_the_list_has_every_fault_of_the_catalogue() -> None:
+    assert {name for name, *_ in FAULTS} | {"chip_back"} == set(KINDS)
+
+
+@pytest.fixture(scope="module")
+def calibrated() -> FaultBench:
+    return FaultBench()
+
+
+@pytest.fixture
+def bench(calibrated: FaultBench) -> FaultBench:
+    return copy.deepcopy(calibrated)
+
+
+def test_a_healthy_robot_is_accused_of_nothing(bench: FaultBench) -> None:
+    bench.run(20.0)
+    assert bench.first_told == {}
+    assert bench.records["left_forearm"]["state"] == "ok"
+    assert bench.records["left_forearm"]["sentences"] == []
+
+
+@pytest.mark.parametrize(("name", "arguments", "code", "doubted"), FAULTS)
+def test_a_fault_is_named_within_a_second(
+    bench: FaultBench, name: str, arguments: dict[str, Any], code: str, doubted: range
+) -> None:
+    bench.inject(name, **arguments)
+    bench.run(1.6 if name == "stuck_taxel" else 1.0)
+    told = {told for told, _ in bench.first_told}
+    assert code in told
+    assert not bench.valid["left_forearm"][list(doubted)].any()
+    assert not bench.touched["left_forearm"][list(doubted)].any()
+
+
+def test_a_chip_that_comes_back_is_believed_again(bench: FaultBench) -> None:
+    bench.inject("chip_gone", **HERE)
+    bench.run(1.0)
+    bench.inject("chip_back", **HERE)
+    bench.run(1.0)
+    assert bench.told == {}
+    pressure = [taxel for taxel in range(36, 48) if taxel not in (42, 46)]
+    assert bench.valid["left_forearm"][pressure].all()
+
+
+def test_a_chip_that_died_and_was_zeroed_away_is_never_believed_again(bench: FaultBench) -> None:
+    """The board sends its constant without an error, as if the triangle were untouched."""
+    bench.inject("chip_gone", **HERE, value=0)
+    bench.run(10.0)
+    assert bench.status("forearm_outer")[3] == 0
+    assert not bench.valid["left_forearm"][36:48].any()
+    assert ("triangle_silenced", "forearm_outer/3") in bench.told
+    others = np.delete(bench.valid["left_forearm"][:192], range(36, 48))
+    assert np.count_nonzero(others) >= 145
+
+
+def test_a_chip_that_was_dead_before_the_calibration_is_not_calibrated_as_untouched(
+    bench: FaultBench,
+) -> None:
+    bench.inject("chip_gone", **HERE, value=0)
+    bench.run(5.0)
+    bench.calibrate(5.0)
+    bench.run(2.0)
+    assert not bench.valid["left_forearm"][36:48].any()
+    told = {code for code, _ in bench.told}
+    assert told & {"triangle_silenced", "triangle_constant", "triangle_frozen"}
+
+
+def test_the_new_zero_of_a_board_is_found_by_itself() -> None:
+    """The zero is one noisy snapshot; without finding it anew some taxels would be touched."""
+    bench = FaultBench()  # a copy's arrays would no longer be views of one
+    bench.inject("chip_gone", **HERE, value=0)
+    bench.run(6.0)
+    assert ("board_rezeroed", "forearm_outer") in bench.told
+    touched = np.zeros(288)
+    for _ in range(40):
+        bench.run(0.05)
+        touched += bench.touched["left_forearm"]
+    assert touched.max() <= 4
+
+
+def test_one_reset_board_leaves_the_others_alone(bench: FaultBench) -> None:
+    bench.inject("board_reset", board="hand")
+    bench.run(2.0)
+    assert bench.valid["left_forearm"].sum() == 240
+    assert not bench.valid["left_hand"].any()
+    assert {where for _, where in bench.told} == {"hand"}

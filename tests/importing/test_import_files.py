@@ -1,0 +1,373 @@
+"""`skin import`: the files of the iCub's world become configurations that can be used."""
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emulator.robot import Robot
+from emulator.scene import Scene
+from skin_host import check
+from skin_host.errors import ConfigurationError
+from skin_host.geometry import lay
+from skin_host.importing.report import Findings
+from skin_host.importing.run import import_files
+from skin_host.importing.writing import configuration_text
+from skin_host.layout import Layout, build_layout, builtin_kinds
+from skin_host.settings import Place, Settings, load, parse_triangles
+
+ROOT = Path(__file__).parents[2]
+DATA = ROOT.parent / "shared" / "data"
+SPEC = DATA / "icub_genova11_left_arm_skinSpec.xml"
+GUI = DATA / "icub_left_forearm_V2_gui.ini"
+POSITIONS = DATA / "icub_left_forearm_V2_positions.txt"
+needs_samples = pytest.mark.skipif(not SPEC.exists(), reason=f"{DATA} is not here")
+
+
+def built(path: Path) -> tuple[Settings, Layout]:
+    settings = load(path)
+    return settings, build_layout(settings, path.parent)
+
+
+@pytest.fixture
+def arm(tmp_path: Path) -> Path:
+    """A small arm: a hand board of one fingertip and a palm, a forearm of two boards."""
+    path = tmp_path / "arm.toml"
+    path.write_text(
+        'robot = "test"\n[buses.arm]\n'
+        + "".join(f'[boards.b{i}]\nbus = "arm"\naddress = {i}\n' for i in (14, 13, 12))
+        + '[[parts.arm.patches]]\nboard = "b14"\ntriangles = "0,8-11"\nshift = 0\n'
+        + '[[parts.arm.patches]]\nboard = "b13"\ntriangles = "0-2"\n'
+        + '[[parts.arm.patches]]\nboard = "b12"\ntriangles = "0-1,5"\n'
+    )
+    return path
+
+
+def run(
+    source: str, file: Path, config: Path | None = None, part: str | None = None
+) -> tuple[Settings, Layout, str]:
+    findings = Findings()
+    output = file.parent / "out.toml"
+    import_files(source, [file], output, findings, config=config, part=part)  # type: ignore[arg-type]
+    return *built(output), "\n".join(str(item) for item in findings.items)
+
+
+@needs_samples
+def test_the_samples_become_an_arm_with_placed_and_located_forearm(tmp_path: Path) -> None:
+    arm, placed, located = (tmp_path / f"{name}.toml" for name in ("arm", "placed", "located"))
+    findings = Findings()
+    import_files("skinspec", [SPEC], arm, findings)
+    import_files("skingui", [GUI], placed, findings, config=arm)
+    import_files("positions", [POSITIONS], located, findings, config=placed)
+    for path in (placed, located):
+        settings, layout = built(path)
+        assert {part.name: part.n_taxels for part in layout.parts} == {
+            "left_arm": 600,
+            "left_forearm": 288,
+        }
+        assert check.describe(settings, layout)["warnings"] == []
+    settings, layout = built(placed)
+    assert settings.parts["left_forearm"].patches[0].places[0] == Place(
+        x_mm=100, y_mm=-20, turn_deg=30, mirror=True
+    )
+    settings, layout = built(located)
+    robot = Robot(settings, layout, Scene())
+    robot.bring_up()
+    robot.step(0.1)
+    assert robot.true_pressure_kpa("left_forearm").shape == (288,)
+    forearm = layout.part("left_forearm")
+    # The file's first row, and triangle 10 of its first board, which was measured whole.
+    assert layout.position_m[forearm.start] == pytest.approx([-0.0308, -0.0669, 0.0235])
+    rows = np.array(
+        [line.split() for line in POSITIONS.read_text().splitlines()[4:] if line.strip()], float
+    )
+    measured = [pad for pad in range(12) if pad not in (6, 10)]
+    ours = layout.position_m[forearm.start + 120 :][:12]
+    assert ours[measured] == pytest.approx(rows[120:132, :3][measured])
+    assert "rms 0.2 mm from a flat triangle_10pad" in findings.table()
+
+
+@needs_samples
+@pytest.mark.parametrize(("source", "file"), [("skingui", GUI), ("positions", POSITIONS)])
+def test_each_sample_makes_a_configuration_by_itself(
+    tmp_path: Path, source: str, file: Path
+) -> None:
+    findings = Findings()
+    output = tmp_path / "alone.toml"
+    import_files(source, [file], output, findings)  # type: ignore[arg-type]
+    assert built(output)[1].n_taxels == 288
+    assert "default set-up" in findings.table()
+
+
+HAND = """\
+robotPart hand
+cardid 14
+width 640
+[SENSORS]
+# type id x y th gain mirror layout
+palmL 8 -25.0 0 0 4.0 0 0
+fingertip2L 0 -32 35 30 4.0 1 0
+"""
+
+
+def test_placed_triangles_move_to_the_part_that_the_display_names(
+    tmp_path: Path, arm: Path
+) -> None:
+    file = tmp_path / "hand.ini"
+    file.write_text(HAND)
+    settings, _, said = run("skingui", file, arm)
+    tip, palm = settings.parts["hand"].patches
+    assert (tip.board, tip.triangles, tip.kind, tip.shift) == ("b14", "0", "fingertip2l", 0)
+    assert tip.places == [Place(x_mm=-32, y_mm=35, turn_deg=30, mirror=True)]
+    assert (palm.triangles, palm.kind) == ("8-11", "palml")
+    assert [patch.board for patch in settings.parts["arm"].patches] == ["b13", "b12"]
+    assert f"{file}:3: width: of the display's window" in said
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("wobble 3 0 0 0 1 0 0", '"wobble" is no kind of unit known here; not read'),
+        ("triangle 3 0 0", 'seen "triangle 3 0 0", wanted a type and 4 to 7 numbers; not read'),
+        ("triangle 200 0 0 0 1", "id 200; wanted 0 to 127; not read"),
+        ("triangle 0 5 5 0 1", "id 0 is placed in line 7; not read"),
+        ("triangle 7 nan 0 0 1", "wanted a type and 4 to 7 numbers; not read"),
+        ("triangle 3 0 0 0 1", 'triangle 3 of board "b14" is not on'),
+    ],
+)
+def test_a_strange_line_of_a_display_is_named(
+    tmp_path: Path, arm: Path, line: str, said: str
+) -> None:
+    file = tmp_path / "hand.ini"
+    file.write_text(HAND + line + "\n")
+    settings, _, remarks = run("skingui", file, arm)
+    assert f"{file}:8: " in remarks
+    assert said in remarks
+    assert len(settings.parts["hand"].patches) == 2
+
+
+def test_a_display_that_names_its_boards_wrongly_is_read_by_the_triangles_that_are_on(
+    tmp_path: Path, arm: Path
+) -> None:
+    file = tmp_path / "forearm.ini"
+    file.write_text(
+        "robotPart forearm\ncardid 12 13\n[SENSORS]\n"
+        "triangle 1 0 0 0 1\ntriangle 2 30 0 0 1\ntriangle 21 60 0 0 1\n"
+    )
+    settings, _, said = run("skingui", file, arm)
+    assert [(patch.board, patch.triangles) for patch in settings.parts["forearm"].patches] == [
+        ("b13", "1-2"),
+        ("b12", "5"),
+    ]
+    assert "cardid [12, 13] are not the boards whose triangles are on" in said
+    assert 'triangles 0 of board "b13" are on but not placed' in said
+
+
+def rows_of(place: Place, kind: str = "triangle_10pad") -> np.ndarray:
+    position_mm, normal = lay(np.array(builtin_kinds()[kind].pads_mm), place)
+    return np.column_stack([position_mm * 1e-3, normal])
+
+
+def forearm_rows() -> np.ndarray:
+    """192 rows a board: three and three triangles with places."""
+    rows = np.zeros((384, 6))
+    for i, slot in enumerate((0, 1, 2, 16, 17, 21)):
+        rows[12 * slot : 12 * slot + 12] = rows_of(
+            Place(x_mm=30 * i, y_mm=5, z_mm=40, normal=(0, 1, 1), turn_deg=20 * i)
+        )
+    return rows
+
+
+def write_rows(path: Path, rows: np.ndarray, head: str = "") -> None:
+    body = "\n".join(" ".join(f"{value:.7f}" for value in row) for row in rows)
+    path.write_text(head + body + "\n")
+
+
+@pytest.fixture
+def forearm(tmp_path: Path, arm: Path) -> Path:
+    text = arm.read_text().replace(
+        '[[parts.arm.patches]]\nboard = "b13"', '[[parts.forearm.patches]]\nboard = "b13"'
+    )
+    text = text.replace(
+        '[[parts.arm.patches]]\nboard = "b12"', '[[parts.forearm.patches]]\nboard = "b12"'
+    )
+    path = tmp_path / "forearm.toml"
+    path.write_text(text.replace('"0-2"\n', '"0-2"\nkind = "triangle_10pad"\n'))
+    return path
+
+
+def test_positions_are_taken_as_they_stand(tmp_path: Path, forearm: Path) -> None:
+    rows = forearm_rows()
+    file = tmp_path / "forearm_V2.txt"
+    write_rows(file, rows)
+    _, layout, said = run("positions", file, forearm)
+    part = layout.part("forearm")
+    assert layout.position_m[part.start : part.start + 36] == pytest.approx(rows[:36, :3], abs=1e-5)
+    assert said == ""
+
+
+def test_taxels_that_copy_their_representative_are_fitted_to_the_measured_ones(
+    tmp_path: Path, forearm: Path
+) -> None:
+    rows = forearm_rows()
+    true = rows[:12, :3].copy()
+    rows[[4, 5, 7, 8]] = rows[3]
+    rows[[6, 10]] = 0
+    by = np.repeat(np.arange(384) // 12 * 12 + 3, 1)
+    by[[6, 10]] = -2
+    file = tmp_path / "forearm.txt"
+    entries = "  ".join(map(str, by))
+    write_rows(file, rows, f"name f\nspatial_sampling taxel\ntaxel2Repr ( {entries} )\n")
+    _, layout, said = run("positions", file, forearm)
+    assert layout.position_m[layout.part("forearm").start :][:12] == pytest.approx(true, abs=1e-4)
+    assert (
+        f'{file}:4: triangle 0 of board "b13": 4 taxels without a place, fitted to the other 6; '
+        "rms 0.0 mm from a flat triangle_10pad"
+    ) in said
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        ("1 2 3 4 5", 'seen "1 2 3 4 5", wanted x y z nx ny nz; taken as no place'),
+        ("1 2 3 4 5 x", "wanted x y z nx ny nz; taken as no place"),
+        ("nan 2 3 4 5 6", "wanted x y z nx ny nz; taken as no place"),
+    ],
+)
+def test_a_strange_row_is_named(tmp_path: Path, forearm: Path, edit: str, said: str) -> None:
+    file = tmp_path / "forearm.txt"
+    write_rows(file, forearm_rows())
+    lines = file.read_text().splitlines()
+    lines[1] = edit
+    file.write_text("\n".join(lines))
+    _, _, remarks = run("positions", file, forearm)
+    assert f"{file}:2: " in remarks
+    assert said in remarks
+
+
+def test_places_of_triangles_that_are_off_and_triangles_without_places_are_named(
+    tmp_path: Path, forearm: Path
+) -> None:
+    rows = forearm_rows()
+    rows[12 * 3 : 12 * 4] = rows_of(Place(x_mm=300))
+    rows[12 * 17 : 12 * 18] = 0
+    file = tmp_path / "forearm.txt"
+    write_rows(file, rows)
+    settings, _, said = run("positions", file, forearm)
+    assert f'{file}:37: places for triangle 3 of board "b13", which is not on; not used' in said
+    assert 'no places for triangles 1 of board "b12"' in said
+    last = [patch for patch in settings.parts["forearm"].patches if patch.board == "b12"]
+    assert [(patch.triangles, bool(patch.positions)) for patch in last] == [
+        ("1", False),
+        ("0,5", True),
+    ]
+
+
+def test_a_positions_file_of_no_known_part_asks_for_one(tmp_path: Path, forearm: Path) -> None:
+    file = tmp_path / "torso.txt"
+    write_rows(file, forearm_rows())
+    with pytest.raises(ConfigurationError, match=r"--part, there are: arm, forearm"):
+        run("positions", file, forearm)
+    _, layout, _ = run("positions", file, forearm, part="forearm")
+    assert layout.position_m[layout.part("forearm").start, 2] != 0
+
+
+MANAGER = """\
+inputPorts ( /icub/skin/a \\
+             /icub/skin/b )
+robot icubTest01
+period 50
+addThreshold 7
+compensationGain 0.2
+contactCompensationGain 0.05
+zeroUpRawData true
+wobble 3
+[SKIN_EVENTS]
+taxelPositionFiles ( positions/gone.txt
+    here.txt )
+"""
+
+
+def test_the_managers_thresholds_and_gains_are_taken(tmp_path: Path, arm: Path) -> None:
+    (tmp_path / "here.txt").write_text("")
+    file = tmp_path / "skinMan.ini"
+    file.write_text(MANAGER)
+    settings, _, said = run("skinmanager", file, arm)
+    assert settings.robot == "icubtest01"
+    assert settings.processing.touch.margin_units == 7
+    assert settings.processing.drift.rule == "proportional"
+    assert settings.processing.drift.gain_per_s == pytest.approx(0.08)
+    for remark in (
+        "1: inputPorts: of its ports",
+        "8: zeroUpRawData true: here values always fall with pressure",
+        '9: "wobble 3" is not understood; not read',
+        "11: positions/gone.txt: not there",
+        "11: here.txt: `skin import positions",
+        "12: the line before lacks its backslash",
+    ):
+        assert f"{file}:{remark}" in said
+
+
+def test_the_manager_alone_is_no_skin(tmp_path: Path) -> None:
+    file = tmp_path / "skinMan.ini"
+    file.write_text(MANAGER)
+    with pytest.raises(ConfigurationError, match="import skinspec first"):
+        run("skinmanager", file)
+
+
+def test_nothing_is_written_when_something_is_wrong(tmp_path: Path, arm: Path) -> None:
+    file = tmp_path / "hand.ini"
+    file.write_text("robotPart Hand!\ncardid 14\n[SENSORS]\nfingertip 0 0 0 0 1\n")
+    before = sorted(path.name for path in tmp_path.iterdir())
+    with pytest.raises(ConfigurationError, match="makes no configuration"):
+        run("skingui", file, arm)
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_positions_files_are_found_from_another_folder(tmp_path: Path, forearm: Path) -> None:
+    file = tmp_path / "forearm.txt"
+    write_rows(file, forearm_rows())
+    run("positions", file, forearm)
+    manager = tmp_path / "skinMan.ini"
+    manager.write_text("addThreshold 3\n")
+    elsewhere = tmp_path / "deep" / "er" / "robot.toml"
+    import_files("skinmanager", [manager], elsewhere, Findings(), config=tmp_path / "out.toml")
+    assert built(elsewhere)[1].position_m == pytest.approx(
+        built(tmp_path / "out.toml")[1].position_m
+    )
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "config").glob("*.toml")), ids=lambda p: p.stem)
+def test_settings_survive_writing(tmp_path: Path, path: Path) -> None:
+    settings = load(path)
+    (tmp_path / path.name).write_text(configuration_text(settings, "a comment\n\nof lines"))
+    assert msgspec.to_builtins(load(tmp_path / path.name)) == msgspec.to_builtins(settings)
+
+
+@given(
+    channel=st.text(st.characters(codec="utf-8"), max_size=20),
+    turn=st.floats(allow_nan=False, allow_infinity=False),
+    option=st.one_of(st.booleans(), st.integers(-(2**62), 2**62), st.text(max_size=9)),
+)
+def test_any_values_survive_writing(
+    tmp_path_factory: pytest.TempPathFactory, channel: str, turn: float, option: object
+) -> None:
+    settings = load(ROOT / "config" / "demo.toml")
+    settings.buses["can0"].channel = channel
+    settings.buses["can0"].options = {"odd key": option}  # type: ignore[dict-item]
+    settings.parts["left_hand"].patches[0].places[0].turn_deg = turn
+    settings.processing.relaxation.beta = [0.1, 0.2]
+    settings.processing.relaxation.tau_s = [1.0, 2e-7]
+    path = tmp_path_factory.mktemp("any") / "robot.toml"
+    path.write_text(configuration_text(settings), encoding="utf-8", newline="")
+    assert msgspec.to_builtins(load(path)) == msgspec.to_builtins(settings)
+
+
+def test_what_is_written_is_what_was_meant_to_be_read() -> None:
+    settings = load(ROOT / "config" / "nao.toml")
+    text = configuration_text(settings)
+    assert "period_ms" not in text  # the default
+    assert parse_triangles(settings.parts["left_upper_arm"].patches[0].triangles) == list(range(9))

@@ -1,0 +1,169 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skin_host.evaluation.rig import flat_skin
+from skin_host.processing.contacts import LOST_NS, ContactTracker
+from skin_host.processing.pipeline import PressureFrame
+
+SETTINGS, LAYOUT = flat_skin(1)
+N = LAYOUT.n_taxels
+SWEEP_NS = 20_000_000
+#: Triangles far apart from each other on the strip.
+HERE, THERE = set(range(12)), set(range(120, 132))
+
+
+class Skin:
+    """Frames of chosen taxels at one pressure, and what the tracker makes of them."""
+
+    def __init__(self):
+        self.tracker = ContactTracker(LAYOUT, 0, SETTINGS)
+        self.seq = 0
+
+    def show(self, *taxels, kpa=20.0, lost=()):
+        touched = np.zeros(N, bool)
+        touched[list(set().union(*taxels))] = True
+        valid = np.ones(N, bool)
+        valid[list(lost)] = False
+        touched &= valid
+        pressure = np.where(touched, kpa, 0.0).astype(np.float32)
+        frame = PressureFrame(
+            "skin",
+            self.seq,
+            self.seq * SWEEP_NS,
+            np.zeros(N, np.uint8),
+            pressure,
+            touched,
+            valid,
+            np.zeros(N, bool),
+        )
+        self.seq += 1
+        return self.tracker.step(frame)
+
+
+def kinds(events):
+    return [(event.event, event.id) for event in events]
+
+
+def test_a_contact_begins_and_ends_once():
+    skin = Skin()
+    assert kinds(skin.show(HERE)) == [("begin", 1)]
+    assert kinds(skin.show(HERE)) == []
+    assert kinds(skin.show()) == [("end", 1)]
+    assert kinds(skin.show()) == []
+
+
+def test_an_event_tells_place_area_pressure_and_force():
+    (event,) = Skin().show(HERE, kpa=50.0)
+    taxels = sorted(HERE)
+    area = LAYOUT.area_mm2[taxels].sum()
+    assert event.taxels == taxels
+    assert event.centroid_m == pytest.approx(LAYOUT.position_m[taxels].mean(axis=0).tolist())
+    assert event.normal == pytest.approx([0.0, 0.0, 1.0])
+    assert event.area_mm2 == pytest.approx(area)
+    assert (event.peak_kpa, event.mean_kpa) == (50.0, pytest.approx(50.0))
+    assert event.force_n == pytest.approx(50e3 * area * 1e-6)
+
+
+def test_two_places_are_two_contacts_with_names_of_their_own():
+    skin = Skin()
+    assert kinds(skin.show(HERE, THERE)) == [("begin", 1), ("begin", 2)]
+    assert kinds(skin.show(THERE)) == [("end", 1)]
+    assert kinds(skin.show(HERE, THERE)) == [("begin", 3)]
+
+
+def test_a_contact_that_grows_and_slides_keeps_its_name():
+    skin = Skin()
+    skin.show({0})
+    reached = {0}
+    for _ in range(30):
+        start, end = LAYOUT.neighbour_start[max(reached)], LAYOUT.neighbour_start[max(reached) + 1]
+        reached = set(LAYOUT.neighbour[start:end].tolist())
+        assert {event.id for event in skin.show(reached)} <= {1}
+
+
+def test_where_two_contacts_merge_the_larger_one_goes_on():
+    skin = Skin()
+    small, large = {0}, {4, 5, 6}
+    between = set(range(12)) - small - large
+    assert kinds(skin.show(small, large)) == [("begin", 1), ("begin", 2)]
+    assert kinds(skin.show(small, large, between)) == [("end", 1), ("move", 2)]
+
+
+def test_where_a_contact_parts_the_larger_piece_keeps_the_name():
+    skin = Skin()
+    small, large = {0}, {4, 5, 6}
+    skin.show(set(range(12)))
+    events = skin.show(small, large)
+    assert sorted((event.event, event.id, len(event.taxels)) for event in events) == [
+        ("begin", 2, 1),
+        ("move", 1, 3),
+    ]
+
+
+def test_a_change_of_pressure_moves_and_noise_does_not():
+    skin = Skin()
+    skin.show(HERE, kpa=20.0)
+    assert skin.show(HERE, kpa=20.5) == []
+    assert kinds(skin.show(HERE, kpa=30.0)) == [("move", 1)]
+
+
+def test_moves_come_no_faster_than_wanted():
+    skin = Skin()
+    skin.tracker = ContactTracker(
+        LAYOUT, 0, flat_skin(1, processing={"touch": {"move_hz": 10.0}})[0]
+    )
+    said = sum(len(skin.show(HERE, kpa=20.0 + 5.0 * number)) for number in range(50))
+    assert said == pytest.approx(50 * SWEEP_NS * 1e-9 * 10.0, abs=2)
+
+
+def test_a_lost_frame_is_not_the_end_of_a_touch():
+    skin = Skin()
+    skin.show(HERE)
+    for _ in range(5):
+        assert skin.show(HERE, lost=HERE) == []
+    assert skin.show(HERE) == []
+
+
+def test_a_touch_of_which_nothing_is_heard_for_long_ends():
+    skin = Skin()
+    skin.show(HERE)
+    sweeps = LOST_NS // SWEEP_NS + 2
+    events = [event for _ in range(sweeps) for event in skin.show(HERE, lost=HERE)]
+    assert kinds(events) == [("end", 1)]
+
+
+def test_where_nothing_is_left_to_feel_the_place_stays():
+    skin = Skin()
+    (begin,) = skin.show(HERE)
+    events = skin.show(HERE, kpa=0.3)
+    assert all(event.centroid_m == begin.centroid_m for event in events)
+
+
+def test_stopping_ends_every_contact():
+    skin = Skin()
+    skin.show(HERE, THERE)
+    assert kinds(skin.tracker.end_all(7, 7)) == [("end", 1), ("end", 2)]
+    assert skin.tracker.end_all(8, 8) == []
+
+
+@given(st.lists(st.sets(st.integers(0, 47), max_size=20), max_size=30))
+def test_every_touched_taxel_is_in_one_contact_and_every_begin_has_its_end(frames):
+    skin = Skin()
+    alive = {}
+    for touched in frames:
+        for event in skin.show(touched):
+            if event.event == "begin":
+                assert event.id not in alive
+            else:
+                assert event.id in alive
+            if event.event == "end":
+                del alive[event.id]
+            else:
+                alive[event.id] = event
+        groups = skin.tracker._groups(sorted(touched))
+        assert sorted(taxel for group in groups for taxel in group) == sorted(touched)
+        assert len(alive) == len(groups)
+    ended = {event.id for event in skin.tracker.end_all(0, 0)}
+    assert ended == set(alive)

@@ -1,0 +1,222 @@
+"""Where a contact is said to be, from an emulated press to the event."""
+
+from typing import Any, get_args
+
+import msgspec
+import numpy as np
+import pytest
+
+from emulator.foam import Drive, Foam, FoamLayer
+from emulator.pads import UNIT_FF, Disc, Pads
+from emulator.viscoelastic import FoamTruth
+from skin_host.errors import ConfigurationError
+from skin_host.layout import Layout, build_layout
+from skin_host.processing.contacts import ContactTracker, TouchEvent
+from skin_host.processing.localization import Method
+from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.pressure import PressureCurve
+from skin_host.settings import Settings, load
+
+UNITS = 57.0
+NOISE_UNITS = 0.4
+TOUCHED_UNITS = 3.0
+SIDE_MM = np.array([8.0, 0.0])
+CONFIGURATION = """
+robot = "r"
+buses.can0 = {{}}
+boards.b = {{ bus = "can0", address = 1 }}
+[parts.palm]
+{keys}
+patches = [{{ board = "b", triangles = "0-15" }}]
+"""
+
+
+@pytest.fixture
+def configured(tmp_path):
+    def make(keys: str = "") -> tuple[Settings, Layout]:
+        path = tmp_path / "robot.toml"
+        path.write_text(CONFIGURATION.format(keys=keys))
+        settings = load(path)
+        return settings, build_layout(settings, tmp_path)
+
+    return make
+
+
+class PressedPalm:
+    """Frames of the palm under the emulator's foam and pads, new foam for every press."""
+
+    def __init__(self, layout: Layout) -> None:
+        self.rng = np.random.default_rng(5)
+        self.layout = layout
+        self.centre_mm = 1e3 * layout.position_m[:, :2]
+        self.foam_mm = layout.parts[0].foam_mm
+        self.pads = Pads(self.centre_mm, layout.radius_mm, self.foam_mm)
+        self.curve = PressureCurve(layout.unit_ff / layout.sensitivity)
+        self.seq = 0
+
+    def inside(self) -> np.ndarray:
+        """A place in the middle of the palm, mm."""
+        middle = self.centre_mm.mean(axis=0)
+        return middle + self.rng.uniform(-6.0, 6.0, 2)
+
+    def press(
+        self,
+        *probes: tuple[np.ndarray, float],
+        diameter_mm: float = 10.0,
+        lost: list[int] | None = None,
+    ) -> PressureFrame:
+        """One frame; `probes` are places (mm) and shares of the strength."""
+        n = len(self.centre_mm)
+        truth = FoamTruth("S", n, rng=self.rng)
+        foam = FoamLayer(Foam.drawn(n, self.rng, self.foam_mm), truth)
+        footprint = self.pads.footprint([Disc(*place, diameter_mm) for place, _ in probes])
+        rise_ff = np.array([share * UNITS * UNIT_FF for _, share in probes])
+        c0_ff = float(self.pads.c0_ff[0])
+        depth = Drive.by_depth(self.foam_mm * rise_ff / (c0_ff + rise_ff))
+        foam.step(footprint, depth, 0.02)
+        felt = foam.step(footprint, depth, 0.5)
+        exact = self.pads.rise_ff(felt, footprint) / UNIT_FF
+        units = np.round(exact + NOISE_UNITS * self.rng.normal(size=n))
+        valid = np.ones(n, bool)
+        valid[lost or []] = False
+        kpa = np.where(valid, np.maximum(self.curve.kpa(units), 0.0), 0.0).astype(np.float32)
+        touched = valid & (units > TOUCHED_UNITS)
+        self.seq += 1
+        raw = np.clip(240 - units, 0, 255).astype(np.uint8)
+        t_ns = 50_000_000 * self.seq
+        return PressureFrame("palm", self.seq, t_ns, raw, kpa, touched, valid, ~valid)
+
+
+def off_mm(event: TouchEvent, place: np.ndarray) -> float:
+    assert event.centroid_m is not None
+    return float(np.linalg.norm(1e3 * np.array(event.centroid_m[:2]) - place))
+
+
+def first_events(settings: Settings, layout: Layout, frame: PressureFrame) -> list[TouchEvent]:
+    return ContactTracker(layout, 0, settings).step(frame)
+
+
+def test_a_template_is_nearer_to_a_10_mm_press_than_the_centroid(configured):
+    plain, layout = configured()
+    template, _ = configured('localization = "template"')
+    palm = PressedPalm(layout)
+    trackers = [ContactTracker(layout, 0, settings) for settings in (plain, template)]
+    found = []
+    for _ in range(60):
+        place = palm.inside()
+        frame = palm.press((place, 1.0))
+        events = [tracker.step(frame)[-1] for tracker in trackers]
+        for tracker in trackers:
+            tracker.end_all(frame.seq, frame.t_ns)
+        found.append([off_mm(event, place) for event in events])
+    centroid_mm, template_mm = np.sqrt((np.array(found) ** 2).mean(axis=0))
+    assert template_mm < 0.3
+    assert template_mm < 0.5 * centroid_mm
+
+
+@pytest.mark.parametrize("method", get_args(Method))
+def test_the_error_told_is_of_the_size_of_the_error_made(configured, method):
+    settings, layout = configured(f'localization = "{method}"')
+    palm = PressedPalm(layout)
+    made, told = [], []
+    for _ in range(60):
+        place = palm.inside()
+        event = first_events(settings, layout, palm.press((place, 1.0)))[0]
+        assert event.sigma_m is not None
+        made.append(off_mm(event, place))
+        told.append(1e3 * event.sigma_m)
+    ratio = np.sqrt(np.mean(np.square(made)) / np.mean(np.square(told)))
+    assert 0.4 < ratio < 2.5
+
+
+def test_one_size_of_probe_may_be_named(configured):
+    settings, layout = configured('localization = "template"\nprobe_mm = [10]')
+    palm = PressedPalm(layout)
+    place = palm.inside()
+    (event,) = first_events(settings, layout, palm.press((place, 1.0)))
+    assert off_mm(event, place) < 0.5
+
+
+def test_of_a_contact_wider_than_any_probe_the_template_says_no_more_than_the_centroid(configured):
+    settings, layout = configured('localization = "template"')
+    palm = PressedPalm(layout)
+    for _ in range(20):
+        place = palm.inside()
+        (event,) = first_events(settings, layout, palm.press((place, 1.0), diameter_mm=24.0))
+        assert off_mm(event, place) < 1.5
+        assert event.sigma_m is not None
+        assert event.sigma_m > 0.2e-3
+
+
+def test_a_contact_somewhat_wider_than_any_probe_is_told_with_less_certainty(configured):
+    settings, layout = configured('localization = "template"')
+    palm = PressedPalm(layout)
+    made, told = [], []
+    for _ in range(15):
+        place = palm.inside()
+        (event,) = first_events(settings, layout, palm.press((place, 1.0), diameter_mm=14.0))
+        made.append(off_mm(event, place))
+        told.append(1e3 * (event.sigma_m or 0.0))
+    assert np.sqrt(np.mean(np.square(made))) < 2.0 * np.sqrt(np.mean(np.square(told)))
+
+
+def test_two_presses_on_one_patch_are_told_apart_unless_the_plain_mean_is_asked_for(configured):
+    plain, layout = configured()
+    template, _ = configured('localization = "template"')
+    palm = PressedPalm(layout)
+    middle = palm.centre_mm.mean(axis=0)
+    places = [middle - SIDE_MM, middle + SIDE_MM]
+    frame = palm.press((places[0], 1.0), (places[1], 0.8))
+    assert len(first_events(plain, layout, frame)) == 1
+    first, second = first_events(template, layout, frame)
+    assert not set(first.taxels) & set(second.taxels)
+    assert off_mm(first, places[0]) < 1.0
+    assert off_mm(second, places[1]) < 1.0
+
+
+def test_a_contact_that_parts_keeps_its_name_on_the_stronger_side(configured):
+    settings, layout = configured('localization = "template"')
+    palm = PressedPalm(layout)
+    tracker = ContactTracker(layout, 0, settings)
+    middle = palm.centre_mm.mean(axis=0)
+    left, right = middle - SIDE_MM, middle + SIDE_MM
+    (begun,) = tracker.step(palm.press((left, 0.7)))
+    moved, other = tracker.step(palm.press((left, 1.0), (right, 0.8)))
+    assert (moved.event, moved.id) == ("move", begun.id)
+    assert other.event == "begin"
+    assert other.id != begun.id
+    assert off_mm(moved, left) < 1.0
+
+
+def test_a_lost_taxel_is_not_believed_to_be_untouched(configured):
+    settings, layout = configured('localization = "template"')
+    palm = PressedPalm(layout)
+    found = []
+    for _ in range(20):
+        place = palm.inside()
+        away = np.linalg.norm(palm.centre_mm - place, axis=1)
+        frame = palm.press((place, 1.0), lost=[int(np.argsort(away)[1])])
+        found.append(off_mm(first_events(settings, layout, frame)[0], place))
+    assert np.sqrt(np.mean(np.square(found))) < 0.6
+
+
+def test_an_end_tells_where_the_contact_was_and_how_surely(configured):
+    settings, layout = configured('localization = "template"')
+    palm = PressedPalm(layout)
+    tracker = ContactTracker(layout, 0, settings)
+    frame = palm.press((palm.inside(), 1.0))
+    (begun,) = tracker.step(frame)
+    (end,) = tracker.end_all(frame.seq, frame.t_ns)
+    assert (end.centroid_m, end.sigma_m) == (begun.centroid_m, begun.sigma_m)
+
+
+@pytest.mark.parametrize("keys", ['localization = "best"', "probe_mm = []", "probe_mm = [0]"])
+def test_a_wrong_choice_is_refused(configured, keys: Any):
+    with pytest.raises(ConfigurationError, match=r"parts\.palm"):
+        configured(keys)
+
+
+def test_the_plain_mean_is_the_default(configured):
+    part = configured()[0].parts["palm"]
+    assert part.localization == "centroid"
+    assert msgspec.to_builtins(part)["probe_mm"] == [6.0, 8.0, 10.0, 12.0]

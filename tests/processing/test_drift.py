@@ -1,0 +1,175 @@
+import numpy as np
+import pytest
+
+from skin_host.processing.drift import BaselineTracker, paper_step, proportional_step
+from skin_host.settings import Drift
+
+N = 24
+NOBODY = np.zeros(N, bool)
+TRIANGLE = np.repeat(np.arange(2, dtype=np.int32), 12)
+
+
+def tracker(rule="proportional", thermal=NOBODY, **settings):
+    return BaselineTracker(np.zeros(N), ~thermal, TRIANGLE, thermal, Drift(rule=rule, **settings))
+
+
+def follow(track, true_baseline, touched=NOBODY, press=0.0, noise=0.0, rng=None):
+    """One second: the tracker is shown what would be read above its baseline."""
+    units = true_baseline - track.baseline + np.where(touched, press, 0.0)
+    if rng is not None:
+        units = units + rng.normal(0.0, noise, N)
+    return track.step(units, touched, NOBODY, 1.0)
+
+
+def test_the_papers_rule_moves_by_a_fixed_step_outside_its_dead_band():
+    units = np.array([-3.0, -0.6, -0.5, -0.1, 0.0, 0.5, 0.6, 9.0])
+    change = paper_step(units, 0.04, 0.1, 0.5)
+    assert change == pytest.approx(np.array([-1, -1, 0, 0, 0, 0, 1, 1]) * 0.004)
+
+
+def test_the_papers_rule_has_no_bias():
+    rng = np.random.default_rng(1)
+    baseline = 0.0
+    for reading in rng.normal(0.0, 1.0, 20_000):
+        baseline += paper_step(np.array([reading - baseline]), 0.04, 0.1, 0.5)[0]
+    assert abs(baseline) < 0.3
+
+
+def test_the_proportional_rule_does_not_depend_on_the_length_of_its_steps():
+    once = proportional_step(np.array([0.2]), 1.0, 0.2, 0.1)[0]
+    left = 0.2
+    for _ in range(10):
+        left -= proportional_step(np.array([left]), 0.1, 0.2, 0.1)[0]
+    assert 0.2 - left == pytest.approx(once)
+
+
+@pytest.mark.parametrize("rule", ["paper", "proportional"])
+@pytest.mark.parametrize("rate", [0.01, 0.05, 0.09, -0.09])
+def test_a_drift_below_the_fastest_rate_is_followed(rule, rate):
+    track = tracker(rule)
+    true = 0.0
+    for _ in range(200):
+        true += rate
+        follow(track, true)
+    assert np.abs(true - track.baseline).max() < 0.9
+
+
+def test_no_rule_leaves_baselines_alone():
+    track = tracker("none")
+    for _ in range(20):
+        follow(track, 2.0)
+    assert not track.baseline.any()
+
+
+def test_a_touched_taxel_shares_the_drift_of_the_untouched():
+    track = tracker()
+    touched = np.arange(N) < 6
+    rng = np.random.default_rng(0)
+    true = 0.0
+    for _ in range(600):
+        true += 0.004
+        follow(track, true, touched, press=30.0, noise=0.1, rng=rng)
+    assert np.abs(true - track.baseline).max() < 0.4
+
+
+def test_a_steady_touch_is_not_absorbed_in_eight_hours():
+    track = tracker()
+    touched = np.arange(N) < 6
+    for _ in range(8 * 360):
+        units = np.where(touched, 8.0 - track.baseline, -track.baseline)
+        assert track.step(units, touched, NOBODY, 10.0) is None
+    assert np.abs(track.baseline).max() < 0.01
+    assert track.frozen[:6].all()
+    assert not track.frozen[6:].any()
+
+
+def test_what_is_left_of_a_contact_that_let_go_is_taken_for_drift():
+    track = tracker()
+    everything = ~NOBODY
+    for _ in range(600):
+        follow(track, 0.0, everything, press=35.0)
+    found = [follow(track, 0.0, everything, press=2.6) for _ in range(2)]
+    assert found[0] is None
+    assert sorted(found[1]) == list(range(N))
+    assert track.baseline == pytest.approx(np.full(N, 2.6))
+
+
+def test_what_is_left_after_a_short_contact_is_still_a_contact():
+    track = tracker()
+    everything = ~NOBODY
+    for press in [35.0] * 10 + [5.0] * 120:
+        assert follow(track, 0.0, everything, press=press) is None
+
+
+def test_taxels_that_bulge_while_others_are_held_are_not_followed():
+    track = tracker()
+    touched, bulged = np.arange(N) < 3, np.arange(N) >= 12
+    for _ in range(60):
+        units = np.where(touched, 20.0, np.where(bulged, -6.0, 0.0)) - track.baseline
+        track.step(units, touched, NOBODY, 1.0)
+    assert np.abs(track.baseline).max() < 0.7
+
+
+def test_a_sudden_fall_is_followed_slowly_and_in_the_end():
+    track = tracker()
+    fallen = np.arange(N) == 5
+    for second in range(2000):
+        track.step(np.where(fallen, -8.0, 0.0) - track.baseline, NOBODY, NOBODY, 1.0)
+        if second == 60:
+            assert track.baseline[5] > -0.5
+    assert track.baseline[5] == pytest.approx(-8.0, abs=0.1)
+
+
+def test_missing_taxels_share_what_the_others_have_in_common():
+    track = tracker()
+    missing = np.arange(N) < 4
+    true = 0.0
+    for _ in range(100):
+        true += 0.01
+        track.step(np.where(missing, 0.0, true - track.baseline), NOBODY, missing, 1.0)
+    assert track.baseline[:4] == pytest.approx(np.full(4, true), abs=0.1)
+
+
+def test_a_baseline_never_leaves_its_limits_and_says_when_it_reaches_them():
+    track = tracker(limit_units=3.0)
+    true = 0.0
+    for _ in range(100):
+        true += 0.05
+        follow(track, true)
+    assert track.baseline == pytest.approx(np.full(N, 3.0))
+    assert track.at_limit.all()
+
+
+def test_thermal_pads_tell_of_drift_when_everything_is_touched():
+    thermal = np.arange(N) % 12 >= 10
+    track = tracker(thermal=thermal)
+    share = np.random.default_rng(3).normal(0.6, 0.1, N)
+    warmth = 0.0
+
+    def second(rate, press):
+        nonlocal warmth
+        warmth += rate
+        drifted = share * warmth
+        units = np.where(thermal, warmth, drifted - track.baseline + press)
+        track.step(units, ~thermal & (press > 0.0), NOBODY, 1.0)
+        return (drifted - track.baseline)[~thermal]
+
+    for rate in (0.02, -0.02):
+        for _ in range(300):
+            second(rate, 0.0)
+    for _ in range(600):
+        error = second(0.01, 30.0)
+    assert np.mean(share[~thermal] * warmth) > 3.0
+    assert np.abs(error).max() < 0.8
+
+
+def test_thermal_pads_that_do_not_feel_the_drift_do_no_harm():
+    thermal = np.arange(N) % 12 >= 10
+    track = tracker(thermal=thermal)
+    rng = np.random.default_rng(4)
+    true = 0.0
+    for _ in range(600):
+        true += 0.01
+        units = np.where(thermal, rng.normal(0.0, 0.3, N), true - track.baseline)
+        track.step(units, NOBODY, NOBODY, 1.0)
+    assert np.abs(true - track.baseline[~thermal]).max() < 0.3

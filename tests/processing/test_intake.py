@@ -1,0 +1,93 @@
+"""Sweeps of boards become samples of parts, in order of time, and silence is told."""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from skin_host.bus.assembler import Sweep
+from skin_host.cli.common import load_skin
+from skin_host.engine import Engine
+from skin_host.processing.intake import PartSample
+
+MS = 1_000_000
+PERIOD = 50 * MS
+DEMO = Path(__file__).parents[2] / "config/demo.toml"
+OUTER, INNER = 1, 2
+
+
+@cache
+def skin():
+    return load_skin(DEMO)
+
+
+def intake():
+    """Of the forearm, both of whose boards have been heard of."""
+    configuration, layout = skin()
+    parts = Engine(configuration, layout, [1])._intake
+    parts.feed([sweep(OUTER, 1), sweep(INNER, 2), sweep(OUTER, 3)])
+    parts.flush()
+    return parts
+
+
+def sweep(board: int, t_ns: int, status: int = 0, fill: int = 240) -> Sweep:
+    triangles = 16 if board == OUTER else 8
+    raw = np.full((16, 12), fill, np.uint8)
+    words = np.full(16, status, np.uint16)
+    return Sweep(board, raw, words, (1 << triangles) - 1, t_ns, 0)
+
+
+def test_a_part_of_two_boards_waits_for_both():
+    parts = intake()
+    assert parts.feed([sweep(OUTER, PERIOD)]) == []
+    (sample,) = parts.feed([sweep(INNER, PERIOD + 3 * MS)])
+    assert sample.t_ns == PERIOD + 3 * MS
+    assert sample.present.all()
+    assert (sample.raw == 240).all()
+
+
+def test_a_dead_board_is_waited_for_no_longer_than_its_second_turn():
+    parts = intake()
+    assert parts.feed([sweep(OUTER, 2 * PERIOD)]) == []
+    (sample,) = parts.feed([sweep(OUTER, 3 * PERIOD)])
+    assert sample.present[: 16 * 12].all()
+    assert not sample.present[16 * 12 :].any()
+
+
+def test_what_the_board_doubts_is_not_present():
+    (sample,) = intake().feed([sweep(OUTER, PERIOD, status=2), sweep(INNER, PERIOD)])
+    assert not sample.present[: 16 * 12].any()
+    assert sample.present[16 * 12 :].all()
+
+
+def test_a_silent_part_says_so_at_once_and_then_once_a_second():
+    parts = intake()
+    parts.feed([sweep(OUTER, PERIOD), sweep(INNER, PERIOD)])
+    said: list[PartSample] = []
+    for t_ms in range(60, 2500, 20):
+        said += parts.expire(t_ms * MS)
+    assert len(said) == 3
+    assert not any(sample.present.any() for sample in said)
+    assert said[0].t_ns <= PERIOD + 4 * PERIOD
+
+
+@given(
+    lateness=st.lists(st.tuples(st.integers(0, 80), st.integers(0, 80)), min_size=3, max_size=12)
+)
+@settings(max_examples=40, deadline=None)
+def test_times_of_a_part_only_rise_however_late_its_boards_are(lateness):
+    arrivals = []
+    latest_ns = {OUTER: 0, INNER: 0}
+    for turn, (outer_ms, inner_ms) in enumerate(lateness, start=1):
+        for board, offset_ms, late_ms in ((OUTER, 0, outer_ms), (INNER, 15, inner_ms)):
+            t_ns = turn * PERIOD + offset_ms * MS
+            # A board's own sweeps come in order.
+            latest_ns[board] = max(latest_ns[board], t_ns + late_ms * MS)
+            arrivals.append((latest_ns[board], sweep(board, t_ns)))
+    parts = intake()
+    times = []
+    for now_ns, one in sorted(arrivals, key=lambda arrival: arrival[0]):
+        times += [sample.t_ns for sample in parts.feed([one]) + parts.expire(now_ns)]
+    assert all(np.diff(times) > 0)

@@ -1,0 +1,161 @@
+"""What repeats itself beyond chance is no sensor; what is merely quiet is one."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from skin_host.processing.liveness import CONVERSION_S, Liveness, change_rate
+
+K = 4
+HERE = np.ones(K, bool)
+NO = np.zeros(K, bool)
+PERIOD_S = 0.05
+
+
+def noisy_bytes(rng: np.random.Generator, sigma: float, centre: np.ndarray) -> np.ndarray:
+    return np.clip(np.rint(centre + sigma * rng.standard_normal((K, 12))), 0, 255).astype(np.uint8)
+
+
+def calibrated(rng: np.random.Generator, sigma: float, centre: np.ndarray) -> Liveness:
+    seen = np.array([noisy_bytes(rng, sigma, centre) for _ in range(100)])
+    return Liveness(K, seen.std(axis=0), PERIOD_S)
+
+
+@given(st.floats(0.05, 3.0), st.floats(0.0, 1.0))
+@settings(max_examples=50, deadline=None)
+def test_the_rate_of_changes_follows_from_the_noise(sigma: float, phase: float) -> None:
+    rng = np.random.default_rng(1)
+    values = np.rint(100 + phase + sigma * rng.standard_normal(4000))
+    seen = np.mean(np.diff(values) != 0)
+    assert change_rate(np.array([values.std()]))[0] == pytest.approx(seen, abs=0.12)
+
+
+@pytest.mark.parametrize("sigma", [0.08, 0.15, 0.3, 0.8, 2.0])
+def test_a_quiet_healthy_triangle_is_not_accused(sigma: float) -> None:
+    rng = np.random.default_rng(3)
+    centre = 240 + rng.uniform(-0.5, 0.5, (K, 12))
+    liveness = calibrated(rng, sigma, centre)
+    for _ in range(4000):
+        liveness.step(noisy_bytes(rng, sigma, centre), HERE, NO)
+        assert not liveness.frozen.any()
+        assert not liveness.stuck.any()
+        assert not liveness.noisy.any()
+
+
+def test_a_triangle_that_drifts_to_the_quiet_middle_of_its_bytes_is_not_accused() -> None:
+    rng = np.random.default_rng(3)
+    sigma = 0.15
+    liveness = calibrated(rng, sigma, np.full((K, 12), 240.5))
+    for centre in np.concatenate([np.linspace(240.5, 241.0, 6000), np.full(3000, 241.0)]):
+        liveness.step(noisy_bytes(rng, sigma, np.full((K, 12), centre)), HERE, NO)
+        assert not liveness.frozen.any()
+
+
+@pytest.mark.parametrize("value", [240, 17, 254])
+def test_a_triangle_that_stops_is_found_within_0_7_s(value: int) -> None:
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+    liveness = calibrated(rng, 0.8, centre)
+    for _ in range(40):
+        liveness.step(noisy_bytes(rng, 0.8, centre), HERE, NO)
+    for _ in range(round(0.7 / PERIOD_S)):
+        raw = noisy_bytes(rng, 0.8, centre)
+        raw[2] = value
+        doubted = liveness.step(raw, HERE, NO)
+    assert liveness.frozen.tolist() == [False, False, True, False]
+    assert doubted is not None
+    assert doubted.all(axis=1).tolist() == [False, False, True, False]
+
+
+def test_a_triangle_at_the_end_of_its_scale_is_pressed_not_dead() -> None:
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+    liveness = calibrated(rng, 0.8, centre)
+    for _ in range(600):
+        raw = noisy_bytes(rng, 0.8, centre)
+        raw[1] = 0
+        liveness.step(raw, HERE, NO)
+    assert not liveness.frozen.any()
+
+
+def test_a_board_that_sends_faster_than_its_chips_convert_repeats_itself_rightly() -> None:
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+    period_s = CONVERSION_S / 4
+    liveness = Liveness(K, np.full((K, 12), 0.8), period_s)
+    for _ in range(500):
+        raw = noisy_bytes(rng, 0.8, centre)
+        for _ in range(4):
+            liveness.step(raw, HERE, NO)
+            assert not liveness.frozen.any()
+            assert not liveness.stuck.any()
+
+
+def test_what_had_an_error_must_show_that_it_lives() -> None:
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+    liveness = calibrated(rng, 0.8, centre)
+    erring = np.array([True, False, False, False])
+    constant = np.full((K, 12), 240, np.uint8)
+    liveness.step(constant, ~erring, erring)
+    for _ in range(100):
+        raw = noisy_bytes(rng, 0.8, centre)
+        raw[0] = 240
+        liveness.step(raw, HERE, NO)
+        assert liveness.unproven[0]
+    for _ in range(6):
+        liveness.step(noisy_bytes(rng, 0.8, centre), HERE, NO)
+    assert not liveness.unproven.any()
+
+
+def test_a_single_pad_that_stops_is_stuck_and_its_triangle_is_not() -> None:
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+    liveness = calibrated(rng, 0.8, centre)
+    for _ in range(30):
+        raw = noisy_bytes(rng, 0.8, centre)
+        raw[1, 5] = 239
+        liveness.step(raw, HERE, NO)
+    assert np.argwhere(liveness.stuck).tolist() == [[1, 5]]
+    assert not liveness.frozen.any()
+
+
+def test_a_touch_is_no_noise_and_a_bad_solder_joint_is() -> None:
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+    liveness = calibrated(rng, 0.8, centre)
+    for k in range(200):
+        pressed = centre.copy()
+        pressed[0] -= 100 * (k // 8 % 2)  # tapped 1.25 times a second
+        raw = noisy_bytes(rng, 0.8, pressed)
+        raw[3, 0] = np.clip(240 + 8 * rng.standard_normal(), 0, 255)
+        liveness.step(raw, HERE, NO)
+        assert not liveness.noisy[:3].any()
+    assert np.argwhere(liveness.noisy).tolist() == [[3, 0]]
+
+
+def test_a_held_hand_is_given_more_time() -> None:
+    """The bytes of an iCub's fingertips repeat for 19 sweeps while its hand holds something."""
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+    liveness = calibrated(rng, 0.8, centre)
+    elsewhere = np.array([False, True, True, False])
+    raw = noisy_bytes(rng, 0.8, centre)
+    for _ in range(19):
+        moving = noisy_bytes(rng, 0.8, centre)
+        moving[0] = raw[0]
+        liveness.step(moving, HERE, NO, elsewhere)
+        assert not liveness.frozen.any()
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=30, deadline=None)
+def test_any_bytes_at_all_are_survived(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    liveness = Liveness(K, rng.choice([0.0, 0.3, 90.0], (K, 12)), PERIOD_S)
+    for _ in range(60):
+        raw = rng.integers(0, 256, (K, 12)).astype(np.uint8)
+        doubted = liveness.step(raw, rng.random(K) < 0.8, rng.random(K) < 0.1)
+        assert doubted is None or doubted.shape == (K, 12)
+    assert np.isfinite(liveness._rate).all()

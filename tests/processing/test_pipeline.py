@@ -1,0 +1,276 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from skin_host.evaluation.rig import Rig, flat_skin
+from skin_host.layout import PadKind
+from skin_host.processing.calibration import Calibrator, Verdict
+from skin_host.processing.pipeline import Pipeline
+from skin_host.processing.pressure import PressureCurve
+from skin_host.processing.relaxation import MODELS
+
+CURVE = PressureCurve(2.88)
+NO_RELAXATION = {"relaxation": {"model": "none"}}
+
+
+def press(rig, units, sweeps, where=slice(0, 6)):
+    activation = np.zeros(rig.n)
+    activation[where] = units
+    return [rig.step(activation) for _ in range(sweeps)]
+
+
+def test_a_press_is_told_with_its_pressure():
+    rig = Rig(1, 0.3, processing=NO_RELAXATION)
+    *_, frame = press(rig, 20.0, 10)
+    assert np.array_equal(np.flatnonzero(frame.touched), range(6))
+    assert frame.pressure_kpa[:6] == pytest.approx(np.full(6, CURVE.kpa(20.0)[0]), abs=3.5)
+    assert frame.pressure_kpa[6:].max() < 5.0
+    assert frame.valid.all()
+    assert not frame.beyond_range.any()
+
+
+def test_a_press_ends_with_two_sweeps_without_it():
+    rig = Rig(1, 0.3)
+    press(rig, 20.0, 50)
+    frames = press(rig, 0.0, 3)
+    assert [bool(frame.touched.any()) for frame in frames] == [True, False, False]
+
+
+def test_pressure_is_never_negative_and_frames_are_counted():
+    rig = Rig(1, 0.4)
+    frames = press(rig, -10.0, 30) + press(rig, 30.0, 30) + press(rig, 0.0, 30)
+    assert all(frame.pressure_kpa.min() >= 0.0 for frame in frames)
+    assert [frame.seq for frame in frames] == list(range(90))
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("update_s", [0.0, 1.0])
+def test_every_model_takes_relaxation_off_a_hold(model, update_s):
+    rig = Rig(1, 0.2, hz=10.0, processing={"relaxation": {"model": model, "update_s": update_s}})
+    frames = press(rig, 30.0, 600)
+    first, last = (float(frame.pressure_kpa[:6].mean()) for frame in (frames[3], frames[-1]))
+    if model == "none":
+        assert last == pytest.approx(first, abs=1.0)
+    else:
+        assert last < first - 3.0
+
+
+def test_states_once_a_second_say_nearly_what_states_at_every_sweep_say():
+    frames = {}
+    for update_s in (0.0, 1.0):
+        rig = Rig(1, 0.4, processing={"relaxation": {"update_s": update_s}})
+        frames[update_s] = [
+            frame.pressure_kpa[:6]
+            for units, sweeps in ((25.0, 300), (0.0, 200), (12.0, 300), (0.0, 200))
+            for frame in press(rig, units, sweeps)
+        ]
+    difference = np.array(frames[0.0]) - np.array(frames[1.0])
+    assert np.sqrt(np.mean(difference**2)) < 0.5
+    assert np.abs(difference).max() < 4.0
+
+
+def test_what_is_not_received_is_not_valid_and_its_history_is_kept():
+    rig = Rig(1, 0.2, processing=NO_RELAXATION)
+    press(rig, 20.0, 20)
+    lost = np.ones(rig.n, bool)
+    lost[:12] = False
+    raw = np.where(lost, rig.read(0.0), 0).astype(np.uint8)
+    for _ in range(3):
+        rig.t_ns += 40_000_000
+        frame = rig.pipeline.step(0, raw, lost, rig.t_ns)
+        assert not frame.valid[:12].any()
+        assert not frame.touched[:12].any()
+        assert not frame.pressure_kpa[:12].any()
+        assert frame.valid[12:].all()
+    (frame,) = press(rig, 20.0, 1)
+    assert frame.touched[:6].all()
+
+
+def test_zeros_for_lost_triangles_leave_no_trace():
+    steady, lossy = (Rig(1, 0.0, processing=NO_RELAXATION) for _ in range(2))
+    here = np.ones(steady.n, bool)
+    for sweep in range(300):
+        here[:] = True
+        if sweep % 7 == 3:
+            here[24:60] = False
+        raw = steady.read(3.0)
+        t_ns = sweep * 40_000_000
+        one = steady.pipeline.step(0, raw, np.ones(steady.n, bool), t_ns)
+        other = lossy.pipeline.step(0, np.where(here, raw, 0).astype(np.uint8), here, t_ns)
+    assert np.array_equal(one.touched, other.touched)
+    assert one.pressure_kpa == pytest.approx(other.pressure_kpa, abs=0.3)
+
+
+def test_a_saturated_taxel_says_that_it_is_beyond_its_range():
+    rig = Rig(1, 0.2, processing=NO_RELAXATION)
+    *_, frame = press(rig, 400.0, 5, where=slice(0, 1))
+    assert frame.beyond_range[0]
+    assert frame.pressure_kpa[0] > 131.0
+    assert not frame.beyond_range[1:].any()
+
+
+def test_thermal_pads_are_no_taxels():
+    rig = Rig(1, 0.2, kind="triangle_10pad")
+    thermal = rig.layout.pad_kind == PadKind.THERMAL
+    *_, frame = press(rig, 20.0, 10, where=slice(None))
+    assert not frame.valid[thermal].any()
+    assert not frame.touched[thermal].any()
+    assert not frame.pressure_kpa[thermal].any()
+    assert frame.touched[~thermal].all()
+
+
+def test_taxels_that_the_calibration_does_not_trust_are_not_valid():
+    settings_, layout = flat_skin(1)
+    calibrator = Calibrator(layout)
+    present = np.ones(layout.n_taxels, bool)
+    for number in range(100):
+        raw = np.full(layout.n_taxels, 240 - number % 2, np.uint8)
+        raw[3] = 255
+        calibrator.add(0, raw, present)
+    found = calibrator.finish("x", "t")
+    assert found.verdict[3] == Verdict.STUCK
+    pipeline = Pipeline(layout, settings_.processing, found)
+    for t_ns in range(5):
+        frame = pipeline.step(0, np.zeros(layout.n_taxels, np.uint8), present, t_ns)
+    assert not frame.valid[3]
+    assert frame.pressure_kpa[3] == 0.0
+    assert frame.touched.sum() == layout.n_taxels - 1
+
+
+def test_of_an_untouched_part_that_nobody_watches_only_touch_is_worked_out():
+    watched, unwatched = (Rig(1, 0.3, seed=9) for _ in range(2))
+    present = np.ones(watched.n, bool)
+    computed = []
+    for sweep in range(500):
+        units = np.where(np.arange(watched.n) < 4, 15.0 * (200 <= sweep < 300), 0.0)
+        raw = watched.read(units)
+        one = watched.pipeline.step(0, raw, present, sweep * 20_000_000)
+        other = unwatched.pipeline.step(0, raw, present, sweep * 20_000_000, pressures=False)
+        assert np.array_equal(one.touched, other.touched)
+        computed.append(other.computed)
+        if other.computed:
+            assert other.pressure_kpa == pytest.approx(one.pressure_kpa, abs=0.7)
+    assert all(computed[202:300])
+    assert np.mean(computed[:200]) < 0.3
+
+
+@pytest.mark.parametrize("jump_ns", [-3_600_000_000_000, 3_600_000_000_000, 10**18])
+def test_a_jump_of_the_clock_changes_pressures_by_less_than_a_unit(jump_ns):
+    rig = Rig(1, 0.0)
+    before = press(rig, 20.0, 250)[-1]
+    rig.t_ns += jump_ns
+    after = press(rig, 20.0, 50)
+    for frame in after:
+        assert frame.pressure_kpa[:6] == pytest.approx(before.pressure_kpa[:6], abs=1.0)
+        assert frame.touched[:6].all()
+
+
+@pytest.mark.parametrize("raw", [0, 255])
+def test_frames_of_one_value_are_survived(raw):
+    rig = Rig(1, 0.3)
+    present = np.ones(rig.n, bool)
+    for _ in range(100):
+        rig.t_ns += 40_000_000
+        frame = rig.pipeline.step(0, np.full(rig.n, raw, np.uint8), present, rig.t_ns)
+        assert np.isfinite(frame.pressure_kpa).all()
+    assert frame.touched.all() == (raw == 0)
+    for _ in range(200):
+        frame = rig.step(0.0)
+    assert not frame.touched.any()
+    assert press(rig, 20.0, 5)[-1].touched[:6].all()
+
+
+def test_a_flickering_taxel_disturbs_no_other():
+    rig = Rig(1, 0.3)
+    rng = np.random.default_rng(2)
+    for _ in range(1000):
+        activation = np.zeros(rig.n)
+        activation[50] = rng.choice([0.0, 230.0])
+        frame = rig.step(activation)
+        assert not np.delete(frame.touched, 50).any()
+    assert np.abs(np.delete(rig.pipeline.baseline - rig.true_baseline, 50)).max() < 0.4
+
+
+def test_a_part_at_rest_is_never_told_as_touched():
+    rig = Rig(2, 0.4, seed=1)
+    assert not any(rig.step(0.0).touched.any() for _ in range(3000))
+
+
+def test_a_rising_temperature_is_no_touch_and_a_press_on_it_is():
+    rig = Rig(1, 0.3, seed=4)
+    for sweep in range(4000):
+        frame = rig.step(0.01 * sweep * rig.dt_s)
+        assert not frame.touched.any()
+    frame = [rig.step(16.0 + 10.0) for _ in range(5)][-1]
+    assert frame.touched.all()
+
+
+def test_a_ten_minute_hold_leaves_no_ghost_though_everything_drifts():
+    rig = Rig(1, 0.3, hz=10.0, seed=6, processing=NO_RELAXATION)
+    pressed = np.arange(rig.n) < 12
+    sweep = 0
+
+    def go(seconds, units):
+        nonlocal sweep
+        touched = []
+        for _ in range(round(seconds * 10)):
+            sweep += 1
+            touched.append(rig.step(np.where(pressed, units, 0.0) + 0.0004 * sweep).touched)
+        return np.array(touched)
+
+    go(20, 0.0)
+    assert go(600, 35.0)[5:, pressed].all()
+    assert not go(60, 0.0)[3:].any()
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 255), st.booleans(), st.integers(-(10**10), 10**10)),
+        min_size=1,
+        max_size=40,
+    )
+)
+@settings(deadline=None, max_examples=50)
+def test_no_bytes_and_no_times_make_nonsense(samples):
+    rig = SHARED
+    t_ns = 0
+    for code, here, step_ns in samples:
+        t_ns += step_ns
+        raw = np.full(rig.n, code, np.uint8)
+        frame = rig.pipeline.step(0, raw, np.full(rig.n, here), t_ns)
+        assert np.isfinite(frame.pressure_kpa).all()
+        assert frame.pressure_kpa.min() >= 0.0
+        assert not (frame.touched & ~frame.valid).any()
+        assert not (frame.beyond_range & ~frame.valid).any()
+        assert np.array_equal(frame.raw, raw)
+
+
+SHARED = Rig(1, 0.3)
+
+
+def test_a_new_pipeline_goes_on_counting_where_the_old_one_stopped():
+    rig = Rig(1, 0.3)
+    for _ in range(7):
+        rig.step(0.0)
+    new = Pipeline(rig.layout, rig.settings.processing, rig.calibration, after=rig.pipeline)
+    assert new.seq(0) == 7
+
+
+def test_a_taxel_touched_for_long_and_a_baseline_at_its_limit_are_told():
+    rig = Rig(
+        1,
+        0.3,
+        hz=5.0,
+        processing={
+            "relaxation": {"model": "none"},
+            "drift": {"frozen_report_s": 60.0, "limit_units": 4.0},
+        },
+    )
+    press(rig, 20.0, 400, where=slice(0, 3))
+    assert np.array_equal(np.flatnonzero(rig.pipeline.frozen(0)), range(3))
+    press(rig, 0.0, 50)
+    assert not rig.pipeline.frozen(0).any()
+    for sweep in range(600):
+        rig.step(0.01 * sweep)
+    assert rig.pipeline.at_limit(0).all()

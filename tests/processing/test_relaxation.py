@@ -1,0 +1,267 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from skin_host.processing.relaxation import (
+    MODELS,
+    STAND_INS,
+    AsymmetricRelaxation,
+    NoRelaxation,
+    PronyRelaxation,
+    PublishedRelaxation,
+    make_model,
+    stand_in,
+)
+
+MID = STAND_INS["mid"]
+LOADING = {"beta": MID.beta, "tau_s": MID.tau_s, "tau_unload_s": MID.tau_unload_s}
+PUBLISHED = {
+    "beta_load": MID.beta,
+    "tau_load_s": MID.tau_s,
+    "beta_unload": MID.beta_unload,
+    "tau_unload_s": MID.tau_unload_s,
+}
+pressures = st.lists(st.floats(0.0, 250.0), min_size=1, max_size=40)
+steps = st.lists(st.tuples(st.floats(0.0, 200.0), st.floats(1e-4, 5.0)), min_size=1, max_size=60)
+
+
+def direct_sum(samples, every=1, mean_s=1.0, threshold_kpa=1.5):
+    """Equation (5) word for word: keep every step, sum every term. Samples hold over dt."""
+    events, answers = [], []
+    now = elapsed = integral = staircase = 0.0
+    for number, (pressure, dt) in enumerate(samples):
+        left = dt
+        while elapsed + left >= mean_s - 1e-9:
+            room = mean_s - elapsed
+            integral += pressure * room
+            now += room
+            left = max(left - room, 0.0)
+            mean = integral / mean_s
+            if abs(mean - staircase) > threshold_kpa:
+                events.append((now, mean - staircase))
+                staircase = mean
+            elapsed = integral = 0.0
+        integral += pressure * left
+        elapsed += left
+        now += left
+        if number % every:
+            continue
+        total = 0.0
+        for instant, step in events:
+            betas, taus = (MID.beta, MID.tau_s) if step > 0 else (MID.beta_unload, MID.tau_unload_s)
+            total += sum(
+                step * beta * (1.0 - np.exp(-(now - instant) / tau))
+                for beta, tau in zip(betas, taus, strict=True)
+            )
+        answers.append(total)
+    return np.array(answers)
+
+
+@given(steps)
+@settings(deadline=None)
+def test_published_is_the_direct_sum_of_equation_5(samples):
+    model = PublishedRelaxation(1, **PUBLISHED)
+    answers = [model.step(np.array([pressure]), dt)[0] for pressure, dt in samples]
+    assert answers == pytest.approx(direct_sum(samples), abs=1e-9)
+
+
+def test_published_is_the_direct_sum_over_long_noisy_loading():
+    rng = np.random.default_rng(5)
+    levels = np.repeat(rng.uniform(0.0, 120.0, 60), 20 * 25)
+    samples = [(level, 0.04) for level in levels + rng.normal(0.0, 0.8, levels.size)]
+    model = PublishedRelaxation(1, **PUBLISHED)
+    answers = np.array([model.step(np.array([c]), dt)[0] for c, dt in samples])
+    assert answers[::500] == pytest.approx(direct_sum(samples, every=500), abs=1e-9)
+
+
+def test_a_step_of_just_the_threshold_makes_no_event():
+    model = PublishedRelaxation(2, **PUBLISHED)
+    for _ in range(400):
+        answer = model.step(np.array([1.5, 1.5000001]), 0.25)
+    assert answer[0] == 0.0
+    assert answer[1] > 0.15
+
+
+def test_the_published_step_takes_effect_at_the_end_of_its_second():
+    model = PublishedRelaxation(1, **PUBLISHED)
+    fifty = np.array([50.0])
+    assert model.step(fifty, 0.999)[0] == 0.0
+    assert model.step(fifty, 0.001)[0] == 0.0
+    expected = sum(50.0 * b * -np.expm1(-0.5 / t) for b, t in zip(MID.beta, MID.tau_s, strict=True))
+    assert model.step(fifty, 0.5)[0] == pytest.approx(expected, abs=1e-12)
+
+
+def test_published_runs_away_under_cycling_and_the_default_does_not():
+    published = PublishedRelaxation(1, **PUBLISHED)
+    asymmetric = AsymmetricRelaxation(1, **LOADING)
+    for _ in range(100):
+        for pressure in (50.0, 0.0):
+            for _ in range(5):
+                runaway = published.step(np.array([pressure]), 1.0)[0]
+                bounded = asymmetric.step(np.array([pressure]), 1.0)[0]
+    assert runaway > 100.0
+    assert bounded < sum(MID.beta) * 50.0
+
+
+def test_the_bleed_forgets_what_the_published_model_never_forgets():
+    left = {}
+    for name in ("published", "published_bleed"):
+        model = make_model(name, 1, MID)
+        for _ in range(100):
+            for pressure, seconds in ((50.0, 10), (0.0, 10)):
+                for _ in range(seconds):
+                    model.step(np.array([pressure]), 1.0)
+        for _ in range(300):
+            left[name] = abs(model.step(np.zeros(1), 1.0)[0])
+    assert left["published"] > 50.0
+    assert left["published_bleed"] < 2.0
+
+
+@given(pressures, st.sampled_from(["float32", "float64"]), st.sampled_from([0.0, 1.0]))
+def test_asymmetric_stays_between_zero_and_its_share_of_the_largest_pressure(c, dtype, update_s):
+    model = make_model("asymmetric", 1, MID, update_s=update_s, dtype=dtype)
+    for pressure in c:
+        answer = model.step(np.array([pressure], dtype), 7.3)[0]
+        assert -1e-6 <= answer <= sum(MID.beta) * max(c) * (1 + 1e-6)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_zero_pressure_relaxes_nothing(name):
+    model = make_model(name, 3, stand_in(name, "mid"))
+    for _ in range(50):
+        assert not model.step(np.zeros(3), 0.3).any()
+
+
+@given(pressures, st.lists(st.floats(0.0, 50.0), min_size=40, max_size=40))
+def test_asymmetric_is_monotone_in_pressure(c, more):
+    model = AsymmetricRelaxation(2, **LOADING)
+    for pressure, extra in zip(c, more, strict=False):
+        lower, higher = model.step(np.array([pressure, pressure + extra]), 3.1)
+        assert higher >= lower - 1e-12
+
+
+@given(steps, st.integers(2, 5), st.sampled_from([0.0, 1.0]))
+@settings(deadline=None)
+def test_split_steps_equal_one_step(samples, pieces, update_s):
+    whole = make_model("asymmetric", 1, MID, update_s=update_s)
+    split = make_model("asymmetric", 1, MID, update_s=update_s)
+    for pressure, dt in samples:
+        one = whole.step(np.array([pressure]), dt)[0]
+        for _ in range(pieces):
+            many = split.step(np.array([pressure]), dt / pieces)[0]
+        assert many == pytest.approx(one, abs=1e-6)
+
+
+@given(st.floats(0.0, 200.0), st.floats(0.0, 200.0), st.integers(2, 7), st.floats(1e-5, 4000.0))
+def test_prony_is_exact_for_straight_lines(start, end, pieces, dt):
+    one, many = (PronyRelaxation(1, beta=MID.beta, tau_s=MID.tau_s) for _ in range(2))
+    for model in (one, many):
+        model.step(np.array([start]), 3.0)
+    whole = one.step(np.array([end]), dt)[0]
+    for piece in range(1, pieces + 1):
+        split = many.step(np.array([start + (end - start) * piece / pieces]), dt / pieces)[0]
+    assert split == pytest.approx(whole, abs=1e-9)
+
+
+def test_prony_matches_the_closed_form_of_a_ramp():
+    beta, tau, dt, slope = 0.2, 30.0, 12.0, 5.0
+    model = PronyRelaxation(1, beta=[beta], tau_s=[tau])
+    model.step(np.zeros(1), 1.0)
+    answer = model.step(np.array([slope * dt]), dt)[0]
+    assert answer == pytest.approx(beta * slope * (dt - tau * -np.expm1(-dt / tau)), abs=1e-12)
+
+
+def test_a_hold_follows_the_exponential_of_equation_3():
+    model = AsymmetricRelaxation(1, beta=[0.3], tau_s=[100.0], tau_unload_s=[300.0])
+    for _ in range(250):
+        held = model.step(np.array([40.0]), 0.4)[0]
+    assert held == pytest.approx(40.0 * 0.3 * -np.expm1(-1.0), abs=1e-9)
+    released = model.step(np.zeros(1), 300.0)[0]
+    assert released == pytest.approx(held * np.exp(-1.0), abs=1e-9)
+
+
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("update_s", [0.0, 1.0])
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
+def test_a_value_that_is_no_number_counts_as_the_last_one(name, update_s, wrong):
+    spoilt, clean = (make_model(name, 2, stand_in(name, "mid"), update_s=update_s) for _ in "ab")
+    for number in range(100):
+        clean.step(np.array([30.0, 10.0]), 0.1)
+        spoilt.step(np.array([wrong if number == 57 else 30.0, 10.0]), 0.1)
+    expected = clean.step(np.array([30.0, 10.0]), 0.1)
+    assert spoilt.step(np.array([30.0, 10.0]), 0.1) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("dt", [-3600.0, -1e-9, np.nan, np.inf])
+def test_time_that_cannot_have_passed_changes_nothing(name, dt):
+    model = make_model(name, 1, stand_in(name, "mid"))
+    for _ in range(20):
+        before = model.step(np.array([30.0]), 0.3)
+    assert model.step(np.array([30.0]), dt) == pytest.approx(before, abs=1e-12)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_parameters_per_taxel_give_what_shared_ones_give(name):
+    n = 3
+    shared = stand_in(name, "mid")
+    per_taxel = type(shared)(
+        *(
+            np.repeat(np.array(getattr(shared, field), float)[:, np.newaxis], n, axis=1)
+            for field in ("beta", "tau_s", "beta_unload", "tau_unload_s")
+        ),
+        shared.clock_kpa,
+    )
+    one, many = make_model(name, n, shared), make_model(name, n, per_taxel)
+    rng = np.random.default_rng(0)
+    for pressure in rng.uniform(0.0, 100.0, (50, n)):
+        assert many.step(pressure, 0.7) == pytest.approx(one.step(pressure, 0.7), abs=1e-12)
+
+
+@pytest.mark.parametrize("name", [name for name in MODELS if name != "none"])
+def test_reset_forgets_the_chosen_taxels_alone(name):
+    model, other = (make_model(name, 2, stand_in(name, "mid")) for _ in "ab")
+    for _ in range(30):
+        model.step(np.array([50.0, 50.0]), 1.0)
+        other.step(np.array([50.0, 50.0]), 1.0)
+    model.reset(np.array([True, False]))
+    gone, kept = model.step(np.zeros(2), 1e-6)
+    assert gone == 0.0
+    assert kept == other.step(np.zeros(2), 1e-6)[1]
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_each_answer_is_an_array_of_its_own(name):
+    model = make_model(name, 1, stand_in(name, "mid"))
+    first = model.step(np.array([50.0]), 10.0)
+    kept = first.copy()
+    model.step(np.array([90.0]), 10.0)
+    assert first == kept
+
+
+def test_no_relaxation_corrects_nothing():
+    assert not NoRelaxation(2).step(np.array([50.0, 250.0]), 1000.0).any()
+
+
+@pytest.mark.parametrize(
+    ("beta", "tau_s", "message"),
+    [
+        ([0.1, 0.2], [1.0], "modes differ"),
+        ([0.1], [0.0], "must be positive"),
+        ([-0.1], [1.0], "not negative"),
+        ([np.nan], [1.0], "finite"),
+        (np.ones((1, 5)), [1.0], "shape"),
+    ],
+)
+def test_impossible_parameters_are_refused(beta, tau_s, message):
+    with pytest.raises(ValueError, match=message):
+        AsymmetricRelaxation(3, beta=beta, tau_s=tau_s, tau_unload_s=tau_s)
+
+
+def test_states_never_become_denormal():
+    model = AsymmetricRelaxation(1, beta=[0.3], tau_s=[0.5], tau_unload_s=[0.5], dtype="float32")
+    model.step(np.array([50.0], np.float32), 1.0)
+    seen = [float(model.step(np.zeros(1, np.float32), 0.3)[0]) for _ in range(400)]
+    assert all(value == 0.0 or value > 1e-37 for value in seen)
+    assert seen[-1] == 0.0

@@ -1,0 +1,78 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skin_host.processing.touch import TouchDetector, threshold_units
+from skin_host.settings import Touch
+
+ON, OFF = np.array([2.0]), np.array([1.5])
+
+
+def told(signal, votes):
+    detector = TouchDetector(ON, OFF, votes)
+    return [bool(detector.step(np.array([value]))[0]) for value in signal]
+
+
+def test_one_sample_over_the_threshold_is_no_touch():
+    assert not any(told([0, 0, 5, 0, 0, 0], votes=2))
+
+
+def test_two_of_three_samples_are_a_touch_and_two_of_three_end_it():
+    assert told([0, 5, 0, 5, 5, 0, 5, 0, 0, 0], votes=2) == [
+        bool(x) for x in (0, 0, 0, 1, 1, 1, 1, 0, 0, 0)
+    ]
+
+
+def test_one_vote_tells_at_once_and_three_wait_for_three():
+    assert told([0, 5, 5, 5, 0, 0, 0], votes=1) == [bool(x) for x in (0, 1, 1, 1, 0, 0, 0)]
+    assert told([0, 5, 5, 5, 0, 0, 0, 0], votes=3) == [bool(x) for x in (0, 0, 0, 1, 1, 1, 0, 0)]
+
+
+def test_exactly_the_threshold_is_a_touch():
+    assert told([2, 2, 2], votes=2)[-1]
+
+
+def test_a_touch_lasts_down_to_the_lower_threshold():
+    assert told([2, 2, 1.6, 1.6, 1.6, 1.4, 1.4], votes=2) == [
+        bool(x) for x in (0, 1, 1, 1, 1, 1, 0)
+    ]
+    assert not any(told([1.6] * 5, votes=2))
+
+
+def test_what_is_no_number_touches_nothing():
+    assert not any(told([np.nan] * 5, votes=2))
+
+
+@given(st.lists(st.floats(0.0, 4.0), max_size=60), st.sampled_from([1, 2, 3]))
+def test_after_three_quiet_samples_nothing_is_touched_and_none_need_be_taken(signal, votes):
+    detector = TouchDetector(ON, OFF, votes)
+    for value in [*signal, 0.0, 0.0, 0.0]:
+        touched = detector.step(np.array([value]))
+    assert not touched.any()
+    assert detector.idle
+
+
+def test_answers_are_not_changed_afterwards():
+    detector = TouchDetector(ON, OFF, 1)
+    first = detector.step(np.array([5.0]))
+    detector.step(np.array([0.0]))
+    detector.reset(np.array([0]))
+    assert first[0]
+
+
+def test_the_threshold_is_the_papers_for_quiet_taxels():
+    # 95th percentile 1 unit above the mean, margin of 2: readings of 3 and more are a touch.
+    (threshold,) = threshold_units(np.array([1.0]), np.zeros(1), np.array([0.4]), Touch())
+    assert 2.0 < threshold <= 3.0
+
+
+def test_noisy_taxels_keep_a_distance_in_proportion_to_their_noise():
+    noise = np.array([1.0, 2.0, 3.0])
+    thresholds = threshold_units(1.645 * noise, np.zeros(3), noise, Touch())
+    assert np.all(thresholds >= 3.6 * noise)
+
+
+def test_a_release_threshold_above_the_threshold_is_refused():
+    with pytest.raises(ValueError, match="release"):
+        TouchDetector(OFF, ON)

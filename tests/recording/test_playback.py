@@ -1,0 +1,205 @@
+"""What was recorded is played again: on CAN, to a broker, through the pipeline."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+
+from emulator.robot import Robot
+from emulator.scene import Scene
+from skin_host.bus.logs import read_channels
+from skin_host.capture import CanLog, capture_broker, capture_buses
+from skin_host.client import SkinClient
+from skin_host.engine import Engine
+from skin_host.errors import RequestError
+from skin_host.layout import Layout, build_layout
+from skin_host.playback import paced, play_on_buses, play_processed, play_said
+from skin_host.publish.address import Broker
+from skin_host.publish.info import encode_info, node_info
+from skin_host.publish.recording import Recorder, read_can, read_said
+from skin_host.replay import calibrate_from_log, replay
+from skin_host.settings import Bus, Mqtt, Settings, load
+from tests.support.broker import Mosquitto
+
+ROOT = Path(__file__).parents[2]
+CONFIG = ROOT / "config" / "icub_hand.toml"
+GRASP = ROOT.parent / "shared" / "data" / "icub_grasp.log"
+PATIENCE_S = 20.0
+needs_grasp = pytest.mark.skipif(not GRASP.exists(), reason=f"{GRASP} is not here")
+
+
+def hand() -> tuple[Settings, Layout]:
+    settings = load(CONFIG)
+    return settings, build_layout(settings, CONFIG.parent)
+
+
+def frames_of(log: Path) -> list[tuple[int, bytes, int]]:
+    return [
+        (int(batch.id[i]), batch.data[i, : batch.dlc[i]].tobytes(), int(batch.t_ns[i]))
+        for _, batch in (read_can(log) if log.suffix == ".mcap" else read_channels(log))
+        for i in range(len(batch))
+    ]
+
+
+def beginning(folder: Path, n_lines: int = 2600) -> Path:
+    """The first seconds of the recorded grasps."""
+    path = folder / "grasp.log"
+    path.write_text("".join(GRASP.read_text().splitlines(keepends=True)[:n_lines]))
+    return path
+
+
+def steps_of(log: Path) -> list[Any]:
+    settings, layout = hand()
+    engine = Engine(settings, layout, [0], calibrate_from_log(log, settings, layout, 5.0))
+    return [
+        (step.frame.t_ns, step.frame.raw.tobytes(), step.frame.pressure_kpa.tobytes(), step.events)
+        for step in replay(log, engine)
+    ]
+
+
+@needs_grasp
+@pytest.mark.parametrize("name", ["a.mcap", "a.log", "a.blf", "a.asc"])
+def test_can_frames_of_every_format_replay_to_the_same(tmp_path: Path, name: str) -> None:
+    grasp = beginning(tmp_path)
+    path = tmp_path / name
+    if path.suffix == ".mcap":
+        with Recorder(path) as recorder:
+            for channel, batch in read_channels(grasp):
+                recorder.can(channel, batch)
+    else:
+        with CanLog(path) as log:
+            for channel, batch in read_channels(grasp):
+                log.put(channel, batch)
+        assert log.frames == 2600
+    assert [frame[:2] for frame in frames_of(path)] == [frame[:2] for frame in frames_of(grasp)]
+    if path.suffix in (".mcap", ".log"):  # the others keep times less exactly
+        assert steps_of(path) == steps_of(grasp)
+    else:
+        assert [step[1] for step in steps_of(path)] == [step[1] for step in steps_of(grasp)]
+
+
+def test_a_format_that_nobody_knows_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RequestError, match=r"wanted one of \.log, \.asc"):
+        CanLog(tmp_path / "a.xyz")
+
+
+@needs_grasp
+async def test_a_recording_played_on_a_bus_is_captured_as_it_was(tmp_path: Path) -> None:
+    grasp = beginning(tmp_path, 400)
+    settings, _ = hand()
+    settings.buses["can0"] = bus = Bus(interface="virtual", channel=f"play-{tmp_path.name}")
+    path = tmp_path / "again.mcap"
+    stop = asyncio.Event()
+    with (
+        Recorder(path) as recorder,
+        can.Bus(interface=bus.interface, channel=bus.channel) as sender,
+    ):
+        capturing = asyncio.create_task(capture_buses(settings, recorder.can, stop))
+        await asyncio.sleep(0.05)
+        assert await play_on_buses(grasp, settings, {"can0": sender}, speed=100) == 400
+        await asyncio.sleep(0.1)
+        stop.set()
+        assert await capturing == 0
+    assert [frame[:2] for frame in frames_of(path)] == [frame[:2] for frame in frames_of(grasp)]
+
+
+async def test_pace_follows_the_recording_and_the_speed() -> None:
+    loop = asyncio.get_running_loop()
+    begun_s = loop.time()
+    items = paced([0, 100, 200], lambda item: item * 1_000_000, speed=4)
+    waited_s = [loop.time() - begun_s async for _ in items]
+    assert waited_s[1] >= 0.024
+    assert waited_s[2] >= 0.049
+
+
+@asynccontextmanager
+async def recording(broker: Mosquitto, path: Path) -> AsyncIterator[Recorder]:
+    stop = asyncio.Event()
+    with Recorder(path) as recorder:
+        address, _ = Broker.from_url(f"mqtt://{broker.host}:{broker.port}", "5")
+        capturing = asyncio.create_task(capture_broker(recorder, address, "skin", "icub", stop))
+        await asyncio.sleep(0.3)
+        yield recorder
+        stop.set()
+        await capturing
+
+
+@needs_grasp
+async def test_what_a_broker_said_is_recorded_and_said_again_byte_for_byte(
+    tmp_path: Path, mosquitto: Mosquitto
+) -> None:
+    settings, layout = hand()
+    settings.mqtt = Mqtt(host=mosquitto.host, port=mosquitto.port)
+    grasp = beginning(tmp_path)
+    first, second = tmp_path / "first.mcap", tmp_path / "second.mcap"
+    calibration = calibrate_from_log(grasp, settings, layout, 5.0)
+    async with recording(mosquitto, first) as recorder:
+        engine = Engine(settings, layout, [0], calibration)
+        assert await play_processed(grasp, engine, settings, speed=20) > 100
+        await asyncio.sleep(0.3)
+    assert recorder.messages["touch"] >= 1
+    assert recorder.messages["frame"] > 50
+    async with recording(mosquitto, second):
+        broker, _ = Broker.from_url(f"mqtt://{mosquitto.host}:{mosquitto.port}", "5")
+        assert await play_said(first, broker, speed=5) == sum(recorder.messages.values())
+        await asyncio.sleep(0.3)
+
+    def said(path: Path, kind: str) -> list[bytes]:
+        return [one.payload for one in read_said(path) if one.topic.endswith(f"/{kind}")]
+
+    assert said(second, "frame") == said(first, "frame")
+    assert said(second, "touch") == said(first, "touch")
+    # What is over does not look alive.
+    assert said(second, "status")[-1] == b"offline"
+
+
+@needs_grasp
+async def test_a_recording_can_be_played_as_another_robot(
+    tmp_path: Path, mosquitto: Mosquitto
+) -> None:
+    _, layout = hand()
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        info = node_info(layout, "main", version="1", configuration="x")
+        recorder.say("skin/icub/nodes/main/status", 0, b"online")
+        recorder.say("skin/icub/nodes/main/info", 0, encode_info(info))
+        recorder.say("skin/icub/left_hand/contact", 1, b"ON")
+    url = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    broker, _ = Broker.from_url(url, "5")
+    async with SkinClient(url, robot="ghost") as skin:
+        contacts = skin.contacts()
+        await asyncio.sleep(0.2)
+        await play_said(path, broker, robot="ghost")
+        async with asyncio.timeout(PATIENCE_S):
+            contact = await anext(contacts)
+            assert (contact.part, contact.touched) == ("left_hand", True)
+            assert (await skin.info())["main"].parts.keys() == {"left_hand"}
+
+
+async def test_an_emulated_robot_can_be_recorded(tmp_path: Path) -> None:
+    settings = load(ROOT / "config" / "demo.toml")
+    layout = build_layout(settings, CONFIG.parent)
+    bus = settings.buses["can0"]
+    bus.channel = tmp_path.name
+    path = tmp_path / "robot.blf"
+    stop = asyncio.Event()
+    robot = Robot(settings, layout, Scene())
+    robot.bring_up()
+    with CanLog(path) as log, can.Bus(interface=bus.interface, channel=bus.channel) as opened:
+        capturing = asyncio.create_task(capture_buses(settings, log.put, stop))
+        living = asyncio.create_task(robot.run({"can0": opened}))
+        async with asyncio.timeout(PATIENCE_S):
+            while log.frames < 500:  # noqa: ASYNC110
+                await asyncio.sleep(0.05)
+        stop.set()
+        await capturing
+        living.cancel()
+        await asyncio.gather(living, return_exceptions=True)
+    ids = {frame[0] >> 8 for frame in frames_of(path)}
+    assert ids == {4}
+    assert np.unique([frame[0] for frame in frames_of(path)]).size == 33

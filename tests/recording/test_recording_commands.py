@@ -1,0 +1,128 @@
+"""The commands around recordings, as they are typed."""
+
+import asyncio
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from skin_host.cli import main
+from skin_host.layout import build_layout
+from skin_host.publish.info import node_info
+from skin_host.publish.mqtt import Publisher
+from skin_host.publish.recording import read_said
+from skin_host.settings import Mqtt, load
+from tests.support.broker import Mosquitto
+
+ROOT = Path(__file__).parents[2]
+CONFIG = ROOT / "config" / "icub_hand.toml"
+GRASP = ROOT.parent / "shared" / "data" / "icub_grasp.log"
+needs_grasp = pytest.mark.skipif(not GRASP.exists(), reason=f"{GRASP} is not here")
+PATIENCE_S = 30.0
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("grasp") / "grasp.log"
+    path.write_text("".join(GRASP.read_text().splitlines(keepends=True)[:2600]))
+    return path
+
+
+@needs_grasp
+def test_a_recording_is_exported_and_drawn(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = ["--config", str(CONFIG)]
+    assert main(["export", str(log), str(tmp_path / "a.npz"), *config]) == 0
+    assert main(["export", str(log), str(tmp_path / "tables"), *config]) == 0
+    assert main(["plot", "map", str(log), str(tmp_path / "map.png"), *config]) == 0
+    said = capsys.readouterr().out.split()
+    assert [Path(line).name for line in said] == [
+        "a.npz",
+        "left_hand.csv",
+        "touches.csv",
+        "map.png",
+    ]
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert arrays["left_hand.pressure_kpa"].shape == (260, 108)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["export", "a.log", "a.npz"], "skin export: a.log: CAN frames need --config"),
+        (["export", "gone.mcap", "a.npz"], "skin export: gone.mcap: cannot be read: No such file"),
+        (["plot", "calibration", "a.json", "a.png"], "skin plot: a calibration is drawn with"),
+        (["record", "a.log"], "skin record: a.log: holds CAN frames alone and needs --config"),
+        (["record", "setup.cfg"], "skin record: setup.cfg: is there already"),
+        (["replay", "a.log"], "skin replay: the following arguments are required: --config"),
+        (["replay", "a.log", "--onto", "can"], "skin replay: --onto can needs --config"),
+        (["replay", "a.log", "--onto", "broker"], "skin replay: a.log: CAN frames need --config"),
+        (["dbc", "gone.toml"], "skin dbc: gone.toml: cannot be read"),
+    ],
+)
+def test_a_wrong_request_is_told_in_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    said: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("setup.cfg").touch()
+    assert main(arguments) == 2
+    seen = capsys.readouterr()
+    assert seen.err.startswith(said)
+    assert seen.err.count("\n") == 1
+    assert seen.out == ""
+    assert [path.name for path in tmp_path.iterdir()] == ["setup.cfg"]
+
+
+def test_a_dbc_is_printed_or_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["dbc", str(CONFIG)]) == 0
+    text = capsys.readouterr().out
+    assert "BO_ 1248 left_hand_T00: 8 left_hand" in text
+    assert main(["dbc", str(CONFIG), "--output", str(tmp_path / "a.dbc")]) == 0
+    assert (tmp_path / "a.dbc").read_text() == text
+
+
+async def test_a_robot_is_recorded_until_ctrl_c_and_played_again(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    layout = build_layout(load(CONFIG), CONFIG.parent)
+    url = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    file = tmp_path / "a.mcap"
+    settings = Mqtt(host=mosquitto.host, port=mosquitto.port)
+    async with Publisher(settings, "icub", "main") as publisher:
+        publisher.put_info(node_info(layout, "main", version="1", configuration="x"))
+        publisher.put_contact("left_hand", touched=True)
+        command = [
+            sys.executable,
+            "-m",
+            "skin_host",
+            "record",
+            str(file),
+            "--broker",
+            url,
+            "--json",
+        ]
+        recording = await asyncio.create_subprocess_exec(
+            *command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+        assert recording.stderr is not None
+        assert b"recording" in await asyncio.wait_for(recording.stderr.readline(), PATIENCE_S)
+        await asyncio.sleep(2.5)  # what is retained comes as soon as it listens
+        recording.send_signal(signal.SIGINT)
+        out, err = await asyncio.wait_for(recording.communicate(), PATIENCE_S)
+    assert recording.returncode == 0, err
+    told = json.loads(out)
+    assert told["messages"] == {"contact": 1, "info": 1, "status": 1}
+    assert {said.topic for said in read_said(file)} >= {"skin/icub/left_hand/contact"}
+    played = await asyncio.to_thread(
+        main, ["replay", str(file), "--onto", "broker", "--broker", url, "--robot", "ghost"]
+    )
+    assert played == 0

@@ -1,0 +1,92 @@
+"""A real mosquitto that a test can start, freeze, kill and bring back."""
+
+import contextlib
+import signal
+import socket
+import subprocess
+import time
+from pathlib import Path
+
+_START_S = 30.0
+
+
+def free_port() -> int:
+    """Return a TCP port of 127.0.0.1 that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+class Mosquitto:
+    """One broker on its own port of 127.0.0.1, open to everybody, remembering nothing.
+
+    The port stays the same over `restart`, so that clients can find it again.
+    """
+
+    host = "127.0.0.1"
+
+    def __init__(self, program: str, directory: Path, settings: str = "") -> None:
+        """Prepare a broker; `settings` are further lines of mosquitto.conf."""
+        self.port = free_port()
+        self.program = program
+        self._log = directory / "mosquitto.log"
+        self._configuration = directory / "mosquitto.conf"
+        self._configuration.write_text(
+            f"listener {self.port} {self.host}\n"
+            f"allow_anonymous true\npersistence false\nlog_dest stderr\n{settings}"
+        )
+        self._process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def log(self) -> str:
+        """What the broker has written so far."""
+        return self._log.read_text(errors="replace")
+
+    def start(self) -> None:
+        """Start the broker and wait until it accepts connections."""
+        with self._log.open("ab") as log:
+            self._process = subprocess.Popen(
+                [self.program, "-c", self._configuration], stdout=log, stderr=log
+            )
+        deadline = time.monotonic() + _START_S
+        while self._process.poll() is None and time.monotonic() < deadline:
+            with contextlib.suppress(OSError):
+                socket.create_connection((self.host, self.port), timeout=1.0).close()
+                return
+            time.sleep(0.005)
+        self.kill()
+        raise RuntimeError(f"mosquitto did not start:\n{self.log}")
+
+    def stop(self) -> None:
+        """End the broker as its service would: clients are told."""
+        self._end(signal.SIGTERM)
+
+    def kill(self) -> None:
+        """End the broker at once, as a loss of power would. Nothing happens if it has ended."""
+        self._end(signal.SIGKILL)
+
+    def freeze(self) -> None:
+        """Stop the broker in its tracks; its connections stay open and silent."""
+        self._running.send_signal(signal.SIGSTOP)
+
+    def resume(self) -> None:
+        """Let a frozen broker go on."""
+        self._running.send_signal(signal.SIGCONT)
+
+    def restart(self) -> None:
+        """Kill the broker if it runs, and start it on the same port."""
+        self.kill()
+        self.start()
+
+    @property
+    def _running(self) -> "subprocess.Popen[bytes]":
+        if self._process is None:
+            raise RuntimeError("the broker does not run")
+        return self._process
+
+    def _end(self, how: signal.Signals) -> None:
+        if self._process is not None:
+            self._process.send_signal(how)
+            self._process.wait(timeout=_START_S)
+            self._process = None

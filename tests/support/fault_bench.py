@@ -1,0 +1,95 @@
+"""A robot, an engine and its health in simulated time: faults happen, and what is told of them."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from emulator.robot import Robot
+from emulator.scene import Fault, Scene
+from skin_host.bus.assembler import Sweep
+from skin_host.diagnosis import Fault as Told
+from skin_host.engine import Engine, Step
+from skin_host.health import Health
+from skin_host.layout import build_layout
+from skin_host.settings import load
+
+CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
+TICK_S = 0.05
+LOOK_EVERY = 2
+#: Simulated time begins at a plausible time of day.
+EPOCH_NS = 1_700_000_000_000_000_000
+
+
+class FaultBench:
+    """A calibrated robot; `run` lets time pass and remembers what is told and when."""
+
+    def __init__(self, calibrate_s: float = 5.0, scene: Scene | None = None) -> None:
+        settings = load(CONFIG)
+        self.layout = build_layout(settings, CONFIG.parent)
+        self.robot = Robot(settings, self.layout, scene)
+        self.robot.bring_up()
+        self.engine = Engine(settings, self.layout, list(range(len(self.layout.parts))))
+        self.health = Health(self.engine)
+        self.t_s = 0.0
+        self.told: dict[tuple[str, str], float] = {}
+        self.says: dict[tuple[str, str], Told] = {}
+        self.first_told: dict[tuple[str, str], float] = {}
+        self.valid: dict[str, np.ndarray] = {}
+        self.touched: dict[str, np.ndarray] = {}
+        self.sweeps: dict[str, Sweep] = {}
+        self.records: dict[str, dict[str, Any]] = {}
+        self.calibrate(calibrate_s)
+        self.run(6.0)
+        self.first_told.clear()
+
+    @property
+    def now_ns(self) -> int:
+        return EPOCH_NS + round(self.t_s * 1e9)
+
+    def calibrate(self, seconds: float) -> None:
+        self.engine.begin_calibration(seconds)
+        self.run(seconds + 0.3)
+        self.engine.use(self.engine.end_calibration("2026-01-01T00:00:00+00:00"))
+
+    def inject(self, name: str, **arguments: Any) -> None:
+        """Make a fault happen now; what was told before is forgotten."""
+        self.robot.inject(Fault(name=name, **arguments))
+        self.first_told.clear()
+        self.since_s = self.t_s
+
+    def status(self, board: str) -> np.ndarray:
+        """Status words of a board's last sweep."""
+        return self.sweeps[board].status
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / TICK_S)):
+            self.t_s += TICK_S
+            for bus, batch in self.robot.step(TICK_S).items():
+                if len(batch):
+                    batch.t_ns[:] += EPOCH_NS - self.robot.t_ns + round(self.t_s * 1e9)
+                    self._note(self.engine.feed(bus, batch))
+            self._note(self.engine.expire(self.now_ns))
+            if round(self.t_s / TICK_S) % LOOK_EVERY == 0:
+                self._look()
+
+    def _note(self, steps: list[Step]) -> None:
+        self.health.note_sweeps(self.engine.sweeps)
+        for sweep in self.engine.sweeps:
+            self.sweeps[self.layout.boards[sweep.board].name] = sweep
+        for step in steps:
+            self.health.note_step(step)
+            self.valid[step.frame.part] = step.frame.valid
+            self.touched[step.frame.part] = step.frame.touched
+
+    def _look(self) -> None:
+        self.health.tick(self.now_ns, {}, {})
+        self.told = {}
+        for part in self.engine.parts:
+            record = self.health.part_record(part, self.now_ns, {}, {})
+            for fault in self.health.diagnosed(part, record, self.now_ns):
+                key = (fault.code, fault.where)
+                self.told[key] = self.t_s
+                self.says[key] = fault
+                self.first_told.setdefault(key, self.t_s)
+            self.records[record["part"]] = record

@@ -1,0 +1,88 @@
+"""A robot and a daemon in one process over a bus of choice: faults as they are lived."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import can
+
+from emulator.robot import Robot
+from emulator.scene import Scene
+from skin_host.daemon import Daemon
+from skin_host.layout import build_layout
+from skin_host.settings import Bus, load
+
+CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
+
+
+class Live:
+    """What `living` gives: the robot, its daemon, and ways to wait."""
+
+    def __init__(self, robot: Robot, daemon: Daemon) -> None:
+        self.robot = robot
+        self.daemon = daemon
+
+    def faults(self) -> set[tuple[str, str]]:
+        """What is told now, by code and place."""
+        return {
+            (fault["code"], fault["where"])
+            for record in self.daemon.records().values()
+            for fault in record["faults"]
+        }
+
+    async def until(self, *codes: str, limit_s: float = 10.0) -> set[tuple[str, str]]:
+        """Wait until all these codes are told."""
+        async with asyncio.timeout(limit_s):
+            while not set(codes) <= {code for code, _ in self.faults()}:  # noqa: ASYNC110
+                await asyncio.sleep(0.02)
+        return self.faults()
+
+    async def until_well(self, limit_s: float = 10.0, *, but: frozenset[str] = frozenset()) -> None:
+        """Wait until all taxels are valid and nothing is told but codes of `but`."""
+        async with asyncio.timeout(limit_s):
+            while not self._well(but):  # noqa: ASYNC110
+                await asyncio.sleep(0.02)
+
+    def _well(self, but: frozenset[str]) -> bool:
+        records = self.daemon.records().values()
+        return all(record["state"] == "ok" for record in records) and {
+            code for code, _ in self.faults()
+        } <= but | {"broker_away"}
+
+
+@contextlib.asynccontextmanager
+async def living(
+    bus: Bus,
+    state: Path,
+    *,
+    port: int = 1,
+    scene: Scene | None = None,
+    config: Path = CONFIG,
+    calibrate_s: float = 1.5,
+) -> AsyncIterator[Live]:
+    """Run both until the block is left; there is no broker unless `port` names one."""
+    settings = load(config)
+    settings.buses["can0"] = bus
+    settings.service.state_directory = str(state)
+    settings.mqtt.port = port
+    settings.processing.calibration.seconds = calibrate_s
+    layout = build_layout(settings, config.parent)
+    robot = Robot(settings, layout, scene)
+    can_bus = can.Bus(interface=bus.interface, channel=bus.channel)
+    daemon = Daemon(settings, layout, configuration=config)
+    stop = asyncio.Event()
+    body = asyncio.create_task(robot.run({"can0": can_bus}))
+    host = asyncio.create_task(daemon.run(stop))
+    try:
+        live = Live(robot, daemon)
+        async with asyncio.timeout(20.0):
+            while daemon.engine.calibration is None:  # noqa: ASYNC110
+                await asyncio.sleep(0.02)
+        yield live
+    finally:
+        stop.set()
+        await asyncio.gather(host, return_exceptions=False)
+        body.cancel()
+        await asyncio.gather(body, return_exceptions=True)
+        can_bus.shutdown()

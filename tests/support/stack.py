@@ -1,0 +1,121 @@
+"""A whole stack: emulated robot, `skin` commands and a real broker, as processes."""
+
+import contextlib
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from skin_host.settings import Bus
+from tests.support.broker import Mosquitto
+from tests.support.subscriber import Subscriber
+
+ROOT = Path(__file__).parents[2]
+#: The lane's emulated processor is slow; here this is never waited for.
+WAIT_S = 200.0
+
+
+class Stack:
+    """Starts and stops the processes of one test, and knows their files."""
+
+    def __init__(self, directory: Path, bus: Bus, bus_kind: str, broker: Mosquitto) -> None:
+        self.directory = directory
+        self.bus = bus
+        self.kind = bus_kind
+        self.broker = broker
+        self.state = directory / "state"
+        self.config = directory / "robot.toml"
+        text = (ROOT / "config/demo.toml").read_text()
+        text = re.sub(r'interface = ".*"', f'interface = "{bus.interface}"', text)
+        text = re.sub(r'channel = ".*"', f'channel = "{bus.channel}"', text)
+        if bus_kind == "vcan":
+            # The lane's processor is emulated; a slower skin leaves it time.
+            text = text.replace('bus = "can0"\naddress', 'bus = "can0"\nperiod_ms = 200\naddress')
+        text += f"\n[mqtt]\nhost = '127.0.0.1'\nport = {broker.port}\n"
+        text += f"\n[service]\nstate_directory = '{self.state}'\n"
+        self.config.write_text(text)
+        self._processes: list[subprocess.Popen[str]] = []
+
+    def start(self, *command: str, scene: Path | None = None) -> "subprocess.Popen[str]":
+        """Start `skin COMMAND...` with a robot on its bus."""
+        robot = [str(self.config)] + ([str(scene)] if scene else [])
+        if self.kind == "virtual":
+            program = [sys.executable, "-m", "tests.support.one_process", *robot, "--"]
+        else:
+            emulate = [sys.executable, "-m", "skin_host", "emulate", *robot[:1]]
+            emulate += ["--scene", str(scene)] if scene else []
+            self._spawn(emulate)
+            program = [sys.executable, "-m", "skin_host"]
+        return self._spawn([*program, *command])
+
+    def _spawn(self, command: list[str]) -> "subprocess.Popen[str]":
+        process = subprocess.Popen(
+            command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        self._processes.append(process)
+        return process
+
+    def calibrate(self, *extra: str) -> Any:
+        """Calibrate an untouched robot; return what the command says as JSON."""
+        process = self.start("calibrate", str(self.config), "--seconds", "1", "--json", *extra)
+        out, err = process.communicate(timeout=WAIT_S)
+        assert process.returncode == 0, err
+        self.stop()
+        return json.loads(out)
+
+    def stop(self) -> list[int]:
+        """Send SIGTERM to everything that still runs; return all exit statuses."""
+        for process in self._processes:
+            if process.poll() is None:
+                process.send_signal(signal.SIGTERM)
+        statuses = []
+        for process in self._processes:
+            try:
+                process.communicate(timeout=WAIT_S)
+            except ValueError:
+                process.wait(timeout=WAIT_S)
+            statuses.append(process.returncode)
+        self._processes.clear()
+        return statuses
+
+    def kill(self) -> None:
+        """End everything at once, as a loss of power would."""
+        for process in self._processes:
+            process.kill()
+            with contextlib.suppress(ValueError):  # its pipes are closed already
+                process.communicate()
+        self._processes.clear()
+
+
+@pytest.fixture
+def stack(
+    tmp_path: Path, can_bus_settings: Bus, bus_kind: str, mosquitto: Mosquitto
+) -> Iterator[Stack]:
+    made = Stack(tmp_path, can_bus_settings, bus_kind, mosquitto)
+    yield made
+    made.kill()
+
+
+@pytest.fixture
+def subscriber(mosquitto: Mosquitto) -> Iterator[Subscriber]:
+    listening = Subscriber(mosquitto.host, mosquitto.port, "skin/demo/#")
+    yield listening
+    listening.close()
+
+
+def wait_for(condition: Callable[[], Any], what: str) -> Any:
+    """Wait until `condition` gives something true, and return that."""
+    deadline = time.monotonic() + WAIT_S
+    while time.monotonic() < deadline:
+        found = condition()
+        if found:
+            return found
+        time.sleep(0.05)
+    raise AssertionError(f"waited {WAIT_S:g} s for {what}")

@@ -1,0 +1,40 @@
+"""A plain paho subscriber: a program that knows nothing of ours."""
+
+import json
+import threading
+from typing import Any
+
+import paho.mqtt.client as mqtt
+
+
+class Subscriber:
+    """Collects everything below a topic, in the order of arrival."""
+
+    def __init__(self, host: str, port: int, topic: str) -> None:
+        self._lock = threading.Lock()
+        self._messages: list[tuple[str, bytes]] = []
+        self._subscribed = threading.Event()
+        self._client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2, protocol=mqtt.MQTTv5)
+        self._client.on_message = self._take
+        self._client.on_connect = lambda client, *_: client.subscribe(topic, qos=1)
+        self._client.on_subscribe = lambda *_: self._subscribed.set()
+        self._client.connect(host, port)
+        self._client.loop_start()
+        assert self._subscribed.wait(20)
+
+    def _take(self, _client: Any, _data: Any, message: mqtt.MQTTMessage) -> None:
+        with self._lock:
+            self._messages.append((message.topic, message.payload))
+
+    def payloads(self, ending: str) -> list[bytes]:
+        """Payloads so far of the topics that end so."""
+        with self._lock:
+            return [payload for topic, payload in self._messages if topic.endswith(ending)]
+
+    def documents(self, ending: str) -> list[Any]:
+        """The same as JSON."""
+        return [json.loads(payload) for payload in self.payloads(ending)]
+
+    def close(self) -> None:
+        self._client.disconnect()
+        self._client.loop_stop()

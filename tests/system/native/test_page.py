@@ -1,0 +1,152 @@
+"""The live page in a real browser, from presses on emulated foam to what a person sees."""
+
+import asyncio
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+
+from skin_host.settings import Bus
+from tests.support.broker import Mosquitto, free_port
+from tests.support.devtools import Page, browser
+from tests.support.stack import ROOT, Stack
+
+SCENE = ROOT / "config" / "scenes" / "demo.toml"
+#: How many pixels of the map are not of its background.
+DRAWN = """(() => {
+    const map = document.getElementById("map");
+    const data = map.getContext("2d").getImageData(0, 0, map.width, map.height).data;
+    let drawn = 0;
+    for (let i = 3; i < data.length; i += 4) if (data[i]) drawn++;
+    return drawn;
+})()"""
+LIVE = 'document.getElementById("status").dataset.level === "ok"'
+STALE = 'document.body.dataset.stale === "true"'
+HEALTHY = """document.querySelector('#health [data-level="ok"]')
+    && !document.querySelector('#health [data-level="alarm"], #health [data-level="warn"]')"""
+CONTACTS = """[...document.querySelectorAll("#contacts tbody tr")]
+    .map(row => [...row.cells].map(cell => cell.textContent))"""
+
+
+@pytest.fixture
+def robot(tmp_path: Path, mosquitto: Mosquitto) -> Stack:
+    """The demo's robot and its daemon."""
+    bus = Bus(interface="virtual", channel=tmp_path.name)
+    return Stack(tmp_path, bus, "virtual", mosquitto)
+
+
+def start(robot: Stack) -> None:
+    robot.start("run", str(robot.config), "--calibrate", scene=SCENE)
+
+
+@asynccontextmanager
+async def page(robot: Stack, profile: Path, width: int = 1280) -> AsyncIterator[Page]:
+    """The page as `skin view` serves it, in a browser; nothing complains until the end."""
+    port = free_port()
+    broker = f"mqtt://{robot.broker.host}:{robot.broker.port}"
+    view = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "skin_host", "view", "--broker", broker),
+        *("--robot", "demo", "--port", str(port)),
+        cwd=ROOT,
+        stdout=asyncio.subprocess.PIPE,
+    )
+    try:
+        assert view.stdout is not None
+        assert f"http://127.0.0.1:{port}/".encode() in await view.stdout.readline()
+        async with browser(profile) as opened:
+            await opened.open(f"http://127.0.0.1:{port}/", width)
+            yield opened
+            assert opened.complaints == []
+    finally:
+        view.terminate()
+        await view.communicate()
+        robot.kill()
+
+
+async def test_a_press_is_seen_and_parts_and_values_can_be_chosen(
+    robot: Stack, tmp_path: Path
+) -> None:
+    start(robot)
+    async with page(robot, tmp_path / "profile") as seen:
+        await seen.until(LIVE)
+        parts = await seen.run(
+            '[...document.querySelectorAll("#parts span")].map(part => part.textContent)'
+        )
+        assert parts == ["all", "left_hand", "left_forearm"]
+        assert await seen.run(DRAWN) > 20_000
+        assert "kPa" in await seen.run('document.getElementById("ticks").textContent')
+        name, number, force, peak, area = (await seen.until(f"({CONTACTS})[0]"))[:5]
+        assert name in parts
+        assert number.startswith("#")
+        assert (force[-2:], peak[-4:], area[-4:]) == (" N", " kPa", " mm²")
+        # A click chooses a taxel, whose course is drawn from before the click on.
+        await seen.run('document.querySelectorAll("#parts button")[2].click()')
+        await seen.press(".")
+        await seen.until('!document.getElementById("tip").hidden')
+        left, top, width, height = await seen.run(
+            """(() => {
+                const box = document.getElementById("map").getBoundingClientRect();
+                return [box.left, box.top, box.width, box.height];
+            })()"""
+        )
+        for step in range(20):
+            await seen.click(left + width / 2 + 7 * step, top + height / 2)
+            if await seen.run('document.querySelectorAll("#chosen button").length'):
+                break
+        await seen.until('/left_forearm/.test(document.getElementById("chosen").textContent)')
+        # Raw values come on request.
+        await seen.press("r")
+        await seen.until('/raw \\d+/.test(document.getElementById("chosen").textContent)')
+        assert "raw 255" in await seen.run('document.getElementById("ticks").textContent')
+        await seen.press("r")
+        await seen.until('/kPa/.test(document.getElementById("chosen").textContent)')
+        # Keys: all parts, dark and light.
+        await seen.press("0")
+        await seen.until('document.querySelector("#parts button").ariaCurrent === "true"')
+        before = await seen.run("document.documentElement.dataset.theme")
+        await seen.press("t")
+        await seen.until(f'document.documentElement.dataset.theme !== "{before}"')
+        assert len(await seen.picture()) > 20_000
+
+
+async def test_stopped_data_are_called_stale_and_everything_comes_back(
+    robot: Stack, tmp_path: Path, mosquitto: Mosquitto
+) -> None:
+    start(robot)
+    async with page(robot, tmp_path / "profile") as seen:
+        await seen.until(LIVE)
+        robot.kill()  # robot and daemon are gone, without a word
+        await seen.until(STALE)
+        assert "stale" in (await seen.run('document.getElementById("banner").textContent')).lower()
+        assert await seen.run(CONTACTS) == []
+        start(robot)
+        await seen.until(f"{LIVE} && !({STALE})")
+        mosquitto.kill()
+        await seen.until(f"{STALE} && /no broker/.test(document.body.innerText)")
+        mosquitto.start()
+        await seen.until(f"{LIVE} && !({STALE})")
+        await seen.until(f"({CONTACTS}).length")
+
+
+async def test_the_skin_can_be_calibrated_from_the_page(robot: Stack, tmp_path: Path) -> None:
+    start(robot)
+    async with page(robot, tmp_path / "profile") as seen:
+        await seen.until(LIVE)
+        # The daemon calibrates at its start, and takes one calibration at a time.
+        await seen.until(f"({HEALTHY}) && !document.getElementById('calibrate').disabled")
+        await seen.run('document.getElementById("calibrate").click()')
+        await seen.until('document.getElementById("confirm").open')
+        await seen.run('document.querySelector("#confirm button.do").click()')
+        await seen.until('/^Calibrated/.test(document.getElementById("banner").textContent)')
+
+
+async def test_a_phone_shows_everything_without_scrolling_sideways(
+    robot: Stack, tmp_path: Path
+) -> None:
+    start(robot)
+    async with page(robot, tmp_path / "profile", width=400) as seen:
+        await seen.until(LIVE)
+        assert await seen.run("document.documentElement.scrollWidth") == 400
+        assert await seen.run(DRAWN) > 8_000

@@ -1,0 +1,224 @@
+"""The page's server: files and a WebSocket, for its own page only."""
+
+import asyncio
+import urllib.error
+import urllib.request
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import InvalidStatus
+
+from skin_host.errors import RequestError, SkinError
+from skin_host.layout import Layout, build_layout
+from skin_host.processing.pipeline import PressureFrame
+from skin_host.publish.info import node_info
+from skin_host.publish.mqtt import Publisher
+from skin_host.settings import Mqtt, load
+from skin_host.viewer.server import Viewer
+from tests.support.broker import Mosquitto, free_port
+
+CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
+PATIENCE_S = 20.0
+
+
+def nowhere() -> str:
+    """A URL of a broker that is not there."""
+    return f"mqtt://127.0.0.1:{free_port()}"
+
+
+async def fetch(url: str, **headers: str) -> tuple[int, Mapping[str, str], bytes]:
+    def get() -> tuple[int, Mapping[str, str], bytes]:
+        try:
+            with urllib.request.urlopen(urllib.request.Request(url, headers=headers)) as answer:
+                return answer.status, dict(answer.headers), answer.read()
+        except urllib.error.HTTPError as error:
+            with error:
+                return error.code, dict(error.headers), error.read()
+
+    return await asyncio.to_thread(get)
+
+
+@asynccontextmanager
+async def page(url: str, **keys: Any) -> AsyncIterator[ClientConnection]:
+    """A page's own connection to its server."""
+    keys = {"origin": url.rstrip("/")} | keys
+    async with connect(url.replace("http", "ws") + "live", max_size=None, **keys) as socket:
+        yield socket
+
+
+async def heard(
+    socket: ClientConnection, wanted: Callable[[Any], bool], patience_s: float = PATIENCE_S
+) -> Any:
+    """The first message that is wanted: bytes as they come, text decoded."""
+    async with asyncio.timeout(patience_s):
+        async for data in socket:
+            message = data if isinstance(data, bytes) else msgspec.json.decode(data)
+            if wanted(message):
+                return message
+    raise AssertionError("the server closed the connection")
+
+
+def of_type(kind: str) -> Callable[[Any], bool]:
+    return lambda message: isinstance(message, dict) and message["type"] == kind
+
+
+def skin() -> Layout:
+    return build_layout(load(CONFIG), CONFIG.parent)
+
+
+async def answer(name: str, payload: bytes) -> Mapping[str, Any]:
+    if name == "calibrate":
+        return {"id": "abc", "verdicts": {"left_hand": {"ok": 104}}}
+    raise RequestError(f"no {name} here")
+
+
+@asynccontextmanager
+async def node(broker: Mosquitto, layout: Layout) -> AsyncIterator[Publisher]:
+    settings = Mqtt(host=broker.host, port=broker.port)
+    async with Publisher(settings, layout.robot, handler=answer) as publisher:
+        publisher.put_info(node_info(layout, "main", version="1", configuration="x"))
+        yield publisher
+
+
+def pressed(layout: Layout, seq: int) -> PressureFrame:
+    n = layout.part("left_hand").n_taxels
+    kpa = np.zeros(n, np.float32)
+    kpa[5] = 12.5
+    yes, no = np.ones(n, np.bool_), np.zeros(n, np.bool_)
+    return PressureFrame("left_hand", seq, seq, np.zeros(n, np.uint8), kpa, no, yes, no)
+
+
+async def test_every_file_that_the_page_names_is_served() -> None:
+    async with Viewer(nowhere(), robot="demo").serving(port=0) as url:
+        status, headers, body = await fetch(url)
+        assert status == 200
+        assert headers["Content-Type"] == "text/html; charset=utf-8"
+        for name, kind in (
+            ("main.js", "text/javascript"),
+            ("page.css", "text/css"),
+            ("icon.svg", "image/svg+xml"),
+        ):
+            assert name.encode() in body
+            status, headers, file = await fetch(url + name)
+            assert status == 200
+            assert headers["Content-Type"].startswith(kind)
+            assert "default-src 'none'" in headers["Content-Security-Policy"]
+            for line in file.decode().splitlines():
+                if ' from "./' in line:
+                    module = line.split('"./')[1].split('"')[0]
+                    assert (await fetch(url + module))[0] == 200
+
+
+async def test_the_page_asks_nothing_of_the_net() -> None:
+    async with Viewer(nowhere(), robot="demo").serving(port=0) as url:
+        for name in ("", "main.js", "map.js", "page.css", "panels.js", "store.js", "strip.js"):
+            _, _, body = await fetch(url + name)
+            assert b"http://" not in body
+            assert b"https://" not in body
+
+
+@pytest.mark.parametrize("path", ["nothing", "../settings.py", "%2e%2e/server.py", "live/x"])
+async def test_nothing_else_is_served(path: str) -> None:
+    async with Viewer(nowhere(), robot="demo").serving(port=0) as url:
+        assert (await fetch(url + path))[0] == 404
+
+
+async def test_a_page_from_elsewhere_is_refused() -> None:
+    async with Viewer(nowhere(), robot="demo").serving(port=0) as url:
+        for origin in ("http://evil.example", None):
+            with pytest.raises(InvalidStatus, match="403"):
+                async with page(url, origin=origin):
+                    pass
+
+
+async def test_a_name_that_was_made_to_point_at_this_machine_is_refused() -> None:
+    async with Viewer(nowhere(), robot="demo").serving(port=0) as url:
+        assert (await fetch(url, Host="evil.example:8080"))[0] == 403
+
+
+async def test_a_port_that_is_taken_is_told_in_one_line() -> None:
+    async with Viewer(nowhere(), robot="demo").serving(port=0) as url:
+        port = int(url.rstrip("/").rpartition(":")[2])
+        with pytest.raises(SkinError, match=f"cannot be served on 127.0.0.1:{port}"):
+            async with Viewer(nowhere(), robot="demo").serving(port=port):
+                pass
+
+
+async def test_the_page_is_told_what_the_broker_tells(mosquitto: Mosquitto) -> None:
+    layout = skin()
+    broker = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    async with (
+        node(mosquitto, layout) as publisher,
+        Viewer(broker, robot="demo").serving(port=0) as url,
+        page(url) as socket,
+    ):
+        told = await heard(socket, of_type("layout"))
+        assert [part["name"] for part in told["parts"]] == ["left_hand", "left_forearm"]
+        assert told["nodes"]["main"]["commands"] is True
+        for seq in range(1, 400):
+            publisher.put_frame(pressed(layout, seq))
+            await asyncio.sleep(0.02)
+            try:
+                message = await heard(socket, lambda m: isinstance(m, bytes), 0.05)
+            except TimeoutError:
+                continue
+            break
+        n = layout.part("left_hand").n_taxels
+        assert np.frombuffer(message, "<f4", n, 32)[5] == 12.5
+        publisher.put_health("left_hand", {"part": "left_hand", "state": "ok"})
+        assert (await heard(socket, of_type("health")))["state"] == "ok"
+
+
+async def test_the_page_may_calibrate(mosquitto: Mosquitto) -> None:
+    broker = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    async with (
+        node(mosquitto, skin()),
+        Viewer(broker, robot="demo").serving(port=0) as url,
+        page(url) as socket,
+    ):
+        await heard(socket, of_type("layout"))
+        await asyncio.sleep(0.1)  # until the node listens for commands, too
+        await socket.send('{"do":"calibrate","node":"main"}')
+        told = await heard(socket, of_type("answer"))
+        assert told["ok"]
+        assert told["result"]["verdicts"] == {"left_hand": {"ok": 104}}
+        await socket.send('{"do":"raw","node":"main"}')
+        told = await heard(socket, of_type("answer"))
+        assert not told["ok"]
+        assert "no raw here" in told["error"]
+
+
+async def test_a_page_without_leave_may_not(mosquitto: Mosquitto) -> None:
+    broker = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    async with (
+        node(mosquitto, skin()),
+        Viewer(broker, robot="demo", commands=False).serving(port=0) as url,
+        page(url) as socket,
+    ):
+        assert (await heard(socket, of_type("status")))["commands"] is False
+        await socket.send('{"do":"calibrate","node":"main"}')
+        told = await heard(socket, of_type("answer"))
+        assert "switched off" in told["error"]
+
+
+@pytest.mark.parametrize("nonsense", ["", "{}", '{"do":"stop","node":"main"}', "[1]", "\x00"])
+async def test_nonsense_from_a_page_is_answered(nonsense: str) -> None:
+    async with Viewer(nowhere(), robot="demo").serving(port=0) as url, page(url) as socket:
+        await socket.send(nonsense)
+        assert not (await heard(socket, of_type("answer")))["ok"]
+
+
+async def test_a_broker_that_comes_late_is_found(mosquitto: Mosquitto) -> None:
+    mosquitto.kill()
+    broker = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    async with Viewer(broker, robot="demo").serving(port=0) as url, page(url) as socket:
+        await asyncio.to_thread(mosquitto.start)
+        await heard(socket, lambda m: isinstance(m, dict) and m.get("connected") is True)
+        async with node(mosquitto, skin()):
+            await heard(socket, of_type("layout"))
