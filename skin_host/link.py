@@ -17,6 +17,9 @@ log = logging.getLogger(__name__)
 
 #: Sweeps and samples that wait are looked at this often.
 EXPIRE_S = 0.02
+#: A pause between two reads counts for no more than this: after a longer one there is no saying
+#: yet who has been silent. Planned pauses are shorter.
+LONGEST_PAUSE_NS = 100_000_000
 #: A bus that does not take the set-up of its boards is tried again after this.
 RETRY_S = 2.0
 STOP_S = 1.0
@@ -27,6 +30,8 @@ class Link:
 
     Attributes:
         ports, boards: by name of the bus.
+        read_ns: everything that had come by then has been read, on the clock of the frames'
+            time stamps. Ages are told from here, not from now: what waits unread is not silent.
 
     Raises:
         BusError: a bus cannot be opened; those already open are closed again.
@@ -34,6 +39,10 @@ class Link:
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
+        self.read_ns = time.time_ns()
+        self._attended_ns = 0
+        self._longest_ns = LONGEST_PAUSE_NS + int(engine.settings.receive.poll_ms * 1e6)
+        self._read_at_ns = time.monotonic_ns()
         self.ports: dict[str, Port] = {}
         self.boards: dict[str, Boards] = {}
         settings, layout = engine.settings, engine.layout
@@ -53,6 +62,7 @@ class Link:
                     layout.triangles,
                     settings.receive.silent_periods,
                     engine.rezero,
+                    self.attended_ns,
                 )
         except SkinError:
             self.close()
@@ -78,10 +88,13 @@ class Link:
 
         def work() -> None:
             nonlocal expire_at_s
+            now_ns = time.time_ns()
+            drained = True
             for bus, port in self.ports.items():
                 batch = port.read()
                 if not len(batch):
                     continue
+                drained &= len(batch) < port.capacity
                 record(bus, batch)
                 boards = self.boards[bus]
                 boards.feed(batch)
@@ -90,12 +103,25 @@ class Link:
                     boards.note_sweep(sweep.board, sweep.present, sweep.t_ns)
                     wake_up.sweep_ended(sweep.board, sweep.t_ns)
                 deliver(steps)
+            if not drained:
+                return
+            self.read_ns = now_ns
+            self._attend()
             now_s = time.monotonic()
             if now_s >= expire_at_s:
                 expire_at_s = now_s + EXPIRE_S
-                deliver(engine.expire(time.time_ns()))
+                deliver(engine.expire(now_ns))
 
         await wake_up.run(work)
+
+    def attended_ns(self) -> int:
+        """Time that the reader has spent looking; it stands still while this process does."""
+        return self._attended_ns
+
+    def _attend(self) -> None:
+        now_ns = time.monotonic_ns()
+        self._attended_ns += min(now_ns - self._read_at_ns, self._longest_ns)
+        self._read_at_ns = now_ns
 
     async def bring_up(self) -> None:
         """Set up and start the boards of every bus; a bus that cannot is tried again for ever."""

@@ -54,6 +54,8 @@ def one_line(error: Exception) -> str:
 class AdapterPort(Port):
     """A bus that python-can reads, frame by frame."""
 
+    capacity = CAPACITY
+
     def __init__(self, name: str, settings: Bus, bus: can.BusABC) -> None:
         super().__init__(name, settings, bus)
         self._opener: ThreadPoolExecutor | None = None

@@ -1,9 +1,10 @@
 """The boards of one bus: found, set up, started, watched, set up again, stopped.
 
-A board that falls silent is asked who it is and how long it has been up, and is set up
-again: at once, then ever more rarely. One that sends, but not what it was set up to send
-(triangles off, another period), has lost its set-up and gets it again. Each is treated
-alone; the others go on undisturbed.
+A board that falls silent is asked who it is and how long it has been up: at once, then
+ever more rarely. One that was reset is set up again; one that was not is told to start,
+which leaves its zero alone; one that does not answer is asked again later. A board that
+sends, but not what it was set up to send (triangles off, another period), has lost its
+set-up and gets it again. Each is treated alone; the others go on undisturbed.
 
 Their pitfalls decide the order (reference of the wire, sections 3 and 4):
 
@@ -19,23 +20,18 @@ Their pitfalls decide the order (reference of the wire, sections 3 and 4):
 import asyncio
 import logging
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Coroutine, Iterable
-from dataclasses import dataclass, field
 from typing import Protocol
 
-import numpy as np
-
+from skin_host.bus.board import GAP_S, BoardRecord, configuration
 from skin_host.bus.commands import (
     SKIN_BOARD_TYPES,
-    BoardType,
     Discover,
     Discovered,
     DiscoveredBootloader,
     GetTimeOfLife,
     Message,
-    SetBoardConfig,
-    SetTriangleConfig,
     SetTxMode,
     TimeOfLife,
     TxMode,
@@ -56,10 +52,9 @@ log = logging.getLogger(__name__)
 DISCOVERY_S = 0.15
 #: Two conversions of twelve stages at decimation 256 (36.9 ms each), and some air.
 NEW_OFFSET_S = 0.09
-MTB3_GAP_PERIODS = 2.5
-GAP_S = 0.01
-ANSWER_S = 0.05
-#: A silent board is set up again at once, then after so long, up to the last.
+#: A board that does not answer within this time has not heard the question.
+ANSWER_S = 0.25
+#: A silent board is seen to at once, then after so long, up to the last.
 RETRY_S = (1.0, 2.0, 4.0, 8.0)
 #: A board must send something wrong for so long before it is set up again, then the pause
 #: doubles up to the last: what setting up does not mend should not be disturbed for ever.
@@ -67,7 +62,6 @@ WRONG_S = 1.0
 WRONG_RETRY_S = (5.0, 10.0, 20.0, 60.0)
 #: A period that is off by more than this share is not the one that was set.
 WRONG_PERIOD = 0.25
-PERIOD_SWEEPS = 16
 _ANSWERS = (MessageClass.ANALOG_COMMAND, MessageClass.MANAGEMENT)
 
 
@@ -76,70 +70,6 @@ class Sender(Protocol):
 
     async def send(self, frames: Iterable[tuple[int, bytes]], gap_s: float = ...) -> None:
         """Send (identifier, data) frames, `gap_s` apart. Raises BusError."""
-
-
-@dataclass(slots=True)
-class BoardRecord:
-    """What is known of one board; part of the health record.
-
-    Attributes:
-        started: it has been set up and told to send.
-        alive: it sends.
-        configurations: how often it was set up.
-        silences: how often it fell silent.
-        resets: how often it had started anew by itself when it was asked.
-        lost_set_ups: how often it sent something else than it was set up to.
-        tx_overflows: how often it said that it had to drop frames.
-    """
-
-    index: int
-    layout: BoardLayout
-    board_type: int | None = None
-    firmware: tuple[int, int, int] | None = None
-    in_bootloader: bool = False
-    started: bool = False
-    alive: bool = False
-    configurations: int = 0
-    configured_ns: int = 0
-    silences: int = 0
-    resets: int = 0
-    lost_set_ups: int = 0
-    tx_overflows: int = 0
-    life_s: float | None = None
-    answered_ns: int = 0
-    last_sweep_ns: int = 0
-    sweep_times_ns: deque[int] = field(default_factory=lambda: deque(maxlen=PERIOD_SWEEPS + 1))
-    missing: int = 0
-    wrong: str = ""
-    wrong_since_ns: int = 0
-    wrong_tries: int = 0
-    wrong_retry_ns: int = 0
-    retry_at_ns: int = 0
-    retries: int = 0
-    commands: list[Message] = field(default_factory=list)
-    busy: "asyncio.Task[None] | None" = None
-
-    @property
-    def interval_ns(self) -> float | None:
-        """Median of its last intervals, None until there are enough."""
-        if len(self.sweep_times_ns) < PERIOD_SWEEPS // 2:
-            return None
-        intervals = np.diff(np.array(self.sweep_times_ns, np.int64))
-        return float(np.median(intervals))
-
-    @property
-    def is_mtb3(self) -> bool:
-        """By its own answer, or by the configuration where it did not answer."""
-        if self.board_type is None:
-            return self.layout.settings.model == "mtb3"
-        return self.board_type == BoardType.SKIN
-
-    @property
-    def gap_s(self) -> float:
-        """How far apart its commands must be."""
-        if self.is_mtb3:
-            return MTB3_GAP_PERIODS * self.layout.settings.period_ms * 1e-3
-        return GAP_S
 
 
 class Boards:
@@ -152,6 +82,8 @@ class Boards:
         triangles: all triangles of the skin.
         silent_periods: a started board is silent after so many periods without a sweep.
         zeroed: called with the board's index just before it takes a new zero.
+        clock: time in ns that only passes while the bus is being read: while nobody looks, no
+            board is silent.
     """
 
     def __init__(
@@ -162,8 +94,10 @@ class Boards:
         triangles: tuple[TriangleLayout, ...],
         silent_periods: float,
         zeroed: Callable[[int], object] = lambda _: None,
+        clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.bus = bus
+        self._clock = clock
         self._zeroed = zeroed
         self._port = port
         self._silent_periods = silent_periods
@@ -223,7 +157,8 @@ class Boards:
         await asyncio.sleep(max(gap_s, NEW_OFFSET_S))
         await self._port.send([command_frame(SetTxMode(TxMode.START), address)])
         record.configurations += 1
-        record.configured_ns = time.monotonic_ns()
+        record.configured_ns = self._clock()
+        record.configured_at_ns = time.monotonic_ns()
         record.sweep_times_ns.clear()
         record.missing = 0
         record.wrong = ""
@@ -234,7 +169,7 @@ class Boards:
 
         No discovery of all here: it would silence the MTB3s that are well.
         """
-        now_ns = time.monotonic_ns()
+        now_ns = self._clock()
         for record in self.records.values():
             if not record.started or record.busy is not None:
                 continue
@@ -310,22 +245,31 @@ class Boards:
         record.busy = asyncio.create_task(do(), name=f"board {record.layout.name}")
 
     async def _revive(self, record: BoardRecord) -> None:
-        """Ask a silent board who it is and how long it has been up, then set it up."""
+        """Ask a silent board who it is and how long it has been up; do what that calls for."""
         address = record.layout.settings.address
         asked_ns = time.monotonic_ns()
-        record.life_s = None
-        questions: list[Message] = [Discover()]
-        if not record.is_mtb3:
-            questions.append(GetTimeOfLife())
-        await self._port.send([command_frame(question, address) for question in questions])
-        await asyncio.sleep(ANSWER_S)
-        answered = record.answered_ns >= asked_ns
-        up_since_ns = asked_ns - int((record.life_s or 0.0) * 1e9)
         # An MTB3 does not tell its age; one that answers and does not send was reset.
-        aged = record.is_mtb3 or record.life_s is not None
-        if answered and aged and up_since_ns > record.configured_ns:
-            record.resets += 1
-        if not record.in_bootloader:
+        tells_age = not record.is_mtb3
+        questions: list[Message] = [Discover()]
+        if tells_age:
+            questions.append(GetTimeOfLife())
+        known = record.board_type is not None
+        sent_before = record.last_sweep_ns > record.configured_ns
+        record.answered_ns, record.life_s = 0, None
+        await self._port.send([command_frame(question, address) for question in questions])
+        while time.monotonic_ns() - asked_ns < ANSWER_S * 1e9:
+            if record.answered_ns and (record.life_s is not None or not tells_age):
+                break
+            await asyncio.sleep(GAP_S)
+        if record.in_bootloader or (known and not record.answered_ns):
+            return
+        reset = record.answered_ns != 0 and not tells_age
+        if record.life_s is not None:
+            reset = asked_ns - int(record.life_s * 1e9) > record.configured_at_ns
+        record.resets += reset
+        if sent_before and record.life_s is not None and not reset and record.retries == 1:
+            await self._port.send([command_frame(SetTxMode(TxMode.START), address)])
+        else:
             await self._set_up(record)
 
     async def stop(self) -> None:
@@ -345,10 +289,10 @@ class Boards:
     def note_sweep(self, board: int, present: int, t_ns: int) -> None:
         """A sweep of this board (index in `Layout.boards`) came, with these triangles.
 
-        Whether a board is silent goes by our own monotonic clock: `t_ns` may jump.
+        Whether a board is silent goes by our own clock: `t_ns` may jump.
         """
         record = self._of_index[board]
-        record.last_sweep_ns = time.monotonic_ns()
+        record.last_sweep_ns = self._clock()
         record.sweep_times_ns.append(t_ns)
         record.missing &= ~present
 
@@ -398,27 +342,3 @@ class Boards:
             record.life_s = answer.seconds
         elif isinstance(answer, TxOverflow):
             record.tx_overflows += 1
-
-
-def configuration(board: BoardLayout, triangles: list[TriangleLayout]) -> list[Message]:
-    """Commands 4D and 50 that set up a board; runs of equal triangles share one command."""
-    settings = board.settings
-    commands: list[Message] = [
-        SetBoardConfig(settings.skin_type, settings.period_ms, settings.no_load)
-    ]
-    run: SetTriangleConfig | None = None
-    for triangle in sorted(triangles, key=lambda triangle: triangle.number):
-        alike = (
-            run is not None
-            and run.last + 1 == triangle.number
-            and (run.shift, run.cdc_offset) == (triangle.shift, triangle.cdc_offset)
-        )
-        first = run.first if run is not None and alike else triangle.number
-        if run is not None and not alike:
-            commands.append(run)
-        run = SetTriangleConfig(
-            first, triangle.number, triangle.shift, cdc_offset=triangle.cdc_offset
-        )
-    if run is not None:
-        commands.append(run)
-    return commands

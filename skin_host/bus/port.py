@@ -100,7 +100,10 @@ class Port(ABC):
         channel: of the interface, e.g. "can0".
         state: of the link, as far as it is known.
         counters: of everything since opening.
+        capacity: most frames of one read.
     """
+
+    capacity: int
 
     def __init__(self, name: str, settings: Bus, bus: can.BusABC) -> None:
         self.name = name

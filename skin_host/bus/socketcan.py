@@ -227,6 +227,8 @@ def _grow_buffer(sock: socket.socket, wanted: int) -> int:
 class SocketCanPort(Port):
     """A SocketCAN interface. `reopen` gives a new bus when the device is back."""
 
+    capacity = CAPACITY
+
     def __init__(
         self,
         name: str,

@@ -1,12 +1,15 @@
 """Boards that reset, come late, stop or lose their set-up are set up again, alone."""
 
 import asyncio
+import time
 from pathlib import Path
 
+import can
 import numpy as np
 import pytest
 
 from emulator.scene import Fault
+from skin_host.bus.commands import SetTxMode, TxMode, command_frame
 from skin_host.settings import Bus
 from tests.support.live import living
 
@@ -90,3 +93,34 @@ async def test_a_dead_bus_floods_no_log(
         assert live.faults() == {("bus_silent", "can0"), ("broker_away", "broker")}
         lines = [record for record in caplog.records if record.levelname != "DEBUG"]
         assert len(lines) <= 1, [record.getMessage() for record in lines]
+
+
+async def test_a_daemon_that_was_held_up_takes_no_board_for_silent(
+    can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    async with living(can_bus_settings, tmp_path) as live:
+        await live.until_well(but=LATELY)
+        records = live.daemon.link.boards["can0"].records.values()
+        before = [(record.configurations, record.silences) for record in records]
+        # Nothing in this process runs, the emulated robot included.
+        time.sleep(1.0)  # noqa: ASYNC251
+        await asyncio.sleep(0.5)
+        assert [(record.configurations, record.silences) for record in records] == before
+
+
+async def test_a_board_that_paused_keeps_its_zero(can_bus_settings: Bus, tmp_path: Path) -> None:
+    async with living(can_bus_settings, tmp_path) as live:
+        await live.until_well(but=LATELY)
+        record = live.daemon.link.boards["can0"].records[14]
+        zeroes = dict(live.daemon.engine.rezeros)
+        bus = can.Bus(interface=can_bus_settings.interface, channel=can_bus_settings.channel)
+        # Somebody else tells the board to stop; it is not reset and stays as it was set up.
+        identifier, data = command_frame(SetTxMode(TxMode.STOP), 14)
+        bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+        async with asyncio.timeout(5.0):
+            while not record.silences:  # noqa: ASYNC110
+                await asyncio.sleep(0.02)
+        await live.until_well(limit_s=5.0, but=LATELY)
+        bus.shutdown()
+        assert record.configurations == 1
+        assert live.daemon.engine.rezeros == zeroes

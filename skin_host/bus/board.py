@@ -1,0 +1,106 @@
+"""One board: what is known of it, and the commands that set it up."""
+
+import asyncio
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from skin_host.bus.commands import BoardType, Message, SetBoardConfig, SetTriangleConfig
+from skin_host.layout import BoardLayout, TriangleLayout
+
+MTB3_GAP_PERIODS = 2.5
+GAP_S = 0.01
+PERIOD_SWEEPS = 16
+
+
+@dataclass(slots=True)
+class BoardRecord:
+    """What is known of one board; part of the health record.
+
+    Attributes:
+        started: it has been set up and told to send.
+        alive: it sends.
+        configurations: how often it was set up.
+        silences: how often it fell silent.
+        resets: how often it had started anew by itself when it was asked.
+        lost_set_ups: how often it sent something else than it was set up to.
+        tx_overflows: how often it said that it had to drop frames.
+
+    Times ending in `_at_ns`, and `answered_ns`, are monotonic; the others are on the clock of
+    `Boards`, which stands still while nobody reads the bus.
+    """
+
+    index: int
+    layout: BoardLayout
+    board_type: int | None = None
+    firmware: tuple[int, int, int] | None = None
+    in_bootloader: bool = False
+    started: bool = False
+    alive: bool = False
+    configurations: int = 0
+    configured_ns: int = 0
+    configured_at_ns: int = 0
+    silences: int = 0
+    resets: int = 0
+    lost_set_ups: int = 0
+    tx_overflows: int = 0
+    life_s: float | None = None
+    answered_ns: int = 0
+    last_sweep_ns: int = 0
+    sweep_times_ns: deque[int] = field(default_factory=lambda: deque(maxlen=PERIOD_SWEEPS + 1))
+    missing: int = 0
+    wrong: str = ""
+    wrong_since_ns: int = 0
+    wrong_tries: int = 0
+    wrong_retry_ns: int = 0
+    retry_at_ns: int = 0
+    retries: int = 0
+    commands: list[Message] = field(default_factory=list)
+    busy: "asyncio.Task[None] | None" = None
+
+    @property
+    def interval_ns(self) -> float | None:
+        """Median of its last intervals, None until there are enough."""
+        if len(self.sweep_times_ns) < PERIOD_SWEEPS // 2:
+            return None
+        intervals = np.diff(np.array(self.sweep_times_ns, np.int64))
+        return float(np.median(intervals))
+
+    @property
+    def is_mtb3(self) -> bool:
+        """By its own answer, or by the configuration where it did not answer."""
+        if self.board_type is None:
+            return self.layout.settings.model == "mtb3"
+        return self.board_type == BoardType.SKIN
+
+    @property
+    def gap_s(self) -> float:
+        """How far apart its commands must be."""
+        if self.is_mtb3:
+            return MTB3_GAP_PERIODS * self.layout.settings.period_ms * 1e-3
+        return GAP_S
+
+
+def configuration(board: BoardLayout, triangles: list[TriangleLayout]) -> list[Message]:
+    """Commands 4D and 50 that set up a board; runs of equal triangles share one command."""
+    settings = board.settings
+    commands: list[Message] = [
+        SetBoardConfig(settings.skin_type, settings.period_ms, settings.no_load)
+    ]
+    run: SetTriangleConfig | None = None
+    for triangle in sorted(triangles, key=lambda triangle: triangle.number):
+        alike = (
+            run is not None
+            and run.last + 1 == triangle.number
+            and (run.shift, run.cdc_offset) == (triangle.shift, triangle.cdc_offset)
+        )
+        first = run.first if run is not None and alike else triangle.number
+        if run is not None and not alike:
+            commands.append(run)
+        run = SetTriangleConfig(
+            first, triangle.number, triangle.shift, cdc_offset=triangle.cdc_offset
+        )
+    if run is not None:
+        commands.append(run)
+    return commands
