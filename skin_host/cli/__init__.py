@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from skin_host import __version__
-from skin_host.cli import emulation, files, measure, operate, recordings, watch
+from skin_host.cli import completion, emulation, files, measure, operate, recordings, watch
 from skin_host.errors import SkinError
 
 
@@ -36,14 +36,16 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(
         title="commands", metavar="COMMAND", required=True, parser_class=_Parser
     )
-    for room in (operate, watch, files, recordings, emulation, measure):
+    for room in (operate, watch, files, recordings, emulation, measure, completion):
         room.add_commands(commands)
     return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
-    arguments = build_parser().parse_args(argv)
+    parser = build_parser()
+    completion.complete_if_asked(parser)
+    arguments = parser.parse_args(argv)
     name = f"skin {arguments.command}"
     try:
         status: int = arguments.run(arguments)

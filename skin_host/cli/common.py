@@ -7,10 +7,11 @@ import logging
 import signal
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from skin_host.layout import Layout, build_layout
-from skin_host.settings import Settings, load
+if TYPE_CHECKING:
+    from skin_host.layout import Layout
+    from skin_host.settings import Settings
 
 Commands = Any  # argparse's own type of sub-parser collections is private
 
@@ -49,13 +50,15 @@ def set_up_logging(verbose: bool) -> None:
         logging.getLogger(noisy).setLevel(logging.WARNING)
 
 
-def load_skin(config: Path) -> tuple[Settings, Layout]:
+def load_skin(config: Path) -> "tuple[Settings, Layout]":
     """Settings and layout of a configuration file.
 
     Raises:
         ConfigurationError: see `settings.load` and `layout.build_layout`.
     """
     from skin_host.errors import ConfigurationError
+    from skin_host.layout import build_layout
+    from skin_host.settings import load
 
     settings = load(config)
     try:

@@ -18,13 +18,13 @@ from skin_host.cli.common import (
     stop_on_signals,
 )
 from skin_host.errors import RequestError
-from skin_host.layout import Layout
-from skin_host.settings import Settings
 
 if TYPE_CHECKING:
     import can
 
     from emulator.robot import Robot
+    from skin_host.layout import Layout
+    from skin_host.settings import Settings
 
 #: Lives on open python-can buses, by name, until cancelled.
 Work = Callable[[dict[str, "can.BusABC"]], Coroutine[Any, Any, None]]
@@ -112,7 +112,7 @@ def _emulate(arguments: argparse.Namespace) -> int:
 
 
 def _on_real_chips(
-    arguments: argparse.Namespace, settings: Settings, opened: contextlib.ExitStack
+    arguments: argparse.Namespace, settings: "Settings", opened: contextlib.ExitStack
 ) -> Work:
     from smbus2 import SMBus
 
@@ -125,8 +125,8 @@ def _on_real_chips(
 
 def _on_emulated_chips(
     arguments: argparse.Namespace,
-    settings: Settings,
-    layout: Layout,
+    settings: "Settings",
+    layout: "Layout",
     opened: contextlib.ExitStack,
 ) -> Work:
     from emulator.clock import RealClock
