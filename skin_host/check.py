@@ -17,6 +17,8 @@ from skin_host.settings import Settings, skin_hash
 #: with as many as there can be.
 FRAME_BITS = (111, 135)
 FRAMES_PER_TRIANGLE = 2
+#: The same of the two frames of six bytes that make one sample of force and torque.
+WRENCH_BITS = (2 * 95, 2 * 115)
 #: A bus that is loaded higher has no room for commands and retransmissions.
 WARN_LOAD = 0.8
 #: Twelve stages at decimation 256 take the chip this long (AD7147; MTB3's timer constants).
@@ -29,7 +31,7 @@ SAME_PLACE_M = 1e-4
 
 
 class BusRecord(TypedDict):
-    """One bus. `load` is the share of its time that skin frames take, least and most."""
+    """One bus. `load` is the share of its time that all configured boards take, least and most."""
 
     name: str
     interface: str
@@ -66,6 +68,18 @@ class PartRecord(TypedDict):
     area_cm2: float
 
 
+class FingertipRecord(TypedDict):
+    """One fingertip on a force/torque board."""
+
+    name: str
+    node: str
+    bus: str
+    address: int
+    period_ms: int
+    shape: str
+    array: str | None
+
+
 class Totals(TypedDict):
     """The whole robot."""
 
@@ -86,6 +100,7 @@ class Description(TypedDict):
     buses: list[BusRecord]
     boards: list[BoardRecord]
     parts: list[PartRecord]
+    fingertips: list[FingertipRecord]
     total: Totals
     warnings: list[str]
 
@@ -100,6 +115,18 @@ def describe(settings: Settings, layout: Layout) -> Description:
         "buses": buses,
         "boards": [_board(board, layout) for board in layout.boards],
         "parts": parts,
+        "fingertips": [
+            {
+                "name": name,
+                "node": tip.node,
+                "bus": tip.bus,
+                "address": tip.address,
+                "period_ms": tip.period_ms,
+                "shape": tip.shape,
+                "array": tip.array,
+            }
+            for name, tip in settings.fingertips.items()
+        ],
         "total": {
             "buses": len(buses),
             "boards": len(layout.boards),
@@ -110,7 +137,7 @@ def describe(settings: Settings, layout: Layout) -> Description:
             "area_cm2": round(sum(part["area_cm2"] for part in parts), 1),
         },
         "warnings": [
-            *_bus_warnings(buses),
+            *_bus_warnings(buses, {tip.bus for tip in settings.fingertips.values()}),
             *_board_warnings(layout),
             *_part_warnings(layout),
         ],
@@ -134,14 +161,20 @@ def _bus(name: str, settings: Settings, layout: Layout) -> BusRecord:
         FRAMES_PER_TRIANGLE * len(board.triangles) * 1000 / board.settings.period_ms
         for board in boards
     )
-    least, most = (bits * frames_per_s / bus.bitrate for bits in FRAME_BITS)
+    samples_per_s = math.fsum(
+        1000 / tip.period_ms for tip in settings.fingertips.values() if tip.bus == name
+    )
+    least, most = (
+        (bits * frames_per_s + wrench_bits * samples_per_s) / bus.bitrate
+        for bits, wrench_bits in zip(FRAME_BITS, WRENCH_BITS, strict=True)
+    )
     return {
         "name": name,
         "interface": bus.interface,
         "channel": bus.channel,
         "boards": len(boards),
         "triangles": sum(len(board.triangles) for board in boards),
-        "frames_per_s": round(frames_per_s, 1),
+        "frames_per_s": round(frames_per_s + 2 * samples_per_s, 1),
         "load": (round(least, 3), round(most, 3)),
     }
 
@@ -175,7 +208,7 @@ def _part(number: int, layout: Layout) -> PartRecord:
     }
 
 
-def _bus_warnings(buses: list[BusRecord]) -> list[str]:
+def _bus_warnings(buses: list[BusRecord], used: set[str]) -> list[str]:
     return [
         f"buses.{bus['name']}: skin frames take {_load(bus)} of the bus; wanted at most "
         f"{WARN_LOAD:.0%}: raise period_ms of its boards, or move boards to another bus"
@@ -184,7 +217,7 @@ def _bus_warnings(buses: list[BusRecord]) -> list[str]:
     ] + [
         f"buses.{bus['name']}: no board is on this bus; it will be opened for nothing"
         for bus in buses
-        if not bus["boards"]
+        if not bus["boards"] and bus["name"] not in used
     ]
 
 
@@ -317,6 +350,24 @@ def table(description: Description) -> str:
             ],
         ),
     ]
+    if description["fingertips"]:
+        sections.append(
+            _columns(
+                ["fingertip", "node", "bus", ">address", ">period", "shape", "array"],
+                [
+                    [
+                        tip["name"],
+                        tip["node"],
+                        tip["bus"],
+                        tip["address"],
+                        f"{tip['period_ms']} ms",
+                        tip["shape"],
+                        tip["array"] or "-",
+                    ]
+                    for tip in description["fingertips"]
+                ],
+            )
+        )
     if description["warnings"]:
         sections.append("\n".join(f"warning: {text}" for text in description["warnings"]))
     return "\n\n".join(sections)

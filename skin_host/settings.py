@@ -15,6 +15,7 @@ from msgspec import Meta, Struct, field
 
 from skin_host.errors import ConfigurationError
 from skin_host.explain import Name, Named, explain, not_finite
+from skin_host.fingertip.settings import Fingertip, wrong_references
 
 Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
@@ -263,6 +264,8 @@ class Settings(_Table):
     parts: Annotated[dict[Name, Part], Meta(min_length=1)]
     #: Kinds of sensor unit beyond the built-in ones.
     kinds: dict[Name, Kind] = {}
+    #: Fingertips on force/torque boards.
+    fingertips: dict[Name, Fingertip] = {}
     processing: Processing = field(default_factory=Processing)
     mqtt: Mqtt = field(default_factory=Mqtt)
     receive: Receive = field(default_factory=Receive)
@@ -304,7 +307,13 @@ def load(path: Path) -> Settings:
     try:
         settings = msgspec.toml.decode(data, type=Settings)
     except msgspec.ValidationError as error:
-        named: Named = {"buses": Bus, "boards": Board, "parts": Part, "kinds": Kind}
+        named: Named = {
+            "buses": Bus,
+            "boards": Board,
+            "parts": Part,
+            "kinds": Kind,
+            "fingertips": Fingertip,
+        }
         document = msgspec.toml.decode(data)
         what = explain(document, error, Settings, named)
         raise ConfigurationError(f"{path}: {what}") from None
@@ -389,6 +398,8 @@ def _check_references(path: Path, settings: Settings) -> None:
     unused = set(settings.boards) - {board for board, _ in used}
     if unused:
         raise wrong(f"boards.{min(unused)}", "no part uses this board; remove it or add a patch")
+    for where, what in wrong_references(settings):
+        raise wrong(where, what)
     relaxation = settings.processing.relaxation
     if (relaxation.beta is None) != (relaxation.tau_s is None):
         raise wrong("processing.relaxation", "`beta` and `tau_s` go together")

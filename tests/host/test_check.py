@@ -106,3 +106,23 @@ def test_the_table_holds_totals_and_warnings() -> None:
     assert total.split()[:5] == ["total", "10", "160", "1920", "0"]
     assert "warning: buses.can0" in text
     assert all(line == line.rstrip() for line in text.splitlines())
+
+
+def test_a_fingertip_is_listed_and_its_samples_load_the_bus() -> None:
+    settings = msgspec.convert(
+        {
+            "robot": "test",
+            "buses": {"can0": {}, "can1": {}},
+            "boards": {"hand": {"bus": "can0", "address": 1, "skin_type": 2}},
+            "parts": {"palm": {"patches": [{"board": "hand", "triangles": "0-3"}]}},
+            "fingertips": {
+                "index": {"bus": "can1", "address": 3, "shape": "sphere", "radius_mm": 9}
+            },
+        },
+        Settings,
+    )
+    description = check.describe(settings, build_layout(settings, Path()))
+    assert description["buses"][1]["frames_per_s"] == 200
+    assert description["buses"][1]["load"] == pytest.approx((0.019, 0.023))
+    assert description["warnings"] == []
+    assert "index      main  can1        3   10 ms  sphere  -" in check.table(description)

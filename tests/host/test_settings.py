@@ -25,6 +25,7 @@ def edited(folder: Path, old: str, new: str) -> Path:
 
 TOP = 'robot = "demo"'
 PATCH = "parts.left_hand.patches[1]"
+TIP = 'fingertips.tip]\nbus = "can0"\naddress = 3\nshape = '
 
 
 @pytest.mark.parametrize(
@@ -92,6 +93,46 @@ PATCH = "parts.left_hand.patches[1]"
             TOP,
             f"{TOP}\n[processing.relaxation]\nbeta = [0.1]",
             "processing.relaxation: `beta` and `tau_s` go together",
+        ),
+        (
+            TOP,
+            f'{TOP}\n[{TIP}"cube"',
+            "fingertips.tip.shape: seen 'cube', wanted one of: sphere, cylinder, ellipsoid, plane",
+        ),
+        (
+            TOP,
+            f'{TOP}\n[{TIP}"sphere"',
+            "fingertips.tip.radius_mm: missing key; a sphere needs it",
+        ),
+        (
+            TOP,
+            f'{TOP}\n[{TIP}"plane"\nradius_mm = 3',
+            "fingertips.tip.radius_mm: a plane has none",
+        ),
+        (
+            TOP,
+            f'{TOP}\n[{TIP}"plane"\nmatrix = [[1, 0, 0, 0, 0, 0]]',
+            "fingertips.tip.matrix: wanted `array` of length 6, seen 1",
+        ),
+        (
+            TOP,
+            f'{TOP}\n[{TIP}"plane"\narray = "palm"',
+            'fingertips.tip.array: no part "palm"; there are: left_hand, left_forearm',
+        ),
+        (
+            TOP,
+            f'{TOP}\n[{TIP}"plane"\nfilter_hz = 50',
+            "fingertips.tip.filter_hz: 50; wanted below 50, half of the samples' rate",
+        ),
+        (
+            TOP,
+            f'{TOP}\n[{TIP.replace("3", "13")}"plane"',
+            'fingertips.tip.address: 13 on bus "can0" is already that of board "forearm_outer"',
+        ),
+        (
+            TOP,
+            f'{TOP}\n[{TIP.replace(".tip", ".left_hand")}"plane"',
+            "fingertips.left_hand: the name is taken by another's topics; choose another",
         ),
     ],
 )
