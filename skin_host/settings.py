@@ -234,6 +234,8 @@ class Mqtt(_Table):
     frame_hz: Annotated[float, Meta(ge=0)] = 0.0
     event_queue: Annotated[int, Meta(ge=16, le=1_000_000)] = 10_000
     commands: bool = True
+    #: Tell Home Assistant of the parts below this prefix, "homeassistant" as a rule.
+    discovery_prefix: Annotated[str, Meta(pattern=r"^[a-zA-Z0-9_/-]+$")] | None = None
 
 
 class Receive(_Table):

@@ -32,6 +32,7 @@ from skin_host.publish.connection import (
     message_properties,
     within,
 )
+from skin_host.publish.home_assistant import discovery
 from skin_host.publish.info import NodeInfo, encode_info
 from skin_host.publish.outbox import Event, Outbox, PublisherCounters
 from skin_host.publish.topics import OFFLINE, ONLINE, Topics
@@ -93,6 +94,7 @@ class Publisher:
         if self._encoding == "cbor":
             messages.load_cbor2()
         self._node = node
+        self._discovery_prefix = settings.discovery_prefix
         self._identifier = f"skin-{robot}-{node}"
         self._desk = CommandDesk(handler) if handler and settings.commands else None
         self._drain_s = drain_s
@@ -133,6 +135,9 @@ class Publisher:
     def put_info(self, info: NodeInfo) -> None:
         """Say what this node is; again whenever that changes."""
         self._outbox.put_state(self.topics.node("info", self._node), encode_info(info))
+        if self._discovery_prefix is not None:
+            for topic, payload in discovery(self._discovery_prefix, self.topics, info).items():
+                self._outbox.put_state(topic, payload)
 
     def put_frame(self, frame: PressureFrame) -> None:
         """Send a frame, if no newer one of its part comes first. It must not change any more."""

@@ -2,6 +2,7 @@
 
 import json
 import threading
+import time
 from typing import Any
 
 import paho.mqtt.client as mqtt
@@ -34,6 +35,17 @@ class Subscriber:
     def documents(self, ending: str) -> list[Any]:
         """The same as JSON."""
         return [json.loads(payload) for payload in self.payloads(ending)]
+
+    def wait_for(self, n: int) -> dict[str, bytes]:
+        """Wait until so many topics have been heard of; return the last payload of each."""
+        deadline_s = time.monotonic() + 20
+        while True:
+            with self._lock:
+                heard = dict(self._messages)
+            if len(heard) >= n:
+                return heard
+            assert time.monotonic() < deadline_s, f"waited for {n} topics, heard {sorted(heard)}"
+            time.sleep(0.02)
 
     def close(self) -> None:
         self._client.disconnect()

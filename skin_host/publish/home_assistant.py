@@ -1,0 +1,72 @@
+"""How Home Assistant finds the skin by itself: its MQTT discovery messages.
+
+Two entities a part, grouped by node: whether anything touches it, and whether it is well.
+Source: Home Assistant's documentation of the MQTT integration ("MQTT discovery") and of its
+binary sensor. Nothing of the configuration but names goes in.
+"""
+
+import re
+from typing import Any, Final
+
+import msgspec
+
+from skin_host.publish.info import NodeInfo
+from skin_host.publish.topics import Topics
+
+#: As on the page and in `skin status`: anything but `ok` is a problem, and says why.
+PROBLEM: Final = "{{ 'OFF' if value_json.state == 'ok' else 'ON' }}"
+WHY: Final = "{{ {'state': value_json.state, 'sentences': value_json.sentences} | tojson }}"
+#: What cannot be felt is not "not touched": then the contact is unavailable.
+FEELS: Final = "{{ 'online' if value_json.state in ('ok', 'degraded') else 'offline' }}"
+
+
+def discovery(prefix: str, topics: Topics, info: NodeInfo) -> dict[str, bytes]:
+    """Topics and payloads, to be retained, that announce the parts of a node.
+
+    Args:
+        prefix: where Home Assistant looks, `homeassistant` unless it was told otherwise.
+        topics: of the robot.
+        info: what the node is.
+    """
+    skin = _identifier(topics.base)
+    alive = {"topic": topics.node("status", info.node)}
+    messages: dict[str, dict[str, Any]] = {}
+    for part in info.parts:
+        health = topics.part("health", part)
+        messages[f"{skin}_{part}_contact"] = {
+            "name": f"{part} contact",
+            "icon": "mdi:gesture-tap",
+            "state_topic": topics.part("contact", part),
+            "availability": [alive, {"topic": health, "value_template": FEELS}],
+            "availability_mode": "all",
+        }
+        messages[f"{skin}_{part}_problem"] = {
+            "name": f"{part} problem",
+            "device_class": "problem",
+            "entity_category": "diagnostic",
+            "state_topic": health,
+            "value_template": PROBLEM,
+            "json_attributes_topic": health,
+            "json_attributes_template": WHY,
+            "availability": [alive],
+        }
+    common = {
+        "qos": 1,
+        "device": {
+            "identifiers": [f"{skin}_nodes_{info.node}"],
+            "name": f"{info.robot} skin, node {info.node}",
+            "sw_version": info.version,
+        },
+        "origin": {"name": "skin-host", "sw_version": info.version},
+    }
+    return {
+        f"{prefix}/binary_sensor/{name}/config": msgspec.json.encode(
+            {"unique_id": name} | message | common
+        )
+        for name, message in messages.items()
+    }
+
+
+def _identifier(base: str) -> str:
+    """Letters, digits, `_` and `-`, which is all that a discovery topic takes."""
+    return re.sub(r"[^a-zA-Z0-9_-]", "_", base)
