@@ -1,0 +1,78 @@
+"""A stand-in for the few names of ROS 2 that `examples/ros2_node.py` uses.
+
+rclpy comes with ROS 2 and with nothing else: it is on no package index. What is ours in the
+example is run with these; what ROS does with the messages is not tested here.
+"""
+
+import sys
+import threading
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pytest
+
+PATIENCE_S = 30.0
+
+
+class Vector3:
+    def __init__(self) -> None:
+        self.x = self.y = self.z = 0.0
+
+
+class WrenchStamped:
+    def __init__(self) -> None:
+        self.header = SimpleNamespace(frame_id="", stamp=SimpleNamespace(sec=0, nanosec=0))
+        self.wrench = SimpleNamespace(force=Vector3(), torque=Vector3())
+
+
+class Float32MultiArray:
+    def __init__(self, data: list[float]) -> None:
+        self.data = data
+
+
+class Node:
+    """Keeps what is published: (topic, message)."""
+
+    enough = 1
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.made: list[str] = []
+        self.published: list[tuple[str, Any]] = []
+        self.heard = threading.Event()
+        nodes.append(self)
+
+    def create_publisher(self, _kind: type, topic: str, _depth: int) -> Any:
+        self.made.append(topic)
+
+        def publish(message: Any) -> None:
+            self.published.append((topic, message))
+            if len(self.published) >= self.enough:
+                self.heard.set()
+
+        return SimpleNamespace(publish=publish)
+
+
+nodes: list[Node] = []
+
+
+def spin(node: Node) -> None:
+    """Return once the node has published enough."""
+    assert node.heard.wait(PATIENCE_S)
+
+
+def install(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make `import rclpy` and what belongs to it find these."""
+    nodes.clear()
+    for name, attributes in {
+        "rclpy": {"init": lambda: None, "spin": spin},
+        "rclpy.node": {"Node": Node},
+        "rclpy.publisher": {"Publisher": SimpleNamespace},
+        "geometry_msgs": {},
+        "geometry_msgs.msg": {"WrenchStamped": WrenchStamped},
+        "std_msgs": {},
+        "std_msgs.msg": {"Float32MultiArray": Float32MultiArray},
+    }.items():
+        module = ModuleType(name)
+        vars(module).update(attributes)
+        monkeypatch.setitem(sys.modules, name, module)
