@@ -4,7 +4,6 @@ import asyncio
 import logging
 import time
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -20,7 +19,7 @@ from skin_host.errors import (
     RequestError,
     SkinError,
 )
-from skin_host.health import Health
+from skin_host.health import Health, Record
 from skin_host.layout import Layout, build_layout
 from skin_host.link import Link
 from skin_host.processing import calibration as calibrations
@@ -239,7 +238,7 @@ class Daemon:
         """
         save_state(self._state_path(), state)
 
-    def records(self) -> dict[str, dict[str, Any]]:
+    def records(self) -> dict[str, Record]:
         """The health record of every part, as it is now."""
         return {self.layout.parts[part].name: self._record_of(part) for part in self.engine.parts}
 
@@ -303,9 +302,8 @@ class Daemon:
         while True:
             await asyncio.sleep(LOOK_S)
             self.link.supervise()
-            now_ns = time.time_ns()
             now_s = time.monotonic()
-            self.health.tick(now_ns, self.link.ports, self.link.boards)
+            self.health.tick(self.link.read_ns, self.link.ports, self.link.boards)
             told: dict[tuple[str, str], str] = {}
             for part in self.engine.parts:
                 record = self._record_of(part)
@@ -313,7 +311,8 @@ class Daemon:
                     (fault["code"], fault["where"]): says
                     for fault, says in zip(record["faults"], record["sentences"], strict=True)
                 }
-                state = (record["state"], record["sentences"])
+                # Not the sentences: numbers in them change all the time.
+                state = (record["state"], {(one["code"], one["where"]) for one in record["faults"]})
                 if said.get(part) != state or now_s - said_s[part] >= HEALTH_S:
                     said[part], said_s[part] = state, now_s
                     self.publisher.put_health(self.layout.parts[part].name, record)
@@ -322,12 +321,10 @@ class Daemon:
                 self._status_s = now_s
                 service.notify("STATUS=" + self._status(len(told)))
 
-    def _record_of(self, part: int) -> dict[str, Any]:
-        now_ns = time.time_ns()
-        record = self.health.part_record(part, now_ns, self.link.ports, self.link.boards)
-        record["output"] = msgspec.to_builtins(self.publisher.counters)
-        self.health.diagnosed(part, record, now_ns)
-        return record
+    def _record_of(self, part: int) -> Record:
+        link = self.link
+        output = msgspec.to_builtins(self.publisher.counters)
+        return self.health.record(part, link.read_ns, link.ports, link.boards, output)
 
     def _status(self, faults: int) -> str:
         rates = self.health.rates()

@@ -6,10 +6,12 @@ and time. Names follow Prometheus' conventions: base units, `_total` for counter
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-Records = dict[str, dict[str, Any]]
+from skin_host.health import Record
+
+Records = dict[str, Record]
 
 MAX_REQUEST_BYTES = 8192
 TIMEOUT_S = 2.0
@@ -50,7 +52,7 @@ def exposition(records: Records) -> str:
     """All records in Prometheus' text format 0.0.4."""
     samples: dict[tuple[str, str, str], dict[str, float]] = {}
 
-    def put(table: dict[str, tuple[str, str, str]], source: dict[str, Any], labels: str) -> None:
+    def put(table: dict[str, tuple[str, str, str]], source: Mapping[str, Any], labels: str) -> None:
         for key, head in table.items():
             value = source.get(key)
             if value is not None:

@@ -117,7 +117,7 @@ def _replay(arguments: argparse.Namespace) -> int:
             if number % 200 == 0:
                 progress.update(0.0, f"{number} frames")
         for part in engine.parts:
-            output.write(messages.health_line(health.part_record(part, None, {}, {})))
+            output.write(messages.health_line(health.replayed(part)))
     progress.close()
     return 0
 

@@ -99,8 +99,7 @@ class Buses:
     def look(self) -> None:
         self.health.tick(self.t_ns, {}, {"can0": self.boards})
         for part in self.engine.parts:
-            record = self.health.part_record(part, self.t_ns, {}, {"can0": self.boards})
-            self.health.diagnosed(part, record, self.t_ns)
+            self.health.record(part, self.t_ns, {}, {"can0": self.boards})
 
 
 def configuration(data: bytes) -> None:

@@ -91,7 +91,7 @@ def test_an_accelerated_month(tmp_path: Path) -> None:
             events.update(event.event for event in step.events)
         if number % 25 == 0:
             health.tick(t_ns, {}, {})
-            health.diagnosed(0, health.part_record(0, t_ns, {}, {}), t_ns)
+            health.record(0, t_ns, {}, {})
         if engine.calibrating and engine.calibration_progress() >= 1.0:
             engine.use(engine.end_calibration("2026-01-01T00:00:00+00:00"))
         if t_ns >= next_hour_ns:

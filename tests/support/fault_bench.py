@@ -8,9 +8,8 @@ import numpy as np
 from emulator.robot import Robot
 from emulator.scene import Fault, Scene
 from skin_host.bus.assembler import Sweep
-from skin_host.diagnosis import Fault as Told
 from skin_host.engine import Engine, Step
-from skin_host.health import Health
+from skin_host.health import Health, Record
 from skin_host.layout import build_layout
 from skin_host.settings import load
 
@@ -33,12 +32,11 @@ class FaultBench:
         self.health = Health(self.engine)
         self.t_s = 0.0
         self.told: dict[tuple[str, str], float] = {}
-        self.says: dict[tuple[str, str], Told] = {}
         self.first_told: dict[tuple[str, str], float] = {}
         self.valid: dict[str, np.ndarray] = {}
         self.touched: dict[str, np.ndarray] = {}
         self.sweeps: dict[str, Sweep] = {}
-        self.records: dict[str, dict[str, Any]] = {}
+        self.records: dict[str, Record] = {}
         self.calibrate(calibrate_s)
         self.run(6.0)
         self.first_told.clear()
@@ -86,10 +84,9 @@ class FaultBench:
         self.health.tick(self.now_ns, {}, {})
         self.told = {}
         for part in self.engine.parts:
-            record = self.health.part_record(part, self.now_ns, {}, {})
-            for fault in self.health.diagnosed(part, record, self.now_ns):
-                key = (fault.code, fault.where)
+            record = self.health.record(part, self.now_ns, {}, {})
+            for fault in record["faults"]:
+                key = (fault["code"], fault["where"])
                 self.told[key] = self.t_s
-                self.says[key] = fault
                 self.first_told.setdefault(key, self.t_s)
             self.records[record["part"]] = record

@@ -5,12 +5,12 @@ can act on. `docs/operations.md` lists the codes and what to do about each.
 """
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from msgspec import Struct
 
-Record = Mapping[str, Any]
+from skin_host.health.record import BoardHealth, BusHealth, Record
 
 #: Share of a bus that strangers' frames may take before they are called babble.
 BABBLE_LOAD = 0.4
@@ -90,7 +90,7 @@ def diagnose(record: Record) -> list[Fault]:
 _SILENT = {"bus_off", "bus_down", "bus_gone", "bus_silent"}
 
 
-def _bus(bus: Record) -> Iterator[Fault]:
+def _bus(bus: BusHealth) -> Iterator[Fault]:
     name = bus["name"]
     state = bus.get("state", "up")
     if state in _BUS_STATES:
@@ -149,7 +149,7 @@ def _bus(bus: Record) -> Iterator[Fault]:
         )
 
 
-def _board(board: Record) -> Iterator[Fault]:
+def _board(board: BoardHealth) -> Iterator[Fault]:
     name = board["name"]
     here = f"board {name} (address {board['address']})"
     if board.get("in_bootloader"):
@@ -195,21 +195,21 @@ def _board(board: Record) -> Iterator[Fault]:
         )
     if events.get("tx_overflows"):
         yield Fault("board_overflows", name, f"{here} could not send all its frames: bus too full")
-    if board["alive"] and board.get("period_seen_ms") is not None:
-        wanted, seen = board["period_ms"], board["period_seen_ms"]
+    wanted, seen, jitter_ms = board["period_ms"], board["period_seen_ms"], board["jitter_ms"]
+    if board["alive"] and seen is not None and jitter_ms is not None:
         if abs(seen - wanted) > PERIOD_SHARE * wanted:
             yield Fault(
                 "board_period", name, f"{here} sends every {seen:.1f} ms instead of {wanted} ms"
             )
-        elif board["jitter_ms"] > JITTER_SHARE * wanted:
+        elif jitter_ms > JITTER_SHARE * wanted:
             yield Fault(
                 "board_jitter",
                 name,
-                f"{here} sends unevenly: its {wanted} ms scatter by {board['jitter_ms']:.1f} ms",
+                f"{here} sends unevenly: its {wanted} ms scatter by {jitter_ms:.1f} ms",
             )
 
 
-def _line_of(board: Record, triangle: int) -> int:
+def _line_of(board: BoardHealth, triangle: int) -> int:
     slot = _ERGO_HAND_SLOTS[triangle] if board.get("skin_type") == 3 else triangle
     return slot // LINE
 
@@ -274,19 +274,19 @@ def _taxels(record: Record) -> Iterator[Fault]:
         taxels = record["taxel_faults"].get(kind)
         if taxels:
             yield Fault(f"taxel_{kind}", part, f"taxels {_list(taxels)} of {part} {what}")
-    if record.get("baseline_at_limit"):
-        taxels = _list(record["baseline_at_limit"])
+    if record["baseline_at_limit"]:
+        at_limit = _list(record["baseline_at_limit"])
         yield Fault(
             "taxel_at_limit",
             part,
-            f"the baselines of taxels {taxels} of {part} cannot follow any farther; calibrate",
+            f"the baselines of taxels {at_limit} of {part} cannot follow any farther; calibrate",
         )
-    if record.get("baseline_frozen"):
-        taxels = _list(record["baseline_frozen"])
+    if record["baseline_frozen"]:
+        held = _list(record["baseline_frozen"])
         yield Fault(
             "taxel_held",
             part,
-            f"taxels {taxels} of {part} have been touched for so long that their zero is uncertain",
+            f"taxels {held} of {part} have been touched for so long that their zero is uncertain",
         )
 
 
@@ -316,7 +316,7 @@ def _part(record: Record) -> Iterator[Fault]:
         )
 
 
-def _output(output: Record | None) -> Iterator[Fault]:
+def _output(output: dict[str, Any] | None) -> Iterator[Fault]:
     if output is None:
         return
     if not output["connected"]:
@@ -333,7 +333,7 @@ def _output(output: Record | None) -> Iterator[Fault]:
         yield Fault("broker_refuses", "broker", f"the broker refuses: {output['last_error']}")
 
 
-def _list(numbers: Any) -> str:
+def _list(numbers: Iterable[int]) -> str:
     """Numbers as a short list with ranges: 1, 4-7, 9."""
     ordered = sorted(numbers)
     runs: list[tuple[int, int]] = []

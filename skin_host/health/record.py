@@ -1,0 +1,146 @@
+"""What the health record of a part holds, key by key: the payload of `<part>/health`.
+
+Plain dictionaries, because they go out as they are. Counters count from the start of the
+daemon. Keys that are not required are left out where nobody can tell: in a replay, which has
+no clock, and where there is no port or no board to ask.
+"""
+
+from typing import Any, NotRequired, TypedDict
+
+
+class LastSecond(TypedDict):
+    """What a bus has gained in about the last second.
+
+    `load` and `other_load` are shares of the bus: of all frames, and of those that are none of
+    the skin's. The others are counts; `wrong` are frames with a wrong header or too few bytes,
+    `spikes` single bytes that were off for one sweep.
+    """
+
+    frames_hz: int
+    load: float
+    other_load: float
+    wrong: int
+    halves: int
+    missed: int
+    unknown: int
+    spikes: int
+    dropped: int
+    error_frames: int
+
+
+class BusHealth(TypedDict):
+    """One bus: the counters of `AssemblerCounters`, and what its port knows.
+
+    `port` are `PortCounters`, `strangers` boards that are not configured (type by address),
+    `stranger` the identifier that strangers' frames have most.
+    """
+
+    name: str
+    channel: str
+    frames: int
+    other: int
+    wrong_header: int
+    short: int
+    unknown_board: int
+    unknown_triangle: int
+    late: int
+    sweeps: int
+    incomplete: int
+    halves: int
+    missed: int
+    state: NotRequired[str]
+    port: NotRequired[dict[str, int]]
+    strangers: NotRequired[dict[int, int]]
+    stranger: NotRequired[str]
+    last_second: NotRequired[LastSecond]
+    silent: NotRequired[bool]
+
+
+class BoardHealth(TypedDict):
+    """One board.
+
+    `period_seen_ms` and `jitter_ms` come from the kernel's time stamps of its last sweeps;
+    `in_doubt` counts taxels whose zero nobody knows; `lately` has the counters among
+    `resets`, `lost_set_ups`, `tx_overflows` and `rezeros` that rose within the last minute.
+    """
+
+    name: str
+    bus: str
+    address: int
+    skin_type: int
+    alive: bool
+    sweeps: int
+    fitted: list[int]
+    triangles_present: int
+    triangles: int
+    period_ms: int
+    period_seen_ms: float | None
+    jitter_ms: float | None
+    rezeros: int
+    in_doubt: int
+    board_type: NotRequired[int | None]
+    wrong_type: NotRequired[bool]
+    firmware: NotRequired[tuple[int, int, int] | None]
+    in_bootloader: NotRequired[bool]
+    configurations: NotRequired[int]
+    silences: NotRequired[int]
+    resets: NotRequired[int]
+    lost_set_ups: NotRequired[int]
+    tx_overflows: NotRequired[int]
+    age_ms: NotRequired[float | None]
+    lately: NotRequired[dict[str, int]]
+
+
+class TriangleHealth(TypedDict):
+    """A triangle that is not well, and why."""
+
+    board: str
+    triangle: int
+    fault: str
+
+
+class Warmth(TypedDict):
+    """How far thermal pads, and all untouched taxels together, read from what was calibrated."""
+
+    thermal_units: float | None
+    common_units: float
+
+
+class CalibrationName(TypedDict):
+    """Which calibration is in use."""
+
+    id: str
+    time: str
+
+
+class FaultName(TypedDict):
+    """What is wrong, for programs: `diagnosis` gives the codes."""
+
+    code: str
+    where: str
+
+
+class Record(TypedDict):
+    """One part. Taxels are told by their number within it; `output` are `PublisherCounters`."""
+
+    part: str
+    frames: int
+    rate_hz: float
+    taxels: int
+    valid_taxels: int
+    invalid: list[int]
+    beyond_range: list[int]
+    triangles: list[TriangleHealth]
+    taxel_verdicts: dict[str, list[int]]
+    taxel_faults: dict[str, list[int]]
+    boards: list[BoardHealth]
+    buses: list[BusHealth]
+    warmth: Warmth | None
+    baseline_frozen: list[int]
+    baseline_at_limit: list[int]
+    calibration: CalibrationName | None
+    state: str
+    age_ms: NotRequired[float | None]
+    output: NotRequired[dict[str, Any]]
+    faults: NotRequired[list[FaultName]]
+    sentences: NotRequired[list[str]]
