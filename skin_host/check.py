@@ -281,7 +281,7 @@ def table(description: Description) -> str:
     total = description["total"]
     sections = [
         f"robot {description['robot']}, configuration {description['configuration']}",
-        _columns(
+        columns(
             ["bus", "interface", "channel", ">boards", ">triangles", ">frames/s", ">load"],
             [
                 [
@@ -296,7 +296,7 @@ def table(description: Description) -> str:
                 for bus in description["buses"]
             ],
         ),
-        _columns(
+        columns(
             [
                 "board",
                 "bus",
@@ -323,7 +323,7 @@ def table(description: Description) -> str:
                 for board in description["boards"]
             ],
         ),
-        _columns(
+        columns(
             ["part", "node", ">boards", ">triangles", ">taxels", ">thermal", ">area"],
             [
                 [
@@ -352,7 +352,7 @@ def table(description: Description) -> str:
     ]
     if description["fingertips"]:
         sections.append(
-            _columns(
+            columns(
                 ["fingertip", "node", "bus", ">address", ">period", "shape", "array"],
                 [
                     [
@@ -378,7 +378,7 @@ def _load(bus: BusRecord) -> str:
     return f"{100 * least:.0f} .. {100 * most:.0f} %"
 
 
-def _columns(heads: list[str], rows: list[list[str | int]]) -> str:
+def columns(heads: list[str], rows: list[list[str | int]]) -> str:
     """Columns as wide as their longest entry; a head that starts with > is to the right."""
     cells = [[head.removeprefix(">") for head in heads], *([str(x) for x in row] for row in rows)]
     widths = [max(len(row[column]) for row in cells) for column in range(len(heads))]

@@ -159,6 +159,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _calibrate(arguments: argparse.Namespace) -> int:
     from skin_host.calibrate import take_calibration
+    from skin_host.cli import verdicts
     from skin_host.daemon import calibration_path, parts_of
     from skin_host.processing import calibration as calibrations
 
@@ -166,28 +167,30 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     if arguments.relaxation is not None or arguments.pressure is not None:
         return fit.run(arguments)
     settings, layout = load_skin(arguments.config)
+    parts = parts_of(layout, arguments.node)
     progress = Progress("calibrating, keep the skin untouched")
     try:
         found = asyncio.run(
-            take_calibration(
-                settings,
-                layout,
-                parts_of(layout, arguments.node),
-                arguments.seconds,
-                progress.update,
-            )
+            take_calibration(settings, layout, parts, arguments.seconds, progress.update)
         )
     finally:
         progress.close()
     path = arguments.output or calibration_path(settings, arguments.node)
     found = calibrations.with_gains_of(found, path, layout)
     calibrations.save(path, found, layout)
-    verdicts = calibrations.summary(found, layout)
+    triangles = verdicts.triangle_verdicts(found, layout, parts)
     if arguments.json:
-        print_json({"file": str(path), "id": found.id, "time": found.time, "verdicts": verdicts})
+        print_json(
+            {
+                "file": str(path),
+                "id": found.id,
+                "time": found.time,
+                "verdicts": calibrations.summary(found, layout),
+                "triangles": triangles,
+            }
+        )
     else:
-        for part, counts in verdicts.items():
-            print(f"{part}: " + ", ".join(f"{n} {name}" for name, n in counts.items()))
+        print(verdicts.table(triangles))
         print(f"calibration {found.id} kept in {path}")
     return 0
 
