@@ -40,11 +40,16 @@ class Thresholds:
     lost_s: float = 0.2
 
 
-def analyse(normal_n: Floats, shear_rate_n_s: Floats, thresholds: Thresholds) -> Flags:
-    """TOUCH, SLIP and OVER of one finger from its elements [n] (Fig. 15)."""
+def analyse(
+    normal_n: Floats, shear_rate_n_s: Floats, thresholds: Thresholds, *, slips: bool = False
+) -> Flags:
+    """TOUCH, SLIP and OVER of one finger from its elements [n] (Fig. 15).
+
+    `slips` says that it slips by another sign than the rate of the shear force.
+    """
     flags = Flags(0)
     largest = float(normal_n.max(initial=0.0))
-    if shear_rate_n_s.max(initial=0.0) > thresholds.slip_n_s:
+    if slips or shear_rate_n_s.max(initial=0.0) > thresholds.slip_n_s:
         flags |= Flags.SLIP
     if largest > thresholds.touch_n or flags & Flags.SLIP:
         flags |= Flags.TOUCH
@@ -103,6 +108,7 @@ class FingerFlags:
         shear_rate_n_s: Floats,
         t_ns: int,
         *,
+        slips: bool = False,
         others_touch: bool = True,
         done: bool = False,
     ) -> list[GraspEvent]:
@@ -112,10 +118,11 @@ class FingerFlags:
             normal_n: float64[n], normal force on each element.
             shear_rate_n_s: float64[n], see `slip.ShearRate`.
             t_ns: time of the sample.
+            slips: it slips by another sign than the rate of the shear force.
             others_touch: the other fingers of the hand touch.
             done: the motion asked for is finished.
         """
-        seen = analyse(normal_n, shear_rate_n_s, self._thresholds)
+        seen = analyse(normal_n, shear_rate_n_s, self._thresholds, slips=slips)
         if seen & Flags.SLIP:
             self._slipped_ns = t_ns
         elif _within(self._slipped_ns, t_ns, self._thresholds.slip_hold_s):

@@ -13,6 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 
+_NEXT, _AFTER = [1, 2, 0], [2, 0, 1]
+
 #: Published factors of Bicchi and Dario, eq. 9, at friction coefficients 0.1, 0.3, 0.5.
 PUBLISHED_FRICTION_FACTOR = {0.1: 1.08, 0.3: 1.62, 0.5: 2.30}
 
@@ -158,7 +160,7 @@ def locate(
     heavy = size >= max(minimum_force_n, 1e-300)  # a NaN is not heavy
     safe = np.where(heavy, size, np.nan)[:, None]
     direction = force / safe
-    arm = np.cross(direction, torque / safe)
+    arm = _cross(direction, torque / safe)
     pitch = (direction * torque / safe).sum(axis=1)
     distance, found = surface.enter(arm, direction)
     point = arm + distance[:, None] * direction
@@ -184,15 +186,14 @@ def sensitivity(force_n: ArrayLike, torque_nmm: ArrayLike, contact: IntrinsicCon
     f = np.atleast_2d(np.asarray(force_n, np.float64))
     m = np.atleast_2d(np.asarray(torque_nmm, np.float64))
     squared = (f**2).sum(axis=1)[:, None]
-    arm = np.cross(f, m) / squared
+    arm = _cross(f, m) / squared
     reach = ((contact.point_mm - arm) * f).sum(axis=1)[:, None] / squared
-    eye = np.eye(3)
     change = np.empty((len(f), 3, 6))
-    for i in range(3):
-        change[:, :, i] = (
-            np.cross(eye[i], m) / squared - 2.0 * f[:, i : i + 1] * arm / squared + reach * eye[i]
-        )
-        change[:, :, 3 + i] = np.cross(f, eye[i]) / squared
+    # d(f x m) = df x m + f x dm, and the reach along f as |f| changes.
+    change[:, :, :3] = -_times(m) - 2.0 * arm[:, :, None] * f[:, None, :]
+    change[:, :, 3:] = _times(f)
+    change /= squared[:, :, None]
+    change[:, :, :3] += reach[:, :, None] * np.eye(3)
     lift = np.einsum("ni,nij->nj", contact.normal, change)
     slope = (contact.normal * f).sum(axis=1)
     tangent: Floats = change - f[:, :, None] * (lift / slope[:, None])[:, None, :]
@@ -222,6 +223,20 @@ def point_covariance(
     along = f / (contact.normal * f).sum(axis=1)[:, None]
     covariance += surface_sd_mm**2 * along[:, :, None] * along[:, None, :]
     return covariance
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    """a x b of rows [n, 3]; numpy's own takes five times as long over a single row."""
+    product: Floats = a[:, _NEXT] * b[:, _AFTER] - a[:, _AFTER] * b[:, _NEXT]
+    return product
+
+
+def _times(a: Floats) -> Floats:
+    """Matrices [n, 3, 3] that turn b into a x b."""
+    matrix = np.zeros((len(a), 3, 3))
+    matrix[:, _AFTER, _NEXT] = a
+    matrix[:, _NEXT, _AFTER] = -a
+    return matrix
 
 
 def sphere_error_bound(radius_mm: float, relative_error: float, friction: float = 0.0) -> float:

@@ -90,23 +90,31 @@ class ShearRate:
         contacts: n.
         rate_hz: of the samples.
         window: w, samples in the line.
+        components: d, of a force; 2 in the tangent plane.
     """
 
-    def __init__(self, contacts: int, rate_hz: float, *, window: int = 6) -> None:
-        self._past = np.full((window, contacts, 2), np.nan)
+    def __init__(
+        self, contacts: int, rate_hz: float, *, window: int = 6, components: int = 2
+    ) -> None:
+        self._past = np.full((window, contacts, components), np.nan)
         offset = np.arange(window) - 0.5 * (window - 1)
         self._weight = offset / (offset @ offset) * rate_hz
 
     def step(self, shear_n: ArrayLike) -> Floats:
-        """|dFs/dt|, float64[n], N/s; 0 until the window is full.
+        """|dFs/dt|, float64[n], N/s, of forces [n, d]; 0 until the window is full.
 
         A reading that is not a number repeats the one before.
         """
+        rate: Floats = np.linalg.norm(self.derivative(shear_n), axis=-1)
+        return rate
+
+    def derivative(self, shear_n: ArrayLike) -> Floats:
+        """dFs/dt itself, float64[n, d], N/s, as `step`."""
         shear = np.asarray(shear_n, np.float64)
         self._past[:-1] = self._past[1:]
         self._past[-1] = np.where(np.isfinite(shear), shear, self._past[-2])
-        rate = np.linalg.norm(np.tensordot(self._weight, self._past, axes=1), axis=-1)
-        known: Floats = np.where(np.isfinite(rate), rate, 0.0)
+        rate = np.tensordot(self._weight, self._past, axes=1)
+        known: Floats = np.where(np.isfinite(rate).all(axis=-1, keepdims=True), rate, 0.0)
         return known
 
     def threshold(self, force_sd_n: float, false_alarms_per_hour: float, rate_hz: float) -> float:

@@ -187,12 +187,15 @@ class WrenchAssembler:
 
     def add(self, batch: FrameBatch) -> list[Wrench]:
         """Take a batch of the bus; give the samples that it completes."""
-        frames = parse_strain(batch)
+        return self.take(parse_strain(batch), batch.t_ns)
+
+    def take(self, frames: StrainFrames, t_ns_of: NDArray[np.int64]) -> list[Wrench]:
+        """The same of frames that were picked out already, and the batch's times [n]."""
         self.counters.wrong_length += frames.wrong_length
         mine = (frames.board == self.board) & (frames.type >= StrainType.FORCE)
         samples = []
         for i in np.flatnonzero(mine).tolist():
-            t_ns = int(batch.t_ns[frames.row[i]])
+            t_ns = int(t_ns_of[frames.row[i]])
             self.last_ns = t_ns
             sample = self._pair(
                 t_ns, int(frames.type[i]), frames.value[i], bool(frames.saturated[i])

@@ -32,12 +32,31 @@ LOST_NS = 500_000_000
 
 
 @dataclass(frozen=True, slots=True)
+class Load:
+    """What a force/torque board says of the contact on its fingertip.
+
+    Attributes:
+        verdict: whether one push on the surface gives this force and torque.
+        force_n, torque_nm: of what touches on the fingertip, about the origin of its frame.
+        shear_n: the share of the force along the surface; None without a place.
+        flags: of the finger, see `fingertip.grasp.Flags`, in lower case.
+    """
+
+    verdict: Literal["contact", "no_single_contact", "several_contacts", "saturated"]
+    force_n: list[float]
+    torque_nm: list[float]
+    shear_n: list[float] | None
+    flags: list[str]
+
+
+@dataclass(frozen=True, slots=True)
 class TouchEvent:
     """A contact begins, moves or ends.
 
     Taxels are numbered within their part. Positions are in the part's frame. `sigma_m` is the
     radial standard error of `centroid_m`, in the skin; None where the place is not known. `end`
-    tells where the contact was last, and its pressures are 0.
+    tells where the contact was last, and its pressures are 0. Without skin, on a fingertip that
+    has nothing but a force/torque board, area and pressures are NaN; `load` is told there only.
     """
 
     event: Literal["begin", "move", "end"]
@@ -53,6 +72,7 @@ class TouchEvent:
     mean_kpa: float
     force_n: float
     sigma_m: float | None = None
+    load: Load | None = None
 
 
 @dataclass(slots=True)

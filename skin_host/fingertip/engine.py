@@ -1,0 +1,212 @@
+"""All fingertips of one node: CAN frames and the skin's contacts in, events out. Pure."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.bus.protocol import FrameBatch, MessageClass
+from skin_host.fingertip.events import FingertipEvent
+from skin_host.fingertip.settings import Fingertip
+from skin_host.fingertip.strain_protocol import (
+    CHANNELS,
+    SILENT_NS,
+    StrainType,
+    Wrench,
+    WrenchAssembler,
+    parse_full_scale,
+    parse_strain,
+)
+from skin_host.fingertip.tip import Tip, Zero
+from skin_host.layout import Layout
+from skin_host.processing.contacts import TouchEvent
+from skin_host.settings import Settings
+
+Floats = NDArray[np.float64]
+
+#: A zero needs so many samples.
+FEWEST_SAMPLES = 10
+
+
+@dataclass(slots=True)
+class TipState:
+    """One fingertip with its board.
+
+    Attributes:
+        number: among those of the configuration.
+        told_scale: float64[6], the full scales that the board told; 0 where it has not.
+        assembler: of its samples; None until the full scales are known.
+        saturated_ns: when a sample was last saturated, 0 never.
+        silenced: times that the board fell silent.
+    """
+
+    name: str
+    number: int
+    settings: Fingertip
+    tip: Tip
+    told_scale: Floats = field(default_factory=lambda: np.zeros(CHANNELS))
+    assembler: WrenchAssembler | None = None
+    last_ns: int = 0
+    frames: int = 0
+    saturated_ns: int = 0
+    silenced: int = 0
+    alive: bool = False
+    zeroing: list[Floats] = field(default_factory=list)
+
+    @property
+    def scale_differs(self) -> bool:
+        """Whether the board told other full scales than the configuration."""
+        if self.settings.full_scale is None:
+            return False
+        known = self.told_scale > 0.0
+        return bool((self.told_scale != np.array(self.settings.full_scale))[known].any())
+
+
+class FingertipEngine:
+    """Assemblers and contact sensing of a node's fingertips.
+
+    Args:
+        settings: the configuration.
+        layout: its skin.
+        parts: indices of the node's parts.
+
+    Attributes:
+        tips: by name.
+        sampled: number of the fingertip and time of each sample that the last `feed` completed.
+    """
+
+    def __init__(self, settings: Settings, layout: Layout, parts: list[int]) -> None:
+        nodes = {layout.parts[part].node for part in parts}
+        self.tips: dict[str, TipState] = {}
+        self.sampled: list[tuple[int, int]] = []
+        self._of_address: dict[str, dict[int, TipState]] = {}
+        self._of_part: dict[int, TipState] = {}
+        self._events: list[FingertipEvent] = []
+        self._zeroing = False
+        for number, (name, table) in enumerate(settings.fingertips.items()):
+            if table.node not in nodes:
+                continue
+            period_ns = 0
+            array = next((i for i in parts if layout.parts[i].name == table.array), None)
+            if array is not None:
+                boards = [layout.boards[i].settings for i in layout.parts[array].boards]
+                period_ns = max(board.period_ms for board in boards) * 1_000_000
+            tip = Tip(name, table, settings.processing.touch.move_hz, period_ns)
+            state = self.tips[name] = TipState(name, number, table, tip)
+            self._of_address.setdefault(table.bus, {})[table.address] = state
+            if array is not None:
+                self._of_part[array] = state
+            if table.full_scale is not None:
+                self._assemble(state, np.array(table.full_scale))
+
+    @property
+    def buses(self) -> set[str]:
+        """Names of the buses that the boards are on."""
+        return set(self._of_address)
+
+    def on_bus(self, bus: str) -> list[TipState]:
+        """The fingertips whose boards are on a bus."""
+        return list(self._of_address.get(bus, {}).values())
+
+    def identifiers(self, bus: str) -> frozenset[int]:
+        """Identifiers of the data frames that the configured boards of a bus send."""
+        return frozenset(
+            MessageClass.ANALOG_STREAM << 8 | address << 4 | kind
+            for address in self._of_address.get(bus, {})
+            for kind in StrainType
+        )
+
+    def take(self) -> list[FingertipEvent]:
+        """What has happened since the last call."""
+        events, self._events = self._events, []
+        return events
+
+    def feed(self, bus: str, batch: FrameBatch) -> None:
+        """Take a batch of frames of one bus."""
+        self.sampled = []
+        here = self._of_address.get(bus)
+        if here is None:
+            return
+        for row in np.flatnonzero(batch.id >> 8 == MessageClass.ANALOG_COMMAND).tolist():
+            self._note_answer(here, int(batch.id[row]), batch.data[row, : batch.dlc[row]].tobytes())
+        frames = parse_strain(batch)
+        if not len(frames.row) and not frames.wrong_length:
+            return
+        for address, state in here.items():
+            mine = np.flatnonzero((frames.board == address) & (frames.type >= StrainType.FORCE))
+            if not len(mine):
+                continue
+            state.frames += len(mine)
+            state.last_ns = int(batch.t_ns[frames.row[mine[-1]]])
+            state.alive = True
+            if state.assembler is not None:
+                for wrench in state.assembler.take(frames, batch.t_ns):
+                    self._note_sample(state, wrench)
+
+    def note_skin(self, part: int, events: Iterable[TouchEvent], t_ns: int) -> None:
+        """A frame of a part (index in the layout) was processed."""
+        state = self._of_part.get(part)
+        if state is not None:
+            state.tip.note_skin(events, t_ns)
+
+    def expire(self, now_ns: int) -> None:
+        """Look for boards that have fallen silent, on the clock of the frames' time stamps."""
+        for state in self.tips.values():
+            if state.alive and now_ns - state.last_ns > SILENT_NS:
+                state.alive = False
+                state.silenced += 1
+            self._events += state.tip.expire(now_ns)
+
+    def end_all(self, t_ns: int) -> None:
+        """End every contact: the daemon stops, or begins anew."""
+        for state in self.tips.values():
+            self._events += state.tip.end_all(t_ns)
+
+    def begin_zero(self) -> None:
+        """Collect samples of the unloaded fingertips from now on."""
+        self._zeroing = True
+        for state in self.tips.values():
+            state.zeroing.clear()
+
+    def end_zero(self) -> dict[str, Zero]:
+        """The zeros that the collected samples give, of those fingertips that sent enough."""
+        self._zeroing = False
+        found = {}
+        for name, state in self.tips.items():
+            if len(state.zeroing) >= FEWEST_SAMPLES:
+                samples = np.array(state.zeroing)
+                found[name] = Zero(samples.mean(axis=0), samples.std(axis=0, ddof=1))
+            state.zeroing.clear()
+        return found
+
+    def use(self, zeros: dict[str, Zero]) -> None:
+        """Work with these zeros from now on; a fingertip without one says nothing."""
+        for name, state in self.tips.items():
+            self._events += state.tip.end_all(state.last_ns)
+            state.tip.use(zeros.get(name))
+
+    def _note_sample(self, state: TipState, wrench: Wrench) -> None:
+        self.sampled.append((state.number, wrench.t_ns))
+        if wrench.saturated:
+            state.saturated_ns = wrench.t_ns
+        if self._zeroing and not wrench.saturated:
+            state.zeroing.append(np.concatenate([wrench.force_n, wrench.torque_nm]))
+        self._events += state.tip.step(wrench)
+
+    def _note_answer(self, here: dict[int, TipState], can_id: int, payload: bytes) -> None:
+        found = parse_full_scale(can_id, payload)
+        if found is None:
+            return
+        address, answer = found
+        state = here.get(address)
+        if state is None:
+            return
+        state.told_scale[answer.channel] = answer.value
+        if state.assembler is None and (state.told_scale > 0.0).all():
+            self._assemble(state, state.told_scale.copy())
+
+    @staticmethod
+    def _assemble(state: TipState, full_scale: Floats) -> None:
+        table = state.settings
+        state.assembler = WrenchAssembler(table.address, table.period_ms, full_scale)

@@ -1,0 +1,350 @@
+"""One fingertip on a force/torque board: samples in, contacts, slips and excess out. Pure.
+
+Force and torque give one contact (Bicchi and Dario; Son et al.), and the flags of Ohka et
+al. Where skin covers the fingertip its contact and this one are joined, each weighted by
+what it knows. Times are those of the frames, ns.
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.fingertip.events import Cause, FingertipEvent, OverEvent, SlipEvent
+from skin_host.fingertip.grasp import FingerFlags, Flags, Thresholds
+from skin_host.fingertip.intrinsic import IntrinsicContact, Verdict, locate
+from skin_host.fingertip.joining import locate_with_skin
+from skin_host.fingertip.settings import Fingertip
+from skin_host.fingertip.slip_watch import SlipWatch
+from skin_host.fingertip.strain_protocol import SILENT_NS, Wrench
+from skin_host.fingertip.wrench import Butterworth2
+from skin_host.processing.contacts import (
+    ALIVE_NS,
+    LOST_NS,
+    MOVED_M,
+    PRESSED_SHARE,
+    Load,
+    TouchEvent,
+)
+
+Floats = NDArray[np.float64]
+
+#: A contact ends at this share of the force at which it begins.
+LET_GO = 0.7
+#: Slips are not looked for while the force of a new contact still builds up.
+SETTLING_NS = 100_000_000
+#: Contacts lighter than so many times the noise of the force say nothing, whatever is configured.
+LEAST_NOISES = 6.0
+#: A twist about the force (mm) is that of several contacts beyond this, and so many times what
+#: noise makes of it.
+PITCH_LIMIT_MM = 1.0
+PITCH_NOISES = 4.0
+#: A skin's contact is joined while it is no older than so many of its periods.
+FRESH_PERIODS = 2.5
+
+Told = Literal["contact", "no_single_contact", "several_contacts", "saturated"]
+_VERDICTS: dict[int, Told] = {
+    Verdict.CONTACT: "contact",
+    Verdict.NO_SINGLE_CONTACT: "no_single_contact",
+    Verdict.SEVERAL_CONTACTS: "several_contacts",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Zero:
+    """What an unloaded board sends: mean and standard deviation, float64[6], N and N m."""
+
+    offset: Floats
+    noise: Floats
+
+
+class Tip:
+    """Contact sensing of one fingertip.
+
+    Args:
+        name: of its topics.
+        settings: its table of the configuration.
+        move_hz: `move` events are sent at most this often.
+        array_period_ns: between two frames of the skin on it.
+
+    Attributes:
+        threshold_n: least force of a contact; noise may raise the configured one.
+        samples: how many have been taken in since the zero was known.
+    """
+
+    def __init__(
+        self, name: str, settings: Fingertip, move_hz: float, array_period_ns: int = 0
+    ) -> None:
+        self.samples = 0
+        self.threshold_n = settings.threshold_n
+        self._name = name
+        self._settings = settings
+        self._surface = settings.surface
+        self._matrix = np.eye(6) if settings.matrix is None else np.array(settings.matrix)
+        self._sensor_mm = np.array(settings.sensor_mm)
+        self._rate_hz = 1000.0 / settings.period_ms
+        self._shortest_ns = int(1e9 / move_hz)
+        self._fresh_ns = int(FRESH_PERIODS * array_period_ns)
+        self._skin: dict[int, TouchEvent] = {}
+        self._skin_ns = 0
+        self._zero: Zero | None = None
+        self._next_id = 1
+        self._said: TouchEvent | None = None
+        self._begun_ns = 0
+        self._looked_ns = 0
+        self._last_ns = 0
+        self._cause: Cause = "rate"
+        self._ids: dict[str, int] = {}
+        self._noise_n = 0.0
+        self._covariance = np.zeros((6, 6))
+        self._forget()
+
+    @property
+    def flags(self) -> Flags:
+        """Of the finger now, see `grasp.Flags`."""
+        return self._finger.flags
+
+    @property
+    def zeroed(self) -> bool:
+        """Whether it is known what the unloaded board sends; nothing comes out before."""
+        return self._zero is not None
+
+    @property
+    def touched(self) -> bool:
+        """Whether a contact lasts."""
+        return self._said is not None
+
+    def use(self, zero: Zero | None) -> None:
+        """Work with this zero from now on. Contacts must have been ended before."""
+        self._zero = zero
+        self.samples = 0
+        if zero is not None:
+            per_channel = self._moved(np.eye(6))
+            self._covariance = per_channel.T @ np.diag(zero.noise**2) @ per_channel
+            self._noise_n = float(np.sqrt(np.trace(self._covariance[:3, :3]) / 3.0))
+            self.threshold_n = max(self._settings.threshold_n, LEAST_NOISES * self._noise_n)
+        self._forget()
+
+    def note_skin(self, events: Iterable[TouchEvent], t_ns: int) -> None:
+        """A frame of the skin on the fingertip brought these events."""
+        self._skin_ns = t_ns
+        for event in events:
+            if event.event == "end":
+                self._skin.pop(event.id, None)
+            else:
+                self._skin[event.id] = event
+
+    def step(self, wrench: Wrench) -> list[FingertipEvent]:
+        """Take a sample; return what happened."""
+        if self._zero is None:
+            return []
+        if abs(wrench.t_ns - self._last_ns) > SILENT_NS and self.samples:
+            # What comes after a pause is not the continuation of what was before.
+            self._restart()
+        self._last_ns = wrench.t_ns
+        self.samples += 1
+        measured = np.concatenate([wrench.force_n, wrench.torque_nm]) - self._zero.offset
+        load = self._moved(measured[None])[0]
+        least_n = self.threshold_n * (1.0 if self._said is None else LET_GO)
+        touches = wrench.saturated or float(np.linalg.norm(load[:3])) >= least_n
+        if self._said is None:
+            if not touches and self.flags == Flags.SEARCH:
+                return []
+            if touches:
+                self._restart()  # what was before is of no contact
+        smooth = self._filter.step(load)
+        if touches and np.linalg.norm(smooth[:3]) < least_n:
+            smooth = load
+        contact = self._locate(smooth, least_n) if touches and not wrench.saturated else None
+        events = self._grasp(load, contact, wrench.t_ns, touches=touches)
+        if touches:
+            events += self._touch(smooth, contact, wrench.t_ns)
+        elif self._said is not None:
+            events += self._end(wrench.t_ns)
+        return events
+
+    def expire(self, now_ns: int) -> list[FingertipEvent]:
+        """End a contact of which nothing has been heard for long."""
+        if self._said is None or now_ns - self._last_ns < LOST_NS:
+            return []
+        return self.end_all(now_ns)
+
+    def end_all(self, t_ns: int) -> list[FingertipEvent]:
+        """End what lasts: the fingertip will not be heard of for a while."""
+        events: list[FingertipEvent] = []
+        if self.flags & Flags.SLIP:
+            number = self._ids["slip"]
+            events.append(SlipEvent("end", number, t_ns, self._name, self._cause, 0.0, 0.0, 0.0))
+        if self.flags & Flags.OVER:
+            events.append(OverEvent("end", self._ids["over"], t_ns, self._name, 0.0))
+        if self._said is not None:
+            events += self._end(t_ns)
+        self._forget()
+        return events
+
+    # ------------------------------------------------------------------ within
+
+    def _forget(self) -> None:
+        self._restart()
+        self._finger = FingerFlags(
+            Thresholds(
+                touch_n=self.threshold_n,
+                over_n=self._settings.over_n,
+                slip_n_s=self._watch.threshold_n_s,
+            )
+        )
+
+    def _restart(self) -> None:
+        """Forget the samples before; contact and flags go on."""
+        self._filter = Butterworth2(self._settings.filter_hz, self._rate_hz, 6)
+        self._watch = SlipWatch(self._settings, self._rate_hz, self._noise_n)
+
+    def _moved(self, measured: Floats) -> Floats:
+        """Rows of what the board sends (N, N m) as force (N) and torque (N mm) on the fingertip."""
+        load: Floats = measured @ self._matrix.T
+        load[:, 3:] *= 1e3
+        if self._sensor_mm.any():
+            load[:, 3:] += np.cross(self._sensor_mm, load[:, :3])
+        return load
+
+    def _locate(self, load: Floats, least_n: float) -> IntrinsicContact:
+        noise_nmm = math.sqrt(float(np.trace(self._covariance[3:, 3:])) / 3.0)
+        force_n = max(float(np.linalg.norm(load[:3])), least_n)
+        return locate(
+            load[:3],
+            load[3:],
+            self._surface,
+            minimum_force_n=least_n,
+            pitch_limit_mm=PITCH_LIMIT_MM + PITCH_NOISES * noise_nmm / force_n,
+        )
+
+    def _felt(self) -> list[TouchEvent]:
+        """Contacts of the skin, as long as it sends."""
+        fresh = abs(self._last_ns - self._skin_ns) <= self._fresh_ns
+        return list(self._skin.values()) if fresh else []
+
+    def _grasp(
+        self, load: Floats, contact: IntrinsicContact | None, t_ns: int, *, touches: bool
+    ) -> list[FingertipEvent]:
+        """Bring the flags up to date by a sample as it came, not smoothed."""
+        settled = self._said is not None and t_ns - self._begun_ns > SETTLING_NS
+        located = contact is not None and contact.verdict[0] == Verdict.CONTACT
+        normal = contact.normal[0] if contact is not None and located else None
+        seen = self._watch.step(load, normal, settled=settled)
+        normal_n = seen.normal_n if touches else 0.0
+        if seen.cause is not None and not self.flags & Flags.SLIP:
+            self._cause = seen.cause
+        told = self._finger.step(
+            np.array([normal_n]),
+            np.array([seen.rate_n_s]),
+            t_ns,
+            slips=seen.cause is not None,
+        )
+        events: list[FingertipEvent] = []
+        for one in told:
+            if one.event == "begin":
+                # The contact may begin with this very sample.
+                self._ids[one.kind] = self._next_id if self._said is None else self._said.id
+            number = self._ids[one.kind]
+            if one.kind == "over":
+                events.append(OverEvent(one.event, number, t_ns, self._name, normal_n))
+                continue
+            forces = normal_n, seen.shear_n, seen.rate_n_s
+            events.append(SlipEvent(one.event, number, t_ns, self._name, self._cause, *forces))
+        return events
+
+    def _touch(
+        self, load: Floats, contact: IntrinsicContact | None, t_ns: int
+    ) -> list[FingertipEvent]:
+        before = self._said
+        if before is not None and 0 <= t_ns - self._looked_ns < self._shortest_ns:
+            return []
+        self._looked_ns = t_ns
+        told = self._described(load, contact, t_ns)
+        if before is None:
+            self._next_id += 1
+            self._begun_ns = t_ns
+        elif not self._worth_saying(before, told):
+            return []
+        self._said = told
+        return [told]
+
+    def _described(self, load: Floats, contact: IntrinsicContact | None, t_ns: int) -> TouchEvent:
+        """The contact as it is now; one without a location is saturated."""
+        felt = self._felt()
+        skin = felt[0] if len(felt) == 1 else None
+        verdict: Told = "saturated"
+        place = None
+        if contact is not None:
+            verdict = _VERDICTS.get(int(contact.verdict[0]), "no_single_contact")
+            if verdict == "contact" and len(felt) > 1:
+                verdict = "several_contacts"
+            if verdict == "contact":
+                place = locate_with_skin(load, contact, self._surface, self._covariance, skin)
+        normal_n, shear = float(np.linalg.norm(load[:3])), None
+        if place is not None:
+            normal_n = max(0.0, -float(load[:3] @ place.normal))
+            shear = (load[:3] + normal_n * place.normal).tolist()
+        torque_nm = (1e-3 * load[3:]).tolist()
+        before = self._said
+        return TouchEvent(
+            "begin" if before is None else "move",
+            self._next_id if before is None else before.id,
+            self.samples,
+            t_ns,
+            self._name,
+            [] if skin is None else skin.taxels,
+            None if place is None else (1e-3 * place.point_mm).tolist(),
+            None if place is None else place.normal.tolist(),
+            math.nan if skin is None else skin.area_mm2,
+            math.nan if skin is None else skin.peak_kpa,
+            math.nan if skin is None else skin.mean_kpa,
+            normal_n,
+            None if place is None else 1e-3 * place.sigma_mm,
+            Load(verdict, load[:3].tolist(), torque_nm, shear, _names(self.flags)),
+        )
+
+    def _end(self, t_ns: int) -> list[FingertipEvent]:
+        last, self._said = self._said, None
+        assert last is not None and last.load is not None
+        known = not math.isnan(last.area_mm2)
+        zero = [0.0, 0.0, 0.0]
+        return [
+            TouchEvent(
+                "end",
+                last.id,
+                self.samples,
+                t_ns,
+                self._name,
+                last.taxels,
+                last.centroid_m,
+                last.normal,
+                last.area_mm2,
+                0.0 if known else math.nan,
+                0.0 if known else math.nan,
+                0.0,
+                last.sigma_m,
+                Load(last.load.verdict, zero, zero, zero, _names(self.flags)),
+            )
+        ]
+
+    def _worth_saying(self, said: TouchEvent, now: TouchEvent) -> bool:
+        assert said.load is not None and now.load is not None
+        if now.t_ns - said.t_ns >= ALIVE_NS:
+            return True
+        if (now.load.verdict, now.load.flags) != (said.load.verdict, said.load.flags):
+            return True
+        change_n = math.dist(now.load.force_n, said.load.force_n)
+        if change_n > max(0.25 * self.threshold_n, PRESSED_SHARE * math.hypot(*said.load.force_n)):
+            return True
+        if now.centroid_m is None or said.centroid_m is None:
+            return now.centroid_m is not said.centroid_m
+        moved_m = math.dist(now.centroid_m, said.centroid_m)
+        return moved_m > max(MOVED_M, now.sigma_m or 0.0)
+
+
+def _names(flags: Flags) -> list[str]:
+    return [str(flag.name).lower() for flag in Flags if flag & flags]
