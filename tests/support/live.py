@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+from collections import Counter
 from collections.abc import AsyncIterator
 from pathlib import Path
 
@@ -19,9 +20,11 @@ CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
 class Live:
     """What `living` gives: the robot, its daemon, and ways to wait."""
 
-    def __init__(self, robot: Robot, daemon: Daemon) -> None:
+    def __init__(self, robot: Robot, daemon: Daemon, frames_sent: Counter[str]) -> None:
         self.robot = robot
         self.daemon = daemon
+        #: Frames that the robot has put on each bus.
+        self.frames_sent = frames_sent
 
     def faults(self) -> set[tuple[str, str]]:
         """What is told now, by code and place."""
@@ -70,12 +73,13 @@ async def living(
     layout = build_layout(settings, config.parent)
     robot = Robot(settings, layout, scene)
     can_bus = can.Bus(interface=bus.interface, channel=bus.channel)
+    frames_sent = _counting(can_bus, "can0")
     daemon = Daemon(settings, layout, configuration=config)
     stop = asyncio.Event()
     body = asyncio.create_task(robot.run({"can0": can_bus}))
     host = asyncio.create_task(daemon.run(stop))
     try:
-        live = Live(robot, daemon)
+        live = Live(robot, daemon, frames_sent)
         async with asyncio.timeout(20.0):
             while daemon.engine.calibration is None:  # noqa: ASYNC110
                 await asyncio.sleep(0.02)
@@ -86,3 +90,16 @@ async def living(
         body.cancel()
         await asyncio.gather(body, return_exceptions=True)
         can_bus.shutdown()
+
+
+def _counting(bus: can.BusABC, name: str) -> Counter[str]:
+    """Count what is sent on a bus."""
+    counts: Counter[str] = Counter()
+    send = bus.send
+
+    def counted(message: can.Message, timeout: float | None = None) -> None:
+        send(message, timeout)
+        counts[name] += 1
+
+    bus.send = counted  # type: ignore[method-assign]
+    return counts
