@@ -38,7 +38,15 @@ def test_each_press_begins_moves_and_ends_where_it_is_with_its_pressure(
                     break
         return found if len(found) == len(PRESSES) else []
 
-    touches = wait_for(all_three, "three touches that began and ended")
+    def seen() -> list[str]:
+        health = subscriber.documents("/health")
+        return [
+            f"{e['part']} {e['id']} {e['event']} {e['taxels']} {e['t_ns'] / 1e9 % 1000:.1f}"
+            for e in subscriber.documents("/touch")
+            if e["event"] != "move"
+        ] + [f"{record['part']}: {record['sentences']}" for record in health[-4:]]
+
+    touches = wait_for(all_three, "three touches that began and ended", seen)
     assert daemon.poll() is None
     statuses = stack.stop()
     assert set(statuses) <= {0}

@@ -86,11 +86,11 @@ class Stack:
         return statuses
 
     def kill(self) -> None:
-        """End everything at once, as a loss of power would."""
+        """End everything at once, as a loss of power would; show what it had said."""
         for process in self._processes:
             process.kill()
             with contextlib.suppress(ValueError):  # its pipes are closed already
-                process.communicate()
+                print(*process.communicate(), sep="\n")
         self._processes.clear()
 
 
@@ -110,12 +110,14 @@ def subscriber(mosquitto: Mosquitto) -> Iterator[Subscriber]:
     listening.close()
 
 
-def wait_for(condition: Callable[[], Any], what: str) -> Any:
-    """Wait until `condition` gives something true, and return that."""
+def wait_for(
+    condition: Callable[[], Any], what: str, seen: Callable[[], object] = lambda: "nothing"
+) -> Any:
+    """Wait until `condition` gives something true, and return that; else say what was seen."""
     deadline = time.monotonic() + WAIT_S
     while time.monotonic() < deadline:
         found = condition()
         if found:
             return found
         time.sleep(0.05)
-    raise AssertionError(f"waited {WAIT_S:g} s for {what}")
+    raise AssertionError(f"waited {WAIT_S:g} s for {what}; seen: {seen()}")

@@ -64,7 +64,6 @@ def test_garbage_on_the_bus_is_counted_and_nothing_else(stack: Stack, subscriber
     wait_for(counted, f"counters {expected}")
     now = bus_record()
     assert now["incomplete"] == before["incomplete"]
-    assert now["missed"] == before["missed"]
     assert not any(subscriber.payloads("/touch"))
     assert daemon.poll() is None
     stack.stop()
