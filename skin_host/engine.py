@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from skin_host.bus.assembler import Assembler, Sweep
 from skin_host.bus.protocol import TRIANGLES, FrameBatch, StatusError, status_error
+from skin_host.fingertip.engine import FingertipEngine
 from skin_host.layout import Layout
-from skin_host.processing.calibration import Calibration, Calibrator
+from skin_host.processing.calibration import Calibration, Calibrator, with_zeros
 from skin_host.processing.contacts import ContactTracker, TouchEvent
 from skin_host.processing.intake import Intake, PartSample
 from skin_host.processing.liveness import PADS, Liveness
@@ -61,6 +62,7 @@ class Engine:
         disabled: parts of which nothing is to come out.
         touch_only: parts whose pressures nobody wants while nothing touches them.
         rezeros: how often each board, by its index, has taken a new zero.
+        fingertips: those of these parts' nodes, if there are any.
     """
 
     def __init__(
@@ -76,6 +78,11 @@ class Engine:
         self.configuration = skin_hash(settings)
         self.calibration = calibration
         self.boards = sorted({board for part in parts for board in layout.parts[part].boards})
+        made = FingertipEngine(settings, layout, parts) if settings.fingertips else None
+        self.fingertips = made if made is not None and made.tips else None
+        buses = {layout.boards[i].settings.bus for i in self.boards}
+        if self.fingertips is not None:
+            buses |= self.fingertips.buses
         self.assemblers = {
             bus: Assembler(
                 [
@@ -84,8 +91,9 @@ class Engine:
                     if layout.boards[i].settings.bus == bus
                 ],
                 settings.receive.close_periods,
+                frozenset() if self.fingertips is None else self.fingertips.identifiers(bus),
             )
-            for bus in sorted({layout.boards[i].settings.bus for i in self.boards})
+            for bus in sorted(buses)
         }
         self.sweeps: list[Sweep] = []
         self.disabled: set[int] = set()
@@ -125,6 +133,8 @@ class Engine:
         for board in boards:
             self._rezeros.pop(board, None)
             self._intake.veto.pop(board, None)
+        if self.fingertips is not None and boards == self.boards:
+            self.fingertips.use(calibration.zeros)
         self._renew_pipeline(self.taxels_of(boards))
 
     def renew(self) -> None:
@@ -157,6 +167,8 @@ class Engine:
         """Collect samples from the next one on; see `end_calibration`."""
         calibrator = Calibrator(self.layout, self.settings.processing.calibration.percentile)
         self._run = _CalibrationRun(calibrator, int(seconds * 1e9))
+        if self.fingertips is not None:
+            self.fingertips.begin_zero()
 
     def calibration_progress(self) -> float:
         """Share of the wanted time that has been collected, 0 to 1."""
@@ -172,10 +184,13 @@ class Engine:
         """
         assert self._run is not None
         run, self._run = self._run, None
-        return run.calibrator.finish(self.configuration, time)
+        found = run.calibrator.finish(self.configuration, time)
+        return found if self.fingertips is None else with_zeros(found, self.fingertips.end_zero())
 
     def feed(self, bus: str, batch: FrameBatch) -> list[Step]:
         """Take a batch of frames of one bus. `sweeps` holds those it completed."""
+        if self.fingertips is not None:
+            self.fingertips.feed(bus, batch)
         self.sweeps = self.assemblers[bus].feed(batch)
         return self._process(self._take(self.sweeps)) if self.sweeps else []
 
@@ -184,6 +199,8 @@ class Engine:
         self.sweeps = [
             sweep for assembler in self.assemblers.values() for sweep in assembler.expire(now_ns)
         ]
+        if self.fingertips is not None:
+            self.fingertips.expire(now_ns)
         samples = self._take(self.sweeps) + self._intake.expire(now_ns)
         return self._process(samples) if samples else []
 
@@ -297,6 +314,8 @@ class Engine:
                     pressures=sample.part not in self.touch_only,
                 )
                 events = self._trackers[sample.part].step(frame)
+                if self.fingertips is not None:
+                    self.fingertips.note_skin(sample.part, events, frame.t_ns)
                 self._note_touched(sample.part, frame)
                 steps.append(Step(sample.part, frame, events))
         return steps

@@ -12,6 +12,7 @@ from skin_host.bus.protocol import FrameBatch
 from skin_host.bus.wake import WakeUp
 from skin_host.engine import Engine, Step
 from skin_host.errors import BusError, SkinError
+from skin_host.fingertip.boards import StrainBoards
 
 log = logging.getLogger(__name__)
 
@@ -30,6 +31,7 @@ class Link:
 
     Attributes:
         ports, boards: by name of the bus.
+        force_torque: the boards of fingertips, by name of the bus.
         read_ns: everything that had come by then has been read, on the clock of the frames'
             time stamps. Ages are told from here, not from now: what waits unread is not silent.
 
@@ -45,6 +47,8 @@ class Link:
         self._read_at_ns = time.monotonic_ns()
         self.ports: dict[str, Port] = {}
         self.boards: dict[str, Boards] = {}
+        self.force_torque: dict[str, StrainBoards] = {}
+        fingertips = engine.fingertips
         settings, layout = engine.settings, engine.layout
         try:
             for bus in engine.assemblers:
@@ -64,6 +68,8 @@ class Link:
                     engine.rezero,
                     self.attended_ns,
                 )
+                if fingertips is not None and (tips := fingertips.on_bus(bus)):
+                    self.force_torque[bus] = StrainBoards(bus, port, tips, self.attended_ns)
         except SkinError:
             self.close()
             raise
@@ -83,6 +89,11 @@ class Link:
         periods_ns = {
             i: engine.layout.boards[i].settings.period_ms * 1_000_000 for i in engine.boards
         }
+        fingertips = engine.fingertips
+        if fingertips is not None:
+            # Beside the indices of boards, which are not negative.
+            for tip in fingertips.tips.values():
+                periods_ns[~tip.number] = tip.settings.period_ms * 1_000_000
         wake_up = WakeUp(engine.settings.receive, periods_ns)
         expire_at_s = 0.0
 
@@ -102,6 +113,9 @@ class Link:
                 for sweep in engine.sweeps:
                     boards.note_sweep(sweep.board, sweep.present, sweep.t_ns)
                     wake_up.sweep_ended(sweep.board, sweep.t_ns)
+                if fingertips is not None:
+                    for number, t_ns in fingertips.sampled:
+                        wake_up.sweep_ended(~number, t_ns)
                 deliver(steps)
             if not drained:
                 return
@@ -125,7 +139,7 @@ class Link:
 
     async def bring_up(self) -> None:
         """Set up and start the boards of every bus; a bus that cannot is tried again for ever."""
-        await asyncio.gather(*(self._bring_up(boards) for boards in self.boards.values()))
+        await asyncio.gather(*(self._bring_up(boards) for boards in self._all_boards()))
 
     async def set_up(self, boards: list[int]) -> None:
         """Send boards, by index, their set-up again and start them.
@@ -139,11 +153,14 @@ class Link:
 
     def supervise(self) -> None:
         """Look after the boards: silent ones, and those that lost their set-up."""
-        for boards in self.boards.values():
+        for boards in self._all_boards():
             boards.supervise()
 
     def all_alive(self) -> bool:
-        """Whether every board has sent at least one sweep."""
+        """Whether every board has sent at least one sweep, or sample of a fingertip."""
+        fingertips = self._engine.fingertips
+        if fingertips is not None and not all(tip.frames for tip in fingertips.tips.values()):
+            return False
         return all(
             record.last_sweep_ns
             for boards in self.boards.values()
@@ -152,7 +169,7 @@ class Link:
 
     async def stop(self) -> None:
         """Tell the boards to stop, as far as their buses still work."""
-        for boards in self.boards.values():
+        for boards in self._all_boards():
             with contextlib.suppress(BusError, TimeoutError):
                 await asyncio.wait_for(boards.stop(), STOP_S)
 
@@ -161,8 +178,11 @@ class Link:
         for port in self.ports.values():
             port.close()
 
+    def _all_boards(self) -> list[Boards | StrainBoards]:
+        return [*self.boards.values(), *self.force_torque.values()]
+
     @staticmethod
-    async def _bring_up(boards: Boards) -> None:
+    async def _bring_up(boards: Boards | StrainBoards) -> None:
         told = ""
         while True:
             try:

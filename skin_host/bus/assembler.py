@@ -75,6 +75,8 @@ class AssemblerCounters:
     frames: int = 0
     #: Not of the skin stream: answers, other sensors, strangers.
     other: int = 0
+    #: Of the configured force/torque boards.
+    force_torque: int = 0
     wrong_header: int = 0
     short: int = 0
     #: Skin frames of a board that is not configured on this bus.
@@ -126,10 +128,17 @@ class Assembler:
     Args:
         boards: (index in `Layout.boards`, board) of the boards on this bus.
         close_periods: a sweep is closed when its first frame is so many periods old.
+        force_torque: identifiers of the data of the configured force/torque boards.
     """
 
-    def __init__(self, boards: list[tuple[int, BoardLayout]], close_periods: float) -> None:
+    def __init__(
+        self,
+        boards: list[tuple[int, BoardLayout]],
+        close_periods: float,
+        force_torque: frozenset[int] = frozenset(),
+    ) -> None:
         self.counters = AssemblerCounters()
+        self._force_torque = force_torque
         self._states: dict[int, _BoardState] = {}
         # By identifier << 8 | header byte of each frame that a configured triangle may send:
         # the board, the number of the frame's bit in its masks, and the bit.
@@ -211,7 +220,9 @@ class Assembler:
         """
         counters = self.counters
         message_class = identifier >> 8
-        if dlc == 0 or identifier > MAX_STANDARD_ID:
+        if identifier in self._force_torque:
+            counters.force_torque += 1
+        elif dlc == 0 or identifier > MAX_STANDARD_ID:
             counters.other += 1
         elif message_class == MessageClass.SKIN_STREAM:
             if header not in _CLASSES:

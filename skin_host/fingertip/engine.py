@@ -18,8 +18,9 @@ from skin_host.fingertip.strain_protocol import (
     parse_full_scale,
     parse_strain,
 )
-from skin_host.fingertip.tip import Tip, Zero
+from skin_host.fingertip.tip import Tip
 from skin_host.layout import Layout
+from skin_host.processing.calibration import Zero
 from skin_host.processing.contacts import TouchEvent
 from skin_host.settings import Settings
 

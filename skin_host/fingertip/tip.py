@@ -7,7 +7,6 @@ what it knows. Times are those of the frames, ns.
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -21,6 +20,7 @@ from skin_host.fingertip.settings import Fingertip
 from skin_host.fingertip.slip_watch import SlipWatch
 from skin_host.fingertip.strain_protocol import SILENT_NS, Wrench
 from skin_host.fingertip.wrench import Butterworth2
+from skin_host.processing.calibration import Zero
 from skin_host.processing.contacts import (
     ALIVE_NS,
     LOST_NS,
@@ -51,14 +51,6 @@ _VERDICTS: dict[int, Told] = {
     Verdict.NO_SINGLE_CONTACT: "no_single_contact",
     Verdict.SEVERAL_CONTACTS: "several_contacts",
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Zero:
-    """What an unloaded board sends: mean and standard deviation, float64[6], N and N m."""
-
-    offset: Floats
-    noise: Floats
 
 
 class Tip:

@@ -39,6 +39,7 @@ class BusHealth(TypedDict):
     channel: str
     frames: int
     other: int
+    force_torque: int
     wrong_header: int
     short: int
     unknown_board: int

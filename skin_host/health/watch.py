@@ -22,6 +22,8 @@ RATE_S = 2.0
 RECENT_NS = 1_000_000_000
 #: After a longer pause between two looks, or a step of the clock, silence is measured anew.
 LONGEST_PAUSE_NS = 1_000_000_000
+#: Taken for the period of a bus without boards of skin: its force/torque boards are faster.
+ALONE_NS = 50_000_000
 #: Intervals that are enough to judge a board's period.
 PERIOD_SWEEPS = 16
 _TRIANGLES = np.arange(TRIANGLES)
@@ -164,7 +166,9 @@ class Watch:
             board: BoardWatch(int(periods * period_ns[board])) for board in engine.boards
         }
         self.buses = {
-            bus: BusWatch(int(periods * max(period_ns[board] for board in self._boards_of(bus))))
+            bus: BusWatch(
+                int(periods * max((period_ns[i] for i in self._boards_of(bus)), default=ALONE_NS))
+            )
             for bus in engine.assemblers
         }
 

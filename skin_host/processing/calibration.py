@@ -9,7 +9,7 @@ of the transmitted byte.
 """
 
 import hashlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from pathlib import Path
 
@@ -33,6 +33,9 @@ JUMP_UNITS = 8
 #: The means of blocks may differ by this much, and by five standard errors.
 STEADY_UNITS = 1.5
 
+#: Of a force/torque board.
+CHANNELS = 6
+
 Floats = NDArray[np.float64]
 
 
@@ -45,6 +48,14 @@ class Verdict(IntEnum):
     STUCK = 3
     OUT_OF_RANGE = 4
     ABSENT = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Zero:
+    """What an unloaded force/torque board sends: mean and sd, float64[6], N and N m."""
+
+    offset: Floats
+    noise: Floats
 
 
 @dataclass(frozen=True)
@@ -61,6 +72,7 @@ class Calibration:
         gain: float64[n], pressure of the taxel over that of the common curve.
         bend: float64[n], its quadratic part over that of the common curve, the gain apart.
         verdict: uint8[n], see `Verdict`.
+        zeros: of the fingertips on force/torque boards, by name.
     """
 
     configuration: str
@@ -72,6 +84,7 @@ class Calibration:
     gain: Floats
     bend: Floats
     verdict: NDArray[np.uint8]
+    zeros: dict[str, Zero] = field(default_factory=dict)
 
     @property
     def usable(self) -> NDArray[np.bool_]:
@@ -169,6 +182,11 @@ def with_gains(calibration: Calibration, gain: Floats, bend: Floats) -> Calibrat
     return _identified(replace(calibration, gain=gain, bend=bend))
 
 
+def with_zeros(calibration: Calibration, zeros: dict[str, Zero]) -> Calibration:
+    """Return the calibration with the zeros of force/torque boards, by name of the fingertip."""
+    return _identified(replace(calibration, zeros=zeros))
+
+
 def with_gains_of(calibration: Calibration, path: Path, layout: Layout) -> Calibration:
     """Return the calibration with the gains of the one in `path`, if there is one that fits.
 
@@ -182,7 +200,10 @@ def with_gains_of(calibration: Calibration, path: Path, layout: Layout) -> Calib
 
 
 def merge(old: Calibration, new: Calibration, renewed: NDArray[np.bool_]) -> Calibration:
-    """Return `old` with the taxels `renewed` [n] taken from `new`; their gains stay."""
+    """Return `old` with the taxels `renewed` [n] taken from `new`; their gains stay.
+
+    Zeros of fingertips are taken from `new` when all taxels are.
+    """
     return _identified(
         replace(
             new,
@@ -192,6 +213,7 @@ def merge(old: Calibration, new: Calibration, renewed: NDArray[np.bool_]) -> Cal
             gain=old.gain,
             bend=old.bend,
             verdict=np.where(renewed, new.verdict, old.verdict),
+            zeros=old.zeros | new.zeros if renewed.all() else old.zeros,
         )
     )
 
@@ -207,6 +229,8 @@ def _identified(calibration: Calibration) -> Calibration:
         calibration.verdict,
     ):
         digest.update(np.ascontiguousarray(array).tobytes())
+    for name, zero in sorted(calibration.zeros.items()):
+        digest.update(name.encode() + zero.offset.tobytes() + zero.noise.tobytes())
     return replace(calibration, id=digest.hexdigest()[:12])
 
 
@@ -232,13 +256,19 @@ class _PartFile(msgspec.Struct, forbid_unknown_fields=True):
     bend: list[float] | None = None
 
 
-class _File(msgspec.Struct, forbid_unknown_fields=True):
+class _ZeroFile(msgspec.Struct, forbid_unknown_fields=True):
+    offset: list[float]
+    noise: list[float]
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
     schema: str
     id: str
     time: str
     robot: str
     configuration: str
     parts: dict[str, _PartFile]
+    fingertips: dict[str, _ZeroFile] = {}
 
 
 def save(path: Path, calibration: Calibration, layout: Layout) -> None:
@@ -258,8 +288,19 @@ def save(path: Path, calibration: Calibration, layout: Layout) -> None:
             bend=_rounded(calibration.bend[mine]),
             verdict=[Verdict(number).name.lower() for number in calibration.verdict[mine]],
         )
+    zeros = {
+        # Forces of coarse and of fine boards alike: not rounded.
+        name: _ZeroFile(zero.offset.tolist(), zero.noise.tolist())
+        for name, zero in calibration.zeros.items()
+    }
     content = _File(
-        SCHEMA, calibration.id, calibration.time, layout.robot, calibration.configuration, parts
+        SCHEMA,
+        calibration.id,
+        calibration.time,
+        layout.robot,
+        calibration.configuration,
+        parts,
+        zeros,
     )
     write_atomic(path, msgspec.json.format(msgspec.json.encode(content), indent=1) + b"\n")
 
@@ -318,4 +359,12 @@ def load(path: Path, layout: Layout, configuration: str) -> Calibration:
         for name in ("gain", "bend"):
             if np.any(arrays[name][mine] <= 0.0):
                 raise refused(f"parts.{part.name}.{name}: every number must be positive")
-    return Calibration(content.configuration, content.id, content.time, verdict=verdict, **arrays)
+    zeros = {}
+    for name, zero in content.fingertips.items():
+        numbers = np.array([zero.offset, zero.noise], np.float64)
+        if numbers.shape != (2, CHANNELS) or not np.isfinite(numbers).all():
+            raise refused(f"fingertips.{name}: wanted twice {CHANNELS} finite numbers")
+        zeros[name] = Zero(*numbers)
+    return Calibration(
+        content.configuration, content.id, content.time, verdict=verdict, zeros=zeros, **arrays
+    )

@@ -9,7 +9,8 @@ import pytest
 from skin_host.fingertip.events import FingertipEvent, OverEvent, SlipEvent
 from skin_host.fingertip.settings import Fingertip
 from skin_host.fingertip.strain_protocol import Wrench
-from skin_host.fingertip.tip import Tip, Zero
+from skin_host.fingertip.tip import Tip
+from skin_host.processing.calibration import Zero
 from skin_host.processing.contacts import TouchEvent
 
 MS = 1_000_000

@@ -1,0 +1,108 @@
+"""The force/torque boards of one bus: set up, started, watched, set up again, stopped."""
+
+import asyncio
+import logging
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Protocol
+
+from skin_host.bus.commands import SetTxMode, command_frame
+from skin_host.errors import BusError
+from skin_host.fingertip.engine import TipState
+from skin_host.fingertip.strain_protocol import SILENT_NS, StrainMode, start_frames
+
+log = logging.getLogger(__name__)
+
+#: Between two commands; the boards' mailboxes are shallow.
+GAP_S = 0.01
+#: A board that is silent or has not told its full scales is set up again at once, then after
+#: so long, up to the last.
+RETRY_S = (1.0, 2.0, 4.0, 8.0)
+
+
+class Sender(Protocol):
+    """What is needed of a port: paced sending."""
+
+    async def send(self, frames: Iterable[tuple[int, bytes]], gap_s: float = ...) -> None:
+        """Send (identifier, data) frames, `gap_s` apart. Raises BusError."""
+
+
+@dataclass(slots=True)
+class _Known:
+    state: TipState
+    frames: int = 0
+    heard_ns: int = 0
+    retry_at_ns: int = 0
+    retries: int = 0
+
+
+class StrainBoards:
+    """Bring-up and supervision.
+
+    Args:
+        bus: its name, for messages.
+        port: where commands are sent.
+        tips: the fingertips whose boards are on this bus.
+        clock: time in ns that stands still while nobody reads the bus.
+    """
+
+    def __init__(
+        self, bus: str, port: Sender, tips: list[TipState], clock: Callable[[], int]
+    ) -> None:
+        self._bus = bus
+        self._port = port
+        self._boards = [_Known(state) for state in tips]
+        self._clock = clock
+        self._busy: asyncio.Task[None] | None = None
+
+    async def bring_up(self) -> None:
+        """Set up and start every board.
+
+        Raises:
+            BusError: the bus does not take frames.
+        """
+        for board in self._boards:
+            await self._set_up(board)
+
+    def supervise(self) -> None:
+        """Look after every board; what is to be done takes place beside everything else."""
+        now_ns = self._clock()
+        for board in self._boards:
+            if board.state.frames != board.frames:
+                board.frames, board.heard_ns = board.state.frames, now_ns
+            silent = now_ns - board.heard_ns > SILENT_NS
+            if not silent and board.state.assembler is not None:
+                board.retries = 0
+            elif board.retry_at_ns and now_ns >= board.retry_at_ns and self._busy is None:
+                self._busy = asyncio.create_task(self._mend(board))
+
+    async def stop(self) -> None:
+        """Tell every board to stop sending.
+
+        Raises:
+            BusError: the bus does not take frames.
+        """
+        if self._busy is not None:
+            self._busy.cancel()
+        stop = SetTxMode(StrainMode.STOP)
+        await self._port.send(
+            [command_frame(stop, board.state.settings.address) for board in self._boards]
+        )
+
+    async def _set_up(self, board: _Known) -> None:
+        table = board.state.settings
+        await self._port.send(start_frames(table.address, table.period_ms), GAP_S)
+        pause_s = RETRY_S[min(board.retries, len(RETRY_S) - 1)]
+        board.retries += 1
+        board.heard_ns = self._clock()
+        board.retry_at_ns = board.heard_ns + int(pause_s * 1e9)
+
+    async def _mend(self, board: _Known) -> None:
+        log.debug("bus %s: the board of %s is set up again", self._bus, board.state.name)
+        try:
+            await self._set_up(board)
+        except BusError as error:
+            board.retry_at_ns = self._clock() + int(RETRY_S[-1] * 1e9)
+            log.debug("%s", error)
+        finally:
+            self._busy = None
