@@ -28,6 +28,7 @@ from skin_host.publish.address import Broker
 
 #: A broker that does not answer for so long is taken for lost.
 TIMEOUT_S = 3.0
+GRACE_S = 0.2
 #: Waiting times between attempts double from the first to the last.
 FIRST_RETRY_S = 0.2
 LAST_RETRY_S = 3.0
@@ -256,14 +257,16 @@ class Retry:
 async def within(timeout_s: float, done: "asyncio.Future[None]") -> None:
     """Wait until a message is sent.
 
+    If this process was stopped meanwhile, the answer may lie unread: it has a moment more.
+
     Raises:
         MqttError: it takes too long; the broker is taken for lost.
     """
-    try:
-        async with asyncio.timeout(timeout_s):
-            await done
-    except TimeoutError:
-        raise MqttError("Operation timed out") from None
+    for patience_s in (timeout_s, GRACE_S):
+        finished, _ = await asyncio.wait([done], timeout=patience_s)
+        if finished:
+            return
+    raise MqttError("Operation timed out")
 
 
 class PackedProperties(Properties):
