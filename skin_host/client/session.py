@@ -56,7 +56,7 @@ class SkinClient:
 
     Args:
         broker: `mqtt://[user[:password]@]host[:port][/base]`, `mqtts://...`, or a `Broker`.
-        robot: its name; without one the only robot that the broker knows.
+        robot: its name; without one the only robot that the broker knows, or that is online.
         base: of the topics; "skin" unless the URL or this says otherwise.
         protocol: of MQTT, for a broker given by URL.
         patience_s: how long entering waits for a broker that is not there.
@@ -305,13 +305,20 @@ class SkinClient:
                 self._take(message, self._topics)
 
     async def _only_robot(self, connection: Connection) -> str:
-        """Find the only robot below the base, by the status of its nodes."""
+        """Find the only robot below the base, by the status of its nodes.
+
+        Of several the only one that is online: the broker remembers who has left.
+        """
         prefix = f"{self._base}/"
-        found: set[str] = set()
+        known: set[str] = set()
+        online: set[str] = set()
 
         async def listen() -> None:
             async for message in connection.messages:
-                found.add(message.topic.value.removeprefix(prefix).partition("/")[0])
+                robot = message.topic.value.removeprefix(prefix).partition("/")[0]
+                known.add(robot)
+                if message.payload == ONLINE:
+                    online.add(robot)
 
         everybody = f"{prefix}+/nodes/+/status"
         await connection.subscribe(everybody, qos=1)
@@ -319,9 +326,9 @@ class SkinClient:
             await asyncio.wait_for(listen(), RETAINED_S)
         except TimeoutError:
             await connection.unsubscribe(everybody)
-        if len(found) == 1:
-            return found.pop()
-        names = ", ".join(sorted(found)[:20]) or "none"
+        if len(meant := online or known) == 1:
+            return meant.pop()
+        names = ", ".join(sorted(meant)[:20]) or "none"
         raise RequestError(
             f'broker {self._broker}: wanted one robot below "{self._base}", there are: {names}; '
             "name the robot"

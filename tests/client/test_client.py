@@ -238,6 +238,9 @@ async def test_the_only_robot_of_a_broker_needs_no_name(mosquitto: Mosquitto) ->
             with pytest.raises(RequestError, match="icub, nao"):
                 async with hearing(mosquitto, None):
                     pass
+        # One that has said goodbye is still known to the broker, but not meant.
+        async with hearing(mosquitto, None) as skin:
+            assert skin.robot == "nao"
 
 
 async def test_nonsense_on_a_topic_is_counted_and_passed_over(mosquitto: Mosquitto) -> None:
