@@ -11,7 +11,7 @@ async def main(url: str) -> None:
     async with SkinClient(url) as skin:
         async for touch in skin.touches():
             if touch.event == "begin":
-                print(touch.part, touch.centroid_m, f"{touch.peak_kpa:.1f} kPa", touch.missed)
+                print(touch.part, touch.centroid_m, f"{touch.force_n:.2f} N", touch.missed)
 
 
 asyncio.run(main(sys.argv[1] if len(sys.argv) > 1 else "mqtt://localhost"))

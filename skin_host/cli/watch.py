@@ -59,10 +59,12 @@ def touch_line(touch: Any) -> str:
     if touch.centroid_m is not None:
         x_mm, y_mm = 1e3 * touch.centroid_m[0], 1e3 * touch.centroid_m[1]
         where = f"({x_mm:6.1f},{y_mm:6.1f}) mm "
-    load = f"{touch.peak_kpa:6.1f} kPa {touch.force_n:6.2f} N"
+    peak = " " * 10 if touch.peak_kpa is None else f"{touch.peak_kpa:6.1f} kPa"
+    load = f"{peak} {touch.force_n:6.2f} N"
     if touch.event == "end":
         load = " " * len(load)
-    return f"{touch.part:<14} {touch.event:<5} #{touch.id:<4} {where} {load}  taxels {taxels}"
+    line = f"{touch.part:<14} {touch.event:<5} #{touch.id:<4} {where} {load}"
+    return f"{line}  taxels {taxels}" if taxels else line.rstrip()
 
 
 def _listen(arguments: argparse.Namespace) -> int:

@@ -12,6 +12,7 @@ from skin_host.client.callbacks import SkinCallbacks
 from skin_host.client.session import CommandError, Node, SkinClient
 from skin_host.client.streams import Contact, Health, Stream
 from skin_host.publish.address import Broker
+from skin_host.publish.grasping import Over, Slip
 from skin_host.publish.info import NodeInfo, PartInfo
 from skin_host.publish.messages import Frame, Touch
 
@@ -23,9 +24,11 @@ __all__ = [
     "Health",
     "Node",
     "NodeInfo",
+    "Over",
     "PartInfo",
     "SkinCallbacks",
     "SkinClient",
+    "Slip",
     "Stream",
     "Touch",
 ]

@@ -10,6 +10,7 @@ from typing import Any, Self, TypeVar
 
 from skin_host.client.session import SkinClient
 from skin_host.client.streams import Contact, Health, Stream
+from skin_host.publish.grasping import Over, Slip
 from skin_host.publish.info import NodeInfo
 from skin_host.publish.messages import Frame, Touch
 
@@ -43,6 +44,14 @@ class SkinCallbacks:
     def on_touch(self, call: Callable[[Touch], object], part: str | None = None) -> None:
         """Call with each touch event of a part, or of all."""
         self._on(lambda: self._skin.touches(part), call)
+
+    def on_slip(self, call: Callable[[Slip], object], part: str | None = None) -> None:
+        """Call when a fingertip, or any, begins or ends to slip."""
+        self._on(lambda: self._skin.slips(part), call)
+
+    def on_over(self, call: Callable[[Over], object], part: str | None = None) -> None:
+        """Call when a fingertip, or any, begins or ends to press too hard."""
+        self._on(lambda: self._skin.overs(part), call)
 
     def on_frame(self, call: Callable[[Frame], object], part: str | None = None) -> None:
         """Call with each frame of a part, or of all."""

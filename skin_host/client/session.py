@@ -25,6 +25,7 @@ from skin_host.publish.connection import (
     is_refusal,
     message_properties,
 )
+from skin_host.publish.grasping import Over, Slip, decode_over, decode_slip
 from skin_host.publish.info import NodeInfo, decode_info
 from skin_host.publish.messages import Frame, MessageError, Touch
 from skin_host.publish.topics import ONLINE, PartTopic, Topics
@@ -34,6 +35,12 @@ MAX_INCOMING = 10_000
 SESSION_S = 60
 #: Retained messages come within this time of a subscription.
 RETAINED_S = 0.5
+
+_EVENTS: dict[str, Callable[[bytes], Touch | Slip | Over]] = {
+    "touch": messages.decode_touch,
+    "slip": decode_slip,
+    "over": decode_over,
+}
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
@@ -120,6 +127,14 @@ class SkinClient:
     def touches(self, part: str | None = None) -> Stream[Touch]:
         """Touch events of a part, or of all."""
         return self._stream("touch", part)
+
+    def slips(self, part: str | None = None) -> Stream[Slip]:
+        """Slips of a fingertip, or of all: they begin and end."""
+        return self._stream("slip", part)
+
+    def overs(self, part: str | None = None) -> Stream[Over]:
+        """When a fingertip, or any, begins or ends to press too hard."""
+        return self._stream("over", part)
 
     def frames(self, part: str | None = None) -> Stream[Frame]:
         """Frames of a part, or of all: pressure in kPa as numpy arrays."""
@@ -407,11 +422,11 @@ class SkinClient:
         if not streams:
             self._streams_changed.set()  # nobody reads it any more
             return
-        item: Touch | Frame | Contact | Health
-        if kind == "touch":
-            item = messages.decode_touch(payload)
+        item: Touch | Slip | Over | Frame | Contact | Health
+        if kind in _EVENTS:
+            item = _EVENTS[kind](payload)
             if item.part != part:
-                raise MessageError(f'a touch of "{item.part}" among those of "{part}"')
+                raise MessageError(f'a {kind} of "{item.part}" among those of "{part}"')
         elif kind == "frame":
             item = messages.decode_frame(part, payload)
         elif not payload:  # a retained message was deleted

@@ -7,11 +7,19 @@ from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 from msgspec.structs import replace
 
+from skin_host.publish.grasping import Over, Slip
 from skin_host.publish.messages import Frame, Touch
 from skin_host.publish.topics import PartTopic
 
 #: What is held for a reader that is slow; then the oldest goes, and is missed.
-HELD = {"touch": 10_000, "frame": 256, "contact": 1000, "health": 1000}
+HELD = {
+    "touch": 10_000,
+    "slip": 10_000,
+    "over": 10_000,
+    "frame": 256,
+    "contact": 1000,
+    "health": 1000,
+}
 #: An event that the broker got twice comes again within so many events.
 DUPLICATE_SPAN = 64
 
@@ -61,7 +69,7 @@ class Stream(AsyncIterator[T], Generic[T]):
                 self._wake.clear()
                 await self._wake.wait()
             item: Any = self._items.popleft()
-            if isinstance(item, Touch):
+            if isinstance(item, Touch | Slip | Over):
                 # A publisher that does not count cannot be checked.
                 missed = self._missed(item.part, item.count, item.t_ns) if item.count else 0
             elif isinstance(item, Frame):

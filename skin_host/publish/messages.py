@@ -10,6 +10,7 @@ zeros to one digit for every four taxels. Three taxels of which the first alone 
 are "1"; twelve of which all but the last are valid are "7ff".
 """
 
+import math
 import re
 from typing import Annotated, Any, Final, Literal, TypeVar
 
@@ -20,7 +21,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from skin_host.errors import SkinError
-from skin_host.processing.contacts import TouchEvent
+from skin_host.processing.contacts import Load, TouchEvent
 from skin_host.processing.pipeline import PressureFrame
 
 FRAME_SCHEMA: Final = "skin.frame/1"
@@ -28,11 +29,12 @@ TOUCH_SCHEMA: Final = "skin.touch/1"
 HEALTH_SCHEMA: Final = "skin.health/1"
 #: One unit of the values of a frame.
 SCALE_KPA = 0.01
-#: Decimals of kPa, of mm2, of m (0.001 mm), of N and of the parts of a unit vector.
+#: Decimals of kPa, of mm2, of m (0.001 mm), of N, of N m and of the parts of a unit vector.
 KPA_DECIMALS = 3
 MM2_DECIMALS = 2
 M_DECIMALS = 6
 N_DECIMALS = 4
+NM_DECIMALS = 6
 NORMAL_DECIMALS = 4
 #: No honest message is longer, no part has more taxels.
 MAX_BYTES = 4 * 1024 * 1024
@@ -81,6 +83,23 @@ class Frame(Struct, frozen=True, eq=False):
     raw: NDArray[np.uint8] | None = None
 
 
+class LoadMessage(Struct, frozen=True, kw_only=True):
+    """What a force/torque board says of the contact on its fingertip.
+
+    Attributes:
+        verdict: whether one push on the surface gives this force and torque.
+        force_n, torque_nm: of what touches on the fingertip, about the origin of its frame.
+        shear_n: the share of the force along the surface; None without a place.
+        flags: of the finger: search, move, touch, slip, over.
+    """
+
+    verdict: Literal["contact", "no_single_contact", "several_contacts", "saturated"]
+    force_n: Vector
+    torque_nm: Vector
+    shear_n: Vector | None
+    flags: Annotated[list[Annotated[str, Meta(max_length=16)]], Meta(max_length=16)]
+
+
 class TouchMessage(Struct, frozen=True, kw_only=True):
     """A contact begins, moves or ends: the payload of `<part>/touch`.
 
@@ -90,6 +109,7 @@ class TouchMessage(Struct, frozen=True, kw_only=True):
         count: how many events of the part this node has had to say so far, this one
             included. A gap is a loss; it starts again at 1 with the node.
         taxels: numbers within the part.
+        area_mm2, peak_kpa, mean_kpa: None on a fingertip without skin.
         sigma_m: radial standard error of `centroid_m`; None where it is not known.
     """
 
@@ -103,16 +123,26 @@ class TouchMessage(Struct, frozen=True, kw_only=True):
     taxels: Annotated[list[Annotated[int, Meta(ge=0, le=MAX_TAXELS)]], Meta(max_length=MAX_TAXELS)]
     centroid_m: Vector | None
     normal: Vector | None
-    area_mm2: float
-    peak_kpa: float
-    mean_kpa: float
+    area_mm2: float | None
+    peak_kpa: float | None
+    mean_kpa: float | None
     force_n: float
     sigma_m: Annotated[float, Meta(ge=0)] | None = None
 
 
-class Touch(TouchMessage, frozen=True, kw_only=True):
-    """An event as it was received; `missed` events of its part were lost just before it."""
+class FingertipTouchMessage(TouchMessage, frozen=True, kw_only=True):
+    """The same of a fingertip on a force/torque board, and what that says."""
 
+    load: LoadMessage
+
+
+class Touch(TouchMessage, frozen=True, kw_only=True):
+    """An event as it was received; `missed` events of its part were lost just before it.
+
+    Only fingertips on force/torque boards have a `load`.
+    """
+
+    load: LoadMessage | None = None
     missed: int = 0
 
 
@@ -215,12 +245,12 @@ def decode_frame(part: str, payload: bytes) -> Frame:
         MessageError: it is not such a payload.
         SkinError: it is CBOR and cbor2 is not installed.
     """
-    _check_size(payload)
+    check_size(payload)
     # A CBOR map starts with 0xA0 to 0xBF, a JSON object with a brace or white space.
     if payload[:1] >= b"\xa0":
         fields, values = _decode_cbor_frame(payload)
     else:
-        fields = _decode(_frame_decoder, payload, "frame")
+        fields = decode(_frame_decoder, payload, "frame")
         values = np.array(fields.values, np.int32)
     if fields.schema != FRAME_SCHEMA:
         raise MessageError(f'frame: schema "{fields.schema}"; this program reads {FRAME_SCHEMA}')
@@ -236,22 +266,25 @@ def decode_frame(part: str, payload: bytes) -> Frame:
 
 def touch_message(event: TouchEvent, count: int) -> TouchMessage:
     """What is said of an event; `count` as in `TouchMessage`. Numbers are rounded as above."""
-    return TouchMessage(
-        event=event.event,
-        id=event.id,
-        seq=event.seq,
-        t_ns=event.t_ns,
-        count=count,
-        part=event.part,
-        taxels=event.taxels,
-        centroid_m=_vector(event.centroid_m, M_DECIMALS),
-        normal=_vector(event.normal, NORMAL_DECIMALS),
-        area_mm2=round(event.area_mm2, MM2_DECIMALS),
-        peak_kpa=round(event.peak_kpa, KPA_DECIMALS),
-        mean_kpa=round(event.mean_kpa, KPA_DECIMALS),
-        force_n=round(event.force_n, N_DECIMALS),
-        sigma_m=None if event.sigma_m is None else round(event.sigma_m, M_DECIMALS),
-    )
+    said: dict[str, Any] = {
+        "event": event.event,
+        "id": event.id,
+        "seq": event.seq,
+        "t_ns": event.t_ns,
+        "count": count,
+        "part": event.part,
+        "taxels": event.taxels,
+        "centroid_m": _vector(event.centroid_m, M_DECIMALS),
+        "normal": _vector(event.normal, NORMAL_DECIMALS),
+        "area_mm2": _known(event.area_mm2, MM2_DECIMALS),
+        "peak_kpa": _known(event.peak_kpa, KPA_DECIMALS),
+        "mean_kpa": _known(event.mean_kpa, KPA_DECIMALS),
+        "force_n": round(event.force_n, N_DECIMALS),
+        "sigma_m": None if event.sigma_m is None else round(event.sigma_m, M_DECIMALS),
+    }
+    if event.load is None:
+        return TouchMessage(**said)
+    return FingertipTouchMessage(**said, load=_load_message(event.load))
 
 
 def encode_touch(event: TouchEvent, count: int) -> bytes:
@@ -265,8 +298,8 @@ def decode_touch(payload: bytes) -> Touch:
     Raises:
         MessageError: it is not such a payload.
     """
-    _check_size(payload)
-    touch = _decode(_touch_decoder, payload, "touch")
+    check_size(payload)
+    touch = decode(_touch_decoder, payload, "touch")
     return replace(touch, missed=0) if touch.missed else touch
 
 
@@ -297,8 +330,8 @@ def decode_health(payload: bytes) -> dict[str, Any]:
     Raises:
         MessageError: it is not such a payload.
     """
-    _check_size(payload)
-    record = _decode(_health_decoder, payload, "health")
+    check_size(payload)
+    record = decode(_health_decoder, payload, "health")
     if record.get("schema") != HEALTH_SCHEMA:
         raise MessageError(f"health: wanted the schema {HEALTH_SCHEMA}")
     return record
@@ -366,14 +399,24 @@ def _decode_cbor_frame(payload: bytes) -> tuple[_FrameFields, NDArray[np.int32]]
     return fields, values
 
 
-def _decode(decoder: "msgspec.json.Decoder[T]", payload: bytes, what: str) -> T:
+def decode(decoder: "msgspec.json.Decoder[T]", payload: bytes, what: str) -> T:
+    """Read a payload of the topic `what`.
+
+    Raises:
+        MessageError: it is not such a payload.
+    """
     try:
         return decoder.decode(payload)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise MessageError(f"{what}: {error}") from None
 
 
-def _check_size(payload: bytes) -> None:
+def check_size(payload: bytes) -> None:
+    """Refuse what no honest program sends.
+
+    Raises:
+        MessageError: it is too long.
+    """
     if len(payload) > MAX_BYTES:
         raise MessageError(f"a message of {len(payload)} bytes; wanted at most {MAX_BYTES}")
 
@@ -387,8 +430,26 @@ def _line(kind: str, keys: dict[str, Any]) -> bytes:
     return _encoder.encode({"type": kind} | keys) + b"\n"
 
 
+def _load_message(load: Load) -> LoadMessage:
+    return LoadMessage(
+        verdict=load.verdict,
+        force_n=_rounded(load.force_n, N_DECIMALS),
+        torque_nm=_rounded(load.torque_nm, NM_DECIMALS),
+        shear_n=_vector(load.shear_n, N_DECIMALS),
+        flags=load.flags,
+    )
+
+
+def _known(value: float, decimals: int) -> float | None:
+    return None if math.isnan(value) else round(value, decimals)
+
+
 def _vector(values: list[float] | None, decimals: int) -> Vector | None:
     if values is None:
         return None
+    return _rounded(values, decimals)
+
+
+def _rounded(values: list[float], decimals: int) -> Vector:
     x, y, z = (round(value, decimals) + 0.0 for value in values)
     return x, y, z

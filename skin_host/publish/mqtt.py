@@ -11,8 +11,9 @@ from collections import deque
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
+from skin_host.fingertip.events import OverEvent, SlipEvent
 from skin_host.processing.contacts import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.publish import messages
@@ -151,6 +152,12 @@ class Publisher:
         """Send a touch event; those of a part arrive in order, and at least once."""
         topic = self.topics.part("touch", event.part)
         self._outbox.put_touch(topic, event, self._json_properties)
+
+    def put_grasp(self, event: SlipEvent | OverEvent) -> None:
+        """Send that a fingertip slips or presses too hard, as surely as a touch event."""
+        kind: Literal["slip", "over"] = "slip" if isinstance(event, SlipEvent) else "over"
+        topic = self.topics.part(kind, event.part)
+        self._outbox.put_grasp(topic, event, self._json_properties)
 
     def put_contact(self, part: str, touched: bool) -> None:
         """Say whether a part is touched at all; nothing is sent if that is known already."""

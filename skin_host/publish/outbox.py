@@ -7,14 +7,17 @@ queue whose losses are counted, and everything retained a mailbox by topic.
 import asyncio
 import logging
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import islice
 from typing import NamedTuple
 
+from skin_host.fingertip.events import OverEvent, SlipEvent
 from skin_host.processing.contacts import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.publish import messages
 from skin_host.publish.connection import MessageProperties
+from skin_host.publish.grasping import encode_grasp
 
 #: `move` events may fill half of the queue: a begin or an end is worth more.
 MOVE_SHARE = 0.5
@@ -49,7 +52,7 @@ class PublisherCounters:
 
 
 class Event(NamedTuple):
-    """Something that must arrive: a touch event, or the answer to a command."""
+    """Something that must arrive: an event of a part, or the answer to a command."""
 
     topic: str
     payload: bytes
@@ -87,7 +90,7 @@ class Outbox:
         self._event_limit = event_limit
         self._move_limit = int(event_limit * MOVE_SHARE)
         self._overflowing = False
-        self._touch_counts: dict[str, int] = {}
+        self._counts: dict[str, int] = {}
         self._frame_ns = int(1e9 / frame_hz) if frame_hz else 0
         self._frame_due_ns: dict[str, int] = {}
 
@@ -115,12 +118,26 @@ class Outbox:
         self, topic: str, touch: TouchEvent, properties: MessageProperties | None
     ) -> None:
         """Take a touch event, or count it as lost; either way it is numbered."""
-        count = self._touch_counts.get(touch.part, 0) + 1
-        self._touch_counts[touch.part] = count
         limit = self._move_limit if touch.event == "move" else self._event_limit
+        self._put_counted(topic, lambda n: messages.encode_touch(touch, n), properties, limit)
+
+    def put_grasp(
+        self, topic: str, event: SlipEvent | OverEvent, properties: MessageProperties | None
+    ) -> None:
+        """Take a slip, or pressing too hard, in the same way."""
+        limit = self._event_limit
+        self._put_counted(topic, lambda n: encode_grasp(event, n), properties, limit)
+
+    def _put_counted(
+        self,
+        topic: str,
+        encode: Callable[[int], bytes],
+        properties: MessageProperties | None,
+        limit: int,
+    ) -> None:
+        count = self._counts[topic] = self._counts.get(topic, 0) + 1
         if len(self.events) < limit:
-            payload = messages.encode_touch(touch, count)
-            self.put_event(Event(topic, payload, properties, is_touch=True))
+            self.put_event(Event(topic, encode(count), properties, is_touch=True))
             return
         self.counters.touches_dropped += 1
         if not self._overflowing:

@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any, NamedTuple, Self
+from typing import IO, Any, NamedTuple, Self, get_args
 
 import msgspec
 import numpy as np
@@ -21,8 +21,9 @@ from skin_host.bus.protocol import FrameBatch
 from skin_host.errors import LogError, SkinError
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.publish import messages
+from skin_host.publish.grasping import decode_over, decode_slip
 from skin_host.publish.recording_schemas import SCHEMAS
-from skin_host.publish.topics import Topics
+from skin_host.publish.topics import PartTopic, Topics
 
 SUFFIX = ".mcap"
 CAN = "can/"
@@ -240,7 +241,7 @@ def _messages(path: Path) -> Iterator[tuple[str, int, bytes]]:
 def _kind(topic: str) -> str | None:
     """frame, touch, ... by the end of a topic; None for what is not recorded."""
     head, _, last = topic.rpartition("/")
-    if last in ("frame", "touch", "contact", "health"):
+    if last in ("frame", "touch", "slip", "over", "contact", "health"):
         return last
     if last in ("status", "info") and "/nodes/" in head:
         return last
@@ -257,6 +258,9 @@ def _checked(topic: str, kind: str, payload: bytes, t_ns: int) -> tuple[bytes, i
         return payload, frame.t_ns
     if kind == "touch":
         return payload, messages.decode_touch(payload).t_ns
+    if kind in ("slip", "over"):
+        found = decode_slip(payload) if kind == "slip" else decode_over(payload)
+        return payload, found.t_ns
     if kind in ("contact", "status"):
         return msgspec.json.encode(_Text(payload.decode())), t_ns
     msgspec.json.decode(payload, type=dict[str, Any])
@@ -290,7 +294,7 @@ def recorded_topics(base: str, robot: str) -> list[str]:
     """What to subscribe to for a whole recording of a robot."""
     topics = Topics(base, robot)
     return [
-        *(topics.part(kind, "+") for kind in ("frame", "touch", "contact", "health")),
+        *(topics.part(kind, "+") for kind in get_args(PartTopic)),
         *(topics.node(kind, "+") for kind in ("status", "info")),
     ]
 

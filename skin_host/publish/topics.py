@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 
 from skin_host.errors import ConfigurationError
 
-PartTopic = Literal["frame", "touch", "contact", "health"]
+PartTopic = Literal["frame", "touch", "slip", "over", "contact", "health"]
 NodeTopic = Literal["status", "info"]
 
 ONLINE = b"online"
@@ -79,7 +79,10 @@ class Topics:
         if not topic.startswith(f"{self.base}/"):
             return None
         match topic[len(self.base) + 1 :].split("/"):
-            case [part, ("frame" | "touch" | "contact" | "health") as part_kind]:
+            case [
+                part,
+                ("frame" | "touch" | "slip" | "over" | "contact" | "health") as part_kind,
+            ]:
                 return Place(part_kind, part)
             case ["nodes", node, ("status" | "info") as node_kind]:
                 return Place(node_kind, node)

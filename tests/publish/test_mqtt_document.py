@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from skin_host.publish import messages
+from skin_host.publish import grasping, messages
 from skin_host.publish.commands import decode_result
 from skin_host.publish.info import NodeInfo, PartInfo, TriangleInfo
 from skin_host.publish.outbox import PublisherCounters
@@ -31,6 +31,16 @@ def test_the_touch_of_the_document_has_exactly_the_keys_of_a_touch() -> None:
     assert keys == list(messages.TouchMessage.__struct_fields__)
 
 
+def test_slips_and_excess_of_the_document_have_exactly_their_keys() -> None:
+    slip = grasping.decode_slip(EXAMPLES["skin.slip/1"])
+    assert slip.cause == "fall"
+    keys = list(msgspec.json.decode(EXAMPLES["skin.slip/1"]))
+    assert keys == list(grasping.SlipMessage.__struct_fields__)
+    assert grasping.decode_over(EXAMPLES["skin.over/1"]).force_n == 10.4
+    keys = list(msgspec.json.decode(EXAMPLES["skin.over/1"]))
+    assert keys == list(grasping.OverMessage.__struct_fields__)
+
+
 def test_the_result_of_the_document_is_a_result() -> None:
     assert decode_result(EXAMPLES["skin.result/1"]).ok
 
@@ -38,6 +48,7 @@ def test_the_result_of_the_document_is_a_result() -> None:
 def test_the_document_names_every_key() -> None:
     keys = {
         *messages.TouchMessage.__struct_fields__,
+        *messages.LoadMessage.__struct_fields__,
         *messages._FrameFields.__struct_fields__,
         *NodeInfo.__struct_fields__,
         *PartInfo.__struct_fields__,
