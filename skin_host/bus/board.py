@@ -11,6 +11,8 @@ from skin_host.layout import BoardLayout, TriangleLayout
 
 MTB3_GAP_PERIODS = 2.5
 GAP_S = 0.01
+#: A period that is off by more than this share is not the one that was set.
+WRONG_PERIOD = 0.25
 PERIOD_SWEEPS = 16
 
 
@@ -60,12 +62,21 @@ class BoardRecord:
     busy: "asyncio.Task[None] | None" = None
 
     @property
-    def interval_ns(self) -> float | None:
-        """Median of its last intervals, None until there are enough."""
+    def wrong_period_ns(self) -> float | None:
+        """Median of its last intervals if the board sends too fast or too slowly, else None.
+
+        Median and mean must agree: sweeps that were held up come in a bunch and make the median
+        short, one long pause makes the mean long, and neither is another period.
+        """
         if len(self.sweep_times_ns) < PERIOD_SWEEPS // 2:
             return None
         intervals = np.diff(np.array(self.sweep_times_ns, np.int64))
-        return float(np.median(intervals))
+        usual_ns, mean_ns = float(np.median(intervals)), float(np.mean(intervals))
+        period_ns = self.layout.settings.period_ms * 1_000_000
+        limit_ns = WRONG_PERIOD * period_ns
+        slow = min(usual_ns, mean_ns) - period_ns > limit_ns
+        fast = period_ns - max(usual_ns, mean_ns) > limit_ns
+        return usual_ns if slow or fast else None
 
     @property
     def is_mtb3(self) -> bool:

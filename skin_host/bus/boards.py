@@ -60,8 +60,6 @@ RETRY_S = (1.0, 2.0, 4.0, 8.0)
 #: doubles up to the last: what setting up does not mend should not be disturbed for ever.
 WRONG_S = 1.0
 WRONG_RETRY_S = (5.0, 10.0, 20.0, 60.0)
-#: A period that is off by more than this share is not the one that was set.
-WRONG_PERIOD = 0.25
 _ANSWERS = (MessageClass.ANALOG_COMMAND, MessageClass.MANAGEMENT)
 
 
@@ -221,12 +219,11 @@ class Boards:
     @staticmethod
     def _judge(record: BoardRecord, now_ns: int) -> None:
         wrong = ""
-        interval = record.interval_ns
-        period_ns = record.layout.settings.period_ms * 1_000_000
+        seen_ns = record.wrong_period_ns
         if record.missing:
             wrong = "does not send all of its triangles"
-        elif interval and abs(interval - period_ns) > WRONG_PERIOD * period_ns:
-            wrong = f"sends every {interval / 1e6:.0f} ms, not {period_ns / 1e6:.0f} ms"
+        elif seen_ns is not None:
+            wrong = f"sends every {seen_ns / 1e6:.0f} ms, not {record.layout.settings.period_ms} ms"
         # What is missing from now on must be missing in every sweep.
         record.missing = record.layout.enabled
         if wrong and not record.wrong:
