@@ -13,7 +13,9 @@ from skin_host.bus.commands import SetTxMode, TxMode, command_frame
 from skin_host.settings import Bus
 from tests.support.live import living
 
+#: Told for a while afterwards, or when this machine is busy.
 LATELY = frozenset({"board_reset", "board_rezeroed", "board_lost_set_up", "board_jitter"})
+LATELY |= {"board_period", "bus_loses_frames"}
 
 
 async def test_a_board_that_resets_is_set_up_again_and_the_others_notice_nothing(

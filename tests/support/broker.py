@@ -1,6 +1,8 @@
 """A real mosquitto that a test can start, freeze, kill and bring back."""
 
+import asyncio
 import contextlib
+import random
 import signal
 import socket
 import subprocess
@@ -90,3 +92,24 @@ class Mosquitto:
             self._process.send_signal(how)
             self._process.wait(timeout=_START_S)
             self._process = None
+
+
+async def break_at_random(broker: Mosquitto, chance: random.Random) -> None:
+    """Kill, stop, restart and freeze the broker until cancelled; it runs in the end."""
+    while True:
+        await asyncio.sleep(chance.uniform(0.2, 2.0))
+        match chance.choice(["restart", "kill", "freeze", "stop"]):
+            case "restart":
+                await asyncio.to_thread(broker.restart)
+            case "kill" | "stop" as how:
+                await asyncio.to_thread(broker.kill if how == "kill" else broker.stop)
+                try:
+                    await asyncio.sleep(chance.uniform(0.1, 2.0))
+                finally:
+                    broker.start()
+            case "freeze":
+                broker.freeze()
+                try:
+                    await asyncio.sleep(chance.uniform(0.1, 5.0))
+                finally:
+                    broker.resume()

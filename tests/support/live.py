@@ -2,8 +2,9 @@
 
 import asyncio
 import contextlib
+import time
 from collections import Counter
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
 import can
@@ -36,16 +37,18 @@ class Live:
 
     async def until(self, *codes: str, limit_s: float = 10.0) -> set[tuple[str, str]]:
         """Wait until all these codes are told."""
-        async with asyncio.timeout(limit_s):
-            while not set(codes) <= {code for code, _ in self.faults()}:  # noqa: ASYNC110
-                await asyncio.sleep(0.02)
+        await self._until(lambda: set(codes) <= {code for code, _ in self.faults()}, limit_s)
         return self.faults()
 
     async def until_well(self, limit_s: float = 10.0, *, but: frozenset[str] = frozenset()) -> None:
         """Wait until all taxels are valid and nothing is told but codes of `but`."""
-        async with asyncio.timeout(limit_s):
-            while not self._well(but):  # noqa: ASYNC110
-                await asyncio.sleep(0.02)
+        await self._until(lambda: self._well(but), limit_s)
+
+    async def _until(self, condition: Callable[[], bool], limit_s: float) -> None:
+        end_s = time.monotonic() + limit_s
+        while not condition():
+            assert time.monotonic() < end_s, f"after {limit_s:g} s: {self.faults()}"
+            await asyncio.sleep(0.02)
 
     def _well(self, but: frozenset[str]) -> bool:
         records = self.daemon.records().values()
@@ -81,7 +84,7 @@ async def living(
     try:
         live = Live(robot, daemon, frames_sent)
         async with asyncio.timeout(20.0):
-            while daemon.engine.calibration is None:  # noqa: ASYNC110
+            while daemon.engine.calibration is None or daemon._calibration_lock.locked():  # noqa: ASYNC110
                 await asyncio.sleep(0.02)
         yield live
     finally:

@@ -90,7 +90,7 @@ class Stack:
         for process in self._processes:
             process.kill()
             with contextlib.suppress(ValueError):  # its pipes are closed already
-                print(*process.communicate(), sep="\n")
+                sys.stdout.writelines(process.communicate())
         self._processes.clear()
 
 
