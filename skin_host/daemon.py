@@ -19,6 +19,8 @@ from skin_host.errors import (
     RequestError,
     SkinError,
 )
+from skin_host.fingertip.desk import FingertipDesk
+from skin_host.fingertip.health import FingertipRecord
 from skin_host.health import Health, Record
 from skin_host.layout import Layout, build_layout
 from skin_host.link import Link
@@ -93,6 +95,7 @@ class Daemon:
             settings.mqtt, layout.robot, node, handler=self.control.handle, folder=folder
         )
         self.publisher.put_info(self._info())
+        self.fingertips = FingertipDesk(self.engine.fingertips, self.publisher)
         self.link = Link(self.engine)
         self._calibration_lock = asyncio.Lock()
         self._feed_s = service.watchdog_interval_s()
@@ -133,6 +136,7 @@ class Daemon:
             await asyncio.gather(*tasks, stopping, return_exceptions=True)
             for part in self.engine.parts:
                 self._end_contacts(part)
+            self.fingertips.end(time.time_ns())
             await self.link.stop()
 
     async def calibrate(self, seconds: float, boards: list[int] | None = None) -> Calibration:
@@ -153,7 +157,9 @@ class Daemon:
             known = self.engine.calibration
             if known is not None:
                 chosen = self.engine.boards if boards is None else boards
-                found = calibrations.merge(known, found, self.engine.taxels_of(chosen))
+                found = calibrations.merge(
+                    known, found, self.engine.taxels_of(chosen), zeros=boards is None
+                )
             path = calibration_path(self.settings, self._node)
             if known is None:
                 found = calibrations.with_gains_of(found, path, self.layout)
@@ -212,6 +218,7 @@ class Daemon:
                 self.engine.configuration,
             ),
             ("buses", settings.buses, self.settings.buses),
+            ("fingertips", settings.fingertips, self.settings.fingertips),
             ("mqtt", settings.mqtt, self.settings.mqtt),
             ("service", settings.service, self.settings.service),
             ("receive", settings.receive, self.settings.receive),
@@ -242,7 +249,9 @@ class Daemon:
         """The health record of every part, as it is now."""
         return {self.layout.parts[part].name: self._record_of(part) for part in self.engine.parts}
 
-    status = records
+    def status(self) -> dict[str, Record | FingertipRecord]:
+        """The same with the fingertips on force/torque boards."""
+        return {**self.records(), **self.fingertips.records(self.link.read_ns)}
 
     def _renew_processing(self) -> None:
         for part in self.engine.parts:
@@ -277,6 +286,7 @@ class Daemon:
         service.notify("READY=1")
 
     def _deliver(self, steps: list[Step]) -> None:
+        self.fingertips.deliver()
         self.health.note_sweeps(self.engine.sweeps)
         for step in steps:
             self.health.note_step(step)
@@ -304,7 +314,7 @@ class Daemon:
             self.link.supervise()
             now_s = time.monotonic()
             self.health.tick(self.link.read_ns, self.link.ports, self.link.boards)
-            told: dict[tuple[str, str], str] = {}
+            told = self.fingertips.tell(self.link.read_ns)
             for part in self.engine.parts:
                 record = self._record_of(part)
                 told |= {
@@ -347,6 +357,7 @@ class Daemon:
             frame_hz=self.settings.mqtt.frame_hz,
             calibration=info,
             commands=self.settings.mqtt.commands,
+            fingertips=self.settings.fingertips,
         )
 
     def _state_path(self) -> Path:

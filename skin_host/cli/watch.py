@@ -97,7 +97,7 @@ async def health_of_all(broker: str, robot: str | None) -> dict[str, dict[str, A
 
     async with SkinClient(broker, robot=robot) as skin:
         nodes = await skin.info()
-        parts = {part for node in nodes.values() for part in node.parts}
+        parts = {part for node in nodes.values() for part in [*node.parts, *node.fingertips]}
         records: dict[str, dict[str, Any]] = {}
         try:
             async with asyncio.timeout(5.0):
@@ -120,6 +120,8 @@ def _status(arguments: argparse.Namespace) -> int:
     print(f"{'part':<16} {'state':<14} {'Hz':>6} {'valid':>11} {'age':>9}")
     for part, record in sorted(records.items()):
         valid = f"{record.get('valid_taxels', 0)}/{record.get('taxels', 0)}"
+        if record.get("kind") == "fingertip":
+            valid = "-"
         age_ms = record.get("age_ms")
         age = "-" if age_ms is None else f"{age_ms:.0f} ms"
         rate = record.get("rate_hz", 0.0)

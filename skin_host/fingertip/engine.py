@@ -61,7 +61,9 @@ class TipState:
         if self.settings.full_scale is None:
             return False
         known = self.told_scale > 0.0
-        return bool((self.told_scale != np.array(self.settings.full_scale))[known].any())
+        # A board tells whole numbers.
+        off = np.abs(self.told_scale - np.array(self.settings.full_scale))
+        return bool((off[known] > 0.5).any())
 
 
 class FingertipEngine:

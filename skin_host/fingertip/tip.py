@@ -100,6 +100,11 @@ class Tip:
         return self._finger.flags
 
     @property
+    def flag_names(self) -> list[str]:
+        """The flags as they are published."""
+        return _names(self.flags)
+
+    @property
     def zeroed(self) -> bool:
         """Whether it is known what the unloaded board sends; nothing comes out before."""
         return self._zero is not None
@@ -296,7 +301,7 @@ class Tip:
             math.nan if skin is None else skin.mean_kpa,
             normal_n,
             None if place is None else 1e-3 * place.sigma_mm,
-            Load(verdict, load[:3].tolist(), torque_nm, shear, _names(self.flags)),
+            Load(verdict, load[:3].tolist(), torque_nm, shear, self.flag_names),
         )
 
     def _end(self, t_ns: int) -> list[FingertipEvent]:
@@ -319,7 +324,7 @@ class Tip:
                 0.0 if known else math.nan,
                 0.0,
                 last.sigma_m,
-                Load(last.load.verdict, zero, zero, zero, _names(self.flags)),
+                Load(last.load.verdict, zero, zero, zero, self.flag_names),
             )
         ]
 

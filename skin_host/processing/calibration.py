@@ -199,10 +199,12 @@ def with_gains_of(calibration: Calibration, path: Path, layout: Layout) -> Calib
     return with_gains(calibration, before.gain, before.bend)
 
 
-def merge(old: Calibration, new: Calibration, renewed: NDArray[np.bool_]) -> Calibration:
+def merge(
+    old: Calibration, new: Calibration, renewed: NDArray[np.bool_], *, zeros: bool = True
+) -> Calibration:
     """Return `old` with the taxels `renewed` [n] taken from `new`; their gains stay.
 
-    Zeros of fingertips are taken from `new` when all taxels are.
+    Zeros of fingertips are taken from `new`, if so wished, as far as it has them.
     """
     return _identified(
         replace(
@@ -213,7 +215,7 @@ def merge(old: Calibration, new: Calibration, renewed: NDArray[np.bool_]) -> Cal
             gain=old.gain,
             bend=old.bend,
             verdict=np.where(renewed, new.verdict, old.verdict),
-            zeros=old.zeros | new.zeros if renewed.all() else old.zeros,
+            zeros=old.zeros | new.zeros if zeros else old.zeros,
         )
     )
 

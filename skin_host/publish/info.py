@@ -4,6 +4,7 @@ The payload of `nodes/<node>/info`, retained. With it a subscriber can draw the 
 give each entry of a frame its place without any file of the robot's.
 """
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Final, Literal
 
 import msgspec
@@ -11,6 +12,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
+from skin_host.fingertip.settings import Fingertip
 from skin_host.layout import Layout, PadKind, PartLayout
 from skin_host.publish.messages import SCALE_KPA, MessageError, Vector
 
@@ -57,6 +59,27 @@ class PartInfo(Struct, frozen=True):
     triangles: list[TriangleInfo]
 
 
+class FingertipInfo(Struct, frozen=True):
+    """A fingertip on a force/torque board: it has no frames, but touches, slips and health.
+
+    Attributes:
+        period_ms: between two samples of its board.
+        shape: sphere, cylinder (about z), ellipsoid (axes along x, y, z) or plane (faces z).
+        size_mm: radius, semi-axes, or nothing for a plane.
+        array: the part whose skin covers it, in the same frame.
+        friction: known coefficient of static friction, or None.
+        threshold_n, over_n: where a contact begins, and where it presses too hard.
+    """
+
+    period_ms: int
+    shape: str
+    size_mm: list[float]
+    array: str | None
+    friction: float | None
+    threshold_n: float
+    over_n: float
+
+
 class NodeInfo(Struct, frozen=True, kw_only=True):
     """The payload of `nodes/<node>/info`.
 
@@ -81,6 +104,7 @@ class NodeInfo(Struct, frozen=True, kw_only=True):
     calibration: CalibrationInfo | None = None
     commands: bool = True
     parts: Annotated[dict[str, PartInfo], Meta(max_length=10_000)]
+    fingertips: Annotated[dict[str, FingertipInfo], Meta(max_length=10_000)] = {}
 
 
 _decoder = msgspec.json.Decoder(NodeInfo)
@@ -96,8 +120,9 @@ def node_info(
     frame_hz: float = 0.0,
     calibration: CalibrationInfo | None = None,
     commands: bool = True,
+    fingertips: Mapping[str, Fingertip] | None = None,
 ) -> NodeInfo:
-    """Describe the parts of `layout` that belong to `node`."""
+    """Describe the parts of `layout`, and of `fingertips` those, that belong to `node`."""
     parts = {
         part.name: _part_info(layout, number, part)
         for number, part in enumerate(layout.parts)
@@ -113,6 +138,11 @@ def node_info(
         calibration=calibration,
         commands=commands,
         parts=parts,
+        fingertips={
+            name: _fingertip_info(tip)
+            for name, tip in (fingertips or {}).items()
+            if tip.node == node
+        },
     )
 
 
@@ -163,6 +193,19 @@ def _part_info(layout: Layout, number: int, part: PartLayout) -> PartInfo:
             for triangle in layout.triangles
             if triangle.part == number
         ],
+    )
+
+
+def _fingertip_info(tip: Fingertip) -> FingertipInfo:
+    size = tip.semi_axes_mm or (() if tip.radius_mm is None else (tip.radius_mm,))
+    return FingertipInfo(
+        tip.period_ms,
+        tip.shape,
+        list(size),
+        tip.array,
+        tip.friction,
+        tip.threshold_n,
+        tip.over_n,
     )
 
 

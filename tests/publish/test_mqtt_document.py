@@ -8,7 +8,7 @@ import numpy as np
 
 from skin_host.publish import grasping, messages
 from skin_host.publish.commands import decode_result
-from skin_host.publish.info import NodeInfo, PartInfo, TriangleInfo
+from skin_host.publish.info import FingertipInfo, NodeInfo, PartInfo, TriangleInfo
 from skin_host.publish.outbox import PublisherCounters
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "mqtt.md").read_text()
@@ -53,6 +53,7 @@ def test_the_document_names_every_key() -> None:
         *NodeInfo.__struct_fields__,
         *PartInfo.__struct_fields__,
         *TriangleInfo.__struct_fields__,
+        *FingertipInfo.__struct_fields__,
     }
     missing = {key for key in keys if not re.search(rf"[`\"]{key}[`\"]", DOCUMENT)}
     assert not missing

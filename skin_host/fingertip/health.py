@@ -1,0 +1,160 @@
+"""How the force/torque boards of fingertips are: a record each, and what is wrong.
+
+The record is published as `<fingertip>/health`, with the same schema, `state`, `faults` and
+`sentences` as that of a part of skin; `docs/operations.md` explains the rest.
+"""
+
+from collections import deque
+from collections.abc import Iterator
+from typing import NotRequired, TypedDict
+
+from skin_host.fingertip.engine import FingertipEngine, TipState
+from skin_host.health.diagnosis import Fault
+from skin_host.health.record import FaultName
+
+#: Rates are means over about this time.
+RATE_NS = 2_000_000_000
+#: Saturation and losses are told for so long after they were last seen.
+HOLD_NS = 3_000_000_000
+#: Single frames without their other half within `RATE_NS` that are told.
+FEW_LONE = 3
+
+
+class FingertipRecord(TypedDict):
+    """One fingertip. Counters count from the start of the daemon.
+
+    `lone` are frames whose other half did not come, `silences` times that the board fell
+    silent, `full_scale` N and N m of its channels, `threshold_n` the least force of a contact,
+    which noise may raise.
+    """
+
+    part: str
+    kind: str
+    state: str
+    bus: str
+    address: int
+    samples: int
+    rate_hz: float
+    lone: int
+    saturated: int
+    wrong_length: int
+    silences: int
+    full_scale: list[float] | None
+    threshold_n: float
+    touched: bool
+    flags: list[str]
+    age_ms: NotRequired[float | None]
+    faults: list[FaultName]
+    sentences: list[str]
+
+
+class FingertipHealth:
+    """Watches the fingertips of an engine. Times are those of the frames."""
+
+    def __init__(self, engine: FingertipEngine) -> None:
+        self._engine = engine
+        self._past: dict[str, deque[tuple[int, int, int]]] = {name: deque() for name in engine.tips}
+        self._lossy_ns: dict[str, int] = {}
+
+    def tick(self, now_ns: int) -> None:
+        """Look at the counters; to be called some times a second."""
+        for name, state in self._engine.tips.items():
+            past = self._past[name]
+            if past and now_ns < past[-1][0]:
+                past.clear()  # the clock was set back
+            counters = None if state.assembler is None else state.assembler.counters
+            samples, lone = (0, 0) if counters is None else (counters.samples, counters.lone)
+            past.append((now_ns, samples, lone))
+            while len(past) > 2 and now_ns - past[1][0] >= RATE_NS:
+                past.popleft()
+            if past[-1][2] - past[0][2] >= FEW_LONE:
+                self._lossy_ns[name] = now_ns
+
+    def records(self, now_ns: int | None) -> dict[str, FingertipRecord]:
+        """What there is to say of each fingertip; without a time (a replay) no ages."""
+        return {name: self._record(state, now_ns) for name, state in self._engine.tips.items()}
+
+    def _record(self, state: TipState, now_ns: int | None) -> FingertipRecord:
+        assembler, table = state.assembler, state.settings
+        counters = None if assembler is None else assembler.counters
+        faults = list(self._faults(state, now_ns))
+        past = self._past[state.name]
+        span_ns = past[-1][0] - past[0][0] if past else 0
+        rate_hz = (past[-1][1] - past[0][1]) / span_ns * 1e9 if span_ns else 0.0
+        record: FingertipRecord = {
+            "part": state.name,
+            "kind": "fingertip",
+            "state": _STATES.get(faults[0].code, "degraded") if faults else "ok",
+            "bus": table.bus,
+            "address": table.address,
+            "samples": 0 if counters is None else counters.samples,
+            "rate_hz": round(rate_hz, 2),
+            "lone": 0 if counters is None else counters.lone,
+            "saturated": 0 if counters is None else counters.saturated,
+            "wrong_length": 0 if counters is None else counters.wrong_length,
+            "silences": state.silenced,
+            "full_scale": None if assembler is None else assembler.full_scale.tolist(),
+            "threshold_n": round(state.tip.threshold_n, 4),
+            "touched": state.tip.touched,
+            "flags": state.tip.flag_names,
+            "faults": [{"code": fault.code, "where": fault.where} for fault in faults],
+            "sentences": [fault.says for fault in faults],
+        }
+        if now_ns is not None:
+            age_ms = (now_ns - state.last_ns) / 1e6
+            record["age_ms"] = round(age_ms, 1) if state.last_ns else None
+        return record
+
+    def _faults(self, state: TipState, now_ns: int | None) -> Iterator[Fault]:
+        """The cause before its consequences: the first one names the state."""
+        name, table = state.name, state.settings
+        here = f"the force/torque board of {name} (bus {table.bus}, address {table.address})"
+
+        def fault(code: str, says: str) -> Fault:
+            return Fault(f"fingertip_{code}", name, says)
+
+        if not state.frames:
+            yield fault("absent", f"{here} has not sent anything yet; check power and address")
+        elif not state.alive and now_ns is not None:
+            yield fault(
+                "silent", f"{here} has stopped sending; it is set up again; check its power"
+            )
+        if state.frames and state.assembler is None:
+            yield fault(
+                "not_configured",
+                f"{here} does not tell its full scales; give them as fingertips.{name}.full_scale",
+            )
+        if state.scale_differs:
+            told = ", ".join(f"{value:g}" for value in state.told_scale)
+            yield fault(
+                "scale",
+                f"{here} tells other full scales ({told}) than fingertips.{name}.full_scale, "
+                "which is used",
+            )
+        if state.assembler is not None and not state.tip.zeroed:
+            yield fault(
+                "not_calibrated",
+                f"{name} has no zero: no contact is told; calibrate it unloaded: "
+                "skin command calibrate",
+            )
+        if now_ns is None:
+            return
+        if state.saturated_ns and abs(now_ns - state.saturated_ns) < HOLD_NS:
+            yield fault("saturated", f"{here} is saturated: the load is beyond its range")
+        if abs(now_ns - self._lossy_ns.get(name, -HOLD_NS)) < HOLD_NS and self._lossy_ns.get(name):
+            yield fault("loses_frames", f"{here}: single frames are lost; the bus is overloaded")
+        if state.tip.threshold_n > table.threshold_n:
+            yield fault(
+                "noisy",
+                f"{name}: contacts below {state.tip.threshold_n:.2f} N drown in the noise of its "
+                f"board; fingertips.{name}.threshold_n asks for {table.threshold_n:g} N",
+            )
+
+
+_STATES = {
+    "fingertip_absent": "no data",
+    "fingertip_silent": "silent",
+    "fingertip_not_configured": "not configured",
+    "fingertip_not_calibrated": "not calibrated",
+    "fingertip_saturated": "saturated",
+}
