@@ -3,6 +3,8 @@
 import asyncio
 from collections import deque
 from dataclasses import dataclass, field
+from functools import reduce
+from operator import or_
 
 import numpy as np
 
@@ -14,6 +16,8 @@ GAP_S = 0.01
 #: A period that is off by more than this share is not the one that was set.
 WRONG_PERIOD = 0.25
 PERIOD_SWEEPS = 16
+#: Triangles must be missing in so many sweeps in a row: single frames get lost, sweeps get cut.
+MISSING_SWEEPS = 5
 
 
 @dataclass(slots=True)
@@ -51,7 +55,7 @@ class BoardRecord:
     answered_ns: int = 0
     last_sweep_ns: int = 0
     sweep_times_ns: deque[int] = field(default_factory=lambda: deque(maxlen=PERIOD_SWEEPS + 1))
-    missing: int = 0
+    presents: deque[int] = field(default_factory=lambda: deque(maxlen=MISSING_SWEEPS))
     wrong: str = ""
     wrong_since_ns: int = 0
     wrong_tries: int = 0
@@ -60,6 +64,13 @@ class BoardRecord:
     retries: int = 0
     commands: list[Message] = field(default_factory=list)
     busy: "asyncio.Task[None] | None" = None
+
+    @property
+    def missing(self) -> int:
+        """Mask of the triangles that it was told to send and has stopped sending."""
+        if len(self.presents) < MISSING_SWEEPS:
+            return 0
+        return self.layout.enabled & ~reduce(or_, self.presents)
 
     @property
     def wrong_period_ns(self) -> float | None:

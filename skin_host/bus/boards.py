@@ -158,7 +158,7 @@ class Boards:
         record.configured_ns = self._clock()
         record.configured_at_ns = time.monotonic_ns()
         record.sweep_times_ns.clear()
-        record.missing = 0
+        record.presents.clear()
         record.wrong = ""
         record.started = True
 
@@ -224,8 +224,6 @@ class Boards:
             wrong = "does not send all of its triangles"
         elif seen_ns is not None:
             wrong = f"sends every {seen_ns / 1e6:.0f} ms, not {record.layout.settings.period_ms} ms"
-        # What is missing from now on must be missing in every sweep.
-        record.missing = record.layout.enabled
         if wrong and not record.wrong:
             record.wrong_since_ns = now_ns
         record.wrong = wrong
@@ -291,7 +289,7 @@ class Boards:
         record = self._of_index[board]
         record.last_sweep_ns = self._clock()
         record.sweep_times_ns.append(t_ns)
-        record.missing &= ~present
+        record.presents.append(present)
 
     def feed(self, batch: FrameBatch) -> None:
         """Take answers out of a batch."""

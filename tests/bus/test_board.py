@@ -42,3 +42,16 @@ def test_the_period_that_was_set_stays_it_when_sweeps_are_held_up(
     intervals_ms: list[float],
 ) -> None:
     assert record_of(intervals_ms).wrong_period_ns is None
+
+
+def test_triangles_that_never_come_are_missing_and_those_of_cut_sweeps_are_not() -> None:
+    record = record_of([])
+    enabled = record.layout.enabled
+    lowest = enabled & -enabled
+    assert record.missing == 0
+    for turn in range(8):
+        record.presents.append(enabled & ~lowest if turn % 2 else lowest)
+    assert record.missing == 0
+    for _ in range(8):
+        record.presents.append(enabled & ~lowest)
+    assert record.missing == lowest
