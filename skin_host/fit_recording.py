@@ -36,7 +36,10 @@ LEAST_KPA = 10.0
 #: A plateau of known pressure lasts at least so long, and is steady to this share of itself.
 PLATEAU_S = 1.0
 STEADY_SHARE = 0.05
-STEADY_UNITS = 0.7
+STEADY_KPA = 3.5
+#: Less than this, or than this share of what was pressed before, is the imprint of it.
+PRESSED_KPA = 4.0
+IMPRINT_SHARE = 0.07
 #: The first part of a plateau, in which the pressure settles, is left out.
 SETTLING_SHARE = 0.3
 
@@ -187,17 +190,19 @@ def fit_pressures(
     Raises:
         RequestError: another number of plateaus than of levels was found.
     """
-    typical = np.median(samples.units(slice(None), samples.usable), axis=1)
-    found = plateaus(typical, samples.dt_s)
-    if len(found) != len(levels_kpa):
-        seen = ", ".join(f"{part.start * samples.dt_s:.0f} s" for part in found) or "none"
-        raise RequestError(
-            f"{len(found)} plateaus of pressure in the recording (at {seen}), "
-            f"{len(levels_kpa)} levels given; wanted one level for each, in their order"
-        )
     pressure = settings.processing.pressure
     unit_ff = layout.unit_ff / layout.sensitivity
     curve = PressureCurve(unit_ff, 1.0, pressure.a_kpa_per_ff2, pressure.b_kpa_per_ff)
+    typical = _typical_kpa(samples, curve, settings)
+    found = plateaus(typical, samples.dt_s)
+    if len(found) != len(levels_kpa):
+        seen = ", ".join(
+            f"{typical[part].mean():.0f} kPa at {part.start * samples.dt_s:.0f} s" for part in found
+        )
+        raise RequestError(
+            f"plateaus of pressure in the recording: {len(found)} ({seen or 'none'}), "
+            f"levels given: {len(levels_kpa)}; wanted one level for each, in their order"
+        )
     everyone = np.ones_like(samples.usable)
     linear, square = [], []
     for part, kept in zip(found, _kept_shares(samples, curve, settings, found), strict=True):
@@ -208,22 +213,52 @@ def fit_pressures(
     return with_gains(samples.calibration, result.gain, result.bend), result
 
 
-def plateaus(units: Floats, dt_s: float) -> list[slice]:
-    """Where a pressed skin is steady: units [t], the median over it. What settles is left out."""
+def plateaus(pressure_kpa: Floats, dt_s: float) -> list[slice]:
+    """Where a pressed skin is steady.
+
+    Args:
+        pressure_kpa: float64[t], what presses a typical taxel; with relaxation taken off, or
+            the imprint of a high pressure is taken for a low one.
+        dt_s: distance of the samples.
+
+    Returns:
+        The plateaus in their order; what settles at the beginning of each is left out.
+    """
     length = max(round(PLATEAU_S / dt_s), 2)
-    if len(units) <= length:
+    if len(pressure_kpa) <= length:
         return []
-    windows = np.lib.stride_tricks.sliding_window_view(units, length)
+    windows = np.lib.stride_tricks.sliding_window_view(pressure_kpa, length)
     spread = windows.max(axis=1) - windows.min(axis=1)
     level = windows.mean(axis=1)
-    limit = np.maximum(2.0 * STEADY_UNITS, STEADY_SHARE * level)
-    steady = (spread <= limit) & (level > 2.0)
+    limit = np.maximum(STEADY_KPA, STEADY_SHARE * level)
+    before = np.maximum.accumulate(level)
+    steady = (spread <= limit) & (level > np.maximum(PRESSED_KPA, IMPRINT_SHARE * before))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], steady, [False]]).astype(np.int8)))
-    found = []
+    pieces: list[tuple[int, int]] = []
     for first, last in edges.reshape(-1, 2):
         begin, end = int(first), int(last) + length - 1
-        found.append(slice(begin + round(SETTLING_SHARE * (end - begin)), end))
-    return found
+        # A moment of noise does not part a plateau: it goes on at the same pressure.
+        if pieces and begin - pieces[-1][1] <= length:
+            earlier = float(pressure_kpa[slice(*pieces[-1])].mean())
+            if abs(float(pressure_kpa[begin:end].mean()) - earlier) <= limit[first]:
+                begin = pieces.pop()[0]
+        pieces.append((begin, end))
+    return [slice(begin + round(SETTLING_SHARE * (end - begin)), end) for begin, end in pieces]
+
+
+def _typical_kpa(samples: Samples, curve: PressureCurve, settings: Settings) -> Floats:
+    """Pressure [t] on a taxel in the middle of all, its relaxation taken off."""
+    curve = curve.part(samples.usable)
+    blocks = [slice(row, row + 1000) for row in range(0, len(samples.raw), 1000)]
+    momentary = np.concatenate(
+        [np.median(curve.kpa(samples.units(block, samples.usable)), axis=1) for block in blocks]
+    )
+    chosen = settings.processing.relaxation
+    model = make_model(chosen.model, 1, parameters_of(chosen))
+    pressure: Floats = momentary.copy()
+    for row in range(len(momentary)):
+        pressure[row] -= model.step(momentary[row : row + 1], samples.dt_s)[0]
+    return pressure
 
 
 def _kept_shares(

@@ -43,6 +43,9 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
+    # numpy, imported later, would else start threads that spin: on a busy machine they make a
+    # product of 100 000 taxels take seven times as long, and never help one of a few thousand.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     parser = build_parser()
     completion.complete_if_asked(parser)
     arguments = parser.parse_args(argv)

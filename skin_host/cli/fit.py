@@ -3,11 +3,10 @@
 import argparse
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING
 
 from skin_host.cli.common import load_skin, print_json
 from skin_host.errors import RequestError
-from skin_host.settings import RelaxationFile
 
 if TYPE_CHECKING:
     import numpy as np
@@ -15,7 +14,15 @@ if TYPE_CHECKING:
 
     from skin_host.processing.fitting import Fit, HoldRecord
 
-FITTED: list[str] = list(get_args(RelaxationFile.__annotations__["model"]))
+#: The models of `settings.RelaxationFile`; named here too, so that `skin --help` needs no numpy.
+FITTED = [
+    "published",
+    "published_bleed",
+    "prony",
+    "asymmetric",
+    "asymmetric_log",
+    "asymmetric_clock",
+]
 
 
 def add_arguments(calibrate: argparse.ArgumentParser) -> None:

@@ -1,10 +1,10 @@
 """The state of the whole skin, and one step of it: bytes to pressure and touch.
 
-What is done at every sweep is little: two numbers per taxel turn its byte into momentary
-pressure, and what the foam has lost is taken off. All that is slow - relaxation, drift,
-and the byte from which on a taxel may be touched - is brought up to date once a window
-(1 s by default) from the means of that time. A sweep in which no byte comes near its
-limit is known to be untouched by one comparison of bytes.
+What is done at every sweep is little: a parabola per taxel turns its byte into pressure.
+All that is slow - relaxation, drift, with them the parabola, and the byte from which on a
+taxel may be touched - is brought up to date once a window (1 s by default) from the means
+of that time. A sweep in which no byte comes near its limit is known to be untouched by one
+comparison of bytes.
 """
 
 from dataclasses import dataclass
@@ -27,6 +27,8 @@ LONGEST_STEP_S = 1.0
 WINDOW_S = 1.0
 #: Of an untouched part whose pressures nobody wants, one sweep in so much time is worked out.
 GLANCE_S = 0.2
+#: Samples are laid aside and summed so many at a time: fewer passes over the taxels.
+ROWS = 8
 
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float32]
@@ -185,24 +187,31 @@ class _PartPipeline:
         self._units_per_kpa = np.where(believed, 1.0 / np.maximum(curve.linear, 1e-9), 0.0)
         on_units = on_units[mine]
         off_units = np.maximum(on_units - settings.touch.hysteresis_units, 0.0)
-        self._near_units = np.minimum(on_units, curve.beyond_units)
+        near_units = np.minimum(on_units, curve.beyond_units)
+        self._near_units = np.where(believed, near_units, np.inf).astype(np.float32)
         self._detector = TouchDetector(
             np.where(believed, curve.kpa(on_units), np.inf).astype(np.float32),
             np.where(believed, curve.kpa(off_units), np.inf).astype(np.float32),
             settings.touch.votes_of_3,
         )
 
+        self._zeros = _constant(np.zeros(m, np.float32))
         self._offset = np.empty(m, np.float32)
+        self._slope = np.empty(m, np.float32)
+        self._level = np.empty(m, np.float32)
         self._near_raw = np.empty(m, np.uint8)
+        self._beyond_raw = np.empty(m, np.uint8)
         self._renew_limits()
         self._last_raw = np.rint(np.clip(self._offset, 0.0, 255.0)).astype(np.uint8)
-        self._units = np.empty(m, np.float32)
-        self._kpa = np.empty(m, np.float32)
+        self._bytes = np.empty(m, np.float32)
         self._near = np.empty(m, np.bool_)
-        self._zeros = _constant(np.zeros(m, np.float32))
         self._nowhere = _constant(np.zeros(m, np.bool_))
         self._always_valid = _constant(believed.copy())
 
+        self._rows = np.zeros((ROWS, m), np.float32)
+        self._row = list(self._rows)
+        self._laid = 0
+        self._part_kpa = np.empty(m, np.float32)
         self._sum_kpa = np.zeros(m, np.float32)
         self._samples = 0
         self._skipped = 0
@@ -224,12 +233,10 @@ class _PartPipeline:
             self._skipped += 1
             return self._frame(t_ns, raw, valid, self._zeros, self._nowhere, self._nowhere, False)
         self._since_glance_s = 0.0
-        momentary, beyond = self._momentary_kpa(quiet)
-        if self._every_sample:
-            self._relaxation.step(momentary, dt_s, self._relaxation_kpa)
-        corrected = np.subtract(momentary, self._relaxation_kpa, out=self._kpa)
+        beyond = self._nowhere if quiet else self._beyond()
+        corrected = self._corrected_kpa(beyond, dt_s)
         touched = self._nowhere if quiet else self._detector.step(corrected)
-        self._gather(corrected, touched, dt_s)
+        self._gather(touched, dt_s)
         pressure = np.fmax(corrected, self._zeros)
         if valid is not self._always_valid:
             missing = ~valid
@@ -264,7 +271,7 @@ class _PartPipeline:
 
     def _receive(self, raw: NDArray[np.uint8], present: Mask) -> Mask:
         """Take in the bytes; return which are valid."""
-        if np.count_nonzero(present) == len(present):
+        if b"\0" not in present.tobytes():
             self._last_raw = raw
             return self._always_valid
         valid: Mask = present & self._believed
@@ -277,29 +284,43 @@ class _PartPipeline:
 
     def _is_quiet(self) -> bool:
         """Whether no taxel can be touched, nor was in the samples that still have a vote."""
+        if not self._detector.idle:
+            return False
         np.less_equal(self._last_raw, self._near_raw, out=self._near)
-        return np.count_nonzero(self._near) == 0 and self._detector.idle
+        return not _any(self._near)
 
-    def _momentary_kpa(self, quiet: bool) -> tuple[Floats, Mask]:
-        """Equation (1) as (square x + linear) x, and which taxels are beyond its range.
+    def _beyond(self) -> Mask:
+        """Which taxels read more than their calibrated range."""
+        np.less(self._last_raw, self._beyond_raw, out=self._near)
+        return self._near.copy() if _any(self._near) else self._nowhere
 
-        Below zero activation the square adds nothing that matters to any use of it.
+    def _corrected_kpa(self, beyond: Mask, dt_s: float) -> Floats:
+        """Equation (1) with the relaxation taken off, laid aside for the means.
+
+        With the byte r that is (square r + slope) r + level. Below zero activation the square
+        adds nothing that matters to any use of it.
         """
-        units, kpa = self._units, self._kpa
-        np.subtract(self._offset, self._last_raw, out=units)
-        np.multiply(units, self._square, out=kpa)
-        np.add(kpa, self._linear, out=kpa)
-        np.multiply(kpa, units, out=kpa)
-        if quiet:
-            return kpa, self._nowhere
-        beyond = units > self._beyond_units
-        if np.count_nonzero(beyond):
-            kpa[beyond] = self._curve.part(beyond).kpa(units[beyond])
-        return kpa, beyond
+        row = self._row[self._laid]
+        np.copyto(self._bytes, self._last_raw)
+        np.multiply(self._bytes, self._square, out=row)
+        np.add(row, self._slope, out=row)
+        np.multiply(row, self._bytes, out=row)
+        np.add(row, self._level, out=row)
+        if beyond is not self._nowhere:
+            units = self._offset[beyond] - self._last_raw[beyond]
+            row[beyond] = self._curve.part(beyond).kpa(units)
+            if not self._every_sample:
+                row[beyond] -= self._relaxation_kpa[beyond]
+        if self._every_sample:
+            self._relaxation.step(row, dt_s, self._relaxation_kpa)
+            np.subtract(row, self._relaxation_kpa, out=row)
+        return row
 
-    def _gather(self, corrected: Floats, touched: Mask, dt_s: float) -> None:
-        """Add the sample to the window's means; at its end bring up to date what is slow."""
-        np.add(self._sum_kpa, corrected, out=self._sum_kpa)
+    def _gather(self, touched: Mask, dt_s: float) -> None:
+        """Count the sample for the window's means; at its end bring up to date what is slow."""
+        self._laid += 1
+        if self._laid == ROWS:
+            self._fold()
         self._samples += 1
         self._elapsed_s += dt_s
         if touched is not self._noted:
@@ -307,12 +328,13 @@ class _PartPipeline:
             self._noted = touched
         if self._elapsed_s < self._window_s:
             return
+        self._fold()
         units: NDArray[np.float64] = self._sum_kpa / self._samples * self._units_per_kpa
         if self._has_thermal:
             np.subtract(self._offset, self._last_raw, out=units, where=self._thermal)
         if not self._every_sample:
             # Within the window the relaxation was constant, and what was skipped was untouched.
-            momentary = self._units
+            momentary = self._part_kpa
             np.multiply(self._sum_kpa, 1.0 / (self._samples + self._skipped), out=momentary)
             np.add(momentary, self._relaxation_kpa, out=momentary)
             self._relaxation.step(momentary, self._elapsed_s, self._relaxation_kpa)
@@ -328,15 +350,40 @@ class _PartPipeline:
         self._noted = self._nowhere
         self._was_missing.fill(False)
 
+    def _fold(self) -> None:
+        np.add.reduce(self._rows[: self._laid], axis=0, out=self._part_kpa)
+        np.add(self._sum_kpa, self._part_kpa, out=self._sum_kpa)
+        self._laid = 0
+
     def _renew_limits(self) -> None:
-        """Where activation is zero, and the byte from which on a taxel may be touched."""
-        np.subtract(self._no_load, self.drift.baseline, out=self._offset, casting="same_kind")
+        """The parabola of each taxel, and the bytes from which on it may be touched or beyond."""
+        offset, slope, level = self._offset, self._slope, self._level
+        np.subtract(self._no_load, self.drift.baseline, out=offset, casting="same_kind")
+        np.multiply(self._square, offset, out=slope)
+        np.add(slope, self._linear, out=level)
+        np.multiply(level, offset, out=level)
+        np.add(slope, slope, out=slope)
+        np.add(slope, self._linear, out=slope)
+        np.negative(slope, out=slope)
+        if not self._every_sample:
+            np.subtract(level, self._relaxation_kpa, out=level)
         # The curve bends down, so this many units are at least needed to make up for the
         # relaxation; the decision itself is made on the pressure.
-        needed = self._near_units + self._units_per_kpa * np.fmax(self._relaxation_kpa, 0.0)
-        near = np.floor(self._offset - needed + 1e-3)
-        near *= self._believed
-        self._near_raw = np.clip(near, 0.0, 255.0).astype(np.uint8)
+        needed = np.fmax(self._relaxation_kpa, self._zeros)
+        np.multiply(needed, self._units_per_kpa, out=needed, casting="same_kind")
+        np.add(needed, self._near_units, out=needed)
+        _as_bytes(offset - needed + 1e-3, self._near_raw)
+        _as_bytes(np.ceil(offset - self._beyond_units), self._beyond_raw)
+
+
+def _any(flags: Mask) -> bool:
+    """Whether any is set; numpy's own takes several times as long for some thousand."""
+    return b"\1" in flags.tobytes()
+
+
+def _as_bytes(levels: Floats, out: NDArray[np.uint8]) -> None:
+    """Round down to 0 .. 255, in place."""
+    np.copyto(out, np.clip(levels, 0.0, 255.0), casting="unsafe")
 
 
 def _constant(array: NDArray[_T]) -> NDArray[_T]:

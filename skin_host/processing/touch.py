@@ -53,7 +53,8 @@ class TouchDetector:
         self._before: Mask = np.zeros(n, dtype=np.bool_)
         self._next: Mask = np.zeros(n, dtype=np.bool_)
         self._scratch: Mask = np.zeros(n, dtype=np.bool_)
-        self._quiet = VOTERS
+        self._bits = self._over.tobytes()
+        self._alike = VOTERS
 
     def step(self, signal: Array) -> Mask:
         """Take one sample [n]; return which taxels are touched [n].
@@ -62,12 +63,12 @@ class TouchDetector:
         array as before as long as nothing has changed, and is never written to again.
         """
         np.greater_equal(signal, self._threshold, out=self._over)
-        if np.count_nonzero(self._over):
-            self._quiet = 0
-        elif self.idle:
+        bits = self._over.tobytes()
+        if bits != self._bits:
+            self._bits, self._alike = bits, 0
+        elif self._alike >= VOTERS:
             return self.touched
-        else:
-            self._quiet += 1
+        self._alike += 1
         self._vote()
         return self.touched
 
@@ -76,7 +77,7 @@ class TouchDetector:
         """Whether nothing is touched or has a vote, so that a sample below all thresholds
         changes nothing and need not be taken.
         """
-        return self._quiet >= VOTERS
+        return self._alike >= VOTERS and b"\1" not in self._bits
 
     def reset(self, taxels: NDArray[np.intp] | Mask) -> None:
         """Forget that some taxels, by number or mask [n], were touched."""
@@ -84,6 +85,7 @@ class TouchDetector:
         for state in (self.touched, self._last, self._before):
             state[taxels] = False
         self._threshold[taxels] = self._on[taxels]
+        self._alike = 0
 
     def _vote(self) -> None:
         over, last, before = self._over, self._last, self._before

@@ -1,20 +1,23 @@
 """From a recording of CAN frames to parameters, and from those to better pressures."""
 
 import json
+from typing import get_args
 
 import numpy as np
 import pytest
 
 from emulator.foam import Foam
+from emulator.viscoelastic import FoamTruth
 from skin_host.bus.protocol import encode_sweep
 from skin_host.cli import main
+from skin_host.cli.fit import FITTED
 from skin_host.errors import RequestError
 from skin_host.evaluation.histories import record
 from skin_host.fit_recording import plateaus
 from skin_host.layout import build_layout
 from skin_host.processing import calibration
 from skin_host.processing.pressure import PressureCurve
-from skin_host.settings import load, skin_hash
+from skin_host.settings import RelaxationFile, load, skin_hash
 
 HZ = 5.0
 TRIANGLES = np.array([0, 1])
@@ -177,14 +180,49 @@ def test_levels_of_air_pressure_become_gains_that_halve_the_error(bench, tmp_pat
     assert found.gain.std() > 0.01
 
 
+def test_the_imprint_of_a_high_level_is_no_level_and_creep_parts_none(bench, tmp_path, capsys):
+    levels = [10.0, 40.0, 80.0, 100.0, 20.0]
+    truth = FoamTruth("S", 1)
+    momentary = [0.0] * 100
+    for level in levels:
+        for pressure, seconds in ((level, 12.0), (0.0, 20.0)):
+            momentary += [
+                float(truth.step_pressure([pressure], 1.0 / HZ)[0])
+                for _ in range(int(seconds * HZ))
+            ]
+    log = tmp_path / "air.log"
+    write_log(log, np.tile(CURVE.units(np.array(momentary)[:, np.newaxis]), (1, N)))
+    output = tmp_path / "palm.json"
+    arguments = ("calibrate", bench, "--pressure", log, "--output", output, "--json", "--levels")
+    status, said = run(capsys, *arguments, *levels)
+    assert (status, said.err) == (0, "")
+    assert json.loads(said.out)["rms_after_kpa"] < 2.0
+    status, said = run(capsys, *arguments, *levels[:-1])
+    assert status == 2
+    assert "plateaus of pressure in the recording: 5" in said.err
+    assert "levels given: 4" in said.err
+
+
 def test_plateaus_are_found_with_what_settles_left_out():
-    units = np.concatenate(
-        [np.zeros(50), np.full(60, 20.0), np.zeros(40), np.linspace(0, 40, 100), np.full(80, 40.0)]
+    kpa = np.concatenate(
+        [np.zeros(50), np.full(60, 20.0), np.zeros(40), np.linspace(0, 90, 100), np.full(80, 90.0)]
     )
-    first, second = plateaus(units, 0.05)
+    first, second = plateaus(kpa, 0.05)
     assert 50 < first.start < first.stop <= 110
     assert 250 - 10 < second.start < second.stop <= 330
     assert plateaus(np.zeros(100), 0.05) == []
+
+
+def test_a_moment_of_noise_parts_no_plateau_and_a_step_does():
+    kpa = np.concatenate([np.zeros(40), np.full(100, 50.0), np.full(100, 70.0), np.zeros(40)])
+    kpa[90] = 58.0
+    first, second = plateaus(kpa, 0.1)
+    assert first.stop - first.start > 60
+    assert kpa[second].mean() == pytest.approx(70.0)
+
+
+def test_the_command_fits_the_models_that_a_configuration_takes():
+    assert list(get_args(RelaxationFile.__annotations__["model"])) == FITTED
 
 
 def test_a_hold_that_is_never_let_go_is_refused(bench, tmp_path, capsys):

@@ -6,7 +6,6 @@ import pytest
 from skin_host.evaluation.accuracy import fitted_hold
 from skin_host.evaluation.histories import grasps, record
 from skin_host.processing.fitting import HoldRecord, fit, merge
-from skin_host.processing.gains import fit_gains
 from skin_host.processing.relaxation import STAND_INS, ParameterSet, make_model
 
 SHARED_RATIO = ParameterSet(
@@ -108,48 +107,6 @@ def test_merging_keeps_time_and_means():
 def test_what_has_no_parameters_is_not_fitted(model):
     with pytest.raises(ValueError, match="no parameters"):
         fit(model, hold_on("L"))
-
-
-def curve(units_ff, gain=1.0, bend=1.0):
-    linear, square = 0.8141 * units_ff, -0.001132 * units_ff**2
-    return linear, square, gain * (linear + bend * square)
-
-
-def test_a_gain_is_found_from_one_level():
-    linear, square, pressure = curve(np.array([[20.0]]), gain=1.3)
-    found = fit_gains(pressure[:, 0], linear, square, np.ones(1, bool))
-    assert found.gain[0] == pytest.approx(1.3)
-    assert not found.bent[0]
-    assert found.rms_after_kpa < 1e-9 < found.rms_before_kpa
-
-
-def test_a_bend_is_found_where_levels_are_many_and_high():
-    ff = np.linspace(10.0, 200.0, 6)[:, np.newaxis]
-    linear, square, pressure = curve(ff, gain=1.1, bend=0.7)
-    found = fit_gains(pressure[:, 0], linear, square, np.ones(1, bool))
-    assert found.bent[0]
-    assert (found.gain[0], found.bend[0]) == (pytest.approx(1.1), pytest.approx(0.7))
-
-
-def test_a_bend_is_not_believed_where_levels_are_low():
-    ff = np.array([[10.0], [20.0], [30.0]])
-    linear, square, pressure = curve(ff, bend=0.5)
-    found = fit_gains(pressure[:, 0], linear, square, np.ones(1, bool))
-    assert not found.bent[0]
-    assert found.bend[0] == 1.0
-
-
-def test_a_taxel_that_feels_nothing_keeps_the_common_curve():
-    linear, square, pressure = curve(np.array([[20.0, 0.0]]))
-    found = fit_gains(pressure[:, 0], linear, square, np.ones(2, bool))
-    assert list(found.fitted) == [True, False]
-    assert found.gain[1] == 1.0
-
-
-@pytest.mark.parametrize("levels", [[], [0.0, 10.0], [-5.0]])
-def test_levels_must_be_pressures(levels):
-    with pytest.raises(ValueError, match="positive"):
-        fit_gains(np.array(levels), np.ones((len(levels), 1)), np.ones((len(levels), 1)), [True])
 
 
 def test_unloading_ratio_and_clock_share_what_is_slow():

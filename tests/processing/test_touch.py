@@ -76,3 +76,28 @@ def test_noisy_taxels_keep_a_distance_in_proportion_to_their_noise():
 def test_a_release_threshold_above_the_threshold_is_refused():
     with pytest.raises(ValueError, match="release"):
         TouchDetector(OFF, ON)
+
+
+@given(
+    st.lists(st.lists(st.integers(0, 3), min_size=4, max_size=4), min_size=1, max_size=40),
+    st.sampled_from([1, 2, 3]),
+    st.lists(st.integers(0, 39), max_size=3),
+)
+def test_the_decision_is_the_vote_counted_out_at_every_sample(rows, votes, resets):
+    detector = TouchDetector(np.full(4, 3.0), np.full(4, 2.0), votes)
+    touched, history = np.zeros(4, bool), [np.zeros(4, bool)] * 3
+    for number, row in enumerate(rows):
+        if number in resets:
+            detector.reset(np.array([1]))
+            touched = touched & (np.arange(4) != 1)
+            history = [over & (np.arange(4) != 1) for over in history]
+        signal = np.array(row, float)
+        history = [*history[1:], signal >= np.where(touched, 2.0, 3.0)]
+        if votes == 1:
+            touched = history[-1]
+        elif votes == 2:
+            touched = np.sum(history, axis=0) >= 2
+        else:
+            count = np.sum(history, axis=0)
+            touched = (count == 3) | (touched & (count > 0))
+        assert np.array_equal(detector.step(signal), touched)

@@ -63,16 +63,15 @@ class AsymmetricRelaxation:
             raise ValueError("clock_kpa: every number must be positive")
         self._per_kpa = per_kpa.astype(dtype) if np.any(per_kpa) else None
         self._tau_s, self._tau_unload_s = tau, tau_unload
-        self._rate = (-1.0 / tau).astype(dtype)
         self._rate_unload = (-1.0 / tau_unload).astype(dtype)
+        self._extra_rate = (1.0 / tau_unload - 1.0 / tau).astype(dtype)
         modes = self._beta.shape[0]
         self._states: Array = np.zeros((modes, n), dtype=dtype)
         self._over: Array = np.empty_like(self._states)
         self._share: Array = np.empty_like(self._states)
-        self._rising: Array = np.empty_like(self._states)
+        self._rises = np.empty(self._states.shape, dtype=np.bool_)
         self._zeros: Array = np.zeros_like(self._states)
         self._age: Array = np.empty(n, dtype=dtype)
-        self._rise: Array = np.empty_like(self._states)
         self._input = FiniteInput(n, dtype)
         self._rates_dt_s = -1.0
         self._fall: Array = np.zeros(1, dtype=dtype)
@@ -109,25 +108,22 @@ class AsymmetricRelaxation:
             self._fall = fall.astype(self._dtype)
             self._extra_rise = (approach(dt_s, self._tau_s) - fall).astype(self._dtype)
             self._rates_dt_s = dt_s
-        np.fmax(self._over, self._zeros, out=self._rising)
+        np.fmax(self._over, self._zeros, out=self._share)
         np.multiply(self._over, self._fall, out=self._over)
-        np.multiply(self._rising, self._extra_rise, out=self._rising)
+        np.multiply(self._share, self._extra_rise, out=self._share)
         np.add(self._states, self._over, out=self._states)
-        np.add(self._states, self._rising, out=self._states)
+        np.add(self._states, self._share, out=self._states)
 
     def _approach_by_clock(self, pressure_kpa: Array, per_kpa: Array, dt_s: float) -> None:
         """q += (1 - exp(-age / tau)) d, where the foam ages by dt exp(C / clock)."""
         np.multiply(pressure_kpa, per_kpa, out=self._age)
         np.exp(self._age, out=self._age)
         np.multiply(self._age, dt_s, out=self._age)
-        # Both directions are worked out and mixed as in `_approach`; expm1 gives minus the share.
-        np.multiply(self._age, self._rate, out=self._rise)
-        np.expm1(self._rise, out=self._rise)
-        np.multiply(self._age, self._rate_unload, out=self._share)
+        # The rate of each state's direction, without a branch; expm1 gives minus the share.
+        np.greater(self._over, 0.0, out=self._rises)
+        np.multiply(self._rises, self._extra_rate, out=self._share)
+        np.add(self._share, self._rate_unload, out=self._share)
+        np.multiply(self._share, self._age, out=self._share)
         np.expm1(self._share, out=self._share)
-        np.subtract(self._rise, self._share, out=self._rise)
-        np.fmax(self._over, self._zeros, out=self._rising)
-        np.multiply(self._over, self._share, out=self._over)
-        np.multiply(self._rising, self._rise, out=self._rising)
-        np.subtract(self._states, self._over, out=self._states)
-        np.subtract(self._states, self._rising, out=self._states)
+        np.multiply(self._share, self._over, out=self._share)
+        np.subtract(self._states, self._share, out=self._states)

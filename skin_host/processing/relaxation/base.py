@@ -133,6 +133,7 @@ class TumblingMean:
         if not 0.0 < length_s < math.inf:
             raise ValueError(f"a window of {length_s} s, wanted a positive length")
         self.length_s = length_s
+        self._nearly_s = length_s - TIME_TOLERANCE_S
         self.elapsed_s = 0.0
         self._summed_s = 0.0
         self._rows: Array = np.zeros((self.ROWS, n), dtype=dtype)
@@ -151,10 +152,12 @@ class TumblingMean:
 
         `windows` is above 1 when the same mean holds over that many whole windows.
         """
-        room = self.length_s - self.elapsed_s
-        if dt_s < room - TIME_TOLERANCE_S:
+        elapsed_s = self.elapsed_s + dt_s
+        if elapsed_s < self._nearly_s:
             self._lay(pressure_kpa, dt_s)
+            self.elapsed_s = elapsed_s
             return
+        room = self.length_s - self.elapsed_s
         self._lay(pressure_kpa, room)
         self._fold()
         np.divide(self._integral, self.length_s, out=self._mean)
@@ -169,6 +172,7 @@ class TumblingMean:
             rest = max(rest - whole * self.length_s, 0.0)
         if rest > 0.0:
             self._lay(pressure_kpa, rest)
+            self.elapsed_s = rest
 
     def reset(self, mask: NDArray[np.bool_] | None) -> None:
         """Forget the samples of this window (of the taxels in `mask`)."""
@@ -181,12 +185,13 @@ class TumblingMean:
             self._summed_s = self.elapsed_s = 0.0
 
     def _lay(self, pressure_kpa: Array, dt_s: float) -> None:
-        np.copyto(self._row[self._laid], pressure_kpa, casting="same_kind")
-        self._weights[self._laid] = dt_s
-        self._laid += 1
-        self.elapsed_s += dt_s
-        if self._laid == self.ROWS:
+        laid = self._laid
+        if laid == self.ROWS:
             self._fold()
+            laid = 0
+        np.copyto(self._row[laid], pressure_kpa)
+        self._weights[laid] = dt_s
+        self._laid = laid + 1
 
     def _fold(self) -> None:
         laid, self._laid = self._laid, 0
