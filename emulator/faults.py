@@ -76,8 +76,11 @@ def check_targets(robot: "Robot", fault: Fault) -> None:
         ConfigurationError: names the key.
     """
     check(fault)
-    if fault.board is not None and fault.board not in robot.boards:
-        known = ", ".join(robot.boards)
+    boards = list(robot.boards)
+    if fault.name == "board_silent":
+        boards += robot.fingertips.boards
+    if fault.board is not None and fault.board not in boards:
+        known = ", ".join(boards)
         raise ConfigurationError(f'board: no board "{fault.board}"; there are: {known}')
     if fault.bus is not None and fault.bus not in robot.wires:
         known = ", ".join(robot.wires)
@@ -239,6 +242,10 @@ def _board_reset(robot: "Robot", fault: Fault) -> Mend:
 
 
 def _board_silent(robot: "Robot", fault: Fault) -> Mend:
+    name = fault.board or ""
+    if name in robot.fingertips.boards:
+        robot.fingertips.hung.add(name)
+        return lambda: robot.fingertips.hung.discard(name)
     number = _board(robot, fault)
     robot.hung.add(number)
     return lambda: robot.hung.discard(number)

@@ -20,6 +20,7 @@ from emulator import faults
 from emulator.bring_up import bring_up
 from emulator.clock import Clock, RealClock
 from emulator.converters import Converters, fidelities, read_rows
+from emulator.fingertips import Fingertips
 from emulator.firmware.arithmetic import TAXELS
 from emulator.link import Link
 from emulator.mtb import Burst, Mtb, make_board
@@ -76,6 +77,7 @@ class Robot:
         t_ns: time since it was switched on.
         boards: the boards by name.
         skin: foam and pads under the scene, with the truth that tests compare with.
+        fingertips: force/torque boards and what lies on them.
         converters: the chips.
         wires: the buses by name.
         hung, late_ns, jitter_ns: faults of boards, by their index in the layout.
@@ -102,7 +104,8 @@ class Robot:
         check(scene)
         self.layout = layout
         self.t_ns = 0
-        self.skin = Skin(layout, scene)
+        self.skin = Skin(layout, scene, settings.fingertips)
+        self.fingertips = Fingertips(settings, layout, scene, self._skin_force_n)
         of_board = fidelities(layout, fidelity)
         self._signal_boards = [of_board[number] == "signal" for number in of_board]
         self.converters = Converters(
@@ -163,12 +166,16 @@ class Robot:
             if self._boards_due_ns <= self.t_ns:
                 self._sample()
                 self._look_ahead()
+            if self._tips_due_ns <= self.t_ns:
+                for bus, batch in self.fingertips.step(self.t_ns):
+                    self.wires[bus].put(batch)
+                self._look_ahead()
             if self.t_ns >= end_ns:
                 break
         return {name: wire.until(self.t_ns) for name, wire in self.wires.items()}
 
     def _next_ns(self, end_ns: int) -> int:
-        next_ns = min(end_ns, self._skin_due_ns, self._boards_due_ns)
+        next_ns = min(end_ns, self._skin_due_ns, self._boards_due_ns, self._tips_due_ns)
         if self._agenda:
             next_ns = min(next_ns, self._agenda[0][0])
         return max(self.t_ns, next_ns)
@@ -181,6 +188,7 @@ class Robot:
             if due is not None and number not in self.hung
         ]
         self._boards_due_ns = _next_tick_ns(min(due_ns)) if due_ns else NEVER_NS
+        self._tips_due_ns = self.fingertips.due_ns
 
     def _move_to(self, t_ns: int) -> None:
         """Time up to `t_ns`; where mechanics is due, its outcome goes to the chips."""
@@ -273,6 +281,7 @@ class Robot:
         for number, board in enumerate(self._boards):
             if self._bus_of[number] == bus and number not in self.hung:
                 self._answer(bus, board.handle(can_id, data, self.t_ns))
+        self._answer(bus, self.fingertips.handle(bus, can_id, data, self.t_ns))
         self._look_ahead()
 
     def _answer(self, bus: str, answers: list[tuple[int, bytes]]) -> None:
@@ -354,6 +363,12 @@ class Robot:
         """True pressure on each taxel of a part now, float64[n], mean over the pad (kPa)."""
         found = self.layout.part(part)
         return self.skin.true_pressure_kpa()[found.start : found.stop]
+
+    def _skin_force_n(self) -> dict[int, float]:
+        """Force (N) of each of the scene's probes on the skin, by its number in the scene."""
+        numbers = self.skin.numbers
+        forces = self.skin.contact_force_n()
+        return {numbers[i]: force_n for i, force_n in forces.items() if i < len(numbers)}
 
     def _stack_sizes(self, bus: str) -> "_StackSizes":
         return _StackSizes(

@@ -43,10 +43,15 @@ class Place(_Table):
     taxel: Annotated[int, Meta(ge=0)] | None = None
     x_mm: float = 0.0
     y_mm: float = 0.0
+    #: On fingertips without skin: from the offset in this direction the place is reached.
+    z_mm: float = 0.0
+    towards: tuple[float, float, float] = (0.0, 0.0, 1.0)
 
 
 class Probe(_Table):
     """A flat object that presses. Exactly one of force, pressure and depth drives it.
+
+    `part` is a part of skin, or a fingertip on a force/torque board.
 
     `kind` "disc" is any object; "grounded" one that is earthed, such as a hand, which is what
     a skin without its conductive cover feels.
@@ -66,6 +71,13 @@ class Probe(_Table):
     compliance_mm_per_n: Annotated[float, Meta(ge=0)] = 0.0
     #: The offset moves: time, x (mm), y (mm), added to the place.
     slide_mm: list[tuple[Seconds, float, float]] = []
+    #: On fingertips with a force/torque board: an object hangs on the probe and is pulled along
+    #: the surface by this force (N); what friction does not hold slides.
+    tangential_n: Keyframes | None = None
+    #: Direction of the pull, from the first of the two axes along the surface.
+    tangential_deg: float = 0.0
+    #: Coefficient of static friction between probe and fingertip.
+    friction: Positive = 0.6
     start_s: Seconds = 0.0
     #: The keyframes start again after this time; 0 is never.
     repeat_s: Seconds = 0.0
@@ -175,6 +187,8 @@ def check(scene: Scene) -> None:
         _check_times(f"{where}.{drives[0]}", [t_s for t_s, _ in getattr(probe, drives[0])])
         if min(value for _, value in getattr(probe, drives[0])) < 0:
             raise ConfigurationError(f"{where}.{drives[0]}: a probe cannot pull; wanted >= 0")
+        if probe.tangential_n is not None:
+            _check_times(f"{where}.tangential_n", [t_s for t_s, _ in probe.tangential_n])
         if probe.slide_mm:
             _check_times(f"{where}.slide_mm", [t_s for t_s, _, _ in probe.slide_mm])
         if probe.at.triangle is not None and probe.at.taxel is not None:

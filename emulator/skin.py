@@ -4,6 +4,8 @@ Mechanics runs for contacts and for foam that still recovers; a pad that nobody 
 its capacitance and costs nothing.
 """
 
+from collections.abc import Collection
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -46,10 +48,16 @@ class Skin:
         resting_ff: float64[n], what it measures untouched at 25 degrees C.
         held_ff: float64[n], what a stuck pad measures instead, else NaN.
         noise_ff: float64[n], rms noise of each pad.
-        probes: the scene's probes, then the live ones.
+        probes: the scene's probes on skin, then the live ones.
+        numbers: of the former, in the scene.
+
+    Args:
+        layout: of the skin.
+        scene: what happens to it.
+        bare: names of fingertips without skin; the probes on them are none of ours.
     """
 
-    def __init__(self, layout: Layout, scene: Scene) -> None:
+    def __init__(self, layout: Layout, scene: Scene, bare: Collection[str] = ()) -> None:
         n = layout.n_taxels
         self._t_ns = 0
         rng = np.random.default_rng([scene.seed, 1])
@@ -87,14 +95,16 @@ class Skin:
         self._covered = np.zeros(n)
         self.capacitance_ff = self.resting_ff.copy()
         self.held_ff = np.full(n, np.nan)
-        self._set_probes(scene.probe)
+        self._set_probes(scene.probe, bare)
         self.temperature_step_c = 0.0
 
-    def _set_probes(self, probes: list[Probe]) -> None:
+    def _set_probes(self, probes: list[Probe], bare: Collection[str]) -> None:
         self.probes: list[Probe] = []
-        self._script = Script(probes)
+        self.numbers = [i for i, probe in enumerate(probes) if probe.part not in bare]
+        self._script = Script([probes[i] for i in self.numbers])
         self._places: list[tuple[Floats, Floats, slice]] = []
-        for number, probe in enumerate(probes):
+        for number in self.numbers:
+            probe = probes[number]
             try:
                 self._place_probe(probe)
             except ConfigurationError as error:
@@ -157,7 +167,7 @@ class Skin:
         return self._foam.pressure_kpa * self._covered
 
     def contact_force_n(self) -> dict[int, float]:
-        """Force (N) of each probe that is in contact now, by its number in the scene."""
+        """Force (N) of each probe that is in contact now, by its number in `probes`."""
         return dict(zip(self._active.tolist(), self._foam.force_n.tolist(), strict=True))
 
     def step(self, t_ns: int) -> Ints:

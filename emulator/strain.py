@@ -33,7 +33,7 @@ class StrainBoard:
         address: 1..14.
         load: gives force (N) and torque (N m) float64[6] on the sensor at a time in ns.
         rng: draws the noise.
-        full_scale: N and N m of each channel, whole numbers up to 65535.
+        full_scale: N and N m of each of the six channels; whole numbers are told.
         noise_share: standard deviation of a channel, as a share of its full scale.
         torque_first: sends torque before force; the order is not promised.
     """
@@ -44,7 +44,7 @@ class StrainBoard:
         load: Callable[[int], ArrayLike],
         rng: np.random.Generator,
         *,
-        full_scale: tuple[int, int, int, int, int, int] = (2000, 2000, 2000, 40, 40, 40),
+        full_scale: tuple[float, ...] = (2000, 2000, 2000, 40, 40, 40),
         noise_share: float = 5e-5,
         torque_first: bool = False,
     ) -> None:
@@ -71,7 +71,7 @@ class StrainBoard:
         elif command == _SET_PERIOD and argument > 0:
             self.period_ms = argument
         elif command == _GET_FULL_SCALE and argument < 6:
-            high, low = divmod(int(self._full_scale[argument]), 256)
+            high, low = divmod(round(self._full_scale[argument]), 256)
             answer = identifier(MessageClass.ANALOG_COMMAND, self.address, HOST_ADDRESS)
             return [(answer, bytes([_GET_FULL_SCALE, argument, high, low]))]
         return []

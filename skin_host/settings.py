@@ -15,7 +15,8 @@ from msgspec import Meta, Struct, field
 
 from skin_host.errors import ConfigurationError
 from skin_host.explain import Name, Named, explain, not_finite
-from skin_host.fingertip.settings import Fingertip, wrong_references
+from skin_host.fingertip.settings import Fingertip as Fingertip  # noqa: PLC0414 (for others too)
+from skin_host.fingertip.settings import wrong_references
 
 Positive = Annotated[float, Meta(gt=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
