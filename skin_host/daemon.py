@@ -316,6 +316,7 @@ class Daemon:
             self.health.tick(self.link.read_ns, self.link.ports, self.link.boards)
             told = self.fingertips.tell(self.link.read_ns)
             for part in self.engine.parts:
+                await asyncio.sleep(0)  # the reader is not to wait for all parts
                 record = self._record_of(part)
                 told |= {
                     (fault["code"], fault["where"]): says

@@ -1,8 +1,10 @@
 """From what was watched to what is told: the health record of a part."""
 
-from dataclasses import asdict
+from itertools import pairwise
+from statistics import fmean, median
 from typing import cast
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -48,6 +50,12 @@ class Describer:
         self._engine = engine
         self._layout = engine.layout
         self._watch = watch
+        #: Of each part, the triangles that each board gives it.
+        self._fitted: dict[int, dict[int, list[int]]] = {part: {} for part in engine.parts}
+        for triangle in self._layout.triangles:
+            if triangle.part in self._fitted:
+                of_board = self._fitted[triangle.part].setdefault(triangle.board, [])
+                of_board.append(triangle.number)
 
     def part(
         self, part: int, now_ns: int | None, ports: dict[str, Port], boards: dict[str, Boards]
@@ -99,14 +107,27 @@ class Describer:
     def _triangles(self, part: int) -> list[TriangleHealth]:
         """The triangles of a part that are not well, and why."""
         unwell: list[TriangleHealth] = []
-        for triangle in self._layout.triangles:
-            if triangle.part != part:
+        for board, numbers in self._fitted[part].items():
+            if self._all_well(board):
                 continue
-            fault = self._triangle_fault(triangle.board, triangle.number)
-            if fault is not None:
-                board = self._layout.boards[triangle.board]
-                unwell.append({"board": board.name, "triangle": triangle.number, "fault": fault})
+            name = self._layout.boards[board].name
+            for number in numbers:
+                fault = self._triangle_fault(board, number)
+                if fault is not None:
+                    unwell.append({"board": name, "triangle": number, "fault": fault})
         return unwell
+
+    def _all_well(self, board: int) -> bool:
+        """As nearly always: everything has come, nothing is reported, everything lives."""
+        watch = self._watch.boards[board]
+        sweep = watch.sweep
+        return (
+            sweep is not None
+            and not watch.silent
+            and not self._layout.boards[board].enabled & ~sweep.present
+            and not sweep.status.any()
+            and not self._engine.liveness[board].unproven.any()
+        )
 
     def _triangle_fault(self, board: int, number: int) -> str | None:
         watch = self._watch.boards[board]
@@ -245,12 +266,12 @@ class Describer:
         boards: dict[str, Boards],
     ) -> BusHealth:
         bus = self._engine.settings.buses[name]
-        counters = asdict(self._engine.assemblers[name].counters)
+        counters = msgspec.to_builtins(self._engine.assemblers[name].counters)
         record = cast(BusHealth, {"name": name, "channel": bus.channel} | counters)
         port = ports.get(name)
         if port is not None:
             record["state"] = str(port.state)
-            record["port"] = asdict(port.counters)
+            record["port"] = msgspec.to_builtins(port.counters)
         manager = boards.get(name)
         if manager is not None:
             record["strangers"] = dict(manager.strangers)
@@ -267,13 +288,15 @@ def _period(watch: BoardWatch, wanted_ms: int) -> tuple[float | None, float | No
     """Mean period and its scatter in ms, None until there are enough sweeps."""
     if len(watch.times_ns) <= FEWEST_INTERVALS:
         return None, None
-    intervals_ms = np.diff(np.array(watch.times_ns, np.float64) - watch.times_ns[0]) / 1e6
-    usual = intervals_ms[intervals_ms < 1.6 * wanted_ms]
+    # Of so few numbers lists are done sooner than arrays.
+    intervals_ms = [(late - early) / 1e6 for early, late in pairwise(watch.times_ns)]
+    usual = [interval_ms for interval_ms in intervals_ms if interval_ms < 1.6 * wanted_ms]
     if len(usual) < FEWEST_INTERVALS:
         usual = intervals_ms
     # From the median deviation: one late sweep of many is no jitter.
-    jitter_ms = SIGMA * float(np.median(np.abs(usual - float(np.median(usual)))))
-    return round(float(np.mean(usual)), 2), round(jitter_ms, 2)
+    middle = median(usual)
+    jitter_ms = SIGMA * median([abs(interval_ms - middle) for interval_ms in usual])
+    return round(fmean(usual), 2), round(jitter_ms, 2)
 
 
 def _last_second(gained: dict[str, float], bitrate: int) -> LastSecond:
