@@ -59,9 +59,11 @@ async def test_what_was_touched_at_a_new_zero_is_in_doubt_until_calibrated(
         engine._touched[part.start : part.start + 4] = True
         await live.daemon.configure([0])
         await live.until("board_in_doubt", limit_s=10.0)
-        await asyncio.sleep(2.5)
-        record = live.daemon.records()["left_hand"]
-        assert record["invalid"] == [0, 1, 2, 3]
+
+        def only_the_touched() -> bool:
+            return live.daemon.records()["left_hand"]["invalid"] == [0, 1, 2, 3]
+
+        await live.wait(only_the_touched, 10.0)
         await live.daemon.calibrate(1.0, [0])
         await live.until_well(but=LATELY)
 

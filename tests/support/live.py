@@ -37,14 +37,15 @@ class Live:
 
     async def until(self, *codes: str, limit_s: float = 10.0) -> set[tuple[str, str]]:
         """Wait until all these codes are told."""
-        await self._until(lambda: set(codes) <= {code for code, _ in self.faults()}, limit_s)
+        await self.wait(lambda: set(codes) <= {code for code, _ in self.faults()}, limit_s)
         return self.faults()
 
     async def until_well(self, limit_s: float = 10.0, *, but: frozenset[str] = frozenset()) -> None:
         """Wait until all taxels are valid and nothing is told but codes of `but`."""
-        await self._until(lambda: self._well(but), limit_s)
+        await self.wait(lambda: self._well(but), limit_s)
 
-    async def _until(self, condition: Callable[[], bool], limit_s: float) -> None:
+    async def wait(self, condition: Callable[[], bool], limit_s: float) -> None:
+        """Wait until a condition holds; else say which faults there are."""
         end_s = time.monotonic() + limit_s
         while not condition():
             assert time.monotonic() < end_s, f"after {limit_s:g} s: {self.faults()}"

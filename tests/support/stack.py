@@ -25,19 +25,27 @@ WAIT_S = 200.0
 class Stack:
     """Starts and stops the processes of one test, and knows their files."""
 
-    def __init__(self, directory: Path, bus: Bus, bus_kind: str, broker: Mosquitto) -> None:
+    def __init__(
+        self,
+        directory: Path,
+        bus: Bus,
+        bus_kind: str,
+        broker: Mosquitto,
+        configuration: str = "demo",
+    ) -> None:
         self.directory = directory
         self.bus = bus
         self.kind = bus_kind
         self.broker = broker
         self.state = directory / "state"
         self.config = directory / "robot.toml"
-        text = (ROOT / "config/demo.toml").read_text()
+        text = (ROOT / f"config/{configuration}.toml").read_text()
         text = re.sub(r'interface = ".*"', f'interface = "{bus.interface}"', text)
         text = re.sub(r'channel = ".*"', f'channel = "{bus.channel}"', text)
         if bus_kind == "vcan":
             # The lane's processor is emulated; a slower skin leaves it time.
             text = text.replace('bus = "can0"\naddress', 'bus = "can0"\nperiod_ms = 200\naddress')
+            text = text.replace("period_ms = 3 ", "period_ms = 10 ")
         text += f"\n[mqtt]\nhost = '127.0.0.1'\nport = {broker.port}\n"
         text += f"\n[service]\nstate_directory = '{self.state}'\n"
         self.config.write_text(text)
