@@ -341,13 +341,19 @@ class SkinClient:
             await asyncio.wait_for(listen(), RETAINED_S)
         except TimeoutError:
             await connection.unsubscribe(everybody)
-        if len(meant := online or known) == 1:
-            return meant.pop()
-        names = ", ".join(sorted(meant)[:20]) or "none"
-        raise RequestError(
-            f'broker {self._broker}: wanted one robot below "{self._base}", there are: {names}; '
-            "name the robot"
-        )
+        meant = online or known
+        if not meant:
+            raise RequestError(
+                f'broker {self._broker}: no robot has said anything below "{self._base}"; '
+                "is `skin run` running?"
+            )
+        if len(meant) > 1:
+            names = ", ".join(sorted(meant)[:20])
+            raise RequestError(
+                f'broker {self._broker}: wanted one robot below "{self._base}", there are: '
+                f"{names}; name the robot"
+            )
+        return meant.pop()
 
     async def _keep_subscribed(self, connection: Connection, topics: Topics) -> None:
         while True:

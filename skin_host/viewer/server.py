@@ -179,7 +179,7 @@ class Viewer:
             if not self._commands:
                 raise RequestError("commands are switched off; start the page with them allowed")
             if self._client is None:
-                raise BrokerError(f"no connection to the broker: {self._why}")
+                raise BrokerError(self._why)
             arguments: dict[str, Any] = {"seconds": RAW_LEASE_S} if wish.do == "raw" else {}
             result = await self._client.command(
                 wish.do, node=wish.node, timeout_s=COMMAND_S, **arguments
@@ -203,8 +203,9 @@ class Viewer:
                     group.create_task(_pass_on(client.health(), picture.take_health))
                     group.create_task(self._watch(client))
             except* SkinError as errors:
-                self._why = str(errors.exceptions[0])
-                _log.warning("%s", self._why)
+                said, self._why = self._why, str(errors.exceptions[0])
+                if self._why != said:
+                    _log.warning("%s; trying again", self._why)
             finally:
                 self._client = None
             self._take_status(connected=False)
@@ -219,7 +220,7 @@ class Viewer:
                 self._picture.forget_contacts()
             nodes = {name: (node.online, node.info) for name, node in client.nodes.items()}
             self._picture.take_nodes(client.robot, nodes)
-            self._why = client.last_error
+            self._why = f"no broker: {client.last_error or 'trying again'}"
             self._take_status(connected=client.connected)
             await asyncio.sleep(NODES_S)
 

@@ -228,7 +228,7 @@ async def test_a_command_to_one_of_two_nodes_names_it(mosquitto: Mosquitto) -> N
 
 
 async def test_the_only_robot_of_a_broker_needs_no_name(mosquitto: Mosquitto) -> None:
-    with pytest.raises(RequestError, match="there are: none"):
+    with pytest.raises(RequestError, match="is `skin run` running"):
         async with hearing(mosquitto, None):
             pass
     async with publishing(mosquitto, "nao"):

@@ -14,12 +14,14 @@ import pytest
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import InvalidStatus
 
+from skin_host.client.session import RETAINED_S
 from skin_host.errors import RequestError, SkinError
 from skin_host.layout import Layout, build_layout
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.publish.info import node_info
 from skin_host.publish.mqtt import Publisher
 from skin_host.settings import Mqtt, load
+from skin_host.viewer import server
 from skin_host.viewer.server import Viewer
 from tests.support.broker import Mosquitto, free_port
 
@@ -222,3 +224,17 @@ async def test_a_broker_that_comes_late_is_found(mosquitto: Mosquitto) -> None:
         await heard(socket, lambda m: isinstance(m, dict) and m.get("connected") is True)
         async with node(mosquitto, skin()):
             await heard(socket, of_type("layout"))
+
+
+async def test_who_waits_for_a_robot_is_told_what_to_start_and_the_log_once(
+    mosquitto: Mosquitto, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "RETRY_S", 0.01)
+    broker = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    async with Viewer(broker).serving(port=0) as url, page(url) as socket:
+        told = await heard(socket, lambda m: isinstance(m, dict) and "skin run" in str(m))
+        assert "is `skin run` running?" in told["error"]
+        await asyncio.sleep(3 * RETAINED_S)  # several attempts
+        async with node(mosquitto, skin()):
+            await heard(socket, of_type("layout"))
+    assert caplog.text.count("is `skin run` running?") == 1

@@ -179,7 +179,7 @@ function showStatus(nowMs) {
   const stale = store.parts.filter((part) => part.stale(nowMs));
   let [text, level] = ["", "ok"];
   if (link !== "open") [text, level] = [link === "lost" ? "this page has lost its server; trying again" : "connecting", link === "lost" ? "alarm" : "wait"];
-  else if (!store.status.connected) [text, level] = [`no broker: ${store.status.error || "trying again"}`, "alarm"];
+  else if (!store.status.connected) [text, level] = [store.status.error || "connecting", "alarm"];
   else if (!store.parts.length) [text, level] = ["waiting for a node to say what it is", "wait"];
   else if (offline.length) [text, level] = [`node ${offline.join(", ")} is offline`, "alarm"];
   else if (stale.length) [text, level] = [`no data from ${stale.map((part) => part.name).join(", ")}`, "alarm"];
