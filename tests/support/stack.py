@@ -127,5 +127,5 @@ def wait_for(
         found = condition()
         if found:
             return found
-        time.sleep(0.05)
+        time.sleep(0.2)
     raise AssertionError(f"waited {WAIT_S:g} s for {what}; seen: {seen()}")
