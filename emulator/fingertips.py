@@ -29,6 +29,8 @@ OFFSET_SHARE = 0.01
 #: Of what the probe's pull hangs on.
 OBJECT_KG = 0.2
 SLIDING_SHARE = 0.85
+#: Inner step of its motion; the contact's spring swings at some 16 Hz.
+STEP_S = 1e-3
 
 
 class Fingertips:
@@ -186,7 +188,7 @@ class _Press:
         if self._object is None:
             static = self._probe.friction
             law = Friction(static=static, sliding=SLIDING_SHARE * static)
-            self._object = HeldObjects(1, law, mass_kg=OBJECT_KG)
+            self._object = HeldObjects(1, law, mass_kg=OBJECT_KG, dt_s=STEP_S)
             dt_s = 0.0
         pull_n = _value(self._probe.tangential_n or [], phase_s)
         return float(self._object.advance([pull_n], [normal_n], dt_s)[0])

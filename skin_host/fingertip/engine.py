@@ -76,6 +76,7 @@ class FingertipEngine:
 
     Attributes:
         tips: by name.
+        held_report_ns: a contact that lasts for longer is reported.
         sampled: number of the fingertip and time of each sample that the last `feed` completed.
     """
 
@@ -83,6 +84,7 @@ class FingertipEngine:
         nodes = {layout.parts[part].node for part in parts}
         self.tips: dict[str, TipState] = {}
         self.sampled: list[tuple[int, int]] = []
+        self.held_report_ns = int(settings.processing.drift.frozen_report_s * 1e9)
         self._of_address: dict[str, dict[int, TipState]] = {}
         self._of_part: dict[int, TipState] = {}
         self._events: list[FingertipEvent] = []

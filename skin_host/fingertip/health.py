@@ -143,6 +143,12 @@ class FingertipHealth:
             yield fault("saturated", f"{here} is saturated: the load is beyond its range")
         if abs(now_ns - self._lossy_ns.get(name, -HOLD_NS)) < HOLD_NS and self._lossy_ns.get(name):
             yield fault("loses_frames", f"{here}: single frames are lost; the bus is overloaded")
+        if state.tip.touched_for_ns(now_ns) > self._engine.held_report_ns:
+            yield fault(
+                "held",
+                f"{name} has been touched for so long that its zero is uncertain; calibrate it "
+                "unloaded",
+            )
         if state.tip.threshold_n > table.threshold_n:
             yield fault(
                 "noisy",

@@ -114,6 +114,10 @@ class Tip:
         """Whether a contact lasts."""
         return self._said is not None
 
+    def touched_for_ns(self, now_ns: int) -> int:
+        """How long the contact has lasted; 0 without one."""
+        return now_ns - self._begun_ns if self.touched else 0
+
     def use(self, zero: Zero | None) -> None:
         """Work with this zero from now on. Contacts must have been ended before."""
         self._zero = zero

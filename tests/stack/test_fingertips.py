@@ -1,0 +1,91 @@
+"""From a press and a slip on an emulated fingertip to messages in a subscriber's hands."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skin_host.settings import Bus
+from tests.support.broker import Mosquitto
+from tests.support.stack import ROOT, Stack, wait_for
+from tests.support.subscriber import Subscriber
+
+SCENE = ROOT / "config" / "scenes" / "fingertips.toml"
+PLACE_MM = 13.0 * np.array([0.3, 0.4, 0.87]) / np.linalg.norm([0.3, 0.4, 0.87])
+
+
+@pytest.fixture
+def fingers(
+    tmp_path: Path, can_bus_settings: Bus, bus_kind: str, mosquitto: Mosquitto
+) -> Iterator[Stack]:
+    made = Stack(tmp_path, can_bus_settings, bus_kind, mosquitto, "fingertips")
+    yield made
+    made.kill()
+
+
+@pytest.fixture
+def heard(mosquitto: Mosquitto) -> Iterator[Subscriber]:
+    listening = Subscriber(mosquitto.host, mosquitto.port, "skin/fingertips/#")
+    yield listening
+    listening.close()
+
+
+def whole(events: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
+    """Events by contact, of those that have ended."""
+    by_contact: dict[int, list[dict[str, Any]]] = {}
+    for event in events:
+        by_contact.setdefault(event["id"], []).append(event)
+    return [found for found in by_contact.values() if found[-1]["event"] == "end"]
+
+
+def test_a_press_and_a_slip_on_a_fingertip_reach_a_subscriber(
+    fingers: Stack, heard: Subscriber
+) -> None:
+    fingers.calibrate()
+    daemon = fingers.start("run", str(fingers.config), scene=SCENE)
+
+    def slipped() -> list[tuple[list[dict[str, Any]], list[dict[str, Any]]]]:
+        """Touches in which something slipped, with their slips."""
+        slips = whole(heard.documents("index/slip"))
+        return [
+            (touch, slip)
+            for touch in whole(heard.documents("index/touch"))
+            for slip in slips
+            if touch[0]["id"] == slip[0]["id"]
+        ]
+
+    def pressed() -> list[list[dict[str, Any]]]:
+        return [one for one in whole(heard.documents("thumb/touch")) if any_taxel(one)]
+
+    def any_taxel(touch: list[dict[str, Any]]) -> bool:
+        return any(event["taxels"] for event in touch)
+
+    touch, slip = wait_for(slipped, "a slip that ended, and its touch")[0]
+    thumb = wait_for(pressed, "a touch of the thumb that its skin felt too")[0]
+    assert daemon.poll() is None
+    assert set(fingers.stop()) <= {0}
+
+    assert [touch[0]["event"], touch[-1]["event"]] == ["begin", "end"]
+    held = [one for one in touch if one["load"]["verdict"] == "contact" and one["force_n"] > 1.5]
+    off_mm = 1e3 * np.array([one["centroid_m"] for one in held]) - PLACE_MM
+    assert np.median(np.linalg.norm(off_mm, axis=1)) < 0.5
+    assert np.median([one["force_n"] for one in held]) == pytest.approx(2.0, abs=0.1)
+    assert {one["area_mm2"] for one in touch} == {None}
+    assert slip[0]["event"] == "begin"
+    assert 0.3 < slip[0]["shear_n"] / slip[0]["force_n"] < 0.8
+    assert touch[0]["t_ns"] < slip[0]["t_ns"] < touch[-1]["t_ns"]
+
+    both = [one for one in thumb if one["taxels"] and one["force_n"] > 2.0]
+    off_mm = 1e3 * np.array([one["centroid_m"] for one in both]) - [3.0, -2.0, 0.0]
+    assert np.median(np.linalg.norm(off_mm, axis=1)) < 0.6
+    assert {one["part"] for one in heard.documents("thumb_skin/touch")} == {"thumb_skin"}
+
+    for part in ("index", "thumb"):
+        contacts = heard.payloads(f"{part}/contact")
+        assert contacts[0] == contacts[-1] == b"OFF"
+        assert b"ON" in contacts
+        assert "ok" in {record["state"] for record in heard.documents(f"{part}/health")}
+    info = heard.documents("main/info")[-1]
+    assert info["fingertips"]["index"]["shape"] == "sphere"
