@@ -39,6 +39,8 @@ LOOK_S = 0.1
 HEALTH_S = 1.0
 #: Faults are logged together, and not more often than this.
 TELL_S = 60.0
+#: Ports log these themselves, at once.
+TOLD_BY_PORTS = {"bus_down", "bus_gone", "bus_off"}
 #: A fault must have lasted for this long to be logged.
 LASTING_S = 2.0
 #: Readiness is told after the first sweeps, or after so long without.
@@ -376,6 +378,7 @@ class Teller:
 
     def look(self, told: dict[tuple[str, str], str], now_s: float) -> None:
         """Take in all faults there are now: their sentences by code and place."""
+        told = {key: says for key, says in told.items() if key[0] not in TOLD_BY_PORTS}
         self._since_s = {key: self._since_s.get(key, now_s) for key in told}
         if now_s - self._line_s < TELL_S:
             return

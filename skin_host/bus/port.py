@@ -32,8 +32,9 @@ _CARRIER_S = 1.5
 #: A frame that the interface does not take within this time is given up.
 SEND_DEADLINE_S = 1.0
 _SEND_RETRY_S = 0.002
-#: A flapping link writes at most one log line in this time.
+#: A flapping link writes at most one log line in this time, which doubles up to the last.
 _QUIET_S = 1.0
+_LONGEST_QUIET_S = 60.0
 
 EXTENDED_FLAG = 0x80000000
 REMOTE_FLAG = 0x40000000
@@ -115,7 +116,8 @@ class Port(ABC):
         self._send_lock = asyncio.Lock()
         self._reason = ""
         self._told = LinkState.UP
-        self._told_at_s = -_QUIET_S
+        self._told_at_s = -2 * _LONGEST_QUIET_S
+        self._quiet_s = _QUIET_S
         self._check_at_s = 0.0
 
     @abstractmethod
@@ -194,8 +196,11 @@ class Port(ABC):
     def _tell(self) -> None:
         """Log the state if it is not the one logged last."""
         now_s = time.monotonic()
-        if self.state is self._told or now_s - self._told_at_s < _QUIET_S:
+        since_s = now_s - self._told_at_s
+        if self.state is self._told or since_s < self._quiet_s:
             return
+        calm = since_s >= 2 * _LONGEST_QUIET_S
+        self._quiet_s = _QUIET_S if calm else min(2 * self._quiet_s, _LONGEST_QUIET_S)
         log.log(
             logging.INFO if self.state is LinkState.UP else logging.WARNING,
             'bus "%s": %s is %s%s, was %s',

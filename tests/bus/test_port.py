@@ -151,6 +151,29 @@ def test_one_line_is_logged_for_a_change_not_for_a_frame(ends, caplog):
     ]
 
 
+def test_a_loose_plug_is_logged_ever_more_rarely(ends, caplog, monkeypatch):
+    ours, _ = ends
+    port = port_on(ours)
+    now_s = 1000.0
+    monkeypatch.setattr("skin_host.bus.port.time.monotonic", lambda: now_s)
+    with caplog.at_level(logging.INFO):
+        for number in range(7200):
+            now_s += 0.5
+            port._enter(LinkState.DOWN if number % 3 else LinkState.UP)
+            port._tell()
+        assert 60 < len(caplog.records) < 70
+        # A calm link is told of at once again.
+        now_s += 121.0
+        port._tell()
+        lines = len(caplog.records)
+        now_s += 121.0
+        for _ in range(2):
+            now_s += 2.5
+            port._enter(LinkState.DOWN if port.state is LinkState.UP else LinkState.UP)
+            port._tell()
+    assert len(caplog.records) == lines + 2
+
+
 def test_a_socket_that_fails_is_replaced():
     # A refused datagram is a one-shot error of the socket, as a removed device is.
     ours, theirs = pair()

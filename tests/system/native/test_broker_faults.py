@@ -12,7 +12,7 @@ from skin_host.processing.contacts import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.publish.mqtt import Publisher
 from skin_host.settings import Mqtt
-from tests.support.broker import Mosquitto
+from tests.support.broker import Mosquitto, break_at_random
 
 PARTS = [f"part_{i}" for i in range(10)]
 TAXELS = 200  # of each of ten parts
@@ -62,31 +62,6 @@ class Load:
                 TouchEvent(kind, contact, self.sweeps, t_ns, part, [1], None, None, 1, 1, 1, 0.1)  # type: ignore[arg-type]
             )
             self.touches += 1
-
-
-async def break_at_random(broker: Mosquitto, chance: random.Random) -> int:
-    """Break the broker until cancelled."""
-    breaks = 0
-    while True:
-        await asyncio.sleep(chance.uniform(0.2, 2.0))
-        breaks += 1
-        match chance.choice(["restart", "kill", "freeze", "stop"]):
-            case "restart":
-                broker.restart()
-            case "kill":
-                broker.kill()
-                await asyncio.sleep(chance.uniform(0.1, 2.0))
-                broker.start()
-            case "stop":
-                broker.stop()
-                await asyncio.sleep(chance.uniform(0.1, 2.0))
-                broker.start()
-            case "freeze":
-                broker.freeze()
-                try:
-                    await asyncio.sleep(chance.uniform(0.1, 5.0))
-                finally:
-                    broker.resume()
 
 
 async def count(stream: Stream[Touch], seen: dict[str, int], told: dict[str, int]) -> None:

@@ -1,0 +1,247 @@
+"""A real daemon at full rate, while its broker and its buses fail: nothing else suffers.
+
+The frames are the emulator's, played at their times by `tests.support.scheduled_bus`.
+ACQUISITION_SECONDS sets how long things are broken.
+"""
+
+import asyncio
+import contextlib
+import logging
+import os
+import random
+import statistics
+import time
+from collections import Counter, defaultdict
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import pytest
+
+from emulator.scene import Place, Probe, Scene
+from skin_host.client import SkinClient, Stream, Touch
+from skin_host.daemon import Daemon
+from skin_host.health import Record
+from skin_host.layout import build_layout
+from skin_host.processing.pipeline import PressureFrame
+from skin_host.settings import Bus, load
+from tests.support import scheduled_bus
+from tests.support.broker import Mosquitto, break_at_random
+from tests.support.scheduled_bus import ScheduledBus
+
+SECONDS = float(os.environ.get("ACQUISITION_SECONDS", "12"))
+PATIENCE_S = 60.0
+FRAMES_A_SWEEP = 32
+#: The skin is left alone for so long, then pressed here and there, again and again.
+UNTOUCHED_S = 6.0
+LOOP_S = 4.0
+PRESS_S = 0.6
+PROBES = 6
+MOST = 0.9
+
+
+def whole_skin(folder: Path) -> Path:
+    """2112 taxels in one part: eleven boards on three buses, at 50 Hz."""
+    lines = ['robot = "load"']
+    for board in range(11):
+        bus, address = divmod(board, 4)
+        lines += [f"[buses.can{bus}]"] * (address == 0)
+        lines += [f"[boards.b{board}]", f'bus = "can{bus}"', f"address = {address + 1}"]
+        lines += ["period_ms = 20", "[[parts.body.patches]]", f'board = "b{board}"']
+        lines += ['triangles = "0-15"']
+    return written(folder, lines)
+
+
+def four_parts(folder: Path) -> Path:
+    """Four parts of 192 taxels, each of one board on a bus of its own, at 20 Hz."""
+    lines = ['robot = "load"']
+    for number in range(4):
+        lines += [f"[buses.can{number}]", f"[boards.b{number}]", f'bus = "can{number}"']
+        lines += ["address = 1", "period_ms = 50"]
+        lines += [f"[[parts.part{number}.patches]]", f'board = "b{number}"', 'triangles = "0-15"']
+    return written(folder, lines)
+
+
+def written(folder: Path, lines: list[str]) -> Path:
+    path = folder / "load.toml"
+    path.write_text("\n".join(lines))
+    return path
+
+
+def pressed(part: str, taxels: int) -> Scene:
+    """Each probe presses once in two seconds, none over the seam of the loop."""
+    probes = [
+        Probe(
+            part=part,
+            at=Place(taxel=number * taxels // PROBES + 3),
+            pressure_kpa=[(0.0, 0.0), (0.1, 60.0), (PRESS_S - 0.1, 60.0), (PRESS_S, 0.0)],
+            start_s=UNTOUCHED_S + 0.1 + (1.8 - PRESS_S) * number / PROBES,
+            repeat_s=2.0,
+        )
+        for number in range(PROBES)
+    ]
+    return Scene(spread=False, probe=probes)
+
+
+@contextlib.asynccontextmanager
+async def daemon_of(config: Path, scene: Scene, port: int) -> AsyncIterator[Daemon]:
+    """A calibrated daemon on scheduled buses."""
+    scheduled_bus.register()
+    settings = load(config)
+    layout = build_layout(settings, config.parent)
+    files = scheduled_bus.record(
+        settings, layout, scene, UNTOUCHED_S + LOOP_S, LOOP_S, config.parent
+    )
+    for bus, file in files.items():
+        settings.buses[bus] = Bus(interface=scheduled_bus.INTERFACE, channel=str(file))
+    settings.mqtt.port = port
+    settings.service.state_directory = str(config.parent)
+    settings.processing.calibration.seconds = 1.0
+    settings.processing.touch.move_hz = 5.0
+    daemon = Daemon(settings, layout)
+    stop = asyncio.Event()
+    running = asyncio.create_task(daemon.run(stop))
+    try:
+        await until(lambda: daemon.engine.calibration or running.done())
+        yield daemon
+    finally:
+        stop.set()
+        await running
+
+
+async def until(condition: Callable[[], object]) -> None:
+    async with asyncio.timeout(PATIENCE_S):
+        while not condition():  # noqa: ASYNC110
+            await asyncio.sleep(0.02)
+
+
+def believed(record: Record) -> bool:
+    return record["valid_taxels"] > MOST * record["taxels"]
+
+
+class Heard:
+    """What a subscriber has heard of the touches of one part."""
+
+    def __init__(self) -> None:
+        self.events: Counter[str] = Counter()
+        self.missed = 0
+        self.last_count = 0
+        self.halves: set[int] = set()
+
+    async def listen(self, stream: Stream[Touch]) -> None:
+        async for touch in stream:
+            self.events[touch.event] += 1
+            self.missed += touch.missed
+            self.last_count = touch.count
+            if touch.event != "move":
+                self.halves ^= {touch.id}
+
+
+async def test_a_broken_broker_costs_no_sweep_and_no_untold_touch(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    heard = Heard()
+    config = whole_skin(tmp_path)
+    url = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    async with SkinClient(url, robot="load") as skin:
+        touches = skin.touches()
+        await skin.ready()
+        listening = asyncio.create_task(heard.listen(touches))
+        async with daemon_of(config, pressed("body", 2112), mosquitto.port) as daemon:
+            buses = dict(ScheduledBus.open_now)
+            await until(lambda: heard.events["end"])
+            breaking = asyncio.create_task(break_at_random(mosquitto, random.Random(1)))
+            await asyncio.sleep(SECONDS)
+            breaking.cancel()
+            await asyncio.gather(breaking, return_exceptions=True)
+            mosquitto.restart()
+            await until(lambda: daemon.publisher.counters.connected and skin.connected)
+            await skin.ready()
+            before = heard.events["end"]
+            await until(lambda: heard.events["end"] > before + PROBES)
+        counters = daemon.publisher.counters
+        await until(lambda: heard.last_count == counters.touches_sent + counters.touches_dropped)
+        listening.cancel()
+    sweeps = 0
+    for name, port in daemon.link.ports.items():
+        assembler = daemon.engine.assemblers[name].counters
+        bus = buses[daemon.settings.buses[name].channel]
+        assert port.counters.frames == bus.given == assembler.frames
+        assert assembler.incomplete == assembler.halves == assembler.late == assembler.missed == 0
+        assert 0 <= bus.given - FRAMES_A_SWEEP * assembler.sweeps < 5 * FRAMES_A_SWEEP
+        sweeps += assembler.sweeps
+    logging.info(
+        "%g s, %d connections: %d sweeps, 0 lost; a frame waited %.0f ms at most; "
+        "touches %s, missed and told %d, dropped %d; frames sent %d, skipped %d",
+        SECONDS,
+        counters.connections,
+        sweeps,
+        1e3 * max(bus.longest_wait_s for bus in buses.values()),
+        dict(heard.events),
+        heard.missed,
+        counters.touches_dropped,
+        counters.frames_sent,
+        counters.frames_skipped,
+    )
+    assert counters.connections > 1
+    assert sum(heard.events.values()) + heard.missed == heard.last_count
+    assert len(heard.halves) <= heard.missed
+
+
+@pytest.mark.parametrize("how", ["cable", "adapter"])
+async def test_one_bus_of_four_that_is_unplugged_leaves_the_others_alone(
+    mosquitto: Mosquitto, tmp_path: Path, caplog: pytest.LogCaptureFixture, how: str
+) -> None:
+    config = four_parts(tmp_path)
+    delays_ms: dict[str, list[float]] = defaultdict(list)
+    async with daemon_of(config, Scene(spread=False), mosquitto.port) as daemon:
+        put = daemon.publisher.put_frame
+        valid: dict[str, list[float]] = defaultdict(list)
+
+        def put_frame(frame: PressureFrame) -> None:
+            delays_ms[frame.part].append((time.time_ns() - frame.t_ns) / 1e6)
+            valid[frame.part].append(float(frame.valid.mean()))
+            put(frame)
+
+        # The emulator draws a few pads that are too noisy to be believed.
+        await until(lambda: all(map(believed, daemon.records().values())))
+        daemon.publisher.put_frame = put_frame  # type: ignore[method-assign]
+        await asyncio.sleep(SECONDS / 2)
+        before = {part: sorted(delays) for part, delays in delays_ms.items()}
+        delays_ms.clear()
+        valid.clear()
+        caplog.clear()
+        caplog.set_level(logging.INFO)
+        channel = daemon.settings.buses["can3"].channel
+        if how == "cable":
+            ScheduledBus.open_now[channel].unplugged = True
+        else:
+            ScheduledBus.removed.add(channel)
+        await asyncio.sleep(SECONDS / 2)
+        after = {part: sorted(delays) for part, delays in delays_ms.items()}
+        lines = [record.getMessage() for record in caplog.records]
+        records = daemon.records()
+        unplugged = valid.pop("part3")[-1]
+        ScheduledBus.removed.discard(channel)
+        for bus in ScheduledBus.open_now.values():
+            bus.unplugged = False
+        await until(lambda: believed(daemon.records()["part3"]))
+    others = ["part0", "part1", "part2"]
+    for part in others:
+        logging.info(
+            "%s: %d frames before, %d after; delay before %.1f ms (99 %%: %.1f), "
+            "after %.1f ms (%.1f)",
+            part,
+            len(before[part]),
+            len(after[part]),
+            statistics.median(before[part]),
+            before[part][int(0.99 * len(before[part]))],
+            statistics.median(after[part]),
+            after[part][int(0.99 * len(after[part]))],
+        )
+        assert min(valid[part]) > MOST
+        assert {fault["code"] for fault in records[part]["faults"]} <= {"taxel_noisy"}
+    assert unplugged == 0.0
+    assert records["part3"]["state"] == "silent"
+    told = {fault["code"] for fault in records["part3"]["faults"]}
+    assert told == {"bus_silent" if how == "cable" else "bus_gone"}
+    assert len(lines) <= 1, lines
