@@ -52,8 +52,9 @@ THERMAL_SMOOTHING_S = 10.0
 DOUBT_UNITS_PER_S = 0.005
 DOUBT_LIMIT_UNITS = 3.5
 SLOW_DOUBT_UNITS_PER_S = 1e-4
-#: Seen untouched again, a taxel is less and less in doubt.
+#: Seen untouched again, a taxel is less and less in doubt, and below this no longer.
 RELIEF_S = 5.0
+DOUBTED_S = 1.0
 #: A contact has let go when less than this share of its largest reading is left ...
 LET_GO_SHARE = 0.4
 #: ... and is still when its mean changes by less than this from window to window.
@@ -208,9 +209,13 @@ class BaselineTracker:
         """Replace the changes by what is common to the untouched; return what was no touch."""
         common = self._common(change, units, free, dt_s)
         alone = ALONE_UNITS_PER_S * dt_s
+        # What was in touch a moment ago is followed by its own rule: it may have drifted unseen.
+        recovering = free & (self._doubt_s > DOUBTED_S)
+        own = change[recovering]
         np.clip(change - common, -alone, alone, out=change)
         change[~free] = 0.0
         change += common
+        change[recovering] = own
         ghosts = self._ghosts(units, touched, dt_s)
         if ghosts is not None:
             change[ghosts] = units[ghosts]
