@@ -9,7 +9,13 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skin_host.bus.protocol import HOST_ADDRESS, FrameBatch, MessageClass, identifier
+from skin_host.bus.protocol import (
+    BROADCAST_ADDRESS,
+    HOST_ADDRESS,
+    FrameBatch,
+    MessageClass,
+    identifier,
+)
 
 Floats = NDArray[np.float64]
 Frame = tuple[int, bytes]
@@ -17,6 +23,9 @@ Frame = tuple[int, bytes]
 NS_PER_MS = 1_000_000
 _SET_MODE, _SET_PERIOD, _GET_FULL_SCALE = 0x07, 0x08, 0x18
 _STOP = 1
+#: Command FF of class 7, "who is there?", and the answer: FF, type of board STRAIN2, firmware.
+_DISCOVER = 0xFF
+_IDENTITY = bytes([_DISCOVER, 12, 2, 0, 9])
 #: Frames of each mode: pairs of types (force, torque), and whether they are calibrated.
 _STREAMS: dict[int, list[tuple[int, int, bool]]] = {
     0: [(0xA, 0xB, True)],
@@ -61,6 +70,13 @@ class StrainBoard:
 
     def handle(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
         """Take a frame from the bus; give what the board sends back."""
+        asked = [
+            identifier(MessageClass.MANAGEMENT, HOST_ADDRESS, to)
+            for to in (self.address, BROADCAST_ADDRESS)
+        ]
+        if can_id in asked and data[:1] == _IDENTITY[:1]:
+            answer = identifier(MessageClass.MANAGEMENT, self.address, HOST_ADDRESS)
+            return [(answer, _IDENTITY)]
         mine = identifier(MessageClass.ANALOG_COMMAND, HOST_ADDRESS, self.address)
         if can_id != mine or len(data) < 2:
             return []

@@ -109,6 +109,8 @@ class Link:
                 record(bus, batch)
                 boards = self.boards[bus]
                 boards.feed(batch)
+                if bus in self.force_torque:
+                    self.force_torque[bus].claim(boards.strangers)
                 steps = engine.feed(bus, batch)
                 for sweep in engine.sweeps:
                     boards.note_sweep(sweep.board, sweep.present, sweep.t_ns)

@@ -30,6 +30,7 @@ class Sender(Protocol):
 @dataclass(slots=True)
 class _Known:
     state: TipState
+    started: bool = False
     frames: int = 0
     heard_ns: int = 0
     retry_at_ns: int = 0
@@ -64,16 +65,22 @@ class StrainBoards:
         for board in self._boards:
             await self._set_up(board)
 
+    def claim(self, strangers: dict[int, int]) -> None:
+        """Take our boards out of those that answered discovery and are no boards of skin."""
+        for board in self._boards:
+            strangers.pop(board.state.settings.address, None)
+
     def supervise(self) -> None:
         """Look after every board; what is to be done takes place beside everything else."""
         now_ns = self._clock()
         for board in self._boards:
             if board.state.frames != board.frames:
                 board.frames, board.heard_ns = board.state.frames, now_ns
-            silent = now_ns - board.heard_ns > SILENT_NS
-            if not silent and board.state.assembler is not None:
-                board.retries = 0
-            elif board.retry_at_ns and now_ns >= board.retry_at_ns and self._busy is None:
+                if board.state.assembler is not None:
+                    board.retries = 0
+            well = now_ns - board.heard_ns <= SILENT_NS and board.state.assembler is not None
+            due = board.started and now_ns >= board.retry_at_ns
+            if due and not well and self._busy is None:
                 self._busy = asyncio.create_task(self._mend(board))
 
     async def stop(self) -> None:
@@ -84,6 +91,8 @@ class StrainBoards:
         """
         if self._busy is not None:
             self._busy.cancel()
+        for board in self._boards:
+            board.started = False
         stop = SetTxMode(StrainMode.STOP)
         await self._port.send(
             [command_frame(stop, board.state.settings.address) for board in self._boards]
@@ -94,8 +103,8 @@ class StrainBoards:
         await self._port.send(start_frames(table.address, table.period_ms), GAP_S)
         pause_s = RETRY_S[min(board.retries, len(RETRY_S) - 1)]
         board.retries += 1
-        board.heard_ns = self._clock()
-        board.retry_at_ns = board.heard_ns + int(pause_s * 1e9)
+        board.started = True
+        board.retry_at_ns = self._clock() + int(pause_s * 1e9)
 
     async def _mend(self, board: _Known) -> None:
         log.debug("bus %s: the board of %s is set up again", self._bus, board.state.name)

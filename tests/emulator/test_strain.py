@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from emulator.strain import StrainBoard
+from skin_host.bus.commands import BoardType, Discover, Discovered, command_frame, parse_answer
 from skin_host.fingertip.strain_protocol import (
     StrainType,
     WrenchAssembler,
@@ -77,6 +78,18 @@ def test_too_much_load_is_clipped_and_flagged():
     assert frames.saturated.all()
     assert frames.value[0, 0] == 0x7FFF
     assert frames.value[1, 2] == -0x8000
+
+
+def test_a_board_says_who_it_is() -> None:
+    board = StrainBoard(3, lambda t_ns: LOAD, np.random.default_rng(1))
+    for asked in (command_frame(Discover(), 15), command_frame(Discover(), 3)):
+        ((can_id, data),) = board.handle(*asked, 0)
+        found = parse_answer(can_id, data)
+        assert found is not None
+        assert found[0] == 3
+        assert isinstance(found[1], Discovered)
+        assert found[1].board_type == BoardType.STRAIN2
+    assert board.handle(*command_frame(Discover(), 4), 0) == []
 
 
 @pytest.mark.parametrize(

@@ -87,5 +87,8 @@ def test_a_press_and_a_slip_on_a_fingertip_reach_a_subscriber(
         assert contacts[0] == contacts[-1] == b"OFF"
         assert b"ON" in contacts
         assert "ok" in {record["state"] for record in heard.documents(f"{part}/health")}
+    # They answer discovery too, and are no strangers.
+    faults = [one["code"] for record in heard.documents("/health") for one in record["faults"]]
+    assert "bus_stranger" not in faults
     info = heard.documents("main/info")[-1]
     assert info["fingertips"]["index"]["shape"] == "sphere"

@@ -1,0 +1,144 @@
+"""Force/torque boards brought up, watched and described, with the emulated ones on the bus."""
+
+import asyncio
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from emulator.faults import parse
+from emulator.robot import Robot
+from emulator.scene import Probe, Scene
+from skin_host.engine import Engine
+from skin_host.fingertip.boards import StrainBoards
+from skin_host.fingertip.engine import FingertipEngine
+from skin_host.fingertip.health import FingertipHealth, FingertipRecord
+from skin_host.layout import build_layout
+from skin_host.settings import load
+
+CONFIG = Path(__file__).parents[2] / "config"
+
+
+class Bench:
+    """The robot of the shipped configuration, its host, and time that they share."""
+
+    def __init__(self, *probes: dict[str, Any], noise: bool = True, **table: Any) -> None:
+        settings = load(CONFIG / "fingertips.toml")
+        index = msgspec.structs.replace(settings.fingertips["index"], **table)
+        settings.fingertips["index"] = index
+        layout = build_layout(settings, CONFIG)
+        scene = Scene(probe=[msgspec.convert(probe, Probe) for probe in probes], noise=noise)
+        self.robot = Robot(settings, layout, scene)
+        self.robot.bring_up()
+        self.engine = Engine(settings, layout, [0])
+        assert self.engine.fingertips is not None
+        self.tips: FingertipEngine = self.engine.fingertips
+        self.health = FingertipHealth(self.tips)
+        self.sent: list[tuple[int, bytes]] = []
+        clock = lambda: self.robot.t_ns  # noqa: E731
+        self.boards = StrainBoards("can0", self, self.tips.on_bus("can0"), clock)
+
+    async def send(self, frames: Iterable[tuple[int, bytes]], gap_s: float = 0.0) -> None:
+        """As a port does, but within the robot's own time."""
+        for can_id, data in frames:
+            self.sent.append((can_id, data))
+            self.robot.receive("can0", can_id, data)
+
+    async def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / 0.02)):
+            self.engine.feed("can0", self.robot.step(0.02)["can0"])
+            self.engine.expire(self.robot.t_ns)
+            self.boards.supervise()
+            self.health.tick(self.robot.t_ns)
+            await asyncio.sleep(0)
+
+    async def calibrate(self) -> None:
+        self.engine.begin_calibration(0.5)
+        await self.run(0.6)
+        self.engine.use(self.engine.end_calibration("2026-01-01T00:00:00+00:00"))
+
+    def record(self, name: str = "index") -> FingertipRecord:
+        return self.health.records(self.robot.t_ns)[name]
+
+    def codes(self, name: str = "index") -> list[str]:
+        return [fault["code"].removeprefix("fingertip_") for fault in self.record(name)["faults"]]
+
+
+async def test_a_board_is_asked_for_its_full_scales_set_up_and_zeroed() -> None:
+    bench = Bench()
+    assert bench.codes() == ["absent"]
+    assert bench.record()["state"] == "no data"
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    assert bench.record()["full_scale"] == [50, 50, 50, 1, 1, 1]
+    assert (bench.record()["state"], bench.codes()) == ("not calibrated", ["not_calibrated"])
+    await bench.calibrate()
+    record = bench.record()
+    assert (record["state"], record["sentences"]) == ("ok", [])
+    assert record["rate_hz"] == pytest.approx(333, rel=0.05)
+    assert record["lone"] == 0
+    assert bench.record("thumb")["rate_hz"] == pytest.approx(100, rel=0.05)
+
+
+async def test_a_board_that_falls_silent_is_told_of_and_set_up_again() -> None:
+    bench = Bench()
+    await bench.boards.bring_up()
+    await bench.calibrate()
+    mend = bench.robot.inject(parse("board_silent board=index"))
+    await bench.run(0.3)
+    assert (bench.record()["state"], bench.codes()) == ("silent", ["silent"])
+    assert bench.codes("thumb") == []
+    before = len(bench.sent)
+    await bench.run(8.0)
+    # Ever more rarely: each time six full scales, the period and the start.
+    assert 3 * 8 <= len(bench.sent) - before <= 5 * 8
+    bench.robot.fingertips.boards["index"].next_ns = None  # it has lost its power
+    mend()
+    await bench.run(9.0)
+    assert bench.codes() == []
+    assert bench.record()["silences"] == 1
+
+
+async def test_full_scales_that_are_given_are_used_and_compared() -> None:
+    bench = Bench(full_scale=(50.0, 50.0, 50.0, 1.0, 1.0, 1.0))
+    await bench.boards.bring_up()
+    await bench.calibrate()
+    assert bench.codes() == []
+    bench.tips.tips["index"].told_scale[2] = 2000.0
+    assert bench.codes() == ["scale"]
+
+
+async def test_a_board_that_does_not_tell_its_full_scales_is_not_configured() -> None:
+    bench = Bench()
+    await bench.boards.bring_up()
+    await bench.run(0.1)
+    state = bench.tips.tips["index"]
+    state.assembler = None
+    state.told_scale[:] = 0.0
+    assert (bench.record()["state"], bench.codes()) == ("not configured", ["not_configured"])
+
+
+async def test_load_beyond_the_range_is_told_and_has_no_place() -> None:
+    bench = Bench({"part": "index", "force_n": [[2.5, 0], [2.6, 60], [4, 60], [4.1, 0]]})
+    await bench.boards.bring_up()
+    await bench.calibrate()
+    await bench.run(2.5)
+    assert (bench.record()["state"], bench.codes()) == ("saturated", ["saturated"])
+    told = [event for event in bench.tips.take() if event.part == "index"]
+    loads = [getattr(event, "load", None) for event in told]
+    assert "saturated" in {load.verdict for load in loads if load is not None}
+    await bench.run(6.0)
+    assert bench.codes() == []
+
+
+async def test_a_contact_without_end_makes_its_zero_uncertain() -> None:
+    bench = Bench({"part": "index", "force_n": [[2.5, 0], [2.6, 1], [600, 1]]})
+    await bench.boards.bring_up()
+    await bench.calibrate()
+    bench.tips.held_report_ns = 2_000_000_000
+    await bench.run(2.5)
+    assert bench.codes() == []
+    await bench.run(2.5)
+    assert bench.codes() == ["held"]
