@@ -13,6 +13,7 @@ from skin_host.bus.port import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
 from skin_host.bus.protocol import FrameBatch
 from skin_host.engine import Engine, Step
 from skin_host.errors import BusError, LogError
+from skin_host.fingertip.desk import FingertipDesk
 from skin_host.publish.address import Broker
 from skin_host.publish.connection import connect
 from skin_host.publish.info import node_info
@@ -151,13 +152,17 @@ async def play_processed(
                 configuration=skin_hash(settings),
                 encoding=settings.mqtt.encoding,
                 commands=False,
+                fingertips=settings.fingertips,
             )
         )
 
         def last_ns(item: tuple[str, FrameBatch]) -> int:
             return int(item[1].t_ns[-1])
 
+        fingertips = FingertipDesk(engine.fingertips, publisher)
+
         def publish(steps: list[Step]) -> int:
+            fingertips.deliver()
             for step in steps:
                 publisher.put_frame(step.frame)
                 for event in step.events:

@@ -87,9 +87,11 @@ def _check(arguments: argparse.Namespace) -> int:
 
 def _replay(arguments: argparse.Namespace) -> int:
     from skin_host.engine import Engine
+    from skin_host.fingertip.health import FingertipHealth
     from skin_host.health import Health
     from skin_host.processing import calibration
     from skin_host.publish import messages
+    from skin_host.publish.grasping import EventLines
     from skin_host.replay import calibrate_from_log, replay
     from skin_host.settings import skin_hash
 
@@ -104,20 +106,24 @@ def _replay(arguments: argparse.Namespace) -> int:
         found = calibrate_from_log(arguments.log, settings, layout, arguments.calibrate_seconds)
     engine = Engine(settings, layout, list(range(len(layout.parts))), found)
     health = Health(engine)
-    counts = dict.fromkeys(engine.parts, 0)
+    tips = engine.fingertips
+    lines = EventLines()
     progress = Progress("replay")
     with _output(arguments.output) as output:
         for number, step in enumerate(replay(arguments.log, engine)):
             health.note_sweeps(engine.sweeps)
             health.note_step(step)
             output.write(messages.frame_line(step.frame))
-            for event in step.events:
-                counts[step.part] += 1
-                output.write(messages.touch_line(event, counts[step.part]))
+            told = step.events if tips is None else [*step.events, *tips.take()]
+            output.writelines(map(lines.line, told))
             if number % 200 == 0:
                 progress.update(0.0, f"{number} frames")
         for part in engine.parts:
             output.write(messages.health_line(health.replayed(part)))
+        if tips is not None:
+            output.writelines(map(lines.line, tips.take()))
+            for record in FingertipHealth(tips).records(None).values():
+                output.write(messages.health_line(record))
     progress.close()
     return 0
 

@@ -363,10 +363,11 @@ def load(path: Path, layout: Layout, configuration: str) -> Calibration:
                 raise refused(f"parts.{part.name}.{name}: every number must be positive")
     zeros = {}
     for name, zero in content.fingertips.items():
-        numbers = np.array([zero.offset, zero.noise], np.float64)
-        if numbers.shape != (2, CHANNELS) or not np.isfinite(numbers).all():
+        offset, noise = np.array(zero.offset), np.array(zero.noise)
+        fits = offset.shape == noise.shape == (CHANNELS,)
+        if not fits or not np.isfinite([offset, noise]).all() or (noise < 0.0).any():
             raise refused(f"fingertips.{name}: wanted twice {CHANNELS} finite numbers")
-        zeros[name] = Zero(*numbers)
+        zeros[name] = Zero(offset, noise)
     return Calibration(
         content.configuration, content.id, content.time, verdict=verdict, zeros=zeros, **arrays
     )

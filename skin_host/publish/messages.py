@@ -341,7 +341,7 @@ def frame_line(frame: PressureFrame) -> bytes:
     """Write a frame as a line of `skin replay`: arrays of all taxels, kPa with three decimals."""
     # Adding 0 turns a rounded -0.0 into 0.0.
     pressure = np.round(frame.pressure_kpa.astype(np.float64), KPA_DECIMALS) + 0.0
-    return _line(
+    return line(
         "frame",
         {
             "part": frame.part,
@@ -357,12 +357,12 @@ def frame_line(frame: PressureFrame) -> bytes:
 
 def touch_line(event: TouchEvent, count: int) -> bytes:
     """Write an event as a line of `skin replay`: the payload as published, and its type."""
-    return _line("touch", _keys(touch_message(event, count)))
+    return line("touch", _keys(touch_message(event, count)))
 
 
 def health_line(record: Any) -> bytes:
     """Write a health record as a line of `skin replay`."""
-    return _line("health", {"schema": HEALTH_SCHEMA} | _keys(record))
+    return line("health", {"schema": HEALTH_SCHEMA} | _keys(record))
 
 
 def load_cbor2() -> Any:
@@ -426,7 +426,8 @@ def _keys(record: Any) -> dict[str, Any]:
     return keys
 
 
-def _line(kind: str, keys: dict[str, Any]) -> bytes:
+def line(kind: str, keys: dict[str, Any]) -> bytes:
+    """Write a line of `skin replay` of this type."""
     return _encoder.encode({"type": kind} | keys) + b"\n"
 
 

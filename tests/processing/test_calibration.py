@@ -124,6 +124,30 @@ def test_other_numbers_have_another_id(untouched):
     assert calibration.with_gains(untouched, untouched.gain, untouched.bend).id == untouched.id
 
 
+def test_zeros_of_fingertips_are_kept_with_it_and_renewed_with_the_whole_skin(untouched, tmp_path):
+    zeros = {"index": calibration.Zero(np.arange(6.0), np.full(6, 1e-3))}
+    taken = calibration.with_zeros(untouched, zeros)
+    assert taken.id != untouched.id
+    path = tmp_path / "calibration.json"
+    calibration.save(path, taken, LAYOUT)
+    found = calibration.load(path, LAYOUT, "abc")
+    assert found.zeros["index"].offset.tolist() == list(range(6))
+    assert found.zeros["index"].noise.tolist() == [1e-3] * 6
+    newer = calibration.with_zeros(
+        untouched, {"index": calibration.Zero(np.ones(6), np.full(6, 1e-3))}
+    )
+    every = np.ones(N, bool)
+    assert calibration.merge(found, newer, every).zeros["index"].offset[0] == 1.0
+    assert calibration.merge(found, newer, ~every, zeros=False).zeros["index"].offset[0] == 0.0
+    # A board that was silent meanwhile keeps the zero that it had.
+    assert calibration.merge(found, untouched, every).zeros["index"].offset[0] == 0.0
+    text = path.read_text()
+    at = text.index('"fingertips"')
+    path.write_text(text[:at] + text[at:].replace('"noise": [', '"noise": [1,', 1))
+    with pytest.raises(CalibrationError, match=r"fingertips\.index: wanted twice 6 finite numbers"):
+        calibration.load(path, LAYOUT, "abc")
+
+
 def test_gains_outlive_a_new_zero(untouched, tmp_path):
     path = tmp_path / "calibration.json"
     assert calibration.with_gains_of(untouched, path, LAYOUT) is untouched

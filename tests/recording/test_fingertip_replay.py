@@ -1,0 +1,60 @@
+"""A recording with force/torque frames through `skin replay`: touches and slips in their order."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from emulator.robot import Robot
+from emulator.scene import load as load_scene
+from skin_host.cli import main
+from skin_host.fingertip.strain_protocol import start_frames
+from skin_host.layout import build_layout
+from skin_host.settings import load
+
+CONFIG = Path(__file__).parents[2] / "config"
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Seven seconds of the shipped scene: a press, a slip, a press of the thumb."""
+    settings = load(CONFIG / "fingertips.toml")
+    scene = load_scene(CONFIG / "scenes" / "fingertips.toml")
+    robot = Robot(settings, build_layout(settings, CONFIG), scene)
+    robot.bring_up()
+    for tip in settings.fingertips.values():
+        for can_id, data in start_frames(tip.address, tip.period_ms):
+            robot.receive("can0", can_id, data)
+    lines = []
+    while robot.t_ns < 7_500_000_000:
+        batch = robot.step(0.02)["can0"]
+        for row in range(len(batch)):
+            t_ns = 1_763_700_000_000_000_000 + int(batch.t_ns[row])
+            payload = batch.data[row, : batch.dlc[row]].tobytes().hex().upper()
+            seconds, micros = t_ns // 10**9, t_ns % 10**9 // 1000
+            lines.append(f"({seconds}.{micros:06}) can0 {batch.id[row]:03X}#{payload}\n")
+    path = tmp_path_factory.mktemp("fingertips") / "fingertips.log"
+    path.write_text("".join(lines))
+    return path
+
+
+def test_a_replay_tells_what_the_fingertips_felt_and_tells_it_again(
+    recording: Path, tmp_path: Path
+) -> None:
+    outputs = [tmp_path / "first.jsonl", tmp_path / "second.jsonl"]
+    for output in outputs:
+        command = ["replay", str(recording), "--config", str(CONFIG / "fingertips.toml")]
+        assert main([*command, "--calibrate-seconds", "1", "--output", str(output)]) == 0
+    assert outputs[0].read_bytes() == outputs[1].read_bytes()
+    lines = [json.loads(line) for line in outputs[0].read_text().splitlines()]
+    touches = [one for one in lines if one["type"] == "touch" and one["part"] == "index"]
+    assert [touches[0]["event"], touches[-1]["event"]] == ["begin", "end"]
+    assert [one["count"] for one in touches] == list(range(1, len(touches) + 1))
+    slips = [one for one in lines if one["type"] == "slip"]
+    assert [slips[0]["event"], slips[0]["count"], slips[0]["id"]] == ["begin", 1, 1]
+    joined = [one for one in lines if one["type"] == "touch" and one["part"] == "thumb"]
+    assert any(one["taxels"] for one in joined)
+    health = {one["part"]: one for one in lines if one["type"] == "health"}
+    assert set(health) == {"thumb_skin", "index", "thumb"}
+    assert health["index"]["state"] == "ok"
+    assert "age_ms" not in health["index"]
