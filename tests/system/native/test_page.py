@@ -8,16 +8,23 @@ from pathlib import Path
 
 import pytest
 
-from skin_host.settings import Bus
-from tests.support.broker import Mosquitto, free_port
+from skin_host.importing.report import Findings
+from skin_host.importing.run import import_files
+from skin_host.importing.writing import configuration_text
+from skin_host.settings import Bus, load
+from tests.support.broker import Mosquitto
 from tests.support.devtools import Page, browser
 from tests.support.stack import ROOT, Stack
 
+SAMPLES = ROOT.parent / "shared" / "data"
 SCENE = ROOT / "config" / "scenes" / "demo.toml"
 #: How many pixels of the map are not of its background.
 DRAWN = """(() => {
     const map = document.getElementById("map");
-    const data = map.getContext("2d").getImageData(0, 0, map.width, map.height).data;
+    const copy = new OffscreenCanvas(map.width, map.height)
+        .getContext("2d", { willReadFrequently: true });
+    copy.drawImage(map, 0, 0);
+    const data = copy.getImageData(0, 0, map.width, map.height).data;
     let drawn = 0;
     for (let i = 3; i < data.length; i += 4) if (data[i]) drawn++;
     return drawn;
@@ -44,19 +51,18 @@ def start(robot: Stack) -> None:
 @asynccontextmanager
 async def page(robot: Stack, profile: Path, width: int = 1280) -> AsyncIterator[Page]:
     """The page as `skin view` serves it, in a browser; nothing complains until the end."""
-    port = free_port()
     broker = f"mqtt://{robot.broker.host}:{robot.broker.port}"
     view = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "skin_host", "view", "--broker", broker),
-        *("--robot", "demo", "--port", str(port)),
+        *("--robot", "demo", "--port", "0"),
         cwd=ROOT,
         stdout=asyncio.subprocess.PIPE,
     )
     try:
         assert view.stdout is not None
-        assert f"http://127.0.0.1:{port}/".encode() in await view.stdout.readline()
+        url = (await view.stdout.readline()).decode().removeprefix("the page: ").strip()
         async with browser(profile) as opened:
-            await opened.open(f"http://127.0.0.1:{port}/", width)
+            await opened.open(url, width)
             yield opened
             assert opened.complaints == []
     finally:
@@ -150,3 +156,32 @@ async def test_a_phone_shows_everything_without_scrolling_sideways(
         await seen.until(LIVE)
         assert await seen.run("document.documentElement.scrollWidth") == 400
         assert await seen.run(DRAWN) > 8_000
+
+
+@pytest.mark.skipif(not SAMPLES.exists(), reason=f"{SAMPLES} is not here")
+async def test_the_imported_arm_of_an_icub_is_drawn(robot: Stack, tmp_path: Path) -> None:
+    arm, findings = robot.config, Findings()
+    demo = load(arm)
+    for source, sample in {
+        "skinspec": "icub_genova11_left_arm_skinSpec.xml",
+        "skingui": "icub_left_forearm_V2_gui.ini",
+        "positions": "icub_left_forearm_V2_positions.txt",
+    }.items():
+        known = None if source == "skinspec" else arm
+        import_files(source, [SAMPLES / sample], arm, findings, config=known)  # type: ignore[arg-type]
+    settings = load(arm)
+    settings.robot = demo.robot
+    settings.buses = dict.fromkeys(settings.buses, robot.bus)
+    settings.mqtt, settings.service = demo.mqtt, demo.service
+    arm.write_text(configuration_text(settings))
+    robot.start("run", str(arm), "--calibrate")
+    async with page(robot, tmp_path / "profile") as seen:
+        await seen.until(LIVE)
+        parts = await seen.run(
+            '[...document.querySelectorAll("#parts span")].map(part => part.textContent)'
+        )
+        assert parts == ["all", "left_arm", "left_forearm"]
+        assert await seen.run(DRAWN) > 20_000
+        for part in (1, 2):  # each alone: the tiled one, and the one that is curved in space
+            await seen.run(f'document.querySelectorAll("#parts button")[{part}].click()')
+            await seen.until(f"{DRAWN} > 20_000")
