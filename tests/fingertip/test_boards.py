@@ -1,21 +1,29 @@
 """Force/torque boards brought up, watched and described, with the emulated ones on the bus."""
 
 import asyncio
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from emulator.faults import parse
 from emulator.robot import Robot
 from emulator.scene import Probe, Scene
+from skin_host.bus.protocol import FrameBatch
 from skin_host.engine import Engine
 from skin_host.fingertip.boards import StrainBoards
 from skin_host.fingertip.engine import FingertipEngine
 from skin_host.fingertip.health import FingertipHealth, FingertipRecord
 from skin_host.layout import build_layout
+from skin_host.processing.calibration import Zero
+from skin_host.processing.contacts import TouchEvent
+from skin_host.publish import messages
 from skin_host.settings import load
 
 CONFIG = Path(__file__).parents[2] / "config"
@@ -142,3 +150,50 @@ async def test_a_contact_without_end_makes_its_zero_uncertain() -> None:
     assert bench.codes() == []
     await bench.run(2.5)
     assert bench.codes() == ["held"]
+
+
+frames = st.lists(
+    st.tuples(
+        st.one_of(
+            # Data of both fingertips, answers, anything.
+            st.sampled_from([0x318, 0x31A, 0x31B, 0x32A, 0x32B, 0x210, 0x220]),
+            st.integers(0, 0x7FF),
+        ),
+        st.one_of(st.binary(min_size=6, max_size=7), st.binary(max_size=8)),
+        st.one_of(st.sampled_from([100_000, 2_900_000]), st.integers(-3_000_000, 700_000_000)),
+    ),
+    max_size=60,
+)
+
+
+@given(frames)
+def test_no_traffic_on_the_bus_breaks_the_engine_or_gives_numbers_that_are_none(
+    traffic: list[tuple[int, bytes, int]],
+) -> None:
+    bench = Bench(full_scale=(50.0, 50.0, 50.0, 1.0, 1.0, 1.0))
+    noise = np.array([2e-3] * 3 + [5e-5] * 3)
+    bench.tips.use(dict.fromkeys(bench.tips.tips, Zero(np.zeros(6), noise)))
+    t_ns = 1_000_000_000
+    for can_id, data, pause_ns in traffic:
+        t_ns = max(0, t_ns + pause_ns)
+        bench.engine.feed("can0", FrameBatch.of([(can_id, data, t_ns)]))
+        bench.engine.expire(t_ns)
+        bench.health.tick(t_ns)
+        bench.health.records(t_ns)
+    bench.tips.end_all(t_ns)
+    open_now: dict[str, set[tuple[str, int]]] = {"touch": set(), "slip": set(), "over": set()}
+    for event in bench.tips.take():
+        kind = "touch" if isinstance(event, TouchEvent) else type(event).__name__[:-5].lower()
+        assert math.isfinite(event.force_n)
+        if isinstance(event, TouchEvent):
+            assert event.centroid_m is None or np.isfinite(event.centroid_m).all()
+            messages.decode_touch(messages.encode_touch(event, 1))
+        key = event.part, event.id
+        if event.event == "begin":
+            assert key not in open_now[kind] or kind != "touch"
+            open_now[kind].add(key)
+        elif event.event == "end":
+            open_now[kind].remove(key)
+        else:
+            assert key in open_now[kind]
+    assert open_now == {"touch": set(), "slip": set(), "over": set()}
