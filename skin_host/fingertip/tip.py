@@ -87,6 +87,7 @@ class Tip:
         self._said: TouchEvent | None = None
         self._begun_ns = 0
         self._looked_ns = 0
+        self._contact: IntrinsicContact | None = None
         self._last_ns = 0
         self._cause: Cause = "rate"
         self._ids: dict[str, int] = {}
@@ -159,10 +160,17 @@ class Tip:
         smooth = self._filter.step(load)
         if touches and np.linalg.norm(smooth[:3]) < least_n:
             smooth = load
-        contact = self._locate(smooth, least_n) if touches and not wrench.saturated else None
-        events = self._grasp(load, contact, wrench.t_ns, touches=touches)
+        # A place is worked out when it may be told; slips are looked for at every sample.
+        looks = self._said is None or not 0 <= wrench.t_ns - self._looked_ns < self._shortest_ns
+        if not touches or wrench.saturated:
+            self._contact = None
+        elif looks:
+            self._contact = self._locate(smooth, least_n)
+        events = self._grasp(load, self._contact, wrench.t_ns, touches=touches)
         if touches:
-            events += self._touch(smooth, contact, wrench.t_ns)
+            if looks:
+                self._looked_ns = wrench.t_ns
+                events += self._touch(smooth, wrench.t_ns)
         elif self._said is not None:
             events += self._end(wrench.t_ns)
         return events
@@ -257,14 +265,9 @@ class Tip:
             events.append(SlipEvent(one.event, number, t_ns, self._name, self._cause, *forces))
         return events
 
-    def _touch(
-        self, load: Floats, contact: IntrinsicContact | None, t_ns: int
-    ) -> list[FingertipEvent]:
+    def _touch(self, load: Floats, t_ns: int) -> list[FingertipEvent]:
         before = self._said
-        if before is not None and 0 <= t_ns - self._looked_ns < self._shortest_ns:
-            return []
-        self._looked_ns = t_ns
-        told = self._described(load, contact, t_ns)
+        told = self._described(load, self._contact, t_ns)
         if before is None:
             self._next_id += 1
             self._begun_ns = t_ns
