@@ -5,9 +5,8 @@ would fit it to one recording; then it meets all histories of that truth, once w
 readings and several times with noise, whole units and a baseline of its own.
 """
 
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -24,9 +23,10 @@ Row = dict[str, Any]
 
 UNIT_FF = 2.88
 NOISE_UNITS = 0.4
-#: A cycle holds and rests 5 s each; the truth takes them in growing steps.
+#: A cycle holds and rests 5 s each, with moves of 0.3 s; the truth takes them in growing steps.
 CYCLE_KPA = 50.0
 CYCLE_STEPS_S = (0.3, 1.4, 3.3)
+CYCLE_MODEL_STEPS_S = (0.3, 4.7)
 #: Untouched samples from which a baseline is known, as in 5 s at 25 Hz.
 BASELINE_SAMPLES = 125
 
@@ -55,38 +55,85 @@ VARIANTS = (
     Variant("asymmetric_clock", 1.0),
     Variant("asymmetric_clock", 1.0, "float32"),
 )
+#: Takes off what the truth has lost.
+PERFECT = Variant("perfect", 0.0)
+
+
+#: What a model and a truth have in common. "law": the truth is a limit of the model's own law,
+#: but for the number of modes. "cause": one of the causes of slow unloading is that of the truth,
+#: if in another form. "none": no mechanism. No model has the plays of H.
+_ASYMMETRIC = {"A": "cause", "S": "none", "L": "law", "H": "cause"}
+FAMILY: dict[str, dict[str, str]] = {
+    "none": dict.fromkeys("ASLH", "none"),
+    "published": dict.fromkeys("ASLH", "none"),
+    "published_bleed": dict.fromkeys("ASLH", "none"),
+    "prony": {"A": "none", "S": "none", "L": "law", "H": "none"},
+    "asymmetric": _ASYMMETRIC,
+    "asymmetric_log": _ASYMMETRIC,
+    "asymmetric_clock": _ASYMMETRIC | {"S": "cause"},
+}
 
 
 @dataclass(frozen=True)
 class Plan:
     """How much is worked out: shares of the histories' length, and copies with noise."""
 
-    truths: tuple[TruthKind, ...] = ("A", "S", "L", "H")
     scale: float = 1.0
     sample_hz: float = 25.0
     copies: int = 4
 
 
-def score(plan: Plan) -> tuple[list[Row], list[Row]]:
-    """Return the rows of errors, and one row per fit, of all truths in the plan."""
+def score(kind: TruthKind, plan: Plan) -> tuple[list[Row], list[Row]]:
+    """Return the rows of errors on a truth, and one row per model fitted to it."""
+    fits = fits_of(kind)
+    records = {
+        name: record(kind, make(plan.scale), plan.sample_hz) for name, make in HISTORIES.items()
+    }
+    series = _Series(records, plan.copies, seed=ord(kind))
+    rows = series.rows(PERFECT, kind, series.true_relaxation())
+    for variant in VARIANTS:
+        relaxation = series.relaxation(variant, _parameters(variant.model, kind))
+        rows += series.rows(variant, kind, relaxation)
+    return rows, [_fit_row(kind, found) for found in fits.values()]
+
+
+def cycles(kind: TruthKind, last: int, variants: tuple[Variant, ...]) -> list[Row]:
+    """Errors at the end of a press after 1, 10, ... `last` cycles of 5 s at 50 kPa, 5 s free.
+
+    The rows of the model "perfect" tell the relaxation of the truth itself.
+    """
+    truth = FoamTruth(kind, 1)
+    models = {
+        variant: make_model(
+            variant.model,
+            1,
+            _parameters(variant.model, kind),
+            update_s=variant.update_s,
+            dtype=variant.dtype,
+        )
+        for variant in variants
+    }
+    marks = {10**power for power in range(int(np.log10(last)) + 1)} | {last}
+    pressed, free = np.array([CYCLE_KPA]), np.zeros(1)
     rows: list[Row] = []
-    fits: list[Row] = []
-    # A fresh process per truth: the parent may run threads, which a fork would not survive.
-    with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
-        for some_rows, some_fits in pool.map(_score_truth, plan.truths, [plan] * len(plan.truths)):
-            rows += some_rows
-            fits += some_fits
-    return rows, fits
+    for cycle in range(1, last + 1):
+        for dt_s in CYCLE_STEPS_S:
+            true_kpa = max(float(truth.step(pressed, dt_s)[0]), 0.0)
+        answers = {PERFECT: np.array([CYCLE_KPA - true_kpa])}
+        for variant, model in models.items():
+            for dt_s in CYCLE_MODEL_STEPS_S:
+                answers[variant] = model.step(pressed, dt_s)
+        if cycle in marks:
+            rows += [_cycle_row(v, kind, cycle, float(a[0]), true_kpa) for v, a in answers.items()]
+        for dt_s in CYCLE_STEPS_S:
+            truth.step(free, dt_s)
+        for model in models.values():
+            for dt_s in CYCLE_MODEL_STEPS_S:
+                model.step(free, dt_s)
+    return rows
 
 
-def cycles(plan: Plan, last: int, names: tuple[str, ...]) -> list[Row]:
-    """Errors at the end of a press after 1, 10, ... `last` cycles of 5 s at 50 kPa, 5 s free."""
-    kinds = plan.truths[:2]
-    jobs = ([last] * len(kinds), [names] * len(kinds))
-    with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
-        return [row for rows in pool.map(_cycle, kinds, *jobs) for row in rows]
-
-
+@cache
 def fitted_hold(kind: TruthKind, sample_hz: float = 25.0) -> HoldRecord:
     """The calibration record of a truth, ready to be fitted."""
     held = record(kind, calibration_hold(), sample_hz)
@@ -94,52 +141,32 @@ def fitted_hold(kind: TruthKind, sample_hz: float = 25.0) -> HoldRecord:
     return merge(held.dt_s, held.momentary_kpa, held.pressure_kpa, 0, release)
 
 
-def _score_truth(kind: TruthKind, plan: Plan) -> tuple[list[Row], list[Row]]:
+@cache
+def fits_of(kind: TruthKind) -> dict[str, Fit]:
+    """Every model with parameters, fitted to the calibration record of a truth."""
     hold = fitted_hold(kind)
     fits = {model: fit(model, hold) for model in MODELS if model not in ("none", "published_bleed")}
     # The bleed has no parameter of its own.
-    fits["published_bleed"] = replace(fits["published"], model="published_bleed")
-    records = {
-        name: record(kind, make(plan.scale), plan.sample_hz) for name, make in HISTORIES.items()
+    return fits | {"published_bleed": replace(fits["published"], model="published_bleed")}
+
+
+def _parameters(model: str, kind: TruthKind) -> ParameterSet:
+    return stand_in("none", "mid") if model == "none" else fits_of(kind)[model].parameters
+
+
+def _cycle_row(
+    variant: Variant, kind: TruthKind, cycle: int, relaxation: float, true_kpa: float
+) -> Row:
+    return {
+        "model": variant.model,
+        "update_s": variant.update_s,
+        "dtype": variant.dtype,
+        "truth": kind,
+        "cycles": cycle,
+        "relaxation_kpa": relaxation,
+        "error_kpa": max(CYCLE_KPA - relaxation, 0.0) - true_kpa,
+        "unclamped_error_kpa": CYCLE_KPA - relaxation - true_kpa,
     }
-    series = _Series(records, plan.copies, seed=ord(kind))
-    rows = series.rows("perfect", 0.0, "float64", kind, series.true_relaxation())
-    for variant in VARIANTS:
-        parameters = (
-            stand_in("none", "mid") if variant.model == "none" else fits[variant.model].parameters
-        )
-        relaxation = series.relaxation(variant, parameters)
-        rows += series.rows(variant.model, variant.update_s, variant.dtype, kind, relaxation)
-    return rows, [_fit_row(kind, found) for found in fits.values()]
-
-
-def _cycle(kind: TruthKind, last: int, names: tuple[str, ...]) -> list[Row]:
-    hold = fitted_hold(kind)
-    truth = FoamTruth(kind, 1)
-    models = {name: make_model(name, 1, fit(name, hold).parameters) for name in names}
-    marks = [10**power for power in range(int(np.log10(last)) + 1)]
-    rows: list[Row] = []
-    for cycle in range(1, last + 1):
-        for dt_s in CYCLE_STEPS_S:
-            true_kpa = max(float(truth.step(np.array([CYCLE_KPA]), dt_s)[0]), 0.0)
-        pressed = {name: model.step(np.array([CYCLE_KPA]), 5.0) for name, model in models.items()}
-        if cycle in marks:
-            rows += [
-                {
-                    "model": name,
-                    "truth": kind,
-                    "cycles": cycle,
-                    "relaxation_kpa": float(relaxation[0]),
-                    "error_kpa": max(CYCLE_KPA - float(relaxation[0]), 0.0) - true_kpa,
-                    "unclamped_error_kpa": CYCLE_KPA - float(relaxation[0]) - true_kpa,
-                }
-                for name, relaxation in pressed.items()
-            ]
-        for dt_s in CYCLE_STEPS_S:
-            truth.step(np.zeros(1), dt_s)
-        for model in models.values():
-            model.step(np.zeros(1), 5.0)
-    return rows
 
 
 class _Series:
@@ -182,9 +209,7 @@ class _Series:
                 result[: len(lost), number * (self._copies + 1) + copy] = lost
         return result
 
-    def rows(
-        self, model: str, update_s: float, dtype: str, truth: str, relaxation: Floats
-    ) -> list[Row]:
+    def rows(self, variant: Variant, truth: str, relaxation: Floats) -> list[Row]:
         rows = []
         for number, (name, one) in enumerate(self._records.items()):
             samples = len(one.pressure_kpa)
@@ -198,10 +223,11 @@ class _Series:
                 resting = error[one.resting]
                 rows.append(
                     {
-                        "model": model,
-                        "update_s": update_s,
-                        "dtype": dtype,
+                        "model": variant.model,
+                        "update_s": variant.update_s,
+                        "dtype": variant.dtype,
                         "truth": truth,
+                        "in_common": FAMILY.get(variant.model, {}).get(truth),
                         "history": name,
                         "noise_units": noise,
                         "rms_kpa": _rms(error),

@@ -116,12 +116,11 @@ def _errors(report: Report) -> bytes:
 
 def _cycles(report: Report) -> bytes:
     figure, axes = _figure()
-    truths = list(dict.fromkeys(row["truth"] for row in report["cycles"]))
-    for truth, style in zip(truths, ("-", "--"), strict=False):
-        for model in dict.fromkeys(row["model"] for row in report["cycles"]):
-            mine = [
-                row for row in report["cycles"] if row["model"] == model and row["truth"] == truth
-            ]
+    rows = [row for row in report["cycles"] if row["model"] in COLOURS and row["update_s"] == 0.0]
+    truths = list(dict.fromkeys(row["truth"] for row in rows))
+    for truth, style in zip(truths, ("-", "--", ":", "-."), strict=False):
+        for model in dict.fromkeys(row["model"] for row in rows):
+            mine = [row for row in rows if row["model"] == model and row["truth"] == truth]
             axes.plot(
                 [row["cycles"] for row in mine],
                 [max(abs(row["unclamped_error_kpa"]), 1e-3) for row in mine],
@@ -135,7 +134,7 @@ def _cycles(report: Report) -> bytes:
         yscale="log",
         xlabel="cycles of 5 s at 50 kPa, 5 s free",
         ylabel="size of the error, kPa",
-        title="Does the error grow? Truth A solid, S dashed",
+        title="Does the error grow? Truth A solid, S dashed, L dotted, H dash-dotted",
     )
     axes.legend(fontsize=7)
     return _png(figure)

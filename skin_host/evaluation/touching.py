@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.viscoelastic import TruthKind
-from skin_host.evaluation.accuracy import fitted_hold
+from skin_host.evaluation.accuracy import fits_of
 from skin_host.evaluation.histories import Holds, record
 from skin_host.evaluation.rig import Rig
-from skin_host.processing.fitting import fit
 from skin_host.processing.pressure import PressureCurve
+from skin_host.settings import Relaxation
 
 Row = dict[str, Any]
 
@@ -23,17 +23,21 @@ BOARDS = 10
 
 
 def false_touches(
-    hours: float, votes: tuple[int, ...] = (1, 2, 3), boards: int = BOARDS
+    hours: float,
+    votes: tuple[int, ...] = (1, 2, 3),
+    noises: tuple[float, ...] = NOISES,
+    boards: int = BOARDS,
 ) -> list[Row]:
     """False touches of untouched skin per taxel-hour, against noise and votes.
 
     Args:
         hours: simulated, at 25 Hz.
         votes: of three samples.
+        noises: in units.
         boards: of 192 taxels each.
     """
     rows = []
-    for noise in NOISES:
+    for noise in noises:
         for needed in votes:
             rig = Rig(boards, noise, seed=3, processing={"touch": {"votes_of_3": needed}})
             before = np.zeros(rig.n, dtype=np.bool_)
@@ -87,60 +91,51 @@ def detection_delays(noise_units: float = 0.4, hz: float = 25.0, boards: int = B
     return rows
 
 
-def drift_lags(minutes: float) -> list[Row]:
-    """How far baselines lag behind a steady drift of all taxels, by rule and rate."""
+def drift_lags(minutes: float, rule: str) -> list[Row]:
+    """How far baselines lag behind a steady drift of all taxels, by rate."""
     rows = []
-    for rule in ("paper", "proportional"):
-        for rate in RATES:
-            rig = Rig(1, 0.4, seed=7, processing={"drift": {"rule": rule, "limit_units": 1000.0}})
-            touched = 0
-            # Never so far that the byte runs out of its scale.
-            seconds = min(60.0 * minutes, 150.0 / rate)
-            sweeps = round(seconds / rig.dt_s)
-            for sweep in range(sweeps):
-                drifted = rate * sweep * rig.dt_s
-                touched += int(np.count_nonzero(rig.step(drifted).touched))
-            lag = rig.true_baseline + drifted - rig.pipeline.baseline
-            rows.append(
-                {
-                    "rule": rule,
-                    "rate_units_per_s": rate,
-                    "seconds": seconds,
-                    "lag_units": float(np.mean(lag)),
-                    "touched_share": touched / (sweeps * rig.n),
-                }
-            )
+    for rate in RATES:
+        rig = Rig(1, 0.4, seed=7, processing={"drift": {"rule": rule, "limit_units": 1000.0}})
+        touched = 0
+        # Never so far that the byte runs out of its scale.
+        seconds = min(60.0 * minutes, 150.0 / rate)
+        sweeps = round(seconds / rig.dt_s)
+        for sweep in range(sweeps):
+            drifted = rate * sweep * rig.dt_s
+            touched += int(np.count_nonzero(rig.step(drifted).touched))
+        lag = rig.true_baseline + drifted - rig.pipeline.baseline
+        rows.append(
+            {
+                "rule": rule,
+                "rate_units_per_s": rate,
+                "seconds": seconds,
+                "lag_units": float(np.mean(lag)),
+                "touched_share": touched / (sweeps * rig.n),
+            }
+        )
     return rows
 
 
-def long_holds(quick: bool) -> list[Row]:
-    """What is said during and after a long press at 65 kPa, while everything drifts.
-
-    Some taxels of many are pressed, or all of them, so that no untouched one tells of drift.
-    """
-    hz = 10.0 if quick else 25.0
-    cases: list[tuple[str, float, float, float]] = [("10 min, 0.004 units/s", 600.0, 0.004, hz)]
+def hold_cases(quick: bool) -> list[tuple[TruthKind, str, float, float, float, bool]]:
+    """The long holds that are asked for, as arguments of `long_hold`; the longest first."""
+    kinds: tuple[TruthKind, ...] = ("A", "S") if quick else ("A", "S", "L", "H")
+    cases: list[tuple[str, float, float, float]] = [
+        ("10 min, 0.004 units/s", 600.0, 0.004, 10.0 if quick else 25.0)
+    ]
     if not quick:
-        cases += [
-            ("10 min, no drift", 600.0, 0.0, 25.0),
-            ("10 min, 0.001 units/s", 600.0, 0.001, 25.0),
+        cases = [
             ("8 h, no drift", 28800.0, 0.0, 5.0),
             ("8 h, 0.001 units/s", 28800.0, 0.001, 5.0),
+            ("10 min, no drift", 600.0, 0.0, 25.0),
+            ("10 min, 0.001 units/s", 600.0, 0.001, 25.0),
+            *cases,
         ]
-    kinds: tuple[TruthKind, ...] = ("A", "S") if quick else ("A", "S", "L", "H")
-    rows = []
-    for kind in kinds:
-        relaxation = fitted_table(kind, "asymmetric_clock")
-        for name, hold_s, rate, hz in cases:
-            rows += [
-                _hold(kind, name, hold_s, rate, hz, alone, relaxation) for alone in (False, True)
-            ]
-    return rows
+    return [(kind, *case, alone) for kind in kinds for case in cases for alone in (False, True)]
 
 
 def fitted_table(kind: TruthKind, model: str) -> dict[str, Any]:
     """The configuration table `processing.relaxation` fitted to a truth's calibration hold."""
-    found = fit(model, fitted_hold(kind)).parameters
+    found = fits_of(kind)[model].parameters
     table: dict[str, Any] = {
         "model": model,
         "beta": list(found.beta),
@@ -154,16 +149,21 @@ def fitted_table(kind: TruthKind, model: str) -> dict[str, Any]:
     return table
 
 
-def _hold(
-    kind: TruthKind,
-    name: str,
-    hold_s: float,
-    rate: float,
-    hz: float,
-    alone: bool,
-    relaxation: dict[str, Any],
+def long_hold(
+    kind: TruthKind, name: str, hold_s: float, rate: float, hz: float, alone: bool
 ) -> Row:
+    """What is said during and after a long press at 65 kPa, while everything drifts.
+
+    Args:
+        kind: the truth; the default model is fitted to its calibration hold.
+        name: of the case.
+        hold_s: length of the press.
+        rate: drift in units per s.
+        hz: sweeps a second.
+        alone: whether all taxels are pressed, so that no untouched one tells of drift.
+    """
     rest_s = 900.0
+    relaxation = fitted_table(kind, Relaxation().model)
     holds: Holds = [(0.0, 30.0), (HOLD_KPA, hold_s), (0.0, rest_s)]
     played = record(kind, holds, hz)
     rig = Rig(1, 0.4, seed=11, hz=hz, processing={"relaxation": relaxation})

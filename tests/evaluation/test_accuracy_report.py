@@ -1,6 +1,7 @@
 """The report's parts in small: what they contain, and that they say what is so."""
 
 import json
+import pickle
 
 import numpy as np
 import pytest
@@ -10,38 +11,36 @@ from skin_host.evaluation.accuracy import Plan
 from skin_host.evaluation.histories import HISTORIES, record
 from skin_host.evaluation.rig import Rig
 
-PLAN = Plan(("S",), 0.03, 5.0, 1)
+PLAN = Plan(0.03, 5.0, 1)
 
 
 @pytest.fixture(scope="module")
 def small():
     """A whole report of one truth, short histories and next to no repeats."""
-    rows, fits = accuracy._score_truth("S", PLAN)
+    rows, fits = accuracy.score("S", PLAN)
     made = {
         "schema": report.SCHEMA,
         "date": "2026-01-02T03:04:05+00:00",
         "machine": report.machine(),
         "quick": True,
-        "default": report.DEFAULT,
+        "default": report._key(report.DEFAULT),
         "rows": rows,
         "fits": fits,
-        "cycles": accuracy._cycle("S", 100, ("published", report.DEFAULT["model"])),
+        "cycles": accuracy.cycles("S", 200, report.QUICKLY_CYCLED),
         "speed": speed.models(0.0, (192, 1920)),
         "pipeline": speed.pipeline(0.0, (1, 10)),
         "unwatched": speed.cost_of_glancing(10.0),
-        "false_touches": touching.false_touches(0.001, (2,), 1),
+        "false_touches": touching.false_touches(0.001, (2,), boards=1),
         "detection": touching.detection_delays(boards=1),
-        "drift": touching.drift_lags(0.1),
+        "drift": touching.drift_lags(0.1, "paper"),
         "holds": [
-            touching._hold(
-                "S", "short", 600.0, 0.0, 5.0, alone, touching.fitted_table("S", "asymmetric")
-            )
-            for alone in (False, True)
+            touching.long_hold("S", "short", 600.0, 0.0, 5.0, alone) for alone in (False, True)
         ],
         "localization": report._localization(20),
         "seconds": 1.0,
     }
     made["summary"] = report.summary(made)
+    made["cycle_evidence"] = report.cycle_evidence(made)
     return made
 
 
@@ -68,6 +67,33 @@ def test_rows_have_what_readers_count_on(small):
     for row in small["speed"]:
         assert {"model", "dtype", "taxels", "ns_per_taxel_step"} <= set(row)
         assert row["ns_per_taxel_step"] > 0.0
+
+
+def test_the_error_of_a_cycle_is_told_with_what_the_truth_itself_still_moves(small):
+    (row,) = small["cycle_evidence"]
+    assert row["true_relaxation_kpa"][1] > row["true_relaxation_kpa"][0] > 5.0
+    assert max(map(abs, row["error_kpa"])) < 0.1 * row["true_relaxation_kpa"][0]
+    assert row["change_by_float32_and_1_hz_kpa"] < 0.01
+    growth, last = report.growth_of_error(report.select(small["cycles"], **small["default"]))
+    assert last == 200
+    assert growth == pytest.approx(abs(row["error_kpa"][1]) - abs(row["error_kpa"][0]))
+
+
+def test_each_row_tells_what_its_model_shares_with_its_truth(small):
+    shared = {row["model"]: row["in_common"] for row in small["rows"]}
+    assert shared["asymmetric_clock"] == "cause"
+    assert shared["asymmetric"] == shared["prony"] == "none"
+    assert accuracy.FAMILY["prony"]["L"] == "law"
+    # No model is what any other truth is made of.
+    assert all(of["H"] != "law" != of["A"] for of in accuracy.FAMILY.values())
+
+
+def test_jobs_are_sent_to_processes_with_all_that_they_need():
+    for name, function, arguments in report._jobs(quick=True):
+        assert pickle.loads(pickle.dumps((name, function, arguments)))[0] == name
+    assert {name for name, *_ in report._jobs(quick=True)} == {
+        name for name, *_ in report._jobs(quick=False)
+    }
 
 
 def test_what_is_on_the_pareto_front_is_beaten_by_nothing(small):
