@@ -17,11 +17,13 @@ from skin_host.publish.topics import Topics
 PROBLEM: Final = "{{ 'OFF' if value_json.state == 'ok' else 'ON' }}"
 WHY: Final = "{{ {'state': value_json.state, 'sentences': value_json.sentences} | tojson }}"
 #: What cannot be felt is not "not touched": then the contact is unavailable.
-FEELS: Final = "{{ 'online' if value_json.state in ('ok', 'degraded') else 'offline' }}"
+FEELS: Final = (
+    "{{ 'online' if value_json.state in ('ok', 'degraded', 'saturated') else 'offline' }}"
+)
 
 
 def discovery(prefix: str, topics: Topics, info: NodeInfo) -> dict[str, bytes]:
-    """Topics and payloads, to be retained, that announce the parts of a node.
+    """Topics and payloads, to be retained, that announce the parts and fingertips of a node.
 
     Args:
         prefix: where Home Assistant looks, `homeassistant` unless it was told otherwise.
@@ -31,7 +33,7 @@ def discovery(prefix: str, topics: Topics, info: NodeInfo) -> dict[str, bytes]:
     skin = _identifier(topics.base)
     alive = {"topic": topics.node("status", info.node)}
     messages: dict[str, dict[str, Any]] = {}
-    for part in info.parts:
+    for part in [*info.parts, *info.fingertips]:
         health = topics.part("health", part)
         messages[f"{skin}_{part}_contact"] = {
             "name": f"{part} contact",

@@ -27,9 +27,21 @@ _HEAD = struct.Struct("<BBHIIIdII")
 _U32 = 2**32
 
 
+#: A fingertip on a force/torque board has contacts and health; its health is what is timed.
+_NO_TAXELS: dict[str, Any] = {
+    "period_ms": 1000,
+    "pads": [],
+    "position_m": [],
+    "normal": [],
+    "radius_mm": [],
+    "area_mm2": [],
+    "triangles": [],
+}
+
+
 @dataclass(slots=True)
 class PartView:
-    """One part: what was heard last, and counters whose change tells pages what is new."""
+    """One part or fingertip: what was heard last; counters tell pages what is new by changing."""
 
     number: int
     node: str
@@ -169,6 +181,15 @@ class Picture:
                 view.number, view.node = len(self.parts), node
                 self.parts[name] = view
                 parts.append({"name": name, "node": node} | msgspec.to_builtins(part))
+        # After them, as parts without taxels: pages number frames by the parts alone.
+        for node, info in nodes.items():
+            for name in info.fingertips:
+                view = old.get(name)
+                if view is None or view.n_taxels:
+                    view = PartView(0, node, 0)
+                view.number, view.node = len(self.parts), node
+                self.parts[name] = view
+                parts.append({"name": name, "node": node, "fingertip": True} | _NO_TAXELS)
         self.version += 1
         self._layout = msgspec.json.encode(
             {
@@ -240,6 +261,7 @@ class _Record(Struct):
 
     state: str = ""
     sentences: list[str] = []
+    rate_hz: float | None = None
     taxels: int | None = None
     valid_taxels: int | None = None
     triangles: list[_Triangle] = []

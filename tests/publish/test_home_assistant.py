@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+import msgspec
 import pytest
 
 from skin_host.layout import build_layout
 from skin_host.publish.home_assistant import discovery
-from skin_host.publish.info import NodeInfo, node_info
+from skin_host.publish.info import FingertipInfo, NodeInfo, node_info
 from skin_host.publish.mqtt import Publisher
 from skin_host.publish.topics import Topics
 from skin_host.settings import Mqtt, load
@@ -65,8 +66,8 @@ def test_a_contact_is_announced_as_documented(told: dict[str, Any]) -> None:
             {"topic": "skin/demo/nodes/main/status"},
             {
                 "topic": "skin/demo/left_hand/health",
-                "value_template": "{{ 'online' if value_json.state in ('ok', 'degraded') "
-                "else 'offline' }}",
+                "value_template": "{{ 'online' if value_json.state in "
+                "('ok', 'degraded', 'saturated') else 'offline' }}",
             },
         ],
         "availability_mode": "all",
@@ -125,6 +126,7 @@ def test_a_base_of_several_words_makes_a_topic_of_one(info: NodeInfo) -> None:
     [
         ("ok", "online", "OFF"),
         ("degraded", "online", "ON"),
+        ("saturated", "online", "ON"),
         ("silent", "offline", "ON"),
         ("no data", "offline", "ON"),
         ("not calibrated", "offline", "ON"),
@@ -145,6 +147,18 @@ def test_a_part_that_feels_nothing_is_unavailable_and_never_untouched(
     assert said(contact["availability"][1]["value_template"]) == feels
     assert said(health["value_template"]) == problem
     assert json.loads(said(health["json_attributes_template"])) == record
+
+
+def test_a_fingertip_is_announced_like_a_part(info: NodeInfo) -> None:
+    tip = FingertipInfo(3, "sphere", [7.0], None, None, 0.1, 10.0)
+    found = discovery(
+        "homeassistant",
+        Topics("skin", "demo"),
+        msgspec.structs.replace(info, fingertips={"tip": tip}),
+    )
+    told = json.loads(found["homeassistant/binary_sensor/skin_demo_tip_contact/config"])
+    assert told["state_topic"] == "skin/demo/tip/contact"
+    assert "homeassistant/binary_sensor/skin_demo_tip_problem/config" in found
 
 
 async def test_it_is_retained_on_the_broker_if_it_was_asked_for(

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 
 from skin_host.client import Contact, Frame, Health, NodeInfo, PartInfo, Touch
-from skin_host.publish.info import TriangleInfo
+from skin_host.publish.info import FingertipInfo, TriangleInfo
 from skin_host.viewer.picture import Cursor, Picture
 
 
@@ -217,3 +217,36 @@ def test_nodes_that_go_offline_are_told() -> None:
     skin.take_nodes("test", {"main": (False, info({"palm": 3}))})
     skin.take_status({"connected": True})
     assert texts(skin.news(cursor))["status"]["nodes"] == {"main": False}
+
+
+def test_a_fingertip_without_skin_is_told_with_its_contacts_and_health() -> None:
+    tip = FingertipInfo(3, "sphere", [7.0], None, None, 0.1, 10.0)
+    other = msgspec.structs.replace(info({"back": 2}, "two"), fingertips={"tip": tip})
+    skin = picture()
+    skin.take_nodes("test", {"two": (True, other), "main": (True, info({"palm": 3}))})
+    skin.take_touch(msgspec.structs.replace(touch("begin", 4, "tip"), taxels=[], peak_kpa=None))
+    skin.take_health(Health("tip", {"state": "saturated", "rate_hz": 333.0}))
+    skin.take_frame(frame("palm", [1, 2, 3]))
+    news = skin.news(Cursor())
+    parts = texts(news)["layout"]["parts"]
+    assert [part["name"] for part in parts] == ["back", "palm", "tip"]
+    assert (parts[2]["fingertip"], parts[2]["pads"]) == (True, [])
+    (told,) = [
+        message
+        for message in map(msgspec.json.decode, (text for text in news if isinstance(text, str)))
+        if message["type"] == "contacts" and message["part"] == "tip"
+    ]
+    assert [(contact["id"], contact["peak_kpa"]) for contact in told["contacts"]] == [(4, None)]
+    assert texts(news)["health"] == {
+        "type": "health",
+        "part": "tip",
+        "state": "saturated",
+        "sentences": [],
+        "rate_hz": 333.0,
+        "taxels": None,
+        "valid_taxels": None,
+        "triangles": [],
+    }
+    # Frames name their part by its place in the layout.
+    (bytes_,) = [message for message in news if isinstance(message, bytes)]
+    assert struct.unpack_from("<H", bytes_, 2) == (1,)

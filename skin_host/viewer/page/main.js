@@ -51,7 +51,7 @@ function take(data) {
   else if (message.type === "contacts") {
     const part = store.part(message.part);
     if (part) part.contacts = message.contacts;
-  } else if (message.type === "health") store.takeHealth(message);
+  } else if (message.type === "health") store.takeHealth(message, performance.now());
   else if (message.type === "answer") answered(message);
 }
 

@@ -94,7 +94,7 @@ export class SkinMap {
 
   get parts() {
     const one = this.shown && this.store.part(this.shown);
-    return one ? [one] : this.store.parts;
+    return one?.n ? [one] : this.store.parts.filter((part) => part.n);
   }
 
   /** Parts have come or changed. */

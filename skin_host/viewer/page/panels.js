@@ -48,7 +48,7 @@ export function showContacts(table, hint, store, nowMs) {
     return row;
   }).forEach((row, i) => {
     const [name, contact] = rows[i];
-    const cells = [name, `#${contact.id}`, `${contact.force_n.toFixed(2)} N`, `${contact.peak_kpa.toFixed(1)} kPa`, `${contact.area_mm2.toFixed(0)} mm²`];
+    const cells = [name, `#${contact.id}`, told(contact.force_n, 2, "N"), told(contact.peak_kpa, 1, "kPa"), told(contact.area_mm2, 0, "mm²")];
     cells.forEach((text, k) => put(row.children[k], text));
   });
 }
@@ -75,11 +75,17 @@ export function showHealth(box, store, shown, nowMs) {
     put(head.lastChild, part.heardMs === null ? "no data" : stale ? "stale" : part.health?.state ?? "");
     const valid = part.health?.valid_taxels;
     const taxels = valid === undefined ? `${part.n} taxels` : `${valid} of ${part.health.taxels} taxels valid`;
-    put(rates, `${part.rate(nowMs).toFixed(1)} frames/s, ${part.missed} missed, ${taxels}`);
-    const said = [...(stale && part.heardMs !== null ? [`No frame for ${((nowMs - part.heardMs) / 1000).toFixed(0)} s.`] : []), ...(part.health?.sentences ?? [])];
+    const frames = `${part.rate(nowMs).toFixed(1)} frames/s, ${part.missed} missed, ${taxels}`;
+    put(rates, part.fingertip ? `${told(part.health?.rate_hz, 0, "samples/s")} of force and torque` : frames);
+    const said = [...(stale && part.heardMs !== null ? [`${part.fingertip ? "Nothing" : "No frame"} for ${((nowMs - part.heardMs) / 1000).toFixed(0)} s.`] : []), ...(part.health?.sentences ?? [])];
     keep(list, said.length, () => document.createElement("li")).forEach((item, k) => put(item, said[k]));
     list.hidden = !said.length;
   });
+}
+
+/** A number with its unit; where there is no skin there is no pressure and no area. */
+function told(value, decimals, unit) {
+  return Number.isFinite(value) ? `${value.toFixed(decimals)} ${unit}` : "–";
 }
 
 function put2(node, text) {

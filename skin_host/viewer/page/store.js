@@ -9,6 +9,7 @@ export class Part {
   constructor(info) {
     this.name = info.name;
     this.node = info.node;
+    this.fingertip = Boolean(info.fingertip); // on a force/torque board: it has no taxels
     this.n = info.pads.length;
     this.periodMs = info.period_ms;
     this.thermal = info.pads.map((pad) => pad === "thermal");
@@ -121,10 +122,11 @@ export class Store {
     if (view.getUint32(4, true) === part.n) part.take(view, nowMs);
   }
 
-  takeHealth(message) {
+  takeHealth(message, nowMs) {
     const part = this.part(message.part);
     if (!part) return;
     part.health = message;
+    if (part.fingertip) part.heardMs = nowMs;
     part.faults = new Set((message.triangles ?? []).map((t) => `${t.board}/${t.triangle}`));
   }
 }
