@@ -4,7 +4,9 @@ The acquisition hands over batches and goes on; a thread writes. What the disk d
 in time, or at all, is lost to the recording, counted, and never felt by anyone else.
 """
 
+import contextlib
 import logging
+import os
 import queue
 import threading
 import time
@@ -61,7 +63,7 @@ class Recorder:
         self._queue: queue.Queue[tuple[str, FrameBatch] | None] = queue.Queue(WAITING_BATCHES)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = path.open("xb")
+            self._file = path.open("xb", buffering=0)
         except OSError as error:
             raise SkinError(f"{path}: cannot be recorded to: {error.strerror}") from None
         self._thread = threading.Thread(target=self._write, name="recorder", daemon=True)
@@ -87,6 +89,7 @@ class Recorder:
         self._thread.join(5.0)
 
     def _write(self) -> None:
+        level = logging.INFO
         try:
             with self._file as file:
                 while True:
@@ -105,10 +108,18 @@ class Recorder:
                     if self.bytes + len(lines) > self._max_bytes:
                         self.ended = f"it reached its {self._max_bytes} bytes"
                         return
-                    file.write(lines)
+                    self._append(lines)
                     self.bytes += len(lines)
                     self.frames += len(item[1])
         except OSError as error:
+            level = logging.WARNING
             self.ended = f"cannot write: {error.strerror}"
+            with contextlib.suppress(OSError):
+                os.truncate(self.path, self.bytes)  # whole lines, all of them counted
         finally:
-            log.info("recording %s ended: %s", self.path, self.ended)
+            log.log(level, "recording %s ended: %s", self.path, self.ended)
+
+    def _append(self, lines: bytes) -> None:
+        rest = memoryview(lines)
+        while rest:
+            rest = rest[self._file.write(rest) :]

@@ -97,6 +97,8 @@ class BoardWatch:
         self.sweeps += 1
         self.heard_ns = sweep.t_ns
         self.silent = False
+        if self.times_ns and not 0 < sweep.t_ns - self.times_ns[-1] < LONGEST_PAUSE_NS:
+            self.times_ns.clear()  # a pause, or the clock was set: no period
         self.times_ns.append(sweep.t_ns)
         here = sweep.present >> _TRIANGLES & 1
         self.absent = (self.absent + 1) * (here == 0)

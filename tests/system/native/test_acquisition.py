@@ -5,117 +5,34 @@ ACQUISITION_SECONDS sets how long things are broken.
 """
 
 import asyncio
-import contextlib
 import logging
 import os
 import random
 import statistics
 import time
 from collections import Counter, defaultdict
-from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
 import pytest
 
-from emulator.scene import Place, Probe, Scene
+from emulator.scene import Scene
 from skin_host.client import SkinClient, Stream, Touch
-from skin_host.daemon import Daemon
-from skin_host.health import Record
-from skin_host.layout import build_layout
 from skin_host.processing.pipeline import PressureFrame
-from skin_host.settings import Bus, load
-from tests.support import scheduled_bus
 from tests.support.broker import Mosquitto, break_at_random
 from tests.support.scheduled_bus import ScheduledBus
+from tests.support.steady import (
+    MOST,
+    PROBES,
+    believed,
+    daemon_of,
+    four_parts,
+    pressed,
+    until,
+    whole_skin,
+)
 
 SECONDS = float(os.environ.get("ACQUISITION_SECONDS", "12"))
-PATIENCE_S = 60.0
 FRAMES_A_SWEEP = 32
-#: The skin is left alone for so long, then pressed here and there, again and again.
-UNTOUCHED_S = 6.0
-LOOP_S = 4.0
-PRESS_S = 0.6
-PROBES = 6
-MOST = 0.9
-
-
-def whole_skin(folder: Path) -> Path:
-    """2112 taxels in one part: eleven boards on three buses, at 50 Hz."""
-    lines = ['robot = "load"']
-    for board in range(11):
-        bus, address = divmod(board, 4)
-        lines += [f"[buses.can{bus}]"] * (address == 0)
-        lines += [f"[boards.b{board}]", f'bus = "can{bus}"', f"address = {address + 1}"]
-        lines += ["period_ms = 20", "[[parts.body.patches]]", f'board = "b{board}"']
-        lines += ['triangles = "0-15"']
-    return written(folder, lines)
-
-
-def four_parts(folder: Path) -> Path:
-    """Four parts of 192 taxels, each of one board on a bus of its own, at 20 Hz."""
-    lines = ['robot = "load"']
-    for number in range(4):
-        lines += [f"[buses.can{number}]", f"[boards.b{number}]", f'bus = "can{number}"']
-        lines += ["address = 1", "period_ms = 50"]
-        lines += [f"[[parts.part{number}.patches]]", f'board = "b{number}"', 'triangles = "0-15"']
-    return written(folder, lines)
-
-
-def written(folder: Path, lines: list[str]) -> Path:
-    path = folder / "load.toml"
-    path.write_text("\n".join(lines))
-    return path
-
-
-def pressed(part: str, taxels: int) -> Scene:
-    """Each probe presses once in two seconds, none over the seam of the loop."""
-    probes = [
-        Probe(
-            part=part,
-            at=Place(taxel=number * taxels // PROBES + 3),
-            pressure_kpa=[(0.0, 0.0), (0.1, 60.0), (PRESS_S - 0.1, 60.0), (PRESS_S, 0.0)],
-            start_s=UNTOUCHED_S + 0.1 + (1.8 - PRESS_S) * number / PROBES,
-            repeat_s=2.0,
-        )
-        for number in range(PROBES)
-    ]
-    return Scene(spread=False, probe=probes)
-
-
-@contextlib.asynccontextmanager
-async def daemon_of(config: Path, scene: Scene, port: int) -> AsyncIterator[Daemon]:
-    """A calibrated daemon on scheduled buses."""
-    scheduled_bus.register()
-    settings = load(config)
-    layout = build_layout(settings, config.parent)
-    files = scheduled_bus.record(
-        settings, layout, scene, UNTOUCHED_S + LOOP_S, LOOP_S, config.parent
-    )
-    for bus, file in files.items():
-        settings.buses[bus] = Bus(interface=scheduled_bus.INTERFACE, channel=str(file))
-    settings.mqtt.port = port
-    settings.service.state_directory = str(config.parent)
-    settings.processing.calibration.seconds = 1.0
-    settings.processing.touch.move_hz = 5.0
-    daemon = Daemon(settings, layout)
-    stop = asyncio.Event()
-    running = asyncio.create_task(daemon.run(stop))
-    try:
-        await until(lambda: daemon.engine.calibration or running.done())
-        yield daemon
-    finally:
-        stop.set()
-        await running
-
-
-async def until(condition: Callable[[], object]) -> None:
-    async with asyncio.timeout(PATIENCE_S):
-        while not condition():  # noqa: ASYNC110
-            await asyncio.sleep(0.02)
-
-
-def believed(record: Record) -> bool:
-    return record["valid_taxels"] > MOST * record["taxels"]
 
 
 class Heard:
@@ -158,6 +75,7 @@ async def test_a_broken_broker_costs_no_sweep_and_no_untold_touch(
             await skin.ready()
             before = heard.events["end"]
             await until(lambda: heard.events["end"] > before + PROBES)
+            await until(lambda: daemon.publisher.counters.touches_waiting < PROBES)
         counters = daemon.publisher.counters
         await until(lambda: heard.last_count == counters.touches_sent + counters.touches_dropped)
         listening.cancel()
@@ -202,7 +120,6 @@ async def test_one_bus_of_four_that_is_unplugged_leaves_the_others_alone(
             valid[frame.part].append(float(frame.valid.mean()))
             put(frame)
 
-        # The emulator draws a few pads that are too noisy to be believed.
         await until(lambda: all(map(believed, daemon.records().values())))
         daemon.publisher.put_frame = put_frame  # type: ignore[method-assign]
         await asyncio.sleep(SECONDS / 2)
