@@ -91,7 +91,7 @@ class Recorder:
     def _write(self) -> None:
         level = logging.INFO
         try:
-            with self._file as file:
+            with self._file:
                 while True:
                     left_s = self._until_s - time.monotonic()
                     if left_s <= 0:
