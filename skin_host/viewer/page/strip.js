@@ -3,7 +3,9 @@ import { DASHES, LINES, paper, theme } from "./colours.js";
 import { HISTORY_S } from "./store.js";
 
 const LEFT = 34;
-const BOTTOM = 16;
+const BOTTOM = 22;
+/** Noise below zero has this much room, and stays clear of the labels. */
+const BELOW = 5;
 /** Points farther apart than this are not joined: nothing was heard between. */
 const GAP_MS = 700;
 
@@ -21,7 +23,7 @@ export function drawStrip(canvas, store, chosen, raw, nowMs) {
   const peak = courses.flat().reduce((top, [, value]) => (value > top ? value : top), 0);
   const top = raw ? 255 : nice(Math.max(peak * 1.1, 5));
   const x = (t) => LEFT + ((t - nowMs) / 1000 / HISTORY_S + 1) * (w - LEFT - 4);
-  const y = (value) => 6 + (1 - value / top) * (h - BOTTOM - 6);
+  const y = (value) => Math.min(6 + (1 - value / top) * (h - BOTTOM - 6), h - BOTTOM + BELOW);
   ctx.font = "11px system-ui, sans-serif";
   ctx.fillStyle = look.dim;
   ctx.strokeStyle = look.line;
