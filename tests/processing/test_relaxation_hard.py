@@ -1,4 +1,11 @@
-"""Hard cases of the relaxation models, in reduced length; `skin report` runs the long ones."""
+"""Hard cases of the relaxation models.
+
+Half a day by default. The full length is five days:
+
+    SOAK_DAYS=5 pytest tests/processing/test_relaxation_hard.py -k days
+"""
+
+import os
 
 import numpy as np
 import pytest
@@ -11,6 +18,7 @@ from skin_host.processing.relaxation import (
     stand_in,
 )
 
+DAYS = float(os.environ.get("SOAK_DAYS", "0.5"))
 CLOCK = stand_in("asymmetric_clock", "mid")
 DEFAULT = {"model": "asymmetric_clock", "parameters": CLOCK, "update_s": 1.0}
 
@@ -45,22 +53,48 @@ def test_a_slow_mode_at_100_hz_in_float32_reaches_what_float64_reaches():
     assert answer == pytest.approx(exact, abs=3e-3)
 
 
-@pytest.mark.parametrize("hz", [50, 100])
-def test_days_of_noisy_work_in_float32_stay_with_float64(hz):
-    """As windows of hz samples: half a day of hours-long holds and of grasps."""
-    rng = np.random.default_rng(hz)
-    seconds = 12 * 3600
+def test_days_of_noisy_work_in_float32_stay_with_float64():
+    """Windows of 50 and of 100 samples side by side: hours-long holds, and grasps."""
+    rng = np.random.default_rng(5)
+    seconds = round(86_400 * DAYS)
     level = np.where(
         np.arange(seconds) % 7200 < 3600, 60.0, 40.0 * (rng.uniform(size=seconds) < 0.3)
     )
-    noise = rng.normal(0.0, 1.0 / np.sqrt(hz), (seconds, 2))
+    noise = rng.normal(0.0, 1.0, (seconds, 4)) / np.sqrt([50, 50, 100, 100])
     samples = np.maximum(level[:, np.newaxis] + noise, 0.0)
-    single, double = (default(2, update_s=0.0, dtype=kind) for kind in ("float32", "float64"))
-    worst = 0.0
-    for sample in samples:
+    single, double = (default(4, update_s=0.0, dtype=kind) for kind in ("float32", "float64"))
+    apart = np.empty(seconds)
+    for second, sample in enumerate(samples):
         difference = single.step(sample, 1.0) - double.step(sample, 1.0)
-        worst = max(worst, float(np.abs(difference).max()))
-    assert worst < 0.01
+        apart[second] = np.abs(difference).max()
+    first, last = apart[: seconds // 2].max(), apart[seconds // 2 :].max()
+    assert max(first, last) < 0.01
+    assert last < 2.0 * first
+
+
+@pytest.mark.parametrize("hz", [50, 100])
+def test_samples_of_an_hour_in_float32_stay_with_float64(hz):
+    rng = np.random.default_rng(hz)
+    single, double = (default(2, dtype=kind) for kind in ("float32", "float64"))
+    for minute in range(60):
+        level = 60.0 * (minute % 3 < 2)
+        for sample in np.maximum(level + rng.normal(0.0, 1.0, (hz, 2)), 0.0):
+            difference = single.step(sample, 1.0 / hz) - double.step(sample, 1.0 / hz)
+            assert np.abs(difference).max() < 0.01
+        for model in (single, double):
+            model.step(np.full(2, level), 59.0)
+
+
+def test_after_1e5_cycles_the_default_in_float32_repeats_itself():
+    model = default(update_s=0.0, dtype="float32")
+    pressed, free = np.full(1, 50.0, np.float32), np.zeros(1, np.float32)
+    peaks = []
+    for cycle in range(100_000):
+        peak = float(model.step(pressed, 5.0)[0])
+        model.step(free, 5.0)
+        if cycle in (19_999, 99_999):
+            peaks.append(peak)
+    assert peaks[1] == pytest.approx(peaks[0], abs=1e-4)
 
 
 @pytest.mark.parametrize("name", ["prony", "asymmetric", "asymmetric_log", "asymmetric_clock"])
