@@ -3,7 +3,7 @@
 The recording begins with some seconds of untouched skin, which serve as its calibration.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -150,7 +150,12 @@ def hold_record(
             now_s += samples.start_s
         inside = (now_s >= time_s[0]) & (now_s <= time_s[-1])
         pressure = np.where(inside, np.interp(now_s, time_s, load_kpa), pressure)
-    return merge(samples.dt_s, momentary, pressure, start, release)
+    record = merge(samples.dt_s, momentary, pressure, start, release)
+    held_units = np.median(samples.units(slice(start, release), chosen), axis=0)
+    half = 0.5 * np.array([[-1.0], [1.0]])
+    low, high = curve.part(chosen).kpa(held_units + half)
+    unit_rms_kpa = float(np.mean(high - low) / np.sqrt(12.0 * np.count_nonzero(chosen)))
+    return replace(record, unit_rms_kpa=unit_rms_kpa)
 
 
 def fit_relaxation(record: HoldRecord, models: list[str]) -> list[Fit]:

@@ -100,6 +100,7 @@ def _relaxation(arguments: argparse.Namespace) -> int:
                 "hold_s": record.hold_s,
                 "rest_s": record.rest_s,
                 "level_kpa": record.level_kpa,
+                "unit_rms_kpa": record.unit_rms_kpa,
                 "fits": [_as_record(found) for found in fits],
                 "remarks": list(chosen.remarks),
             }
@@ -179,6 +180,7 @@ def _describe(fits: list["Fit"], model: str, record: "HoldRecord") -> str:
         for found in fits
     ]
     (chosen,) = [found for found in fits if found.model == model]
+    lines.append(f"of that, readings in whole units leave up to {record.unit_rms_kpa:.2f} kPa")
     lines += [f"not known from this record: {remark}" for remark in chosen.remarks]
     lines += [
         f"not known from this record: {name}, only within a factor of {factor:g}"

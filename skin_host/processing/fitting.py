@@ -44,12 +44,15 @@ class HoldRecord:
         momentary_kpa: float64[t], mean of C over each step.
         pressure_kpa: float64[t], true pressure at the end of each step, NaN where unknown.
         released: index of the first step after the release.
+        unit_rms_kpa: what readings in whole units leave of an error at the hold's level, if no
+            noise blurs them; 0 for exact readings.
     """
 
     dt_s: Floats
     momentary_kpa: Floats
     pressure_kpa: Floats
     released: int
+    unit_rms_kpa: float = 0.0
 
     @property
     def hold_s(self) -> float:

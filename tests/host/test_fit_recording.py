@@ -86,6 +86,8 @@ def test_a_hold_and_release_becomes_a_file_that_the_configuration_takes(bench, h
     told = json.loads(said.out)
     assert told["hold_s"] == pytest.approx(240.0, abs=2.0)
     assert told["level_kpa"] == pytest.approx(57.0, abs=4.0)
+    # Six taxels at 1.7 kPa a unit.
+    assert told["unit_rms_kpa"] == pytest.approx(1.7 / np.sqrt(12 * 6), abs=0.03)
     by_model = {found["model"]: found for found in told["fits"]}
     assert by_model["asymmetric_clock"]["rms_hold_kpa"] < 1.0
     assert by_model["asymmetric_clock"]["rms_rest_kpa"] < 1.0
@@ -102,6 +104,7 @@ def test_people_are_told_what_the_record_cannot_tell(bench, hold, capsys):
     status, said = run(capsys, "calibrate", bench, "--relaxation", log, "--weight-kpa", 50)
     assert status == 0
     assert "> asymmetric_clock" in said.out
+    assert "readings in whole units leave up to 0.2" in said.out
     assert "not known from this record" in said.out
     assert "bench.relaxation.json" in said.out
 
