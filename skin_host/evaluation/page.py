@@ -150,7 +150,7 @@ def _sections(report: Report) -> list[Section]:
                     "losses that grow with pressure (A and H), are in no model: H is the truth "
                     "against which no model is in family. `asymmetric` and `asymmetric_log` share "
                     "nothing with S. Read those rows for what to expect of foam whose law nobody "
-                    "knows."
+                    f"knows. {tables.verdict_of_strangers(report)}"
                 ),
             ],
             [tables.family(report)],

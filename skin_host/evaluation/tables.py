@@ -3,13 +3,17 @@
 from dataclasses import astuple
 from typing import Any
 
-from skin_host.evaluation.accuracy import FAMILY, PERFECT, VARIANTS
+from skin_host.evaluation.accuracy import FAMILY, PERFECT, VARIANTS, Variant
 from skin_host.evaluation.histories import HISTORIES
 
 Row = dict[str, Any]
 Report = dict[str, Any]
 Table = tuple[list[str], list[list[str]]]
 
+#: The variants but for their numbers' type.
+ALONE = [variant for variant in VARIANTS if variant.dtype == "float64"]
+#: What happens to it at every press and release, its plays, is in no model.
+STRANGER = "H"
 IN_COMMON = {"law": "its law", "cause": "a cause", "none": "nothing"}
 
 
@@ -77,28 +81,55 @@ def errors(report: Report, noise: float, measure: str) -> Table:
 
 def family(report: Report) -> Table:
     """RMS over the judged histories on each truth, and what model and truth have in common."""
-    truths = list(dict.fromkeys(row["truth"] for row in report["rows"]))
+    truths = _truths(report)
     rows = []
-    for variant in VARIANTS:
-        if variant.dtype != "float64":
-            continue
+    for variant in ALONE:
         cells = []
         for truth in truths:
-            squares = [
-                row["rms_kpa"] ** 2
-                for row in report["rows"]
-                if (row["model"], row["update_s"], row["dtype"]) == astuple(variant)
-                and row["truth"] == truth
-                and row["noise_units"] == 0.0
-                and row["history"] not in ("hold", "walk")
+            cells += [
+                f"{_rms(report, variant, truth):.2f}",
+                IN_COMMON[FAMILY[variant.model][truth]],
             ]
-            rms = (sum(squares) / len(squares)) ** 0.5
-            cells += [f"{rms:.2f}", IN_COMMON[FAMILY[variant.model][truth]]]
-        rows.append([variant.model, _states(variant.update_s), *cells])
+        overall = f"{_rms(report, variant, *truths):.2f}"
+        rows.append([variant.model, _states(variant.update_s), *cells, overall])
     head = ["model", "states"]
     for truth in truths:
         head += [f"{truth}: kPa RMS", "shares"]
-    return head, rows
+    return [*head, "all"], rows
+
+
+def verdict_of_strangers(report: Report) -> str:
+    """In a sentence, how the default stands on the truth that no model is kin to."""
+    truths = _truths(report)
+    if STRANGER not in truths:
+        return f"Truth {STRANGER} is left out of a quick report."
+    default = Variant(report["default"]["model"], report["default"]["update_s"])
+    others = [variant for variant in ALONE if variant.update_s == default.update_s]
+    best = min(others, key=lambda variant: _rms(report, variant, STRANGER))
+    said = f"On {STRANGER} the default leaves {_rms(report, default, STRANGER):.2f} kPa RMS"
+    if best == default:
+        return said + ", less than any other with states as often."
+    return said + (
+        f" and `{best.model}` {_rms(report, best, STRANGER):.2f}; over all truths it is "
+        f"{_rms(report, default, *truths):.2f} and {_rms(report, best, *truths):.2f}."
+    )
+
+
+def _truths(report: Report) -> list[str]:
+    return list(dict.fromkeys(row["truth"] for row in report["rows"]))
+
+
+def _rms(report: Report, variant: Variant, *truths: str) -> float:
+    """RMS over the judged histories on some truths, exact readings."""
+    squares = [
+        row["rms_kpa"] ** 2
+        for row in report["rows"]
+        if (row["model"], row["update_s"], row["dtype"]) == astuple(variant)
+        and row["truth"] in truths
+        and row["noise_units"] == 0.0
+        and row["history"] not in ("hold", "walk")
+    ]
+    return float((sum(squares) / len(squares)) ** 0.5)
 
 
 def cycles(report: Report) -> Table:

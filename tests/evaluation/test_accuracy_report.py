@@ -6,7 +6,7 @@ import pickle
 import numpy as np
 import pytest
 
-from skin_host.evaluation import accuracy, bench_processing, page, report, speed, touching
+from skin_host.evaluation import accuracy, bench_processing, page, report, speed, tables, touching
 from skin_host.evaluation.accuracy import Plan
 from skin_host.evaluation.histories import HISTORIES, record
 from skin_host.evaluation.rig import Rig
@@ -84,6 +84,9 @@ def test_each_row_tells_what_its_model_shares_with_its_truth(small):
     assert shared["asymmetric_clock"] == "cause"
     assert shared["asymmetric"] == shared["prony"] == "none"
     assert accuracy.FAMILY["prony"]["L"] == "law"
+    assert "left out" in tables.verdict_of_strangers(small)
+    as_if = small | {"rows": [row | {"truth": "H"} for row in small["rows"]]}
+    assert tables.verdict_of_strangers(as_if).startswith("On H the default leaves 0.")
     # No model is what any other truth is made of.
     assert all(of["H"] != "law" != of["A"] for of in accuracy.FAMILY.values())
 
