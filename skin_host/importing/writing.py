@@ -21,6 +21,7 @@ def configuration_text(settings: Settings, comment: str = "") -> str:
         ("buses", settings.buses),
         ("boards", settings.boards),
         ("kinds", settings.kinds),
+        ("fingertips", settings.fingertips),
     ):
         for name, table in tables.items():
             lines += _table(f"{section}.{name}", table, empty=True)

@@ -45,7 +45,7 @@ async def node(broker: Mosquitto) -> AsyncIterator[Publisher]:
     ("example", "line"),
     [
         ("subscriber.py", "left_hand begin 7 2.00 N"),
-        ("client.py", "left_hand (0.1, 0.0, 0.0) 31.0 kPa 0"),
+        ("client.py", "left_hand (0.1, 0.0, 0.0) 2.00 N 0"),
     ],
 )
 async def test_a_subscriber_prints_a_touch(mosquitto: Mosquitto, example: str, line: str) -> None:

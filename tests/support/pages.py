@@ -75,8 +75,10 @@ def mentioned(page: str) -> list[list[str]]:
 
 
 def _words(line: str) -> list[str]:
-    """One command's words; of a pipe the first command's."""
+    """One command's words; of a pipe the first command's, of `eval` what is evaluated."""
     words = shlex.split(line, comments=True)
+    if words[:1] == ["eval"]:
+        words = words[1].removeprefix("$(").removesuffix(")").split()
     for stop in ("|", ">", "&&"):
         if stop in words:
             words = words[: words.index(stop)]

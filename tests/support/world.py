@@ -32,20 +32,20 @@ from tests.support.pages import ROOT
 SAMPLES = ROOT.parent / "shared" / "data"
 CONFIG = ROOT / "config" / "demo.toml"
 PATIENCE_S = 30.0
-#: A finger that presses soon, and again and again.
-SCENE = Scene(
-    probe=[
-        Probe(
-            part="left_hand",
-            at=Place(triangle=8 - 4),
-            diameter_mm=10,
-            pressure_kpa=[(0, 0), (0.1, 60), (0.5, 60), (0.6, 0)],
-            start_s=6,
-            repeat_s=1,
-        )
-    ]
-)
 _numbers = itertools.count()
+
+
+def pressed_from(start_s: float) -> Scene:
+    """A finger presses the thumb, again and again."""
+    press = Probe(
+        part="left_hand",
+        at=Place(triangle=4),
+        diameter_mm=10,
+        pressure_kpa=[(0, 0), (0.1, 60), (0.5, 60), (0.6, 0)],
+        start_s=start_s,
+        repeat_s=1,
+    )
+    return Scene(probe=[press])
 
 
 class World:
@@ -86,12 +86,12 @@ class World:
         """Some seconds of the robot as CAN frames and as what it says."""
         settings = load(self.robot)
         layout = build_layout(settings, self.folder)
-        robot = Robot(settings, layout, SCENE)
+        robot = Robot(settings, layout, pressed_from(8.0))
         robot.bring_up()
         since_ns = 1_763_700_000_000_000_000
         log, blf = self.folder / "grasp.log", self.folder / "grasp.blf"
         with CanLog(log) as frames, CanLog(blf) as same:
-            for _ in range(80):
+            for _ in range(90):
                 batch = robot.step(0.1)["can0"]
                 later = FrameBatch(batch.id, batch.dlc, batch.data, batch.t_ns + since_ns)
                 for sink in (frames, same):
@@ -153,7 +153,7 @@ class World:
                 Bus(interface="virtual", channel=self.channel("robot")),
                 self.state,
                 port=int(self.broker.rpartition(":")[2]),
-                scene=SCENE,
+                scene=pressed_from(6.0),
                 config=self.robot,
             ):
                 ready.set()
