@@ -45,7 +45,8 @@ SHARP_MM = 0.5
 class _Table:
     """Patterns around one pad: rows are places, columns the pads that any of them covers.
 
-    `moments` are 1, x, y, x^2 + y^2 of the places; `shape` [places, 3, pads] are the pattern
+    `moments` are 1, x, y, x^2 + y^2 of the places, each times what a place is worth before
+    anything is read (see `TemplateLocalizer`); `shape` [places, 3, pads] are the pattern
     and its slopes along x and y, per mm.
     """
 
@@ -60,6 +61,11 @@ class _Table:
 
 class TemplateLocalizer:
     """Matches the readings around the strongest pad with those of a round probe.
+
+    The strength of the push is not known, and two pads alone do not tell how far aside of
+    them the probe lies: farther away and stronger reads the same. Strong pushes are taken to
+    be rarer, with the square of the strength, which has no scale; so a place counts in
+    proportion to the size of its pattern.
 
     A contact wider than the largest probe can touch is like none of the patterns: of it the
     centroid is told.
@@ -118,7 +124,9 @@ class TemplateLocalizer:
         match /= table.pattern_squared @ coarse
         place = int(match.argmax())
         # What the best pattern leaves over, beyond noise: the contact is of another shape.
-        misfit = float((coarse * reading) @ reading - match[place]) / max(len(mine) - 3, 1)
+        left = float((coarse * reading) @ reading - match[place])
+        excess = max(0.0, left - (np.count_nonzero(trust) - 3))
+        misfit = 1.0 + excess / max(len(mine) - 3, 1)
         match -= match[place]
         match *= np.float32(0.5)
         likely = np.exp(match, out=match)
@@ -133,7 +141,7 @@ class TemplateLocalizer:
                 x, y, variance_mm2 = refined
         position_m = self._position_m[strongest] + (1e-3 * x) * table.basis[0]
         position_m += (1e-3 * y) * table.basis[1]
-        return Location(position_m, 1e-3 * math.sqrt(variance_mm2 * max(1.0, misfit)))
+        return Location(position_m, 1e-3 * math.sqrt(variance_mm2 * misfit))
 
     def _is_wide(self, taxels: Indices) -> bool:
         """Whether two of the taxels are farther apart than any probe reaches."""
@@ -179,12 +187,12 @@ class TemplateLocalizer:
         pattern = np.concatenate(patterns)
         used = pattern.max(axis=0) > 0.0
         pattern = pattern[:, used]
+        moments = np.column_stack([np.ones(len(place_mm)), place_mm, (place_mm**2).sum(axis=1)])
+        moments *= np.linalg.norm(pattern, axis=1, keepdims=True)
         return _Table(
             pads[used],
             place_mm,
-            np.column_stack([np.ones(len(place_mm)), place_mm, (place_mm**2).sum(axis=1)]).astype(
-                np.float32
-            ),
+            moments.astype(np.float32),
             pattern.astype(np.float32),
             (pattern**2).astype(np.float32),
             np.concatenate([pattern[:, None], np.concatenate(slopes)[:, :, used]], axis=1).astype(
