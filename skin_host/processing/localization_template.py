@@ -47,16 +47,17 @@ class _Table:
 
     `moments` are 1, x, y, x^2 + y^2 of the places, each times what a place is worth before
     anything is read (see `TemplateLocalizer`); `shape` [places, 3, pads] are the pattern
-    and its slopes along x and y, per mm.
+    and its slopes along x and y, per mm. `frame` [3, 3] holds, in mm, the pad's position and
+    what 1 mm along x and y adds to it.
     """
 
     pads: Indices
     place_mm: Floats
     moments: Floats32
     pattern: Floats32
-    pattern_squared: Floats32
+    twice_squared: Floats32
     shape: Floats32
-    basis: Floats
+    frame: Floats
 
 
 class TemplateLocalizer:
@@ -92,7 +93,14 @@ class TemplateLocalizer:
         self._radius_mm = radius_mm
         self._probes_mm = np.atleast_1d(np.asarray(probe_mm, np.float64))
         self._noise_units = noise_units
-        self._widest_m = 1e-3 * float(self._probes_mm.max() + 2.0 * radius_mm.max(initial=0.0))
+        widest_m = 1e-3 * float(self._probes_mm.max() + 2.0 * radius_mm.max(initial=0.0))
+        #: For each taxel those that no probe reaches together with it, as bits of a number.
+        self._far = [
+            int.from_bytes(np.packbits(away, bitorder="little").tobytes(), "little")
+            for away in (
+                np.linalg.norm(position_m - here, axis=1) > widest_m for here in position_m
+            )
+        ]
         self._centroid = CentroidLocalizer(position_m, noise_units=noise_units)
         self._tables: dict[int, _Table] = {}
 
@@ -105,54 +113,52 @@ class TemplateLocalizer:
         peak = float(units[strongest])
         if not 0.0 < peak < np.inf:
             return None
-        if self._is_wide(mine):
+        if self._is_wide(mine.tolist()):
             return self._centroid.locate(taxels, units, usable)
         table = self._tables.get(strongest)
         if table is None:
             if len(self._tables) >= MOST_TABLES:
                 self._tables.pop(next(iter(self._tables)))
             table = self._tables[strongest] = self._lay_down(strongest)
-        # float32 throughout: one float64 among these would copy the tables at each touch.
-        reading = units.take(table.pads).astype(np.float32)
-        trust = usable.take(table.pads).astype(np.float32)
-        reading *= trust
-        spread = (GAIN_SPREAD * reading) ** 2
-        coarse = trust / (spread + np.float32(self._noise_units**2 + (STEP_SHARE * peak) ** 2))
+        # Each call of numpy costs as much as its work here, so there are few. float32
+        # throughout: one float64 among these would copy the tables at each touch.
+        trust = usable.take(table.pads)
+        reading = np.multiply(units.take(table.pads), trust, dtype=np.float32)
+        spread = reading * reading
+        spread *= np.float32(GAIN_SPREAD**2)
+        unsure = np.float32(self._noise_units**2 + (STEP_SHARE * peak) ** 2)
+        coarse = np.divide(trust, spread + unsure, dtype=np.float32)
+        weighted = coarse * reading
         # The strength of the push is unknown: for each place take the one that fits best.
-        match = table.pattern @ (coarse * reading)
+        match = table.pattern @ weighted
         match *= match
-        match /= table.pattern_squared @ coarse
+        match /= table.twice_squared @ coarse
         place = int(match.argmax())
+        best = match[place]
         # What the best pattern leaves over, beyond noise: the contact is of another shape.
-        left = float((coarse * reading) @ reading - match[place])
+        left = float(weighted @ reading) - 2.0 * float(best)
         excess = max(0.0, left - (np.count_nonzero(trust) - 3))
         misfit = 1.0 + excess / max(len(mine) - 3, 1)
-        match -= match[place]
-        match *= np.float32(0.5)
-        likely = np.exp(match, out=match)
-        total, x, y, squared = (likely @ table.moments).tolist()
+        match -= best
+        total, x, y, squared = (np.exp(match, out=match) @ table.moments).tolist()
         x, y = x / total, y / total
         variance_mm2 = max(squared / total - x * x - y * y, 0.0)
         if variance_mm2 < SHARP_MM**2:
-            fine = trust / (spread + np.float32(self._noise_units**2))
+            spread += np.float32(self._noise_units**2)
+            fine = np.divide(trust, spread, dtype=np.float32)
             refined = _refine(table, place, reading, fine)
             # A pattern that stands still under the probe refines nothing.
             if refined is not None and refined[2] < variance_mm2 + STEP_MM**2:
                 x, y, variance_mm2 = refined
-        position_m = self._position_m[strongest] + (1e-3 * x) * table.basis[0]
-        position_m += (1e-3 * y) * table.basis[1]
-        return Location(position_m, 1e-3 * math.sqrt(variance_mm2 * misfit))
+        place_mm = np.array((1.0, x, y)) @ table.frame
+        return Location(1e-3 * place_mm, 1e-3 * math.sqrt(variance_mm2 * misfit))
 
-    def _is_wide(self, taxels: Indices) -> bool:
+    def _is_wide(self, taxels: list[int]) -> bool:
         """Whether two of the taxels are farther apart than any probe reaches."""
-        position_m = self._position_m[taxels]
-        low, high = position_m.min(axis=0), position_m.max(axis=0)
-        if math.dist(low, high) <= self._widest_m:
-            return False
-        if (high - low).max() > self._widest_m:
-            return True
-        off = position_m[:, None] - position_m[None]
-        return bool((off * off).sum(axis=2).max() > self._widest_m**2)
+        mask = 0
+        for taxel in taxels:
+            mask |= 1 << taxel
+        return any(mask & self._far[taxel] for taxel in taxels)
 
     def _lay_down(self, centre: int) -> _Table:
         """Patterns of all places at which this pad would read about the most."""
@@ -194,11 +200,11 @@ class TemplateLocalizer:
             place_mm,
             moments.astype(np.float32),
             pattern.astype(np.float32),
-            (pattern**2).astype(np.float32),
+            (2.0 * pattern**2).astype(np.float32),
             np.concatenate([pattern[:, None], np.concatenate(slopes)[:, :, used]], axis=1).astype(
                 np.float32
             ),
-            basis,
+            np.concatenate([1e3 * self._position_m[centre : centre + 1], basis[:2]]),
         )
 
 
