@@ -211,11 +211,16 @@ class Engine:
         ]
         return self._process(self._take(self.sweeps) + self._intake.flush())
 
-    def rezero(self, board: int) -> int:
+    def rezero(self, board: int, believed: bool = True) -> int:
         """A board has taken a new zero: find out where its taxels read now.
 
         For some two seconds none of them is valid. Taxels that were touched just before stay
         invalid until they are calibrated.
+
+        Args:
+            board: its index.
+            believed: whether touches that were seen just before are to be believed. Those of a
+                board that was not set up are none.
 
         Returns:
             How many taxels those are.
@@ -223,7 +228,7 @@ class Engine:
         if self.calibration is None:
             return 0
         taxels = self._taxels_of(board)
-        touched: NDArray[np.bool_] = np.logical_and(self._touched[taxels], taxels >= 0)
+        touched: NDArray[np.bool_] = self._touched[taxels] & (taxels >= 0) & believed
         before = self._rezeros.get(board)
         if before is not None:
             touched |= before.doubted.reshape(TRIANGLES, PADS)

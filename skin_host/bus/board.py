@@ -15,6 +15,8 @@ MTB3_GAP_PERIODS = 2.5
 GAP_S = 0.01
 #: A period that is off by more than this share is not the one that was set.
 WRONG_PERIOD = 0.25
+#: A board's own intervals, but for the longest and shortest fifth, lie within this share.
+UNEVEN = 0.1
 PERIOD_SWEEPS = 16
 #: Triangles must be missing in so many sweeps in a row: single frames get lost, sweeps get cut.
 MISSING_SWEEPS = 5
@@ -74,20 +76,19 @@ class BoardRecord:
 
     @property
     def wrong_period_ns(self) -> float | None:
-        """Median of its last intervals if the board sends too fast or too slowly, else None.
+        """Median of its last intervals if the board was set to another period, else None.
 
-        Median and mean must agree: sweeps that were held up come in a bunch and make the median
-        short, one long pause makes the mean long, and neither is another period.
+        A board's timer is regular whatever it was set to. What comes unevenly, in bunches or
+        after pauses is held up somewhere, and setting the board up again would mend nothing.
         """
         if len(self.sweep_times_ns) < PERIOD_SWEEPS // 2:
             return None
         intervals = np.diff(np.array(self.sweep_times_ns, np.int64))
-        usual_ns, mean_ns = float(np.median(intervals)), float(np.mean(intervals))
+        low_ns, usual_ns, high_ns = np.percentile(intervals, (20, 50, 80)).tolist()
         period_ns = self.layout.settings.period_ms * 1_000_000
-        limit_ns = WRONG_PERIOD * period_ns
-        slow = min(usual_ns, mean_ns) - period_ns > limit_ns
-        fast = period_ns - max(usual_ns, mean_ns) > limit_ns
-        return usual_ns if slow or fast else None
+        regular = high_ns - low_ns < UNEVEN * usual_ns
+        wrong = abs(usual_ns - period_ns) > WRONG_PERIOD * period_ns
+        return usual_ns if regular and wrong else None
 
     @property
     def is_mtb3(self) -> bool:

@@ -53,7 +53,9 @@ DISCOVERY_S = 0.15
 #: Two conversions of twelve stages at decimation 256 (36.9 ms each), and some air.
 NEW_OFFSET_S = 0.09
 #: A board that does not answer within this time has not heard the question.
-ANSWER_S = 0.25
+ANSWER_S = 1.0
+#: One that never answers is set up every so many questions all the same: it may be mute only.
+MUTE_QUESTIONS = 4
 #: A silent board is seen to at once, then after so long, up to the last.
 RETRY_S = (1.0, 2.0, 4.0, 8.0)
 #: A board must send something wrong for so long before it is set up again, then the pause
@@ -79,7 +81,8 @@ class Boards:
         boards: (index in `Layout.boards`, board) of this bus.
         triangles: all triangles of the skin.
         silent_periods: a started board is silent after so many periods without a sweep.
-        zeroed: called with the board's index just before it takes a new zero.
+        zeroed: called just before a board takes a new zero, with its index and whether what it
+            sent until now was what it had been set up to send.
         clock: time in ns that only passes while the bus is being read: while nobody looks, no
             board is silent.
     """
@@ -91,7 +94,7 @@ class Boards:
         boards: list[tuple[int, BoardLayout]],
         triangles: tuple[TriangleLayout, ...],
         silent_periods: float,
-        zeroed: Callable[[int], object] = lambda _: None,
+        zeroed: Callable[[int, bool], object] = lambda *_: None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.bus = bus
@@ -131,7 +134,13 @@ class Boards:
                 kind,
                 address,
             )
-        await asyncio.gather(*(self._set_up(record) for record in self.records.values()))
+        heard = [record for record in self.records.values() if record.board_type is not None]
+        for record in self.records.values():
+            if record.board_type is None:
+                # Asked again later: one that is just starting would take the end of its set-up.
+                record.started = True
+                record.configured_ns = self._clock()
+        await asyncio.gather(*(self._set_up(record) for record in heard))
 
     async def set_up(self, address: int) -> None:
         """Send a board its set-up and start it.
@@ -148,7 +157,7 @@ class Boards:
         address = record.layout.settings.address
         gap_s = record.gap_s
         frames = [command_frame(command, address) for command in record.commands]
-        self._zeroed(record.index)
+        self._zeroed(record.index, record.configurations > 0 and not record.missing)
         await self._port.send(frames, gap_s)
         await asyncio.sleep(max(gap_s, NEW_OFFSET_S))
         await self._port.send([frames[-1]])
@@ -209,7 +218,7 @@ class Boards:
         record.lost_set_ups += 1
         if record.wrong_tries == 1:
             log.warning(
-                "bus %s: board %s %s: it is set up again",
+                "bus %s: board %s %s: it is set up",
                 self.bus,
                 record.layout.name,
                 record.wrong,
@@ -220,7 +229,9 @@ class Boards:
     def _judge(record: BoardRecord, now_ns: int) -> None:
         wrong = ""
         seen_ns = record.wrong_period_ns
-        if record.missing:
+        if not record.configurations:
+            wrong = "sends without having been set up"
+        elif record.missing:
             wrong = "does not send all of its triangles"
         elif seen_ns is not None:
             wrong = f"sends every {seen_ns / 1e6:.0f} ms, not {record.layout.settings.period_ms} ms"
@@ -248,15 +259,18 @@ class Boards:
         questions: list[Message] = [Discover()]
         if tells_age:
             questions.append(GetTimeOfLife())
-        known = record.board_type is not None
         sent_before = record.last_sweep_ns > record.configured_ns
         record.answered_ns, record.life_s = 0, None
         await self._port.send([command_frame(question, address) for question in questions])
+        last_sweep_ns = record.last_sweep_ns
         while time.monotonic_ns() - asked_ns < ANSWER_S * 1e9:
             if record.answered_ns and (record.life_s is not None or not tells_age):
                 break
+            if tells_age and record.last_sweep_ns > last_sweep_ns and sent_before:
+                return  # it only paused
             await asyncio.sleep(GAP_S)
-        if record.in_bootloader or (known and not record.answered_ns):
+        mute = record.board_type is None and record.retries % MUTE_QUESTIONS == 0
+        if record.in_bootloader or not (record.answered_ns or mute):
             return
         reset = record.answered_ns != 0 and not tells_age
         if record.life_s is not None:

@@ -67,8 +67,12 @@ async def living(
     scene: Scene | None = None,
     config: Path = CONFIG,
     calibrate_s: float = 1.5,
+    robot_late_s: float = 0.0,
 ) -> AsyncIterator[Live]:
-    """Run both until the block is left; there is no broker unless `port` names one."""
+    """Run both until the block is left; there is no broker unless `port` names one.
+
+    The robot may get its power later than the daemon; what was sent until then is lost on it.
+    """
     settings = load(config)
     settings.buses["can0"] = bus
     settings.service.state_directory = str(state)
@@ -80,7 +84,14 @@ async def living(
     frames_sent = _counting(can_bus, "can0")
     daemon = Daemon(settings, layout, configuration=config)
     stop = asyncio.Event()
-    body = asyncio.create_task(robot.run({"can0": can_bus}))
+
+    async def live_on() -> None:
+        await asyncio.sleep(robot_late_s)
+        while robot_late_s and can_bus.recv(0) is not None:
+            pass
+        await robot.run({"can0": can_bus})
+
+    body = asyncio.create_task(live_on())
     host = asyncio.create_task(daemon.run(stop))
     try:
         live = Live(robot, daemon, frames_sent)
