@@ -43,6 +43,8 @@ TELL_S = 60.0
 TOLD_BY_PORTS = {"bus_down", "bus_gone", "bus_off"}
 #: A fault must have lasted for this long to be logged.
 LASTING_S = 2.0
+#: What is no news while a calibration is being taken.
+_UNTIL_CALIBRATED = {"part_not_calibrated", "fingertip_not_calibrated"}
 #: Readiness is told after the first sweeps, or after so long without.
 PATIENCE_S = 3.0
 
@@ -329,6 +331,8 @@ class Daemon:
                 if said.get(part) != state or now_s - said_s[part] >= HEALTH_S:
                     said[part], said_s[part] = state, now_s
                     self.publisher.put_health(self.layout.parts[part].name, record)
+            if self.engine.calibrating:
+                told = {key: says for key, says in told.items() if key[0] not in _UNTIL_CALIBRATED}
             self._teller.look(told, now_s)
             if now_s - self._status_s >= HEALTH_S:
                 self._status_s = now_s
