@@ -65,8 +65,8 @@ PERFECT = Variant("perfect", 0.0)
 _ASYMMETRIC = {"A": "cause", "S": "none", "L": "law", "H": "cause"}
 FAMILY: dict[str, dict[str, str]] = {
     "none": dict.fromkeys("ASLH", "none"),
-    "published": dict.fromkeys("ASLH", "none"),
-    "published_bleed": dict.fromkeys("ASLH", "none"),
+    "published": _ASYMMETRIC,
+    "published_bleed": _ASYMMETRIC,
     "prony": {"A": "none", "S": "none", "L": "law", "H": "none"},
     "asymmetric": _ASYMMETRIC,
     "asymmetric_log": _ASYMMETRIC,

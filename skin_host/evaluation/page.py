@@ -138,9 +138,9 @@ def _sections(report: Report) -> list[Section]:
                 (
                     "The same errors truth by truth, with what model and truth have in common. "
                     "`its law`: the truth is a limit of the model's own law, but for the number of "
-                    "modes; so is L, with no asymmetry and no clock, for all of them but the "
-                    "published one. `a cause`: the model has one of the truth's causes of slow "
-                    "unloading, if in another form. `nothing`: it has none of them."
+                    "modes; so is L, without asymmetry and clock, for all of them. `a cause`: the "
+                    "model has one of the truth's causes of slow unloading, if in another form. "
+                    "`nothing`: it has none of them."
                 ),
                 (
                     "The default, `asymmetric_clock`, lays slow unloading half to direction and "
@@ -198,11 +198,12 @@ def _sections(report: Report) -> list[Section]:
                     "The published model runs away; the others follow the truth to a cycle that "
                     "repeats. What still moves after cycle 100, which is 1000 s, is the truth: its "
                     "slowest modes take 6000 s, and a hold of one hour shows them in part. The "
-                    "default's error is a share of that relaxation, since losses that grow with "
-                    "pressure cannot be seen at one level. The last table tells that neither "
-                    "float32 nor states at 1 Hz nor the number of cycles adds to it, and by how "
-                    "much two models differ in the end that fit the hold equally well: less than "
-                    "that no fit to this record can promise."
+                    "default's error is a share of that relaxation: on A, since losses that grow "
+                    "with pressure cannot be seen at one level; on H it is largest, since a fit "
+                    "takes what the plays leave of a hold for slow modes. The last table tells "
+                    "that neither float32 nor states at 1 Hz nor the number of cycles adds to it, "
+                    "and by how much two models differ in the end that fit the hold equally well: "
+                    "less than that no fit to this record can promise."
                 ),
             ],
             [tables.cycles(report), tables.cycle_evidence(report)],

@@ -74,7 +74,7 @@ def pipeline(seconds: float, sizes: tuple[int, ...] = (1, 10)) -> list[Row]:
     rows: list[Row] = []
     for boards in sizes:
         n = 192 * boards
-        for touched in (0, 12, 96, n // 4, n):
+        for touched in sorted({0, 12, 96, n // 4, n}):
             for watched in (True, False):
                 if touched and not watched:
                     continue  # what is touched is always worked out
