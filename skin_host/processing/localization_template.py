@@ -43,10 +43,11 @@ SHARP_MM = 0.5
 
 @dataclass(frozen=True, slots=True)
 class _Table:
-    """Patterns around one pad: rows are places, columns the pads that any of them covers.
+    """Patterns around one pad, of all places on trial and the pads that any of them covers.
 
-    `moments` are 1, x, y, x^2 + y^2 of the places, each times what a place is worth before
-    anything is read (see `TemplateLocalizer`); `shape` [places, 3, pads] are the pattern
+    `pattern` and twice its square are [pads, places]: BLAS is faster over long rows.
+    `moments` [places, 4] are 1, x, y, x^2 + y^2 of the places, each times what a place is worth
+    before anything is read (see `TemplateLocalizer`); `shape` [places, 3, pads] are the pattern
     and its slopes along x and y, per mm. `frame` [3, 3] holds, in mm, the pad's position and
     what 1 mm along x and y adds to it.
     """
@@ -130,9 +131,9 @@ class TemplateLocalizer:
         coarse = np.divide(trust, spread + unsure, dtype=np.float32)
         weighted = coarse * reading
         # The strength of the push is unknown: for each place take the one that fits best.
-        match = table.pattern @ weighted
+        match = weighted @ table.pattern
         match *= match
-        match /= table.twice_squared @ coarse
+        match /= coarse @ table.twice_squared
         place = int(match.argmax())
         best = match[place]
         # What the best pattern leaves over, beyond noise: the contact is of another shape.
@@ -199,8 +200,8 @@ class TemplateLocalizer:
             pads[used],
             place_mm,
             moments.astype(np.float32),
-            pattern.astype(np.float32),
-            (2.0 * pattern**2).astype(np.float32),
+            np.ascontiguousarray(pattern.T, np.float32),
+            np.ascontiguousarray(2.0 * pattern.T**2, np.float32),
             np.concatenate([pattern[:, None], np.concatenate(slopes)[:, :, used]], axis=1).astype(
                 np.float32
             ),
