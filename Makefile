@@ -18,7 +18,7 @@ demo: .venv/demo.stamp  ## emulator, daemon, broker and page together; DURATION=
 test: lint  ## all that needs no root and no hardware
 	@$(BIN)/python -m pytest
 
-test-system: .venv/dev.stamp  ## real CAN, I2C, broker and browser; root, if packages are missing
+test-system: .venv/dev.stamp .venv/fuzz.stamp  ## real CAN, I2C, broker and browser; root, if packages are missing
 	@tools/lane/packages
 	@$(BIN)/python -m compileall -q skin_host emulator tests
 	@echo "on this host: broker, browser, the lane itself"
@@ -49,6 +49,7 @@ clean:  ## the virtual environment, the lane's machine and caches
 
 # The stamps are newer than pyproject.toml once its dependencies are installed.
 .venv/dev.stamp: EXTRAS := dev
+.venv/fuzz.stamp: EXTRAS := fuzz
 .venv/demo.stamp: EXTRAS := demo
 .venv/%.stamp: pyproject.toml | .venv/bin/python
 	@echo "installing skin-host[$(EXTRAS)] into .venv"

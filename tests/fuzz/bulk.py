@@ -1,8 +1,6 @@
 """Long fuzzing: mutated bytes by the million, at the speed of the code.
 
-    python -m tests.fuzz.bulk --frames 1000000 --configurations 100000 --commands 100000
-
-With `--coverage` the same entries run under atheris, guided by coverage, for `--seconds`.
+python -m tests.fuzz.bulk --frames 1000000 --configurations 100000 --commands 100000
 """
 
 import argparse
@@ -95,43 +93,14 @@ async def _commands(random_: random.Random, count: int) -> int:
     return commands.answered
 
 
-def _guided(seconds: float) -> None:
-    import atheris
-
-    with atheris.instrument_imports(include=["skin_host"]):
-        pass
-    entries = (
-        targets.configuration,
-        targets.calibration_file,
-        targets.state_file,
-        lambda data: targets.Buses().feed(data),
-        lambda data: asyncio.run(
-            targets.Commands().take(targets.COMMANDS[data[0] % len(targets.COMMANDS)], data[1:])
-        ),
-    )
-
-    def one(data: bytes) -> None:
-        if len(data) > 1:
-            entries[data[0] % len(entries)](data[1:])
-
-    atheris.instrument_all()
-    atheris.Setup([sys.argv[0], f"-max_total_time={seconds:.0f}", "-max_len=4096"], one)
-    atheris.Fuzz()
-
-
 def main() -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("--frames", type=int, default=20_000)
     parser.add_argument("--configurations", type=int, default=500)
     parser.add_argument("--commands", type=int, default=500)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--coverage", action="store_true")
-    parser.add_argument("--seconds", type=float, default=20.0)
     arguments = parser.parse_args()
     logging.disable(logging.CRITICAL)
-    if arguments.coverage:
-        _guided(arguments.seconds)
-        return 0
     done = {
         "frames": _frames(np.random.default_rng(arguments.seed), arguments.frames),
         "configurations": _configurations(random.Random(arguments.seed), arguments.configurations),
