@@ -53,6 +53,7 @@ class AD7147:
         self._bank_2 = self._registers[reg.BANK_2 : reg.BANK_3].reshape(-1, reg.STAGE_WORDS)
         self._capacitance_ff = np.zeros(reg.N_CINS)
         self._input_noise_ff = np.zeros(reg.N_CINS)
+        self._held = np.zeros(reg.N_STAGES, np.bool_)
         self._clean = np.zeros(reg.N_STAGES)
         self._unseen = np.zeros(reg.N_STAGES, bool)
         self._ambient = AmbientTracking(self._registers)
@@ -84,6 +85,11 @@ class AD7147:
         """
         values = np.asarray(values, np.float64)
         self._input_noise_ff[: len(values)] = values
+        self._set_up_is_stale = True
+
+    def hold_results(self, held: NDArray[np.bool_]) -> None:
+        """Results bool[12] that show no noise at all, not even the converter's own."""
+        self._held[:] = held
         self._set_up_is_stale = True
 
     def advance(self, dt_s: float) -> None:
@@ -193,7 +199,7 @@ class AD7147:
             self._weights, self._offset_ff = reg.decode_stages(self._bank_2)
             chip = self._noise_codes_rms[self._power.decimation]
             picked_up = np.square(self._weights) @ np.square(self._input_noise_ff / self._q_ff)
-            self._sigma = np.sqrt(chip**2 + picked_up)
+            self._sigma = np.sqrt(chip**2 + picked_up) * ~self._held
             self._ambient.configure()
             self._set_up_is_stale = False
             self._ideal_is_stale = True

@@ -178,6 +178,14 @@ class Converters:
         else:
             self.signal.set_input_noise_ff(np.array([chip]), values[None])
 
+    def hold_results(self, chip: int, held: NDArray[np.bool_]) -> None:
+        """Results bool[12] of a chip that show no noise at all, not even the converter's own."""
+        if chip in self.registers:
+            self._sync(chip)
+            self.registers[chip].hold_results(held)
+        else:
+            self.signal.hold_results(chip, held)
+
     def _sync(self, chip: int) -> None:
         """Bring a chip to the present."""
         late_ns = self._t_ns - self._synced_ns[chip]

@@ -192,11 +192,14 @@ def _stuck_taxel(robot: "Robot", fault: Fault) -> Mend:
     if fault.value is not None:
         held_ff = skin.resting_ff[taxels] + fault.value
     skin.held_ff[taxels] = held_ff
-    mend_noise = _noise(robot, fault, 0.0)
+    chip = _chip(robot, fault)
+    own = np.arange(TAXELS_PER_TRIANGLE) + TAXELS_PER_TRIANGLE * chip
+    held = (own >= taxels.start) & (own < taxels.stop)
+    robot.converters.hold_results(chip, held)
 
     def mend() -> None:
         skin.held_ff[taxels] = np.nan
-        mend_noise()
+        robot.converters.hold_results(chip, np.zeros_like(held))
         robot.pass_on(taxels)
 
     robot.pass_on(taxels)
@@ -318,7 +321,9 @@ KINDS: dict[str, Kind] = {
     ),
     "chip_back": Kind("a chip that was gone answers again", _CHIP, _chip_back),
     "stuck_taxel": Kind(
-        "a taxel stays as it is; value: at so many fF above rest", (*_CHIP, "taxel"), _stuck_taxel
+        "a taxel's result stays as it is; value: so many fF above rest",
+        (*_CHIP, "taxel"),
+        _stuck_taxel,
     ),
     "noisy_taxel": Kind(
         "a badly soldered taxel; value: rms in units of 2.88 fF",

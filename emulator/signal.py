@@ -64,6 +64,7 @@ class SignalSkin:
         self._ideal = np.zeros((n, reg.N_STAGES))
         self._clean = np.zeros((n, reg.N_STAGES))
         self._unseen = np.zeros((n, reg.N_STAGES), bool)
+        self._held = np.zeros((n, reg.N_STAGES), bool)
         self._sigma = np.zeros((n, reg.N_STAGES))
         self._results = np.zeros((n, reg.N_STAGES), np.uint16)
         self._noise = np.zeros((n, NOISE_BLOCK, reg.N_STAGES))
@@ -80,6 +81,11 @@ class SignalSkin:
         self._noise_ff[chips] = values
         for chip in chips:
             self._update_sigma(int(chip))
+
+    def hold_results(self, chip: int, held: NDArray[np.bool_]) -> None:
+        """Results bool[12] of a chip that show no noise at all, not even the converter's own."""
+        self._held[chip] = held
+        self._update_sigma(chip)
 
     def configure(
         self, chips: Iterable[int], stages: StageMap, cdc_offset: int, power_control: int
@@ -173,7 +179,8 @@ class SignalSkin:
         squares = np.zeros(reg.N_CINS)
         squares[:TAXELS] = np.square(self._noise_ff[chip] / self._q_ff)
         own = reg.NOISE_CODES_RMS[self._power[chip].decimation]
-        self._sigma[chip] = np.sqrt(own**2 + np.square(self._weights[stages]) @ squares)
+        sigma = np.sqrt(own**2 + np.square(self._weights[stages]) @ squares)
+        self._sigma[chip] = sigma * ~self._held[chip]
 
 
 class SignalChips:

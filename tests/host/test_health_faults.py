@@ -10,8 +10,8 @@ from emulator.faults import KINDS
 from tests.support.fault_bench import FaultBench
 
 HERE = {"board": "forearm_outer", "triangle": 3}
-#: A pad that the fault holds in the middle of a byte, so that the noise of the converter, which
-#: stays, hardly moves it: it is told after 1.4 s. Where the noise does move it, it is a quiet pad.
+#: A lively pad, held in the middle of a byte. This board compensates temperature: it takes the
+#: noise of its thermal pads from every byte, which moves one that is held near an edge of its byte.
 HELD = 7
 #: What happens -> what must be told, and which taxels of the forearm must not be believed.
 FAULTS: list[tuple[str, dict[str, Any], str, range]] = [
@@ -61,7 +61,8 @@ def test_a_fault_is_named_within_a_second(
     bench: FaultBench, name: str, arguments: dict[str, Any], code: str, doubted: range
 ) -> None:
     bench.inject(name, **arguments)
-    bench.run(1.6 if name == "stuck_taxel" else 1.0)
+    # The odds of one in 10^7 take a pad that moved in 4 of 5 samples before just over a second.
+    bench.run(1.2 if name == "stuck_taxel" else 1.0)
     told = {told for told, _ in bench.first_told}
     assert code in told
     assert not bench.valid["left_forearm"][list(doubted)].any()
