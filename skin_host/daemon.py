@@ -128,7 +128,7 @@ class Daemon:
             asyncio.create_task(self._housekeep(), name="housekeeping"),
         ]
         if self.settings.service.metrics_port:
-            serving = metrics.serve(self.settings.service.metrics_port, self.records)
+            serving = metrics.serve(self.settings.service.metrics_port, self.status)
             tasks.append(asyncio.create_task(serving, name="metrics"))
         stopping = asyncio.create_task(stop.wait(), name="stop")
         try:

@@ -9,9 +9,11 @@ import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+from skin_host.fingertip.health import FingertipRecord
 from skin_host.health import Record
 
-Records = dict[str, Record]
+#: Of parts, and of fingertips on force/torque boards, by name.
+Records = Mapping[str, Record | FingertipRecord]
 
 MAX_REQUEST_BYTES = 8192
 TIMEOUT_S = 2.0
@@ -39,6 +41,14 @@ _BOARD = {
     "configurations": ("skin_board_configurations_total", "counter", "Times it was set up"),
     "resets": ("skin_board_resets_total", "counter", "Times it started anew by itself"),
 }
+_FINGERTIP = {
+    "samples": ("skin_fingertip_samples_total", "counter", "Samples of force and torque"),
+    "rate_hz": ("skin_fingertip_rate_hertz", "gauge", "Samples a second"),
+    "lone": ("skin_fingertip_lone_total", "counter", "Force without torque, or the other way"),
+    "saturated": ("skin_fingertip_saturated_total", "counter", "Saturated samples"),
+    "silences": ("skin_fingertip_silences_total", "counter", "Times its board fell silent"),
+    "touched": ("skin_fingertip_touched", "gauge", "Whether it is touched"),
+}
 _OUTPUT = {
     "connected": ("skin_broker_connected", "gauge", "Whether the broker is there"),
     "frames_sent": ("skin_mqtt_frames_total", "counter", "Frames sent to the broker"),
@@ -58,18 +68,19 @@ def exposition(records: Records) -> str:
             if value is not None:
                 samples.setdefault(head, {})[labels] = float(value)
 
-    for name, record in sorted(records.items()):
+    every: Mapping[str, Mapping[str, Any]] = records
+    for name, record in sorted(every.items()):
         part = _label("part", name)
-        put(_PART, record, part)
+        put(_FINGERTIP if record.get("kind") == "fingertip" else _PART, record, part)
         faults = ("skin_faults", "gauge", "Faults that are told of now")
         samples.setdefault(faults, {})[part] = float(len(record.get("faults", ())))
-        for bus in record["buses"]:
+        for bus in record.get("buses", ()):
             put(
                 _BUS,
                 bus | bus.get("port", {}) | {"frames": bus["frames"]},
                 _label("bus", bus["name"]),
             )
-        for board in record["boards"]:
+        for board in record.get("boards", ()):
             put(_BOARD, board, _label("board", board["name"]))
         put(_OUTPUT, record.get("output", {}), "")
     return "".join(_lines(samples))

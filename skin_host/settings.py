@@ -425,7 +425,7 @@ def _known(table: dict[str, Any]) -> str:
 
 
 def skin_hash(settings: Settings) -> str:
-    """Identify what a calibration belongs to: the boards, their set-up, and the parts.
+    """Identify what a calibration belongs to: the boards, their set-up, parts and fingertips.
 
     Twelve hexadecimal digits. Processing, publishing and channel names do not count, so
     a calibration survives a change of the threshold or a move to another interface.
@@ -441,4 +441,8 @@ def skin_hash(settings: Settings) -> str:
         ]
         for name, part in settings.parts.items()
     }
-    return hashlib.sha256(msgspec.json.encode([boards, parts])).hexdigest()[:12]
+    described: list[Any] = [boards, parts]
+    if settings.fingertips:
+        tips = settings.fingertips.items()
+        described.append({name: [tip.bus, tip.address, tip.full_scale] for name, tip in tips})
+    return hashlib.sha256(msgspec.json.encode(described)).hexdigest()[:12]

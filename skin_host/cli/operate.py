@@ -179,6 +179,11 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     found = calibrations.with_gains_of(found, path, layout)
     calibrations.save(path, found, layout)
     triangles = verdicts.triangle_verdicts(found, layout, parts)
+    tips = {
+        name: name in found.zeros
+        for name, tip in settings.fingertips.items()
+        if tip.node == arguments.node
+    }
     if arguments.json:
         print_json(
             {
@@ -187,10 +192,13 @@ def _calibrate(arguments: argparse.Namespace) -> int:
                 "time": found.time,
                 "verdicts": calibrations.summary(found, layout),
                 "triangles": triangles,
+                "fingertips": tips,
             }
         )
     else:
         print(verdicts.table(triangles))
+        for name, zeroed in tips.items():
+            print(f"{name}: " + ("zero taken" if zeroed else "its board sent nothing; no zero"))
         print(f"calibration {found.id} kept in {path}")
     return 0
 

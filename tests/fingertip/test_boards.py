@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from emulator.faults import parse
 from emulator.robot import Robot
 from emulator.scene import Probe, Scene
+from skin_host import metrics
 from skin_host.bus.protocol import FrameBatch
 from skin_host.engine import Engine
 from skin_host.fingertip.boards import StrainBoards
@@ -88,6 +89,15 @@ async def test_a_board_is_asked_for_its_full_scales_set_up_and_zeroed() -> None:
     assert record["rate_hz"] == pytest.approx(333, rel=0.05)
     assert record["lone"] == 0
     assert bench.record("thumb")["rate_hz"] == pytest.approx(100, rel=0.05)
+
+
+async def test_metrics_tell_of_fingertips() -> None:
+    bench = Bench()
+    await bench.boards.bring_up()
+    await bench.calibrate()
+    page = metrics.exposition(bench.health.records(bench.robot.t_ns))
+    assert 'skin_fingertip_touched{part="index"} 0' in page
+    assert 'skin_faults{part="thumb"} 0' in page
 
 
 async def test_a_board_that_falls_silent_is_told_of_and_set_up_again() -> None:

@@ -184,6 +184,8 @@ def test_a_calibration_fits_when_only_the_processing_or_the_channel_changed(
 def test_a_calibration_does_not_fit_other_boards(tmp_path: Path) -> None:
     other = edited(tmp_path, "address = 13", "address = 11")
     assert skin_hash(load(other)) != skin_hash(load(DEMO))
+    with_tip = edited(tmp_path, TOP, f'{TOP}\n[{TIP}"plane"')
+    assert skin_hash(load(with_tip)) != skin_hash(load(DEMO))
 
 
 def test_the_demo_builds() -> None:
