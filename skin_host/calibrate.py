@@ -1,17 +1,23 @@
-"""Take a calibration without a daemon: bring the boards up, look, stop them again."""
+"""Take a calibration without a daemon, and find the one that is kept."""
 
 import asyncio
 import contextlib
+import logging
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
+from pathlib import Path
 
+from skin_host import service
 from skin_host.engine import Engine
-from skin_host.errors import SkinError
+from skin_host.errors import CalibrationError, OtherSkinError, SkinError
 from skin_host.layout import Layout
 from skin_host.link import Link
+from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration
-from skin_host.settings import Settings
+from skin_host.settings import Settings, skin_hash
+
+log = logging.getLogger(__name__)
 
 #: So long after it should have ended, a calibration without data is given up.
 GRACE_S = 5.0
@@ -87,3 +93,29 @@ async def collect(
             "powered and answer"
         )
     return found
+
+
+def calibration_path(settings: Settings, node: str) -> Path:
+    """Where a node keeps its calibration."""
+    directory = service.state_directory(settings.service.state_directory)
+    return directory / f"{settings.robot}-{node}.calibration.json"
+
+
+def stored_calibration(settings: Settings, layout: Layout, node: str) -> Calibration | None:
+    """The calibration that was kept, or None if there is none.
+
+    A damaged file is told of and counts as none: a service goes on without it.
+
+    Raises:
+        OtherSkinError: it belongs to another configuration.
+    """
+    path = calibration_path(settings, node)
+    if not path.exists():
+        return None
+    try:
+        return calibrations.load(path, layout, skin_hash(settings))
+    except OtherSkinError:
+        raise
+    except CalibrationError as error:
+        log.warning("%s", error)
+        return None

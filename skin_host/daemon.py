@@ -9,20 +9,15 @@ import msgspec
 
 from skin_host import __version__, metrics, service
 from skin_host.bus.protocol import FrameBatch
-from skin_host.calibrate import collect
+from skin_host.calibrate import calibration_path, collect
 from skin_host.control import Control
 from skin_host.engine import Engine, Step
-from skin_host.errors import (
-    CalibrationError,
-    ConfigurationError,
-    OtherSkinError,
-    RequestError,
-    SkinError,
-)
+from skin_host.errors import ConfigurationError, RequestError, SkinError
 from skin_host.fingertip.desk import FingertipDesk
 from skin_host.fingertip.health import FingertipRecord
 from skin_host.health import Health, Record
-from skin_host.layout import Layout, build_layout
+from skin_host.health.telling import Teller
+from skin_host.layout import Layout, build_layout, parts_of
 from skin_host.link import Link
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration
@@ -37,12 +32,6 @@ log = logging.getLogger(__name__)
 LOOK_S = 0.1
 #: ... else this often.
 HEALTH_S = 1.0
-#: Faults are logged together, and not more often than this.
-TELL_S = 60.0
-#: Ports log these themselves, at once.
-TOLD_BY_PORTS = {"bus_down", "bus_gone", "bus_off"}
-#: A fault must have lasted for this long to be logged.
-LASTING_S = 2.0
 #: What is no news while a calibration is being taken.
 _UNTIL_CALIBRATED = {"part_not_calibrated", "fingertip_not_calibrated"}
 #: Readiness is told after the first sweeps, or after so long without.
@@ -370,79 +359,6 @@ class Daemon:
     def _state_path(self) -> Path:
         directory = service.state_directory(self.settings.service.state_directory)
         return directory / f"{self.settings.robot}-{self._node}.state.json"
-
-
-class Teller:
-    """Logs faults that last and faults that are over, in at most one line a minute."""
-
-    def __init__(self) -> None:
-        self._since_s: dict[tuple[str, str], float] = {}
-        self._logged: set[tuple[str, str]] = set()
-        self._line_s = -TELL_S
-
-    def look(self, told: dict[tuple[str, str], str], now_s: float) -> None:
-        """Take in all faults there are now: their sentences by code and place."""
-        told = {key: says for key, says in told.items() if key[0] not in TOLD_BY_PORTS}
-        self._since_s = {key: self._since_s.get(key, now_s) for key in told}
-        if now_s - self._line_s < TELL_S:
-            return
-        new = [
-            key
-            for key, since_s in self._since_s.items()
-            if key not in self._logged and now_s - since_s >= LASTING_S
-        ]
-        over = [key for key in self._logged if key not in told]
-        if not new and not over:
-            return
-        self._line_s = now_s
-        self._logged = (self._logged - set(over)) | set(new)
-        words = []
-        if new:
-            more = f" (and {len(new) - 1} more faults; see `skin status`)" if len(new) > 1 else ""
-            words.append(told[new[0]] + more)
-        if over:
-            names = ", ".join(f"{code} {where}" for code, where in sorted(over)[:3])
-            words.append(f"over: {names}" + (f" and {len(over) - 3} more" * (len(over) > 3)))
-        log.log(logging.WARNING if new else logging.INFO, "%s", "; ".join(words))
-
-
-def parts_of(layout: Layout, node: str) -> list[int]:
-    """Indices of the parts that belong to a node.
-
-    Raises:
-        ConfigurationError: none does.
-    """
-    parts = [i for i, part in enumerate(layout.parts) if part.node == node]
-    if not parts:
-        known = ", ".join(sorted({part.node for part in layout.parts}))
-        raise ConfigurationError(f'no part belongs to node "{node}"; there are: {known}')
-    return parts
-
-
-def calibration_path(settings: Settings, node: str) -> Path:
-    """Where a node keeps its calibration."""
-    directory = service.state_directory(settings.service.state_directory)
-    return directory / f"{settings.robot}-{node}.calibration.json"
-
-
-def stored_calibration(settings: Settings, layout: Layout, node: str) -> Calibration | None:
-    """The calibration that was kept, or None if there is none.
-
-    A damaged file is told of and counts as none: a service goes on without it.
-
-    Raises:
-        OtherSkinError: it belongs to another configuration.
-    """
-    path = calibration_path(settings, node)
-    if not path.exists():
-        return None
-    try:
-        return calibrations.load(path, layout, skin_hash(settings))
-    except OtherSkinError:
-        raise
-    except CalibrationError as error:
-        log.warning("%s", error)
-        return None
 
 
 async def _first_failure(tasks: list[asyncio.Task[None]], stopping: "asyncio.Task[bool]") -> None:

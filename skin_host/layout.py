@@ -337,3 +337,16 @@ def _neighbours(
         found.append(np.nonzero(near)[1] + part.start)
     start = np.concatenate([[0], np.cumsum(np.concatenate(counts))])
     return start.astype(np.int32), np.concatenate(found).astype(np.int32)
+
+
+def parts_of(layout: Layout, node: str) -> list[int]:
+    """Indices of the parts that belong to a node.
+
+    Raises:
+        ConfigurationError: none does.
+    """
+    parts = [i for i, part in enumerate(layout.parts) if part.node == node]
+    if not parts:
+        known = ", ".join(sorted({part.node for part in layout.parts}))
+        raise ConfigurationError(f'no part belongs to node "{node}"; there are: {known}')
+    return parts

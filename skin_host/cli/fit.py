@@ -113,7 +113,7 @@ def _relaxation(arguments: argparse.Namespace) -> int:
 
 def _pressure(arguments: argparse.Namespace) -> int:
     from skin_host import fit_recording
-    from skin_host.daemon import calibration_path
+    from skin_host.calibrate import calibration_path
     from skin_host.processing import calibration as calibrations
 
     if not arguments.levels or min(arguments.levels) <= 0.0:

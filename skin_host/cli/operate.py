@@ -129,7 +129,8 @@ def reload_on_hangup(daemon: "Daemon") -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from skin_host.daemon import Daemon, stored_calibration
+    from skin_host.calibrate import stored_calibration
+    from skin_host.daemon import Daemon
 
     set_up_logging(arguments.verbose)
     settings, layout = load_skin(arguments.config)
@@ -158,9 +159,9 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _calibrate(arguments: argparse.Namespace) -> int:
-    from skin_host.calibrate import take_calibration
+    from skin_host.calibrate import calibration_path, take_calibration
     from skin_host.cli import verdicts
-    from skin_host.daemon import calibration_path, parts_of
+    from skin_host.layout import parts_of
     from skin_host.processing import calibration as calibrations
 
     set_up_logging(arguments.verbose)

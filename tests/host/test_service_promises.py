@@ -11,7 +11,7 @@ import pytest
 from skin_host import metrics, service
 from skin_host.bus.logs import read_channels
 from skin_host.bus.protocol import FrameBatch, encode_sweep
-from skin_host.daemon import TELL_S, Teller
+from skin_host.health.telling import TELL_S, Teller
 from skin_host.recorder import Recorder, candump_lines
 from skin_host.settings import Bus, Touch, load
 from skin_host.state import State, Thresholds, load_state, save_state
