@@ -50,12 +50,11 @@ async def run(duration_s: float | None, stop: asyncio.Event, page_port: int) -> 
         async with local_broker() as broker, _robot(settings, layout):
             settings.mqtt.host, settings.mqtt.port = broker.host, broker.port
             settings.mqtt.protocol = broker.protocol
-            url = f"mqtt://{broker.host}:{broker.port}"
-            viewer = Viewer(url, robot=settings.robot, protocol=broker.protocol)
+            viewer = Viewer(broker.url, robot=settings.robot)
             async with viewer.serving(port=page_port) as page:
                 _explain(settings, broker, page)
                 daemon = Daemon(settings, layout)
-                listening = asyncio.create_task(_listen(url, settings, touches))
+                listening = asyncio.create_task(_listen(broker.url, settings.robot, touches))
                 await daemon.run(stop, calibrate=True)
                 # The last events are on their way through the broker.
                 await asyncio.sleep(0.2)
@@ -106,6 +105,7 @@ def _explain(settings: Settings, broker: LocalBroker, page: str) -> None:
     else:
         print(f"Emulator and daemon meet on {bus.channel}.")
     print(f"Broker: {broker.kind} on {broker.host}:{broker.port}. To listen along:")
+    print(f"    .venv/bin/skin listen --broker '{broker.url}'")
     print(f"    mosquitto_sub -p {broker.port} -v -t 'skin/demo/+/touch'")
     print(f"The live page: {page}")
     print(f"Calibrating for {CALIBRATION_S:g} s, then touches as they come:", flush=True)
@@ -130,9 +130,9 @@ async def _robot(settings: Settings, layout: Layout) -> AsyncIterator[None]:
                 raise SkinError(f"the emulator failed: {result}") from result
 
 
-async def _listen(url: str, settings: Settings, touches: "Counter[str]") -> None:
+async def _listen(url: str, robot: str, touches: "Counter[str]") -> None:
     """Be one more subscriber: count the touches and print those that begin and end."""
-    async with SkinClient(url, robot=settings.robot, protocol=settings.mqtt.protocol) as skin:
+    async with SkinClient(url, robot=robot) as skin:
         async for touch in skin.touches():
             touches[touch.event] += 1
             if touch.event != "move":

@@ -62,7 +62,8 @@ class SkinClient:
     """One robot's skin, heard over MQTT.
 
     Args:
-        broker: `mqtt://[user[:password]@]host[:port][/base]`, `mqtts://...`, or a `Broker`.
+        broker: `mqtt://[user[:password]@]host[:port][/base][?protocol=3.1.1]`, `mqtts://...`, or
+            a `Broker`.
         robot: its name; without one the only robot that the broker knows, or that is online.
         base: of the topics; "skin" unless the URL or this says otherwise.
         protocol: of MQTT, for a broker given by URL.
@@ -215,6 +216,8 @@ class SkinClient:
                 await self._until(lambda: self._connection or self._failure)
         except TimeoutError:
             why = self.last_error or "it does not answer"
+            if self._broker.v5 and "does not answer" in why:
+                why += "; if it speaks MQTT 3.1.1 alone, end its URL with ?protocol=3.1.1"
             self._failure = BrokerError(f"broker {self._broker}: cannot connect: {why}")
         except BaseException:
             await self._stop()

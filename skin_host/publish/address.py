@@ -53,7 +53,11 @@ class Broker:
 
     @classmethod
     def from_url(cls, url: str, protocol: Literal["5", "3.1.1"] = "5") -> tuple["Broker", str]:
-        """Read `mqtt://[user[:password]@]host[:port][/base]`; `mqtts` is TLS.
+        """Read `mqtt://[user[:password]@]host[:port][/base][?protocol=3.1.1]`; `mqtts` is TLS.
+
+        Args:
+            url: the URL.
+            protocol: of MQTT, unless the URL names one.
 
         Returns:
             the broker, and the base of the topics ("" if the URL has none).
@@ -61,7 +65,7 @@ class Broker:
         Raises:
             RequestError: it is not such a URL.
         """
-        wanted = "wanted mqtt://[user@]host[:port][/base] or mqtts://..."
+        wanted = "wanted mqtt://[user@]host[:port][/base][?protocol=3.1.1] or mqtts://..."
         try:
             parts = urlsplit(url)
             port = parts.port
@@ -70,6 +74,15 @@ class Broker:
         if parts.scheme not in ("mqtt", "mqtts") or not parts.hostname:
             # The URL may hold a password, so it is not repeated here.
             raise RequestError(f'the URL of the broker begins "{parts.scheme}:"; {wanted}')
+        match parts.query:
+            case "":
+                pass
+            case "protocol=3.1.1":
+                protocol = "3.1.1"
+            case "protocol=5":
+                protocol = "5"
+            case query:
+                raise RequestError(f'the URL of the broker ends with "?{query}"; {wanted}')
         secure = parts.scheme == "mqtts"
         broker = cls(
             parts.hostname,

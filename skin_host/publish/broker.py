@@ -36,6 +36,11 @@ class LocalBroker(NamedTuple):
         """The newest version of MQTT that it speaks."""
         return "5" if self.kind == "mosquitto" else "3.1.1"
 
+    @property
+    def url(self) -> str:
+        """What `Broker.from_url` takes."""
+        return f"mqtt://{self.host}:{self.port}" + "?protocol=3.1.1" * (self.protocol != "5")
+
 
 @asynccontextmanager
 async def local_broker() -> AsyncIterator[LocalBroker]:

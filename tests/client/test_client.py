@@ -1,6 +1,7 @@
 """A program hears the skin through a real broker, and through what happens to it."""
 
 import asyncio
+import socket
 import threading
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
@@ -308,3 +309,11 @@ def test_callbacks_raise_what_entering_raises() -> None:
     with pytest.raises(BrokerError):
         with SkinCallbacks(f"mqtt://127.0.0.1:{free_port()}", robot="r", patience_s=0.2):
             pass
+
+
+async def test_who_meets_silence_is_told_of_the_older_protocol() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as deaf:  # connections are made and never read
+        url = f"mqtt://127.0.0.1:{deaf.getsockname()[1]}"
+        with pytest.raises(BrokerError, match=r"end its URL with \?protocol=3\.1\.1"):
+            async with SkinClient(url, robot="robot", patience_s=3.5):
+                pass

@@ -25,7 +25,20 @@ def test_a_short_url_is_filled_up() -> None:
     assert (broker.port, broker.tls, broker.v5, base) == (1883, None, False, "")
 
 
-@pytest.mark.parametrize("url", ["http://x", "x", "mqtt://", "mqtt://x:y", "mqtt://u:secret@"])
+@pytest.mark.parametrize(("query", "protocol"), [("", "5"), ("3.1.1", "3.1.1"), ("5", "5")])
+def test_a_url_can_name_the_protocol(query: str, protocol: str) -> None:
+    url = "mqtt://robot/lab" + (f"?protocol={query}" if query else "")
+    broker, base = Broker.from_url(url)
+    assert (broker.protocol, base) == (protocol, "lab")
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        *("http://x", "x", "mqtt://", "mqtt://x:y", "mqtt://u:secret@"),
+        *("mqtt://u:secret@x?protocol=4", "mqtt://u:secret@x?a=b"),
+    ],
+)
 def test_what_is_no_such_url_is_refused_without_repeating_it(url: str) -> None:
     with pytest.raises(RequestError, match="wanted mqtt://") as raised:
         Broker.from_url(url)

@@ -54,6 +54,7 @@ async def test_the_embedded_broker_carries_everything() -> None:
     pytest.importorskip("amqtt")
     async with local.embedded_broker() as broker:
         host, port, kind = broker
+        assert broker.url == f"mqtt://{host}:{port}?protocol=3.1.1"
         seen = await publish_and_listen(host, port, broker.protocol)
     assert kind == "amqtt"
     assert sorted(seen) == ["contact", "frame", "status", "status", "touch"]
