@@ -2,6 +2,7 @@
 
 import html
 import json
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,6 +15,7 @@ STYLE = """
 body{font:16px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;
 color:#1b1f24}
 table{border-collapse:collapse;margin:1rem 0;font-size:.85rem;display:block;overflow-x:auto}
+td{white-space:nowrap}
 td,th{padding:.25rem .6rem;border-bottom:1px solid #d8dee4;text-align:right}
 td:first-child,th:first-child{text-align:left}
 img{max-width:100%}
@@ -71,7 +73,7 @@ def to_html(sections: list[Section], title: str) -> str:
     ]
     for section in sections:
         parts.append(f"<h2>{html.escape(section.title)}</h2>")
-        parts += [f"<p>{html.escape(paragraph)}</p>" for paragraph in section.text]
+        parts += [f"<p>{_code(html.escape(paragraph))}</p>" for paragraph in section.text]
         for head, rows in section.tables:
             parts.append("<table><tr>" + "".join(f"<th>{html.escape(h)}</th>" for h in head))
             parts += [
@@ -82,6 +84,10 @@ def to_html(sections: list[Section], title: str) -> str:
             alt = html.escape(section.title)
             parts.append(f'<p><img src="{section.picture}" alt="{alt}"></p>')
     return "\n".join(parts)
+
+
+def _code(text: str) -> str:
+    return re.sub("`([^`]+)`", r"<code>\1</code>", text)
 
 
 def _sections(report: Report) -> list[Section]:

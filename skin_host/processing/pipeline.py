@@ -301,7 +301,7 @@ class _PartPipeline:
         adds nothing that matters to any use of it.
         """
         row = self._row[self._laid]
-        np.copyto(self._bytes, self._last_raw)
+        self._bytes[...] = self._last_raw
         np.multiply(self._bytes, self._square, out=row)
         np.add(row, self._slope, out=row)
         np.multiply(row, self._bytes, out=row)
@@ -378,7 +378,7 @@ class _PartPipeline:
 
 def _any(flags: Mask) -> bool:
     """Whether any is set; numpy's own takes several times as long for some thousand."""
-    return b"\1" in flags.tobytes()
+    return flags.tobytes().find(1) >= 0
 
 
 def _as_bytes(levels: Floats, out: NDArray[np.uint8]) -> None:

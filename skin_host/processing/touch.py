@@ -55,6 +55,7 @@ class TouchDetector:
         self._scratch: Mask = np.zeros(n, dtype=np.bool_)
         self._bits = self._over.tobytes()
         self._alike = VOTERS
+        self._none = True
 
     def step(self, signal: Array) -> Mask:
         """Take one sample [n]; return which taxels are touched [n].
@@ -65,7 +66,7 @@ class TouchDetector:
         np.greater_equal(signal, self._threshold, out=self._over)
         bits = self._over.tobytes()
         if bits != self._bits:
-            self._bits, self._alike = bits, 0
+            self._bits, self._alike, self._none = bits, 0, bits.find(1) < 0
         elif self._alike >= VOTERS:
             return self.touched
         self._alike += 1
@@ -77,7 +78,7 @@ class TouchDetector:
         """Whether nothing is touched or has a vote, so that a sample below all thresholds
         changes nothing and need not be taken.
         """
-        return self._alike >= VOTERS and b"\1" not in self._bits
+        return self._none and self._alike >= VOTERS
 
     def reset(self, taxels: NDArray[np.intp] | Mask) -> None:
         """Forget that some taxels, by number or mask [n], were touched."""

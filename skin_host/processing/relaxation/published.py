@@ -101,7 +101,7 @@ class PublishedRelaxation:
             return mix(self._weights(self._mean.elapsed_s), self._states, out)
         if out is None:
             return self._relaxation.copy()
-        np.copyto(out, self._relaxation)
+        out[...] = self._relaxation
         return out
 
     def reset(self, mask: NDArray[np.bool_] | None = None) -> None:

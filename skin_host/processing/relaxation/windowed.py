@@ -27,7 +27,7 @@ class WindowedRelaxation:
         self._mean.feed(pressure_kpa, clean_dt(dt_s), self._complete)
         if out is None:
             return self._relaxation.copy()
-        np.copyto(out, self._relaxation)
+        out[...] = self._relaxation
         return out
 
     def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
