@@ -6,7 +6,6 @@ python -m tests.fuzz.guided SECONDS
 import asyncio
 import logging
 import sys
-import tempfile
 from pathlib import Path
 
 import atheris
@@ -59,8 +58,9 @@ def seed(folder: Path) -> None:
 
 if __name__ == "__main__":
     logging.disable(logging.CRITICAL)
-    with tempfile.TemporaryDirectory() as corpus:
-        seed(Path(corpus))
-        limits = [f"-max_total_time={sys.argv[1]}", f"-max_len={LONGEST_BYTES}", "-len_control=0"]
-        atheris.Setup([sys.argv[0], *limits, corpus], one)
-        atheris.Fuzz()
+    corpus = Path("corpus")
+    corpus.mkdir(exist_ok=True)
+    seed(corpus)
+    limits = [f"-max_total_time={sys.argv[1]}", f"-max_len={LONGEST_BYTES}", "-len_control=0"]
+    atheris.Setup([sys.argv[0], *limits, str(corpus)], one)
+    atheris.Fuzz()

@@ -80,7 +80,7 @@ async def daemon_of(
         settings.buses[bus] = Bus(interface=scheduled_bus.INTERFACE, channel=str(file))
     settings.mqtt.port = port
     settings.service.state_directory = str(state or config.parent)
-    settings.processing.calibration.seconds = 1.0
+    settings.processing.calibration.seconds = 3.0
     settings.processing.touch.move_hz = 5.0
     daemon = Daemon(settings, layout)
     stop = asyncio.Event()

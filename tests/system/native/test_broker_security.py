@@ -17,6 +17,7 @@ from skin_host.publish.mqtt import Publisher
 from skin_host.settings import Mqtt
 from tests.support import programs
 from tests.support.broker import Mosquitto
+from tests.support.certificates import authority, certificate
 
 PATIENCE_S = 30.0
 PASSWORD = "open-sesame"
@@ -32,34 +33,15 @@ def touch(number: int) -> TouchEvent:
     return TouchEvent("begin", number, number, number, "palm", [1], None, None, 1, 1.0, 1.0, 0.1)
 
 
-def openssl(folder: Path, *arguments: str) -> None:
-    subprocess.run(
-        [programs.require("openssl"), *arguments], cwd=folder, check=True, capture_output=True
-    )
-
-
 @pytest.fixture(scope="module")
 def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An authority, another one, and certificates of the broker: good, expired, of another name."""
     folder = tmp_path_factory.mktemp("certificates")
     for name in ("ca", "other"):
-        openssl(
-            folder, "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2",
-            "-keyout", f"{name}.key", "-out", f"{name}.crt", "-subj", f"/CN=test {name}",
-        )  # fmt: skip
-    for name, address, days in (
-        ("good", "IP:127.0.0.1", "2"),
-        ("expired", "IP:127.0.0.1", "-1"),
-        ("stranger", "DNS:example.org", "2"),
-    ):
-        openssl(
-            folder, "req", "-newkey", "rsa:2048", "-nodes", "-keyout", f"{name}.key",
-            "-out", f"{name}.csr", "-subj", "/CN=broker", "-addext", f"subjectAltName={address}",
-        )  # fmt: skip
-        openssl(
-            folder, "x509", "-req", "-in", f"{name}.csr", "-CA", "ca.crt", "-CAkey", "ca.key",
-            "-days", days, "-copy_extensions", "copy", "-out", f"{name}.crt",
-        )  # fmt: skip
+        authority(folder, name)
+    certificate(folder, "good", "IP:127.0.0.1")
+    certificate(folder, "expired", "IP:127.0.0.1", days=-1)
+    certificate(folder, "stranger", "DNS:example.org")
     return folder
 
 
