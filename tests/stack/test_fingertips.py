@@ -43,7 +43,7 @@ def whole(events: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
 def test_a_press_and_a_slip_on_a_fingertip_reach_a_subscriber(
     fingers: Stack, heard: Subscriber
 ) -> None:
-    fingers.calibrate()
+    assert fingers.calibrate()["fingertips"] == {"index": True, "thumb": True}
     daemon = fingers.start("run", str(fingers.config), scene=SCENE)
 
     def slipped() -> list[tuple[list[dict[str, Any]], list[dict[str, Any]]]]:
