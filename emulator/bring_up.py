@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from skin_host.bus.commands import (
+from skin_host.bus.protocol.commands import (
     Message,
     SetBoardConfig,
     SetTriangleConfig,

@@ -9,14 +9,6 @@ from dataclasses import fields
 from itertools import groupby
 from typing import NamedTuple
 
-from skin_host.bus.commands import (
-    ANSWERS,
-    COMMANDS,
-    TX_OVERFLOW_TYPE,
-    DiscoveredBootloader,
-    Message,
-    TactileSetup,
-)
 from skin_host.bus.protocol import (
     BROADCAST_ADDRESS,
     HEADER_A,
@@ -29,6 +21,8 @@ from skin_host.bus.protocol import (
     identifier,
     skin_id,
 )
+from skin_host.bus.protocol.answers import ANSWERS, TX_OVERFLOW_TYPE, DiscoveredBootloader
+from skin_host.bus.protocol.commands import COMMANDS, Message, TactileSetup
 from skin_host.errors import RequestError
 from skin_host.layout import Layout
 

@@ -4,16 +4,10 @@ import asyncio
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from skin_host.bus.commands import (
-    BoardType,
-    Discover,
-    Discovered,
-    DiscoveredBootloader,
-    command_frame,
-    parse_answer,
-)
 from skin_host.bus.port import open_port
 from skin_host.bus.protocol import BROADCAST_ADDRESS, find_skin_frames
+from skin_host.bus.protocol.answers import Discovered, DiscoveredBootloader, parse_answer
+from skin_host.bus.protocol.commands import BoardType, Discover, command_frame
 from skin_host.settings import Bus, Receive
 
 LISTEN_S = 0.5

@@ -25,15 +25,14 @@ from emulator.firmware.arithmetic import (
     Words,
 )
 from emulator.firmware.chips import SLOTS, Chips
-from skin_host.bus.commands import (
+from skin_host.bus.protocol import TRIANGLES, FrameBatch, MessageClass, encode_sweep
+from skin_host.bus.protocol.answers import (
     AdditionalInfo,
-    BoardType,
     Discovered,
     DiscoveredBootloader,
     FirmwareVersion,
-    Message,
 )
-from skin_host.bus.protocol import TRIANGLES, FrameBatch, MessageClass, encode_sweep
+from skin_host.bus.protocol.commands import BoardType, Message
 
 NS_PER_MS = 1_000_000
 INFO_PARTS = 8

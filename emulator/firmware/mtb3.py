@@ -10,7 +10,16 @@ import numpy as np
 from emulator.firmware.arithmetic import NO_GAIN, transmit_16, transmit_legacy
 from emulator.firmware.board import BOOTLOADER_S, Frame, Identity, Mtb
 from emulator.firmware.chips import CHIPS_PER_LINE, Chips, StageMap
-from skin_host.bus.commands import (
+from skin_host.bus.protocol import (
+    BROADCAST_ADDRESS,
+    HEADER_A,
+    TRIANGLES,
+    FrameBatch,
+    MessageClass,
+    identifier,
+)
+from skin_host.bus.protocol.answers import PingAnswer, ResetAnswer, answer_frame
+from skin_host.bus.protocol.commands import (
     BoardType,
     Discover,
     EnterBootloader,
@@ -19,8 +28,6 @@ from skin_host.bus.commands import (
     Management,
     Message,
     Ping,
-    PingAnswer,
-    ResetAnswer,
     SetAdditionalInfo,
     SetBoardAddress,
     SetBoardConfig,
@@ -28,16 +35,7 @@ from skin_host.bus.commands import (
     SetTxMode,
     TactileSetup,
     TactileSetup2,
-    answer_frame,
     parse_command,
-)
-from skin_host.bus.protocol import (
-    BROADCAST_ADDRESS,
-    HEADER_A,
-    TRIANGLES,
-    FrameBatch,
-    MessageClass,
-    identifier,
 )
 
 #: The sampling timer counts at 312.5 kHz.

@@ -11,7 +11,9 @@ import numpy as np
 from emulator.firmware.arithmetic import transmit_32
 from emulator.firmware.board import BOOTLOADER_S, NS_PER_MS, Frame, Identity, Mtb
 from emulator.firmware.chips import SLOTS, Chips, StageMap
-from skin_host.bus.commands import (
+from skin_host.bus.protocol import BROADCAST_ADDRESS, TRIANGLES, MessageClass
+from skin_host.bus.protocol.answers import TimeOfLife, answer_frame
+from skin_host.bus.protocol.commands import (
     BoardType,
     Discover,
     EnterBootloader,
@@ -27,11 +29,8 @@ from skin_host.bus.commands import (
     SetTriangleConfig,
     SetTxMode,
     TactileSetup,
-    TimeOfLife,
-    answer_frame,
     parse_command,
 )
-from skin_host.bus.protocol import BROADCAST_ADDRESS, TRIANGLES, MessageClass
 
 POWER_CONTROL = 0x00B0
 DEFAULT_CDC_OFFSET = 0x2200

@@ -8,7 +8,7 @@ from operator import or_
 
 import numpy as np
 
-from skin_host.bus.commands import BoardType, Message, SetBoardConfig, SetTriangleConfig
+from skin_host.bus.protocol.commands import BoardType, Message, SetBoardConfig, SetTriangleConfig
 from skin_host.layout import BoardLayout, TriangleLayout
 
 MTB3_GAP_PERIODS = 2.5

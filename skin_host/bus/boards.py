@@ -25,24 +25,26 @@ from collections.abc import Callable, Coroutine, Iterable
 from typing import Protocol
 
 from skin_host.bus.board import GAP_S, BoardRecord, configuration
-from skin_host.bus.commands import (
-    SKIN_BOARD_TYPES,
-    Discover,
-    Discovered,
-    DiscoveredBootloader,
-    GetTimeOfLife,
-    Message,
-    SetTxMode,
-    TimeOfLife,
-    TxMode,
-    TxOverflow,
-    command_frame,
-    parse_answer,
-)
 from skin_host.bus.protocol import (
     BROADCAST_ADDRESS,
     FrameBatch,
     MessageClass,
+)
+from skin_host.bus.protocol.answers import (
+    Discovered,
+    DiscoveredBootloader,
+    TimeOfLife,
+    TxOverflow,
+    parse_answer,
+)
+from skin_host.bus.protocol.commands import (
+    SKIN_BOARD_TYPES,
+    Discover,
+    GetTimeOfLife,
+    Message,
+    SetTxMode,
+    TxMode,
+    command_frame,
 )
 from skin_host.errors import BusError
 from skin_host.layout import BoardLayout, TriangleLayout

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
-from skin_host.bus.commands import SetTxMode, command_frame
+from skin_host.bus.protocol.commands import SetTxMode, command_frame
 from skin_host.errors import BusError
 from skin_host.fingertip.engine import TipState
 from skin_host.fingertip.strain_protocol import SILENT_NS, StrainMode, start_frames

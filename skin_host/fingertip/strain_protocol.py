@@ -13,8 +13,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skin_host.bus.commands import Analog, SetTransmissionPeriod, SetTxMode, command_frame
 from skin_host.bus.protocol import HOST_ADDRESS, FrameBatch, MessageClass, identifier
+from skin_host.bus.protocol.commands import Analog, SetTransmissionPeriod, SetTxMode, command_frame
 
 Floats = NDArray[np.float64]
 

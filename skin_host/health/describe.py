@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.bus.boards import Boards
-from skin_host.bus.commands import SKIN_BOARD_TYPES
 from skin_host.bus.port import Port
 from skin_host.bus.protocol import TRIANGLES, StatusError, out_of_range, status_error
+from skin_host.bus.protocol.commands import SKIN_BOARD_TYPES
 from skin_host.engine import Engine
 from skin_host.health.record import (
     BoardHealth,

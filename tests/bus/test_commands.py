@@ -6,16 +6,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skin_host.bus import commands
-from skin_host.bus.commands import (
-    AccGyroSetup,
-    Discover,
+from skin_host.bus.protocol import answers, commands
+from skin_host.bus.protocol.answers import (
     Discovered,
     DiscoveredBootloader,
     FirmwareVersion,
+    PingAnswer,
+    TxOverflow,
+    parse_answer,
+)
+from skin_host.bus.protocol.commands import (
+    AccGyroSetup,
+    Discover,
     GetFirmwareVersion,
     Ping,
-    PingAnswer,
     SetBoardAddress,
     SetBoardConfig,
     SetTriangleConfig,
@@ -23,9 +27,7 @@ from skin_host.bus.commands import (
     TactileSetup,
     TactileSetup2,
     TxMode,
-    TxOverflow,
     command_frame,
-    parse_answer,
     parse_command,
 )
 
@@ -92,7 +94,7 @@ def test_garbage_never_breaks_the_parsers(can_id, payload):
         assert parsed is None or 1 <= parsed[0] <= 15
 
 
-@pytest.mark.parametrize("kind", commands.COMMANDS + commands.ANSWERS)
+@pytest.mark.parametrize("kind", commands.COMMANDS + answers.ANSWERS)
 def test_every_message_survives_the_wire(kind):
     values = kind.LAYOUT.unpack(bytes(range(1, kind.LAYOUT.size + 1)))
     message = kind(*values)

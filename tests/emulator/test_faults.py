@@ -10,8 +10,8 @@ from emulator.faults import KINDS, parse
 from emulator.robot import Robot
 from emulator.scene import Fault, Scene
 from skin_host import settings as configurations
-from skin_host.bus.commands import Discover, command_frame
 from skin_host.bus.protocol import FrameBatch
+from skin_host.bus.protocol.commands import Discover, command_frame
 from skin_host.errors import ConfigurationError
 from skin_host.layout import build_layout
 

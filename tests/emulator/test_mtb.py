@@ -10,14 +10,17 @@ from hypothesis.extra import numpy as arrays
 
 from emulator.firmware.arithmetic import GAIN, GAIN_V2, transmit_16, transmit_32
 from emulator.mtb import make_board
-from skin_host.bus import commands
-from skin_host.bus.commands import (
+from skin_host.bus.protocol import commands
+from skin_host.bus.protocol.answers import (
     AdditionalInfo,
-    Discover,
     Discovered,
     DiscoveredBootloader,
-    EnterBootloader,
     FirmwareVersion,
+    TimeOfLife,
+)
+from skin_host.bus.protocol.commands import (
+    Discover,
+    EnterBootloader,
     GetAdditionalInfo,
     GetFirmwareVersion,
     GetTimeOfLife,
@@ -29,7 +32,6 @@ from skin_host.bus.commands import (
     SetTriangleConfig,
     SetTxMode,
     TactileSetup,
-    TimeOfLife,
     TxMode,
 )
 from tests.support.board import RESTING_FF, BoardOnBench

@@ -3,15 +3,12 @@ of icub-firmware."""
 
 import pytest
 
-from skin_host.bus.commands import (
+from skin_host.bus.protocol.answers import Discovered, FirmwareVersion, PingAnswer, ResetAnswer
+from skin_host.bus.protocol.commands import (
     Discover,
-    Discovered,
     EnterBootloader,
-    FirmwareVersion,
     GetFirmwareVersion,
     Ping,
-    PingAnswer,
-    ResetAnswer,
     SetBoardAddress,
     SetBoardConfig,
     SetTriangleConfig,

@@ -10,8 +10,9 @@ from emulator import scene as scenes
 from emulator.robot import Robot
 from emulator.scene import Place, Probe, Scene
 from skin_host import settings as configurations
-from skin_host.bus.commands import Discover, Discovered, command_frame, parse_answer
 from skin_host.bus.protocol import FrameBatch, find_skin_frames
+from skin_host.bus.protocol.answers import Discovered, parse_answer
+from skin_host.bus.protocol.commands import Discover, command_frame
 from skin_host.errors import ConfigurationError, LogError
 from skin_host.layout import Layout, build_layout
 from skin_host.settings import Settings

@@ -9,7 +9,7 @@ from emulator import single_board
 from emulator.ad7147 import AD7147
 from emulator.clock import Clock, SteppedClock
 from emulator.i2c import build_lines
-from skin_host.bus.commands import (
+from skin_host.bus.protocol.commands import (
     Discover,
     Message,
     SetBoardConfig,

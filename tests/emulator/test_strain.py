@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from emulator.strain import StrainBoard
-from skin_host.bus.commands import BoardType, Discover, Discovered, command_frame, parse_answer
+from skin_host.bus.protocol.answers import Discovered, parse_answer
+from skin_host.bus.protocol.commands import BoardType, Discover, command_frame
 from skin_host.fingertip.strain_protocol import (
     StrainType,
     WrenchAssembler,

@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skin_host.bus.commands import SetTxMode
 from skin_host.bus.protocol import FrameBatch
+from skin_host.bus.protocol.commands import SetTxMode
 from skin_host.fingertip.strain_protocol import (
     FullScale,
     GetFullScale,

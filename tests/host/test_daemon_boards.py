@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from emulator.scene import Fault
-from skin_host.bus.commands import SetTxMode, TxMode, command_frame
+from skin_host.bus.protocol.commands import SetTxMode, TxMode, command_frame
 from skin_host.settings import Bus
 from tests.support.live import living
 

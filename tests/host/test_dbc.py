@@ -10,18 +10,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skin_host.bus.commands import (
-    ANSWERS,
+from skin_host.bus.protocol import encode_sweep, status_word
+from skin_host.bus.protocol.answers import ANSWERS, Discovered, FirmwareVersion, answer_frame
+from skin_host.bus.protocol.commands import (
     COMMANDS,
-    Discovered,
-    FirmwareVersion,
     SetBoardConfig,
     SetTriangleConfig,
     TactileSetup,
-    answer_frame,
     command_frame,
 )
-from skin_host.bus.protocol import encode_sweep, status_word
 from skin_host.dbc import dbc_text
 from skin_host.errors import RequestError
 from skin_host.layout import build_layout

@@ -6,7 +6,8 @@ from emulator.ad7147 import AD7147
 from emulator.firmware.chips import I2cChips
 from emulator.i2c import build_lines
 from emulator.mtb import make_board
-from skin_host.bus.commands import Message, command_frame, parse_answer
+from skin_host.bus.protocol.answers import parse_answer
+from skin_host.bus.protocol.commands import Message, command_frame
 
 RESTING_FF = 9000.0
 STEP_NS = 1_000_000

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import can
 
-from skin_host.bus.commands import (
+from skin_host.bus.protocol.commands import (
     SetBoardConfig,
     SetTriangleConfig,
     SetTxMode,
