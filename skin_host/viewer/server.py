@@ -63,7 +63,6 @@ class Viewer:
     Args:
         broker: URL or `Broker`, see `SkinClient`.
         robot: its name; without one the only robot that the broker knows.
-        base: of the topics.
         commands: whether pages may calibrate and ask for raw values.
     """
 
@@ -72,13 +71,9 @@ class Viewer:
         broker: str | Broker,
         *,
         robot: str | None = None,
-        base: str | None = None,
-        protocol: Literal["5", "3.1.1"] = "5",
         commands: bool = True,
     ) -> None:
-        self._new_client: Callable[[], SkinClient] = lambda: SkinClient(
-            broker, robot=robot, base=base, protocol=protocol
-        )
+        self._new_client: Callable[[], SkinClient] = lambda: SkinClient(broker, robot=robot)
         self._commands = commands
         self._picture = Picture()
         self._client: SkinClient | None = None
