@@ -16,8 +16,9 @@ from skin_host.health.record import FaultName
 RATE_NS = 2_000_000_000
 #: Saturation and losses are told for so long after they were last seen.
 HOLD_NS = 3_000_000_000
-#: Single frames without their other half within `RATE_NS` that are told.
+#: Frames without their other half within `RATE_NS` that are told: so many, and this share.
 FEW_LONE = 3
+LONE_SHARE = 0.01
 
 
 class FingertipRecord(TypedDict):
@@ -67,7 +68,8 @@ class FingertipHealth:
             past.append((now_ns, samples, lone))
             while len(past) > 2 and now_ns - past[1][0] >= RATE_NS:
                 past.popleft()
-            if past[-1][2] - past[0][2] >= FEW_LONE:
+            lone, samples = past[-1][2] - past[0][2], past[-1][1] - past[0][1]
+            if lone >= max(FEW_LONE, LONE_SHARE * samples):
                 self._lossy_ns[name] = now_ns
 
     def records(self, now_ns: int | None) -> dict[str, FingertipRecord]:
@@ -142,7 +144,11 @@ class FingertipHealth:
         if state.saturated_ns and abs(now_ns - state.saturated_ns) < HOLD_NS:
             yield fault("saturated", f"{here} is saturated: the load is beyond its range")
         if abs(now_ns - self._lossy_ns.get(name, -HOLD_NS)) < HOLD_NS and self._lossy_ns.get(name):
-            yield fault("loses_frames", f"{here}: single frames are lost; the bus is overloaded")
+            yield fault(
+                "loses_frames",
+                f"{here}: force comes without torque, or the other way: frames are lost or late; "
+                "the bus is overloaded or badly terminated",
+            )
         if state.tip.touched_for_ns(now_ns) > self._engine.held_report_ns:
             yield fault(
                 "held",

@@ -24,6 +24,10 @@ CHANNELS = 6
 SILENT_NS = 100_000_000
 
 
+#: Frames of one sample come together; the next one's are a period later.
+PAIR_NS_PER_MS = 750_000
+
+
 class StrainType(IntEnum):
     """Type of a stream: the low nibble of its identifier."""
 
@@ -153,7 +157,7 @@ class StrainCounters:
 
     Attributes:
         samples: pairs found.
-        lone: frames whose other half did not come within half a period.
+        lone: frames whose other half did not come in time.
         saturated: samples with a saturated channel.
         wrong_length: frames that were no force and no torque.
     """
@@ -168,8 +172,8 @@ class StrainCounters:
 class WrenchAssembler:
     """Pairs the force and torque frames of one board, in either order.
 
-    Two frames belong together if they are of different types and came within half a
-    period of each other; a frame whose other half is late is counted and dropped, so that
+    Two frames belong together if they are of different types and came within three quarters
+    of a period of each other; a frame whose other half is late is counted and dropped, so that
     force is never joined with the torque of another sample.
 
     Args:
@@ -212,7 +216,7 @@ class WrenchAssembler:
         self, t_ns: int, kind: int, value: NDArray[np.int32], saturated: bool
     ) -> Wrench | None:
         half, self._half = self._half, None
-        if half is None or half[1] == kind or abs(t_ns - half[0]) > self.period_ms * 500_000:
+        if half is None or half[1] == kind or abs(t_ns - half[0]) > self.period_ms * PAIR_NS_PER_MS:
             self.counters.lone += half is not None
             self._half = (t_ns, kind, value, saturated)
             return None
