@@ -3,6 +3,7 @@
 The recording begins with some seconds of untouched skin, which serve as its calibration.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -31,8 +32,9 @@ Mask = NDArray[np.bool_]
 TAKES_PART = 0.6
 #: What a taxel reads in its pressed time: the recording may be mostly rest.
 PRESSED_QUANTILE = 0.95
-#: Less than this is no hold.
+#: Less than this is no hold, nor is what is pressed for less than this share of its time.
 LEAST_KPA = 10.0
+HELD_SHARE = 0.98
 #: A plateau of known pressure lasts at least so long, and is steady to this share of itself.
 PLATEAU_S = 1.0
 STEADY_SHARE = 0.05
@@ -70,8 +72,20 @@ class Samples:
         return units
 
 
-def read_samples(log: Path, settings: Settings, layout: Layout, seconds: float) -> Samples:
+def read_samples(
+    log: Path,
+    settings: Settings,
+    layout: Layout,
+    seconds: float,
+    progress: Callable[[float], None] = lambda _: None,
+) -> Samples:
     """Read a recording whose first `seconds` are untouched.
+
+    Args:
+        log: the recording.
+        settings, layout: of the skin that it is of.
+        seconds: how long it is untouched.
+        progress: is told now and then how many minutes have been read.
 
     Raises:
         LogError: unreadable, or with next to nothing of this skin in it.
@@ -85,6 +99,8 @@ def read_samples(log: Path, settings: Settings, layout: Layout, seconds: float) 
         times_ns[step.part].append(step.frame.t_ns)
         raws[step.part].append(step.frame.raw)
         valids[step.part].append(step.frame.valid)
+        if step.frame.seq % 500 == 0:
+            progress((step.frame.t_ns - times_ns[step.part][0]) / 60e9)
     heard = [part for part, times in enumerate(times_ns) if len(times) > 10]
     if not heard:
         raise LogError(f"{log}: ten sweeps or fewer; wanted a recording of a hold or of levels")
@@ -120,7 +136,7 @@ def hold_record(
         weight_kpa: the pressure of a dead weight that was laid on and taken off again.
 
     Raises:
-        RequestError: nothing was pressed for long, or it was not let go.
+        RequestError: nothing was pressed for long, or more than once, or it was not let go.
     """
     # Some thousand samples tell who takes part; the whole is looked at for those alone.
     thin = slice(None, None, max(len(samples.raw) // 4000, 1))
@@ -139,6 +155,11 @@ def hold_record(
     release = len(held) - int(np.argmax(held[::-1]))
     if release >= len(held) - 10 / samples.dt_s:
         raise RequestError("the recording ends before the release; wanted 10 s of rest or more")
+    presses = int(np.count_nonzero(held[start + 1 : release] & ~held[start : release - 1])) + 1
+    if np.mean(held[start:release]) < HELD_SHARE:
+        raise RequestError(
+            f"the skin was pressed {presses} times; wanted one hold at one level and its release"
+        )
     pressure = np.full(len(momentary), np.nan)
     pressure[release:] = 0.0
     if weight_kpa is not None:

@@ -5,14 +5,17 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from skin_host.cli.common import load_skin, print_json
+from skin_host.cli.common import Progress, load_skin, print_json
 from skin_host.errors import RequestError
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from skin_host import fit_recording
+    from skin_host.layout import Layout
     from skin_host.processing.fitting import Fit, HoldRecord
+    from skin_host.settings import Settings
 
 #: The models of `settings.RelaxationFile`; named here too, so that `skin --help` needs no numpy.
 FITTED = [
@@ -80,7 +83,7 @@ def _relaxation(arguments: argparse.Namespace) -> int:
     model = arguments.model or settings.processing.relaxation.model
     if model == "none":
         raise RequestError('the configured model is "none"; say which to fit with --model')
-    samples = fit_recording.read_samples(arguments.relaxation, settings, layout, arguments.seconds)
+    samples = _read_samples(arguments.relaxation, settings, layout, arguments.seconds)
     pressure = settings.processing.pressure
     curve = PressureCurve(
         layout.unit_ff / layout.sensitivity, 1.0, pressure.a_kpa_per_ff2, pressure.b_kpa_per_ff
@@ -119,7 +122,7 @@ def _pressure(arguments: argparse.Namespace) -> int:
     if not arguments.levels or min(arguments.levels) <= 0.0:
         raise RequestError("--pressure needs --levels: the known pressures in kPa, above 0")
     settings, layout = load_skin(arguments.config)
-    samples = fit_recording.read_samples(arguments.pressure, settings, layout, arguments.seconds)
+    samples = _read_samples(arguments.pressure, settings, layout, arguments.seconds)
     found, fit = fit_recording.fit_pressures(samples, settings, layout, arguments.levels)
     path = arguments.output or calibration_path(settings, arguments.node)
     calibrations.save(path, found, layout)
@@ -153,17 +156,37 @@ def _pressure(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _read_samples(
+    log: Path, settings: "Settings", layout: "Layout", seconds: float
+) -> "fit_recording.Samples":
+    from skin_host.fit_recording import read_samples
+
+    progress = Progress(f"reading {log.name}")
+    try:
+        return read_samples(
+            log,
+            settings,
+            layout,
+            seconds,
+            lambda minutes: progress.update(0.0, f"{minutes:.0f} min"),
+        )
+    finally:
+        progress.close()
+
+
 def _read_load(path: Path) -> tuple["NDArray[np.float64]", "NDArray[np.float64]"]:
     import numpy as np
 
+    wanted = "rising times in s and pressures in kPa, parted by commas"
     try:
         table = np.loadtxt(path, delimiter=",", ndmin=2, comments=("#", "t"))
-    except (OSError, ValueError) as error:
-        raise RequestError(f"{path}: {error}") from None
+    except OSError as error:
+        raise RequestError(f"{path}: {error.strerror}; wanted {wanted}") from None
+    except ValueError as error:
+        raise RequestError(f"{path}: {error}; wanted {wanted}") from None
     if table.shape[1] != 2 or len(table) < 2 or np.any(np.diff(table[:, 0]) <= 0.0):
         raise RequestError(
-            f"{path}: {table.shape[0]} lines of {table.shape[1]} numbers; wanted rising times in s "
-            "and pressures in kPa, parted by commas"
+            f"{path}: {table.shape[0]} lines of {table.shape[1]} numbers; wanted {wanted}"
         )
     return table[:, 0], table[:, 1]
 

@@ -236,3 +236,25 @@ def test_a_hold_that_is_never_let_go_is_refused(bench, tmp_path, capsys):
     status, said = run(capsys, "calibrate", bench, "--relaxation", log)
     assert status == RequestError.exit_status
     assert "release" in said.err
+
+
+def test_a_recording_of_several_presses_is_no_hold(bench, tmp_path, capsys):
+    units = np.zeros((600, N))
+    for start in (60, 200, 340):
+        units[start : start + 80, :4] = 20.0
+    log = tmp_path / "presses.log"
+    write_log(log, units)
+    status, said = run(capsys, "calibrate", bench, "--relaxation", log)
+    assert status == 2
+    assert said.err.count("\n") == 1
+    assert "pressed 3 times; wanted one hold" in said.err
+    assert not bench.with_suffix(".relaxation.json").exists()
+
+
+def test_what_is_no_load_cell_is_refused_with_what_is_wanted(bench, hold, capsys):
+    log, _ = hold
+    for wrong in (bench, bench.with_name("nowhere.csv")):
+        status, said = run(capsys, "calibrate", bench, "--relaxation", log, "--load", wrong)
+        assert status == 2
+        assert str(wrong) in said.err
+        assert "wanted rising times in s and pressures in kPa" in said.err
