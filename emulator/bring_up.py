@@ -41,6 +41,7 @@ def bring_up(robot: "Robot") -> None:
                 if turn < len(own_set_ups):
                     command(board, own_set_ups[turn])
             robot.step(settle_s)
+    robot.fingertips.start(robot.t_ns)
     for board in boards:
         command(board, SetTxMode(TxMode.START))
 

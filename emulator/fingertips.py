@@ -14,6 +14,12 @@ from emulator.fingertip_worlds import Friction, HeldObjects
 from emulator.scene import Keyframes, Probe, Scene, resolve, tangents
 from emulator.strain import StrainBoard
 from skin_host.bus.protocol import FrameBatch
+from skin_host.bus.protocol.commands import (
+    SetTransmissionPeriod,
+    SetTxMode,
+    TxMode,
+    command_frame,
+)
 from skin_host.errors import ConfigurationError
 from skin_host.layout import Layout
 from skin_host.settings import Fingertip, Settings
@@ -58,7 +64,7 @@ class Fingertips:
     ) -> None:
         self.boards: dict[str, StrainBoard] = {}
         self.hung: set[str] = set()
-        self._bus_of = {name: tip.bus for name, tip in settings.fingertips.items()}
+        self._tips = settings.fingertips
         self._skin_force_n = skin_force_n
         self._presses: dict[str, list[_Press]] = {}
         for number, (name, tip) in enumerate(settings.fingertips.items()):
@@ -92,6 +98,15 @@ class Fingertips:
             default=NEVER_NS,
         )
 
+    def start(self, t_ns: int) -> None:
+        """Let all boards send, at the periods of the configuration, for use without a host."""
+        for name, board in self.boards.items():
+            for message in (
+                SetTransmissionPeriod(self._tips[name].period_ms),
+                SetTxMode(TxMode.START),
+            ):
+                board.handle(*command_frame(message, board.address), t_ns)
+
     def slipped_mm(self, name: str) -> float:
         """How far what presses on a fingertip has slid over it since it was put there."""
         return max((press.slipped_mm for press in self._presses[name]), default=0.0)
@@ -99,7 +114,7 @@ class Fingertips:
     def step(self, t_ns: int) -> list[tuple[str, FrameBatch]]:
         """Bring all boards to `t_ns`; the frames that they send, by bus."""
         return [
-            (self._bus_of[name], board.step(t_ns))
+            (self._tips[name].bus, board.step(t_ns))
             for name, board in self.boards.items()
             if name not in self.hung
         ]
@@ -109,7 +124,7 @@ class Fingertips:
         return [
             answer
             for name, board in self.boards.items()
-            if self._bus_of[name] == bus and name not in self.hung
+            if self._tips[name].bus == bus and name not in self.hung
             for answer in board.handle(can_id, data, t_ns)
         ]
 

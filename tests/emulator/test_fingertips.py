@@ -113,6 +113,15 @@ def test_skin_and_board_of_the_thumb_make_one_estimate_in_one_frame() -> None:
     assert held[-1].force_n == pytest.approx(3.0, rel=0.03)
 
 
+def test_without_a_host_the_boards_stream_too() -> None:
+    settings = load(PATH)
+    robot = Robot(settings, build_layout(settings, CONFIG))
+    robot.bring_up()
+    batch = robot.step(0.3)["can0"]
+    assert np.count_nonzero(batch.id == 0x31A) == pytest.approx(100, abs=2)
+    assert np.count_nonzero(batch.id == 0x32B) == pytest.approx(30, abs=2)
+
+
 def test_frames_of_configured_boards_are_no_strangers() -> None:
     world = World()
     counters = world.engine.assemblers["can0"].counters
