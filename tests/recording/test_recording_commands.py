@@ -5,10 +5,12 @@ import json
 import signal
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from skin_host.cli import main
 from skin_host.layout import build_layout
@@ -17,6 +19,7 @@ from skin_host.publish.mqtt import Publisher
 from skin_host.publish.recording import read_said
 from skin_host.settings import Mqtt, load
 from tests.support.broker import Mosquitto
+from tests.support.world import World
 
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / "config" / "icub_hand.toml"
@@ -49,6 +52,27 @@ def test_a_recording_is_exported_and_drawn(
     ]
     with np.load(tmp_path / "a.npz") as arrays:
         assert arrays["left_hand.pressure_kpa"].shape == (260, 108)
+
+
+def test_a_recording_opens_with_the_mcap_reader_and_replays_to_the_same_bytes(
+    tmp_path: Path,
+) -> None:
+    world = World(tmp_path, tmp_path, Mosquitto("never started", tmp_path))
+    world.write_recordings()
+    with (tmp_path / "grasp.mcap").open("rb") as file:
+        topics = {channel.topic for _, channel, _ in make_reader(file).iter_messages()}
+    assert {"skin/demo/left_hand/frame", "skin/demo/left_hand/touch"} < topics
+    replayed = []
+    for number, name in enumerate(["grasp.mcap", "grasp.mcap", "grasp.log"]):
+        output = tmp_path / f"{number}.jsonl"
+        log = str(tmp_path / name)
+        assert main(["replay", log, "--config", str(world.robot), "--output", str(output)]) == 0
+        replayed.append(output.read_bytes())
+    assert replayed[0] == replayed[1] == replayed[2]
+    kinds = Counter(json.loads(line)["type"] for line in replayed[0].splitlines())
+    assert kinds["frame"] > 100
+    assert kinds["touch"] >= 2
+    assert kinds["health"] == 2
 
 
 @pytest.mark.parametrize(
