@@ -3,6 +3,7 @@
 import argparse
 import asyncio
 import contextlib
+import logging
 import sys
 from collections.abc import Callable, Coroutine
 from pathlib import Path
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from emulator.robot import Robot
     from skin_host.layout import Layout
     from skin_host.settings import Settings
+
+log = logging.getLogger(__name__)
 
 #: Lives on open python-can buses, by name, until cancelled.
 Work = Callable[[dict[str, "can.BusABC"]], Coroutine[Any, Any, None]]
@@ -107,6 +110,8 @@ def _emulate(arguments: argparse.Namespace) -> int:
         for name, bus in wanted.items():
             buses[name] = open_bus(name, bus)
             opened.callback(buses[name].shutdown)
+        channels = ", ".join(bus.channel for bus in wanted.values())
+        log.info("%s is emulated on %s", settings.robot, channels)
         asyncio.run(_until_stopped(lambda: work(buses), arguments.duration))
     return 0
 

@@ -50,6 +50,7 @@ class Stack:
         text += f"\n[service]\nstate_directory = '{self.state}'\n"
         self.config.write_text(text)
         self._processes: list[subprocess.Popen[str]] = []
+        self._said: list[Path] = []
 
     def start(self, *command: str, scene: Path | None = None) -> "subprocess.Popen[str]":
         """Start `skin COMMAND...` with a robot on its bus."""
@@ -59,22 +60,34 @@ class Stack:
         else:
             emulate = [sys.executable, "-m", "skin_host", "emulate", *robot[:1]]
             emulate += ["--scene", str(scene)] if scene else []
-            self._spawn(emulate)
+            self._await_robot(self._spawn(emulate))
             program = [sys.executable, "-m", "skin_host"]
         return self._spawn([*program, *command])
 
     def _spawn(self, command: list[str]) -> "subprocess.Popen[str]":
-        process = subprocess.Popen(
-            command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
+        said = self.directory / f"{len(self._said)}.log"
+        with said.open("w") as log:
+            process = subprocess.Popen(
+                command, cwd=ROOT, stdout=subprocess.PIPE, stderr=log, text=True
+            )
         self._processes.append(process)
+        self._said.append(said)
         return process
+
+    def _await_robot(self, process: "subprocess.Popen[str]") -> None:
+        """A robot is switched on before its host; the other order has a test of its own."""
+        said = self._said[-1]
+        deadline = time.monotonic() + WAIT_S
+        while "is emulated on" not in said.read_text():
+            assert process.poll() is None, said.read_text()
+            assert time.monotonic() < deadline, said.read_text()
+            time.sleep(0.1)
 
     def calibrate(self, *extra: str) -> Any:
         """Calibrate an untouched robot; return what the command says as JSON."""
         process = self.start("calibrate", str(self.config), "--seconds", "1", "--json", *extra)
-        out, err = process.communicate(timeout=WAIT_S)
-        assert process.returncode == 0, err
+        out, _ = process.communicate(timeout=WAIT_S)
+        assert process.returncode == 0, self._said[-1].read_text()
         self.stop()
         return json.loads(out)
 
@@ -98,7 +111,9 @@ class Stack:
         for process in self._processes:
             process.kill()
             with contextlib.suppress(ValueError):  # its pipes are closed already
-                sys.stdout.writelines(process.communicate())
+                process.communicate()
+        for said in self._said:
+            sys.stdout.write(said.read_text())
         self._processes.clear()
 
 
