@@ -39,7 +39,7 @@ def add_commands(commands: Commands) -> None:
         commands,
         "emulate",
         "be the robot on a CAN bus; faults are taken from stdin, see docs/scenes.md",
-        "skin emulate config/demo.toml --scene config/scenes/three_presses.toml --channel vcan0",
+        "skin emulate config/icub_hand.toml --channel vcan0",
     )
     add_config(emulate)
     emulate.add_argument("--scene", type=Path, help="what happens to the skin (TOML)")
