@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from emulator.faults import KINDS
+from skin_host.health.diagnosis import diagnose
 from tests.support.fault_bench import FaultBench
 
 HERE = {"board": "forearm_outer", "triangle": 3}
@@ -100,6 +101,14 @@ def test_a_chip_that_was_dead_before_the_calibration_is_not_calibrated_as_untouc
     assert not bench.valid["left_forearm"][36:48].any()
     told = {code for code, _ in bench.told}
     assert told & {"triangle_silenced", "triangle_constant", "triangle_frozen"}
+
+
+def test_a_taxel_that_the_calibration_refused_is_told(bench: FaultBench) -> None:
+    record = bench.records["left_hand"]
+    refused = record | {"taxel_verdicts": {"out_of_range": [5, 6], "noisy": [7]}, "invalid": [5, 7]}
+    (fault,) = diagnose(refused)
+    assert (fault.code, fault.where) == ("taxel_refused", "left_hand")
+    assert "taxels 5 of left_hand" in fault.says
 
 
 def test_the_new_zero_of_a_board_is_found_by_itself() -> None:
