@@ -42,7 +42,8 @@ class Fingertip(Struct, forbid_unknown_fields=True, kw_only=True):
     #: A part whose skin covers the fingertip, in the same frame: both make one estimate.
     array: Name | None = None
     node: Name = "main"
-    period_ms: Annotated[int, Meta(ge=1, le=255)] = 10
+    #: A sample is sent this often; at 10 ms slips are told after a millimetre.
+    period_ms: Annotated[int, Meta(ge=1, le=255)] = 5
     #: N and N m that the largest value of each channel stands for; the board is asked without.
     full_scale: tuple[Positive, Positive, Positive, Positive, Positive, Positive] | None = None
     #: Calibration matrix: what the board sends (N, N m) to the force and torque of whatever

@@ -23,7 +23,8 @@ class Bench:
     """A tip that has been zeroed, and pushes on points of its sphere."""
 
     def __init__(self, **settings: Any) -> None:
-        table: dict[str, Any] = {"shape": "sphere", "radius_mm": RADIUS_MM} | settings
+        table: dict[str, Any] = {"shape": "sphere", "radius_mm": RADIUS_MM, "period_ms": 10}
+        table |= settings
         self.tip = Tip("index", Fingertip(bus="can0", address=3, **table), 50.0, 50 * MS)
         self.tip.use(Zero(OFFSET, NOISE))
         self.rng = np.random.default_rng(1)

@@ -122,7 +122,7 @@ def test_a_fingertip_is_listed_and_its_samples_load_the_bus() -> None:
         Settings,
     )
     description = check.describe(settings, build_layout(settings, Path()))
-    assert description["buses"][1]["frames_per_s"] == 200
-    assert description["buses"][1]["load"] == pytest.approx((0.019, 0.023))
+    assert description["buses"][1]["frames_per_s"] == 400
+    assert description["buses"][1]["load"] == pytest.approx((0.038, 0.046))
     assert description["warnings"] == []
-    assert "index      main  can1        3   10 ms  sphere  -" in check.table(description)
+    assert "index      main  can1        3    5 ms  sphere  -" in check.table(description)

@@ -121,8 +121,8 @@ TIP = 'fingertips.tip]\nbus = "can0"\naddress = 3\nshape = '
         ),
         (
             TOP,
-            f'{TOP}\n[{TIP}"plane"\nfilter_hz = 50',
-            "fingertips.tip.filter_hz: 50; wanted below 50, half of the samples' rate",
+            f'{TOP}\n[{TIP}"plane"\nfilter_hz = 100',
+            "fingertips.tip.filter_hz: 100; wanted below 100, half of the samples' rate",
         ),
         (
             TOP,
