@@ -247,7 +247,10 @@ class Engine:
     def end_part(self, part: int, t_ns: int) -> list[TouchEvent]:
         """End every contact of a part."""
         seq = self._pipeline.seq(part) if self._pipeline else 0
-        return self._trackers[part].end_all(seq, t_ns)
+        events = self._trackers[part].end_all(seq, t_ns)
+        if self.fingertips is not None:
+            self.fingertips.note_skin(part, events, t_ns)
+        return events
 
     def end_contacts(self, t_ns: int) -> list[tuple[int, list[TouchEvent]]]:
         """End every contact, by part: the daemon stops."""

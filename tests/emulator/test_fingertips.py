@@ -113,6 +113,21 @@ def test_skin_and_board_of_the_thumb_make_one_estimate_in_one_frame() -> None:
     assert held[-1].force_n == pytest.approx(3.0, rel=0.03)
 
 
+def test_a_contact_of_the_skin_that_was_ended_is_not_joined_any_more() -> None:
+    world = World(
+        {"part": "thumb_skin", "diameter_mm": 8, "force_n": [[2, 0], [2.3, 3], [60, 3]]},
+    )
+    world.run(1.5)
+    assert world.touches("thumb")[-1].taxels
+    world.engine.disabled.add(0)
+    world.engine.end_part(0, world.robot.t_ns)
+    world.run(0.06)
+    world.engine.disabled.clear()
+    world.run(1.2)  # the skin begins a new contact, the only one
+    last = world.touches("thumb")[-1]
+    assert last.load is not None and last.load.verdict == "contact"
+
+
 def test_without_a_host_the_boards_stream_too() -> None:
     settings = load(PATH)
     robot = Robot(settings, build_layout(settings, CONFIG))
