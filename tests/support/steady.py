@@ -12,7 +12,7 @@ from skin_host.layout import build_layout
 from skin_host.settings import Bus, load
 from tests.support import scheduled_bus
 
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 #: The skin is left alone for so long, then pressed here and there, again and again.
 UNTOUCHED_S = 6.0
 LOOP_S = 4.0

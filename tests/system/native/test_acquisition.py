@@ -17,6 +17,7 @@ import pytest
 
 from emulator.scene import Scene
 from skin_host.client import SkinClient, Stream, Touch
+from skin_host.health import Record
 from skin_host.processing.pipeline import PressureFrame
 from tests.support.broker import Mosquitto, break_at_random
 from tests.support.scheduled_bus import ScheduledBus
@@ -33,6 +34,10 @@ from tests.support.steady import (
 
 SECONDS = float(os.environ.get("ACQUISITION_SECONDS", "12"))
 FRAMES_A_SWEEP = 32
+
+
+def codes(record: Record) -> set[str]:
+    return {fault["code"] for fault in record["faults"]}
 
 
 class Heard:
@@ -124,6 +129,7 @@ async def test_one_bus_of_four_that_is_unplugged_leaves_the_others_alone(
         daemon.publisher.put_frame = put_frame  # type: ignore[method-assign]
         await asyncio.sleep(SECONDS / 2)
         before = {part: sorted(delays) for part, delays in delays_ms.items()}
+        known = {part: codes(record) for part, record in daemon.records().items()}
         delays_ms.clear()
         valid.clear()
         caplog.clear()
@@ -156,9 +162,8 @@ async def test_one_bus_of_four_that_is_unplugged_leaves_the_others_alone(
             after[part][int(0.99 * len(after[part]))],
         )
         assert min(valid[part]) > MOST
-        assert {fault["code"] for fault in records[part]["faults"]} <= {"taxel_noisy"}
+        assert codes(records[part]) <= known[part] | {"taxel_noisy"}
     assert unplugged == 0.0
     assert records["part3"]["state"] == "silent"
-    told = {fault["code"] for fault in records["part3"]["faults"]}
-    assert told == {"bus_silent" if how == "cable" else "bus_gone"}
+    assert ("bus_silent" if how == "cable" else "bus_gone") in codes(records["part3"])
     assert len(lines) <= 1, lines
