@@ -2,6 +2,7 @@
 
 import argparse
 import asyncio
+import json
 import logging
 import signal
 from pathlib import Path
@@ -218,6 +219,7 @@ def _scan(arguments: argparse.Namespace) -> int:
 
 
 def _command(arguments: argparse.Namespace) -> int:
+    from skin_host.cli.watch import status_table
     from skin_host.client import SkinClient
 
     request: dict[str, Any] = {
@@ -241,9 +243,12 @@ def _command(arguments: argparse.Namespace) -> int:
     answer = asyncio.run(work())
     if arguments.json:
         print_json(answer)
+    elif arguments.name == "status":
+        print(status_table(answer))
     else:
         for key, value in answer.items():
-            print(f"{key}: {value}")
+            text = json.dumps(value) if isinstance(value, dict | list) else str(value)
+            print(f"{key}: {text}")
     return 0
 
 

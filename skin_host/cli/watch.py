@@ -112,12 +112,9 @@ async def health_of_all(broker: str, robot: str | None) -> dict[str, dict[str, A
         return records
 
 
-def _status(arguments: argparse.Namespace) -> int:
-    records = asyncio.run(health_of_all(arguments.broker, arguments.robot))
-    if arguments.json:
-        print_json(records)
-        return 0
-    print(f"{'part':<16} {'state':<14} {'Hz':>6} {'valid':>11} {'age':>9}")
+def status_table(records: dict[str, dict[str, Any]]) -> str:
+    """Health records by part as text for a terminal."""
+    lines = [f"{'part':<16} {'state':<14} {'Hz':>6} {'valid':>11} {'age':>9}"]
     for part, record in sorted(records.items()):
         valid = f"{record.get('valid_taxels', 0)}/{record.get('taxels', 0)}"
         if record.get("kind") == "fingertip":
@@ -125,9 +122,17 @@ def _status(arguments: argparse.Namespace) -> int:
         age_ms = record.get("age_ms")
         age = "-" if age_ms is None else f"{age_ms:.0f} ms"
         rate = record.get("rate_hz", 0.0)
-        print(f"{part:<16} {record.get('state', '?'):<14} {rate:>6.1f} {valid:>11} {age:>9}")
-        for sentence in record.get("sentences", ()):
-            print(f"    {sentence}")
+        lines.append(f"{part:<16} {record.get('state', '?'):<14} {rate:>6.1f} {valid:>11} {age:>9}")
+        lines += [f"    {sentence}" for sentence in record.get("sentences", ())]
+    return "\n".join(lines)
+
+
+def _status(arguments: argparse.Namespace) -> int:
+    records = asyncio.run(health_of_all(arguments.broker, arguments.robot))
+    if arguments.json:
+        print_json(records)
+        return 0
+    print(status_table(records))
     return 0 if all(record.get("state") == "ok" for record in records.values()) else 1
 
 
