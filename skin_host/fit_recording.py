@@ -35,6 +35,8 @@ PRESSED_QUANTILE = 0.95
 #: Less than this is no hold, nor is what is pressed for less than this share of its time.
 LEAST_KPA = 10.0
 HELD_SHARE = 0.98
+#: Pressure that changes by more than this share of the hold's from one sample to the next moves.
+MOVING_SHARE = 0.1
 #: A plateau of known pressure lasts at least so long, and is steady to this share of itself.
 PLATEAU_S = 1.0
 STEADY_SHARE = 0.05
@@ -171,6 +173,10 @@ def hold_record(
             now_s += samples.start_s
         inside = (now_s >= time_s[0]) & (now_s <= time_s[-1])
         pressure = np.where(inside, np.interp(now_s, time_s, load_kpa), pressure)
+    # While it moves, reading and load cell are not of the same moment.
+    moving = np.abs(np.diff(momentary)) > MOVING_SHARE * strongest[chosen].mean()
+    pressure[:-1][moving] = np.nan
+    pressure[1:][moving] = np.nan
     record = merge(samples.dt_s, momentary, pressure, start, release)
     held_units = np.median(samples.units(slice(start, release), chosen), axis=0)
     half = 0.5 * np.array([[-1.0], [1.0]])

@@ -22,8 +22,6 @@ Mask = NDArray[np.bool_]
 FINE_S = 1.0
 GROWTH = 1.1
 COARSE_S = 60.0
-#: A change of the pressure by more than this between samples is sudden.
-SUDDEN_KPA = 2.0
 #: Doubt about the pressure at any time, and about a parameter before anything is seen (as the
 #: logarithm of a factor). Together they keep what the record does not show near the stand-in.
 DOUBT_KPA = 0.3
@@ -252,7 +250,9 @@ def _least_squares(
         vector, damping = candidates[best], float(max(trials[best], 1e-9))
         if gain < 1e-5 * costs[best]:
             break
-    spread = np.sqrt(np.diag(np.linalg.inv(normal)))
+    # Where the record is worse than was assumed, so is what it tells.
+    worse = max(1.0, _rms(here[: np.count_nonzero(known)]))
+    spread = worse * np.sqrt(np.diag(np.linalg.inv(normal)))
     return vector, spread
 
 

@@ -258,3 +258,26 @@ def test_what_is_no_load_cell_is_refused_with_what_is_wanted(bench, hold, capsys
         assert status == 2
         assert str(wrong) in said.err
         assert "wanted rising times in s and pressures in kPa" in said.err
+
+
+def test_a_sample_taken_while_the_probe_moved_does_not_count(bench, tmp_path, capsys):
+    played = record("A", [(0.0, 10.0), (60.0, 240.0), (0.0, 240.0)], HZ)
+    units = np.zeros((len(played.momentary_kpa), N))
+    units[:, :6] = CURVE.units(played.momentary_kpa[:, np.newaxis])
+    units[np.argmax(played.pressure_kpa > 30.0)] *= 0.7
+    write_log(tmp_path / "hold.log", units)
+    time_s = np.arange(len(played.pressure_kpa)) / HZ
+    cell = tmp_path / "load.csv"
+    np.savetxt(cell, np.column_stack([time_s, played.pressure_kpa]), delimiter=",")
+    arguments = (
+        "calibrate",
+        bench,
+        "--relaxation",
+        tmp_path / "hold.log",
+        "--load",
+        cell,
+        "--json",
+    )
+    status, said = run(capsys, *arguments)
+    assert status == 0
+    assert max(found["rms_hold_kpa"] for found in json.loads(said.out)["fits"]) < 0.7
