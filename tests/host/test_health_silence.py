@@ -1,0 +1,43 @@
+"""Silence is measured while somebody listens: no pause and no set clock is a board's fault."""
+
+import copy
+
+import pytest
+
+from tests.support.fault_bench import FaultBench
+
+
+@pytest.fixture(scope="module")
+def calibrated() -> FaultBench:
+    return FaultBench()
+
+
+@pytest.fixture
+def bench(calibrated: FaultBench) -> FaultBench:
+    return copy.deepcopy(calibrated)
+
+
+@pytest.mark.parametrize("pause_s", [3.0, 3600.0])
+def test_a_look_after_a_pause_accuses_nobody_before_anything_is_read(
+    bench: FaultBench, pause_s: float
+) -> None:
+    bench.t_s += pause_s
+    bench._look()
+    assert bench.told == {}
+    bench.run(0.5)
+    assert bench.told == {}
+
+
+@pytest.mark.parametrize("jump_s", [-86_400.0, 0.0, 86_400.0])
+def test_a_board_that_died_before_the_clock_was_set_is_told_after_it(
+    bench: FaultBench, jump_s: float
+) -> None:
+    bench.inject("board_silent", board="hand")
+    bench.run(0.1)
+    bench.t_s += jump_s
+    bench.run(1.0)
+    assert ("board_silent", "hand") in bench.told
+    bench.t_s += jump_s
+    bench.run(0.1)
+    # It stays silent until it sends.
+    assert ("board_silent", "hand") in bench.told
