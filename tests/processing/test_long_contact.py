@@ -1,5 +1,7 @@
 """Long steady contacts through the whole pipeline: never absorbed, and no ghost afterwards."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -15,12 +17,17 @@ TEN_MINUTES_S, EIGHT_HOURS_S = 600.0, 28800.0
 FEW, ALL = 6, 192
 
 
+@cache
+def history(truth, seconds, hz):
+    return record(truth, [(0.0, BEFORE_S), (HOLD_KPA, seconds), (0.0, AFTER_S)], hz)
+
+
 def hold(truth, seconds, *, hz, pressed, drift=0.0):
     """Shares [t] of the pressed taxels told as touched: before, in the hold, and after it.
 
     Everything drifts by so many units a second. Nothing else may be told as touched.
     """
-    played = record(truth, [(0.0, BEFORE_S), (HOLD_KPA, seconds), (0.0, AFTER_S)], hz)
+    played = history(truth, seconds, hz)
     rig = Rig(1, 0.3, seed=21, hz=hz)
     here = np.arange(rig.n) < pressed
     told = []
