@@ -19,7 +19,7 @@ from skin_host.settings import Settings, skin_hash
 
 log = logging.getLogger(__name__)
 
-#: So long after it should have ended, a calibration without data is given up.
+#: When nothing has come for so long, a calibration ends with what it has.
 GRACE_S = 5.0
 
 
@@ -80,11 +80,13 @@ async def collect(
         SkinError: no board sent a sweep.
     """
     engine.begin_calibration(seconds)
-    deadline_s = time.monotonic() + seconds + GRACE_S
+    grown_s = time.monotonic()
     share = 0.0
-    while share < 1.0 and time.monotonic() < deadline_s:
+    while share < 1.0 and time.monotonic() - grown_s < GRACE_S:
         await asyncio.sleep(0.02)
-        share = engine.calibration_progress()
+        before, share = share, engine.calibration_progress()
+        if share > before:
+            grown_s = time.monotonic()
         progress(share)
     found = engine.end_calibration(datetime.now(UTC).isoformat(timespec="seconds"))
     if share == 0.0:
