@@ -82,6 +82,8 @@ async def daemon_of(
     settings.service.state_directory = str(state or config.parent)
     settings.processing.calibration.seconds = 3.0
     settings.processing.touch.move_hz = 5.0
+    # At this rate, chance touches one of so many noisy taxels all the time.
+    settings.processing.touch.margin_units = 8.0
     daemon = Daemon(settings, layout)
     stop = asyncio.Event()
     running = asyncio.create_task(daemon.run(stop))
