@@ -62,8 +62,13 @@ def test_a_press_and_a_slip_on_a_fingertip_reach_a_subscriber(
     def any_taxel(touch: list[dict[str, Any]]) -> bool:
         return any(event["taxels"] for event in touch)
 
-    touch, slip = wait_for(slipped, "a slip that ended, and its touch")[0]
-    thumb = wait_for(pressed, "a touch of the thumb that its skin felt too")[0]
+    def seen() -> object:
+        """The last events and health of each, for whoever reads that they were not enough."""
+        kinds = ("index/touch", "index/slip", "thumb/touch", "thumb_skin/touch", "index/health")
+        return {kind: (len(heard.payloads(kind)), heard.documents(kind)[-2:]) for kind in kinds}
+
+    touch, slip = wait_for(slipped, "a slip that ended, and its touch", seen)[0]
+    thumb = wait_for(pressed, "a touch of the thumb that its skin felt too", seen)[0]
     assert daemon.poll() is None
     assert set(fingers.stop()) <= {0}
 
