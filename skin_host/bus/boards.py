@@ -51,7 +51,8 @@ from skin_host.layout import BoardLayout, TriangleLayout
 
 log = logging.getLogger(__name__)
 
-DISCOVERY_S = 0.15
+#: Boards answer at once; a busy computer hears them later.
+DISCOVERY_S = 0.5
 #: Two conversions of twelve stages at decimation 256 (36.9 ms each), and some air.
 NEW_OFFSET_S = 0.09
 #: A board that does not answer within this time has not heard the question.
@@ -120,7 +121,11 @@ class Boards:
             BusError: the bus does not take frames.
         """
         await self._port.send([command_frame(Discover(), BROADCAST_ADDRESS)])
-        await asyncio.sleep(DISCOVERY_S)
+        end_s = time.monotonic() + DISCOVERY_S
+        while any(record.board_type is None for record in self.records.values()):
+            if time.monotonic() > end_s:
+                break
+            await asyncio.sleep(GAP_S)
         for address, record in self.records.items():
             if record.board_type is None:
                 log.warning(
@@ -277,7 +282,7 @@ class Boards:
         reset = record.answered_ns != 0 and not tells_age
         if record.life_s is not None:
             reset = asked_ns - int(record.life_s * 1e9) > record.configured_at_ns
-        record.resets += reset
+        record.resets += reset and record.configurations > 0
         if sent_before and record.life_s is not None and not reset and record.retries == 1:
             await self._port.send([command_frame(SetTxMode(TxMode.START), address)])
         else:
