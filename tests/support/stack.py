@@ -20,6 +20,8 @@ from tests.support.subscriber import Subscriber
 ROOT = Path(__file__).parents[2]
 #: The lane's emulated processor is slow; here this is never waited for.
 WAIT_S = 200.0
+#: How long a daemon takes to start there.
+START_S = 40.0
 
 
 class Stack:
@@ -61,10 +63,22 @@ class Stack:
             program = [sys.executable, "-m", "tests.support.one_process", *robot, "--"]
         else:
             emulate = [sys.executable, "-m", "skin_host", "emulate", *robot[:1]]
-            emulate += ["--scene", str(scene)] if scene else []
+            emulate += ["--scene", str(self._later(scene))] if scene else []
             self._await_robot(self._spawn(emulate))
             program = [sys.executable, "-m", "skin_host"]
         return self._spawn([*program, *command])
+
+    def _later(self, scene: Path) -> Path:
+        """The same scene, but nothing is touched until the slow daemon has set the boards up."""
+        later = self.directory / scene.name
+        later.write_text(
+            re.sub(
+                r"(?m)^start_s = (\S+)",
+                lambda found: f"start_s = {float(found[1]) + START_S}",
+                scene.read_text(),
+            )
+        )
+        return later
 
     def _spawn(self, command: list[str]) -> "subprocess.Popen[str]":
         said = self.directory / f"{len(self._said)}.log"

@@ -33,10 +33,10 @@ def test_candump_shows_the_frames_of_the_protocol(stack: Stack):
 def test_mosquitto_sub_receives_the_touches_of_a_press(stack: Stack):
     stack.calibrate()
     listen = [programs.require("mosquitto_sub"), "-V", "5", "-p", str(stack.broker.port)]
-    listen += ["-t", "skin/demo/+/touch", "-C", "30", "-W", "90"]
+    listen += ["-t", "skin/demo/+/touch", "-C", "30", "-W", "150"]
     listening = subprocess.Popen(listen, stdout=subprocess.PIPE, text=True)
     stack.start("run", str(stack.config), scene=SCENE)
-    out, _ = listening.communicate(timeout=100)
+    out, _ = listening.communicate(timeout=160)
     events = [json.loads(line) for line in out.splitlines()]
     assert {event["event"] for event in events} == {"begin", "move", "end"}
     assert {event["part"] for event in events} == {"left_forearm", "left_hand"}
