@@ -141,9 +141,13 @@ class Boards:
                 kind,
                 address,
             )
-        heard = [record for record in self.records.values() if record.board_type is not None]
+        heard = [
+            record
+            for record in self.records.values()
+            if record.board_type is not None or record.last_sweep_ns
+        ]
         for record in self.records.values():
-            if record.board_type is None:
+            if record not in heard:
                 # Asked again later: one that is just starting would take the end of its set-up.
                 record.started = True
                 record.configured_ns = self._clock()
@@ -222,7 +226,7 @@ class Boards:
         wait_s = WRONG_RETRY_S[min(record.wrong_tries, len(WRONG_RETRY_S) - 1)]
         record.wrong_retry_ns = now_ns + int(wait_s * 1e9)
         record.wrong_tries += 1
-        record.lost_set_ups += 1
+        record.lost_set_ups += record.configurations > 0
         if record.wrong_tries == 1:
             log.warning(
                 "bus %s: board %s %s: it is set up",
