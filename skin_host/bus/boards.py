@@ -141,13 +141,11 @@ class Boards:
                 kind,
                 address,
             )
-        heard = [
-            record
-            for record in self.records.values()
-            if record.board_type is not None or record.last_sweep_ns
-        ]
+        heard = []
         for record in self.records.values():
-            if record not in heard:
+            if record.board_type is not None or record.last_sweep_ns:
+                heard.append(record)
+            else:
                 # Asked again later: one that is just starting would take the end of its set-up.
                 record.started = True
                 record.configured_ns = self._clock()

@@ -2,29 +2,17 @@
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
+from skin_host.bus.board import GAP_S
+from skin_host.bus.boards import RETRY_S, Sender
 from skin_host.bus.protocol.commands import SetTxMode, command_frame
 from skin_host.errors import BusError
 from skin_host.fingertip.engine import TipState
 from skin_host.fingertip.strain_protocol import SILENT_NS, StrainMode, start_frames
 
 log = logging.getLogger(__name__)
-
-#: Between two commands; the boards' mailboxes are shallow.
-GAP_S = 0.01
-#: A board that is silent or has not told its full scales is set up again at once, then after
-#: so long, up to the last.
-RETRY_S = (1.0, 2.0, 4.0, 8.0)
-
-
-class Sender(Protocol):
-    """What is needed of a port: paced sending."""
-
-    async def send(self, frames: Iterable[tuple[int, bytes]], gap_s: float = ...) -> None:
-        """Send (identifier, data) frames, `gap_s` apart. Raises BusError."""
 
 
 @dataclass(slots=True)

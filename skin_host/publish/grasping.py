@@ -5,7 +5,6 @@ from typing import Annotated, Final, Literal
 
 import msgspec
 from msgspec import Meta, Struct
-from msgspec.structs import replace
 
 from skin_host.fingertip.events import FingertipEvent, OverEvent, SlipEvent
 from skin_host.processing.contacts import TouchEvent
@@ -13,8 +12,7 @@ from skin_host.publish.messages import (
     N_DECIMALS,
     Count,
     Int64,
-    check_size,
-    decode,
+    decode_event,
     line,
     touch_line,
 )
@@ -132,9 +130,7 @@ def decode_slip(payload: bytes) -> Slip:
     Raises:
         MessageError: it is not such a payload.
     """
-    check_size(payload)
-    slip = decode(_slip_decoder, payload, "slip")
-    return replace(slip, missed=0) if slip.missed else slip
+    return decode_event(_slip_decoder, payload, "slip")
 
 
 def decode_over(payload: bytes) -> Over:
@@ -143,6 +139,4 @@ def decode_over(payload: bytes) -> Over:
     Raises:
         MessageError: it is not such a payload.
     """
-    check_size(payload)
-    over = decode(_over_decoder, payload, "over")
-    return replace(over, missed=0) if over.missed else over
+    return decode_event(_over_decoder, payload, "over")

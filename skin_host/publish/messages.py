@@ -52,6 +52,7 @@ Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 HexMask = Annotated[str, Meta(max_length=MAX_TAXELS // 4)]
 Vector = tuple[float, float, float]
 T = TypeVar("T")
+S = TypeVar("S", bound=Struct)
 _HEX = re.compile("[0-9a-f]*")
 
 
@@ -298,9 +299,7 @@ def decode_touch(payload: bytes) -> Touch:
     Raises:
         MessageError: it is not such a payload.
     """
-    check_size(payload)
-    touch = decode(_touch_decoder, payload, "touch")
-    return replace(touch, missed=0) if touch.missed else touch
+    return decode_event(_touch_decoder, payload, "touch")
 
 
 def encode_contact(touched: bool) -> bytes:
@@ -409,6 +408,16 @@ def decode(decoder: "msgspec.json.Decoder[T]", payload: bytes, what: str) -> T:
         return decoder.decode(payload)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise MessageError(f"{what}: {error}") from None
+
+
+def decode_event(decoder: "msgspec.json.Decoder[S]", payload: bytes, what: str) -> S:
+    """Read a numbered event of the topic `what`; how many were missed is not the sender's to say.
+
+    Raises:
+        MessageError: it is not such a payload.
+    """
+    check_size(payload)
+    return replace(decode(decoder, payload, what), missed=0)
 
 
 def check_size(payload: bytes) -> None:
