@@ -7,6 +7,7 @@ what it knows. Times are those of the frames, ns.
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -314,26 +315,9 @@ class Tip:
     def _end(self, t_ns: int) -> list[FingertipEvent]:
         last, self._said = self._said, None
         assert last is not None and last.load is not None
-        known = not math.isnan(last.area_mm2)
         zero = [0.0, 0.0, 0.0]
-        return [
-            TouchEvent(
-                "end",
-                last.id,
-                self.samples,
-                t_ns,
-                self._name,
-                last.taxels,
-                last.centroid_m,
-                last.normal,
-                last.area_mm2,
-                0.0 if known else math.nan,
-                0.0 if known else math.nan,
-                0.0,
-                last.sigma_m,
-                Load(last.load.verdict, zero, zero, zero, self.flag_names),
-            )
-        ]
+        load = Load(last.load.verdict, zero, zero, zero, self.flag_names)
+        return [replace(last.ended(self.samples, t_ns), load=load)]
 
     def _worth_saying(self, said: TouchEvent, now: TouchEvent) -> bool:
         assert said.load is not None and now.load is not None

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal
 
@@ -73,6 +73,19 @@ class TouchEvent:
     force_n: float
     sigma_m: float | None = None
     load: Load | None = None
+
+    def ended(self, seq: int, t_ns: int) -> "TouchEvent":
+        """The contact's end: where it was last; what is known of its pressures is 0."""
+        nothing_kpa = math.nan if math.isnan(self.area_mm2) else 0.0
+        return replace(
+            self,
+            event="end",
+            seq=seq,
+            t_ns=t_ns,
+            peak_kpa=nothing_kpa,
+            mean_kpa=nothing_kpa,
+            force_n=0.0,
+        )
 
 
 @dataclass(slots=True)
@@ -238,22 +251,7 @@ class ContactTracker:
         )
 
     def _closed(self, name: int, seq: int, t_ns: int) -> TouchEvent:
-        last = self._contacts.pop(name).said
-        return TouchEvent(
-            "end",
-            name,
-            seq,
-            t_ns,
-            self._name,
-            last.taxels,
-            last.centroid_m,
-            last.normal,
-            last.area_mm2,
-            0.0,
-            0.0,
-            0.0,
-            last.sigma_m,
-        )
+        return self._contacts.pop(name).said.ended(seq, t_ns)
 
     def _worth_saying(self, said: TouchEvent, now: TouchEvent) -> bool:
         if 0 <= now.t_ns - said.t_ns < self._shortest_ns:
