@@ -15,9 +15,10 @@ from skin_host.errors import LogError, RequestError, SkinError
 from skin_host.files import write_atomic
 from skin_host.layout import Layout
 from skin_host.processing.calibration import Calibration
-from skin_host.publish import messages
+from skin_host.publish.frames import decode_frame
 from skin_host.publish.info import PartInfo, decode_info, node_info
-from skin_host.publish.messages import TouchMessage, touch_message
+from skin_host.publish.messages import TouchMessage, decode_touch, touch_message
+from skin_host.publish.payload import MessageError
 from skin_host.publish.recording import read_said
 from skin_host.replay import calibrate_from_log, replay
 from skin_host.settings import Settings, skin_hash
@@ -116,7 +117,7 @@ def read_messages(recording: Path) -> Series:
         name, kind = said.topic.split("/")[-2:]
         try:
             if kind == "frame":
-                frame = messages.decode_frame(name, said.payload)
+                frame = decode_frame(name, said.payload)
                 growing = parts.setdefault(name, _Growing())
                 if growing.kpa and len(growing.kpa[0]) != len(frame.valid):
                     raise LogError(
@@ -132,10 +133,10 @@ def read_messages(recording: Path) -> Series:
                     frame.raw,
                 )
             elif kind == "touch":
-                touches.append(messages.decode_touch(said.payload))
+                touches.append(decode_touch(said.payload))
             elif kind == "info":
                 shapes |= decode_info(said.payload).parts
-        except messages.MessageError as error:
+        except MessageError as error:
             raise LogError(f"{recording}: {said.topic}: {error}") from None
     if not parts:
         raise LogError(f"{recording}: holds no frames of pressure")

@@ -90,8 +90,7 @@ def _replay(arguments: argparse.Namespace) -> int:
     from skin_host.fingertip.health import FingertipHealth
     from skin_host.health import Health
     from skin_host.processing import calibration
-    from skin_host.publish import messages
-    from skin_host.publish.grasping import EventLines
+    from skin_host.publish.lines import EventLines, frame_line, health_line
     from skin_host.replay import calibrate_from_log, replay
     from skin_host.settings import skin_hash
 
@@ -113,17 +112,17 @@ def _replay(arguments: argparse.Namespace) -> int:
         for number, step in enumerate(replay(arguments.log, engine)):
             health.note_sweeps(engine.sweeps)
             health.note_step(step)
-            output.write(messages.frame_line(step.frame))
+            output.write(frame_line(step.frame))
             told = step.events if tips is None else [*step.events, *tips.take()]
             output.writelines(map(lines.line, told))
             if number % 200 == 0:
                 progress.update(0.0, f"{number} frames")
         for part in engine.parts:
-            output.write(messages.health_line(health.replayed(part)))
+            output.write(health_line(health.replayed(part)))
         if tips is not None:
             output.writelines(map(lines.line, tips.take()))
             for record in FingertipHealth(tips).records(None).values():
-                output.write(messages.health_line(record))
+                output.write(health_line(record))
     progress.close()
     return 0
 

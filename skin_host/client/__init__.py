@@ -12,9 +12,10 @@ from skin_host.client.callbacks import SkinCallbacks
 from skin_host.client.session import CommandError, Node, SkinClient
 from skin_host.client.streams import Contact, Health, Stream
 from skin_host.publish.address import Broker
+from skin_host.publish.frames import Frame
 from skin_host.publish.grasping import Over, Slip
 from skin_host.publish.info import NodeInfo, PartInfo
-from skin_host.publish.messages import Frame, Touch
+from skin_host.publish.messages import Touch
 
 __all__ = [
     "Broker",

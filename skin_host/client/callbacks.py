@@ -10,9 +10,10 @@ from typing import Any, Self, TypeVar
 
 from skin_host.client.session import SkinClient
 from skin_host.client.streams import Contact, Health, Stream
+from skin_host.publish.frames import Frame
 from skin_host.publish.grasping import Over, Slip
 from skin_host.publish.info import NodeInfo
-from skin_host.publish.messages import Frame, Touch
+from skin_host.publish.messages import Touch
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)

@@ -11,7 +11,6 @@ from weakref import WeakSet
 
 from skin_host.client.streams import Contact, Health, Stream
 from skin_host.errors import BrokerError, RequestError, SkinError
-from skin_host.publish import messages
 from skin_host.publish.address import Broker
 from skin_host.publish.commands import Result, decode_result, encode_request
 from skin_host.publish.connection import (
@@ -25,9 +24,11 @@ from skin_host.publish.connection import (
     is_refusal,
     message_properties,
 )
+from skin_host.publish.frames import Frame, decode_frame
 from skin_host.publish.grasping import Over, Slip, decode_over, decode_slip
 from skin_host.publish.info import NodeInfo, decode_info
-from skin_host.publish.messages import Frame, MessageError, Touch
+from skin_host.publish.messages import Touch, decode_contact, decode_health, decode_touch
+from skin_host.publish.payload import JSON_TYPE, MessageError
 from skin_host.publish.topics import ONLINE, PartTopic, Topics
 
 MAX_INCOMING = 10_000
@@ -37,7 +38,7 @@ SESSION_S = 60
 RETAINED_S = 0.5
 
 _EVENTS: dict[str, Callable[[bytes], Touch | Slip | Over]] = {
-    "touch": messages.decode_touch,
+    "touch": decode_touch,
     "slip": decode_slip,
     "over": decode_over,
 }
@@ -270,7 +271,7 @@ class SkinClient:
     async def _ask(self, node: str, name: str, arguments: dict[str, Any]) -> None:
         connection = await self._until(lambda: self._connection)
         assert connection is not None and self._topics is not None
-        properties = message_properties(self._broker, messages.JSON_TYPE)
+        properties = message_properties(self._broker, JSON_TYPE)
         if properties is not None:
             properties.ResponseTopic = self._topics.reply(node, self._identifier)
         await connection.publish(
@@ -437,13 +438,13 @@ class SkinClient:
             if item.part != part:
                 raise MessageError(f'a {kind} of "{item.part}" among those of "{part}"')
         elif kind == "frame":
-            item = messages.decode_frame(part, payload)
+            item = decode_frame(part, payload)
         elif not payload:  # a retained message was deleted
             self._latest.pop((kind, part), None)
             return
         elif kind == "contact":
-            item = self._latest[kind, part] = Contact(part, messages.decode_contact(payload))
+            item = self._latest[kind, part] = Contact(part, decode_contact(payload))
         else:
-            item = self._latest[kind, part] = Health(part, messages.decode_health(payload))
+            item = self._latest[kind, part] = Health(part, decode_health(payload))
         for stream in streams:
             stream.put(item)

@@ -7,8 +7,9 @@ from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 from msgspec.structs import replace
 
+from skin_host.publish.frames import Frame
 from skin_host.publish.grasping import Over, Slip
-from skin_host.publish.messages import Frame, Touch
+from skin_host.publish.messages import Touch
 from skin_host.publish.topics import PartTopic
 
 #: What is held for a reader that is slow; then the oldest goes, and is missed.

@@ -20,7 +20,7 @@ import numpy as np
 
 from skin_host.errors import RequestError
 from skin_host.processing.pipeline import PressureFrame
-from skin_host.publish.messages import encode_frame
+from skin_host.publish.frames import encode_frame
 from skin_host.publish.mqtt import Publisher
 from skin_host.settings import Mqtt
 

@@ -16,11 +16,10 @@ import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from skin_host.errors import SkinError
-from skin_host.publish.messages import MessageError
+from skin_host.publish.payload import MessageError, decode
 
 RESULT_SCHEMA = "skin.result/1"
 MAX_REQUEST_BYTES = 64 * 1024
-MAX_RESULT_BYTES = 4 * 1024 * 1024
 #: So many commands may run at a time.
 MAX_RUNNING = 8
 #: So many requests are taken at once, and so many a second in the long run.
@@ -52,6 +51,9 @@ class _Identified(Struct):
     id: Annotated[str, Meta(max_length=64)] | int | UnsetType = UNSET
 
 
+_result_decoder = msgspec.json.Decoder(Result)
+
+
 def encode_request(arguments: Mapping[str, Any]) -> bytes:
     """Write the request of a command."""
     return msgspec.json.encode(dict(arguments))
@@ -63,12 +65,7 @@ def decode_result(payload: bytes) -> Result:
     Raises:
         MessageError: it is not one.
     """
-    if len(payload) > MAX_RESULT_BYTES:
-        raise MessageError(f"result: {len(payload)} bytes; wanted at most {MAX_RESULT_BYTES}")
-    try:
-        result = msgspec.json.decode(payload, type=Result)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise MessageError(f"result: {error}") from None
+    result = decode(_result_decoder, payload, "result")
     if result.schema != RESULT_SCHEMA:
         raise MessageError(f'result: schema "{result.schema}"; wanted {RESULT_SCHEMA}')
     return result

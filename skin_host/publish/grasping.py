@@ -1,21 +1,13 @@
 """What is said of slips and of pressing too hard: `<part>/slip`, `<part>/over`. Pure."""
 
-from collections import Counter
 from typing import Annotated, Final, Literal
 
 import msgspec
 from msgspec import Meta, Struct
 
-from skin_host.fingertip.events import FingertipEvent, OverEvent, SlipEvent
-from skin_host.processing.contacts import TouchEvent
-from skin_host.publish.messages import (
-    N_DECIMALS,
-    Count,
-    Int64,
-    decode_event,
-    line,
-    touch_line,
-)
+from skin_host.fingertip.events import OverEvent, SlipEvent
+from skin_host.publish.messages import N_DECIMALS
+from skin_host.publish.payload import Count, Int64, decode_event
 
 SLIP_SCHEMA: Final = "skin.slip/1"
 OVER_SCHEMA: Final = "skin.over/1"
@@ -106,22 +98,6 @@ def grasp_message(event: SlipEvent | OverEvent, count: int) -> SlipMessage | Ove
 def encode_grasp(event: SlipEvent | OverEvent, count: int) -> bytes:
     """Write the payload of `<part>/slip` or `<part>/over`."""
     return msgspec.json.encode(grasp_message(event, count))
-
-
-class EventLines:
-    """Events as lines of `skin replay`: the payload as published, and its type; numbered."""
-
-    def __init__(self) -> None:
-        self._counts: Counter[tuple[str, type]] = Counter()
-
-    def line(self, event: FingertipEvent) -> bytes:
-        """A touch, slip, or excess as a line."""
-        key = event.part, type(event)
-        self._counts[key] += 1
-        if isinstance(event, TouchEvent):
-            return touch_line(event, self._counts[key])
-        kind = "slip" if isinstance(event, SlipEvent) else "over"
-        return line(kind, msgspec.to_builtins(grasp_message(event, self._counts[key])))
 
 
 def decode_slip(payload: bytes) -> Slip:

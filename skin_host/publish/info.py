@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from skin_host.fingertip.settings import Fingertip
 from skin_host.layout import Layout, PadKind, PartLayout
-from skin_host.publish.messages import SCALE_KPA, MessageError, Vector
+from skin_host.publish.frames import SCALE_KPA
+from skin_host.publish.payload import MessageError, Vector, decode
 
 INFO_SCHEMA: Final = "skin.info/1"
 #: 100 000 taxels and their triangles fit.
@@ -157,12 +158,7 @@ def decode_info(payload: bytes) -> NodeInfo:
     Raises:
         MessageError: it is not such a payload.
     """
-    if len(payload) > MAX_BYTES:
-        raise MessageError(f"info: {len(payload)} bytes; wanted at most {MAX_BYTES}")
-    try:
-        info = _decoder.decode(payload)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise MessageError(f"info: {error}") from None
+    info = decode(_decoder, payload, "info", MAX_BYTES)
     for name, part in info.parts.items():
         n = len(part.pads)
         lists: tuple[list[Any], ...] = (part.position_m, part.normal, part.radius_mm, part.area_mm2)

@@ -16,7 +16,6 @@ from typing import Any, Literal, NamedTuple, Self
 from skin_host.fingertip.events import OverEvent, SlipEvent
 from skin_host.processing.contacts import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
-from skin_host.publish import messages
 from skin_host.publish.address import Broker
 from skin_host.publish.commands import CommandDesk, Handler
 from skin_host.publish.connection import (
@@ -33,9 +32,12 @@ from skin_host.publish.connection import (
     message_properties,
     within,
 )
+from skin_host.publish.frames import encode_frame, load_cbor2
 from skin_host.publish.home_assistant import discovery
 from skin_host.publish.info import NodeInfo, encode_info
+from skin_host.publish.messages import encode_contact, encode_health
 from skin_host.publish.outbox import Event, Outbox, PublisherCounters
+from skin_host.publish.payload import CBOR_TYPE, JSON_TYPE
 from skin_host.publish.topics import OFFLINE, ONLINE, Topics
 from skin_host.settings import Mqtt
 
@@ -93,7 +95,7 @@ class Publisher:
         self._broker = Broker.from_settings(settings, folder)
         self._encoding = settings.encoding
         if self._encoding == "cbor":
-            messages.load_cbor2()
+            load_cbor2()
         self._node = node
         self._discovery_prefix = settings.discovery_prefix
         self._identifier = f"skin-{robot}-{node}"
@@ -109,14 +111,12 @@ class Publisher:
         self._task: asyncio.Task[None] | None = None
 
         cbor = self._encoding == "cbor"
-        frame_type = messages.CBOR_TYPE if cbor else messages.JSON_TYPE
+        frame_type = CBOR_TYPE if cbor else JSON_TYPE
         properties = message_properties(self._broker, frame_type, text=not cbor)
         if properties is not None:
             properties.MessageExpiryInterval = FRAME_EXPIRY_S
         self._frame_properties = PackedProperties.of(properties)
-        self._json_properties = PackedProperties.of(
-            message_properties(self._broker, messages.JSON_TYPE)
-        )
+        self._json_properties = PackedProperties.of(message_properties(self._broker, JSON_TYPE))
         self._text_properties = PackedProperties.of(message_properties(self._broker, "text/plain"))
 
     @property
@@ -162,13 +162,13 @@ class Publisher:
     def put_contact(self, part: str, touched: bool) -> None:
         """Say whether a part is touched at all; nothing is sent if that is known already."""
         topic = self.topics.part("contact", part)
-        payload = messages.encode_contact(touched)
+        payload = encode_contact(touched)
         if self._outbox.retained.get(topic) != payload:
             self._outbox.put_state(topic, payload)
 
     def put_health(self, part: str, record: Any) -> None:
         """Say how a part is: a record with keys that JSON can hold."""
-        self._outbox.put_state(self.topics.part("health", part), messages.encode_health(record))
+        self._outbox.put_state(self.topics.part("health", part), encode_health(record))
 
     async def __aenter__(self) -> Self:
         self._task = asyncio.create_task(self._run(), name="mqtt publisher")
@@ -261,7 +261,7 @@ class Publisher:
                 raw = time.monotonic() < self._raw_until_s
                 for _ in range(min(FRAME_WINDOW, len(outbox.frames))):
                     frame = outbox.take_frame()
-                    payload = messages.encode_frame(frame, self._encoding, raw=raw)
+                    payload = encode_frame(frame, self._encoding, raw=raw)
                     topic = self.topics.part("frame", frame.part)
                     written = connection.send(topic, payload, properties=self._frame_properties)
                     outbox.counters.frames_sent += 1
@@ -347,7 +347,7 @@ class Publisher:
         self._desk.take(name, payload, partial(self._answer, reply_to, correlation))
 
     def _answer(self, topic: str, correlation: bytes, payload: bytes) -> None:
-        properties = message_properties(self._broker, messages.JSON_TYPE)
+        properties = message_properties(self._broker, JSON_TYPE)
         if properties is not None and correlation:
             properties.CorrelationData = correlation
         self._outbox.put_event(Event(topic, payload, properties, is_touch=False))

@@ -15,9 +15,9 @@ from typing import NamedTuple
 from skin_host.fingertip.events import OverEvent, SlipEvent
 from skin_host.processing.contacts import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
-from skin_host.publish import messages
 from skin_host.publish.connection import MessageProperties
 from skin_host.publish.grasping import encode_grasp
+from skin_host.publish.messages import encode_touch
 
 #: `move` events may fill half of the queue: a begin or an end is worth more.
 MOVE_SHARE = 0.5
@@ -119,7 +119,7 @@ class Outbox:
     ) -> None:
         """Take a touch event, or count it as lost; either way it is numbered."""
         limit = self._move_limit if touch.event == "move" else self._event_limit
-        self._put_counted(topic, lambda n: messages.encode_touch(touch, n), properties, limit)
+        self._put_counted(topic, lambda n: encode_touch(touch, n), properties, limit)
 
     def put_grasp(
         self, topic: str, event: SlipEvent | OverEvent, properties: MessageProperties | None

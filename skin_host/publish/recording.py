@@ -20,8 +20,9 @@ from msgspec import Struct
 from skin_host.bus.protocol import FrameBatch
 from skin_host.errors import LogError, SkinError
 from skin_host.processing.pipeline import PressureFrame
-from skin_host.publish import messages
+from skin_host.publish.frames import Frame, decode_frame, encode_frame
 from skin_host.publish.grasping import decode_over, decode_slip
+from skin_host.publish.messages import decode_touch
 from skin_host.publish.recording_schemas import SCHEMAS
 from skin_host.publish.topics import PartTopic, Topics
 
@@ -252,12 +253,12 @@ def _checked(topic: str, kind: str, payload: bytes, t_ns: int) -> tuple[bytes, i
     """The data to record, and when it was sent."""
     if kind == "frame":
         part = topic.split("/")[-2]
-        frame = messages.decode_frame(part, payload)
+        frame = decode_frame(part, payload)
         if payload[:1] >= b"\xa0":
             payload = _as_json(frame)
         return payload, frame.t_ns
     if kind == "touch":
-        return payload, messages.decode_touch(payload).t_ns
+        return payload, decode_touch(payload).t_ns
     if kind in ("slip", "over"):
         found = decode_slip(payload) if kind == "slip" else decode_over(payload)
         return payload, found.t_ns
@@ -267,7 +268,7 @@ def _checked(topic: str, kind: str, payload: bytes, t_ns: int) -> tuple[bytes, i
     return payload, t_ns
 
 
-def _as_json(frame: messages.Frame) -> bytes:
+def _as_json(frame: Frame) -> bytes:
     none = np.zeros(len(frame.valid), np.bool_)
     raw = frame.raw if frame.raw is not None else np.zeros(len(frame.valid), np.uint8)
     whole = PressureFrame(
@@ -280,7 +281,7 @@ def _as_json(frame: messages.Frame) -> bytes:
         frame.valid,
         frame.beyond_range,
     )
-    return messages.encode_frame(whole, raw=frame.raw is not None)
+    return encode_frame(whole, raw=frame.raw is not None)
 
 
 def _decode(path: Path, topic: str, data: bytes, kind: type[Any]) -> Any:

@@ -4,7 +4,8 @@ import numpy as np
 from msgspec.structs import replace
 
 from skin_host.client.streams import HELD, Contact, Stream
-from skin_host.publish.messages import Frame, Touch
+from skin_host.publish.frames import Frame
+from skin_host.publish.messages import Touch
 
 
 def touch(count: int, t_ns: int | None = None, part: str = "palm") -> Touch:

@@ -10,6 +10,7 @@ from skin_host.fingertip.events import OverEvent, SlipEvent
 from skin_host.processing.contacts import Load, TouchEvent
 from skin_host.publish import grasping, messages
 from skin_host.publish.outbox import Outbox
+from skin_host.publish.payload import MessageError
 
 SLIP = SlipEvent("begin", 4, 10, "index", "rate", 2.01, 1.14, 7.5)
 OVER = OverEvent("end", 4, 12, "index", 9.5)
@@ -33,7 +34,7 @@ def test_what_was_said_is_what_is_heard() -> None:
 @given(st.binary(max_size=200))
 def test_no_payload_of_a_stranger_raises_anything_else(payload: bytes) -> None:
     for decode in (grasping.decode_slip, grasping.decode_over):
-        with pytest.raises(messages.MessageError):
+        with pytest.raises(MessageError):
             decode(payload)
 
 

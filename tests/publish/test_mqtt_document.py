@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from skin_host.publish import grasping, messages
+from skin_host.publish import frames, grasping, messages
 from skin_host.publish.commands import decode_result
 from skin_host.publish.info import FingertipInfo, NodeInfo, PartInfo, TriangleInfo
 from skin_host.publish.outbox import PublisherCounters
@@ -19,7 +19,7 @@ EXAMPLES = {
 
 
 def test_the_frame_of_the_document_is_a_frame() -> None:
-    frame = messages.decode_frame("palm", EXAMPLES["skin.frame/1"])
+    frame = frames.decode_frame("palm", EXAMPLES["skin.frame/1"])
     np.testing.assert_allclose(frame.pressure_kpa[2:4], [3.12, 12.07])
     assert np.flatnonzero(~frame.valid).tolist() == [11]
 
@@ -49,7 +49,7 @@ def test_the_document_names_every_key() -> None:
     keys = {
         *messages.TouchMessage.__struct_fields__,
         *messages.LoadMessage.__struct_fields__,
-        *messages._FrameFields.__struct_fields__,
+        *frames._FrameFields.__struct_fields__,
         *NodeInfo.__struct_fields__,
         *PartInfo.__struct_fields__,
         *TriangleInfo.__struct_fields__,

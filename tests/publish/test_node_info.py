@@ -7,7 +7,7 @@ import pytest
 
 from skin_host.layout import build_layout
 from skin_host.publish.info import CalibrationInfo, decode_info, encode_info, node_info
-from skin_host.publish.messages import MessageError
+from skin_host.publish.payload import MessageError
 from skin_host.settings import load, skin_hash
 
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"

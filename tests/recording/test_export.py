@@ -12,7 +12,7 @@ from skin_host.errors import LogError, RequestError
 from skin_host.export import Series, export, read_frames, read_messages
 from skin_host.layout import build_layout
 from skin_host.processing.pipeline import PressureFrame
-from skin_host.publish import messages
+from skin_host.publish.frames import encode_frame
 from skin_host.publish.recording import Recorder
 from skin_host.replay import calibrate_from_log
 from skin_host.settings import load
@@ -103,7 +103,7 @@ def test_a_recording_of_messages_gives_the_same_arrays(
                 np.isfinite(kpa),
                 part.beyond_range[row],
             )
-            payload = messages.encode_frame(frame, raw=True)
+            payload = encode_frame(frame, raw=True)
             recorder.say("skin/icub/left_hand/frame", row, payload)
     seen = read_messages(path).parts["left_hand"]
     np.testing.assert_array_equal(seen.t_ns, part.t_ns)

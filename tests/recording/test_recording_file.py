@@ -14,7 +14,8 @@ from skin_host.bus.protocol import FrameBatch
 from skin_host.errors import LogError
 from skin_host.processing.contacts import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
-from skin_host.publish import messages
+from skin_host.publish.frames import encode_frame
+from skin_host.publish.messages import encode_touch
 from skin_host.publish.recording import Recorder, read_can, read_said
 
 TOPIC = "skin/demo/palm"
@@ -27,11 +28,11 @@ def frame(seq: int, encoding: Any = "json", *, raw: bool = False) -> bytes:
     sent = PressureFrame(
         "palm", seq, 1000 * seq, np.arange(m, dtype=np.uint8), kpa, none, ~none, none
     )
-    return messages.encode_frame(sent, encoding, raw=raw)
+    return encode_frame(sent, encoding, raw=raw)
 
 
 def touch(event: Any, number: int) -> bytes:
-    return messages.encode_touch(
+    return encode_touch(
         TouchEvent(event, 7, number, 500, "palm", [1, 2], None, None, 40.0, 3.0, 2.0, 0.1), number
     )
 

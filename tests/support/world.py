@@ -20,8 +20,9 @@ from skin_host.capture import CanLog
 from skin_host.engine import Engine
 from skin_host.layout import build_layout
 from skin_host.processing import calibration
-from skin_host.publish import messages
+from skin_host.publish.frames import encode_frame
 from skin_host.publish.info import encode_info, node_info
+from skin_host.publish.messages import encode_touch
 from skin_host.publish.recording import Recorder
 from skin_host.replay import calibrate_from_log, read_buses
 from skin_host.settings import Bus, load
@@ -106,10 +107,10 @@ class World:
                 recorder.can(self.channel("robot"), batch)
                 for step in engine.feed(bus, batch):
                     topic = f"skin/demo/{step.frame.part}"
-                    payload = messages.encode_frame(step.frame)
+                    payload = encode_frame(step.frame)
                     recorder.say(f"{topic}/frame", step.frame.t_ns, payload)
                     for i, event in enumerate(step.events):
-                        payload = messages.encode_touch(event, i + 1)
+                        payload = encode_touch(event, i + 1)
                         recorder.say(f"{topic}/touch", event.t_ns, payload)
 
     def write_imports(self) -> None:
