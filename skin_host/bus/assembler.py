@@ -9,6 +9,7 @@ back, it is.
 """
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,10 +32,8 @@ from skin_host.layout import BoardLayout
 PAUSE_PERIODS = 0.5
 #: A triangle is awaited until it was missing in so many sweeps in a row.
 PATIENCE_SWEEPS = 3
-_HALVES = 2 * TRIANGLES
-_FIRST_HALVES = 0x55555555
-#: Masks of groups of 2, 4, 8, 16 bits, by half their width.
-_GROUPS = {1: 0x33333333, 2: 0x0F0F0F0F, 4: 0x00FF00FF, 8: 0xFFFF}
+#: What a triangle's bit in a mask of triangles makes in a mask of halves: its A and its B.
+_BOTH = 1 << TRIANGLES | 1
 #: What a frame brings behind its header, and two of them together.
 _NOTHING = bytes(7)
 _TRIANGLE = np.dtype([("raw", np.uint8, TAXELS), ("status", ">u2")])
@@ -47,8 +46,7 @@ _CLASSES = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Sweep:
+class Sweep(NamedTuple):
     """One board's values of one period.
 
     Attributes:
@@ -96,13 +94,13 @@ class AssemblerCounters:
 
 @dataclass(slots=True)
 class _BoardState:
-    """One board's sweep in progress; masks have bit 2 * triangle for A, the next one for B.
+    """One board's sweep in progress; masks have bits 0-15 for A frames, 16-31 for B frames.
 
     Attributes:
         wanted: halves that the configured triangles send.
         awaited: those without which a sweep is not complete.
         missing: those of `awaited` that have not come; 0 between sweeps.
-        values: what came, by number of the bit.
+        values: what came of each triangle, A and B in turn.
     """
 
     index: int
@@ -118,7 +116,7 @@ class _BoardState:
     sent: int = 0
     sent_first_ns: int = -(1 << 62)
     sent_last_ns: int = 0
-    values: list[bytes] = field(default_factory=lambda: [_NOTHING] * _HALVES)
+    values: list[bytes] = field(default_factory=lambda: [_NOTHING] * 2 * TRIANGLES)
     absent_for: list[int] = field(default_factory=lambda: [0] * TRIANGLES)
 
 
@@ -141,13 +139,13 @@ class Assembler:
         self._force_torque = force_torque
         self._states: dict[int, _BoardState] = {}
         # By identifier << 8 | header byte of each frame that a configured triangle may send:
-        # the board, the number of the frame's bit in its masks, and the bit.
+        # the board, the place among its values, and the bit in its masks.
         self._slots: dict[int, tuple[_BoardState, int, int]] = {}
         for index, board in boards:
             period_ns = board.settings.period_ms * 1_000_000
             wanted = 0
             for triangle in board.triangles:
-                wanted |= 3 << 2 * triangle
+                wanted |= _BOTH << triangle
             state = _BoardState(
                 index,
                 period_ns,
@@ -179,11 +177,11 @@ class Assembler:
                 # Old firmware: no status; what lies behind the DLC is not defined.
                 payload = payload[: TAXELS - VALUES_A] + b"\0\0"  # noqa: PLW2901
             t_ns = seconds * NS_PER_S + nanoseconds
-            state, number, bit = slot
+            state, place, bit = slot
             if (bit & state.missing and t_ns <= state.certain_until_ns) or self._belongs(
                 state, bit, t_ns, sweeps
             ):
-                state.values[number] = payload
+                state.values[place] = payload
                 state.last_ns = t_ns
                 state.missing ^= bit
                 if not state.missing:
@@ -210,8 +208,8 @@ class Assembler:
         for half, header in enumerate((HEADER_A, HEADER_B)):
             for message_class in _CLASSES[header]:
                 identifier = message_class << 8 | address << 4 | triangle
-                number = 2 * triangle + half
-                self._slots[identifier << 8 | header] = state, number, 1 << number
+                bit = 1 << triangle + half * TRIANGLES
+                self._slots[identifier << 8 | header] = state, 2 * triangle + half, bit
 
     def _usable(self, identifier: int, dlc: int, header: int) -> bool:
         """Count a frame that is not a whole one of a configured triangle.
@@ -259,8 +257,8 @@ class Assembler:
         ):
             self._close(state, sweeps)
         if not bit & state.awaited:
-            triangle = (bit.bit_length() - 1) // 2
-            both = 3 << 2 * triangle
+            triangle = (bit.bit_length() - 1) % TRIANGLES
+            both = _BOTH << triangle
             state.awaited |= both
             state.absent_for[triangle] = 0
             if state.missing:
@@ -277,26 +275,24 @@ class Assembler:
 
     def _close(self, state: _BoardState, sweeps: list[Sweep]) -> None:
         got = state.awaited & ~state.missing
-        pairs = got & got >> 1 & _FIRST_HALVES
+        present = got & got >> TRIANGLES
         missed = 0
         if state.sent_last_ns:
             apart = round((state.last_ns - state.sent_last_ns) / state.period_ns)
             missed = max(0, apart - 1)
-        triangles = np.frombuffer(bytearray().join(state.values), _TRIANGLE)
-        if state.wanted & ~(pairs * 3):
-            absent = [triangle for triangle in range(TRIANGLES) if not pairs >> 2 * triangle & 1]
-            triangles[absent] = 0
-            self._note_absent(state, pairs)
-        elif any(state.absent_for):
-            state.absent_for = [0] * TRIANGLES
         counters = self.counters
         counters.sweeps += 1
-        counters.incomplete += state.missing != 0
-        counters.halves += (got ^ pairs * 3).bit_count()
         counters.missed += missed
-        if pairs:
+        triangles = np.frombuffer(bytearray().join(state.values), _TRIANGLE)
+        if got != state.wanted:
+            counters.incomplete += state.missing != 0
+            counters.halves += (got ^ present * _BOTH).bit_count()
+            triangles[[not present >> triangle & 1 for triangle in range(TRIANGLES)]] = 0
+            self._note_absent(state, present)
+        elif any(state.absent_for):
+            state.absent_for = [0] * TRIANGLES
+        if present:
             status = triangles["status"].astype(np.uint16)
-            present = _every_second_bit(pairs)
             sweeps.append(
                 Sweep(state.index, triangles["raw"], status, present, state.last_ns, missed)
             )
@@ -306,21 +302,13 @@ class Assembler:
         state.missing = 0
 
     @staticmethod
-    def _note_absent(state: _BoardState, pairs: int) -> None:
+    def _note_absent(state: _BoardState, present: int) -> None:
         for triangle in range(TRIANGLES):
-            both = 3 << 2 * triangle
-            if pairs & both:
+            if present >> triangle & 1:
                 state.absent_for[triangle] = 0
-            elif state.wanted & both:
+            elif state.wanted >> triangle & 1:
                 state.absent_for[triangle] += 1
                 if state.absent_for[triangle] >= PATIENCE_SWEEPS:
-                    state.awaited &= ~both
+                    state.awaited &= ~(_BOTH << triangle)
         if not state.awaited:
             state.awaited = state.wanted
-
-
-def _every_second_bit(bits: int) -> int:
-    """Bits 0, 2, 4, ... 30 moved together; the others must be 0."""
-    for width in (1, 2, 4, 8):
-        bits = (bits | bits >> width) & _GROUPS[width]
-    return bits
