@@ -6,6 +6,14 @@ from pathlib import Path
 from tests.support import programs
 
 _LIMIT_S = 120.0
+#: A browser that minds its own business.
+QUIET = [
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
 
 
 def page_text(url: str, profile: Path, *, wait_ms: int = 5000) -> str:
@@ -35,6 +43,7 @@ def _chromium(profile: Path, *arguments: str) -> str:
             "--no-sandbox",  # root has no sandbox of its own
             "--disable-gpu",
             "--disable-dev-shm-usage",
+            *QUIET,
             "--hide-scrollbars",
             f"--user-data-dir={profile}",
             *arguments,

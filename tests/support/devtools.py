@@ -14,6 +14,7 @@ from typing import Any
 from websockets.asyncio.client import ClientConnection, connect
 
 from tests.support import programs
+from tests.support.browser import QUIET
 
 PATIENCE_S = 60.0
 
@@ -105,6 +106,7 @@ async def browser(profile: Path) -> AsyncIterator[Page]:
         "--no-sandbox",  # root has no sandbox of its own
         "--disable-gpu",
         "--disable-dev-shm-usage",
+        *QUIET,
         "--remote-debugging-port=0",
         f"--user-data-dir={profile}",
         "about:blank",

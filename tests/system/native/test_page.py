@@ -1,7 +1,5 @@
 """The live page in a real browser, from presses on emulated foam to what a person sees."""
 
-import asyncio
-import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -13,8 +11,9 @@ from skin_host.importing.run import import_files
 from skin_host.importing.writing import configuration_text
 from skin_host.settings import Bus, load
 from tests.support.broker import Mosquitto
-from tests.support.devtools import Page, browser
+from tests.support.devtools import Page
 from tests.support.stack import ROOT, Stack
+from tests.support.viewing import LIVE, viewing
 
 SAMPLES = ROOT.parent / "shared" / "data"
 SCENE = ROOT / "config" / "scenes" / "demo.toml"
@@ -29,7 +28,6 @@ DRAWN = """(() => {
     for (let i = 3; i < data.length; i += 4) if (data[i]) drawn++;
     return drawn;
 })()"""
-LIVE = 'document.getElementById("status").dataset.level === "ok"'
 STALE = 'document.body.dataset.stale === "true"'
 HEALTHY = """document.querySelector('#health [data-level="ok"]')
     && !document.querySelector('#health [data-level="alarm"], #health [data-level="warn"]')"""
@@ -50,24 +48,11 @@ def start(robot: Stack) -> None:
 
 @asynccontextmanager
 async def page(robot: Stack, profile: Path, width: int = 1280) -> AsyncIterator[Page]:
-    """The page as `skin view` serves it, in a browser; nothing complains until the end."""
-    broker = f"mqtt://{robot.broker.host}:{robot.broker.port}"
-    view = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "skin_host", "view", "--broker", broker),
-        *("--robot", "demo", "--port", "0"),
-        cwd=ROOT,
-        stdout=asyncio.subprocess.PIPE,
-    )
+    """The page of the robot, which ends with it."""
     try:
-        assert view.stdout is not None
-        url = (await view.stdout.readline()).decode().removeprefix("the page: ").strip()
-        async with browser(profile) as opened:
-            await opened.open(url, width)
+        async with viewing(robot.broker, "demo", profile, width) as opened:
             yield opened
-            assert opened.complaints == []
     finally:
-        view.terminate()
-        await view.communicate()
         robot.kill()
 
 
