@@ -2,18 +2,19 @@
 
 import asyncio
 import math
+import runpy
 import subprocess
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
-from importlib import util
+from dataclasses import replace
+from itertools import count, repeat
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from skin_host.client import Frame, Touch
 from skin_host.layout import build_layout
 from skin_host.processing.contacts import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
@@ -68,61 +69,49 @@ async def test_a_subscriber_prints_a_touch(mosquitto: Mosquitto, example: str, l
     assert (await reading).decode().strip() == line
 
 
-def ros_example(monkeypatch: pytest.MonkeyPatch) -> Any:
-    ros.install(monkeypatch)
-    spec = util.spec_from_file_location("ros2_node", EXAMPLES / "ros2_node.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+async def said_to_ros(
+    broker: Mosquitto, monkeypatch: pytest.MonkeyPatch, messages: Iterator[Any]
+) -> ros.Node:
+    """Run the ROS 2 example until it has passed on two of these frames or touches."""
+    ros.install(monkeypatch, enough=2)
+    monkeypatch.setattr(sys, "argv", ["ros2_node.py", f"mqtt://{broker.host}:{broker.port}"])
+    async with node(broker) as publisher:
+        running = asyncio.create_task(
+            asyncio.to_thread(runpy.run_path, str(EXAMPLES / "ros2_node.py"))
+        )
+        while not running.done():
+            message = next(messages)
+            put = publisher.put_touch if message is BEGIN else publisher.put_frame
+            put(message)
+            await asyncio.wait([running], timeout=0.2)
+        await running
+    (skin,) = ros.nodes
+    return skin
 
 
-def test_what_is_not_valid_is_no_number_in_ros(monkeypatch: pytest.MonkeyPatch) -> None:
-    skin = ros_example(monkeypatch).SkinNode()
-    frame = Frame(
-        "palm", 1, 0, np.array([1.5, 0.0]), np.array([True, False]), np.zeros(2, np.bool_)
-    )
-    for _ in range(2):
-        skin.on_frame(frame)
-    assert skin.made == ["palm/pressure"]
-    assert skin.published[0][0] == "palm/pressure"
-    first, second = skin.published[0][1].data
-    assert (first, math.isnan(second)) == (1.5, True)
-
-
-def test_a_contact_pushes_against_the_normal_and_turns_the_part_about_its_origin(
-    monkeypatch: pytest.MonkeyPatch,
+async def test_what_is_not_valid_is_no_number_in_ros(
+    mosquitto: Mosquitto, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    skin = ros_example(monkeypatch).SkinNode()
-    event = {name: getattr(BEGIN, name) for name in Touch.__struct_fields__ if hasattr(BEGIN, name)}
-    skin.on_touch(Touch(**event))
-    ((topic, said),) = skin.published
+    n = build_layout(load(CONFIG), CONFIG.parent).part("left_hand").n_taxels
+    zeros, valid = np.zeros(n, np.bool_), np.arange(n) == 0
+    kpa = np.where(valid, np.float32(1.5), np.float32(0.0))
+    frame = PressureFrame("left_hand", 1, 2, np.zeros(n, np.uint8), kpa, zeros, valid, zeros)
+    skin = await said_to_ros(mosquitto, monkeypatch, (replace(frame, seq=seq) for seq in count()))
+    assert skin.made == ["left_hand/pressure"]
+    for topic, message in skin.published[:2]:
+        assert topic == "left_hand/pressure"
+        assert message.data[0] == 1.5
+        assert all(map(math.isnan, message.data[1:]))
+        assert len(message.data) == n
+
+
+async def test_a_contact_pushes_against_the_normal_and_turns_the_part_about_its_origin(
+    mosquitto: Mosquitto, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    skin = await said_to_ros(mosquitto, monkeypatch, repeat(BEGIN))
+    topic, said = skin.published[0]
     assert (topic, said.header.frame_id) == ("left_hand/wrench", "left_hand")
     assert (said.header.stamp.sec, said.header.stamp.nanosec) == (10**9, 5)
     assert vars(said.wrench.force) == {"x": 0, "y": 0, "z": -2.0}
     # 2 N down at x = 0.1 m: the x side goes down, which is a positive turn about y.
     assert vars(said.wrench.torque) == {"x": 0, "y": pytest.approx(0.2), "z": 0}
-
-
-async def test_the_ros_node_passes_on_what_the_skin_says(
-    mosquitto: Mosquitto, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    example = ros_example(monkeypatch)
-    monkeypatch.setattr(ros.Node, "enough", 2)
-    layout = build_layout(load(CONFIG), CONFIG.parent)
-    n = layout.part("left_hand").n_taxels
-    zeros = np.zeros(n, np.bool_)
-    frame = PressureFrame(
-        "left_hand", 1, 2, np.zeros(n, np.uint8), np.full(n, 3.0), zeros, ~zeros, zeros
-    )
-    url = f"mqtt://{mosquitto.host}:{mosquitto.port}"
-    async with node(mosquitto) as publisher:
-        running = asyncio.create_task(asyncio.to_thread(example.main, url))
-        while not running.done():
-            publisher.put_touch(BEGIN)
-            publisher.put_frame(frame)
-            await asyncio.wait([running], timeout=0.2)
-        await running
-    (skin,) = ros.nodes
-    assert {topic for topic, _ in skin.published} <= {"left_hand/pressure", "left_hand/wrench"}

@@ -33,16 +33,14 @@ class Float32MultiArray:
 class Node:
     """Keeps what is published: (topic, message)."""
 
-    enough = 1
-
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, enough: int) -> None:
         self.name = name
+        self.enough = enough
         self.made: list[str] = []
         self.published: list[tuple[str, Any]] = []
         self.heard = threading.Event()
-        nodes.append(self)
 
-    def create_publisher(self, _kind: type, topic: str, _depth: int) -> Any:
+    def create_publisher(self, _kind: type, topic: str, qos_profile: int) -> Any:
         self.made.append(topic)
 
         def publish(message: Any) -> None:
@@ -61,13 +59,16 @@ def spin(node: Node) -> None:
     assert node.heard.wait(PATIENCE_S)
 
 
-def install(monkeypatch: pytest.MonkeyPatch) -> None:
+def install(monkeypatch: pytest.MonkeyPatch, enough: int) -> None:
     """Make `import rclpy` and what belongs to it find these."""
+
+    def create_node(name: str) -> Node:
+        nodes.append(Node(name, enough))
+        return nodes[-1]
+
     nodes.clear()
     for name, attributes in {
-        "rclpy": {"init": lambda: None, "spin": spin},
-        "rclpy.node": {"Node": Node},
-        "rclpy.publisher": {"Publisher": SimpleNamespace},
+        "rclpy": {"init": lambda: None, "create_node": create_node, "spin": spin},
         "geometry_msgs": {},
         "geometry_msgs.msg": {"WrenchStamped": WrenchStamped},
         "std_msgs": {},
