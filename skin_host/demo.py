@@ -13,7 +13,7 @@ from pathlib import Path
 import can
 
 from skin_host.cli.common import load_skin
-from skin_host.cli.watch import touch_line
+from skin_host.cli.lines import event_line
 from skin_host.client import SkinClient
 from skin_host.daemon import Daemon
 from skin_host.errors import ConfigurationError, SkinError
@@ -136,4 +136,4 @@ async def _listen(url: str, robot: str, touches: "Counter[str]") -> None:
         async for touch in skin.touches():
             touches[touch.event] += 1
             if touch.event != "move":
-                print(touch_line(touch), flush=True)
+                print(event_line(touch), flush=True)

@@ -2,7 +2,6 @@
 
 import argparse
 import asyncio
-import json
 from typing import Any
 
 import msgspec
@@ -22,7 +21,7 @@ def add_commands(commands: Commands) -> None:
     listen = add_command(
         commands,
         "listen",
-        "print touches as they come",
+        "print touches and slips as they come",
         "skin listen --part left_hand --broker mqtt://robot.local",
     )
     add_broker(listen)
@@ -52,37 +51,22 @@ def add_broker(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", help="whose skin, if the broker knows several robots")
 
 
-def touch_line(touch: Any) -> str:
-    """One readable line of a touch event (`publish.messages.Touch`)."""
-    taxels = ", ".join(map(str, touch.taxels[:8])) + (" ..." if len(touch.taxels) > 8 else "")
-    where = " " * 19
-    if touch.centroid_m is not None:
-        x_mm, y_mm = 1e3 * touch.centroid_m[0], 1e3 * touch.centroid_m[1]
-        where = f"({x_mm:6.1f},{y_mm:6.1f}) mm "
-    peak = " " * 10 if touch.peak_kpa is None else f"{touch.peak_kpa:6.1f} kPa"
-    load = f"{peak} {touch.force_n:6.2f} N"
-    if touch.event == "end":
-        load = " " * len(load)
-    line = f"{touch.part:<14} {touch.event:<5} #{touch.id:<4} {where} {load}"
-    return f"{line}  taxels {taxels}" if taxels else line.rstrip()
-
-
 def _listen(arguments: argparse.Namespace) -> int:
+    from skin_host.cli.lines import event_line, missed_line
     from skin_host.client import SkinClient
 
     async def work() -> None:
         printed = 0
         async with SkinClient(arguments.broker, robot=arguments.robot) as skin:
-            async for touch in skin.touches(arguments.part):
-                if touch.missed:
-                    note = f"({touch.missed} events were missed)"
-                    print(json.dumps({"missed": touch.missed}) if arguments.json else note)
-                if touch.event == "move" and not arguments.moves:
+            async for event in skin.events(arguments.part):
+                if event.missed:
+                    print(missed_line(event, as_json=arguments.json), flush=True)
+                if event.event == "move" and not arguments.moves:
                     continue
                 if arguments.json:
-                    print(msgspec.json.encode(touch).decode(), flush=True)
+                    print(msgspec.json.encode(event).decode(), flush=True)
                 else:
-                    print(touch_line(touch), flush=True)
+                    print(event_line(event), flush=True)
                 printed += 1
                 if printed == arguments.count:
                     return

@@ -128,27 +128,31 @@ class SkinClient:
 
     def touches(self, part: str | None = None) -> Stream[Touch]:
         """Touch events of a part, or of all."""
-        return self._stream("touch", part)
+        return self._stream(part, "touch")
 
     def slips(self, part: str | None = None) -> Stream[Slip]:
         """Slips of a fingertip, or of all: they begin and end."""
-        return self._stream("slip", part)
+        return self._stream(part, "slip")
 
     def overs(self, part: str | None = None) -> Stream[Over]:
         """When a fingertip, or any, begins or ends to press too hard."""
-        return self._stream("over", part)
+        return self._stream(part, "over")
+
+    def events(self, part: str | None = None) -> Stream[Touch | Slip | Over]:
+        """Touches, slips and excesses of a part, or of all, in the order in which they come."""
+        return self._stream(part, "touch", "slip", "over")
 
     def frames(self, part: str | None = None) -> Stream[Frame]:
         """Frames of a part, or of all: pressure in kPa as numpy arrays."""
-        return self._stream("frame", part)
+        return self._stream(part, "frame")
 
     def contacts(self, part: str | None = None) -> Stream[Contact]:
         """Whether parts are touched: as it is now, and each change."""
-        return self._stream("contact", part)
+        return self._stream(part, "contact")
 
     def health(self, part: str | None = None) -> Stream[Health]:
         """How parts are: as it is now, and each change."""
-        return self._stream("health", part)
+        return self._stream(part, "health")
 
     async def ready(self) -> None:
         """Wait until all that was asked for so far has reached the broker."""
@@ -245,11 +249,11 @@ class SkinClient:
             await self._news.wait()
         return found
 
-    def _stream(self, kind: PartTopic, part: str | None) -> Stream[Any]:
-        stream: Stream[Any] = Stream(kind, part)
+    def _stream(self, part: str | None, *kinds: PartTopic) -> Stream[Any]:
+        stream: Stream[Any] = Stream(part, *kinds)
         self._streams.add(stream)
         for (known_kind, known_part), state in self._latest.items():
-            if known_kind == kind and part in (None, known_part):
+            if known_kind in kinds and part in (None, known_part):
                 stream.put(state)
         self._streams_changed.set()
         return stream
@@ -387,7 +391,7 @@ class SkinClient:
             yield topics.reply("+", self._identifier)
         else:
             yield topics.result("+", "+")
-        asked = {(stream.kind, stream.part) for stream in self._streams}
+        asked = {(kind, stream.part) for stream in self._streams for kind in stream.kinds}
         for kind, part in asked:
             if part is None or (kind, None) not in asked:
                 yield topics.part(kind, part or "+")
@@ -427,7 +431,7 @@ class SkinClient:
         streams = [
             stream
             for stream in self._streams
-            if stream.kind == kind and stream.part in (None, part)
+            if kind in stream.kinds and stream.part in (None, part)
         ]
         if not streams:
             self._streams_changed.set()  # nobody reads it any more

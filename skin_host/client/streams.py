@@ -42,15 +42,16 @@ class Health(NamedTuple):
 
 
 class Stream(AsyncIterator[T], Generic[T]):
-    """All of one kind from the moment of asking on; made by `SkinClient`, ends with it."""
+    """All of some kinds from the moment of asking on; made by `SkinClient`, ends with it."""
 
-    def __init__(self, kind: PartTopic, part: str | None) -> None:
-        self.kind: PartTopic = kind
+    def __init__(self, part: str | None, *kinds: PartTopic) -> None:
         self.part = part
-        self._items: deque[T] = deque(maxlen=HELD[kind])
+        self.kinds = kinds
+        self._items: deque[T] = deque(maxlen=max(HELD[kind] for kind in kinds))
         self._wake = asyncio.Event()
         self._closed = False
-        self._last: dict[str, tuple[int, int]] = {}
+        #: By kind and part; each has numbers of its own.
+        self._last: dict[tuple[type, str], tuple[int, int]] = {}
 
     def put(self, item: T) -> None:
         """Add what was heard."""
@@ -72,20 +73,21 @@ class Stream(AsyncIterator[T], Generic[T]):
             item: Any = self._items.popleft()
             if isinstance(item, Touch | Slip | Over):
                 # A publisher that does not count cannot be checked.
-                missed = self._missed(item.part, item.count, item.t_ns) if item.count else 0
+                missed = self._missed(item, item.count) if item.count else 0
             elif isinstance(item, Frame):
-                missed = self._missed(item.part, item.seq, item.t_ns)
+                missed = self._missed(item, item.seq)
             else:
                 return cast(T, item)
             if missed is not None:
                 # Other streams hold the same object, and may have missed less.
                 return cast(T, replace(item, missed=missed) if missed else item)
 
-    def _missed(self, part: str, number: int, t_ns: int) -> int | None:
+    def _missed(self, item: Touch | Slip | Over | Frame, number: int) -> int | None:
         """How many numbers were passed over; None for one that was heard before."""
-        last, last_ns = self._last.get(part, (number - 1, t_ns))
-        if number <= last and t_ns <= last_ns and last - number < DUPLICATE_SPAN:
+        kind = type(item), item.part
+        last, last_ns = self._last.get(kind, (number - 1, item.t_ns))
+        if number <= last and item.t_ns <= last_ns and last - number < DUPLICATE_SPAN:
             return None
-        self._last[part] = number, t_ns
+        self._last[kind] = number, item.t_ns
         # A smaller number at a later time says that the node was started anew.
         return max(0, number - last - 1)

@@ -5,6 +5,7 @@ from msgspec.structs import replace
 
 from skin_host.client.streams import HELD, Contact, Stream
 from skin_host.publish.frames import Frame
+from skin_host.publish.grasping import Over
 from skin_host.publish.messages import Touch
 
 
@@ -37,42 +38,42 @@ async def heard(stream: Stream[Touch]) -> list[tuple[int, int]]:
 
 
 async def test_a_gap_is_told_by_the_next_event() -> None:
-    stream: Stream[Touch] = Stream("touch", None)
+    stream: Stream[Touch] = Stream(None, "touch")
     for count in (5, 6, 9, 10):
         stream.put(touch(count))
     assert await heard(stream) == [(5, 0), (6, 0), (9, 2), (10, 0)]
 
 
 async def test_parts_are_counted_apart() -> None:
-    stream: Stream[Touch] = Stream("touch", None)
+    stream: Stream[Touch] = Stream(None, "touch")
     for item in (touch(5), touch(90, part="arm"), touch(6), touch(92, part="arm")):
         stream.put(item)
     assert await heard(stream) == [(5, 0), (90, 0), (6, 0), (92, 1)]
 
 
 async def test_an_event_that_comes_twice_is_heard_once() -> None:
-    stream: Stream[Touch] = Stream("touch", None)
+    stream: Stream[Touch] = Stream(None, "touch")
     for count in (1, 2, 3, 1, 2, 3, 4):
         stream.put(touch(count))
     assert await heard(stream) == [(1, 0), (2, 0), (3, 0), (4, 0)]
 
 
 async def test_a_node_that_starts_anew_counts_anew() -> None:
-    stream: Stream[Touch] = Stream("touch", None)
+    stream: Stream[Touch] = Stream(None, "touch")
     for item in (touch(40), touch(1, t_ns=1000), touch(2, t_ns=1001)):
         stream.put(item)
     assert await heard(stream) == [(40, 0), (1, 0), (2, 0)]
 
 
 async def test_a_node_that_starts_anew_with_an_earlier_clock_is_heard() -> None:
-    stream: Stream[Touch] = Stream("touch", None)
+    stream: Stream[Touch] = Stream(None, "touch")
     for item in (touch(4000), touch(1, t_ns=1), touch(2, t_ns=2)):
         stream.put(item)
     assert await heard(stream) == [(4000, 0), (1, 0), (2, 0)]
 
 
 async def test_what_a_slow_reader_loses_is_told() -> None:
-    stream: Stream[Touch] = Stream("touch", None)
+    stream: Stream[Touch] = Stream(None, "touch")
     held = HELD["touch"]
     stream.put(touch(1))
     assert (await anext(stream)).missed == 0
@@ -83,7 +84,7 @@ async def test_what_a_slow_reader_loses_is_told() -> None:
 
 
 async def test_sweeps_between_two_frames_are_told() -> None:
-    stream: Stream[Frame] = Stream("frame", None)
+    stream: Stream[Frame] = Stream(None, "frame")
     for seq in (7, 8, 12):
         stream.put(frame(seq))
     stream.close()
@@ -91,8 +92,8 @@ async def test_sweeps_between_two_frames_are_told() -> None:
 
 
 async def test_two_streams_of_one_event_do_not_disturb_each_other() -> None:
-    early: Stream[Touch] = Stream("touch", None)
-    late: Stream[Touch] = Stream("touch", None)
+    early: Stream[Touch] = Stream(None, "touch")
+    late: Stream[Touch] = Stream(None, "touch")
     early.put(touch(1))
     shared = touch(5)
     early.put(shared)
@@ -102,7 +103,7 @@ async def test_two_streams_of_one_event_do_not_disturb_each_other() -> None:
 
 
 async def test_events_that_are_not_counted_are_all_heard() -> None:
-    stream: Stream[Touch] = Stream("touch", None)
+    stream: Stream[Touch] = Stream(None, "touch")
     uncounted = replace(touch(1), count=0)
     stream.put(uncounted)
     stream.put(uncounted)
@@ -110,7 +111,17 @@ async def test_events_that_are_not_counted_are_all_heard() -> None:
 
 
 async def test_states_pass_as_they_are() -> None:
-    stream: Stream[Contact] = Stream("contact", "palm")
+    stream: Stream[Contact] = Stream("palm", "contact")
     stream.put(Contact("palm", True))
     stream.close()
     assert [contact async for contact in stream] == [Contact("palm", True)]
+
+
+async def test_kinds_of_events_have_numbers_of_their_own_and_stay_in_order() -> None:
+    stream: Stream[Touch | Over] = Stream("palm", "touch", "over")
+    over = Over(event="begin", id=1, t_ns=1, count=1, part="palm", force_n=10.0)
+    for item in (touch(7), over, touch(8), replace(over, t_ns=2, count=4), touch(8)):
+        stream.put(item)
+    stream.close()
+    seen = [(type(event).__name__, event.count, event.missed) async for event in stream]
+    assert seen == [("Touch", 7, 0), ("Over", 1, 0), ("Touch", 8, 0), ("Over", 4, 2)]
