@@ -8,11 +8,13 @@ frame is there.
 - notifier_callback: the Notifier on the event loop with a callback;
 - batch: this project's port, assembler and plan of wake-ups, as the daemon runs them.
 
+Beside them runs what no program could do without: sleep, and have the kernel copy the frames.
 At last the whole way from frames to touches runs at the highest rate, to see what is lost.
 """
 
 import asyncio
 import multiprocessing
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -44,7 +46,7 @@ PATHS = ("notifier_async", "notifier_callback", "batch")
 #: Frames a second; 0 is as fast as the sender can.
 RATES = (2000, 8000, 32000, 0)
 #: The paths run so long before the measurement begins; the whole way takes a calibration first.
-_WARM_UP_S = dict.fromkeys(PATHS, 0.5) | {"pipeline": 3.0}
+_WARM_UP_S = dict.fromkeys(PATHS, 0.5) | {"kernel": 0.5, "pipeline": 3.0}
 _CALIBRATION_S = 1.0
 #: Frames that have not come within this time after the last are lost.
 _DRAIN_S = 0.5
@@ -60,9 +62,10 @@ def run(*, quick: bool = False) -> dict[str, Any]:
     """
     wire = Wire.here()
     seconds, long_s = (1.0, 5.0) if quick else (5.0, 60.0)
-    rows = [_measure(wire, path, rate, seconds) for rate in RATES for path in PATHS]
-    whole = _measure(wire, "pipeline", max(RATES), long_s) | {"seconds": long_s}
-    return {"transport": wire.transport, "rows": rows, "pipeline": whole}
+    rows = [measure(wire, path, rate, seconds) for rate in RATES for path in PATHS]
+    kernel = [measure(wire, "kernel", rate, seconds) for rate in RATES if rate]
+    whole = measure(wire, "pipeline", max(RATES), long_s) | {"seconds": long_s}
+    return {"transport": wire.transport, "rows": rows, "kernel": kernel, "pipeline": whole}
 
 
 def describe(document: dict[str, Any]) -> str:
@@ -70,12 +73,15 @@ def describe(document: dict[str, Any]) -> str:
     lines = [
         f"Reading skin frames over {document['transport']}; CPU of one core, the share of the",
         "first path's CPU per frame, and the delay from a sweep's last frame to the sweep:",
-        " frames/s  path                CPU %  ns/frame   share    lost   p50 us   p99 us",
+        " frames/s received  path                CPU %  ns/frame   share    lost   p50 us   p99 us",
     ]
+    reference_ns = {}
     for row in document["rows"]:
         if row["path"] == PATHS[0]:
-            reference = row["ns_per_frame"]
-        lines.append(_line(row, reference))
+            reference_ns[row["frames_per_s"]] = row["ns_per_frame"]
+        lines.append(_line(row, reference_ns[row["frames_per_s"]]))
+    lines.append("The kernel's part of it alone, asleep between two reads, nothing decoded:")
+    lines += [_line(row, reference_ns[row["frames_per_s"]]) for row in document["kernel"]]
     whole = document["pipeline"]
     lines += [f"The whole way from frames to touches, {whole['seconds']:g} s:", _line(whole, 0)]
     return "\n".join(lines)
@@ -84,13 +90,22 @@ def describe(document: dict[str, Any]) -> str:
 def _line(row: Row, reference_ns: float) -> str:
     share = reference_ns / row["ns_per_frame"] if row["ns_per_frame"] else 0.0
     return (
-        f"{row['frames_per_s'] or 'saturated':>9}  {row['path']:18}{row['cpu_percent']:7.1f}"
+        f"{row['frames_per_s'] or 'saturated':>9}{row['received_per_s']:9}"
+        f"  {row['path']:18}{row['cpu_percent']:7.1f}"
         f"{row['ns_per_frame']:10.0f}{'1/' + format(share, '.1f') if share else '':>8}"
         f"{row['lost']:8d}{row['delay_p50_us']:9.0f}{row['delay_p99_us']:9.0f}"
     )
 
 
-def _measure(wire: Wire, path: str, frames_per_s: int, seconds: float) -> Row:
+def measure(wire: Wire, path: str, frames_per_s: int, seconds: float) -> Row:
+    """Run one path on its own stream: one of `PATHS`, "kernel" or "pipeline".
+
+    Args:
+        wire: where the stream runs.
+        path: what reads it.
+        frames_per_s: pace of the sender, 0 for as fast as it can.
+        seconds: of the measurement, after warming up.
+    """
     stream = Stream.of(frames_per_s)
     # Four periods of an untouched skin's noise: what is touched is not the question here.
     shape = (4, stream.boards, TRIANGLES, TAXELS)
@@ -135,12 +150,14 @@ class _Meter:
 
     def end(self) -> None:
         began_s, cpu_began_s, frames_began = self.began
+        seconds = time.monotonic() - began_s
         cpu_s = time.process_time() - cpu_began_s
         frames = self.frames - frames_began
         delays_us = np.array(self.delays_ns or [0]) / 1e3
         self.result = {
-            "cpu_percent": round(100 * cpu_s / (time.monotonic() - began_s), 3),
+            "cpu_percent": round(100 * cpu_s / seconds, 3),
             "ns_per_frame": round(1e9 * cpu_s / frames) if frames else 0,
+            "received_per_s": round(frames / seconds),
             "lost": 0,
             "delay_p50_us": round(float(np.percentile(delays_us, 50)), 1),
             "delay_p99_us": round(float(np.percentile(delays_us, 99)), 1),
@@ -238,6 +255,26 @@ async def _batch(parent: Connection, wire: Wire, stream: Stream) -> None:
     await _read_batches(parent, settings, meter, assembler.feed)
 
 
+async def _kernel(parent: Connection, wire: Wire, stream: Stream) -> None:
+    meter = _Meter()
+    settings = stream.settings(wire.bus())
+    port = open_port(BUS, settings.buses[BUS], settings.receive)
+    ended = threading.Event()
+
+    def read() -> None:
+        while not ended.is_set():
+            time.sleep(settings.receive.poll_ms * 1e-3)
+            meter.frames += len(port.read())
+
+    # In a thread, so that no event loop stands between the sleep and the read.
+    reading = threading.Thread(target=read)
+    reading.start()
+    await _obey(parent, meter)
+    ended.set()
+    reading.join()
+    port.close()
+
+
 async def _pipeline(parent: Connection, wire: Wire, stream: Stream) -> None:
     settings = stream.settings(wire.bus())
     layout = build_layout(settings, Path())
@@ -288,5 +325,6 @@ _PATHS: dict[str, Callable[[Connection, Wire, Stream], Any]] = {
     "notifier_async": _notifier_async,
     "notifier_callback": _notifier_callback,
     "batch": _batch,
+    "kernel": _kernel,
     "pipeline": _pipeline,
 }
