@@ -2,9 +2,10 @@
 
 The two frames of a triangle share an identifier and are told apart by their first byte, and
 so are the commands and the answers of a board: in a DBC file that byte is a multiplexer.
+Force/torque boards send words; they are N and N m where the full scales are known.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from itertools import groupby
 from typing import NamedTuple
@@ -22,14 +23,33 @@ from skin_host.bus.protocol import (
     skin_id,
 )
 from skin_host.bus.protocol.answers import ANSWERS, TX_OVERFLOW_TYPE, DiscoveredBootloader
-from skin_host.bus.protocol.commands import COMMANDS, Message, TactileSetup
+from skin_host.bus.protocol.commands import (
+    COMMANDS,
+    Message,
+    SetTransmissionPeriod,
+    SetTxMode,
+    TactileSetup,
+)
 from skin_host.errors import RequestError
+from skin_host.fingertip.settings import Fingertip, Six
+from skin_host.fingertip.strain_protocol import (
+    ZERO_WORD,
+    FullScale,
+    GetFullScale,
+    StrainMode,
+    StrainType,
+)
 from skin_host.layout import Layout
 
 ADDRESSES = range(1, 15)
 _BYTES = {"B": 1, "H": 2, "I": 4}
 #: The commands' timer counts this (reference of the wire, command 4C).
 _TIMER_US = 3.2
+#: The full scales of words that stay words.
+_WORDS = (ZERO_WORD,) * 3
+#: What force/torque boards understand and say, beside their streams.
+_STRAIN_COMMANDS = (SetTxMode, SetTransmissionPeriod, GetFullScale)
+_STRAIN_ANSWERS = (FullScale,)
 
 
 class _Board(NamedTuple):
@@ -40,27 +60,47 @@ class _Board(NamedTuple):
     triangles: list[tuple[int, str]]
 
 
+class _Sensor(NamedTuple):
+    """A force/torque board; its full scales (N, N m) if they are known."""
+
+    name: str
+    address: int
+    full_scale: Six | None = None
+
+
 class _Signal(NamedTuple):
     name: str
     start: int
     bits: int
     multiplexed: str = ""
     factor: float = 1.0
+    offset: float = 0.0
     unit: str = ""
     big_endian: bool = False
 
 
-def dbc_text(layout: Layout | None = None, bus: str | None = None) -> str:
+def dbc_text(
+    layout: Layout | None = None,
+    bus: str | None = None,
+    fingertips: Mapping[str, Fingertip] | None = None,
+) -> str:
     """Write a DBC file.
 
     Args:
         layout: describe the boards and triangles of this skin; None is all that can be.
         bus: of the layout's buses; None if there is but one.
+        fingertips: of the same robot, by name: those on force/torque boards.
 
     Raises:
         RequestError: the layout has several buses and none is named, or not this one.
     """
-    boards = _every_board() if layout is None else _boards_of(layout, bus)
+    if layout is None:
+        boards, sensors = _every_board(), [_Sensor(f"FT{n}", n) for n in ADDRESSES]
+    else:
+        tips = fingertips or {}
+        bus = _chosen(bus, layout, tips)
+        boards = _boards_of(layout, bus)
+        sensors = _sensors_of(tips, bus, {board.name for board in boards})
     lines = [
         'VERSION ""',
         "",
@@ -68,11 +108,16 @@ def dbc_text(layout: Layout | None = None, bus: str | None = None) -> str:
         "",
         "BS_:",
         "",
-        "BU_: host " + " ".join(board.name for board in boards),
+        "BU_: host "
+        + " ".join([*(board.name for board in boards), *(sensor.name for sensor in sensors)]),
         "",
     ]
     remarks: list[str] = []
     values: list[str] = []
+    commands, answers = COMMANDS, ANSWERS
+    if layout is None:  # a board of either sort may have the address
+        commands = (GetFullScale, *COMMANDS)
+        answers = (FullScale, *ANSWERS)
     for board in boards:
         for triangle, about in board.triangles:
             can_id = skin_id(board.address, triangle)
@@ -80,8 +125,14 @@ def dbc_text(layout: Layout | None = None, bus: str | None = None) -> str:
             lines += _message(can_id, name, 8, board.name, "host", _skin_signals())
             remarks.append(f'CM_ BO_ {can_id} "{about}";')
             values.append(f'VAL_ {can_id} Header {HEADER_A} "first seven" {HEADER_B} "last five" ;')
-        _add_commands(board, lines, values)
-    _add_commands(_Board("all", BROADCAST_ADDRESS, []), lines, values)
+        _add_commands(board, commands, answers, lines, values)
+        can_id = identifier(MessageClass.MANAGEMENT, board.address, TX_OVERFLOW_TYPE)
+        lines += _message(can_id, f"{board.name}_tx_overflow", 0, board.name, "host", [])
+    for sensor in sensors:
+        _add_streams(sensor, lines, remarks)
+        if layout is not None:
+            _add_commands(sensor, _STRAIN_COMMANDS, _STRAIN_ANSWERS, lines, values)
+    _add_commands(_Board("all", BROADCAST_ADDRESS, []), COMMANDS, (), lines, values)
     return "\n".join([*lines, *remarks, "", *values, ""])
 
 
@@ -92,13 +143,18 @@ def _every_board() -> list[_Board]:
     ]
 
 
-def _boards_of(layout: Layout, bus: str | None) -> list[_Board]:
-    buses = list(dict.fromkeys(board.settings.bus for board in layout.boards))
+def _chosen(bus: str | None, layout: Layout, tips: Mapping[str, Fingertip]) -> str:
+    used = [board.settings.bus for board in layout.boards] + [tip.bus for tip in tips.values()]
+    buses = list(dict.fromkeys(used))
     if bus is None and len(buses) > 1:
         raise RequestError(f"the configuration has several buses; say which: {', '.join(buses)}")
     bus = bus or buses[0]
     if bus not in buses:
         raise RequestError(f'no bus "{bus}"; there are: {", ".join(buses)}')
+    return bus
+
+
+def _boards_of(layout: Layout, bus: str) -> list[_Board]:
     found = []
     for number, board in enumerate(layout.boards):
         if board.settings.bus != bus:
@@ -110,11 +166,24 @@ def _boards_of(layout: Layout, bus: str | None) -> list[_Board]:
                 first = triangle.first - part.start
                 about = f"{part.name}, taxels {first} to {first + TAXELS - 1}"
                 triangles.append((triangle.number, about))
-        name = board.name.replace("-", "_")
-        # Names are identifiers, and two are taken.
-        name = name if name[0].isalpha() and name not in ("host", "all") else f"board_{name}"
-        found.append(_Board(name, board.settings.address, sorted(triangles)))
+        found.append(_Board(_symbol(board.name), board.settings.address, sorted(triangles)))
     return found
+
+
+def _sensors_of(tips: Mapping[str, Fingertip], bus: str, taken: set[str]) -> list[_Sensor]:
+    found = []
+    for name, tip in tips.items():
+        if tip.bus == bus:
+            symbol = _symbol(name)
+            symbol += "_ft" if symbol in taken else ""
+            found.append(_Sensor(symbol, tip.address, tip.full_scale))
+    return found
+
+
+def _symbol(name: str) -> str:
+    """A name as a DBC file takes it: an identifier, and two are taken."""
+    name = name.replace("-", "_")
+    return name if name[0].isalpha() and name not in ("host", "all") else f"board_{name}"
 
 
 def _skin_signals() -> list[_Signal]:
@@ -131,11 +200,42 @@ def _skin_signals() -> list[_Signal]:
     return signals
 
 
-def _add_commands(board: _Board, lines: list[str], values: list[str]) -> None:
-    """The commands to a board and its answers; everybody (address 15) gives no answer."""
-    for kinds, suffix, to_board in ((COMMANDS, "", True), (ANSWERS, "_answer", False)):
-        if board.address == BROADCAST_ADDRESS and not to_board:
-            continue
+def _add_streams(sensor: _Sensor, lines: list[str], remarks: list[str]) -> None:
+    """Force and torque of a board, and the same before its own calibration."""
+    for kind in StrainType:
+        can_id = identifier(MessageClass.ANALOG_STREAM, sensor.address, kind)
+        quantity, unit = ("torque", "Nm") if kind & 1 else ("force", "N")
+        scales = None
+        if sensor.full_scale is not None and kind >= StrainType.FORCE:
+            scales = sensor.full_scale[3:] if kind & 1 else sensor.full_scale[:3]
+        signals = [
+            _Signal(
+                f"{quantity}_{axis}", start, 16, "", full / ZERO_WORD, -full, unit if scales else ""
+            )
+            for axis, start, full in zip("xyz", (0, 16, 32), scales or _WORDS, strict=True)
+        ]
+        # Sent by a saturated board alone: its frames are one byte longer.
+        signals.append(_Signal("saturated", 48, 8))
+        lines += _message(
+            can_id, f"{sensor.name}_{kind.name.lower()}", 7, sensor.name, "host", signals
+        )
+        if kind < StrainType.FORCE:
+            remarks.append(f'CM_ BO_ {can_id} "before the calibration of the board, no unit";')
+        elif scales is None:
+            remarks.append(
+                f'CM_ BO_ {can_id} "in 1/{ZERO_WORD} of the full scale of each channel";'
+            )
+
+
+def _add_commands(
+    board: _Board | _Sensor,
+    commands: Sequence[type[Message]],
+    answers: Sequence[type[Message]],
+    lines: list[str],
+    values: list[str],
+) -> None:
+    """The commands to a board and its answers."""
+    for kinds, suffix, to_board in ((commands, "", True), (answers, "_answer", False)):
         for message_class, group in groupby(kinds, key=lambda kind: kind.CLASS):
             # Two answers share a code; the application's own holds the fields of the other.
             messages = [kind for kind in group if kind is not DiscoveredBootloader]
@@ -152,9 +252,9 @@ def _add_commands(board: _Board, lines: list[str], values: list[str]) -> None:
             lines += _message(can_id, f"{board.name}_{word}{suffix}", length, *ends, signals)
             names = " ".join(f'{kind.CODE} "{kind.__name__}"' for kind in messages)
             values.append(f"VAL_ {can_id} Code {names} ;")
-    if board.address != BROADCAST_ADDRESS:
-        can_id = identifier(MessageClass.MANAGEMENT, board.address, TX_OVERFLOW_TYPE)
-        lines += _message(can_id, f"{board.name}_tx_overflow", 0, board.name, "host", [])
+            if isinstance(board, _Sensor) and to_board:
+                names = " ".join(f'{mode.value} "{mode.name.lower()}"' for mode in StrainMode)
+                values.append(f"VAL_ {can_id} C{SetTxMode.CODE:02X}_mode {names} ;")
 
 
 def _fields(messages: Iterable[type[Message]]) -> Iterator[_Signal]:
@@ -168,14 +268,19 @@ def _fields(messages: Iterable[type[Message]]) -> Iterator[_Signal]:
             if kind is TactileSetup and name == "timer":
                 unit, factor = "us", _TIMER_US
             signal = f"C{kind.CODE:02X}_{name}"
-            yield _Signal(signal, start, 8 * size, f"m{kind.CODE}", factor, unit)
+            big = kind.LAYOUT.format.startswith(">") and size > 1
+            # Of a big-endian field the highest bit is named, which is in its first byte.
+            place = start + 7 if big else start
+            yield _Signal(
+                signal, place, 8 * size, f"m{kind.CODE}", factor, unit=unit, big_endian=big
+            )
             start += 8 * size
 
 
 def _formats(layout: str) -> Iterator[int]:
     """Sizes (bytes) of the fields of a `struct` format: "<3BHH" is 1, 1, 1, 2, 2."""
     count = ""
-    for letter in layout.lstrip("<"):
+    for letter in layout.lstrip("<>"):
         if letter.isdigit():
             count += letter
         elif letter == "s":
@@ -192,10 +297,11 @@ def _message(
     lines = [f"BO_ {can_id} {name}: {length} {sender}"]
     for signal in signals:
         order = "@0+" if signal.big_endian else "@1+"
-        top = (2**signal.bits - 1) * signal.factor
+        top = (2**signal.bits - 1) * signal.factor + signal.offset
         multiplexed = f" {signal.multiplexed}" if signal.multiplexed else ""
         lines.append(
             f" SG_ {signal.name}{multiplexed} : {signal.start}|{signal.bits}{order} "
-            f'({signal.factor:g},0) [0|{top:.17g}] "{signal.unit}" {receiver}'
+            f"({signal.factor:.15g},{signal.offset:.15g}) [{signal.offset:.15g}|{top:.15g}] "
+            f'"{signal.unit}" {receiver}'
         )
     return [*lines, ""]

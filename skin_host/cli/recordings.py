@@ -265,8 +265,11 @@ def _dbc(arguments: argparse.Namespace) -> int:
     from skin_host.dbc import dbc_text
     from skin_host.files import write_atomic
 
-    layout = None if arguments.config is None else load_skin(arguments.config)[1]
-    text = dbc_text(layout, arguments.bus)
+    if arguments.config is None:
+        text = dbc_text(bus=arguments.bus)
+    else:
+        settings, layout = load_skin(arguments.config)
+        text = dbc_text(layout, arguments.bus, settings.fingertips)
     if arguments.output is None:
         print(text, end="")
     else:

@@ -15,12 +15,22 @@ from skin_host.bus.protocol.answers import ANSWERS, Discovered, FirmwareVersion,
 from skin_host.bus.protocol.commands import (
     COMMANDS,
     SetBoardConfig,
+    SetTransmissionPeriod,
     SetTriangleConfig,
+    SetTxMode,
     TactileSetup,
     command_frame,
 )
 from skin_host.dbc import dbc_text
 from skin_host.errors import RequestError
+from skin_host.fingertip.strain_protocol import (
+    FullScale,
+    GetFullScale,
+    StrainMode,
+    StrainType,
+    encode_strain,
+    start_frames,
+)
 from skin_host.layout import build_layout
 from skin_host.settings import load
 
@@ -124,6 +134,74 @@ def test_a_configuration_gives_its_own_boards_and_triangles() -> None:
         database.get_message_by_frame_id(0x4E0 | 5)  # no such triangle in the hand
     with pytest.raises(KeyError):
         database.get_message_by_frame_id(0x410)  # no such board
+
+
+WORDS = st.lists(st.integers(-0x8000, 0x7FFF), min_size=3, max_size=3)
+
+
+@given(board=st.integers(1, 14), kind=st.sampled_from(StrainType), values=WORDS)
+def test_force_and_torque_are_decoded_alike(
+    board: int, kind: StrainType, values: list[int]
+) -> None:
+    can_id, payload = encode_strain(board, kind, values)
+    seen = decode(every_board(), can_id, payload)
+    quantity = "torque" if kind in (StrainType.TORQUE, StrainType.RAW_TORQUE) else "force"
+    assert seen == {f"{quantity}_{axis}": value for axis, value in zip("xyz", values, strict=True)}
+    can_id, payload = encode_strain(board, kind, values, overflow=5)
+    assert decode(every_board(), can_id, payload) == seen | {"saturated": 5}
+
+
+@cache
+def fingers() -> Any:
+    settings = load(CONFIG / "fingertips.toml")
+    settings.fingertips["thumb"].full_scale = (33.3, 40.0, 50.0, 0.5, 0.75, 1.0)
+    text = dbc_text(build_layout(settings, CONFIG), fingertips=settings.fingertips)
+    return cantools.database.load_string(text, "dbc", strict=True)
+
+
+@given(values=WORDS)
+def test_with_the_full_scales_force_and_torque_have_units(values: list[int]) -> None:
+    for kind, quantity, unit, scales in (
+        (StrainType.FORCE, "force", "N", (33.3, 40.0, 50.0)),
+        (StrainType.TORQUE, "torque", "Nm", (0.5, 0.75, 1.0)),
+    ):
+        can_id, payload = encode_strain(2, kind, values)
+        message = fingers().get_message_by_frame_id(can_id)
+        assert message.name == f"thumb_{quantity}"
+        assert message.senders == ["thumb"]
+        assert message.get_signal_by_name(f"{quantity}_x").unit == unit
+        seen = decode(fingers(), can_id, payload)
+        wanted = [value * scale / 0x8000 for value, scale in zip(values, scales, strict=True)]
+        assert list(seen.values()) == pytest.approx(wanted, abs=1e-9)
+
+
+def test_where_a_full_scale_is_not_known_no_unit_is_claimed() -> None:
+    message = fingers().get_message_by_frame_id(encode_strain(1, StrainType.FORCE, [0, 0, 0])[0])
+    assert message.name == "index_force"
+    assert message.comment == "in 1/32768 of the full scale of each channel"
+    assert {signal.unit for signal in message.signals} == {None}
+
+
+@pytest.mark.parametrize("database", [every_board, fingers])
+def test_commands_to_a_force_torque_board_are_decoded_alike(database: Any) -> None:
+    seen = [decode(database(), can_id, payload) for can_id, payload in start_frames(2, 10)]
+    codes = [GetFullScale.CODE] * 6 + [SetTransmissionPeriod.CODE, SetTxMode.CODE]
+    assert [one["Code"] for one in seen] == codes
+    assert [one["C18_channel"] for one in seen[:6]] == list(range(6))
+    assert seen[6]["C08_period_ms"] == 10
+    assert seen[7]["C07_mode"] == StrainMode.CALIBRATED
+    # The one number with its high byte first.
+    can_id, payload = answer_frame(FullScale(4, 0x1234), 2)
+    seen_answer = decode(database(), can_id, payload)
+    assert (seen_answer["C18_channel"], seen_answer["C18_value"]) == (4, 0x1234)
+
+
+def test_a_sensor_with_the_name_of_a_board_gets_one_of_its_own() -> None:
+    settings = load(CONFIG / "fingertips.toml")
+    settings.fingertips = {"hand": settings.fingertips["thumb"]}
+    text = dbc_text(build_layout(settings, CONFIG), fingertips=settings.fingertips)
+    database = cantools.database.load_string(text, "dbc", strict=True)
+    assert {node.name for node in database.nodes} == {"host", "hand", "hand_ft"}
 
 
 def test_of_several_buses_one_must_be_named() -> None:
