@@ -3,7 +3,7 @@
 import asyncio
 import socket
 import threading
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,8 @@ from skin_host.publish.info import node_info
 from skin_host.publish.mqtt import Publisher
 from skin_host.settings import Mqtt, load
 from tests.support.broker import Mosquitto, free_port
+from tests.support.waiting import PATIENCE_S, until
 
-PATIENCE_S = 20.0
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
 
 
@@ -55,20 +55,15 @@ async def publishing(
     broker: Mosquitto, robot: str = "robot", node: str = "main", **keys: Any
 ) -> AsyncIterator[Publisher]:
     settings = Mqtt(host=broker.host, port=broker.port, **keys)
+    commands = f"skin/{robot}/nodes/{node}/cmd/+"
+    before = broker.subscriptions(commands)
     async with Publisher(settings, robot, node, handler=answer) as publisher:
-        await until(lambda: publisher.counters.connected)
-        await asyncio.sleep(0.05)  # until it listens for commands, too
+        await until(lambda: broker.subscriptions(commands) > before)
         yield publisher
 
 
 def hearing(broker: Mosquitto, robot: str | None = "robot", **keys: Any) -> SkinClient:
     return SkinClient(f"mqtt://{broker.host}:{broker.port}", robot=robot, **keys)
-
-
-async def until(condition: Callable[[], object]) -> None:
-    async with asyncio.timeout(PATIENCE_S):
-        while not condition():  # noqa: ASYNC110
-            await asyncio.sleep(0.01)
 
 
 async def take(stream: Any, n: int) -> list[Any]:

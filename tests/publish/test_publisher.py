@@ -2,7 +2,7 @@
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -20,9 +20,11 @@ from skin_host.processing.pipeline import PressureFrame
 from skin_host.publish.mqtt import Publisher
 from skin_host.settings import Mqtt
 from tests.support.broker import Mosquitto, free_port
+from tests.support.waiting import PATIENCE_S, until
 
-PATIENCE_S = 20.0
 STATUS = "skin/robot/nodes/main/status"
+#: What a node listens to; it has subscribed to all else by then.
+COMMANDS = "skin/robot/nodes/main/cmd/+"
 
 
 def frame(seq: int, t_ns: int = 0, part: str = "palm") -> PressureFrame:
@@ -76,12 +78,6 @@ async def listening(broker: Mosquitto, topic: str = "skin/#") -> AsyncIterator[L
     yield listener
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
-
-
-async def until(condition: Callable[[], object]) -> None:
-    async with asyncio.timeout(PATIENCE_S):
-        while not condition():  # noqa: ASYNC110
-            await asyncio.sleep(0.01)
 
 
 def settings(broker: Mosquitto, **keys: Any) -> Mqtt:
@@ -355,8 +351,7 @@ async def asking(broker: Mosquitto) -> AsyncIterator[tuple[aiomqtt.Client, Liste
             async with aiomqtt.Client(
                 broker.host, broker.port, protocol=aiomqtt.ProtocolVersion.V5
             ) as client:
-                await until(lambda: seen.payloads("status"))
-                await asyncio.sleep(0.1)  # until it has subscribed, too
+                await until(lambda: broker.subscriptions(COMMANDS))
                 yield client, seen
 
 
@@ -413,8 +408,7 @@ async def test_a_refused_command_says_why(
 async def test_a_flood_of_commands_is_cut_and_counted(mosquitto: Mosquitto) -> None:
     async with Publisher(settings(mosquitto), "robot", handler=answer) as publisher:
         async with aiomqtt.Client(mosquitto.host, mosquitto.port) as client:
-            await until(lambda: publisher.counters.connected)
-            await asyncio.sleep(0.1)
+            await until(lambda: mosquitto.subscriptions(COMMANDS))
             for _ in range(300):
                 await client.publish("skin/robot/nodes/main/cmd/scan", "{}", qos=0)
             await until(
@@ -429,10 +423,10 @@ async def test_a_flood_of_commands_is_cut_and_counted(mosquitto: Mosquitto) -> N
 async def test_a_retained_command_is_not_obeyed(mosquitto: Mosquitto) -> None:
     async with aiomqtt.Client(mosquitto.host, mosquitto.port) as client:
         await client.publish("skin/robot/nodes/main/cmd/scan", "{}", qos=1, retain=True)
-    for protocol in ("5", "3.1.1"):
+    for nth, protocol in enumerate(("5", "3.1.1"), start=1):
         keys = settings(mosquitto, protocol=protocol)
         async with Publisher(keys, "robot", handler=answer) as publisher:
-            await until(lambda p=publisher: p.counters.connected)
+            await until(lambda nth=nth: mosquitto.subscriptions(COMMANDS) == nth)
             await asyncio.sleep(0.2)
             assert publisher.counters.commands_taken == 0
 

@@ -21,15 +21,15 @@ from skin_host.layout import Layout, build_layout
 from skin_host.playback import paced, play_on_buses, play_processed, play_said
 from skin_host.publish.address import Broker
 from skin_host.publish.info import encode_info, node_info
-from skin_host.publish.recording import Recorder, read_can, read_said
+from skin_host.publish.recording import Recorder, read_can, read_said, recorded_topics
 from skin_host.replay import calibrate_from_log, replay
 from skin_host.settings import Bus, Mqtt, Settings, load
 from tests.support.broker import Mosquitto
+from tests.support.waiting import PATIENCE_S, until
 
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / "config" / "icub_hand.toml"
 GRASP = ROOT.parent / "shared" / "data" / "icub_grasp.log"
-PATIENCE_S = 20.0
 needs_grasp = pytest.mark.skipif(not GRASP.exists(), reason=f"{GRASP} is not here")
 
 
@@ -102,7 +102,7 @@ async def test_a_recording_played_on_a_bus_is_captured_as_it_was(tmp_path: Path)
         capturing = asyncio.create_task(capture_buses(settings, recorder.can, stop))
         await asyncio.sleep(0.05)
         assert await play_on_buses(grasp, settings, {"can0": sender}, speed=100) == 400
-        await asyncio.sleep(0.1)
+        await asyncio.sleep(0.1)  # several times what lies between two looks at the bus
         stop.set()
         assert await capturing == 0
     assert [frame[:2] for frame in frames_of(path)] == [frame[:2] for frame in frames_of(grasp)]
@@ -122,8 +122,10 @@ async def recording(broker: Mosquitto, path: Path) -> AsyncIterator[Recorder]:
     stop = asyncio.Event()
     with Recorder(path) as recorder:
         address, _ = Broker.from_url(f"mqtt://{broker.host}:{broker.port}", "5")
+        last = recorded_topics("skin", "icub")[-1]
+        before = broker.subscriptions(last)
         capturing = asyncio.create_task(capture_broker(recorder, address, "skin", "icub", stop))
-        await asyncio.sleep(0.3)
+        await until(lambda: broker.subscriptions(last) > before)
         yield recorder
         stop.set()
         await capturing
@@ -141,13 +143,15 @@ async def test_what_a_broker_said_is_recorded_and_said_again_byte_for_byte(
     async with recording(mosquitto, first) as recorder:
         engine = Engine(settings, layout, [0], calibration)
         assert await play_processed(grasp, engine, settings, speed=20) > 100
-        await asyncio.sleep(0.3)
+        # The last thing said is that the node goes.
+        await until(lambda: recorder.messages.get("status") == 2)
     assert recorder.messages["touch"] >= 1
     assert recorder.messages["frame"] > 50
-    async with recording(mosquitto, second):
+    async with recording(mosquitto, second) as again:
         broker, _ = Broker.from_url(f"mqtt://{mosquitto.host}:{mosquitto.port}", "5")
         assert await play_said(first, broker, speed=5) == sum(recorder.messages.values())
-        await asyncio.sleep(0.3)
+        # Those recorded, the one that the broker had kept, and a last one at the end of the play.
+        await until(lambda: again.messages.get("status") == recorder.messages["status"] + 2)
 
     def said(path: Path, kind: str) -> list[bytes]:
         return [one.payload for one in read_said(path) if one.topic.endswith(f"/{kind}")]

@@ -10,14 +10,19 @@ import time
 from pathlib import Path
 
 _START_S = 30.0
+#: Ports that no client of anybody's is given, so that one stays free while its broker is away.
+_PORTS = range(10_000, 32_768)
+#: What the broker writes down: the usual, and who subscribes to what.
+_LOGGED = ("error", "warning", "notice", "information", "subscribe")
 
 
 def free_port() -> int:
     """Return a TCP port of 127.0.0.1 that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+    while True:
+        port = random.choice(_PORTS)
+        with socket.socket() as probe, contextlib.suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port
 
 
 class Mosquitto:
@@ -36,7 +41,9 @@ class Mosquitto:
         self._configuration = directory / "mosquitto.conf"
         self._configuration.write_text(
             f"listener {self.port} {self.host}\n"
-            f"allow_anonymous true\npersistence false\nlog_dest stderr\n{settings}"
+            f"allow_anonymous true\npersistence false\nlog_dest stderr\n"
+            + "".join(f"log_type {kind}\n" for kind in _LOGGED)
+            + settings
         )
         self._process: subprocess.Popen[bytes] | None = None
 
@@ -44,6 +51,10 @@ class Mosquitto:
     def log(self) -> str:
         """What the broker has written so far."""
         return self._log.read_text(errors="replace")
+
+    def subscriptions(self, topic: str) -> int:
+        """How many times somebody has subscribed to exactly this topic so far."""
+        return self.log.count(f" {topic}\n") if self._log.exists() else 0
 
     def start(self) -> None:
         """Start the broker and wait until it accepts connections."""

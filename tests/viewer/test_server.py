@@ -24,9 +24,9 @@ from skin_host.settings import Mqtt, load
 from skin_host.viewer import server
 from skin_host.viewer.server import Viewer
 from tests.support.broker import Mosquitto, free_port
+from tests.support.waiting import PATIENCE_S, until
 
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
-PATIENCE_S = 20.0
 
 
 def nowhere() -> str:
@@ -185,7 +185,7 @@ async def test_the_page_may_calibrate(mosquitto: Mosquitto) -> None:
         page(url) as socket,
     ):
         await heard(socket, of_type("layout"))
-        await asyncio.sleep(0.1)  # until the node listens for commands, too
+        await until(lambda: mosquitto.subscriptions("skin/demo/nodes/main/cmd/+"))
         await socket.send('{"do":"calibrate","node":"main"}')
         told = await heard(socket, of_type("answer"))
         assert told["ok"]
