@@ -28,8 +28,10 @@ NOISY_UNITS = 1.5
 SATURATED_SHARE = 0.05
 #: Samples whose means are compared to see a touch come or go during calibration.
 BLOCK = 10
-#: A larger step from sample to sample is a touch that comes or goes, not noise.
+#: A step from sample to sample is a touch that comes or goes, not noise, if it is larger than
+#: this and than so many times the median step (four standard deviations).
 JUMP_UNITS = 8
+JUMP_MEDIANS = 6
 #: The means of blocks may differ by this much, and by five standard errors.
 STEADY_UNITS = 1.5
 
@@ -101,7 +103,7 @@ class Calibrator:
         self._percentile = percentile
         self._counts = np.zeros((n, 256), dtype=np.int64)
         self._last = np.full(n, -1, dtype=np.int16)
-        self._successive = np.zeros(n)
+        self._steps = np.zeros((n, 256), dtype=np.int32)
         self._block_sum = np.zeros(n)
         self._block_count = np.zeros(n, dtype=np.int64)
         self._lowest = np.full(n, np.inf)
@@ -114,9 +116,8 @@ class Calibrator:
         seen = raw[present]
         self._counts[taxels, seen] += 1
         value = seen.astype(np.int16)
-        step = value - self._last[taxels]
-        noise = (self._last[taxels] >= 0) & (np.abs(step) <= JUMP_UNITS)
-        self._successive[taxels] += np.where(noise, step**2.0, 0.0)
+        known = self._last[taxels] >= 0
+        self._steps[taxels[known], np.abs(value - self._last[taxels])[known]] += 1
         self._last[taxels] = value
         self._block_sum[taxels] += value
         self._block_count[taxels] += 1
@@ -144,7 +145,7 @@ class Calibrator:
         percentile = no_load - (255.0 - from_top)
         noise = np.sqrt(variance)
 
-        steady_noise = np.sqrt(self._successive / np.maximum(samples - 1, 1) / 2.0)
+        steady_noise = _steady_noise(self._steps)
         moved = np.where(np.isfinite(self._lowest), self._highest - self._lowest, 0.0)
         touched = moved > STEADY_UNITS + 5.0 * steady_noise / np.sqrt(BLOCK)
         # The least activation seen is the nearest to an untouched taxel that there is.
@@ -218,6 +219,21 @@ def merge(
             zeros=old.zeros | new.zeros if zeros else old.zeros,
         )
     )
+
+
+def _steady_noise(steps: NDArray[np.int32]) -> Floats:
+    """Standard deviation [n] that steps from sample to sample tell, a touch's left out.
+
+    Args:
+        steps: int32[n, 256], how often each size of step was seen.
+    """
+    sizes = np.arange(256.0)
+    cumulative = np.cumsum(steps, axis=1)
+    median = np.argmax(2 * cumulative >= cumulative[:, -1:], axis=1)
+    noise = sizes <= np.maximum(JUMP_UNITS, JUMP_MEDIANS * median)[:, np.newaxis]
+    squares = np.sum(steps * sizes**2, axis=1, where=noise)
+    variance: Floats = squares / np.maximum(cumulative[:, -1], 1) / 2.0
+    return np.sqrt(variance)
 
 
 def _identified(calibration: Calibration) -> Calibration:

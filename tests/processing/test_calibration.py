@@ -64,6 +64,14 @@ def test_a_noisy_taxel_is_named_and_used():
     assert found.usable[5]
 
 
+@pytest.mark.parametrize("sd", [3.0, 5.0, 8.0])
+def test_noise_of_any_size_is_no_touch(sd):
+    sweeps = np.rint(200.0 + np.random.default_rng(11).normal(0.0, sd, (100, N)))
+    found = calibrated(sweeps)
+    assert np.mean(found.verdict == Verdict.NOISY) > 0.99
+    assert np.median(found.noise) == pytest.approx(sd, rel=0.05)
+
+
 @pytest.mark.parametrize(("first", "last"), [(0, 60), (60, 125), (40, 80)])
 def test_a_touch_during_calibration_is_named_and_left_out_of_the_baseline(first, last):
     sweeps = noisy(np.random.default_rng(5))
