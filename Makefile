@@ -16,7 +16,7 @@ demo: .venv/demo.stamp  ## emulator, daemon, broker and page together; DURATION=
 	@exec $(BIN)/skin demo $(if $(DURATION),--duration $(DURATION))
 
 test: lint  ## all that needs no root and no hardware
-	@$(BIN)/python -m pytest
+	@$(BIN)/python -m pytest --numprocesses=3 --dist=loadfile
 
 test-system: .venv/dev.stamp .venv/fuzz.stamp  ## real CAN, I2C, broker and browser; root, if packages are missing
 	@tools/lane/packages

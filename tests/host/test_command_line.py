@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from skin_host.cli import main
+
 ROOT = Path(__file__).parents[2]
 DEMO = ROOT / "config/demo.toml"
 
@@ -58,10 +60,9 @@ def test_a_wrong_configuration_is_named_by_file_and_key(tmp_path, old, new, path
     refused(skin("check", config), 2, config, path, seen)
 
 
-def test_every_configuration_of_the_project_is_right():
-    for config in sorted((ROOT / "config").glob("*.toml")):
-        result = skin("check", str(config))
-        assert result.returncode == 0, result.stderr
+@pytest.mark.parametrize("config", sorted((ROOT / "config").glob("*.toml")), ids=lambda at: at.stem)
+def test_every_configuration_of_the_project_is_right(config, capsys):
+    assert main(["check", str(config)]) == 0, capsys.readouterr().err
 
 
 def test_a_missing_interface_is_named_with_what_mends_it(tmp_path):
@@ -114,13 +115,18 @@ def test_a_wrong_command_is_one_line_and_status_2(arguments):
     refused(skin(*arguments), 2)
 
 
-def test_every_command_has_help_with_an_example():
-    listing = skin("--help").stdout
-    commands = re.findall(r"^    ([a-z]+)", listing, flags=re.MULTILINE)
+def help_of(capsys: pytest.CaptureFixture[str], *command: str) -> str:
+    with pytest.raises(SystemExit) as ended:
+        main([*command, "--help"])
+    assert ended.value.code == 0
+    return capsys.readouterr().out
+
+
+def test_every_command_has_help_with_an_example(capsys):
+    commands = re.findall(r"^    ([a-z]+)", help_of(capsys), flags=re.MULTILINE)
     assert {"run", "calibrate", "check", "replay", "emulate", "demo", "scan"} <= set(commands)
     for command in commands:
-        text = skin(command, "--help").stdout
-        assert f"Example: skin {command}" in text
+        assert f"Example: skin {command}" in help_of(capsys, command)
 
 
 def test_a_reader_that_leaves_early_is_no_error():
