@@ -1,6 +1,7 @@
 """Touched taxels that lie together are one contact, and a contact has a life."""
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -27,6 +28,8 @@ PRESSED_SHARE = 0.1
 ALIVE_NS = 1_000_000_000
 #: Below this peak a contact is all but gone, and where it is only noise would tell.
 FELT_KPA = 2.0
+#: Pieces of a contact are contacts of their own when they have been apart for so long.
+PARTED_NS = 150_000_000
 #: A touched taxel of which nothing is heard for less than this is taken to be touched still.
 LOST_NS = 500_000_000
 
@@ -93,6 +96,8 @@ class _Contact:
     taxels: frozenset[int]
     said: TouchEvent
     heard_ns: int
+    #: Since when it has been in pieces.
+    parted_ns: int | None = None
 
 
 class ContactTracker:
@@ -129,6 +134,7 @@ class ContactTracker:
         groups = self._groups(self._touched(frame))
         if self._places is not None:
             groups = self._places.look(frame, groups, self._neighbours)
+        groups = self._kept_whole(groups, frame.t_ns)
         names = self._identify(groups)
         events = [
             self._closed(name, frame.seq, frame.t_ns)
@@ -186,6 +192,33 @@ class ContactTracker:
                         group.append(other)
             groups.append(frozenset(group))
         return groups
+
+    def _kept_whole(self, groups: list[frozenset[int]], t_ns: int) -> list[frozenset[int]]:
+        """The groups, with pieces of one contact taken together that have just come apart.
+
+        As a contact begins or lets go its taxels pass their thresholds one by one, and for a
+        moment it is an archipelago.
+        """
+        home = {taxel: name for name, contact in self._contacts.items() for taxel in contact.taxels}
+        pieces: dict[int, list[frozenset[int]]] = {name: [] for name in self._contacts}
+        kept = []
+        for group in groups:
+            overlaps = Counter(home[taxel] for taxel in sorted(group) if taxel in home)
+            if overlaps:
+                pieces[overlaps.most_common(1)[0][0]].append(group)
+            else:
+                kept.append(group)
+        for name, parts in pieces.items():
+            contact = self._contacts[name]
+            if len(parts) < 2:
+                contact.parted_ns = None
+            elif contact.parted_ns is None:
+                contact.parted_ns = t_ns
+            if contact.parted_ns is not None and 0 <= t_ns - contact.parted_ns < PARTED_NS:
+                kept.append(frozenset().union(*parts))
+            else:
+                kept += parts
+        return sorted(kept, key=min)
 
     def _identify(self, groups: list[frozenset[int]]) -> list[int]:
         """Give each group the name of the contact that it continues, or a new one.

@@ -18,7 +18,7 @@ from skin_host.processing.calibration import Calibration
 from skin_host.processing.drift import BaselineTracker
 from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.relaxation import OWN_MEANS, make_model, parameters_of
-from skin_host.processing.touch import TouchDetector, threshold_units
+from skin_host.processing.touch import Imprints, TouchDetector, threshold_units
 from skin_host.settings import Processing
 
 #: A longer step is a gap or a jump of the clock: the pressure in it is not known.
@@ -189,8 +189,10 @@ class _PartPipeline:
         off_units = np.maximum(on_units - settings.touch.hysteresis_units, 0.0)
         near_units = np.minimum(on_units, curve.beyond_units)
         self._near_units = np.where(believed, near_units, np.inf).astype(np.float32)
+        on_kpa = np.where(believed, curve.kpa(on_units), np.inf).astype(np.float32)
+        self._imprints = Imprints(on_kpa)
         self._detector = TouchDetector(
-            np.where(believed, curve.kpa(on_units), np.inf).astype(np.float32),
+            on_kpa,
             np.where(believed, curve.kpa(off_units), np.inf).astype(np.float32),
             settings.touch.votes_of_3,
         )
@@ -237,6 +239,8 @@ class _PartPipeline:
         corrected = self._corrected_kpa(beyond, dt_s)
         touched = self._nowhere if quiet else self._detector.step(corrected)
         self._gather(touched, dt_s)
+        if not quiet:
+            touched = self._imprints.step(touched, corrected)
         pressure = np.fmax(corrected, self._zeros)
         if valid is not self._always_valid:
             missing = ~valid
@@ -341,6 +345,7 @@ class _PartPipeline:
         ghosts = self.drift.step(units, self._was_touched, self._was_missing, self._elapsed_s)
         if ghosts is not None:
             self._detector.reset(ghosts)
+        self._imprints.fade(self._elapsed_s)
         self._renew_limits()
         self._sum_kpa.fill(0.0)
         self._samples = 0

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skin_host.evaluation.rig import flat_skin
-from skin_host.processing.contacts import LOST_NS, ContactTracker
+from skin_host.processing.contacts import LOST_NS, PARTED_NS, ContactTracker
 from skin_host.processing.pipeline import PressureFrame
 
 SETTINGS, LAYOUT = flat_skin(1)
@@ -91,10 +91,31 @@ def test_where_two_contacts_merge_the_larger_one_goes_on():
     assert kinds(skin.show(small, large, between)) == [("end", 1), ("move", 2)]
 
 
+def test_a_contact_that_lets_go_taxel_by_taxel_is_one_to_its_end():
+    skin = Skin()
+    skin.show(set(range(12)))
+    for left in ({0, 4, 5, 6}, {0, 5}, {0}):
+        assert [(one.event, one.id, set(one.taxels)) for one in skin.show(left)] == [
+            ("move", 1, left)
+        ]
+    assert kinds(skin.show()) == [("end", 1)]
+
+
+def test_pieces_that_come_together_again_are_one_contact_for_as_long_as_they_do():
+    skin = Skin()
+    whole, pieces = set(range(12)), {0, 4, 5, 6}
+    skin.show(whole)
+    for _ in range(20):
+        assert kinds(skin.show(pieces)) == [("move", 1)]
+        assert kinds(skin.show(whole)) == [("move", 1)]
+
+
 def test_where_a_contact_parts_the_larger_piece_keeps_the_name():
     skin = Skin()
     small, large = {0}, {4, 5, 6}
     skin.show(set(range(12)))
+    for _ in range(PARTED_NS // SWEEP_NS + 1):
+        assert kinds(skin.show(small, large)) in ([], [("move", 1)])
     events = skin.show(small, large)
     assert sorted((event.event, event.id, len(event.taxels)) for event in events) == [
         ("begin", 2, 1),
@@ -162,8 +183,7 @@ def test_every_touched_taxel_is_in_one_contact_and_every_begin_has_its_end(frame
                 del alive[event.id]
             else:
                 alive[event.id] = event
-        groups = skin.tracker._groups(sorted(touched))
-        assert sorted(taxel for group in groups for taxel in group) == sorted(touched)
-        assert len(alive) == len(groups)
+        said = [taxel for event in alive.values() for taxel in event.taxels]
+        assert sorted(said) == sorted(touched)
     ended = {event.id for event in skin.tracker.end_all(0, 0)}
     assert ended == set(alive)

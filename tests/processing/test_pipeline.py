@@ -192,6 +192,16 @@ def test_a_flickering_taxel_disturbs_no_other():
     assert np.abs(np.delete(rig.pipeline.baseline - rig.true_baseline, 50)).max() < 0.4
 
 
+def test_what_a_hard_press_leaves_is_no_touch_though_it_would_be_one_by_itself():
+    told = []
+    for before_units in (0.0, 45.0):
+        rig = Rig(1, 0.3, processing=NO_RELAXATION)
+        press(rig, before_units, 50)
+        press(rig, 0.0, 5)
+        told.append(any(frame.touched.any() for frame in press(rig, 2.0, 50)))
+    assert told == [True, False]
+
+
 def test_a_part_at_rest_is_never_told_as_touched():
     rig = Rig(2, 0.4, seed=1)
     assert not any(rig.step(0.0).touched.any() for _ in range(3000))

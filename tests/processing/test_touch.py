@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skin_host.processing.touch import TouchDetector, threshold_units
+from skin_host.processing.touch import Imprints, TouchDetector, threshold_units
 from skin_host.settings import Touch
 
 ON, OFF = np.array([2.0]), np.array([1.5])
@@ -101,3 +101,37 @@ def test_the_decision_is_the_vote_counted_out_at_every_sample(rows, votes, reset
             count = np.sum(history, axis=0)
             touched = (count == 3) | (touched & (count > 0))
         assert np.array_equal(detector.step(signal), touched)
+
+
+def told_after_a_press(press, rest, *, rest_s=0.0):
+    """Whether a rest is told as a new touch, after a press and so long of nothing."""
+    detector, imprints = TouchDetector(ON, OFF), Imprints(ON)
+    told = []
+    for value in [press] * 5 + [0.0] * 3:
+        signal = np.array([value])
+        told.append(bool(imprints.step(detector.step(signal), signal)[0]))
+    assert any(told)
+    imprints.fade(rest_s)
+    for _ in range(5):
+        signal = np.array([rest])
+        told.append(bool(imprints.step(detector.step(signal), signal)[0]))
+    return told[-1]
+
+
+def test_what_a_hard_press_leaves_in_the_foam_is_no_new_touch():
+    assert not told_after_a_press(100.0, 4.5)
+    assert told_after_a_press(20.0, 4.5)  # a softer one leaves less
+    assert told_after_a_press(100.0, 6.0)  # and this is more than it left
+
+
+def test_what_a_press_has_left_is_forgotten():
+    assert told_after_a_press(100.0, 3.0, rest_s=10.0)
+
+
+def test_a_press_that_goes_down_without_end_is_one_touch():
+    detector, imprints = TouchDetector(ON, OFF), Imprints(ON)
+    told = [
+        bool(imprints.step(detector.step(np.array([value])), np.array([value]))[0])
+        for value in [100.0] * 5 + [3.0] * 50
+    ]
+    assert told == [False] + [True] * 54
