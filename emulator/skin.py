@@ -9,11 +9,12 @@ from collections.abc import Collection
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.firmware.arithmetic import GAIN, GAIN_V2, TAXELS
+from emulator.firmware.arithmetic import TAXELS
 from emulator.foam import Drive, Foam, FoamLayer, Footprint
 from emulator.pads import Disc, Pads, Rectangle, draw_noise_ff, draw_resting_ff
 from emulator.scene import Moment, Probe, Scene, Script, resolve, tangents
 from emulator.viscoelastic import FoamTruth
+from skin_host.bus.protocol.compensation import GAIN, GAIN_V2
 from skin_host.errors import ConfigurationError
 from skin_host.layout import Layout, PadKind
 

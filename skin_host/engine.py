@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from skin_host.bus.assembler import Assembler, Sweep
 from skin_host.bus.protocol import TRIANGLES, FrameBatch, StatusError, status_error
+from skin_host.bus.protocol.compensation import thermal_gains
 from skin_host.fingertip.engine import FingertipEngine
 from skin_host.layout import Layout
 from skin_host.processing.calibration import Calibration, Calibrator, with_zeros
@@ -18,6 +19,7 @@ from skin_host.processing.contacts import ContactTracker, TouchEvent
 from skin_host.processing.intake import Intake, PartSample
 from skin_host.processing.liveness import PADS, Liveness
 from skin_host.processing.pipeline import Pipeline, PressureFrame
+from skin_host.processing.repeats import Repeats
 from skin_host.processing.rezero import Rezero
 from skin_host.settings import Settings, skin_hash
 
@@ -272,8 +274,21 @@ class Engine:
             if self.calibration is not None:
                 taxels = self._taxels_of(board)
                 noise = np.where(taxels >= 0, self.calibration.noise[taxels], 0.0)
-            period_s = self.layout.boards[board].settings.period_ms * 1e-3
-            made[board] = Liveness(TRIANGLES, noise, period_s)
+            settings = self.layout.boards[board].settings
+            gains = [thermal_gains(settings.skin_type, number)[0] for number in range(TRIANGLES)]
+            shifts = dict.fromkeys(range(TRIANGLES), 0)
+            shifts |= {
+                triangle.number: triangle.shift
+                for triangle in self.layout.triangles
+                if triangle.board == board
+            }
+            repeats = Repeats(
+                gains,
+                list(shifts.values()),
+                settings.no_load,
+                truncates=settings.model == "mtb3",
+            )
+            made[board] = Liveness(TRIANGLES, noise, settings.period_ms * 1e-3, repeats)
         return made
 
     def _taxels_of(self, board: int) -> NDArray[np.int32]:
@@ -337,7 +352,7 @@ class Engine:
         return steps
 
     def _note_touched(self, index: int, frame: PressureFrame) -> None:
-        """Liveness must know which triangles are touched, but only when that changes."""
+        """Liveness must know which pads are touched, but only when that changes."""
         part = self.layout.parts[index]
         touched = self._touched[part.start : part.stop]
         if np.array_equal(touched, frame.touched):
@@ -345,9 +360,9 @@ class Engine:
         touched[:] = frame.touched
         for board in part.boards:
             taxels = self._taxels_of(board)
-            triangles = np.any(self._touched[taxels] & (taxels >= 0), axis=1)
-            if triangles.any():
-                self._intake.touched[board] = triangles
+            pads = self._touched[taxels] & (taxels >= 0)
+            if pads.any():
+                self._intake.touched[board] = pads
             else:
                 self._intake.touched.pop(board, None)
 

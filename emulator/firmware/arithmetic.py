@@ -17,14 +17,6 @@ TAXELS = 12
 ABSENT = 0xFFFF
 LEGACY_NO_LOAD = 244
 
-#: Temperature gains x128 per taxel, for skin types 0 and 8; all 0 for palms and fingertips.
-GAIN = (70, 96, 83, 38, 38, 70, 0, 45, 77, 164, 0, 77)
-GAIN_V2 = (58, 91, 39, 23, 35, 90, 0, 38, 68, 115, 0, 86)
-NO_GAIN = (0,) * TAXELS
-#: The taxels whose change stands for the temperature.
-THERMAL_TAXEL = 6
-THERMAL_TAXEL_PALM = 11
-
 Bytes = NDArray[np.uint8]
 Words = NDArray[np.uint16]
 Ints = NDArray[np.int32]

@@ -13,17 +13,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.firmware.arithmetic import (
-    GAIN,
-    GAIN_V2,
-    NO_GAIN,
-    TAXELS,
-    THERMAL_TAXEL,
-    THERMAL_TAXEL_PALM,
-    Bytes,
-    Ints,
-    Words,
-)
+from emulator.firmware.arithmetic import TAXELS, Bytes, Ints, Words
 from emulator.firmware.chips import SLOTS, Chips
 from skin_host.bus.protocol import TRIANGLES, FrameBatch, MessageClass, encode_sweep
 from skin_host.bus.protocol.answers import (
@@ -33,6 +23,7 @@ from skin_host.bus.protocol.answers import (
     FirmwareVersion,
 )
 from skin_host.bus.protocol.commands import BoardType, Message
+from skin_host.bus.protocol.compensation import thermal_gains
 
 NS_PER_MS = 1_000_000
 INFO_PARTS = 8
@@ -133,11 +124,7 @@ class Mtb(ABC):
 
         Source: `computedrift` of embot_app_application_theSkin.cpp.
         """
-        if self.skin_type == 0:
-            return GAIN, THERMAL_TAXEL
-        if self.skin_type == 8 or (self.skin_type == 3 and triangle > 4):
-            return GAIN_V2, THERMAL_TAXEL
-        return NO_GAIN, THERMAL_TAXEL_PALM
+        return thermal_gains(self.skin_type, triangle)
 
     @property
     def message_class(self) -> MessageClass:

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from emulator.firmware.arithmetic import NO_GAIN, transmit_16, transmit_legacy
+from emulator.firmware.arithmetic import transmit_16, transmit_legacy
 from emulator.firmware.board import BOOTLOADER_S, Frame, Identity, Mtb
 from emulator.firmware.chips import CHIPS_PER_LINE, Chips, StageMap
 from skin_host.bus.protocol import (
@@ -37,6 +37,7 @@ from skin_host.bus.protocol.commands import (
     TactileSetup2,
     parse_command,
 )
+from skin_host.bus.protocol.compensation import NO_GAIN
 
 #: The sampling timer counts at 312.5 kHz.
 TIMER_TICK_NS = 3200

@@ -24,7 +24,7 @@ from skin_host.health.record import (
 from skin_host.health.watch import BoardWatch, Watch
 from skin_host.layout import PadKind
 from skin_host.processing.calibration import Verdict
-from skin_host.processing.intake import lifted
+from skin_host.processing.intake import FAR_PADS, lifted
 
 #: An event of a board is told for so long.
 LATELY_NS = 60_000_000_000
@@ -149,7 +149,7 @@ class Describer:
         if liveness.unproven[number]:
             return "silenced" if watch.error[number] else "constant"
         # Single pads are told with the taxels; here it is the whole triangle.
-        many = np.count_nonzero(out_of_range(status)) > 6
+        many = np.count_nonzero(out_of_range(status)) >= FAR_PADS
         other = lifted(sweep.raw[number : number + 1], status)[0]
         return "out of range" if many or other else None
 

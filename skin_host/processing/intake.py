@@ -19,6 +19,8 @@ from skin_host.processing.liveness import PADS, Liveness
 SILENCE_REPEAT_NS = 1_000_000_000
 #: So many pads far below zero pressure are no accident.
 LIFTED_PADS = 2
+#: Nor is one, while so many are far out of range.
+FAR_PADS = 7
 _NONE_ERRS = np.zeros(TRIANGLES, np.bool_)
 
 
@@ -81,7 +83,7 @@ class Intake:
     Attributes:
         veto: bool[16, 12] by index of the board: taxels that are not to be believed for a
             reason that the bytes do not show.
-        touched: bool[16] by index of the board: triangles that are touched, where any is.
+        touched: bool[16, 12] by index of the board: pads that are touched, where any is.
     """
 
     def __init__(
@@ -228,6 +230,8 @@ def lifted(raw: NDArray[np.uint8], status: NDArray[np.uint16]) -> NDArray[np.boo
     Pressing cannot do it. Plugs of data lines that were swapped, or a chip at another one's
     address, put the pads of one triangle on the baselines of another.
     """
-    below = out_of_range(status) & (raw == 255)
-    found: NDArray[np.bool_] = np.count_nonzero(below, axis=-1) >= LIFTED_PADS
+    far = out_of_range(status)
+    below = np.count_nonzero(far & (raw == 255), axis=-1)
+    torn = (below > 0) & (np.count_nonzero(far, axis=-1) >= FAR_PADS)
+    found: NDArray[np.bool_] = (below >= LIFTED_PADS) | torn
     return found

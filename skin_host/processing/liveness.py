@@ -18,9 +18,7 @@ What holds still may have a reason. While an iCub's hand holds an object its byt
 longer than those of the open hand (the IROS 2012 recordings: some pads for 44 sweeps, a whole
 fingertip for 19), so repeats count for less while the board feels a touch.
 
-A broken pad can still show a little of its converter's noise. So single pads are judged by a
-running likelihood ratio (Page's CUSUM) between their own rate and a rare change. A pad that
-has merely grown quieter is not accused: on real hands that happens for long times.
+Single pads are judged in `stuck`.
 
 Only conversions count: a chip needs 36.9 ms for its twelve stages (AD7147, decimation 256),
 and a board that sends more often repeats itself.
@@ -31,6 +29,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.bus.protocol.compensation import NO_GAIN
+from skin_host.processing.repeats import Repeats
+from skin_host.processing.stuck import TOUCHED_PACE, StuckPads, at_end, longest_run
+
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -39,11 +41,10 @@ PADS = 12
 CONVERSION_S = 0.0369
 #: A run of repeats with a probability below 1/odds is not chance.
 TRIANGLE_ODDS = 1e9
-TAXEL_ODDS = 1e7
 #: However lively it was, a triangle is not given up in less than nine conversions (0.45 s at
-#: 20 Hz), a taxel not in less than twelve.
+#: 20 Hz), and no pad of it is taken to move more often than in so many of its samples.
 MOST_TRIANGLE_RATE = 0.9
-MOST_TAXEL_RATE = 0.8
+MOST_PAD_RATE = 0.8
 #: A triangle that the calibration saw move at all is expected to move so often at least.
 LEAST_TRIANGLE_RATE = 0.02
 #: Rates follow what is seen over about this time, in steps of about this many samples.
@@ -51,22 +52,19 @@ RATE_MEMORY_S = 10.0
 #: So much of it a calibration is taken for.
 CALIBRATED_S = 5.0
 RATE_SAMPLES = 20
-#: A repeat while the board is touched weighs one in so much.
-TOUCHED_PACE = 6
-#: So many changes make what was frozen, stuck, or had an error, believable again.
+#: So many changes make what was frozen, or had an error, believable again.
 PROBATION_CHANGES = 3
-#: A stuck pad's byte moves in so many samples at most, and in this share of its own rate.
-STUCK_RATE = 0.05
-STUCK_SHARE = 0.15
 #: Without a calibration, pads are taken to have this much noise (units).
 USUAL_NOISE_UNITS = 0.5
-#: A taxel is noisy when its byte jumps up and down by more than this many units, and more
-#: than so many times the noise that was calibrated, in this share of the samples.
+#: A byte jumps when it goes up and down by more than this many units, and more than so many
+#: times the noise that was calibrated.
 NOISY_UNITS = 3.0
 NOISY_SIGMAS = 5.0
-NOISY_SHARE = 0.3
-CALM_SHARE = 0.1
-LONGEST_RUN = 1e6
+#: A taxel is noisy when its jumps, as multiples of that and at most so large, are this in the
+#: mean over all samples; and calm again below that. Large ones are rarer by chance than many.
+MOST_JUMP = 2.0
+NOISY_MEAN = 0.4
+CALM_MEAN = 0.1
 NOISE_MEMORY_SAMPLES = 8
 #: A spike is one sweep off by more than this many units, and so many times the noise.
 SPIKE_UNITS = 7.0
@@ -93,19 +91,26 @@ class Liveness:
             All zeros in a triangle mean that it was constant already when calibrated: it
             has to prove itself first.
         period_s: how often the board sends.
+        repeats: tells which pads say something new; without it, those whose byte changes.
 
     Attributes:
         frozen: bool[k], triangles that repeat themselves beyond chance.
         unproven: bool[k], triangles that had an error, or were frozen, and have not shown
             since that they live.
-        stuck: bool[k, 12], single pads that repeat themselves in a living triangle.
         noisy: bool[k, 12], pads that jump up and down much more than when calibrated.
         spikes: how often a single pad of a triangle was off for one sweep and back in the
             next: no sensor does that, a damaged frame does.
     """
 
-    def __init__(self, k: int, noise_units: Floats | None, period_s: float) -> None:
+    def __init__(
+        self,
+        k: int,
+        noise_units: Floats | None,
+        period_s: float,
+        repeats: Repeats | None = None,
+    ) -> None:
         shape = (k, PADS)
+        repeats = repeats or Repeats([NO_GAIN] * k, [0] * k, 0, truncates=False)
         calibrated = noise_units is not None
         if noise_units is None:
             noise_units = np.full(shape, USUAL_NOISE_UNITS)
@@ -113,7 +118,8 @@ class Liveness:
         self._weight = min(1.0, RATE_SAMPLES * period_s / RATE_MEMORY_S)
         self._memory = RATE_MEMORY_S / max(period_s, CONVERSION_S)
         self._seen = CALIBRATED_S / max(period_s, CONVERSION_S)
-        self._rate: Floats = np.minimum(change_rate(noise_units), MOST_TAXEL_RATE)
+        self._pads = StuckPads(noise_units, self._share, period_s, repeats)
+        self._rate: Floats = np.minimum(change_rate(noise_units), MOST_PAD_RATE)
         self._triangle_rate: Floats = 1.0 - np.prod(1.0 - self._rate, axis=1)
         # What is too much noise nobody knows before the calibration.
         jump = np.maximum(NOISY_UNITS, NOISY_SIGMAS * noise_units)
@@ -125,7 +131,6 @@ class Liveness:
         self._present = np.zeros(k, np.bool_)
         self._step = np.zeros(shape, np.int16)
         self._jumping = np.zeros(shape)
-        self._score = np.zeros(shape)
         self._surprise = np.zeros(k)
         self._changes = np.zeros(shape, np.int64)
         self._alive = np.zeros(k, np.int64)
@@ -133,11 +138,14 @@ class Liveness:
         self._to_show = np.where(constant, PROBATION_CHANGES, 0)
         self.frozen: Mask = np.zeros(k, np.bool_)
         self.unproven: Mask = constant
-        self.stuck: Mask = np.zeros(shape, np.bool_)
-        self._any_stuck = False
         self.noisy: Mask = np.zeros(shape, np.bool_)
         self.spikes = 0
         self._renew_limits()
+
+    @property
+    def stuck(self) -> Mask:
+        """bool[k, 12], single pads that repeat themselves in a living triangle."""
+        return self._pads.stuck
 
     def step(
         self,
@@ -152,7 +160,7 @@ class Liveness:
             raw: uint8[k, 12], the bytes.
             present: bool[k], triangles that came, and without an error in their status.
             erring: bool[k], triangles whose status word has an error.
-            touched: bool[k], triangles that were touched a moment ago, if any was.
+            touched: bool[k, 12], pads that were touched a moment ago, if any was.
 
         Returns:
             bool[k, 12], pads that are not to be believed now, or None if all are.
@@ -161,7 +169,7 @@ class Liveness:
         changed = (raw != self._raw) & compared[:, None]
         self._note_jumps(raw, changed, compared)
         self._note_triangles(raw, changed, compared, erring, touched)
-        self._note_pads(raw, changed, compared, touched)
+        self._pads.step(raw, changed, compared, self.unproven, touched)
         np.copyto(self._raw, raw, where=present[:, None])
         self._present = present.copy()
         if touched is None:
@@ -189,14 +197,15 @@ class Liveness:
             self._surprise[:] = 0.0
             return
         expected = self._expected
-        at_end = _at_end(raw)
-        if at_end.any():
+        ends = at_end(raw)
+        if ends.any():
             # What stands at an end of the scale cannot move, however well it is.
-            movable = (self._pad_surprise * ~at_end).sum(axis=1)
-            expected = np.where(at_end.all(axis=1), 0.0, np.minimum(expected, movable))
+            movable = (self._pad_expected * ~ends).sum(axis=1)
+            expected = np.where(ends.all(axis=1), 0.0, np.minimum(expected, movable))
         if touched is not None:
             # A chip that died can look touched itself; only what others feel excuses it.
-            elsewhere = np.count_nonzero(touched) > touched
+            felt = np.count_nonzero(touched, axis=1)
+            elsewhere = felt.sum() > felt
             expected = np.where(elsewhere, expected / TOUCHED_PACE, expected)
         self._surprise += np.where(compared, expected, 0.0)
         self._surprise[alive] = 0.0
@@ -207,26 +216,6 @@ class Liveness:
         self.unproven = self._to_show > 0
         self.frozen = (too_long | self.frozen) & self.unproven & ~erring
 
-    def _note_pads(
-        self, raw: NDArray[np.uint8], changed: Mask, compared: Mask, touched: Mask | None
-    ) -> None:
-        score = self._score
-        score += self._up * (compared[:, None] if touched is None else self._calm(compared))
-        score -= self._up_and_down * changed
-        np.maximum(score, 0.0, out=score)
-        over = score >= math.log(TAXEL_ODDS)
-        if not over.any() and not self._any_stuck:
-            return
-        idle = _at_end(raw) | self.unproven[:, None]
-        score[idle & ~self.stuck] = 0.0
-        np.minimum(score, math.log(TAXEL_ODDS), out=score)
-        self.stuck = (self.stuck & (score > 0.0)) | (over & ~idle)
-        self._any_stuck = bool(self.stuck.any())
-
-    @staticmethod
-    def _calm(compared: Mask) -> Floats:
-        return compared[:, None] / TOUCHED_PACE
-
     def _note_jumps(self, raw: NDArray[np.uint8], changed: Mask, compared: Mask) -> None:
         """A step up followed by a step down is noise; a touch goes one way at a time."""
         step = np.where(changed, raw.astype(np.int16) - self._raw, 0).astype(np.int16)
@@ -235,22 +224,22 @@ class Liveness:
         if not jump.any() and not self._jumping.any():
             np.copyto(self._step, step, where=compared[:, None])
             return
-        spike = jump & (np.minimum(np.abs(step), np.abs(self._step)) > self._spike)
-        alone = np.count_nonzero(spike & (self._jumping < CALM_SHARE), axis=1) == 1
+        size = np.minimum(np.abs(step), np.abs(self._step))
+        spike = jump & (size > self._spike)
+        alone = np.count_nonzero(spike & (self._jumping < CALM_MEAN), axis=1) == 1
         self.spikes += int(np.count_nonzero(alone))
         np.copyto(self._step, step, where=compared[:, None])
-        self._jumping += np.where(
-            compared[:, None], (jump - self._jumping) / NOISE_MEMORY_SAMPLES, 0.0
-        )
+        jumped = jump * np.minimum(size / self._jump, MOST_JUMP)
+        self._jumping += compared[:, None] * (jumped - self._jumping) / NOISE_MEMORY_SAMPLES
         self._jumping[self._jumping < 1e-3] = 0.0
-        self.noisy = self._jumping > np.where(self.noisy, CALM_SHARE, NOISY_SHARE)
+        self.noisy = self._jumping > np.where(self.noisy, CALM_MEAN, NOISY_MEAN)
 
     def _learn(self) -> None:
         """Let the rates follow what was seen of those that live."""
         seen = np.maximum(self._samples, 1)
         weight = self._weight * (~self.unproven & (self._samples >= RATE_SAMPLES // 2))
         self._triangle_rate += weight * (self._alive / seen - self._triangle_rate)
-        movable = ~self.stuck & ~_at_end(self._raw)
+        movable = ~self.stuck & ~at_end(self._raw)
         self._rate += (weight[:, None] * movable) * (self._changes / seen[:, None] - self._rate)
         self._seen = min(self._seen + self._share * RATE_SAMPLES, self._memory)
         self._samples[:] = 0
@@ -260,42 +249,7 @@ class Liveness:
 
     def _renew_limits(self) -> None:
         """How long a pad may repeat itself, and how much each repeat of a triangle tells."""
-        longest = longest_run(np.minimum(self._rate, MOST_TAXEL_RATE), self._seen, TAXEL_ODDS)
-        self._pad_surprise = self._share * math.log(TAXEL_ODDS) / longest
-        rare = np.clip(STUCK_SHARE * self._rate, 1e-6, STUCK_RATE)
-        self._up = np.maximum(self._pad_surprise + self._share * np.log1p(-rare), 0.0)
-        self._up_and_down = self._up + np.log(np.maximum(self._rate, 1e-6) / rare)
+        self._pad_expected = -self._share * np.log1p(-np.minimum(self._rate, MOST_PAD_RATE))
         together = np.clip(self._triangle_rate, LEAST_TRIANGLE_RATE, MOST_TRIANGLE_RATE)
         run = longest_run(together, self._seen, TRIANGLE_ODDS)
         self._expected = self._share * math.log(TRIANGLE_ODDS) / run
-
-
-def longest_run(rate: Floats, samples: float, odds: float) -> Floats:
-    """How many samples without a change are less probable than 1/odds.
-
-    Args:
-        rate: share of samples with a change.
-        samples: of how many it was seen.
-        odds: of the run.
-
-    The sum of ln((n + i) / (n - c + i)) over a run is taken as its integral and solved by
-    bisection; a rate of 0 allows a run without end.
-    """
-    still = np.maximum((1.0 - rate) * samples, 0.5)
-    n = np.maximum(samples, still)
-    wanted = math.log(odds)
-    low, high = np.zeros_like(still), np.full_like(still, LONGEST_RUN)
-    for _ in range(24):
-        k = 0.5 * (low + high)
-        told = (n + k) * np.log(n + k) - n * np.log(n)
-        told -= (still + k) * np.log(still + k) - still * np.log(still)
-        enough = told > wanted
-        high = np.where(enough, k, high)
-        low = np.where(enough, low, k)
-    return high
-
-
-def _at_end(raw: NDArray[np.uint8]) -> Mask:
-    """Bytes at an end of the scale, 0 or 255."""
-    ends: Mask = (raw == 0) | (raw == 255)
-    return ends

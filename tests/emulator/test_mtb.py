@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from emulator.firmware.arithmetic import GAIN, GAIN_V2, transmit_16, transmit_32
+from emulator.firmware.arithmetic import transmit_16, transmit_32
 from emulator.mtb import make_board
 from skin_host.bus.protocol import commands
 from skin_host.bus.protocol.answers import (
@@ -34,6 +34,7 @@ from skin_host.bus.protocol.commands import (
     TactileSetup,
     TxMode,
 )
+from skin_host.bus.protocol.compensation import GAIN, GAIN_V2
 from tests.support.board import RESTING_FF, BoardOnBench
 
 START = SetTxMode(TxMode.START)

@@ -1,4 +1,7 @@
-"""Every fault of the emulator's catalogue is told within a second, by its right name."""
+"""Every fault of the emulator's catalogue is told by its right name, all but one in a second.
+
+`python -m tests.support.fault_times` measures how soon, in many places each.
+"""
 
 import copy
 from typing import Any
@@ -11,15 +14,12 @@ from skin_host.health.diagnosis import diagnose
 from tests.support.fault_bench import FaultBench
 
 HERE = {"board": "forearm_outer", "triangle": 3}
-#: A lively pad, held in the middle of a byte. This board compensates temperature: it takes the
-#: noise of its thermal pads from every byte, which moves one that is held near an edge of its byte.
-HELD = 7
 #: What happens -> what must be told, and which taxels of the forearm must not be believed.
 FAULTS: list[tuple[str, dict[str, Any], str, range]] = [
     ("chip_gone", HERE, "triangle_not_connected", range(36, 48)),
     ("chip_gone", HERE | {"value": 0}, "triangle_no_ack", range(36, 48)),
     ("chip_gone", HERE | {"value": 0x8000}, "triangle_frozen", range(36, 48)),
-    ("stuck_taxel", HERE | {"taxel": HELD}, "taxel_stuck", range(36 + HELD, 37 + HELD)),
+    ("stuck_taxel", HERE | {"taxel": 7}, "taxel_stuck", range(43, 44)),
     ("noisy_taxel", HERE | {"taxel": 4}, "taxel_noisy", range(40, 41)),
     ("shorted_finger", HERE, "line_shorted", range(48)),
     ("wrong_address", HERE | {"value": 0}, "triangle_not_connected", range(36, 48)),
@@ -58,12 +58,12 @@ def test_a_healthy_robot_is_accused_of_nothing(bench: FaultBench) -> None:
 
 
 @pytest.mark.parametrize(("name", "arguments", "code", "doubted"), FAULTS)
-def test_a_fault_is_named_within_a_second(
+def test_a_fault_is_named_in_time(
     bench: FaultBench, name: str, arguments: dict[str, Any], code: str, doubted: range
 ) -> None:
     bench.inject(name, **arguments)
-    # The odds of one in 10^7 take a pad that moved in 4 of 5 samples before just over a second.
-    bench.run(1.2 if name == "stuck_taxel" else 1.0)
+    # Chance lets single pads repeat themselves for longer than that: see `processing.stuck`.
+    bench.run(8.0 if name == "stuck_taxel" else 1.0)
     told = {told for told, _ in bench.first_told}
     assert code in told
     assert not bench.valid["left_forearm"][list(doubted)].any()

@@ -91,3 +91,24 @@ def test_times_of_a_part_only_rise_however_late_its_boards_are(lateness):
     for now_ns, one in sorted(arrivals, key=lambda arrival: arrival[0]):
         times += [sample.t_ns for sample in parts.feed([one]) + parts.expire(now_ns)]
     assert all(np.diff(times) > 0)
+
+
+def far(pads: int) -> int:
+    """A status word that calls the first pads far out of range."""
+    return ((1 << pads) - 1) << 4
+
+
+def test_a_triangle_far_out_of_range_both_ways_is_not_pressed_but_dead():
+    """Its other pads stand at the end of the scale, as if pressed as hard as can be."""
+    dead = sweep(OUTER, PERIOD, status=far(9), fill=0)
+    dead.raw[:, 0] = 255
+    (sample,) = intake().feed([dead, sweep(INNER, PERIOD)])
+    assert not sample.present[: 16 * 12].any()
+
+
+def test_a_torn_pad_does_not_silence_the_pressed_ones_beside_it():
+    torn = sweep(OUTER, PERIOD, status=far(4), fill=0)
+    torn.raw[:, 0] = 255
+    (sample,) = intake().feed([torn, sweep(INNER, PERIOD)])
+    assert sample.present[: 16 * 12].reshape(16, 12)[:, 4:].all()
+    assert not sample.present[: 16 * 12].reshape(16, 12)[:, :4].any()

@@ -1,0 +1,191 @@
+"""A stuck pad is told from a quiet one by odds, and the odds are what they say."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emulator.firmware.arithmetic import transmit_16, transmit_32
+from skin_host.bus.protocol.compensation import GAIN, GAIN_V2, NO_GAIN, THERMAL_TAXEL
+from skin_host.processing import stuck
+from skin_host.processing.repeats import Repeats
+from skin_host.processing.stuck import StuckPads
+
+K = 8
+SHAPE = (K, 12)
+PERIOD_S = 0.05
+HERE = np.ones(K, bool)
+NO = np.zeros(K, bool)
+NO_LOAD = 240
+
+
+class Watched:
+    """Pads of a board that are shown to a watcher sweep by sweep."""
+
+    def __init__(self, seen: np.ndarray, repeats: Repeats | None = None, share: float = 1.0):
+        plain = Repeats([NO_GAIN] * K, [2] * K, NO_LOAD, truncates=False)
+        self.pads = StuckPads(seen.std(axis=0), share, PERIOD_S, repeats or plain)
+        self.raw = seen[-1]
+        self.accusations = 0
+
+    def show(self, raw: np.ndarray, touched: np.ndarray | None = None) -> None:
+        before = self.pads.stuck
+        self.pads.step(raw, raw != self.raw, HERE, NO, touched)
+        self.raw = raw
+        self.accusations += np.count_nonzero(self.pads.stuck & ~before)
+
+
+def to_bytes(units: np.ndarray) -> np.ndarray:
+    return np.clip(np.rint(units), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("sigma", [0.1, 0.4, 0.7, 1.5])
+def test_false_accusations_are_as_rare_as_the_odds_say(
+    sigma: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stuck, "ODDS", 1000.0)
+    rng = np.random.default_rng(5)
+    centre = 240 + rng.uniform(-0.5, 0.5, SHAPE)
+    watched = Watched(to_bytes(centre + sigma * rng.standard_normal((100, *SHAPE))))
+    began = 0
+    for _ in range(6000):
+        begins = watched.pads._run == stuck.BEGUN
+        watched.show(to_bytes(centre + sigma * rng.standard_normal(SHAPE)))
+        began += np.count_nonzero(begins)
+    expected = began / stuck.ODDS
+    assert watched.accusations <= expected + 4 * math.sqrt(expected) + 1
+    if sigma == 0.7:
+        assert watched.accusations > 0.1 * expected  # nor is anybody spared
+
+
+@pytest.mark.parametrize("sigma", [0.3, 0.45, 0.6])
+def test_a_pad_that_drifts_from_the_edge_of_a_byte_to_its_middle_is_not_accused(
+    sigma: float,
+) -> None:
+    rng = np.random.default_rng(3)
+    watched = Watched(to_bytes(240.5 + sigma * rng.standard_normal((100, *SHAPE))))
+    for centre in np.concatenate([np.full(6000, 240.5), np.linspace(240.5, 241, 600)]):
+        watched.show(to_bytes(centre + sigma * rng.standard_normal(SHAPE)))
+    for _ in range(3000):
+        watched.show(to_bytes(241 + sigma * rng.standard_normal(SHAPE)))
+    assert watched.accusations == 0
+
+
+def sweeps_until_stuck(
+    watched: Watched, rng: np.random.Generator, units: float, touched: np.ndarray | None = None
+) -> int:
+    for sweep in range(1, 400):
+        raw = to_bytes(240.3 + 0.8 * rng.standard_normal(SHAPE))
+        raw[1, 5] = units
+        watched.show(raw, touched)
+        if watched.pads.stuck.any():
+            assert np.argwhere(watched.pads.stuck).tolist() == [[1, 5]]
+            return sweep
+    raise AssertionError("never told")
+
+
+def lively() -> tuple[Watched, np.random.Generator]:
+    rng = np.random.default_rng(3)
+    return Watched(to_bytes(240.3 + 0.8 * rng.standard_normal((100, *SHAPE)))), rng
+
+
+def test_a_pad_that_stops_is_stuck_until_it_moves_again() -> None:
+    watched, rng = lively()
+    assert sweeps_until_stuck(watched, rng, 239) * PERIOD_S < 4
+    for _ in range(20):
+        watched.show(to_bytes(240.3 + 0.8 * rng.standard_normal(SHAPE)))
+    assert not watched.pads.stuck.any()
+
+
+def test_a_pad_that_is_stuck_as_if_touched_is_found_as_soon() -> None:
+    watched, rng = lively()
+    alone = np.zeros(SHAPE, bool)
+    alone[1, 5] = True
+    found = sweeps_until_stuck(watched, rng, 190, alone)
+    again, rng = lively()
+    assert found <= sweeps_until_stuck(again, rng, 190) + 3
+
+
+def test_while_something_else_is_touched_a_pad_may_rest_for_longer() -> None:
+    watched, rng = lively()
+    elsewhere = np.zeros(SHAPE, bool)
+    elsewhere[3, 0] = True
+    found = sweeps_until_stuck(watched, rng, 239, elsewhere)
+    again, rng = lively()
+    assert found > 3 * sweeps_until_stuck(again, rng, 239)
+
+
+@pytest.mark.parametrize("value", [0, 255])
+def test_a_pad_at_an_end_of_its_scale_is_not_called_stuck(value: int) -> None:
+    watched, rng = lively()
+    for _ in range(400):
+        raw = to_bytes(240.3 + 0.8 * rng.standard_normal(SHAPE))
+        raw[1, 5] = value
+        watched.show(raw)
+    assert not watched.pads.stuck.any()
+
+
+# ---------------------------------------------------------------------- compensation
+
+
+def sent(words: np.ndarray, gain: tuple[int, ...], shift: int, truncates: bool) -> np.ndarray:
+    """Bytes uint8[K, 12] of what the chips say, their zero being at 20000."""
+    transmit = transmit_16 if truncates else transmit_32
+    values, _ = transmit(
+        words.astype(np.uint16),
+        np.full(SHAPE, 20000, np.int32),
+        np.full(K, shift, np.int32),
+        np.full(K, NO_LOAD, np.int32),
+        np.tile(np.array(gain, np.int32), (K, 1)),
+        np.full(K, THERMAL_TAXEL, np.intp),
+    )
+    return values
+
+
+@given(
+    st.sampled_from([GAIN, GAIN_V2, NO_GAIN]),
+    st.integers(0, 4),
+    st.booleans(),
+    st.integers(0, 2**32 - 1),
+)
+@settings(max_examples=60, deadline=None)
+def test_a_word_that_stays_is_a_repetition_whatever_is_taken_from_it(
+    gain: tuple[int, ...], shift: int, truncates: bool, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    repeats = Repeats([gain] * K, [shift] * K, NO_LOAD, truncates=truncates)
+    held = 20000 + rng.integers(-10, 60, SHAPE)
+    raw, seen = np.zeros(SHAPE, np.uint8), np.zeros(SHAPE, bool)
+    for _ in range(40):
+        held[:, THERMAL_TAXEL] = 20000 + rng.integers(-12, 13, K)
+        before, raw = raw, sent(held, gain, shift, truncates)
+        inside = (raw > 0) & (raw < 255)
+        moved, _ = repeats.step(raw, raw != before, inside)
+        inside[:, THERMAL_TAXEL] = False
+        seen, before_seen = seen | inside, seen
+        assert not (moved & before_seen & inside).any()
+
+
+def test_a_stuck_pad_is_found_though_the_noise_of_the_thermal_pad_moves_its_byte() -> None:
+    rng = np.random.default_rng(3)
+    repeats = Repeats([GAIN] * K, [2] * K, NO_LOAD, truncates=False)
+
+    def sweep() -> np.ndarray:
+        return np.rint(20000 + 3.0 * rng.standard_normal(SHAPE))
+
+    seen = np.array([sent(sweep(), GAIN, 2, False) for _ in range(100)])
+    watched = Watched(seen, repeats)
+    for _ in range(2000):
+        watched.show(sent(sweep(), GAIN, 2, False))
+    assert watched.accusations == 0
+    held, changes = sweep(), 0
+    for _ in range(160):
+        words = sweep()
+        words[2, [0, 1, 9]] = held[2, [0, 1, 9]]
+        before = watched.raw
+        watched.show(sent(words, GAIN, 2, False))
+        changes += np.count_nonzero((watched.raw != before)[2, [0, 1, 9]])
+    assert changes > 30
+    assert np.argwhere(watched.pads.stuck).tolist() == [[2, 0], [2, 1], [2, 9]]
