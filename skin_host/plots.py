@@ -24,6 +24,7 @@ VERDICT_COLOURS = {
     Verdict.STUCK: "#d55e00",
     Verdict.OUT_OF_RANGE: "#cc79a7",
     Verdict.ABSENT: "#999999",
+    Verdict.TOO_FEW: "#333333",
 }
 
 

@@ -276,15 +276,15 @@ def _taxels(record: Record) -> Iterator[Fault]:
             yield Fault(f"taxel_{kind}", part, f"taxels {_list(taxels)} of {part} {what}")
     verdicts = record["taxel_verdicts"]
     # What a triangle that is told of did not send, was absent because of that.
-    kinds = ["stuck", "out_of_range"] + ["absent"] * (not record["triangles"])
+    kinds = ["stuck", "out_of_range"] + ["absent", "too_few"] * (not record["triangles"])
     refused = {taxel for kind in kinds for taxel in verdicts.get(kind, ())}
     refused &= set(record["invalid"])
     if refused:
         yield Fault(
             "taxel_refused",
             part,
-            f"taxels {_list(refused)} of {part} were stuck, out of range or absent when "
-            "calibrated; they are not valid until a calibration finds them well",
+            f"taxels {_list(refused)} of {part} were stuck, out of range, absent or heard "
+            "too rarely when calibrated; they are not valid until a calibration finds them well",
         )
     if record["baseline_at_limit"]:
         at_limit = _list(record["baseline_at_limit"])

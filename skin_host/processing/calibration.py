@@ -26,6 +26,8 @@ SCHEMA = "skin.calibration/1"
 NOISY_UNITS = 1.5
 #: With more than this share of its samples at the ends of the scale, a taxel is out of range.
 SATURATED_SHARE = 0.05
+#: Fewer samples than this say neither where a taxel rests nor how noisy it is.
+FEWEST_SAMPLES = 10
 #: Samples whose means are compared to see a touch come or go during calibration.
 BLOCK = 10
 #: A step from sample to sample is a touch that comes or goes, not noise, if it is larger than
@@ -50,6 +52,7 @@ class Verdict(IntEnum):
     STUCK = 3
     OUT_OF_RANGE = 4
     ABSENT = 5
+    TOO_FEW = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +162,7 @@ class Calibrator:
         verdict[touched] = Verdict.TOUCHED
         verdict[ends > SATURATED_SHARE * samples] = Verdict.OUT_OF_RANGE
         verdict[(counts[:, 0] == samples) | (counts[:, 255] == samples)] = Verdict.STUCK
+        verdict[samples < FEWEST_SAMPLES] = Verdict.TOO_FEW
         verdict[samples == 0] = Verdict.ABSENT
         absent = samples == 0
         for array in (baseline, percentile, noise):

@@ -108,6 +108,13 @@ def test_what_was_never_received_is_absent():
     assert calibration.summary(found, LAYOUT) == {"skin": {"ok": N - 12, "absent": 12}}
 
 
+@pytest.mark.parametrize("samples", [1, 9])
+def test_what_was_hardly_ever_received_is_not_judged_by_that(samples):
+    found = calibrated(np.full((samples, N), 240))
+    assert np.all(found.verdict == Verdict.TOO_FEW)
+    assert not found.usable.any()
+
+
 def test_lost_sweeps_do_not_shift_the_baseline():
     sweeps = noisy(np.random.default_rng(9))
     present = np.random.default_rng(10).uniform(size=(125, N)) > 0.3
