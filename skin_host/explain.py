@@ -4,16 +4,15 @@ import difflib
 import math
 import re
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import Struct
+
+from skin_host.fields import Name
 
 Table = type[Struct]
 Named = dict[str, Table]
-
-#: Names end up in MQTT topics and in file names.
-Name = Annotated[str, Meta(pattern=r"^[a-z0-9_-]+$", max_length=64)]
 
 
 def explain(document: Any, error: msgspec.ValidationError, root: Table, named: Named) -> str:

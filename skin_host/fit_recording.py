@@ -3,7 +3,7 @@
 The recording begins with some seconds of untouched skin, which serve as its calibration.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,8 +22,9 @@ from skin_host.processing.fitting import Fit, HoldRecord, fit, merge
 from skin_host.processing.gains import GainFit, fit_gains
 from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.relaxation import make_model, parameters_of
+from skin_host.relaxation_settings import RELAXATION_SCHEMA
 from skin_host.replay import calibrate_from_log, replay
-from skin_host.settings import RELAXATION_SCHEMA, Settings
+from skin_host.settings import Settings
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -185,7 +186,7 @@ def hold_record(
     return replace(record, unit_rms_kpa=unit_rms_kpa)
 
 
-def fit_relaxation(record: HoldRecord, models: list[str]) -> list[Fit]:
+def fit_relaxation(record: HoldRecord, models: Sequence[str]) -> list[Fit]:
     """Fit models to a record, the best first."""
     fits = [fit(model, record) for model in models]
     return sorted(fits, key=_error)

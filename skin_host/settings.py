@@ -14,15 +14,14 @@ import msgspec
 from msgspec import Meta, Struct, field
 
 from skin_host.errors import ConfigurationError
-from skin_host.explain import Name, Named, explain, not_finite
+from skin_host.explain import Named, explain, not_finite
+from skin_host.fields import Name, NotNegative, Positive
 from skin_host.fingertip.settings import Fingertip as Fingertip  # noqa: PLC0414 (for others too)
 from skin_host.fingertip.settings import wrong_references
+from skin_host.relaxation_settings import Relaxation, with_file, wrong_parameters
 
-Positive = Annotated[float, Meta(gt=0)]
-NotNegative = Annotated[float, Meta(ge=0)]
 Byte = Annotated[int, Meta(ge=0, le=255)]
 TRIANGLES_PER_BOARD = 16
-RELAXATION_SCHEMA = "skin.relaxation/1"
 
 
 class _Table(Struct, forbid_unknown_fields=True, kw_only=True):
@@ -137,48 +136,6 @@ class Pressure(_Table):
     #: The palm of the paper: 2 mm of foam; the radius follows from its Figs. 11 to 13.
     pad_radius_mm: Positive = 2.1
     foam_mm: Positive = 2.0
-
-
-class Relaxation(_Table):
-    """Which viscoelastic model corrects the pressure, and its parameters.
-
-    `set` names a stand-in for the paper's lost Table I; explicit numbers replace it.
-    """
-
-    model: Literal[
-        "none",
-        "published",
-        "published_bleed",
-        "prony",
-        "asymmetric",
-        "asymmetric_log",
-        "asymmetric_clock",
-    ] = "asymmetric_clock"
-    set: Literal["mild", "mid", "strong"] = "mid"
-    beta: list[NotNegative] | None = None
-    tau_s: list[Positive] | None = None
-    beta_unload: list[NotNegative] | None = None
-    tau_unload_s: list[Positive] | None = None
-    #: Of `asymmetric_clock`: compression by this pressure makes relaxation e times faster.
-    clock_kpa: Positive | None = None
-    #: States are brought up to date this often; 0 means at every sweep.
-    update_s: NotNegative = 1.0
-    #: A file written by `skin calibrate --relaxation`; it replaces the numbers above.
-    file: str | None = None
-
-
-class RelaxationFile(Struct, kw_only=True):
-    """What `skin calibrate --relaxation` writes: one model's parameters for one foam."""
-
-    schema: str
-    model: Literal[
-        "published", "published_bleed", "prony", "asymmetric", "asymmetric_log", "asymmetric_clock"
-    ]
-    beta: list[NotNegative]
-    tau_s: list[Positive]
-    beta_unload: list[NotNegative]
-    tau_unload_s: list[Positive]
-    clock_kpa: Positive | None = None
 
 
 class Touch(_Table):
@@ -325,40 +282,9 @@ def load(path: Path) -> Settings:
     for where, number in not_finite(msgspec.toml.decode(data)):
         raise ConfigurationError(f"{path}: {where}: seen {number}, wanted a finite number")
     _check_references(path, settings)
-    return _with_relaxation_file(path, settings)
-
-
-def _with_relaxation_file(path: Path, settings: Settings) -> Settings:
-    """Put the numbers of `processing.relaxation.file` in place."""
-    relaxation = settings.processing.relaxation
-    if relaxation.file is None:
-        return settings
-    file = path.parent / relaxation.file
-
-    def wrong(what: str) -> ConfigurationError:
-        return ConfigurationError(
-            f"{path}: processing.relaxation.file: {file}: {what}; "
-            "make one with: skin calibrate CONFIG --relaxation LOG"
-        )
-
-    try:
-        found = msgspec.json.decode(file.read_bytes(), type=RelaxationFile)
-    except OSError as error:
-        raise wrong(f"cannot be read: {error.strerror}") from None
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise wrong(f"not a relaxation file: {error}") from None
-    if found.schema != RELAXATION_SCHEMA:
-        raise wrong(f'schema "{found.schema}", wanted "{RELAXATION_SCHEMA}"')
-    replaced = msgspec.structs.replace(
-        relaxation,
-        model=found.model,
-        beta=found.beta,
-        tau_s=found.tau_s,
-        beta_unload=found.beta_unload,
-        tau_unload_s=found.tau_unload_s,
-        clock_kpa=found.clock_kpa,
-    )
-    processing = msgspec.structs.replace(settings.processing, relaxation=replaced)
+    processing = settings.processing
+    relaxation = with_file(processing.relaxation, path)
+    processing = msgspec.structs.replace(processing, relaxation=relaxation)
     return msgspec.structs.replace(settings, processing=processing)
 
 
@@ -403,21 +329,9 @@ def _check_references(path: Path, settings: Settings) -> None:
         raise wrong(f"boards.{min(unused)}", "no part uses this board; remove it or add a patch")
     for where, what in wrong_references(settings):
         raise wrong(where, what)
-    relaxation = settings.processing.relaxation
-    if (relaxation.beta is None) != (relaxation.tau_s is None):
-        raise wrong("processing.relaxation", "`beta` and `tau_s` go together")
-    lengths = {
-        len(values)
-        for values in (
-            relaxation.beta,
-            relaxation.tau_s,
-            relaxation.beta_unload,
-            relaxation.tau_unload_s,
-        )
-        if values is not None
-    }
-    if len(lengths) > 1 or 0 in lengths:
-        raise wrong("processing.relaxation", "the lists of parameters differ in length")
+    misfit = wrong_parameters(settings.processing.relaxation)
+    if misfit is not None:
+        raise wrong("processing.relaxation", misfit)
 
 
 def _known(table: dict[str, Any]) -> str:

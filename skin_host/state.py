@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta, Struct, field
 
-from skin_host.explain import Name
+from skin_host.fields import Name
 from skin_host.files import write_atomic
 from skin_host.settings import Touch
 

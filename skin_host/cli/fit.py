@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from skin_host.cli.common import Progress, load_skin, print_json
 from skin_host.errors import RequestError
+from skin_host.relaxation_settings import FITTED
 
 if TYPE_CHECKING:
     import numpy as np
@@ -16,16 +17,6 @@ if TYPE_CHECKING:
     from skin_host.layout import Layout
     from skin_host.processing.fitting import Fit, HoldRecord
     from skin_host.settings import Settings
-
-#: The models of `settings.RelaxationFile`; named here too, so that `skin --help` needs no numpy.
-FITTED = [
-    "published",
-    "published_bleed",
-    "prony",
-    "asymmetric",
-    "asymmetric_log",
-    "asymmetric_clock",
-]
 
 
 def add_arguments(calibrate: argparse.ArgumentParser) -> None:

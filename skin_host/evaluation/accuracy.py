@@ -16,7 +16,8 @@ from emulator.viscoelastic import FoamTruth, TruthKind
 from skin_host.evaluation.histories import HISTORIES, Record, calibration_hold, record
 from skin_host.processing.fitting import Fit, HoldRecord, fit, merge
 from skin_host.processing.pressure import PressureCurve
-from skin_host.processing.relaxation import MODELS, ParameterSet, make_model, stand_in
+from skin_host.processing.relaxation import ParameterSet, make_model, stand_in
+from skin_host.relaxation_settings import FITTED
 
 Floats = NDArray[np.float64]
 Row = dict[str, Any]
@@ -145,7 +146,7 @@ def fitted_hold(kind: TruthKind, sample_hz: float = 25.0) -> HoldRecord:
 def fits_of(kind: TruthKind) -> dict[str, Fit]:
     """Every model with parameters, fitted to the calibration record of a truth."""
     hold = fitted_hold(kind)
-    fits = {model: fit(model, hold) for model in MODELS if model not in ("none", "published_bleed")}
+    fits = {model: fit(model, hold) for model in FITTED if model != "published_bleed"}
     # The bleed has no parameter of its own.
     return fits | {"published_bleed": replace(fits["published"], model="published_bleed")}
 

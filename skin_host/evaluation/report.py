@@ -24,8 +24,7 @@ from skin_host.evaluation import accuracy, page, speed, touching
 from skin_host.evaluation.accuracy import Plan, Variant
 from skin_host.evaluation.histories import TRUTHS
 from skin_host.evaluation.localization_trials import Case, errors, localizer_for
-from skin_host.processing.relaxation import MODELS
-from skin_host.settings import Relaxation
+from skin_host.relaxation_settings import MODELS, Relaxation
 
 Row = dict[str, Any]
 Report = dict[str, Any]

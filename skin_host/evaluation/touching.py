@@ -10,7 +10,7 @@ from skin_host.evaluation.accuracy import fits_of
 from skin_host.evaluation.histories import Holds, record
 from skin_host.evaluation.rig import Rig
 from skin_host.processing.pressure import PressureCurve
-from skin_host.settings import Relaxation
+from skin_host.relaxation_settings import Relaxation
 
 Row = dict[str, Any]
 

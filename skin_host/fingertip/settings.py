@@ -5,13 +5,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from msgspec import Meta, Struct
 
-from skin_host.explain import Name
+from skin_host.fields import Name, Positive
 from skin_host.fingertip.intrinsic import Plane, Quadric, Surface, cylinder, ellipsoid, sphere
 
 if TYPE_CHECKING:
     from skin_host.settings import Settings
 
-Positive = Annotated[float, Meta(gt=0)]
 Vector = tuple[float, float, float]
 Six = tuple[float, float, float, float, float, float]
 

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.processing.relaxation import MODELS, ParameterSet, make_model, stand_in
+from skin_host.processing.relaxation import ParameterSet, make_model, stand_in
 from skin_host.processing.relaxation.base import Parameters
 from skin_host.processing.relaxation.sets import shared_cause
+from skin_host.relaxation_settings import FITTED
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -162,7 +163,7 @@ def fit(model: str, record: HoldRecord) -> Fit:
     Raises:
         ValueError: no such model, or one without parameters.
     """
-    if model not in MODELS or model == "none":
+    if model not in FITTED:
         raise ValueError(f'no parameters to fit in a model "{model}"')
     if model.startswith("published"):
         return _fit_published(model, record)

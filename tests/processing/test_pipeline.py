@@ -8,7 +8,7 @@ from skin_host.layout import PadKind
 from skin_host.processing.calibration import Calibrator, Verdict
 from skin_host.processing.pipeline import Pipeline
 from skin_host.processing.pressure import PressureCurve
-from skin_host.processing.relaxation import MODELS
+from skin_host.relaxation_settings import MODELS
 
 CURVE = PressureCurve(2.88)
 NO_RELAXATION = {"relaxation": {"model": "none"}}

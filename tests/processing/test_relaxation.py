@@ -4,7 +4,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skin_host.processing.relaxation import (
-    MODELS,
     STAND_INS,
     AsymmetricRelaxation,
     NoRelaxation,
@@ -13,6 +12,7 @@ from skin_host.processing.relaxation import (
     make_model,
     stand_in,
 )
+from skin_host.relaxation_settings import FITTED, MODELS
 
 MID = STAND_INS["mid"]
 LOADING = {"beta": MID.beta, "tau_s": MID.tau_s, "tau_unload_s": MID.tau_unload_s}
@@ -219,7 +219,7 @@ def test_parameters_per_taxel_give_what_shared_ones_give(name):
         assert many.step(pressure, 0.7) == pytest.approx(one.step(pressure, 0.7), abs=1e-12)
 
 
-@pytest.mark.parametrize("name", [name for name in MODELS if name != "none"])
+@pytest.mark.parametrize("name", FITTED)
 def test_reset_forgets_the_chosen_taxels_alone(name):
     model, other = (make_model(name, 2, stand_in(name, "mid")) for _ in "ab")
     for _ in range(30):

@@ -5,7 +5,6 @@ from skin_host.processing.relaxation.base import Relaxation
 from skin_host.processing.relaxation.prony import NoRelaxation, PronyRelaxation
 from skin_host.processing.relaxation.published import PublishedRelaxation
 from skin_host.processing.relaxation.sets import (
-    MODELS,
     OWN_MEANS,
     STAND_INS,
     ParameterSet,
@@ -17,7 +16,6 @@ from skin_host.processing.relaxation.sets import (
 from skin_host.processing.relaxation.windowed import WindowedRelaxation
 
 __all__ = [
-    "MODELS",
     "OWN_MEANS",
     "STAND_INS",
     "AsymmetricRelaxation",

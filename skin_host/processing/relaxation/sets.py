@@ -16,20 +16,12 @@ from skin_host.processing.relaxation.base import Parameters, Relaxation
 from skin_host.processing.relaxation.prony import NoRelaxation, PronyRelaxation
 from skin_host.processing.relaxation.published import PublishedRelaxation
 from skin_host.processing.relaxation.windowed import WindowedRelaxation
-from skin_host.settings import Relaxation as Settings
+from skin_host.relaxation_settings import MODELS
+from skin_host.relaxation_settings import Relaxation as Settings
 
 BLEED_S = 20.0
 #: Evenly spaced modes, from a second to what an hour's record can tell from a constant.
 LOG_TAU_S = (1.0, 4.8, 23.0, 110.0, 520.0, 2500.0)
-MODELS = (
-    "none",
-    "published",
-    "published_bleed",
-    "prony",
-    "asymmetric",
-    "asymmetric_log",
-    "asymmetric_clock",
-)
 #: Models that take means of their own, and so must see every sample.
 OWN_MEANS = ("published", "published_bleed")
 #: The pressure at which the stand-ins' time constants hold when there is a clock.

@@ -1,0 +1,10 @@
+"""What a single value of a file may be, where several files have such values."""
+
+from typing import Annotated
+
+from msgspec import Meta
+
+#: Names end up in MQTT topics and in file names.
+Name = Annotated[str, Meta(pattern=r"^[a-z0-9_-]+$", max_length=64)]
+Positive = Annotated[float, Meta(gt=0)]
+NotNegative = Annotated[float, Meta(ge=0)]

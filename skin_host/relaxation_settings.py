@@ -1,0 +1,105 @@
+"""Table `[processing.relaxation]` of a configuration, and the file of a foam that was fitted.
+
+The names of the models stand here alone. Nothing here needs numpy: `skin --help` tells them.
+"""
+
+from pathlib import Path
+from typing import Literal, get_args
+
+import msgspec
+from msgspec import Struct
+
+from skin_host.errors import ConfigurationError
+from skin_host.fields import NotNegative, Positive
+
+RELAXATION_SCHEMA = "skin.relaxation/1"
+
+FittedModel = Literal[
+    "published", "published_bleed", "prony", "asymmetric", "asymmetric_log", "asymmetric_clock"
+]
+Model = Literal["none", FittedModel]
+#: The models that have parameters, and all models.
+FITTED: tuple[FittedModel, ...] = get_args(FittedModel)
+MODELS: tuple[Model, ...] = get_args(Model)
+
+
+class Relaxation(Struct, forbid_unknown_fields=True, kw_only=True):
+    """Which viscoelastic model corrects the pressure, and its parameters.
+
+    `set` names a stand-in for the paper's lost Table I; explicit numbers replace it.
+    """
+
+    model: Model = "asymmetric_clock"
+    set: Literal["mild", "mid", "strong"] = "mid"
+    beta: list[NotNegative] | None = None
+    tau_s: list[Positive] | None = None
+    beta_unload: list[NotNegative] | None = None
+    tau_unload_s: list[Positive] | None = None
+    #: Of `asymmetric_clock`: compression by this pressure makes relaxation e times faster.
+    clock_kpa: Positive | None = None
+    #: States are brought up to date this often; 0 means at every sweep.
+    update_s: NotNegative = 1.0
+    #: A file written by `skin calibrate --relaxation`; it replaces the numbers above.
+    file: str | None = None
+
+
+class RelaxationFile(Struct, kw_only=True):
+    """What `skin calibrate --relaxation` writes: one model's parameters for one foam."""
+
+    schema: str
+    model: FittedModel
+    beta: list[NotNegative]
+    tau_s: list[Positive]
+    beta_unload: list[NotNegative]
+    tau_unload_s: list[Positive]
+    clock_kpa: Positive | None = None
+
+
+def wrong_parameters(table: Relaxation) -> str | None:
+    """What does not fit together in a table; None if all does."""
+    if (table.beta is None) != (table.tau_s is None):
+        return "`beta` and `tau_s` go together"
+    given = (table.beta, table.tau_s, table.beta_unload, table.tau_unload_s)
+    lengths = {len(values) for values in given if values is not None}
+    if len(lengths) > 1 or 0 in lengths:
+        return "the lists of parameters differ in length"
+    return None
+
+
+def with_file(table: Relaxation, configuration: Path) -> Relaxation:
+    """Put the numbers of the file that a table names in place.
+
+    Args:
+        table: of this configuration.
+        configuration: the file's name is relative to its folder.
+
+    Raises:
+        ConfigurationError: the file is missing or no relaxation file.
+    """
+    if table.file is None:
+        return table
+    file = configuration.parent / table.file
+
+    def wrong(what: str) -> ConfigurationError:
+        return ConfigurationError(
+            f"{configuration}: processing.relaxation.file: {file}: {what}; "
+            "make one with: skin calibrate CONFIG --relaxation LOG"
+        )
+
+    try:
+        found = msgspec.json.decode(file.read_bytes(), type=RelaxationFile)
+    except OSError as error:
+        raise wrong(f"cannot be read: {error.strerror}") from None
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise wrong(f"not a relaxation file: {error}") from None
+    if found.schema != RELAXATION_SCHEMA:
+        raise wrong(f'schema "{found.schema}", wanted "{RELAXATION_SCHEMA}"')
+    return msgspec.structs.replace(
+        table,
+        model=found.model,
+        beta=found.beta,
+        tau_s=found.tau_s,
+        beta_unload=found.beta_unload,
+        tau_unload_s=found.tau_unload_s,
+        clock_kpa=found.clock_kpa,
+    )
