@@ -76,24 +76,43 @@ def _listen(arguments: argparse.Namespace) -> int:
 
 
 async def health_of_all(broker: str, robot: str | None) -> dict[str, dict[str, Any]]:
-    """The health record of every part that the robot's nodes say they have."""
+    """The health record of every part that the robot's nodes say they have.
+
+    What the broker remembers of a part whose node has gone is not how the part is.
+    """
     from skin_host.client import SkinClient
 
     async with SkinClient(broker, robot=robot) as skin:
         nodes = await skin.info()
-        parts = {part for node in nodes.values() for part in [*node.parts, *node.fingertips]}
+        parts = {
+            part: name for name, node in nodes.items() for part in [*node.parts, *node.fingertips]
+        }
         records: dict[str, dict[str, Any]] = {}
         try:
             async with asyncio.timeout(5.0):
                 async for health in skin.health():
                     records[health.part] = health.record
-                    if parts <= set(records):
+                    if set(parts) <= set(records):
                         break
         except TimeoutError:
             pass
-        for part in parts - set(records):
-            records[part] = {"state": "not heard of", "part": part}
+        for part, node in parts.items():
+            if skin.nodes[node].online is False:
+                records[part] = _gone(part, node, records.get(part, {}))
+            elif part not in records:
+                records[part] = {"state": "not heard of", "part": part}
         return records
+
+
+def _gone(part: str, node: str, last: dict[str, Any]) -> dict[str, Any]:
+    """The record of a part of which nobody says anything now; `last` is the last that was said."""
+    return {
+        **{key: last[key] for key in ("kind", "taxels") if key in last},
+        "part": part,
+        "state": "offline",
+        "valid_taxels": 0,
+        "sentences": [f"node {node} is offline: is `skin run` running there?"],
+    }
 
 
 def status_table(records: dict[str, dict[str, Any]]) -> str:

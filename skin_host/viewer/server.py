@@ -90,8 +90,10 @@ class Viewer:
             SkinError: the port cannot be had.
         """
         local = host in LOOPBACK
-        # It calls every file that it serves a rejected connection.
-        logging.getLogger("websockets.server").setLevel(logging.WARNING)
+        # It calls every file that it serves a rejected connection ...
+        logger = logging.getLogger("websockets.server")
+        logger.setLevel(logging.WARNING)
+        logger.addFilter(_is_no_idle_visit)
         try:
             server = await serve(
                 self._talk,
@@ -232,6 +234,11 @@ class Viewer:
 async def _pass_on(stream: Stream[T], take: Callable[[T], None]) -> None:
     async for item in stream:
         take(item)
+
+
+def _is_no_idle_visit(record: logging.LogRecord) -> bool:
+    """... and a failure every connection that a browser opens beforehand and does not use."""
+    return record.getMessage() != "opening handshake failed"
 
 
 def _page_files() -> dict[str, tuple[str, bytes]]:

@@ -44,3 +44,24 @@ async def test_a_running_daemon_answers_and_refuses_in_one_line(
     assert said.out == ""
     assert said.err.count("\n") == 1
     assert "tail" in said.err
+
+
+async def test_a_daemon_that_has_gone_leaves_no_part_that_looks_well(
+    mosquitto: Mosquitto, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    url = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    async with living(
+        Bus(interface="virtual", channel=tmp_path.name), tmp_path, port=mosquitto.port
+    ):
+        assert await skin("status", "--json", "--broker", url) in (0, 1)
+        before = json.loads(capsys.readouterr().out)
+    assert await skin("status", "--json", "--broker", url) == 0
+    after = json.loads(capsys.readouterr().out)
+    for part in ("left_hand", "left_forearm"):
+        assert before[part]["state"] != "offline"
+        assert after[part]["state"] == "offline"
+        assert after[part]["taxels"] == before[part]["taxels"]
+        assert after[part]["valid_taxels"] == 0
+        assert "rate_hz" not in after[part]
+    assert await skin("status", "--broker", url) == 1
+    assert "node main is offline" in capsys.readouterr().out

@@ -131,6 +131,21 @@ async def test_nothing_else_is_served(path: str) -> None:
         assert (await fetch(url + path))[0] == 404
 
 
+async def test_who_connects_and_says_nothing_is_not_talked_of(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async with Viewer(nowhere(), robot="demo").serving(port=0) as url:
+        host, _, port = url.removeprefix("http://").strip("/").partition(":")
+        _, idle = await asyncio.open_connection(host, int(port))
+        idle.close()
+        await idle.wait_closed()
+        _, strange = await asyncio.open_connection(host, int(port))
+        strange.write(b"what is this?\r\n\r\n")
+        strange.close()
+        assert (await fetch(url))[0] == 200
+    assert not [record for record in caplog.records if record.name.startswith("websockets")]
+
+
 async def test_a_page_from_elsewhere_is_refused() -> None:
     async with Viewer(nowhere(), robot="demo").serving(port=0) as url:
         for origin in ("http://evil.example", None):

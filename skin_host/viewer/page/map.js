@@ -294,7 +294,8 @@ export class SkinMap {
     for (let i = 0; i < part.n; i++) {
       const x = ox + pose.x[i] * scale;
       const y = oy + pose.y[i] * scale;
-      const r = part.radius[i] * scale;
+      // Drawn in raw values only: it lies between pads that feel pressure.
+      const r = part.radius[i] * scale * (part.thermal[i] && this.raw ? 0.6 : 1);
       if (x < -r || y < -r || x > w + r || y > h + r) continue;
       const behind = pose.towards[i] < 0;
       if (part.thermal[i] && !this.raw) { if (!behind && r > 3) squares.push(x, y, r); }
