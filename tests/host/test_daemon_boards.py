@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 from emulator.scene import Fault
-from skin_host.bus.protocol.commands import SetTxMode, TxMode, command_frame
+from skin_host.bus.protocol import FrameBatch
+from skin_host.bus.protocol.commands import (
+    SetTriangleConfig,
+    SetTxMode,
+    TxMode,
+    command_frame,
+)
 from skin_host.settings import Bus
 from tests.support.live import living
 
@@ -135,3 +141,39 @@ async def test_a_robot_that_starts_after_its_daemon_is_set_up_whole(
         records = live.daemon.link.boards["can0"].records.values()
         assert all((record.configurations, record.resets) == (1, 0) for record in records)
         assert not any(live.daemon.engine.in_doubt(record.index).any() for record in records)
+
+
+async def test_while_the_daemon_is_behind_no_board_is_set_up(
+    can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    """What it reads then is old, and may have lost its end to the kernel."""
+    async with living(can_bus_settings, tmp_path) as live:
+        await live.until_well(but=LATELY)
+        link = live.daemon.link
+        record = link.boards["can0"].records[14]
+        port = link.ports["can0"]
+        usual = port.read, port.capacity
+        waiting: list[tuple[int, bytes, int]] = []
+
+        def read_too_little() -> FrameBatch:
+            batch = usual[0]()
+            rows = zip(batch.id, batch.dlc, batch.data, batch.t_ns, strict=True)
+            waiting.extend((int(i), bytes(data[:n]), int(t_ns)) for i, n, data, t_ns in rows)
+            some = waiting[: port.capacity]
+            del waiting[: port.capacity]
+            return FrameBatch.of(some)
+
+        port.read, port.capacity = read_too_little, 4  # type: ignore[method-assign]
+        bus = can.Bus(interface=can_bus_settings.interface, channel=can_bus_settings.channel)
+        none = SetTriangleConfig(0, 15, 2, flags=0, cdc_offset=0x2200)
+        for command in (none, SetTxMode(TxMode.START)):
+            identifier, data = command_frame(command, 14)
+            bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+        await asyncio.sleep(0.5)
+        read_ns = link.read_ns
+        await asyncio.sleep(2.5)
+        assert link.read_ns == read_ns
+        assert (record.configurations, record.lost_set_ups) == (1, 0)
+        port.read, port.capacity = usual  # type: ignore[method-assign]
+        await live.wait(lambda: record.configurations == 2)
+        bus.shutdown()
