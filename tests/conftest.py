@@ -11,7 +11,7 @@ import pytest
 from skin_host.settings import Bus
 from tests.support import programs
 from tests.support.broker import Mosquitto
-from tests.support.stack import stack, subscriber  # noqa: F401  (fixtures for all)
+from tests.support.stack import configuration, stack, subscriber  # noqa: F401  (fixtures for all)
 from tests.support.vcan import Vcan
 
 _numbers = itertools.count()

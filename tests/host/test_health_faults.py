@@ -3,7 +3,6 @@
 `python -m tests.support.fault_times` measures how soon, in many places each.
 """
 
-import copy
 from typing import Any
 
 import numpy as np
@@ -38,16 +37,6 @@ FAULTS: list[tuple[str, dict[str, Any], str, range]] = [
 
 def test_the_list_has_every_fault_of_the_catalogue() -> None:
     assert {name for name, *_ in FAULTS} | {"chip_back"} == set(KINDS)
-
-
-@pytest.fixture(scope="module")
-def calibrated() -> FaultBench:
-    return FaultBench()
-
-
-@pytest.fixture
-def bench(calibrated: FaultBench) -> FaultBench:
-    return copy.deepcopy(calibrated)
 
 
 def test_a_healthy_robot_is_accused_of_nothing(bench: FaultBench) -> None:

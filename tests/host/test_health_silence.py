@@ -1,20 +1,8 @@
 """Silence is measured while somebody listens: no pause and no set clock is a board's fault."""
 
-import copy
-
 import pytest
 
 from tests.support.fault_bench import FaultBench
-
-
-@pytest.fixture(scope="module")
-def calibrated() -> FaultBench:
-    return FaultBench()
-
-
-@pytest.fixture
-def bench(calibrated: FaultBench) -> FaultBench:
-    return copy.deepcopy(calibrated)
 
 
 @pytest.mark.parametrize("pause_s", [3.0, 3600.0])

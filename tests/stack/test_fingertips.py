@@ -1,14 +1,10 @@
 """From a press and a slip on an emulated fingertip to messages in a subscriber's hands."""
 
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from skin_host.settings import Bus
-from tests.support.broker import Mosquitto
 from tests.support.stack import ROOT, Stack, wait_for
 from tests.support.subscriber import Subscriber
 
@@ -17,19 +13,8 @@ PLACE_MM = 13.0 * np.array([0.3, 0.4, 0.87]) / np.linalg.norm([0.3, 0.4, 0.87])
 
 
 @pytest.fixture
-def fingers(
-    tmp_path: Path, can_bus_settings: Bus, bus_kind: str, mosquitto: Mosquitto
-) -> Iterator[Stack]:
-    made = Stack(tmp_path, can_bus_settings, bus_kind, mosquitto, "fingertips")
-    yield made
-    made.kill()
-
-
-@pytest.fixture
-def heard(mosquitto: Mosquitto) -> Iterator[Subscriber]:
-    listening = Subscriber(mosquitto.host, mosquitto.port, "skin/fingertips/#")
-    yield listening
-    listening.close()
+def configuration() -> str:
+    return "fingertips"
 
 
 def whole(events: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
@@ -41,23 +26,23 @@ def whole(events: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
 
 
 def test_a_press_and_a_slip_on_a_fingertip_reach_a_subscriber(
-    fingers: Stack, heard: Subscriber
+    stack: Stack, subscriber: Subscriber
 ) -> None:
-    assert fingers.calibrate()["fingertips"] == {"index": True, "thumb": True}
-    daemon = fingers.start("run", str(fingers.config), scene=SCENE)
+    assert stack.calibrate()["fingertips"] == {"index": True, "thumb": True}
+    daemon = stack.start("run", str(stack.config), scene=SCENE)
 
     def slipped() -> list[tuple[list[dict[str, Any]], list[dict[str, Any]]]]:
         """Touches in which something slipped, with their slips."""
-        slips = whole(heard.documents("index/slip"))
+        slips = whole(subscriber.documents("index/slip"))
         return [
             (touch, slip)
-            for touch in whole(heard.documents("index/touch"))
+            for touch in whole(subscriber.documents("index/touch"))
             for slip in slips
             if touch[0]["id"] == slip[0]["id"]
         ]
 
     def pressed() -> list[list[dict[str, Any]]]:
-        return [one for one in whole(heard.documents("thumb/touch")) if any_taxel(one)]
+        return [one for one in whole(subscriber.documents("thumb/touch")) if any_taxel(one)]
 
     def any_taxel(touch: list[dict[str, Any]]) -> bool:
         return any(event["taxels"] for event in touch)
@@ -65,12 +50,15 @@ def test_a_press_and_a_slip_on_a_fingertip_reach_a_subscriber(
     def seen() -> object:
         """The last events and health of each, for whoever reads that they were not enough."""
         kinds = ("index/touch", "index/slip", "thumb/touch", "thumb_skin/touch", "index/health")
-        return {kind: (len(heard.payloads(kind)), heard.documents(kind)[-2:]) for kind in kinds}
+        return {
+            kind: (len(subscriber.payloads(kind)), subscriber.documents(kind)[-2:])
+            for kind in kinds
+        }
 
     touch, slip = wait_for(slipped, "a slip that ended, and its touch", seen)[0]
     thumb = wait_for(pressed, "a touch of the thumb that its skin felt too", seen)[0]
     assert daemon.poll() is None
-    assert set(fingers.stop()) <= {0}
+    assert set(stack.stop()) <= {0}
 
     assert [touch[0]["event"], touch[-1]["event"]] == ["begin", "end"]
     held = [one for one in touch if one["load"]["verdict"] == "contact" and one["force_n"] > 1.5]
@@ -85,15 +73,15 @@ def test_a_press_and_a_slip_on_a_fingertip_reach_a_subscriber(
     both = [one for one in thumb if one["taxels"] and one["force_n"] > 2.0]
     off_mm = 1e3 * np.array([one["centroid_m"] for one in both]) - [3.0, -2.0, 0.0]
     assert np.median(np.linalg.norm(off_mm, axis=1)) < 0.6
-    assert {one["part"] for one in heard.documents("thumb_skin/touch")} == {"thumb_skin"}
+    assert {one["part"] for one in subscriber.documents("thumb_skin/touch")} == {"thumb_skin"}
 
     for part in ("index", "thumb"):
-        contacts = heard.payloads(f"{part}/contact")
+        contacts = subscriber.payloads(f"{part}/contact")
         assert contacts[0] == contacts[-1] == b"OFF"
         assert b"ON" in contacts
-        assert "ok" in {record["state"] for record in heard.documents(f"{part}/health")}
+        assert "ok" in {record["state"] for record in subscriber.documents(f"{part}/health")}
     # They answer discovery too, and are no strangers.
-    faults = [one["code"] for record in heard.documents("/health") for one in record["faults"]]
+    faults = [one["code"] for record in subscriber.documents("/health") for one in record["faults"]]
     assert "bus_stranger" not in faults
-    info = heard.documents("main/info")[-1]
+    info = subscriber.documents("main/info")[-1]
     assert info["fingertips"]["index"]["shape"] == "sphere"

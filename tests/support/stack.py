@@ -33,7 +33,7 @@ class Stack:
         bus: Bus,
         bus_kind: str,
         broker: Mosquitto,
-        configuration: str = "demo",
+        configuration: str,
     ) -> None:
         self.directory = directory
         self.bus = bus
@@ -135,17 +135,23 @@ class Stack:
 
 
 @pytest.fixture
+def configuration() -> str:
+    """Of `config/`, without its ending; its robot has the same name. Tests may choose another."""
+    return "demo"
+
+
+@pytest.fixture
 def stack(
-    tmp_path: Path, can_bus_settings: Bus, bus_kind: str, mosquitto: Mosquitto
+    tmp_path: Path, can_bus_settings: Bus, bus_kind: str, mosquitto: Mosquitto, configuration: str
 ) -> Iterator[Stack]:
-    made = Stack(tmp_path, can_bus_settings, bus_kind, mosquitto)
+    made = Stack(tmp_path, can_bus_settings, bus_kind, mosquitto, configuration)
     yield made
     made.kill()
 
 
 @pytest.fixture
-def subscriber(mosquitto: Mosquitto) -> Iterator[Subscriber]:
-    listening = Subscriber(mosquitto.host, mosquitto.port, "skin/demo/#")
+def subscriber(mosquitto: Mosquitto, configuration: str) -> Iterator[Subscriber]:
+    listening = Subscriber(mosquitto.host, mosquitto.port, f"skin/{configuration}/#")
     yield listening
     listening.close()
 

@@ -39,7 +39,7 @@ CONTACTS = """[...document.querySelectorAll("#contacts tbody tr")]
 def robot(tmp_path: Path, mosquitto: Mosquitto) -> Stack:
     """The demo's robot and its daemon."""
     bus = Bus(interface="virtual", channel=tmp_path.name)
-    return Stack(tmp_path, bus, "virtual", mosquitto)
+    return Stack(tmp_path, bus, "virtual", mosquitto, "demo")
 
 
 def start(robot: Stack) -> None:
