@@ -84,7 +84,7 @@ def plot_map(series: Series, output: Path, part: str, at_s: float | None = None)
     kpa = one.pressure_kpa[row]
     thermal = np.array([pad == "thermal" for pad in shape.pads])
     position_mm = np.array(shape.position_m) @ _face_on(np.array(shape.normal)).T * 1e3
-    figure, axes = _pyplot().subplots(figsize=(8, 6), layout="constrained")
+    figure, axes = _pyplot().subplots(figsize=(8, 6), layout="compressed")
     for triangle in shape.triangles:
         outline_mm = np.array(triangle.outline_m) @ _face_on(np.array(shape.normal)).T * 1e3
         axes.fill(*outline_mm[:, :2].T, facecolor="none", edgecolor="#b0b0b0", linewidth=0.8)
@@ -115,7 +115,7 @@ def plot_map(series: Series, output: Path, part: str, at_s: float | None = None)
                 **style,
             )
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(loc="upper right", fontsize="small")
+        figure.legend(loc="outside lower center", ncols=2, fontsize="small")
     figure.colorbar(dots, label="pressure / kPa")
     axes.set_aspect("equal")
     axes.set_xlabel("x / mm")
