@@ -1,0 +1,95 @@
+"""What boards say of themselves is noted, and told with the health of their part."""
+
+from collections.abc import Iterable
+
+import pytest
+
+from skin_host.bus.boards import Boards
+from skin_host.bus.protocol import FrameBatch, MessageClass, identifier
+from skin_host.bus.protocol.answers import Discovered, DiscoveredBootloader, answer_frame
+from skin_host.bus.protocol.commands import BoardType, Message
+from skin_host.engine import Engine
+from skin_host.health import Health, Record
+from skin_host.layout import build_layout
+from skin_host.settings import load
+from tests.support.stack import ROOT
+
+CONFIG = ROOT / "config" / "demo.toml"
+S = 1_000_000_000
+HAND = 14
+TX_OVERFLOW = 5
+
+
+class Nowhere:
+    """Sends nothing: what boards say is fed by hand."""
+
+    async def send(self, frames: Iterable[tuple[int, bytes]], gap_s: float = 0.0) -> None:
+        raise AssertionError("nothing is to be sent")
+
+
+class Heard:
+    """The boards of the demo's bus, what they say, and what is told of it."""
+
+    def __init__(self) -> None:
+        settings = load(CONFIG)
+        layout = build_layout(settings, CONFIG.parent)
+        engine = Engine(settings, layout, [0, 1])
+        boards = [(i, layout.boards[i]) for i in engine.boards]
+        self.boards = Boards("can0", Nowhere(), boards, layout.triangles, 4.0)
+        self.health = Health(engine)
+        self.now_ns = 1_700_000_000 * S
+        self.look()
+
+    def say(self, *frames: tuple[int, bytes]) -> None:
+        self.boards.feed(FrameBatch.of([(i, data, self.now_ns) for i, data in frames]))
+        self.look()
+
+    def answer(self, message: Message, address: int) -> None:
+        self.say(answer_frame(message, address))
+
+    def look(self) -> None:
+        self.now_ns += S // 10
+        self.health.tick(self.now_ns, {}, {"can0": self.boards})
+
+    def record(self) -> Record:
+        return self.health.record(0, self.now_ns, {}, {"can0": self.boards})
+
+    def told(self) -> set[tuple[str, str]]:
+        record = self.record()
+        assert len(record["sentences"]) == len(record["faults"])
+        return {(fault["code"], fault["where"]) for fault in record["faults"]}
+
+
+@pytest.fixture
+def heard() -> Heard:
+    return Heard()
+
+
+def test_a_board_in_its_bootloader_is_told_until_its_application_answers(heard: Heard) -> None:
+    heard.answer(DiscoveredBootloader(BoardType.MTB4, 4, 0), HAND)
+    assert ("board_in_bootloader", "hand") in heard.told()
+    heard.answer(Discovered(BoardType.MTB4, 1, 25, 0), HAND)
+    assert not {code for code, _ in heard.told()} & {"board_in_bootloader", "board_wrong_type"}
+
+
+def test_a_board_of_another_kind_at_the_address_is_told(heard: Heard) -> None:
+    heard.answer(Discovered(BoardType.STRAIN2, 2, 0, 0), HAND)
+    assert ("board_wrong_type", "hand") in heard.told()
+
+
+def test_a_board_that_nobody_configured_is_told(heard: Heard) -> None:
+    heard.answer(Discovered(BoardType.MTB4, 1, 25, 0), 7)
+    assert ("bus_stranger", "can0/7") in heard.told()
+
+
+def test_a_board_that_could_not_send_is_told(heard: Heard) -> None:
+    heard.say((identifier(MessageClass.MANAGEMENT, HAND, TX_OVERFLOW), b""))
+    assert ("board_overflows", "hand") in heard.told()
+    assert heard.boards.records[HAND].tx_overflows == 1
+
+
+def test_a_board_tells_its_firmware(heard: Heard) -> None:
+    heard.answer(Discovered(BoardType.MTB4, 1, 25, 3), HAND)
+    (hand,) = heard.record()["boards"]
+    assert hand.get("firmware") == (1, 25, 3)
+    assert hand.get("board_type") == BoardType.MTB4
