@@ -158,9 +158,15 @@ class Boards:
             BusError: the bus does not take frames.
         """
         record = self.records[address]
-        if record.busy is not None:
+        while record.busy is not None:
             await asyncio.wait([record.busy])
-        await self._set_up(record)
+        # Busy, so that nobody sees to its silence meanwhile.
+        task = asyncio.create_task(self._set_up(record), name=f"board {record.layout.name}")
+        record.busy = task
+        try:
+            await task
+        finally:
+            record.busy = None
 
     async def _set_up(self, record: BoardRecord) -> None:
         address = record.layout.settings.address

@@ -73,6 +73,19 @@ async def test_what_was_touched_at_a_new_zero_is_in_doubt_until_calibrated(
         await live.until_well(but=LATELY)
 
 
+async def test_a_board_that_is_set_up_by_command_is_not_called_silent_meanwhile(
+    can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    async with living(can_bus_settings, tmp_path) as live:
+        await live.until_well(but=LATELY)
+        record = live.daemon.link.boards["can0"].records[14]
+        for number in range(2, 5):
+            await live.daemon.configure([0])
+            assert (record.configurations, record.silences, record.resets) == (number, 0, 0)
+        await live.until_well(but=LATELY)
+        assert (record.configurations, record.silences, record.resets) == (4, 0, 0)
+
+
 async def test_one_board_is_calibrated_and_the_others_keep_theirs(
     can_bus_settings: Bus, tmp_path: Path
 ) -> None:
