@@ -58,8 +58,11 @@ def test_installing_and_removing_leaves_the_configuration(tmp_path: Path) -> Non
     assert (root / "etc/systemd/network/80-skin-can.network").exists()
     own = root / "etc/skin-host/main.toml"
     own.write_text("robot = 'x'\n")
+    enabled = root / "etc/systemd/system/multi-user.target.wants/skin-host@main.service"
+    enabled.parent.mkdir()
+    enabled.symlink_to("/etc/systemd/system/skin-host@.service")
     subprocess.run([*run, "uninstall", *extra], cwd=ROOT, check=True, capture_output=True)
-    left = [path.relative_to(root) for path in root.rglob("*") if path.is_file()]
+    left = [path.relative_to(root) for path in root.rglob("*") if not path.is_dir()]
     assert left == [Path("etc/skin-host/main.toml")]
 
 
