@@ -12,13 +12,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
-import msgspec
 import numpy as np
 from msgspec import Meta, Struct, field
 from numpy.typing import NDArray
 
 from skin_host.errors import ConfigurationError
 from skin_host.layout import TAXELS_PER_TRIANGLE, Layout
+from skin_host.settings import read_toml
 
 Seconds = Annotated[float, Meta(ge=0)]
 Positive = Annotated[float, Meta(gt=0)]
@@ -151,18 +151,7 @@ def load(path: Path) -> Scene:
     Raises:
         ConfigurationError: unreadable, not TOML, or wrong; the message names file and key.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from None
-    try:
-        scene = msgspec.toml.decode(data, type=Scene)
-    except msgspec.ValidationError as error:
-        text, _, place = str(error).partition(" - at ")
-        place = place.strip("`").removeprefix("$.")
-        raise ConfigurationError(f"{path}: {place}: {text}") from None
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"{path}: not TOML: {error}") from None
+    scene = read_toml(path, Scene, {})
     try:
         check(scene)
     except ConfigurationError as error:

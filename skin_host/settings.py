@@ -8,7 +8,7 @@ name the file and the path inside it. `docs/configuration.md` explains every key
 
 import hashlib
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct, field
@@ -21,6 +21,7 @@ from skin_host.fingertip.settings import wrong_references
 from skin_host.relaxation_settings import Relaxation, with_file, wrong_parameters
 
 Byte = Annotated[int, Meta(ge=0, le=255)]
+T = TypeVar("T", bound=Struct)
 TRIANGLES_PER_BOARD = 16
 
 
@@ -254,8 +255,13 @@ def parse_triangles(text: str) -> list[int]:
     return numbers
 
 
-def load(path: Path) -> Settings:
-    """Read and check a configuration file.
+def read_toml(path: Path, table: type[T], named: Named) -> T:
+    """Read a file whose keys are those of a table.
+
+    Args:
+        path: of the file.
+        table: what it must be.
+        named: its sections that hold tables by name, and the type of these.
 
     Raises:
         ConfigurationError: unreadable, not TOML, or wrong; the message names file and key.
@@ -265,22 +271,31 @@ def load(path: Path) -> Settings:
     except OSError as error:
         raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from None
     try:
-        settings = msgspec.toml.decode(data, type=Settings)
+        found = msgspec.toml.decode(data, type=table)
     except msgspec.ValidationError as error:
-        named: Named = {
-            "buses": Bus,
-            "boards": Board,
-            "parts": Part,
-            "kinds": Kind,
-            "fingertips": Fingertip,
-        }
-        document = msgspec.toml.decode(data)
-        what = explain(document, error, Settings, named)
+        what = explain(msgspec.toml.decode(data), error, table, named)
         raise ConfigurationError(f"{path}: {what}") from None
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{path}: not TOML: {error}") from None
     for where, number in not_finite(msgspec.toml.decode(data)):
         raise ConfigurationError(f"{path}: {where}: seen {number}, wanted a finite number")
+    return found
+
+
+def load(path: Path) -> Settings:
+    """Read and check a configuration file.
+
+    Raises:
+        ConfigurationError: unreadable, not TOML, or wrong; the message names file and key.
+    """
+    named: Named = {
+        "buses": Bus,
+        "boards": Board,
+        "parts": Part,
+        "kinds": Kind,
+        "fingertips": Fingertip,
+    }
+    settings = read_toml(path, Settings, named)
     _check_references(path, settings)
     processing = settings.processing
     relaxation = with_file(processing.relaxation, path)

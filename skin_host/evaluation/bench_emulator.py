@@ -16,12 +16,12 @@ import numpy as np
 from emulator.robot import Robot
 from emulator.scene import Place, Probe, Scene
 from emulator.skin import MOVING_NS, Skin
+from skin_host.evaluation.rig import wired
 from skin_host.layout import Layout, build_layout
 from skin_host.settings import Settings
 
 Row = dict[str, Any]
 
-BOARDS_PER_BUS = 14
 SWEEP_S = 0.05
 REPEATS = 3
 
@@ -53,20 +53,13 @@ def run(*, quick: bool = False) -> list[Row]:
 
 def robot_of(boards: int, triangles: int) -> tuple[Settings, Layout]:
     """Settings and layout of a robot with one part of so many triangles a board."""
-    names = [f"b{number}" for number in range(boards)]
+    wiring = wired(boards)
     document = {
         "robot": "bench",
-        "buses": {f"can{number // BOARDS_PER_BUS}": {} for number in range(boards)},
-        "boards": {
-            name: {
-                "bus": f"can{number // BOARDS_PER_BUS}",
-                "address": number % BOARDS_PER_BUS + 1,
-            }
-            for number, name in enumerate(names)
-        },
+        **wiring,
         "parts": {
             name: {"patches": [{"board": name, "triangles": f"0-{triangles - 1}"}]}
-            for name in names
+            for name in wiring["boards"]
         },
     }
     settings = msgspec.convert(document, Settings)

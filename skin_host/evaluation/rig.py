@@ -19,26 +19,32 @@ from skin_host.settings import Settings
 BOARDS_PER_BUS = 14
 
 
+def wired(boards: int) -> dict[str, dict[str, Any]]:
+    """Tables of so many boards, on as many buses as they need."""
+    places = [divmod(number, BOARDS_PER_BUS) for number in range(boards)]
+    return {
+        "buses": {f"can{bus}": {} for bus, _ in places},
+        "boards": {
+            f"b{number}": {"bus": f"can{bus}", "address": place + 1}
+            for number, (bus, place) in enumerate(places)
+        },
+    }
+
+
 def flat_skin(
     boards: int, kind: str = "triangle", processing: dict[str, Any] | None = None
 ) -> tuple[Settings, Layout]:
     """Settings and layout of one part of `boards` full boards, 192 pads each."""
-    names = [f"b{number}" for number in range(boards)]
+    wiring = wired(boards)
     document = {
         "robot": "rig",
-        "buses": {f"can{number // BOARDS_PER_BUS}": {} for number in range(boards)},
-        "boards": {
-            name: {
-                "bus": f"can{number // BOARDS_PER_BUS}",
-                "address": number % BOARDS_PER_BUS + 1,
-            }
-            for number, name in enumerate(names)
-        },
+        **wiring,
         "parts": {
             "skin": {
                 "foam_mm": 2.0,
                 "patches": [
-                    {"board": name, "triangles": "0-15", "kind": kind, "shift": 3} for name in names
+                    {"board": name, "triangles": "0-15", "kind": kind, "shift": 3}
+                    for name in wiring["boards"]
                 ],
             }
         },

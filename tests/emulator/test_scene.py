@@ -19,9 +19,9 @@ def test_the_scenes_that_come_with_the_project_are_right(path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("sed = 1", "unknown field `sed`"),
-        ("seed = 'x'", "seed: Expected `int`, got `str`"),
-        ("[[probe]]\npart = 'a'\ndiameter_mm = -1", r"probe\[0\].diameter_mm: Expected `float` >"),
+        ("sed = 1", "unknown key `sed`; meant `seed`"),
+        ("seed = 'x'", "seed: wanted `int`, seen `str`"),
+        ("[[probe]]\npart = 'a'\ndiameter_mm = -1", r"probe\[0\].diameter_mm: wanted `float` >"),
         ("[[probe]]\npart = 'a'", r"probe\[0\]: driven by none; wanted one of force_n"),
         (
             "[[probe]]\npart = 'a'\nforce_n = [[0, 1]]\ndepth_mm = [[0, 1]]",
@@ -37,6 +37,10 @@ def test_the_scenes_that_come_with_the_project_are_right(path: Path) -> None:
             r"probe\[0\].at: has both",
         ),
         ("[temperature]\nkeyframes_c = []", "temperature.keyframes_c: is empty"),
+        (
+            "[[probe]]\npart = 'a'\nforce_n = [[0, nan]]",
+            r"force_n\[0\]\[1\]: seen nan, wanted a finite",
+        ),
         ("seed = ", "not TOML"),
     ],
 )

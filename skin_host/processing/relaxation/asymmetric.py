@@ -4,9 +4,9 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from skin_host.processing.relaxation.base import (
-    NEGLIGIBLE_KPA,
     Array,
     FiniteInput,
+    Flush,
     Parameters,
     approach,
     as_modes,
@@ -14,9 +14,6 @@ from skin_host.processing.relaxation.base import (
     clean_dt,
     mix,
 )
-
-#: Often enough: a state takes 40 time constants from negligible to denormal.
-FLUSH_EVERY_S = 10.0
 
 
 class AsymmetricRelaxation:
@@ -76,7 +73,7 @@ class AsymmetricRelaxation:
         self._rates_dt_s = -1.0
         self._fall: Array = np.zeros(1, dtype=dtype)
         self._extra_rise: Array = np.zeros(1, dtype=dtype)
-        self._since_flush_s = 0.0
+        self._flush = Flush()
         self.bytes_per_taxel = (modes + 1) * self._dtype.itemsize
 
     def step(self, pressure_kpa: Array, dt_s: float, out: Array | None = None) -> Array:
@@ -88,11 +85,7 @@ class AsymmetricRelaxation:
             self._approach(dt_s)
         else:
             self._approach_by_clock(pressure_kpa, self._per_kpa, dt_s)
-        self._since_flush_s += dt_s
-        if self._since_flush_s >= FLUSH_EVERY_S:
-            self._since_flush_s = 0.0
-            np.abs(self._states, out=self._over)
-            np.putmask(self._states, self._over < NEGLIGIBLE_KPA, 0.0)
+        self._flush.step(self._states, self._over, dt_s)
         return mix(self._beta, self._states, out)
 
     def reset(self, mask: NDArray[np.bool_] | None = None) -> None:

@@ -14,6 +14,8 @@ Parameters = Sequence[float] | Array
 TIME_TOLERANCE_S = 1e-9
 #: Below this a state is as good as zero; denormal numbers would cost 6 to 8 times the time.
 NEGLIGIBLE_KPA = 1e-20
+#: So often such states are looked for: one takes 40 time constants from there to denormal.
+FLUSH_EVERY_S = 10.0
 
 
 class Relaxation(Protocol):
@@ -115,6 +117,21 @@ class FiniteInput:
         else:
             np.copyto(self.last, pressure_kpa, where=np.isfinite(pressure_kpa))
         return self.last
+
+
+class Flush:
+    """Makes negligible states zero, once in a while."""
+
+    def __init__(self) -> None:
+        self._since_s = 0.0
+
+    def step(self, states: Array, scratch: Array, dt_s: float) -> None:
+        """Let time pass; `scratch`, as large as `states`, is overwritten."""
+        self._since_s += dt_s
+        if self._since_s >= FLUSH_EVERY_S:
+            self._since_s = 0.0
+            np.abs(states, out=scratch)
+            np.putmask(states, scratch < NEGLIGIBLE_KPA, 0.0)
 
 
 class TumblingMean:

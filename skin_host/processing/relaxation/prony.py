@@ -4,9 +4,9 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from skin_host.processing.relaxation.base import (
-    NEGLIGIBLE_KPA,
     Array,
     FiniteInput,
+    Flush,
     Parameters,
     approach,
     as_modes,
@@ -16,7 +16,6 @@ from skin_host.processing.relaxation.base import (
 )
 
 SERIES_BELOW = 1e-4
-FLUSH_EVERY_S = 10.0
 
 
 class NoRelaxation:
@@ -73,7 +72,7 @@ class PronyRelaxation:
         self._fresh = np.ones(n, dtype=np.bool_)
         self._any_fresh = True
         self._input = FiniteInput(n, dtype)
-        self._since_flush_s = 0.0
+        self._flush = Flush()
         self.bytes_per_taxel = (self._beta.shape[0] + 2) * self._dtype.itemsize + 1
 
     def step(self, pressure_kpa: Array, dt_s: float, out: Array | None = None) -> Array:
@@ -97,11 +96,7 @@ class PronyRelaxation:
         np.multiply(self._start, ramp.astype(self._dtype), out=self._scratch)
         np.add(self._states, self._scratch, out=self._states)
         np.copyto(self._start, end)
-        self._since_flush_s += dt_s
-        if self._since_flush_s >= FLUSH_EVERY_S:
-            self._since_flush_s = 0.0
-            np.abs(self._states, out=self._scratch)
-            np.putmask(self._states, self._scratch < NEGLIGIBLE_KPA, 0.0)
+        self._flush.step(self._states, self._scratch, dt_s)
         return mix(self._beta, self._states, out)
 
     def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
