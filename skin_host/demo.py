@@ -26,6 +26,8 @@ log = logging.getLogger(__name__)
 
 CALIBRATION_S = 3.0
 VCAN = "vcan0"
+#: So long may the last events be on their way through the broker.
+LAST_EVENTS_S = 5.0
 
 
 async def run(duration_s: float | None, stop: asyncio.Event, page_port: int) -> int:
@@ -56,8 +58,7 @@ async def run(duration_s: float | None, stop: asyncio.Event, page_port: int) -> 
                 daemon = Daemon(settings, layout)
                 listening = asyncio.create_task(_listen(broker.url, settings.robot, touches))
                 await daemon.run(stop, calibrate=True)
-                # The last events are on their way through the broker.
-                await asyncio.sleep(0.2)
+                await _heard(touches, daemon.publisher.counters.touches_sent)
                 listening.cancel()
                 await asyncio.gather(listening, return_exceptions=True)
     sent = daemon.publisher.counters
@@ -128,6 +129,14 @@ async def _robot(settings: Settings, layout: Layout) -> AsyncIterator[None]:
             (result,) = await asyncio.gather(living, return_exceptions=True)
             if isinstance(result, Exception):
                 raise SkinError(f"the emulator failed: {result}") from result
+
+
+async def _heard(touches: "Counter[str]", sent: int) -> None:
+    """Wait until the listener has all events, or they must be lost."""
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(LAST_EVENTS_S):
+            while touches.total() < sent:  # noqa: ASYNC110
+                await asyncio.sleep(0.02)
 
 
 async def _listen(url: str, robot: str, touches: "Counter[str]") -> None:

@@ -8,6 +8,7 @@ import pytest
 from skin_host.evaluation.histories import record
 from skin_host.evaluation.rig import Rig
 from skin_host.layout import PadKind
+from skin_host.processing.calibration import FEWEST_SAMPLES
 from skin_host.processing.pressure import PressureCurve
 
 CURVE = PressureCurve(2.88)
@@ -28,7 +29,7 @@ def hold(truth, seconds, *, hz, pressed, drift=0.0):
     Everything drifts by so many units a second. Nothing else may be told as touched.
     """
     played = history(truth, seconds, hz)
-    rig = Rig(1, 0.3, seed=21, hz=hz)
+    rig = Rig(1, 0.3, seed=21, hz=hz, calibrate_s=max(5.0, FEWEST_SAMPLES / hz))
     here = np.arange(rig.n) < pressed
     told = []
     for sweep, units in enumerate(CURVE.units(played.momentary_kpa)):
