@@ -25,18 +25,20 @@ from skin_host.viewer.server import Viewer
 log = logging.getLogger(__name__)
 
 CALIBRATION_S = 3.0
+PAGE_PORT = 8080
 VCAN = "vcan0"
 #: So long may the last events be on their way through the broker.
 LAST_EVENTS_S = 5.0
 
 
-async def run(duration_s: float | None, stop: asyncio.Event, page_port: int) -> int:
+async def run(duration_s: float | None, stop: asyncio.Event, page_port: int | None) -> int:
     """Run until `stop` or for `duration_s`; the last line on stdout is a JSON summary.
 
     Args:
         duration_s: None runs on.
         stop: set it to end.
-        page_port: where the live page is served on this machine; 0 is any free port.
+        page_port: where the live page is served on this machine; 0 is any free port, None
+            the usual one, or any if somebody has that.
 
     Raises:
         SkinError: a broker, a bus or the emulator cannot be started.
@@ -46,6 +48,8 @@ async def run(duration_s: float | None, stop: asyncio.Event, page_port: int) -> 
     if duration_s is not None:
         asyncio.get_running_loop().call_later(duration_s, stop.set)
     touches: Counter[str] = Counter()
+    # The page and the listener find the broker too, which is no news.
+    logging.getLogger("skin_host.client").setLevel(logging.WARNING)
     with tempfile.TemporaryDirectory(prefix="skin-demo-") as state:
         settings.service.state_directory = state
         settings.processing.calibration.seconds = CALIBRATION_S
@@ -53,7 +57,7 @@ async def run(duration_s: float | None, stop: asyncio.Event, page_port: int) -> 
             settings.mqtt.host, settings.mqtt.port = broker.host, broker.port
             settings.mqtt.protocol = broker.protocol
             viewer = Viewer(broker.url, robot=settings.robot)
-            async with viewer.serving(port=page_port) as page:
+            async with served(viewer, page_port) as page:
                 _explain(settings, broker, page)
                 daemon = Daemon(settings, layout)
                 listening = asyncio.create_task(_listen(broker.url, settings.robot, touches))
@@ -75,6 +79,24 @@ async def run(duration_s: float | None, stop: asyncio.Event, page_port: int) -> 
     }
     print(json.dumps(summary))
     return 0
+
+
+@contextlib.asynccontextmanager
+async def served(viewer: Viewer, port: int | None) -> AsyncIterator[str]:
+    """Serve the page as `run` says; gives its URL.
+
+    Raises:
+        SkinError: the port cannot be had.
+    """
+    async with contextlib.AsyncExitStack() as stack:
+        try:
+            wanted = viewer.serving(port=PAGE_PORT if port is None else port)
+            url = await stack.enter_async_context(wanted)
+        except SkinError:
+            if port is not None:
+                raise
+            url = await stack.enter_async_context(viewer.serving(port=0))
+        yield url
 
 
 def configuration(name: str) -> Path:

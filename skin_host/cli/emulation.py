@@ -73,7 +73,12 @@ def add_commands(commands: Commands) -> None:
         "skin demo --duration 15",
     )
     demo.add_argument("--duration", type=float, metavar="S", help="end after so many seconds")
-    demo.add_argument("--page-port", type=int, default=8080, help="of the live page; 0 is any")
+    demo.add_argument(
+        "--page-port",
+        type=int,
+        metavar="PORT",
+        help="of the live page, 0 is any; without it 8080, or any if that is taken",
+    )
     add_log_level(demo)
     demo.set_defaults(run=_demo)
 

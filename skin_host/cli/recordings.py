@@ -152,6 +152,12 @@ def _record(arguments: argparse.Namespace) -> int:
         with CanLog(file) as log:
             told = asyncio.run(_capture(arguments, None, log))
         told |= {"frames": log.frames}
+    if arguments.config is not None and not told.get("frames", told.get("messages", {}).get("can")):
+        print(
+            f"no CAN frame came on the buses of {arguments.config}; is the bus up? "
+            "(An interface `virtual` is heard by its own program alone.)",
+            file=sys.stderr,
+        )
     if arguments.json:
         print_json({"file": str(file)} | told)
     else:

@@ -8,6 +8,7 @@ alone.
 import asyncio
 import contextlib
 import logging
+import os
 from collections.abc import AsyncIterator, Callable
 from http import HTTPStatus
 from importlib import resources
@@ -105,9 +106,9 @@ class Viewer:
                 server_header=None,
             )
         except OSError as error:
+            why = os.strerror(error.errno) if error.errno else str(error)
             raise SkinError(
-                f"the page cannot be served on {host}:{port}: {error.strerror or error}; "
-                "choose another port with --port"
+                f"the page cannot be served on {host}:{port}: {why}; choose another port"
             ) from None
         async with server:
             listening = asyncio.create_task(self._listen(), name="viewer")

@@ -6,6 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+from skin_host import demo
+from skin_host.errors import SkinError
+from skin_host.viewer.server import Viewer
+from tests.support.broker import free_port
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -34,3 +41,15 @@ def test_the_demo_ends_by_itself_with_a_summary_of_touches(tmp_path):
     assert summary["touches_begun"] >= 1
     assert summary["touches_ended"] == summary["touches_begun"]
     assert summary["bus"] in {"virtual", "socketcan"}
+
+
+async def test_where_the_usual_port_is_taken_the_page_is_at_another(monkeypatch):
+    viewer = Viewer(f"mqtt://127.0.0.1:{free_port()}", robot="demo")
+    async with demo.served(viewer, 0) as taken:
+        port = int(taken.rstrip("/").rpartition(":")[2])
+        monkeypatch.setattr(demo, "PAGE_PORT", port)
+        async with demo.served(viewer, None) as elsewhere:
+            assert elsewhere != taken
+        with pytest.raises(SkinError, match="Address already in use; choose another port"):
+            async with demo.served(viewer, port):
+                pass

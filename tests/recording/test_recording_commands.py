@@ -114,6 +114,15 @@ def test_a_dbc_is_printed_or_written(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert (tmp_path / "a.dbc").read_text() == text
 
 
+@pytest.mark.parametrize("name", ["a.log", "a.mcap"])
+def test_a_recording_of_a_bus_on_which_nothing_came_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    config = str(CONFIG.parent / "demo.toml")
+    assert main(["record", str(tmp_path / name), "--config", config, "--seconds", "0.1"]) == 0
+    assert f"no CAN frame came on the buses of {config}" in capsys.readouterr().err
+
+
 async def test_a_robot_is_recorded_until_ctrl_c_and_played_again(
     mosquitto: Mosquitto, tmp_path: Path
 ) -> None:
