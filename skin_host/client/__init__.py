@@ -9,8 +9,9 @@ The client finds the broker again by itself. What was lost meanwhile is told by 
 """
 
 from skin_host.client.callbacks import SkinCallbacks
+from skin_host.client.heard import Contact, Health
 from skin_host.client.session import CommandError, Node, SkinClient
-from skin_host.client.streams import Contact, Health, Stream
+from skin_host.client.streams import Stream
 from skin_host.publish.address import Broker
 from skin_host.publish.frames import Frame
 from skin_host.publish.grasping import Over, Slip

@@ -8,8 +8,9 @@ from concurrent.futures import Future
 from functools import partial
 from typing import Any, Self, TypeVar
 
+from skin_host.client.heard import Contact, Health
 from skin_host.client.session import SkinClient
-from skin_host.client.streams import Contact, Health, Stream
+from skin_host.client.streams import Stream
 from skin_host.publish.frames import Frame
 from skin_host.publish.grasping import Over, Slip
 from skin_host.publish.info import NodeInfo

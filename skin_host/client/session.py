@@ -9,7 +9,9 @@ from dataclasses import dataclass
 from typing import Any, Literal, Self, TypeVar
 from weakref import WeakSet
 
-from skin_host.client.streams import Contact, Health, Stream
+from skin_host.client.heard import Contact, Health, read
+from skin_host.client.robots import RETAINED_S, only_robot
+from skin_host.client.streams import Stream
 from skin_host.errors import BrokerError, RequestError, SkinError
 from skin_host.publish.address import Broker
 from skin_host.publish.commands import Result, decode_result, encode_request
@@ -24,24 +26,16 @@ from skin_host.publish.connection import (
     is_refusal,
     message_properties,
 )
-from skin_host.publish.frames import Frame, decode_frame
-from skin_host.publish.grasping import Over, Slip, decode_over, decode_slip
+from skin_host.publish.frames import Frame
+from skin_host.publish.grasping import Over, Slip
 from skin_host.publish.info import NodeInfo, decode_info
-from skin_host.publish.messages import Touch, decode_contact, decode_health, decode_touch
-from skin_host.publish.payload import JSON_TYPE, MessageError
+from skin_host.publish.messages import Touch
+from skin_host.publish.payload import JSON_TYPE
 from skin_host.publish.topics import ONLINE, PartTopic, Topics
 
 MAX_INCOMING = 10_000
 #: The broker keeps touch events for us for so long while we are away (MQTT 5).
 SESSION_S = 60
-#: Retained messages come within this time of a subscription.
-RETAINED_S = 0.5
-
-_EVENTS: dict[str, Callable[[bytes], Touch | Slip | Over]] = {
-    "touch": decode_touch,
-    "slip": decode_slip,
-    "over": decode_over,
-}
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
@@ -320,48 +314,12 @@ class SkinClient:
 
     async def _talk(self, connection: Connection) -> None:
         if self._topics is None:
-            self._robot = await self._only_robot(connection)
+            self._robot = await only_robot(connection, self._broker, self._base)
             self._topics = Topics(self._base, self._robot)
         async with asyncio.TaskGroup() as group:
             group.create_task(self._keep_subscribed(connection, self._topics))
             async for message in connection.messages:
                 self._take(message, self._topics)
-
-    async def _only_robot(self, connection: Connection) -> str:
-        """Find the only robot below the base, by the status of its nodes.
-
-        Of several the only one that is online: the broker remembers who has left.
-        """
-        prefix = f"{self._base}/"
-        known: set[str] = set()
-        online: set[str] = set()
-
-        async def listen() -> None:
-            async for message in connection.messages:
-                robot = message.topic.value.removeprefix(prefix).partition("/")[0]
-                known.add(robot)
-                if message.payload == ONLINE:
-                    online.add(robot)
-
-        everybody = f"{prefix}+/nodes/+/status"
-        await connection.subscribe(everybody, qos=1)
-        try:
-            await asyncio.wait_for(listen(), RETAINED_S)
-        except TimeoutError:
-            await connection.unsubscribe(everybody)
-        meant = online or known
-        if not meant:
-            raise RequestError(
-                f'broker {self._broker}: no robot has said anything below "{self._base}"; '
-                "is `skin run` running?"
-            )
-        if len(meant) > 1:
-            names = ", ".join(sorted(meant)[:20])
-            raise RequestError(
-                f'broker {self._broker}: wanted one robot below "{self._base}", there are: '
-                f"{names}; name the robot"
-            )
-        return meant.pop()
 
     async def _keep_subscribed(self, connection: Connection, topics: Topics) -> None:
         while True:
@@ -436,19 +394,11 @@ class SkinClient:
         if not streams:
             self._streams_changed.set()  # nobody reads it any more
             return
-        item: Touch | Slip | Over | Frame | Contact | Health
-        if kind in _EVENTS:
-            item = _EVENTS[kind](payload)
-            if item.part != part:
-                raise MessageError(f'a {kind} of "{item.part}" among those of "{part}"')
-        elif kind == "frame":
-            item = decode_frame(part, payload)
-        elif not payload:  # a retained message was deleted
+        item = read(kind, part, payload)
+        if item is None:
             self._latest.pop((kind, part), None)
             return
-        elif kind == "contact":
-            item = self._latest[kind, part] = Contact(part, decode_contact(payload))
-        else:
-            item = self._latest[kind, part] = Health(part, decode_health(payload))
+        if isinstance(item, Contact | Health):
+            self._latest[kind, part] = item
         for stream in streams:
             stream.put(item)

@@ -3,7 +3,7 @@
 import asyncio
 from collections import deque
 from collections.abc import AsyncIterator
-from typing import Any, Generic, NamedTuple, TypeVar, cast
+from typing import Any, Generic, TypeVar, cast
 
 from msgspec.structs import replace
 
@@ -25,20 +25,6 @@ HELD = {
 DUPLICATE_SPAN = 64
 
 T = TypeVar("T")
-
-
-class Contact(NamedTuple):
-    """Whether anything touches a part."""
-
-    part: str
-    touched: bool
-
-
-class Health(NamedTuple):
-    """How a part is; `docs/operations.md` explains the keys of `record`."""
-
-    part: str
-    record: dict[str, Any]
 
 
 class Stream(AsyncIterator[T], Generic[T]):

@@ -3,7 +3,8 @@
 import numpy as np
 from msgspec.structs import replace
 
-from skin_host.client.streams import HELD, Contact, Stream
+from skin_host.client.heard import Contact
+from skin_host.client.streams import HELD, Stream
 from skin_host.publish.frames import Frame
 from skin_host.publish.grasping import Over
 from skin_host.publish.messages import Touch

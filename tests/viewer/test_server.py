@@ -14,7 +14,7 @@ import pytest
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import InvalidStatus
 
-from skin_host.client.session import RETAINED_S
+from skin_host.client.robots import RETAINED_S
 from skin_host.errors import RequestError, SkinError
 from skin_host.layout import Layout, build_layout
 from skin_host.processing.pipeline import PressureFrame
