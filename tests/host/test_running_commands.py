@@ -4,6 +4,7 @@ import asyncio
 import json
 from collections.abc import AsyncIterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import pytest_asyncio
@@ -44,6 +45,31 @@ async def test_a_running_daemon_answers_and_refuses_in_one_line(
     assert said.out == ""
     assert said.err.count("\n") == 1
     assert "tail" in said.err
+
+
+async def test_every_command_can_be_given_to_a_running_daemon(
+    url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async def command(*words: str) -> Any:
+        assert await skin("command", *words, "--json", "--broker", url) == 0
+        return json.loads(capsys.readouterr().out)
+
+    before = (await command("status"))["left_hand"]["calibration"]
+    recorded = await command("record", "--file", "run.log", "--seconds", "60")
+    assert recorded["file"] == str(tmp_path / "recordings/run.log")
+    found = await command("calibrate", "--board", "hand", "--seconds", "0.5")
+    assert found["verdicts"]["left_hand"]["ok"] > 50
+    assert found["id"] != before["id"]
+    assert (await command("configure", "--board", "hand"))["boards"] == ["hand"]
+    assert (await command("disable", "--part", "left_hand"))["disabled"] == ["left_hand"]
+    assert (await command("status"))["left_hand"]["state"] == "disabled"
+    assert (await command("enable", "--part", "left_hand"))["disabled"] == []
+    assert (await command("raw", "--seconds", "1"))["seconds"] == 1.0
+    ended = await command("stop_recording")
+    assert ended["lost"] == 0
+    assert ended["frames"] > 100
+    assert await skin("command", "calibrate", "--board", "foot", "--broker", url) == 1
+    assert "foot" in capsys.readouterr().err
 
 
 async def test_a_daemon_that_has_gone_leaves_no_part_that_looks_well(
