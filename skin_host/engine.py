@@ -262,10 +262,6 @@ class Engine:
             self.fingertips.note_skin(part, events, t_ns)
         return events
 
-    def end_contacts(self, t_ns: int) -> list[tuple[int, list[TouchEvent]]]:
-        """End every contact, by part: the daemon stops."""
-        return [(part, self.end_part(part, t_ns)) for part in self._trackers]
-
     def _new_liveness(self, boards: list[int]) -> dict[int, Liveness]:
         """Watchers for some boards; of what is used of each, the calibrated noise."""
         made = {}

@@ -4,9 +4,7 @@ python-can's readers know the formats: candump (.log), Vector ASC and BLF, CSV, 
 MF4, and the text ones compressed (.gz).
 """
 
-import asyncio
-import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import can
@@ -21,32 +19,20 @@ CAPACITY = 1024
 WINDOW_NS = 4_000_000
 
 
-def read_log(
-    path: Path, window_ns: int = WINDOW_NS, channel: str | None = None
-) -> Iterator[FrameBatch]:
-    """The frames of a recording at full speed, in batches as a live bus would give.
+def read_channels(path: Path, window_ns: int = WINDOW_NS) -> Iterator[tuple[str, FrameBatch]]:
+    """Channel and frames of a recording at full speed, in batches as a live bus would give.
 
     Times are exact to the microsecond. They count from the epoch where the format has a
-    date, else from the start of the recording.
+    date, else from the start of the recording. Frames of one window are handed on channel
+    by channel; the name of a channel is "" where the recording has none.
 
     Args:
         path: file; its suffix tells the format.
         window_ns: a batch spans at most so long.
-        channel: only the frames of this channel, as the recording names it.
 
     Raises:
         LogError: absent, of no known format, empty, or damaged; what came before the
             damage has then been handed on.
-    """
-    for batch_channel, batch in read_channels(path, window_ns):
-        if channel is None or batch_channel == channel:
-            yield batch
-
-
-def read_channels(path: Path, window_ns: int = WINDOW_NS) -> Iterator[tuple[str, FrameBatch]]:
-    """As `read_log`, with the name of the channel; "" where the recording has none.
-
-    Frames of one window are handed on channel by channel.
     """
     windows: dict[str, list[tuple[int, bytes, int]]] = {}
     end_ns = 0
@@ -58,20 +44,6 @@ def read_channels(path: Path, window_ns: int = WINDOW_NS) -> Iterator[tuple[str,
             end_ns = frame[2] + window_ns
         windows.setdefault(channel, []).append(frame)
     yield from ((name, FrameBatch.of(frames)) for name, frames in windows.items())
-
-
-async def replay_log(
-    path: Path, window_ns: int = WINDOW_NS, speed: float = 1.0
-) -> AsyncIterator[tuple[str, FrameBatch]]:
-    """As `read_channels`, at the recording's own pace times `speed`."""
-    start: tuple[float, int] | None = None
-    for channel, batch in read_channels(path, window_ns):
-        last_ns = int(batch.t_ns[-1])
-        if start is None:
-            start = (time.monotonic(), int(batch.t_ns[0]))
-        due_s = start[0] + (last_ns - start[1]) * 1e-9 / speed
-        await asyncio.sleep(max(0.0, due_s - time.monotonic()))
-        yield channel, batch
 
 
 def _frames(path: Path) -> Iterator[tuple[str, tuple[int, bytes, int]]]:

@@ -186,7 +186,6 @@ class WrenchAssembler:
     period_ms: int
     full_scale: Floats
     counters: StrainCounters = field(default_factory=StrainCounters)
-    last_ns: int | None = None
     _half: tuple[int, int, NDArray[np.int32], bool] | None = None
 
     def add(self, batch: FrameBatch) -> list[Wrench]:
@@ -200,17 +199,12 @@ class WrenchAssembler:
         samples = []
         for i in np.flatnonzero(mine).tolist():
             t_ns = int(t_ns_of[frames.row[i]])
-            self.last_ns = t_ns
             sample = self._pair(
                 t_ns, int(frames.type[i]), frames.value[i], bool(frames.saturated[i])
             )
             if sample is not None:
                 samples.append(sample)
         return samples
-
-    def is_silent(self, now_ns: int) -> bool:
-        """Whether nothing has come for 100 ms, or never."""
-        return self.last_ns is None or now_ns - self.last_ns > SILENT_NS
 
     def _pair(
         self, t_ns: int, kind: int, value: NDArray[np.int32], saturated: bool

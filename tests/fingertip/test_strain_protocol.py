@@ -145,11 +145,3 @@ def test_saturation_is_told():
     )
     assert [sample.saturated for sample in samples] == [True, False]
     assert assembler.counters.saturated == 1
-
-
-def test_a_sensor_is_silent_after_100_ms():
-    assembler = WrenchAssembler(13, 10, SCALE)
-    assert assembler.is_silent(0)
-    assembler.add(stream((5, "f", 0)))
-    assert not assembler.is_silent(105 * MS)
-    assert assembler.is_silent(106 * MS)

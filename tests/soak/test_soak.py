@@ -109,8 +109,8 @@ def test_an_accelerated_month(tmp_path: Path) -> None:
             sizes.append(resident_bytes())
             if len(sizes) % 24 == 1:
                 tell_growth(f"hour {len(sizes)}", sizes)
-    for _, left in engine.end_contacts(t_ns):
-        events.update(event.event for event in left)
+    for part in engine.parts:
+        events.update(event.event for event in engine.end_part(part, t_ns))
     counters = engine.assemblers["can0"].counters
     assert (counters.frames, counters.sweeps) == (2 * count, count)
     assert counters.incomplete == counters.halves == counters.missed == counters.late == 0
