@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from skin_host.bus.protocol.compensation import NO_GAIN
 from skin_host.processing.repeats import Repeats
-from skin_host.processing.stuck import TOUCHED_PACE, StuckPads, at_end, longest_run
+from skin_host.processing.stuck import TOUCHED_PACE, StuckPads, inside, longest_run
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -197,11 +197,11 @@ class Liveness:
             self._surprise[:] = 0.0
             return
         expected = self._expected
-        ends = at_end(raw)
-        if ends.any():
+        movable = inside(raw)
+        if not movable.all():
             # What stands at an end of the scale cannot move, however well it is.
-            movable = (self._pad_expected * ~ends).sum(axis=1)
-            expected = np.where(ends.all(axis=1), 0.0, np.minimum(expected, movable))
+            most = (self._pad_expected * movable).sum(axis=1)
+            expected = np.where(movable.any(axis=1), np.minimum(expected, most), 0.0)
         if touched is not None:
             # A chip that died can look touched itself; only what others feel excuses it.
             felt = np.count_nonzero(touched, axis=1)
@@ -239,7 +239,7 @@ class Liveness:
         seen = np.maximum(self._samples, 1)
         weight = self._weight * (~self.unproven & (self._samples >= RATE_SAMPLES // 2))
         self._triangle_rate += weight * (self._alive / seen - self._triangle_rate)
-        movable = ~self.stuck & ~at_end(self._raw)
+        movable = ~self.stuck & inside(self._raw)
         self._rate += (weight[:, None] * movable) * (self._changes / seen[:, None] - self._rate)
         self._seen = min(self._seen + self._share * RATE_SAMPLES, self._memory)
         self._samples[:] = 0

@@ -55,7 +55,7 @@ class StuckPads:
 
     Attributes:
         stuck: bool[k, 12].
-        told: float64[k, 12], what a repetition tells now, the negative logarithm of its odds.
+        longest: float64[k, 12], repeats in a row that chance allows now.
     """
 
     def __init__(
@@ -70,10 +70,9 @@ class StuckPads:
         self._most = np.minimum(most, MOST_RATE)
         self._seen = np.full(shape, float(CALIBRATED_SAMPLES))
         self._moved = resting * CALIBRATED_SAMPLES
-        self._run = np.zeros(shape, np.int64)
-        self._surprise = np.zeros(shape)
+        self._run = np.zeros(shape)
         self._to_show = np.zeros(shape, np.int64)
-        self._new_seen = np.zeros(shape, np.int64)
+        self._new_seen = np.zeros(shape)
         self._new_moved = np.zeros(shape, np.int64)
         self._samples = 0
         self.stuck: Mask = np.zeros(shape, np.bool_)
@@ -97,29 +96,27 @@ class StuckPads:
             unproven: bool[k], triangles that are not believed at all.
             touched: bool[k, 12], pads that were touched a moment ago, if any was.
         """
-        # A byte at an end of the scale cannot tell whether its pad moves.
-        within = compared[:, None] & ~at_end(raw)
+        within = inside(raw) & compared[:, None]
         moved, told = self._repeats.step(raw, changed, within)
-        begun = self._run >= self._begun
-        self._run += told
-        self._run[moved] = 0
-        tells = self.told * (begun & told)
+        run = self._run
         if touched is None:
-            self._new_seen += begun & told
-            self._new_moved += begun & moved
+            # A run counts when it ends: one that does not may be no chance.
+            ended = moved & (run >= self._begun)
+            np.add(self._new_seen, run - (self._begun - 1), out=self._new_seen, where=ended)
+            self._new_moved += ended
+            run += told
         else:
             # What a pad feels all by itself is no excuse: it may be stuck there.
-            tells = np.where(np.count_nonzero(touched) > touched, tells / TOUCHED_PACE, tells)
-        self._surprise += tells
-        self._surprise[moved] = 0.0
+            run += told / np.where(np.count_nonzero(touched) > touched, TOUCHED_PACE, 1)
+        np.copyto(run, 0.0, where=moved)
         self._samples += 1
         if self._samples >= STEP_SAMPLES:
             self._learn(unproven)
-        too_long = self._surprise > math.log(ODDS)
+        too_long = run > self.longest
         if not self._any_stuck and not too_long.any():
             return
-        self._surprise[unproven] = 0.0
-        too_long &= self._surprise > 0.0
+        run[unproven] = 0.0
+        too_long &= run > 0.0
         self._to_show -= moved & (self._to_show > 0)
         self._to_show[too_long] = PROBATION_MOVES
         self.stuck = self._to_show > 0
@@ -129,16 +126,16 @@ class StuckPads:
         """Let the rates follow what was seen of pads that live."""
         lives = ~self.stuck & ~unproven[:, None]
         keep = np.where(lives, 1.0 - self._forget, 1.0)
-        self._seen = self._seen * keep + np.where(lives, self._new_seen, 0)
+        self._seen = self._seen * keep + np.where(lives, self._new_seen, 0.0)
         self._moved = self._moved * keep + np.where(lives, self._new_moved, 0)
-        self._new_seen[:] = 0
+        self._new_seen[:] = 0.0
         self._new_moved[:] = 0
         self._samples = 0
         self._renew_limits()
 
     def _renew_limits(self) -> None:
         rate = np.minimum(self._moved / np.maximum(self._seen, 1.0), self._most)
-        self.told = math.log(ODDS) / longest_run(rate, self._seen, ODDS)
+        self.longest = self._begun + longest_run(rate, self._seen, ODDS)
 
 
 def rate_in_run(noise_units: Floats) -> Floats:
@@ -177,7 +174,7 @@ def longest_run(rate: Floats, samples: Floats | float, odds: float) -> Floats:
     return high
 
 
-def at_end(raw: NDArray[np.uint8]) -> Mask:
-    """Bytes at an end of the scale, 0 or 255."""
-    ends: Mask = (raw == 0) | (raw == 255)
-    return ends
+def inside(raw: NDArray[np.uint8]) -> Mask:
+    """Bytes that are not at an end of the scale: those cannot tell whether their pad moves."""
+    mask: Mask = raw - np.uint8(1) < np.uint8(254)  # 0 wraps to 255
+    return mask

@@ -148,4 +148,4 @@ def test_any_bytes_at_all_are_survived(seed: int) -> None:
         doubted = liveness.step(raw, rng.random(K) < 0.8, rng.random(K) < 0.1)
         assert doubted is None or doubted.shape == (K, 12)
     assert np.isfinite(liveness._rate).all()
-    assert np.isfinite(liveness._pads.told).all()
+    assert np.isfinite(liveness._pads.longest).all()
