@@ -26,7 +26,8 @@ PRESSED_KPA = 2.0
 PRESSED_SHARE = 0.1
 #: A contact in which nothing changes says so this often: it is still there.
 ALIVE_NS = 1_000_000_000
-#: Below this peak a contact is all but gone, and where it is only noise would tell.
+#: Below this peak a contact is all but gone, and where it is only noise would tell; above it
+#: an untouched taxel may be about to be touched.
 FELT_KPA = 2.0
 #: Pieces of a contact are contacts of their own when they have been apart for so long.
 PARTED_NS = 150_000_000
@@ -131,7 +132,7 @@ class ContactTracker:
         """Return what happened since the last frame: ends first, then moves and begins."""
         if not self._contacts and not np.count_nonzero(frame.touched):
             return []
-        groups = self._groups(self._touched(frame))
+        groups = self._joined(self._groups(self._touched(frame)), frame)
         if self._places is not None:
             groups = self._places.look(frame, groups, self._neighbours)
         groups = self._kept_whole(groups, frame.t_ns)
@@ -192,6 +193,40 @@ class ContactTracker:
                         group.append(other)
             groups.append(frozenset(group))
         return groups
+
+    def _joined(self, groups: list[frozenset[int]], frame: PressureFrame) -> list[frozenset[int]]:
+        """The groups, with each new one joined to those that it will grow together with.
+
+        What lands on the skin passes the thresholds of its taxels one by one. Those between
+        two that have passed feel something already.
+        """
+        known = set().union(*(contact.taxels for contact in self._contacts.values()))
+        if len(groups) < 2 or all(group & known for group in groups):
+            return groups
+        felt = set(np.flatnonzero(frame.pressure_kpa >= FELT_KPA).tolist()).union(*groups)
+        joined: list[frozenset[int]] = []
+        left = list(groups)
+        while left:
+            group = left.pop(0)
+            if not group & known:
+                reached = self._reach(group, felt)
+                near = [other for other in [*joined, *left] if other & reached]
+                joined = [other for other in joined if not other & reached]
+                left = [other for other in left if not other & reached]
+                group = group.union(*near)
+            joined.append(group)
+        return sorted(joined, key=min)
+
+    def _reach(self, group: frozenset[int], among: set[int]) -> set[int]:
+        """Taxels that a group is connected with through others of a set."""
+        reached = set(group)
+        way = list(group)
+        for taxel in way:  # grows while it is walked
+            for other in self._neighbours[taxel]:
+                if other in among and other not in reached:
+                    reached.add(other)
+                    way.append(other)
+        return reached
 
     def _kept_whole(self, groups: list[frozenset[int]], t_ns: int) -> list[frozenset[int]]:
         """The groups, with pieces of one contact taken together that have just come apart.

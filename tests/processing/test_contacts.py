@@ -21,13 +21,15 @@ class Skin:
         self.tracker = ContactTracker(LAYOUT, 0, SETTINGS)
         self.seq = 0
 
-    def show(self, *taxels, kpa=20.0, lost=()):
+    def show(self, *taxels, kpa=20.0, lost=(), felt=()):
+        """`felt` taxels feel something but have too few votes yet."""
         touched = np.zeros(N, bool)
         touched[list(set().union(*taxels))] = True
         valid = np.ones(N, bool)
         valid[list(lost)] = False
         touched &= valid
         pressure = np.where(touched, kpa, 0.0).astype(np.float32)
+        pressure[list(felt)] = 4.0
         frame = PressureFrame(
             "skin",
             self.seq,
@@ -89,6 +91,23 @@ def test_where_two_contacts_merge_the_larger_one_goes_on():
     between = set(range(12)) - small - large
     assert kinds(skin.show(small, large)) == [("begin", 1), ("begin", 2)]
     assert kinds(skin.show(small, large, between)) == [("end", 1), ("move", 2)]
+
+
+def test_a_hand_that_lands_taxel_by_taxel_is_one_contact_from_the_first():
+    skin = Skin()
+    whole = set(range(12))
+    (event,) = skin.show({0}, {4, 5}, felt=whole - {0, 4, 5})
+    assert (event.event, set(event.taxels)) == ("begin", {0, 4, 5})
+    (event,) = skin.show({0}, {4, 5}, {8}, felt=whole - {0, 4, 5, 8})
+    assert (event.event, event.id, set(event.taxels)) == ("move", 1, {0, 4, 5, 8})
+    assert kinds(skin.show(whole)) == [("move", 1)]
+
+
+def test_two_contacts_with_something_felt_between_them_stay_two():
+    skin = Skin()
+    one, other = {0}, {4, 5}
+    assert kinds(skin.show(one, other)) == [("begin", 1), ("begin", 2)]
+    assert kinds(skin.show(one, other, felt=set(range(12)) - one - other)) == []
 
 
 def test_a_contact_that_lets_go_taxel_by_taxel_is_one_to_its_end():
