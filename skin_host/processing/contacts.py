@@ -200,8 +200,10 @@ class ContactTracker:
         What lands on the skin passes the thresholds of its taxels one by one. Those between
         two that have passed feel something already.
         """
+        if len(groups) < 2 or self._are_as_before(groups):
+            return groups
         known = set().union(*(contact.taxels for contact in self._contacts.values()))
-        if len(groups) < 2 or all(group & known for group in groups):
+        if not any(known.isdisjoint(group) for group in groups):
             return groups
         felt = set(np.flatnonzero(frame.pressure_kpa >= FELT_KPA).tolist()).union(*groups)
         joined: list[frozenset[int]] = []
@@ -216,6 +218,10 @@ class ContactTracker:
                 group = group.union(*near)
             joined.append(group)
         return sorted(joined, key=min)
+
+    def _are_as_before(self, groups: list[frozenset[int]]) -> bool:
+        """Whether each group is a contact that had the same taxels."""
+        return {contact.taxels for contact in self._contacts.values()}.issuperset(groups)
 
     def _reach(self, group: frozenset[int], among: set[int]) -> set[int]:
         """Taxels that a group is connected with through others of a set."""
@@ -234,6 +240,10 @@ class ContactTracker:
         As a contact begins or lets go its taxels pass their thresholds one by one, and for a
         moment it is an archipelago.
         """
+        if self._are_as_before(groups):
+            for contact in self._contacts.values():
+                contact.parted_ns = None
+            return groups
         home = {taxel: name for name, contact in self._contacts.items() for taxel in contact.taxels}
         pieces: dict[int, list[frozenset[int]]] = {name: [] for name in self._contacts}
         kept = []
