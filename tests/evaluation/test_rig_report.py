@@ -3,6 +3,7 @@ from pathlib import Path
 import pytest
 
 from skin_host.evaluation import rig_report
+from skin_host.evaluation.cup_grasp import PERIOD_S
 from skin_host.evaluation.rig_report import Results, Row
 
 
@@ -25,12 +26,12 @@ def test_the_emulated_palm_agrees_with_what_the_paper_measured(rows: list[Row]) 
     assert [row["fact"] for row in measured if not row["agrees"]] == []
 
 
-def test_a_cup_survives_only_fingers_that_feel_it(rows: list[Row]) -> None:
-    grasped = {row["fact"]: row["ours"] for row in rows if row["figure"] == "19"}
-    assert grasped == {
-        "cups intact of 1 grasped with feedback": 1,
-        "cups intact of 1 grasped without": 0,
-    }
+def test_a_cup_survives_only_fingers_that_feel_it(results: Results) -> None:
+    blind, felt = results.grasps
+    assert not blind.intact
+    assert max(felt.peak_n) < 0.9 * max(blind.peak_n)
+    # A busy machine may tell the fingers too late, and the cup breaks as it would.
+    assert felt.intact or max(felt.late_s) > 3 * PERIOD_S
 
 
 def test_the_default_model_follows_the_load_cell_where_the_published_one_drifts_off(
