@@ -193,16 +193,17 @@ def _stuck_taxel(robot: "Robot", fault: Fault) -> Mend:
         held_ff = skin.resting_ff[taxels] + fault.value
     skin.held_ff[taxels] = held_ff
     chip = _chip(robot, fault)
-    own = np.arange(TAXELS_PER_TRIANGLE) + TAXELS_PER_TRIANGLE * chip
-    held = (own >= taxels.start) & (own < taxels.stop)
-    robot.converters.hold_results(chip, held)
+
+    def show() -> None:
+        own = slice(TAXELS_PER_TRIANGLE * chip, TAXELS_PER_TRIANGLE * (chip + 1))
+        robot.converters.hold_results(chip, ~np.isnan(skin.held_ff[own]))
+        robot.pass_on(taxels)
 
     def mend() -> None:
         skin.held_ff[taxels] = np.nan
-        robot.converters.hold_results(chip, np.zeros_like(held))
-        robot.pass_on(taxels)
+        show()
 
-    robot.pass_on(taxels)
+    show()
     return mend
 
 

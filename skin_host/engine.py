@@ -107,7 +107,15 @@ class Engine:
         self.disabled: set[int] = set()
         self.touch_only: set[int] = set()
         self.liveness = self._new_liveness(self.boards)
-        self._intake = Intake(layout, parts, settings.receive.silent_periods, self.liveness)
+        curve = settings.processing.pressure
+        full_ff = -0.5 * curve.b_kpa_per_ff / curve.a_kpa_per_ff2 if curve.a_kpa_per_ff2 else np.inf
+        self._intake = Intake(
+            layout,
+            parts,
+            settings.receive.silent_periods,
+            self.liveness,
+            full_ff if full_ff > 0.0 else np.inf,
+        )
         self.rezeros = dict.fromkeys(self.boards, 0)
         self._rezeros: dict[int, Rezero] = {}
         self._unanswered: dict[int, int] = {}

@@ -19,8 +19,10 @@ from skin_host.processing.liveness import PADS, Liveness
 SILENCE_REPEAT_NS = 1_000_000_000
 #: So many pads far below zero pressure are no accident.
 LIFTED_PADS = 2
-#: Nor is one, while so many are far out of range.
+#: Nor is one, while so many are far out of range. Nor are so many, where that is more than so
+#: many times the capacitance at which the pressure curve ends.
 FAR_PADS = 7
+FAR_SHARE = 1.5
 _NONE_ERRS = np.zeros(TRIANGLES, np.bool_)
 
 
@@ -79,6 +81,7 @@ class Intake:
         parts: indices of the parts that this daemon reads.
         silent_periods: a board is taken for dead after so many periods without a sweep.
         liveness: who watches each board's bytes, by index of the board; may be replaced.
+        full_ff: capacitance at which the curve of pressure ends, of a pad of sensitivity 1.
 
     Attributes:
         veto: bool[16, 12] by index of the board: taxels that are not to be believed for a
@@ -92,11 +95,17 @@ class Intake:
         parts: list[int],
         silent_periods: float,
         liveness: dict[int, Liveness],
+        full_ff: float = np.inf,
     ) -> None:
         self.liveness = liveness
         self.veto: dict[int, NDArray[np.bool_]] = {}
         self.touched: dict[int, NDArray[np.bool_]] = {}
         self._silent_periods = silent_periods
+        self._unpressable = {
+            board: _unpressable(layout, board, full_ff)
+            for part in parts
+            for board in layout.parts[part].boards
+        }
         self._states: list[_PartState] = []
         self._of_board: dict[int, list[_PartState]] = {}
         for index in parts:
@@ -128,7 +137,8 @@ class Intake:
             if states is None:
                 continue
             touched = self.touched.get(sweep.board)
-            trusted = _trusted(sweep, self.liveness[sweep.board], touched)
+            unpressable = self._unpressable[sweep.board]
+            trusted = _trusted(sweep, self.liveness[sweep.board], touched, unpressable)
             veto = self.veto.get(sweep.board)
             received = trusted.ravel()
             trusted = received if veto is None else (trusted & ~veto).ravel()
@@ -205,7 +215,10 @@ class Intake:
 
 
 def _trusted(
-    sweep: Sweep, liveness: Liveness, touched: NDArray[np.bool_] | None
+    sweep: Sweep,
+    liveness: Liveness,
+    touched: NDArray[np.bool_] | None,
+    unpressable: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
     """bool[16, 12]: the triangle came, its chip answers and lives, the value is within range."""
     here = (sweep.present >> np.arange(TRIANGLES) & 1).astype(np.bool_)
@@ -215,13 +228,26 @@ def _trusted(
         erring = status_error(sweep.status) != 0
         here &= ~erring
         here &= ~lifted(sweep.raw, sweep.status)
-        trusted = ~out_of_range(sweep.status) & here[:, None]
+        far = out_of_range(sweep.status)
+        here &= ~(unpressable & (np.count_nonzero(far, axis=1) >= FAR_PADS))
+        trusted = ~far & here[:, None]
     else:
         trusted = np.repeat(here[:, None], PADS, axis=1)
     doubted = liveness.step(sweep.raw, here, erring, touched)
     if doubted is not None:
         trusted &= ~doubted
     return trusted
+
+
+def _unpressable(layout: Layout, board: int, full_ff: float) -> NDArray[np.bool_]:
+    """Triangles bool[16] of a board that nothing can press far out of their range.
+
+    A pad is far out at twice the capacitance of all its units (reference of the wire, 4.3).
+    """
+    taxels = layout.boards[board].taxel_index[:, 0]
+    far_ff = 2.0 * layout.no_load[taxels] * layout.unit_ff[taxels]
+    found: NDArray[np.bool_] = far_ff > FAR_SHARE * full_ff * layout.sensitivity[taxels]
+    return found
 
 
 def lifted(raw: NDArray[np.uint8], status: NDArray[np.uint16]) -> NDArray[np.bool_]:

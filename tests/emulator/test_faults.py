@@ -101,6 +101,21 @@ def test_a_stuck_taxel_stays_where_it_is_told(robot: Robot) -> None:
 
 
 @pytest.mark.parametrize("fidelity", ["signal", "chip"])
+def test_several_stuck_taxels_of_a_chip_stay_and_are_mended_one_by_one(fidelity: str) -> None:
+    robot = make(Scene(), fidelity)
+    robot.inject(Fault(name="stuck_taxel", board="hand", triangle=9, taxel=4))
+    mend = robot.inject(Fault(name="stuck_taxel", board="hand", triangle=9, taxel=5))
+
+    def still() -> list[int]:
+        rows = np.array([triangle(frames(robot, 0.05), 14, 9)[0] for _ in range(60)])
+        return np.flatnonzero(np.ptp(rows[1:], axis=0) == 0).tolist()
+
+    assert still() == [4, 5]
+    mend()
+    assert still() == [4]
+
+
+@pytest.mark.parametrize("fidelity", ["signal", "chip"])
 def test_a_noisy_taxel_moves_more_than_its_neighbours(fidelity: str) -> None:
     robot = make(Scene(), fidelity)
     robot.inject(Fault(name="noisy_taxel", board="hand", triangle=9, taxel=5))

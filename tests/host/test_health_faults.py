@@ -17,7 +17,7 @@ HERE = {"board": "forearm_outer", "triangle": 3}
 FAULTS: list[tuple[str, dict[str, Any], str, range]] = [
     ("chip_gone", HERE, "triangle_not_connected", range(36, 48)),
     ("chip_gone", HERE | {"value": 0}, "triangle_no_ack", range(36, 48)),
-    ("chip_gone", HERE | {"value": 0x8000}, "triangle_frozen", range(36, 48)),
+    ("chip_gone", HERE | {"value": 0x8000}, "triangle_out_of_range", range(36, 48)),
     ("stuck_taxel", HERE | {"taxel": 7}, "taxel_stuck", range(43, 44)),
     ("noisy_taxel", HERE | {"taxel": 4}, "taxel_noisy", range(40, 41)),
     ("shorted_finger", HERE, "line_shorted", range(48)),
@@ -57,6 +57,18 @@ def test_a_fault_is_named_in_time(
     assert code in told
     assert not bench.valid["left_forearm"][list(doubted)].any()
     assert not bench.touched["left_forearm"][list(doubted)].any()
+
+
+@pytest.mark.parametrize("value_ff", [None, 40.0])
+def test_a_chip_whose_results_all_stand_still_is_frozen_within_a_second(
+    bench: FaultBench, value_ff: float | None
+) -> None:
+    for taxel in range(12):
+        bench.inject("stuck_taxel", **HERE, taxel=taxel, value=value_ff)
+    bench.run(1.0)
+    assert ("triangle_frozen", "forearm_outer/3") in bench.told
+    assert not bench.valid["left_forearm"][36:48].any()
+    assert not bench.touched["left_forearm"][36:48].any()
 
 
 def test_a_chip_that_comes_back_is_believed_again(bench: FaultBench) -> None:

@@ -1,5 +1,6 @@
 """Sweeps of boards become samples of parts, in order of time, and silence is told."""
 
+import dataclasses
 from functools import cache
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 from skin_host.bus.assembler import Sweep
 from skin_host.cli.common import load_skin
 from skin_host.engine import Engine
-from skin_host.processing.intake import PartSample
+from skin_host.processing.intake import PartSample, _unpressable
 
 MS = 1_000_000
 PERIOD = 50 * MS
@@ -104,6 +105,20 @@ def test_a_triangle_far_out_of_range_both_ways_is_not_pressed_but_dead():
     dead.raw[:, 0] = 255
     (sample,) = intake().feed([dead, sweep(INNER, PERIOD)])
     assert not sample.present[: 16 * 12].any()
+
+
+def test_pads_that_say_more_than_any_press_could_are_a_dead_chips() -> None:
+    """Shift 2: far is 691 fF, of pads that end at 360 fF. Three of twelve still look pressed."""
+    (sample,) = intake().feed([sweep(OUTER, PERIOD, status=far(9), fill=0), sweep(INNER, PERIOD)])
+    assert not sample.present[: 16 * 12].any()
+
+
+def test_fine_scales_can_be_pressed_far_out() -> None:
+    """Shift 0, as on some fingertips: far is 173 fF, and what is left of the triangle counts."""
+    _, layout = skin()
+    fine = dataclasses.replace(layout, unit_ff=np.full(layout.n_taxels, 0.36))
+    assert not _unpressable(fine, OUTER, 360.0).any()
+    assert _unpressable(layout, OUTER, 360.0).all()
 
 
 def test_a_torn_pad_does_not_silence_the_pressed_ones_beside_it():
