@@ -102,9 +102,21 @@ async def embedded_broker() -> AsyncIterator[LocalBroker]:
             "no MQTT broker: neither mosquitto nor the package amqtt is installed; mend it with: "
             "apt install mosquitto, or pip install 'skin-host[demo]'"
         ) from None
+
+    class TidyBroker(Broker):  # type: ignore[misc]
+        """Ends a connection without a word where amqtt lets asyncio cancel it as a failure."""
+
+        async def stream_connected(
+            self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, listener_name: str
+        ) -> None:
+            try:
+                await super().stream_connected(reader, writer, listener_name)
+            except asyncio.CancelledError:
+                writer.close()
+
     port = _free_port()
     everybody = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}}
-    broker = Broker(
+    broker = TidyBroker(
         BrokerConfig(
             listeners={"default": ListenerConfig(bind=f"{HOST}:{port}")}, plugins=everybody
         )

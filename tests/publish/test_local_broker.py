@@ -1,8 +1,9 @@
 """The demo finds a broker on every machine."""
 
 import asyncio
+import socket
 import sys
-from collections.abc import Callable
+from typing import Any
 
 import aiomqtt
 import numpy as np
@@ -14,12 +15,7 @@ from skin_host.processing.pipeline import PressureFrame
 from skin_host.publish import broker as local
 from skin_host.publish.mqtt import Publisher
 from skin_host.settings import Mqtt
-
-
-async def until(condition: Callable[[], object]) -> None:
-    async with asyncio.timeout(20.0):
-        while not condition():  # noqa: ASYNC110
-            await asyncio.sleep(0.01)
+from tests.support.waiting import until
 
 
 async def publish_and_listen(host: str, port: int, protocol: str) -> list[str]:
@@ -94,3 +90,18 @@ async def test_a_mosquitto_that_does_not_start_is_an_error_that_says_so() -> Non
     with pytest.raises(BrokerError, match="did not start"):
         async with local.mosquitto_broker("/bin/false"):
             pass
+
+
+def test_a_connection_that_is_left_when_the_program_ends_is_no_failure() -> None:
+    pytest.importorskip("amqtt")
+    told: list[dict[str, Any]] = []
+
+    async def leave() -> None:
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: told.append(context))
+        async with local.embedded_broker() as broker:
+            client.connect((broker.host, broker.port))
+            await asyncio.sleep(0.2)  # until the broker waits for the client's first words
+
+    with socket.socket() as client:
+        asyncio.run(leave())
+    assert told == []
