@@ -135,7 +135,7 @@ class ContactTracker:
         groups = self._joined(self._groups(self._touched(frame)), frame)
         if self._places is not None:
             groups = self._places.look(frame, groups, self._neighbours)
-        groups = self._kept_whole(groups, frame.t_ns)
+        groups = self._kept_whole(groups, frame)
         names = self._identify(groups)
         events = [
             self._closed(name, frame.seq, frame.t_ns)
@@ -234,11 +234,13 @@ class ContactTracker:
                     way.append(other)
         return reached
 
-    def _kept_whole(self, groups: list[frozenset[int]], t_ns: int) -> list[frozenset[int]]:
+    def _kept_whole(
+        self, groups: list[frozenset[int]], frame: PressureFrame
+    ) -> list[frozenset[int]]:
         """The groups, with pieces of one contact taken together that have just come apart.
 
         As a contact begins or lets go its taxels pass their thresholds one by one, and for a
-        moment it is an archipelago.
+        moment it is an archipelago. Pieces that hardly feel anything never become contacts.
         """
         if self._are_as_before(groups):
             for contact in self._contacts.values():
@@ -257,12 +259,16 @@ class ContactTracker:
             contact = self._contacts[name]
             if len(parts) < 2:
                 contact.parted_ns = None
-            elif contact.parted_ns is None:
-                contact.parted_ns = t_ns
-            if contact.parted_ns is not None and 0 <= t_ns - contact.parted_ns < PARTED_NS:
+                kept += parts
+                continue
+            if contact.parted_ns is None:
+                contact.parted_ns = frame.t_ns
+            strong = [part for part in parts if frame.pressure_kpa[list(part)].max() >= FELT_KPA]
+            if 0 <= frame.t_ns - contact.parted_ns < PARTED_NS or len(strong) < 2:
                 kept.append(frozenset().union(*parts))
             else:
-                kept += parts
+                strong.sort(key=len)
+                kept += [*strong[:-1], strong[-1].union(*(set(parts) - set(strong)))]
         return sorted(kept, key=min)
 
     def _identify(self, groups: list[frozenset[int]]) -> list[int]:

@@ -142,6 +142,13 @@ def test_where_a_contact_parts_the_larger_piece_keeps_the_name():
     ]
 
 
+def test_a_piece_that_hardly_feels_anything_is_no_contact_of_its_own():
+    skin = Skin()
+    skin.show(set(range(12)))
+    for _ in range(20):
+        assert kinds(skin.show({0}, {4, 5, 6}, kpa=1.0)) in ([], [("move", 1)])
+
+
 def test_a_change_of_pressure_moves_and_noise_does_not():
     skin = Skin()
     skin.show(HERE, kpa=20.0)
