@@ -31,7 +31,7 @@ MEMORY_S = 300.0
 STEP_SAMPLES = 20
 #: A calibration is worth so many samples of runs that have begun.
 CALIBRATED_SAMPLES = 100
-#: However lively it was, a pad is not given up before it repeats so often: ODDS at this rate.
+#: No pad is taken to move more often than in so many of its samples, nor to have less noise.
 MOST_RATE = 0.8
 LEAST_NOISE_UNITS = 0.1
 #: A quiet pad at the edge between two bytes moves often until it drifts away from there. Its rate
@@ -49,7 +49,7 @@ class StuckPads:
 
     Args:
         noise_units: float64[k, 12], calibrated noise of the bytes.
-        share: of its samples are new conversions.
+        share: how many of its samples are new conversions, 0 to 1.
         period_s: how often the board sends.
         repeats: tells which pads say something new.
 
