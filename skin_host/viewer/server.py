@@ -165,11 +165,14 @@ class Viewer:
 
     async def _tell(self, page: ServerConnection) -> None:
         cursor = Cursor()
+        now_s = asyncio.get_running_loop().time
+        due_s = now_s()
         while True:
             # Sending waits for a slow page; what comes meanwhile is passed over.
             for message in self._picture.news(cursor):
                 await page.send(message)
-            await asyncio.sleep(TICK_S)
+            due_s = max(due_s + TICK_S, now_s())
+            await asyncio.sleep(due_s - now_s())
 
     async def _take_wish(self, page: ServerConnection, message: str | bytes) -> None:
         try:
