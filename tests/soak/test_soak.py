@@ -78,6 +78,7 @@ def test_an_accelerated_month(tmp_path: Path) -> None:
     t_ns = 1_700_000_000_000_000_000
     count = int(DAYS * 86_400_000 / PERIOD_MS)
     events: Counter[str] = Counter()
+    told: Counter[str] = Counter()
     planned = 0
     sizes: list[int] = []
     engine.begin_calibration(20.0)
@@ -92,7 +93,9 @@ def test_an_accelerated_month(tmp_path: Path) -> None:
         ids, data = encode_sweep(1, triangle, values[None].astype(np.uint8), status)
         times = np.array([t_ns, t_ns + 120_000])
         batch = FrameBatch(ids, np.full(2, 8, np.uint8), data, times)
-        steps = engine.feed("can0", batch) + engine.expire(t_ns + 150_000)
+        steps = engine.feed("can0", batch)
+        health.note_sweeps(engine.sweeps)
+        steps += engine.expire(t_ns + 150_000)
         health.note_sweeps(engine.sweeps)
         for step in steps:
             health.note_step(step)
@@ -100,7 +103,7 @@ def test_an_accelerated_month(tmp_path: Path) -> None:
         if number % 5 == 0:
             health.tick(t_ns, {}, {})
         if number % 25 == 0:
-            health.record(0, t_ns, {}, {})
+            told.update(fault["code"] for fault in health.record(0, t_ns, {}, {})["faults"])
         if engine.calibrating and engine.calibration_progress() >= 1.0:
             engine.use(engine.end_calibration("2026-01-01T00:00:00+00:00"))
         if t_ns >= next_hour_ns:
@@ -115,6 +118,7 @@ def test_an_accelerated_month(tmp_path: Path) -> None:
     assert (counters.frames, counters.sweeps) == (2 * count, count)
     assert counters.incomplete == counters.halves == counters.missed == counters.late == 0
     assert events["begin"] == events["end"] == planned
+    assert set(told) == {"part_not_calibrated"}, told
     logging.info("%g days: %d sweeps, %d touches", DAYS, count, planned)
     if sizes:
         tell_growth("at the end", sizes)
