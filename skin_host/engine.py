@@ -331,7 +331,7 @@ class Engine:
             fitted = taxels >= 0
             baseline = np.where(fitted, self._pipeline.baseline[taxels], 0.0)
             found = rezero.finish(baseline, self.calibration.noise[taxels])
-            self._pipeline.baseline[taxels[fitted]] = found[fitted]
+            self._pipeline.take_zero(taxels[fitted], found[fitted])
         elif rezero.settled(sweep.t_ns):
             self._intake.veto[sweep.board] = self.in_doubt(sweep.board)
 

@@ -124,6 +124,22 @@ class Pipeline:
         """
         return self._parts[part_index].step(raw, present, t_ns, pressures)
 
+    def take_zero(self, taxels: NDArray[np.int32], baseline: NDArray[np.float64]) -> None:
+        """Go on from new baselines: a board has taken its zero anew.
+
+        What was received of the taxels before is told against the old zero, so it is forgotten:
+        they are untouched until their next sample.
+
+        Args:
+            taxels: int32[k], which ones.
+            baseline: float64[k], theirs from now on, in units.
+        """
+        self.baseline[taxels] = baseline
+        anew = np.zeros(len(self.baseline), np.bool_)
+        anew[taxels] = True
+        for part in self._parts:
+            part.begin_anew(anew)
+
     def seq(self, part_index: int) -> int:
         """Number of the part's next frame."""
         return self._parts[part_index].seq
@@ -150,7 +166,7 @@ class _PartPipeline:
         curve: PressureCurve,
         on_units: NDArray[np.float64],
     ) -> None:
-        mine = slice(part.start, part.stop)
+        self._mine = mine = slice(part.start, part.stop)
         m = part.n_taxels
         self._name = part.name
         self.seq = 0
@@ -204,7 +220,7 @@ class _PartPipeline:
         self._near_raw = np.empty(m, np.uint8)
         self._beyond_raw = np.empty(m, np.uint8)
         self._renew_limits()
-        self._last_raw = np.rint(np.clip(self._offset, 0.0, 255.0)).astype(np.uint8)
+        self._last_raw = self._untouched_raw()
         self._bytes = np.empty(m, np.float32)
         self._near = np.empty(m, np.bool_)
         self._nowhere = _constant(np.zeros(m, np.bool_))
@@ -249,6 +265,15 @@ class _PartPipeline:
             beyond = beyond & valid
         return self._frame(t_ns, raw, valid, pressure, touched, beyond, True)
 
+    def begin_anew(self, taxels: Mask) -> None:
+        """Forget the last samples of some taxels, bool[n] over the skin: baselines are new."""
+        anew = taxels[self._mine]
+        if not _any(anew):
+            return
+        self._renew_limits()
+        self._last_raw = np.where(anew, self._untouched_raw(), self._last_raw)
+        self._detector.reset(anew)
+
     def _frame(
         self,
         t_ns: int,
@@ -285,6 +310,9 @@ class _PartPipeline:
             return self._always_valid
         np.logical_or(self._was_missing, ~valid, out=self._was_missing)
         return valid
+
+    def _untouched_raw(self) -> NDArray[np.uint8]:
+        return np.rint(np.clip(self._offset, 0.0, 255.0)).astype(np.uint8)
 
     def _is_quiet(self) -> bool:
         """Whether no taxel can be touched, nor was in the samples that still have a vote."""

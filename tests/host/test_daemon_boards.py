@@ -8,7 +8,7 @@ import can
 import numpy as np
 import pytest
 
-from emulator.scene import Fault
+from emulator.scene import Fault, Place, Probe
 from skin_host.bus.protocol import FrameBatch
 from skin_host.bus.protocol.commands import (
     SetTriangleConfig,
@@ -61,15 +61,23 @@ async def test_what_was_touched_at_a_new_zero_is_in_doubt_until_calibrated(
     async with living(can_bus_settings, tmp_path) as live:
         await live.until_well(but=LATELY)
         engine = live.daemon.engine
-        # As the pipeline would say it of taxels 0 to 3, the little that matters here.
         part = engine.layout.part("left_hand")
-        engine._touched[part.start : part.start + 4] = True
+        touched = engine._touched[part.start : part.stop]
+        probe = live.robot.touch(
+            Probe(part="left_hand", at=Place(taxel=3), diameter_mm=4, force_n=[(0, 1)])
+        )
+        probe.press(2.0)
+        await live.wait(lambda: bool(touched[3]))
         await live.daemon.configure([0])
         await live.until("board_in_doubt")
 
         def only_the_touched() -> bool:
-            return live.daemon.records()["left_hand"]["invalid"] == [0, 1, 2, 3]
+            return live.daemon.records()["left_hand"]["invalid"] == [3]
 
+        await live.wait(only_the_touched)
+        # What was zero under a press lies beyond the scale without it: the board takes zero again.
+        probe.lift()
+        await live.daemon.configure([0])
         await live.wait(only_the_touched)
         await live.daemon.calibrate(1.0, [0])
         await live.until_well(but=LATELY)

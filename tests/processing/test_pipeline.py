@@ -284,3 +284,26 @@ def test_a_taxel_touched_for_long_and_a_baseline_at_its_limit_are_told():
     for sweep in range(600):
         rig.step(0.01 * sweep)
     assert rig.pipeline.at_limit(0).all()
+
+
+def test_a_new_zero_forgets_what_was_received_against_the_old_one():
+    rig = Rig(1, 0.3, processing=NO_RELAXATION)
+    press(rig, 0.0, 20)
+    # Whatever the bytes were before the new zero: untouched is 244 from now on.
+    vetoed = np.ones(rig.n, bool)
+    vetoed[:12] = False
+    raw = rig.read(0.0)
+    raw[:12] = 244
+    rig.pipeline.take_zero(
+        np.arange(12, dtype=np.int32), np.full(12, float(rig.layout.no_load[0]) - 244.0)
+    )
+    for present in (vetoed, vetoed, vetoed, ~np.zeros(rig.n, bool)):
+        rig.t_ns += 40_000_000
+        frame = rig.pipeline.step(0, raw, present, rig.t_ns)
+        assert not frame.touched.any()
+    assert frame.valid.all()
+    raw[3] = 214
+    rig.t_ns += 40_000_000
+    rig.pipeline.step(0, raw, np.ones(rig.n, bool), rig.t_ns)
+    frame = rig.pipeline.step(0, raw, np.ones(rig.n, bool), rig.t_ns + 40_000_000)
+    assert np.flatnonzero(frame.touched).tolist() == [3]
