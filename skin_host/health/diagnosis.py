@@ -5,7 +5,7 @@ can act on. `docs/operations.md` lists the codes and what to do about each.
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from typing import Any
 
 from msgspec import Struct
@@ -190,8 +190,8 @@ def _board(board: BoardHealth) -> Iterator[Fault]:
         yield Fault(
             "board_in_doubt",
             name,
-            f"{here} took its zero while {board['in_doubt']} taxels were touched; they are not "
-            f"valid until calibrated: skin command calibrate --board {name}",
+            f"{here} took its zero while it was touched (taxels: {board['in_doubt']}); those are "
+            f"not valid until calibrated: skin command calibrate --board {name}",
         )
     if events.get("tx_overflows"):
         yield Fault("board_overflows", name, f"{here} could not send all its frames: bus too full")
@@ -265,15 +265,15 @@ def _triangles(record: Record, silent: set[str]) -> Iterator[Fault]:
 def _taxels(record: Record) -> Iterator[Fault]:
     part = record["part"]
     says = {
-        "stuck": "repeat the same byte in a triangle that is otherwise alive; they are not valid",
-        "noisy": "jump up and down far more than when calibrated; they are not valid",
-        "out_of_range": "read far outside their range; they are not valid",
-        "drifting": "have drifted far from their calibration; calibrate when nothing touches",
+        "stuck": "the same byte for too long in a triangle that is otherwise alive; not valid",
+        "noisy": "up and down far more than when calibrated; not valid",
+        "out_of_range": "far out of range; not valid",
+        "drifting": "far from the calibration by now; calibrate when nothing touches",
     }
     for kind, what in says.items():
         taxels = record["taxel_faults"].get(kind)
         if taxels:
-            yield Fault(f"taxel_{kind}", part, f"taxels {_list(taxels)} of {part} {what}")
+            yield Fault(f"taxel_{kind}", part, f"{_named(taxels)} of {part}: {what}")
     verdicts = record["taxel_verdicts"]
     # What a triangle that is told of did not send, was absent because of that.
     kinds = ["stuck", "out_of_range"] + ["absent", "too_few"] * (not record["triangles"])
@@ -283,22 +283,22 @@ def _taxels(record: Record) -> Iterator[Fault]:
         yield Fault(
             "taxel_refused",
             part,
-            f"taxels {_list(refused)} of {part} were stuck, out of range, absent or heard "
-            "too rarely when calibrated; they are not valid until a calibration finds them well",
+            f"{_named(refused)} of {part}: stuck, out of range, absent or heard too rarely when "
+            "calibrated; not valid until a calibration says better",
         )
     if record["baseline_at_limit"]:
-        at_limit = _list(record["baseline_at_limit"])
+        at_limit = _named(record["baseline_at_limit"])
         yield Fault(
             "taxel_at_limit",
             part,
-            f"the baselines of taxels {at_limit} of {part} cannot follow any farther; calibrate",
+            f"{at_limit} of {part}: the baseline cannot follow any farther; calibrate",
         )
     if record["baseline_frozen"]:
-        held = _list(record["baseline_frozen"])
+        held = _named(record["baseline_frozen"])
         yield Fault(
             "taxel_held",
             part,
-            f"taxels {held} of {part} have been touched for so long that their zero is uncertain",
+            f"{held} of {part}: touched for so long that the zero is uncertain",
         )
 
 
@@ -343,6 +343,10 @@ def _output(output: dict[str, Any] | None) -> Iterator[Fault]:
         )
     if output["refused"]:
         yield Fault("broker_refuses", "broker", f"the broker refuses: {output['last_error']}")
+
+
+def _named(taxels: Collection[int]) -> str:
+    return f"{'taxel' if len(taxels) == 1 else 'taxels'} {_list(taxels)}"
 
 
 def _list(numbers: Iterable[int]) -> str:

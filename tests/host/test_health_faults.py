@@ -109,7 +109,7 @@ def test_a_taxel_that_the_calibration_refused_is_told(bench: FaultBench) -> None
     refused = record | {"taxel_verdicts": {"out_of_range": [5, 6], "noisy": [7]}, "invalid": [5, 7]}
     (fault,) = diagnose(refused)
     assert (fault.code, fault.where) == ("taxel_refused", "left_hand")
-    assert "taxels 5 of left_hand" in fault.says
+    assert "taxel 5 of left_hand" in fault.says
 
 
 def test_the_new_zero_of_a_board_is_found_by_itself() -> None:
