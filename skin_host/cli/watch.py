@@ -31,7 +31,12 @@ def add_commands(commands: Commands) -> None:
     listen.add_argument("--count", type=int, metavar="N", help="end after N lines")
     listen.set_defaults(run=_listen)
 
-    status = add_command(commands, "status", "show how every part is", "skin status --json")
+    status = add_command(
+        commands,
+        "status",
+        "show how every part is; exit status 1 unless all is well",
+        "skin status --json",
+    )
     add_broker(status)
     status.add_argument("--json", action="store_true", help="one JSON document")
     status.set_defaults(run=_status)
@@ -134,8 +139,8 @@ def _status(arguments: argparse.Namespace) -> int:
     records = asyncio.run(health_of_all(arguments.broker, arguments.robot))
     if arguments.json:
         print_json(records)
-        return 0
-    print(status_table(records))
+    else:
+        print(status_table(records))
     return 0 if all(record.get("state") == "ok" for record in records.values()) else 1
 
 

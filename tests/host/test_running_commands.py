@@ -81,7 +81,7 @@ async def test_a_daemon_that_has_gone_leaves_no_part_that_looks_well(
     ):
         assert await skin("status", "--json", "--broker", url) in (0, 1)
         before = json.loads(capsys.readouterr().out)
-    assert await skin("status", "--json", "--broker", url) == 0
+    assert await skin("status", "--json", "--broker", url) == 1
     after = json.loads(capsys.readouterr().out)
     for part in ("left_hand", "left_forearm"):
         assert before[part]["state"] != "offline"
