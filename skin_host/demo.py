@@ -26,7 +26,6 @@ log = logging.getLogger(__name__)
 
 CALIBRATION_S = 3.0
 PAGE_PORT = 8080
-LAST_EVENTS_S = 10.0
 VCAN = "vcan0"
 #: So long may the last events be on their way through the broker.
 LAST_EVENTS_S = 5.0

@@ -19,6 +19,7 @@ from skin_host.processing.contacts import ContactTracker, TouchEvent
 from skin_host.processing.intake import Intake, PartSample
 from skin_host.processing.liveness import PADS, Liveness
 from skin_host.processing.pipeline import Pipeline, PressureFrame
+from skin_host.processing.pressure import vertex
 from skin_host.processing.repeats import Repeats
 from skin_host.processing.rezero import Rezero
 from skin_host.settings import Settings, skin_hash
@@ -108,13 +109,12 @@ class Engine:
         self.touch_only: set[int] = set()
         self.liveness = self._new_liveness(self.boards)
         curve = settings.processing.pressure
-        full_ff = -0.5 * curve.b_kpa_per_ff / curve.a_kpa_per_ff2 if curve.a_kpa_per_ff2 else np.inf
         self._intake = Intake(
             layout,
             parts,
             settings.receive.silent_periods,
             self.liveness,
-            full_ff if full_ff > 0.0 else np.inf,
+            float(vertex(curve.a_kpa_per_ff2, curve.b_kpa_per_ff)),
         )
         self.rezeros = dict.fromkeys(self.boards, 0)
         self._rezeros: dict[int, Rezero] = {}

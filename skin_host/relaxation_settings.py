@@ -11,6 +11,7 @@ from msgspec import Struct
 
 from skin_host.errors import ConfigurationError
 from skin_host.fields import NotNegative, Positive
+from skin_host.files import read_document
 
 RELAXATION_SCHEMA = "skin.relaxation/1"
 
@@ -86,14 +87,7 @@ def with_file(table: Relaxation, configuration: Path) -> Relaxation:
             "make one with: skin calibrate CONFIG --relaxation LOG"
         )
 
-    try:
-        found = msgspec.json.decode(file.read_bytes(), type=RelaxationFile)
-    except OSError as error:
-        raise wrong(f"cannot be read: {error.strerror}") from None
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise wrong(f"not a relaxation file: {error}") from None
-    if found.schema != RELAXATION_SCHEMA:
-        raise wrong(f'schema "{found.schema}", wanted "{RELAXATION_SCHEMA}"')
+    found = read_document(file, RelaxationFile, RELAXATION_SCHEMA, "relaxation", wrong)
     return msgspec.structs.replace(
         table,
         model=found.model,

@@ -161,12 +161,7 @@ class Boards:
         while record.busy is not None:
             await asyncio.wait([record.busy])
         # Busy, so that nobody sees to its silence meanwhile.
-        task = asyncio.create_task(self._set_up(record), name=f"board {record.layout.name}")
-        record.busy = task
-        try:
-            await task
-        finally:
-            record.busy = None
+        await self._occupy(record, self._set_up(record))
 
     async def _set_up(self, record: BoardRecord) -> None:
         address = record.layout.settings.address
@@ -260,10 +255,19 @@ class Boards:
                 await work
             except BusError as error:
                 log.debug("bus %s: %s", self.bus, error)
-            finally:
-                record.busy = None
 
-        record.busy = asyncio.create_task(do(), name=f"board {record.layout.name}")
+        self._occupy(record, do())
+
+    @staticmethod
+    def _occupy(record: BoardRecord, work: Coroutine[None, None, None]) -> "asyncio.Task[None]":
+        """Begin what nothing else is done to the board beside."""
+
+        def end(_: "asyncio.Task[None]") -> None:
+            record.busy = None
+
+        record.busy = asyncio.create_task(work, name=f"board {record.layout.name}")
+        record.busy.add_done_callback(end)
+        return record.busy
 
     async def _revive(self, record: BoardRecord) -> None:
         """Ask a silent board who it is and how long it has been up; do what that calls for."""

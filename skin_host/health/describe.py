@@ -149,8 +149,9 @@ class Describer:
         if liveness.unproven[number]:
             return "silenced" if watch.error[number] else "constant"
         # Single pads are told with the taxels; here it is the whole triangle.
-        many = np.count_nonzero(out_of_range(status)) >= FAR_PADS
-        other = lifted(sweep.raw[number : number + 1], status)[0]
+        far = out_of_range(status)
+        many = np.count_nonzero(far) >= FAR_PADS
+        other = lifted(sweep.raw[number : number + 1], far)[0]
         return "out of range" if many or other else None
 
     def _taxel_faults(self, part: int, pressure: NDArray[np.bool_]) -> dict[str, list[int]]:

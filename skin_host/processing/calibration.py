@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.errors import CalibrationError, OtherSkinError
-from skin_host.files import write_atomic
+from skin_host.files import read_document, write_atomic
 from skin_host.layout import Layout, PadKind
 
 SCHEMA = "skin.calibration/1"
@@ -343,14 +343,7 @@ def load(path: Path, layout: Layout, configuration: str) -> Calibration:
     def refused(what: str) -> CalibrationError:
         return CalibrationError(f"{path}: {what}; take a new one with: skin calibrate CONFIG")
 
-    try:
-        content = msgspec.json.decode(path.read_bytes(), type=_File)
-    except OSError as error:
-        raise refused(f"cannot be read: {error.strerror}") from None
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise refused(f"not a calibration file: {error}") from None
-    if content.schema != SCHEMA:
-        raise refused(f'schema "{content.schema}", wanted "{SCHEMA}"')
+    content = read_document(path, _File, SCHEMA, "calibration", refused)
     if content.configuration != configuration:
         raise OtherSkinError(
             f"{path}: belongs to configuration {content.configuration} "

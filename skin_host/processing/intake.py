@@ -227,8 +227,8 @@ def _trusted(
     if sweep.status.any():
         erring = status_error(sweep.status) != 0
         here &= ~erring
-        here &= ~lifted(sweep.raw, sweep.status)
         far = out_of_range(sweep.status)
+        here &= ~lifted(sweep.raw, far)
         here &= ~(unpressable & (np.count_nonzero(far, axis=1) >= FAR_PADS))
         trusted = ~far & here[:, None]
     else:
@@ -250,13 +250,16 @@ def _unpressable(layout: Layout, board: int, full_ff: float) -> NDArray[np.bool_
     return found
 
 
-def lifted(raw: NDArray[np.uint8], status: NDArray[np.uint16]) -> NDArray[np.bool_]:
+def lifted(raw: NDArray[np.uint8], far: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Triangles bool[k] whose pads read far below zero pressure: that is not their chip.
 
     Pressing cannot do it. Plugs of data lines that were swapped, or a chip at another one's
     address, put the pads of one triangle on the baselines of another.
+
+    Args:
+        raw: uint8[k, 12].
+        far: bool[k, 12], pads that their status words call far out of range.
     """
-    far = out_of_range(status)
     below = np.count_nonzero(far & (raw == 255), axis=-1)
     torn = (below > 0) & (np.count_nonzero(far, axis=-1) >= FAR_PADS)
     found: NDArray[np.bool_] = (below >= LIFTED_PADS) | torn

@@ -31,7 +31,13 @@ from numpy.typing import NDArray
 
 from skin_host.bus.protocol.compensation import NO_GAIN
 from skin_host.processing.repeats import Repeats
-from skin_host.processing.stuck import TOUCHED_PACE, StuckPads, inside, longest_run
+from skin_host.processing.stuck import (
+    MOST_RATE,
+    TOUCHED_PACE,
+    StuckPads,
+    inside,
+    longest_run,
+)
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -42,9 +48,8 @@ CONVERSION_S = 0.0369
 #: A run of repeats with a probability below 1/odds is not chance.
 TRIANGLE_ODDS = 1e9
 #: However lively it was, a triangle is not given up in less than nine conversions (0.45 s at
-#: 20 Hz), and no pad of it is taken to move more often than in so many of its samples.
+#: 20 Hz).
 MOST_TRIANGLE_RATE = 0.9
-MOST_PAD_RATE = 0.8
 #: A triangle that the calibration saw move at all is expected to move so often at least.
 LEAST_TRIANGLE_RATE = 0.02
 #: Rates follow what is seen over about this time, in steps of about this many samples.
@@ -119,7 +124,7 @@ class Liveness:
         self._memory = RATE_MEMORY_S / max(period_s, CONVERSION_S)
         self._seen = CALIBRATED_S / max(period_s, CONVERSION_S)
         self._pads = StuckPads(noise_units, self._share, period_s, repeats)
-        self._rate: Floats = np.minimum(change_rate(noise_units), MOST_PAD_RATE)
+        self._rate: Floats = np.minimum(change_rate(noise_units), MOST_RATE)
         self._triangle_rate: Floats = 1.0 - np.prod(1.0 - self._rate, axis=1)
         # What is too much noise nobody knows before the calibration.
         jump = np.maximum(NOISY_UNITS, NOISY_SIGMAS * noise_units)
@@ -249,7 +254,7 @@ class Liveness:
 
     def _renew_limits(self) -> None:
         """How long a pad may repeat itself, and how much each repeat of a triangle tells."""
-        self._pad_expected = -self._share * np.log1p(-np.minimum(self._rate, MOST_PAD_RATE))
+        self._pad_expected = -self._share * np.log1p(-np.minimum(self._rate, MOST_RATE))
         together = np.clip(self._triangle_rate, LEAST_TRIANGLE_RATE, MOST_TRIANGLE_RATE)
         run = longest_run(together, self._seen, TRIANGLE_ODDS)
         self._expected = self._share * math.log(TRIANGLE_ODDS) / run

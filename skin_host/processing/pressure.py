@@ -15,6 +15,14 @@ B_KPA_PER_FF = 0.8141
 TANGENT_FROM = 0.9
 
 
+def vertex(square: ArrayLike, linear: ArrayLike) -> Array:
+    """Return where the parabolas square x^2 + linear x turn back; inf where they never do."""
+    bend = np.asarray(square, dtype=np.float64)
+    bent = bend < 0.0
+    turn = -np.asarray(linear, dtype=np.float64) / np.where(bent, 2.0 * bend, 1.0)
+    return np.where(bent, turn, np.inf)
+
+
 class PressureCurve:
     """C = gain (a S^2 + b S) with S = unit_ff times the activation, for each of n taxels.
 
@@ -46,7 +54,7 @@ class PressureCurve:
         self.linear: Array = factor * slope * unit
         bent = self.square < 0.0
         self.beyond_units: Array = np.full(unit.shape, np.inf)
-        vertex_units = -self.linear[bent] / (2.0 * self.square[bent])
+        vertex_units = vertex(self.square, self.linear)[bent]
         self.beyond_units[bent] = (1.0 - np.sqrt(1.0 - TANGENT_FROM)) * vertex_units
         self.tail_slope: Array = self.linear.copy()
         self.tail_slope[bent] += 2.0 * self.square[bent] * self.beyond_units[bent]
