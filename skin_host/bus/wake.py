@@ -27,8 +27,8 @@ GIVE_UP_NS = 10_000_000
 SLIP_NS = 50_000
 #: With a plan for every board, the ports are read at least this often.
 LONGEST_NS = 20_000_000
-#: With so many sweeps a second one is always due: then the reader rests for an interval of polling
-#: after each look, and in proportion with fewer, so that wake-ups never cost more than the frames.
+#: With so many sweeps a second one is always due: then looks begin an interval of polling apart,
+#: and in proportion with fewer, so that wake-ups never cost more than the frames.
 BUSY_HZ = 1000.0
 
 
@@ -100,9 +100,11 @@ class WakeUp:
 
             def wake() -> None:
                 try:
+                    began_ns = time.monotonic_ns()
                     work()
+                    rest_ns = self._rest_ns - (time.monotonic_ns() - began_ns)
                     now_ns = time.time_ns()
-                    timer.set(max(self._plan.next_ns(now_ns) - now_ns, self._rest_ns, 1))
+                    timer.set(max(self._plan.next_ns(now_ns) - now_ns, rest_ns, 1))
                 except Exception as error:
                     loop.remove_reader(timer.fileno)
                     if not failure.done():

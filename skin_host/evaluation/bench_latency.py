@@ -4,6 +4,9 @@ Four processes, as on a robot: a sender that fills a bus with the frames of seve
 which is pressed and released; the daemon at its default settings; mosquitto; a subscriber. The
 delay is the time at which the message was received less its `t_ns`, the kernel's time stamp of
 the frame that completed the sweep. All share one clock.
+
+Beside it, in the same run and at the same load: how long a message of that size takes from
+another program to that subscriber, which is what no daemon could do without.
 """
 
 import asyncio
@@ -12,6 +15,7 @@ import logging
 import multiprocessing
 import tempfile
 import time
+from collections import defaultdict
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -31,6 +35,11 @@ from skin_host.publish.broker import find_mosquitto, mosquitto_broker
 _READY_S = 60.0
 _CALIBRATION_S = 1.0
 _PRESSED_BOARD, _PRESSED_TRIANGLE, _PRESSED_TAXELS = 3, 7, slice(2, 6)
+
+#: Messages of another program: so far apart, and about as long as a touch.
+_PLAIN_S = 0.028
+_PLAIN_TOPIC = "skin/bench/plain/touch"
+_PLAIN_BYTES = 300
 
 Document = dict[str, Any]
 
@@ -53,11 +62,22 @@ def run(*, quick: bool = False) -> Document:
 
 def describe(document: Document) -> str:
     """The document as text."""
+    plain = document["plain"]
+    p50, p99 = (document[key] / plain[key] for key in ("delay_p50_us", "delay_p99_us"))
     return (
         f"From the last CAN frame of a sweep ({document['transport']}, "
         f"{document['frames_per_s']} frames/s) to the touch at a subscriber of mosquitto:\n"
-        f"  {document['messages']} messages   p50 {document['delay_p50_us'] / 1e3:.2f} ms   "
-        f"p99 {document['delay_p99_us'] / 1e3:.2f} ms   max {document['delay_max_us'] / 1e3:.2f} ms"
+        f"{_line(document)}\n"
+        "A message of that length from another program to that subscriber, at the same load:\n"
+        f"{_line(plain)}\n"
+        f"Frame to touch takes {p50:.1f} times as long at p50, {p99:.1f} times at p99."
+    )
+
+
+def _line(row: Document) -> str:
+    return (
+        f"  {row['messages']} messages   p50 {row['delay_p50_us'] / 1e3:.2f} ms   "
+        f"p99 {row['delay_p99_us'] / 1e3:.2f} ms   max {row['delay_max_us'] / 1e3:.2f} ms"
     )
 
 
@@ -73,7 +93,7 @@ async def _run(program: str, seconds: float) -> Document:
             context.Process(target=_daemon, args=(wire, stream, broker.port), daemon=True),
             context.Process(
                 target=send,
-                args=(sender_child_end, wire, stream, _READY_S + seconds, _scenes(stream)),
+                args=(sender_child_end, wire, stream, _READY_S + 2 * seconds, _scenes(stream)),
                 daemon=True,
             ),
         ]
@@ -85,24 +105,51 @@ async def _run(program: str, seconds: float) -> Document:
             listener_end.recv()
             sender_end.send(1)
             await asyncio.sleep(seconds)
-            listener_end.send("end")
-            delays_us = np.array(await asyncio.to_thread(listener_end.recv)) / 1e3
+            touches_ns = await _collected(listener_end)
+            await _publish_plain(broker.port, seconds)
+            plain_ns = (await _collected(listener_end))[_PLAIN_TOPIC]
         finally:
             for process in processes:
                 process.terminate()
                 process.join()
-    if not len(delays_us):
+    delays_ns = [delay_ns for delays_ns in touches_ns.values() for delay_ns in delays_ns]
+    if not delays_ns:
         raise SkinError("no touch was published")
-    p50, p99 = np.percentile(delays_us, [50, 99])
     return {
         "transport": wire.transport,
         "broker": "mosquitto",
         "frames_per_s": stream.frames_per_s,
+        **_row(delays_ns),
+        "plain": _row(plain_ns),
+    }
+
+
+def _row(delays_ns: list[int]) -> Document:
+    delays_us = np.array(delays_ns) / 1e3
+    p50, p99 = np.percentile(delays_us, [50, 99])
+    return {
         "messages": len(delays_us),
         "delay_p50_us": round(float(p50), 1),
         "delay_p99_us": round(float(p99), 1),
         "delay_max_us": round(float(delays_us.max()), 1),
     }
+
+
+async def _collected(listener: Connection) -> dict[str, list[int]]:
+    """The delays (ns) of what the subscriber has heard since it was asked last, by topic."""
+    listener.send(None)
+    delays_ns: dict[str, list[int]] = await asyncio.to_thread(listener.recv)
+    return delays_ns
+
+
+async def _publish_plain(broker_port: int, seconds: float) -> None:
+    """Publish messages that say when they were sent, as a touch does."""
+    filling = "-" * _PLAIN_BYTES
+    async with aiomqtt.Client("127.0.0.1", broker_port, timeout=10.0) as client:
+        for _ in range(round(seconds / _PLAIN_S)):
+            document = {"event": "plain", "t_ns": time.time_ns(), "filling": filling}
+            await client.publish(_PLAIN_TOPIC, json.dumps(document), qos=1)
+            await asyncio.sleep(_PLAIN_S)
 
 
 def _scenes(stream: Stream) -> list[NDArray[np.uint8]]:
@@ -129,32 +176,28 @@ def _daemon(wire: Wire, stream: Stream, broker_port: int) -> None:
 
 
 def _listen(parent: Connection, broker_port: int) -> None:
-    """Process: tell the parent that there is a calibration; then collect delays until told."""
+    """Process: tell the parent that there is a calibration; then collect delays for it."""
     asyncio.run(_collect(parent, broker_port))
 
 
 async def _collect(parent: Connection, broker_port: int) -> None:
-    delays_ns: list[int] = []
+    delays_ns: defaultdict[str, list[int]] = defaultdict(list)
+
+    def answer() -> None:
+        parent.recv()
+        parent.send(dict(delays_ns))
+        delays_ns.clear()
+
+    asyncio.get_running_loop().add_reader(parent.fileno(), answer)
     told = False
-    loop = asyncio.get_running_loop()
-    end = asyncio.Event()
-    loop.add_reader(parent.fileno(), end.set)
-
-    async def hear() -> None:
-        nonlocal told
-        async with aiomqtt.Client("127.0.0.1", broker_port, timeout=10.0) as client:
-            await client.subscribe("skin/bench/+/touch", qos=1)
-            await client.subscribe("skin/bench/nodes/+/info", qos=1)
-            async for message in client.messages:
-                now_ns = time.time_ns()
-                document = json.loads(message.payload)
-                if "event" in document:
-                    delays_ns.append(now_ns - document["t_ns"])
-                elif not told and document["calibration"] is not None:
-                    told = True
-                    parent.send(None)
-
-    hearing = asyncio.create_task(hear())
-    await end.wait()
-    parent.send(delays_ns)
-    hearing.cancel()
+    async with aiomqtt.Client("127.0.0.1", broker_port, timeout=10.0) as client:
+        await client.subscribe("skin/bench/+/touch", qos=1)
+        await client.subscribe("skin/bench/nodes/+/info", qos=1)
+        async for message in client.messages:
+            now_ns = time.time_ns()
+            document = json.loads(message.payload)
+            if "event" in document:
+                delays_ns[str(message.topic)].append(now_ns - document["t_ns"])
+            elif not told and document["calibration"] is not None:
+                told = True
+                parent.send(None)

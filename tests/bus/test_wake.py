@@ -119,7 +119,7 @@ async def test_an_idle_reader_does_not_spin():
     assert 1 <= calls <= 2 + elapsed_s / 0.02
 
 
-async def test_when_a_sweep_is_always_due_it_rests_for_a_poll_after_each_look():
+async def test_when_a_sweep_is_always_due_looks_begin_a_poll_apart():
     boards = dict.fromkeys(range(14), 10 * MS)
     wake_up = WakeUp(Receive(poll_ms=20.0), boards)
     calls = 0
