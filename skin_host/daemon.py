@@ -281,13 +281,15 @@ class Daemon:
     def _deliver(self, steps: list[Step]) -> None:
         self.fingertips.deliver()
         self.health.note_sweeps(self.engine.sweeps)
+        # Touches first: they leave before the frames are encoded.
         for step in steps:
-            self.health.note_step(step)
-            if step.part not in self.engine.touch_only:
-                self.publisher.put_frame(step.frame)
             for event in step.events:
                 self.publisher.put_touch(event)
+        for step in steps:
+            self.health.note_step(step)
             self.publisher.put_contact(step.frame.part, touched=bool(step.frame.touched.any()))
+            if step.part not in self.engine.touch_only:
+                self.publisher.put_frame(step.frame)
         # systemd's dog is fed here and nowhere else: after work that was done.
         now_s = time.monotonic()
         if self._feed_s is not None and now_s - self._fed_s > 0.5 * self._feed_s:

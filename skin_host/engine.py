@@ -212,6 +212,10 @@ class Engine:
         self.sweeps = self.assemblers[bus].feed(batch)
         return self._process(self._take(self.sweeps)) if self.sweeps else []
 
+    def judge(self) -> None:
+        """Do, while there is time, what the next sweep would have to wait for else."""
+        self._intake.judge()
+
     def expire(self, now_ns: int) -> list[Step]:
         """Hand on what has waited too long, on the clock of the frames' time stamps."""
         self.sweeps = [

@@ -86,6 +86,7 @@ class Link:
             record: called with each batch as it came.
         """
         engine = self._engine
+        loop = asyncio.get_running_loop()
         periods_ns = {
             i: engine.layout.boards[i].settings.period_ms * 1_000_000 for i in engine.boards
         }
@@ -119,6 +120,8 @@ class Link:
                     for number, t_ns in fingertips.sampled:
                         wake_up.sweep_ended(~number, t_ns)
                 deliver(steps)
+            # After what was delivered has been sent.
+            loop.call_soon(engine.judge)
             if not drained:
                 return
             self.read_ns = now_ns

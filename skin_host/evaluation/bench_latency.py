@@ -10,6 +10,7 @@ another program to that subscriber, which is what no daemon could do without.
 """
 
 import asyncio
+import gc
 import json
 import logging
 import multiprocessing
@@ -172,6 +173,7 @@ def _daemon(wire: Wire, stream: Stream, broker_port: int) -> None:
     with tempfile.TemporaryDirectory(prefix="skin-bench-") as state:
         settings.service.state_directory = state
         daemon = Daemon(settings, build_layout(settings, Path()))
+        gc.freeze()  # as `skin run` does
         asyncio.run(daemon.run(asyncio.Event(), calibrate=True))
 
 

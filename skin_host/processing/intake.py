@@ -3,6 +3,10 @@
 A part may be fed by several boards, each with its own clock. A sample of the part is
 ready when every board that is alive has given a sweep, or when one gives its second: no
 board waits for a dead one. What did not come, or came with an error, is not present.
+
+Whether a chip still lives takes longer to tell than all the rest of a sample takes, and is
+no matter of one sweep. So what a sweep says of that holds from the next one on, and is
+worked out by `judge` when there is time.
 """
 
 from dataclasses import dataclass, field
@@ -24,6 +28,12 @@ LIFTED_PADS = 2
 FAR_PADS = 7
 FAR_SHARE = 1.5
 _NONE_ERRS = np.zeros(TRIANGLES, np.bool_)
+_BITS = np.arange(TRIANGLES)
+
+Mask = NDArray[np.bool_]
+#: Of a sweep: its bytes, the triangles that came without an error, those with one, and the pads
+#: that were touched just before.
+_Seen = tuple[NDArray[np.uint8], Mask, Mask, Mask | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +51,8 @@ class PartSample:
 
     part: int
     raw: NDArray[np.uint8]
-    present: NDArray[np.bool_]
-    received: NDArray[np.bool_]
+    present: Mask
+    received: Mask
     t_ns: int
 
 
@@ -64,8 +74,8 @@ class _PartState:
     feeds: dict[int, _Feed]
     period_ns: int
     raw: NDArray[np.uint8]
-    present: NDArray[np.bool_]
-    received: NDArray[np.bool_]
+    present: Mask
+    received: Mask
     first_ns: int = 0
     last_ns: int = 0
     said_ns: int = 0
@@ -98,9 +108,10 @@ class Intake:
         full_ff: float = np.inf,
     ) -> None:
         self.liveness = liveness
-        self.veto: dict[int, NDArray[np.bool_]] = {}
-        self.touched: dict[int, NDArray[np.bool_]] = {}
+        self.veto: dict[int, Mask] = {}
+        self.touched: dict[int, Mask] = {}
         self._silent_periods = silent_periods
+        self._unjudged: dict[int, _Seen] = {}
         self._unpressable = {
             board: _unpressable(layout, board, full_ff)
             for part in parts
@@ -136,9 +147,8 @@ class Intake:
             states = self._of_board.get(sweep.board)
             if states is None:
                 continue
-            touched = self.touched.get(sweep.board)
-            unpressable = self._unpressable[sweep.board]
-            trusted = _trusted(sweep, self.liveness[sweep.board], touched, unpressable)
+            self._judge(sweep.board)
+            trusted = self._trusted(sweep)
             veto = self.veto.get(sweep.board)
             received = trusted.ravel()
             trusted = received if veto is None else (trusted & ~veto).ravel()
@@ -163,6 +173,16 @@ class Intake:
                 ):
                     self._emit(state, samples)
         return samples
+
+    def judge(self) -> None:
+        """Bring the liveness of all boards up to their last sweeps; `feed` does it else."""
+        for board in list(self._unjudged):
+            self._judge(board)
+
+    def _judge(self, board: int) -> None:
+        seen = self._unjudged.pop(board, None)
+        if seen is not None:
+            self.liveness[board].step(*seen)
 
     def expire(self, now_ns: int) -> list[PartSample]:
         """Hand on what has waited for a whole period, and say which parts are silent."""
@@ -189,6 +209,27 @@ class Intake:
                 self._emit(state, samples)
         return samples
 
+    def _trusted(self, sweep: Sweep) -> Mask:
+        """bool[16, 12]: the triangle came, its chip answers and lives, the value is in range."""
+        here = (sweep.present >> _BITS & 1).astype(np.bool_)
+        erring = _NONE_ERRS
+        trusted: Mask
+        if sweep.status.any():
+            erring = status_error(sweep.status) != 0
+            here &= ~erring
+            far = out_of_range(sweep.status)
+            here &= ~lifted(sweep.raw, far)
+            unpressable = self._unpressable[sweep.board]
+            here &= ~(unpressable & (np.count_nonzero(far, axis=1) >= FAR_PADS))
+            trusted = ~far & here[:, None]
+        else:
+            trusted = np.repeat(here[:, None], PADS, axis=1)
+        doubted = self.liveness[sweep.board].doubted
+        if doubted is not None:
+            trusted &= ~doubted
+        self._unjudged[sweep.board] = (sweep.raw, here, erring, self.touched.get(sweep.board))
+        return trusted
+
     def _emit(self, state: _PartState, samples: list[PartSample]) -> None:
         for feed in state.feeds.values():
             if not feed.fresh:
@@ -214,43 +255,18 @@ class Intake:
         state.silent_at_ns = state.last_ns + int(self._silent_periods * state.period_ns)
 
 
-def _trusted(
-    sweep: Sweep,
-    liveness: Liveness,
-    touched: NDArray[np.bool_] | None,
-    unpressable: NDArray[np.bool_],
-) -> NDArray[np.bool_]:
-    """bool[16, 12]: the triangle came, its chip answers and lives, the value is within range."""
-    here = (sweep.present >> np.arange(TRIANGLES) & 1).astype(np.bool_)
-    erring = _NONE_ERRS
-    trusted: NDArray[np.bool_]
-    if sweep.status.any():
-        erring = status_error(sweep.status) != 0
-        here &= ~erring
-        far = out_of_range(sweep.status)
-        here &= ~lifted(sweep.raw, far)
-        here &= ~(unpressable & (np.count_nonzero(far, axis=1) >= FAR_PADS))
-        trusted = ~far & here[:, None]
-    else:
-        trusted = np.repeat(here[:, None], PADS, axis=1)
-    doubted = liveness.step(sweep.raw, here, erring, touched)
-    if doubted is not None:
-        trusted &= ~doubted
-    return trusted
-
-
-def _unpressable(layout: Layout, board: int, full_ff: float) -> NDArray[np.bool_]:
+def _unpressable(layout: Layout, board: int, full_ff: float) -> Mask:
     """Triangles bool[16] of a board that nothing can press far out of their range.
 
     A pad is far out at twice the capacitance of all its units (reference of the wire, 4.3).
     """
     taxels = layout.boards[board].taxel_index[:, 0]
     far_ff = 2.0 * layout.no_load[taxels] * layout.unit_ff[taxels]
-    found: NDArray[np.bool_] = far_ff > FAR_SHARE * full_ff * layout.sensitivity[taxels]
+    found: Mask = far_ff > FAR_SHARE * full_ff * layout.sensitivity[taxels]
     return found
 
 
-def lifted(raw: NDArray[np.uint8], far: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def lifted(raw: NDArray[np.uint8], far: Mask) -> Mask:
     """Triangles bool[k] whose pads read far below zero pressure: that is not their chip.
 
     Pressing cannot do it. Plugs of data lines that were swapped, or a chip at another one's
@@ -262,5 +278,5 @@ def lifted(raw: NDArray[np.uint8], far: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """
     below = np.count_nonzero(far & (raw == 255), axis=-1)
     torn = (below > 0) & (np.count_nonzero(far, axis=-1) >= FAR_PADS)
-    found: NDArray[np.bool_] = (below >= LIFTED_PADS) | torn
+    found: Mask = (below >= LIFTED_PADS) | torn
     return found

@@ -103,6 +103,7 @@ class Liveness:
         unproven: bool[k], triangles that had an error, or were frozen, and have not shown
             since that they live.
         noisy: bool[k, 12], pads that jump up and down much more than when calibrated.
+        doubted: bool[k, 12], pads that are not to be believed, or None if all are.
         spikes: how often a single pad of a triangle was off for one sweep and back in the
             next: no sensor does that, a damaged frame does.
     """
@@ -136,6 +137,7 @@ class Liveness:
         self._present = np.zeros(k, np.bool_)
         self._step = np.zeros(shape, np.int16)
         self._jumping = np.zeros(shape)
+        self._any_jumping = False
         self._surprise = np.zeros(k)
         self._changes = np.zeros(shape, np.int64)
         self._alive = np.zeros(k, np.int64)
@@ -144,8 +146,10 @@ class Liveness:
         self.frozen: Mask = np.zeros(k, np.bool_)
         self.unproven: Mask = constant
         self.noisy: Mask = np.zeros(shape, np.bool_)
+        self.doubted: Mask | None = None
         self.spikes = 0
         self._renew_limits()
+        self._doubt()
 
     @property
     def stuck(self) -> Mask:
@@ -158,7 +162,7 @@ class Liveness:
         present: Mask,
         erring: Mask,
         touched: Mask | None = None,
-    ) -> Mask | None:
+    ) -> None:
         """Take one sweep.
 
         Args:
@@ -166,9 +170,6 @@ class Liveness:
             present: bool[k], triangles that came, and without an error in their status.
             erring: bool[k], triangles whose status word has an error.
             touched: bool[k, 12], pads that were touched a moment ago, if any was.
-
-        Returns:
-            bool[k, 12], pads that are not to be believed now, or None if all are.
         """
         compared = present & self._present
         changed = (raw != self._raw) & compared[:, None]
@@ -182,10 +183,11 @@ class Liveness:
             self._changes += changed
         if int(self._samples.max()) >= RATE_SAMPLES:
             self._learn()
-        if self.unproven.any() or self.stuck.any() or self.noisy.any():
-            doubted: Mask = self.unproven[:, None] | self.stuck | self.noisy
-            return doubted
-        return None
+        self._doubt()
+
+    def _doubt(self) -> None:
+        doubts = self.unproven.any() or self.stuck.any() or self.noisy.any()
+        self.doubted = self.unproven[:, None] | self.stuck | self.noisy if doubts else None
 
     def _note_triangles(
         self,
@@ -223,12 +225,12 @@ class Liveness:
 
     def _note_jumps(self, raw: NDArray[np.uint8], changed: Mask, compared: Mask) -> None:
         """A step up followed by a step down is noise; a touch goes one way at a time."""
-        step = np.where(changed, raw.astype(np.int16) - self._raw, 0).astype(np.int16)
+        step = np.where(changed, np.subtract(raw, self._raw, dtype=np.int16), np.int16(0))
         far = np.abs(step) > self._jump
-        jump = far & (np.abs(self._step) > self._jump) & ((step ^ self._step) < 0)
-        if not jump.any() and not self._jumping.any():
+        if not self._any_jumping and not far.any():
             np.copyto(self._step, step, where=compared[:, None])
             return
+        jump = far & (np.abs(self._step) > self._jump) & ((step ^ self._step) < 0)
         size = np.minimum(np.abs(step), np.abs(self._step))
         spike = jump & (size > self._spike)
         alone = np.count_nonzero(spike & (self._jumping < CALM_MEAN), axis=1) == 1
@@ -237,6 +239,7 @@ class Liveness:
         jumped = jump * np.minimum(size / self._jump, MOST_JUMP)
         self._jumping += compared[:, None] * (jumped - self._jumping) / NOISE_MEMORY_SAMPLES
         self._jumping[self._jumping < 1e-3] = 0.0
+        self._any_jumping = bool(self._jumping.any())
         self.noisy = self._jumping > np.where(self.noisy, CALM_MEAN, NOISY_MEAN)
 
     def _learn(self) -> None:

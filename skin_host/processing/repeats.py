@@ -35,7 +35,6 @@ class Repeats:
         self, gains: list[tuple[int, ...]], shifts: list[int], no_load: int, *, truncates: bool
     ) -> None:
         self._gain = np.array(gains) / 128
-        self._has_thermal = self._gain.any(axis=1)
         # Coarser bytes hide what compensation does to them.
         self._compensated = bool(self._gain.any()) and max(shifts) <= MOST_SHIFT
         if not self._compensated:
@@ -44,6 +43,10 @@ class Repeats:
         tables = [_words(gain, shift, no_load, truncates) for gain, shift in kinds]
         self._lowest = np.concatenate([lowest for lowest, _ in tables])
         self._pattern = np.concatenate([pattern for _, pattern in tables])
+        # At an end of its scale the thermal pad does not tell what was taken.
+        scale = np.arange(256)
+        tells = [((scale > 0) & (scale < 255)) | (not any(gain)) for gain, _ in kinds]
+        self._tells = np.concatenate(tells)[:, None]
         self._kind = np.array([256 * kinds.index(kind) for kind in zip(gains, shifts, strict=True)])
         self._shift = np.array(shifts, np.int64)[:, None]
         self._base = np.zeros(self._gain.shape, np.int64)
@@ -75,11 +78,8 @@ class Repeats:
         """
         if not self._compensated:
             return changed, within
-        thermal = raw[:, THERMAL_TAXEL]
-        # At an end of its scale the thermal pad does not tell what was taken.
-        known = ((thermal > 0) & (thermal < 255)) | ~self._has_thermal
-        told = within & known[:, None]
-        row = self._kind + thermal
+        row = self._kind + raw[:, THERMAL_TAXEL]
+        told = within & self._tells[row]
         base = self._lowest[row] - (raw << self._shift)
         words = self._pattern[row]
         up = np.minimum(np.maximum(base - self._base, -63), 63)

@@ -127,6 +127,12 @@ class Connection(aiomqtt.Client):
             self._sent[info.mid] = done
         return done
 
+    def flush(self) -> None:
+        """Write what was sent in this turn of the loop now, not at its end."""
+        sock = self._client.socket()
+        if sock is not None:
+            self._write(self._client, sock)
+
     async def _wait_for(self, fut: Any, timeout: float | None) -> Any:  # noqa: ASYNC109  # aiomqtt names it
         """Wait as aiomqtt does, and never lose a cancellation.
 

@@ -283,6 +283,7 @@ class Publisher:
             while in_flight and in_flight[0].done.done():
                 in_flight.popleft()
                 outbox.event_sent()
+            news = False
             while len(in_flight) < min(len(outbox.events), TOUCH_WINDOW):
                 event = outbox.events[len(in_flight)]
                 done = connection.send(
@@ -290,6 +291,9 @@ class Publisher:
                 )
                 done.add_done_callback(lambda _: outbox.events_put.set())
                 in_flight.append(_InFlight(done, now_s() + TIMEOUT_S))
+                news = True
+            if news:
+                connection.flush()  # a touch is not to wait for the frames to be encoded
 
     async def _send_retained(self, connection: Connection) -> None:
         outbox = self._outbox

@@ -94,6 +94,30 @@ def test_times_of_a_part_only_rise_however_late_its_boards_are(lateness):
     assert all(np.diff(times) > 0)
 
 
+def test_what_sweeps_say_of_a_chips_life_holds_from_the_next_one_on():
+    """And does so whether it is worked out at once or when the next sweep comes."""
+    rng = np.random.default_rng(1)
+    lazy, eager = intake(), intake()
+    frozen_at = None
+    for turn in range(1, 120):
+        one = sweep(OUTER, turn * PERIOD)
+        one.raw[:] = rng.normal(240.0, 1.0, one.raw.shape).round()
+        one.raw[3] = 200  # a triangle that repeats itself for ever
+        samples = [parts.feed([one]) + parts.expire((turn + 1) * PERIOD) for parts in (lazy, eager)]
+        eager.judge()
+        for mine, its in zip(*samples, strict=True):
+            assert (mine.present == its.present).all()
+        dead = eager.liveness[OUTER].frozen[3]
+        believed = [sample.present[3 * 12 : 4 * 12].any() for sample in samples[1]]
+        if frozen_at is None and dead:
+            frozen_at = turn
+        elif frozen_at is not None:
+            assert not any(believed), turn
+        else:
+            assert all(believed[-1:]), turn
+    assert frozen_at is not None
+
+
 def far(pads: int) -> int:
     """A status word that calls the first pads far out of range."""
     return ((1 << pads) - 1) << 4

@@ -62,10 +62,10 @@ def test_a_triangle_that_stops_is_found_within_0_7_s(value: int) -> None:
     for _ in range(round(0.7 / PERIOD_S)):
         raw = noisy_bytes(rng, 0.8, centre)
         raw[2] = value
-        doubted = liveness.step(raw, HERE, NO)
+        liveness.step(raw, HERE, NO)
     assert liveness.frozen.tolist() == [False, False, True, False]
-    assert doubted is not None
-    assert doubted.all(axis=1).tolist() == [False, False, True, False]
+    assert liveness.doubted is not None
+    assert liveness.doubted.all(axis=1).tolist() == [False, False, True, False]
 
 
 def test_a_triangle_at_the_end_of_its_scale_is_pressed_not_dead() -> None:
@@ -145,7 +145,7 @@ def test_any_bytes_at_all_are_survived(seed: int) -> None:
     liveness = Liveness(K, rng.choice([0.0, 0.3, 90.0], (K, 12)), PERIOD_S)
     for _ in range(60):
         raw = rng.integers(0, 256, (K, 12)).astype(np.uint8)
-        doubted = liveness.step(raw, rng.random(K) < 0.8, rng.random(K) < 0.1)
-        assert doubted is None or doubted.shape == (K, 12)
+        liveness.step(raw, rng.random(K) < 0.8, rng.random(K) < 0.1)
+        assert liveness.doubted is None or liveness.doubted.shape == (K, 12)
     assert np.isfinite(liveness._rate).all()
     assert np.isfinite(liveness._pads.longest).all()
