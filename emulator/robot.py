@@ -5,10 +5,9 @@ commands. Nothing here knows the time of day; `run` is the only door to the outs
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from heapq import heappop, heappush
-from itertools import count, groupby
+from itertools import count
 from pathlib import Path
 
 import can
@@ -18,12 +17,13 @@ from numpy.typing import NDArray
 
 from emulator import faults
 from emulator.bring_up import bring_up
+from emulator.bursts import Bursts
 from emulator.clock import Clock, RealClock
-from emulator.converters import Converters, fidelities, read_rows
+from emulator.converters import Converters, fidelities
 from emulator.fingertips import Fingertips
 from emulator.firmware.arithmetic import TAXELS
 from emulator.link import Link
-from emulator.mtb import Burst, Mtb, make_board
+from emulator.mtb import Mtb, make_board
 from emulator.recording import load_recordings
 from emulator.scene import Fault, Probe, Scene, check
 from emulator.skin import NEVER_NS, Skin
@@ -43,23 +43,6 @@ LONGEST_CATCH_UP_NS = 250_000_000
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
-
-
-@dataclass(frozen=True, slots=True)
-class _Known:
-    """A burst of several boards as they were at `versions`.
-
-    Attributes:
-        chips: all chips of these boards.
-        row: intp[k], where in `chips` that of each triangle is, -1 for none.
-        frames_of: which of the frames go to which bus.
-    """
-
-    versions: list[int]
-    burst: Burst
-    chips: Ints
-    row: Ints
-    frames_of: list[tuple[str, slice]]
 
 
 class Robot:
@@ -134,7 +117,7 @@ class Robot:
         }
         self._recordings = load_recordings(layout, recordings or {})
         self._in_bus_order = sorted(range(len(self._boards)), key=self._bus_of.__getitem__)
-        self._bursts: dict[tuple[int, ...], _Known] = {}
+        self._bursts = Bursts(self._boards, self._bus_of, self.converters)
         self._rng = np.random.default_rng([scene.seed, 5])
         self.hung: set[int] = set()
         self.late_ns: dict[int, int] = {}
@@ -229,13 +212,8 @@ class Robot:
                     self.wires[bus].put(self._sample_alone(number, board))
             self._answer(bus, board.answers())
         for numbers in together.values():
-            known = self._burst(numbers)
-            raw = read_rows(self.converters.signal, known.chips, known.row)
-            batch = known.burst.frames(raw, self.t_ns)
-            for bus, rows in known.frames_of:
-                self.wires[bus].put(
-                    FrameBatch(batch.id[rows], batch.dlc[rows], batch.data[rows], batch.t_ns[rows])
-                )
+            for bus, batch in self._bursts.frames(numbers, self.t_ns):
+                self.wires[bus].put(batch)
 
     def _sample_alone(self, number: int, board: Mtb) -> FrameBatch:
         jitter_ns = self.jitter_ns.get(number, 0.0)
@@ -244,33 +222,6 @@ class Robot:
         if recording is not None:
             return recording.frames(board.address, self.t_ns + delay_ns)
         return board.sample(self.t_ns + delay_ns)
-
-    def _burst(self, numbers: list[int]) -> _Known:
-        """What these boards send, gathered anew only if one of them has changed."""
-        boards = [self._boards[number] for number in numbers]
-        versions = [board.version for board in boards]
-        known = self._bursts.get(tuple(numbers))
-        if known is None or known.versions != versions:
-            burst = Burst(boards)
-            of_board = np.array(numbers, np.intp)[burst.board]
-            # A board reads all its chips, whether their triangles are enabled or not.
-            wired = np.concatenate([self.converters.chip_of_slot[number] for number in numbers])
-            chips = np.sort(wired[wired >= 0])
-            sent = [
-                self.converters.chip_of_slot[board][slot]
-                for board, slot in zip(of_board, burst.slot, strict=True)
-            ]
-            row = np.array(
-                [np.searchsorted(chips, one) if one >= 0 else -1 for one in sent], np.intp
-            )
-            frames_of: list[tuple[str, slice]] = []
-            start = 0
-            for bus, of_bus in groupby(self._bus_of[board] for board in of_board):
-                stop = start + 2 * len(list(of_bus))
-                frames_of.append((bus, slice(start, stop)))
-                start = stop
-            known = self._bursts[tuple(numbers)] = _Known(versions, burst, chips, row, frames_of)
-        return known
 
     # ------------------------------------------------------------------ the host's side
 
