@@ -236,8 +236,8 @@ class Engine:
     def rezero(self, board: int, believed: bool = True) -> int:
         """A board has taken a new zero: find out where its taxels read now.
 
-        For some two seconds none of them is valid. Taxels that were touched just before stay
-        invalid until they are calibrated.
+        For two seconds, longer for slow boards, none of them is valid. Taxels that were touched
+        just before stay invalid until they are calibrated.
 
         Args:
             board: its index.

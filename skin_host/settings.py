@@ -145,7 +145,8 @@ class Touch(_Table):
     margin_units: NotNegative = 2.0
     minimum_threshold_units: NotNegative = 1.0
     hysteresis_units: NotNegative = 0.5
-    #: A taxel is touched when so many of its last three samples say so.
+    #: A taxel is touched when so many of its last three samples say so. Of two, both must be
+    #: above what noise does; else a third is needed.
     votes_of_3: Literal[1, 2, 3] = 2
     #: `move` events are sent at most this often for a contact.
     move_hz: Positive = 50.0

@@ -18,7 +18,7 @@ from skin_host.processing.calibration import Calibration
 from skin_host.processing.drift import BaselineTracker
 from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.relaxation import OWN_MEANS, make_model, parameters_of
-from skin_host.processing.touch import Imprints, TouchDetector, threshold_units
+from skin_host.processing.touch import Imprints, TouchDetector, sure_units, threshold_units
 from skin_host.settings import Processing
 
 #: A longer step is a gap or a jump of the clock: the pressure in it is not known.
@@ -96,8 +96,9 @@ class Pipeline:
             calibration.percentile, calibration.baseline, calibration.noise, settings.touch
         )
         believed = calibration.usable & (layout.pad_kind == PadKind.PRESSURE)
+        sure_at_units = sure_units(on_units, calibration.noise)
         self._parts = [
-            _PartPipeline(self, layout, part, settings, believed, curve, on_units)
+            _PartPipeline(self, layout, part, settings, believed, curve, on_units, sure_at_units)
             for part in layout.parts
         ]
         if after is not None:
@@ -165,6 +166,7 @@ class _PartPipeline:
         believed: Mask,
         curve: PressureCurve,
         on_units: NDArray[np.float64],
+        sure_at_units: NDArray[np.float64],
     ) -> None:
         self._mine = mine = slice(part.start, part.stop)
         m = part.n_taxels
@@ -211,6 +213,7 @@ class _PartPipeline:
             on_kpa,
             np.where(believed, curve.kpa(off_units), np.inf).astype(np.float32),
             settings.touch.votes_of_3,
+            np.where(believed, curve.kpa(sure_at_units[mine]), np.inf).astype(np.float32),
         )
 
         self._zeros = _constant(np.zeros(m, np.float32))

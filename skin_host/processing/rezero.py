@@ -11,11 +11,13 @@ anybody could know; it is in doubt until it is calibrated again.
 import numpy as np
 from numpy.typing import NDArray
 
-#: How long the new zero is looked at, then how long the pipeline needs to take it over.
+#: The new zero is looked at for so long, and for so many sweeps, however slow the board; then the
+#: pipeline needs so long to take it over.
 LOOK_NS = 1_000_000_000
+LOOK_SWEEPS = 20
 SETTLE_NS = 1_100_000_000
 #: Less samples than this say nothing.
-FEWEST = 5
+FEWEST = 10
 #: A zero that has moved by more than this was not taken of an untouched pad.
 LARGEST_UNITS = 30.0
 #: Noise of so many standard deviations must fit between the mean and the end of the scale.
@@ -40,21 +42,23 @@ class Rezero:
         self._no_load = no_load
         self._sum = np.zeros(len(no_load))
         self._count = np.zeros(len(no_load), np.int64)
+        self._sweeps = 0
         self._since_ns: int | None = None
-        self._looking = True
+        self._ended_ns: int | None = None
         self.doubted: Mask = touched.copy()
 
     def step(self, raw: NDArray[np.uint8], present: Mask, t_ns: int) -> bool:
         """Take one sweep: bytes [n], and which were received. True once: it has seen enough."""
         if self._since_ns is None:
             self._since_ns = t_ns
-        if not self._looking:
+        if self._ended_ns is not None:
             return False
-        if 0 <= t_ns - self._since_ns < LOOK_NS:
+        if 0 <= t_ns - self._since_ns < LOOK_NS or self._sweeps < LOOK_SWEEPS:
             self._sum += np.where(present, self._no_load - raw, 0.0)
             self._count += present
+            self._sweeps += 1
             return False
-        self._looking = False
+        self._ended_ns = t_ns
         return True
 
     @property
@@ -64,7 +68,7 @@ class Rezero:
 
     def settled(self, t_ns: int) -> bool:
         """Whether the new baselines are in use."""
-        return not self._looking and abs(t_ns - (self._since_ns or 0)) >= LOOK_NS + SETTLE_NS
+        return self._ended_ns is not None and abs(t_ns - self._ended_ns) >= SETTLE_NS
 
     def finish(self, baseline: Floats, noise: Floats) -> Floats:
         """Return the baselines [n] that hold from now on, in units.

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skin_host.processing.touch import Imprints, TouchDetector, threshold_units
+from skin_host.processing.touch import Imprints, TouchDetector, sure_units, threshold_units
 from skin_host.settings import Touch
 
 ON, OFF = np.array([2.0]), np.array([1.5])
@@ -27,6 +27,21 @@ def test_two_of_three_samples_are_a_touch_and_two_of_three_end_it():
 def test_one_vote_tells_at_once_and_three_wait_for_three():
     assert told([0, 5, 5, 5, 0, 0, 0], votes=1) == [bool(x) for x in (0, 1, 1, 1, 0, 0, 0)]
     assert told([0, 5, 5, 5, 0, 0, 0, 0], votes=3) == [bool(x) for x in (0, 0, 0, 1, 1, 1, 0, 0)]
+
+
+def test_what_is_barely_above_the_threshold_must_last_for_three_samples():
+    detector = TouchDetector(ON, OFF, 2, sure=np.array([4.0]))
+    signal = [0, 3, 3, 0, 0, 3, 3, 3, 1.6, 1.6, 0, 0, 0, 3, 4, 4, 0, 0]
+    told = [bool(detector.step(np.array([value]))[0]) for value in signal]
+    assert told == [bool(x) for x in (0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 0, 0, 0, 0, 1, 1, 0)]
+
+
+def test_a_noisy_taxel_is_sure_further_above_its_threshold():
+    noise = np.array([0.3, 0.8])
+    threshold = threshold_units(np.array([1.0, 1.4]), np.zeros(2), noise, Touch())
+    quiet, noisy = sure_units(threshold, noise) - threshold
+    assert quiet == 0.0
+    assert noisy > 1.0
 
 
 def test_exactly_the_threshold_is_a_touch():
@@ -79,26 +94,29 @@ def test_a_release_threshold_above_the_threshold_is_refused():
 
 
 @given(
-    st.lists(st.lists(st.integers(0, 3), min_size=4, max_size=4), min_size=1, max_size=40),
+    st.lists(st.lists(st.integers(0, 4), min_size=4, max_size=4), min_size=1, max_size=40),
     st.sampled_from([1, 2, 3]),
     st.lists(st.integers(0, 39), max_size=3),
 )
 def test_the_decision_is_the_vote_counted_out_at_every_sample(rows, votes, resets):
-    detector = TouchDetector(np.full(4, 3.0), np.full(4, 2.0), votes)
-    touched, history = np.zeros(4, bool), [np.zeros(4, bool)] * 3
+    detector = TouchDetector(np.full(4, 3.0), np.full(4, 2.0), votes, sure=np.full(4, 4.0))
+    nothing = np.zeros(4, bool)
+    touched, over, sure = nothing, [nothing] * 3, [nothing] * 3
     for number, row in enumerate(rows):
         if number in resets:
             detector.reset(np.array([1]))
-            touched = touched & (np.arange(4) != 1)
-            history = [over & (np.arange(4) != 1) for over in history]
+            others = np.arange(4) != 1
+            touched = touched & others
+            over, sure = [one & others for one in over], [one & others for one in sure]
         signal = np.array(row, float)
-        history = [*history[1:], signal >= np.where(touched, 2.0, 3.0)]
+        over = [*over[1:], signal >= np.where(touched, 2.0, 3.0)]
+        sure = [*sure[1:], signal >= 4.0]
+        count = np.sum(over, axis=0)
         if votes == 1:
-            touched = history[-1]
+            touched = over[-1]
         elif votes == 2:
-            touched = np.sum(history, axis=0) >= 2
+            touched = (count == 3) | (np.sum(sure, axis=0) >= 2) | (touched & (count >= 2))
         else:
-            count = np.sum(history, axis=0)
             touched = (count == 3) | (touched & (count > 0))
         assert np.array_equal(detector.step(signal), touched)
 

@@ -1,0 +1,62 @@
+"""The new zero of a board is looked at for long enough, and told where it cannot be known."""
+
+import numpy as np
+import pytest
+
+from skin_host.processing.rezero import LARGEST_UNITS, LOOK_SWEEPS, Rezero
+
+N = 192
+NO_LOAD = np.full(N, 240.0)
+NOISE_UNITS = 0.7
+NONE = np.zeros(N, np.bool_)
+S = 1_000_000_000
+
+
+def look(rezero: Rezero, offset_units: np.ndarray, period_s: float) -> tuple[int, int]:
+    """Send sweeps until it has seen enough; return how many that took, and when it was, in ns."""
+    rng = np.random.default_rng(2)
+    t_ns = 1_700_000_000 * S
+    for number in range(1000):
+        raw = np.rint(NO_LOAD - offset_units + NOISE_UNITS * rng.standard_normal(N))
+        if rezero.step(np.clip(raw, 0, 255).astype(np.uint8), ~NONE, t_ns):
+            return number, t_ns
+        t_ns += round(period_s * S)
+    raise AssertionError("never ends")
+
+
+@pytest.mark.parametrize("period_s", [0.02, 0.05, 0.2, 1.0])
+def test_a_slow_boards_zero_is_known_as_well_as_that_of_a_quick_one(period_s: float) -> None:
+    offset = np.linspace(-3.0, 3.0, N)
+    rezero = Rezero(NONE, NO_LOAD)
+    sweeps, _ = look(rezero, offset, period_s)
+    assert sweeps == max(LOOK_SWEEPS, round(1.0 / period_s))
+    found = rezero.finish(np.zeros(N), np.full(N, NOISE_UNITS))
+    # A baseline that is off by half a unit makes noise look like a touch.
+    assert np.std(found - offset) < 0.2
+    assert not rezero.doubted.any()
+
+
+def test_it_settles_a_second_after_the_look_however_long_that_took() -> None:
+    rezero = Rezero(NONE, NO_LOAD)
+    _, ended_ns = look(rezero, np.zeros(N), 0.2)
+    assert not rezero.settled(ended_ns)
+    assert not rezero.settled(ended_ns + S)
+    assert rezero.settled(ended_ns + 2 * S)
+
+
+def test_a_zero_taken_under_a_press_is_in_doubt() -> None:
+    offset = np.where(np.arange(N) == 7, -LARGEST_UNITS - 5.0, 0.0)
+    touched = np.arange(N) == 3
+    rezero = Rezero(touched, NO_LOAD)
+    look(rezero, np.maximum(offset, -60.0), 0.05)
+    found = rezero.finish(np.zeros(N), np.full(N, NOISE_UNITS))
+    assert np.flatnonzero(rezero.doubted).tolist() == [3, 7]
+    assert found[[3, 7]].tolist() == [0.0, 0.0]
+
+
+def test_a_clock_that_is_set_back_does_not_end_the_look_early() -> None:
+    rezero = Rezero(NONE, NO_LOAD)
+    raw = NO_LOAD.astype(np.uint8)
+    t_ns = 1_700_000_000 * S
+    ended = [rezero.step(raw, ~NONE, t_ns - number * S) for number in range(LOOK_SWEEPS + 1)]
+    assert ended == [False] * LOOK_SWEEPS + [True]
