@@ -33,9 +33,9 @@ from skin_host.layout import build_layout
 from skin_host.publish.broker import find_mosquitto, mosquitto_broker
 
 #: The daemon must have set itself up and calibrated by then; the lane's processor is slow.
-_READY_S = 60.0
+_READY_S = 150.0
 _CALIBRATION_S = 1.0
-_PRESSED_BOARD, _PRESSED_TRIANGLE, _PRESSED_TAXELS = 3, 7, slice(2, 6)
+_PRESSED_TRIANGLE, _PRESSED_TAXELS = 7, slice(2, 6)
 
 #: Messages of another program: so far apart, and about as long as a touch.
 _PLAIN_S = 0.028
@@ -46,7 +46,7 @@ Document = dict[str, Any]
 
 
 def run(*, quick: bool = False) -> Document:
-    """Measure; all delays in microseconds.
+    """Measure on a full bus.
 
     Args:
         quick: for 5 s instead of 30 s.
@@ -55,10 +55,23 @@ def run(*, quick: bool = False) -> Document:
         BrokerError: mosquitto is not installed.
         SkinError: the daemon did not come up.
     """
+    return measure(FULL_BUS_FRAMES_PER_S, 5.0 if quick else 30.0)
+
+
+def measure(frames_per_s: int, seconds: float) -> Document:
+    """Measure; all delays in microseconds.
+
+    Args:
+        frames_per_s: on the bus; a slow computer may not bear a full one.
+        seconds: for touches, and again for messages of another program.
+
+    Raises:
+        BrokerError, SkinError: as `run`.
+    """
     program = find_mosquitto()
     if program is None:
         raise BrokerError("mosquitto is not installed; `apt install mosquitto`")
-    return asyncio.run(_run(program, 5.0 if quick else 30.0))
+    return asyncio.run(_measure(program, Stream.of(frames_per_s), seconds))
 
 
 def describe(document: Document) -> str:
@@ -82,9 +95,8 @@ def _line(row: Document) -> str:
     )
 
 
-async def _run(program: str, seconds: float) -> Document:
+async def _measure(program: str, stream: Stream, seconds: float) -> Document:
     wire = Wire.here()
-    stream = Stream.of(FULL_BUS_FRAMES_PER_S)
     context = multiprocessing.get_context("spawn")
     async with mosquitto_broker(program) as broker:
         sender_end, sender_child_end = context.Pipe()
@@ -160,7 +172,7 @@ def _scenes(stream: Stream) -> list[NDArray[np.uint8]]:
     depth = np.zeros(40)
     depth[:24] = 70.0 * np.sin(np.pi * (np.arange(24) + 0.5) / 24)
     pressed = quiet.copy()
-    pressed[:, _PRESSED_BOARD, _PRESSED_TRIANGLE, _PRESSED_TAXELS] -= depth.astype(int)[:, None]
+    pressed[:, stream.boards // 2, _PRESSED_TRIANGLE, _PRESSED_TAXELS] -= depth.astype(int)[:, None]
     return [quiet.astype(np.uint8), pressed.astype(np.uint8)]
 
 

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.bus.protocol.compensation import NO_GAIN
+from skin_host.processing.masks import Mask, any_of
 from skin_host.processing.repeats import Repeats
 from skin_host.processing.stuck import (
     MOST_RATE,
@@ -40,7 +41,6 @@ from skin_host.processing.stuck import (
 )
 
 Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 PADS = 12
 
@@ -145,6 +145,7 @@ class Liveness:
         self._to_show = np.where(constant, PROBATION_CHANGES, 0)
         self.frozen: Mask = np.zeros(k, np.bool_)
         self.unproven: Mask = constant
+        self._any_to_show = any_of(constant)
         self.noisy: Mask = np.zeros(shape, np.bool_)
         self.doubted: Mask | None = None
         self.spikes = 0
@@ -186,7 +187,7 @@ class Liveness:
         self._doubt()
 
     def _doubt(self) -> None:
-        doubts = self.unproven.any() or self.stuck.any() or self.noisy.any()
+        doubts = self._any_to_show or self._pads.any_stuck or any_of(self.noisy)
         self.doubted = self.unproven[:, None] | self.stuck | self.noisy if doubts else None
 
     def _note_triangles(
@@ -200,8 +201,9 @@ class Liveness:
         alive = changed.any(axis=1)
         if touched is None:
             self._alive += alive
-        if alive.all() and not self._to_show.any() and not erring.any():
-            self._surprise[:] = 0.0
+        all_alive = alive.tobytes() == compared.tobytes()
+        if all_alive and not self._any_to_show and not any_of(erring):
+            self._surprise[compared] = 0.0
             return
         expected = self._expected
         movable = inside(raw)
@@ -221,13 +223,14 @@ class Liveness:
         self._to_show[too_long | erring] = PROBATION_CHANGES
         self._surprise[erring] = 0.0
         self.unproven = self._to_show > 0
+        self._any_to_show = any_of(self.unproven)
         self.frozen = (too_long | self.frozen) & self.unproven & ~erring
 
     def _note_jumps(self, raw: NDArray[np.uint8], changed: Mask, compared: Mask) -> None:
         """A step up followed by a step down is noise; a touch goes one way at a time."""
         step = np.where(changed, np.subtract(raw, self._raw, dtype=np.int16), np.int16(0))
         far = np.abs(step) > self._jump
-        if not self._any_jumping and not far.any():
+        if not self._any_jumping and not any_of(far):
             np.copyto(self._step, step, where=compared[:, None])
             return
         jump = far & (np.abs(self._step) > self._jump) & ((step ^ self._step) < 0)
@@ -239,7 +242,7 @@ class Liveness:
         jumped = jump * np.minimum(size / self._jump, MOST_JUMP)
         self._jumping += compared[:, None] * (jumped - self._jumping) / NOISE_MEMORY_SAMPLES
         self._jumping[self._jumping < 1e-3] = 0.0
-        self._any_jumping = bool(self._jumping.any())
+        self._any_jumping = any_of(self._jumping > 0.0)
         self.noisy = self._jumping > np.where(self.noisy, CALM_MEAN, NOISY_MEAN)
 
     def _learn(self) -> None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from skin_host.layout import Layout, PadKind, PartLayout
 from skin_host.processing.calibration import Calibration
 from skin_host.processing.drift import BaselineTracker
+from skin_host.processing.masks import Mask, any_of
 from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.relaxation import OWN_MEANS, make_model, parameters_of
 from skin_host.processing.touch import Imprints, TouchDetector, sure_units, threshold_units
@@ -30,7 +31,6 @@ GLANCE_S = 0.2
 #: Samples are laid aside and summed so many at a time: fewer passes over the taxels.
 ROWS = 8
 
-Mask = NDArray[np.bool_]
 Floats = NDArray[np.float32]
 _T = TypeVar("_T", bound=np.generic)
 
@@ -271,7 +271,7 @@ class _PartPipeline:
     def begin_anew(self, taxels: Mask) -> None:
         """Forget the last samples of some taxels, bool[n] over the skin: baselines are new."""
         anew = taxels[self._mine]
-        if not _any(anew):
+        if not any_of(anew):
             return
         self._renew_limits()
         self._last_raw = np.where(anew, self._untouched_raw(), self._last_raw)
@@ -322,12 +322,12 @@ class _PartPipeline:
         if not self._detector.idle:
             return False
         np.less_equal(self._last_raw, self._near_raw, out=self._near)
-        return not _any(self._near)
+        return not any_of(self._near)
 
     def _beyond(self) -> Mask:
         """Which taxels read more than their calibrated range."""
         np.less(self._last_raw, self._beyond_raw, out=self._near)
-        return self._near.copy() if _any(self._near) else self._nowhere
+        return self._near.copy() if any_of(self._near) else self._nowhere
 
     def _corrected_kpa(self, beyond: Mask, dt_s: float) -> Floats:
         """Equation (1) with the relaxation taken off, laid aside for the means.
@@ -410,11 +410,6 @@ class _PartPipeline:
         np.add(needed, self._near_units, out=needed)
         _as_bytes(offset - needed + 1e-3, self._near_raw)
         _as_bytes(np.ceil(offset - self._beyond_units), self._beyond_raw)
-
-
-def _any(flags: Mask) -> bool:
-    """Whether any is set; numpy's own takes several times as long for some thousand."""
-    return flags.tobytes().find(1) >= 0
 
 
 def _as_bytes(levels: Floats, out: NDArray[np.uint8]) -> None:

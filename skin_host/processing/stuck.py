@@ -16,10 +16,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.processing.masks import Mask, any_of
 from skin_host.processing.repeats import Repeats
 
 Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 #: A run with a probability below 1/odds is not chance. 2000 taxels at 20 Hz begin some 10^11
 #: runs a year.
@@ -56,6 +56,7 @@ class StuckPads:
 
     Attributes:
         stuck: bool[k, 12].
+        any_stuck: whether any is.
         longest: float64[k, 12], repeats in a row that chance allows now.
     """
 
@@ -77,7 +78,7 @@ class StuckPads:
         self._new_moved = np.zeros(shape, np.int64)
         self._samples = 0
         self.stuck: Mask = np.zeros(shape, np.bool_)
-        self._any_stuck = False
+        self.any_stuck = False
         self._renew_limits()
 
     def step(
@@ -114,14 +115,14 @@ class StuckPads:
         if self._samples >= STEP_SAMPLES:
             self._learn(unproven)
         too_long = run > self.longest
-        if not self._any_stuck and not too_long.any():
+        if not self.any_stuck and not any_of(too_long):
             return
         run[unproven] = 0.0
         too_long &= run > 0.0
         self._to_show -= moved & (self._to_show > 0)
         self._to_show[too_long] = PROBATION_MOVES
         self.stuck = self._to_show > 0
-        self._any_stuck = bool(self.stuck.any())
+        self.any_stuck = any_of(self.stuck)
 
     def _learn(self, unproven: Mask) -> None:
         """Let the rates follow what was seen of pads that live."""
