@@ -22,6 +22,7 @@ import numpy as np
 from can.typechecking import CanFilter
 from numpy.typing import NDArray
 
+from skin_host.bus.interfaces import can_interfaces
 from skin_host.bus.port import SKIN_CLASSES, LinkState, Port
 from skin_host.bus.protocol import NS_PER_S, FrameBatch
 from skin_host.errors import BusError
@@ -339,18 +340,13 @@ def _check_interface(name: str, settings: Bus) -> None:
     channel = settings.channel
     where = f'bus "{name}": {channel}'
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
-
-        def is_can(interface: str) -> bool:
-            return _ask_interface(sock, interface, _SIOCGIFHWADDR) == _ARPHRD_CAN
-
         if not _interface_exists(channel):
-            there = [interface for _, interface in socket.if_nameindex() if is_can(interface)]
             raise BusError(
                 f"{where}: no such network interface (CAN interfaces here: "
-                f"{', '.join(there) or 'none'}); plug the adapter in, or for a trial "
+                f"{', '.join(can_interfaces()) or 'none'}); plug the adapter in, or for a trial "
                 f"`sudo ip link add dev {channel} type vcan && sudo ip link set {channel} up`"
             )
-        if not is_can(channel):
+        if _ask_interface(sock, channel, _SIOCGIFHWADDR) != _ARPHRD_CAN:
             raise BusError(
                 f"{where}: not a CAN interface; `ip -brief link show type can` lists those"
             )

@@ -8,10 +8,10 @@ import argparse
 import asyncio
 import contextlib
 import os
-from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
+from skin_host.bus.interfaces import can_interfaces
 from skin_host.cli.common import Commands, add_command
 
 if TYPE_CHECKING:
@@ -21,9 +21,6 @@ Completer = Callable[..., Iterable[str]]
 
 #: A shell that waits for a broker for longer feels broken.
 PATIENCE_S = 1.0
-NETWORKS = Path("/sys/class/net")
-#: What /sys/class/net/*/type says of a CAN interface (ARPHRD_CAN, linux/if_arp.h).
-CAN_TYPE = "280"
 RECORDINGS = ("mcap", "log", "blf", "asc", "trc", "csv")
 
 
@@ -104,12 +101,9 @@ def _nodes(parsed_args: argparse.Namespace, **_: Any) -> set[str]:
     return {part.node for part in settings.parts.values()}
 
 
-def _channels(**_: Any) -> Iterator[str]:
+def _channels(**_: Any) -> list[str]:
     """CAN interfaces of this machine."""
-    for network in NETWORKS.glob("*"):
-        with contextlib.suppress(OSError):
-            if (network / "type").read_text().strip() == CAN_TYPE:
-                yield network.name
+    return can_interfaces()
 
 
 def _settings(parsed_args: argparse.Namespace) -> "Settings | None":

@@ -10,12 +10,12 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from pathlib import Path
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.bus.interfaces import NETWORKS, can_interfaces
 from skin_host.bus.protocol import TRIANGLES, encode_sweep
 from skin_host.evaluation.stand_in import HOST, INTERFACE, StandInBus, register
 from skin_host.settings import Bus, Settings
@@ -103,8 +103,8 @@ class Wire:
     @classmethod
     def here(cls) -> "Wire":
         """The first vcan interface that is up, else a new stand-in."""
-        for _, name in socket.if_nameindex():
-            flags = Path("/sys/class/net", name, "flags")
+        for name in can_interfaces():
+            flags = NETWORKS / name / "flags"
             if name.startswith("vcan") and int(flags.read_text(), 16) & 1:
                 return cls(name)
         with StandInBus() as one, StandInBus() as other:

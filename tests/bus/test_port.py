@@ -1,6 +1,8 @@
 """Reading in batches: every frame with its time, every loss counted, no state that ends it."""
 
+import errno
 import logging
+import socket
 import struct
 import time
 
@@ -276,7 +278,11 @@ def test_python_cans_socketcan_under_another_name_is_read_in_batches():
         (Bus(interface="slcan", channel="/dev/none"), "slcan /dev/none: cannot be opened"),
     ],
 )
-def test_what_cannot_be_opened_is_one_line_with_its_name(bus, says):
+def test_what_cannot_be_opened_is_one_line_with_its_name(bus, says, monkeypatch):
+    def refuse():
+        raise OSError(errno.EAFNOSUPPORT, "no netlink in the service's sandbox")
+
+    monkeypatch.setattr(socket, "if_nameindex", refuse)
     with pytest.raises(BusError, match=f'bus "left": .*{says}') as caught:
         open_port("left", bus, Receive())
     assert "\n" not in str(caught.value)

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from paho.mqtt import publish
 
+from skin_host.bus import interfaces
 from skin_host.cli import completion, main
 from skin_host.layout import build_layout
 from skin_host.publish.info import encode_info, node_info
@@ -149,7 +150,7 @@ def test_channels_are_the_can_interfaces_of_the_machine(
     for name, kind in {"can0": "280", "eth0": "1", "vcan0": "280"}.items():
         (tmp_path / name).mkdir()
         (tmp_path / name / "type").write_text(kind + "\n")
-    monkeypatch.setattr(completion, "NETWORKS", tmp_path)
+    monkeypatch.setattr(interfaces, "NETWORKS", tmp_path)
     assert set(completion._channels()) == {"can0", "vcan0"}
 
 
