@@ -18,6 +18,7 @@ from skin_host.bus.assembler import Sweep
 from skin_host.bus.protocol import TRIANGLES, out_of_range, status_error
 from skin_host.layout import Layout
 from skin_host.processing.liveness import PADS, Liveness
+from skin_host.processing.masks import Mask
 
 #: A silent part says so at once and then once a second.
 SILENCE_REPEAT_NS = 1_000_000_000
@@ -30,7 +31,6 @@ FAR_SHARE = 1.5
 _NONE_ERRS = np.zeros(TRIANGLES, np.bool_)
 _BITS = np.arange(TRIANGLES)
 
-Mask = NDArray[np.bool_]
 #: Of a sweep: its bytes, the triangles that came without an error, those with one, and the pads
 #: that were touched just before.
 _Seen = tuple[NDArray[np.uint8], Mask, Mask, Mask | None]

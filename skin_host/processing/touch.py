@@ -5,11 +5,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.processing.masks import Mask
 from skin_host.settings import Touch
 
 Array = NDArray[np.floating]
 Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 #: Samples that have a vote.
 VOTERS = 3
 HALF_UNIT = 0.5
