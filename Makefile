@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip --quiet --quiet --disable-pip-version-check --no-inp
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-system install uninstall lint format clean
+.PHONY: help demo docs test test-system simulate install uninstall lint format clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z.-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -16,17 +16,32 @@ demo: .venv/demo.stamp  ## emulator, daemon, broker and page together; DURATION=
 	@exec $(BIN)/skin demo $(if $(DURATION),--duration $(DURATION))
 
 test: lint  ## all that needs no root and no hardware
-	@$(BIN)/python -m pytest --numprocesses=3 --dist=loadfile
+	@tools/timed "pytest" $(BIN)/python -m pytest --numprocesses=3 --dist=loadfile
 
-test-system: .venv/dev.stamp .venv/fuzz.stamp  ## real CAN, I2C, broker and browser; root, if packages are missing
-	@tools/lane/packages
+# Real time on a shared computer: a test that fails is run once more, and the summary names it.
+AGAIN := --reruns=1 -rR
+
+test-system: .venv/dev.stamp .venv/fuzz.stamp  ## real CAN, I2C, systemd, broker and browser; root, if packages are missing
+	@tools/timed "packages" tools/lane/packages
 	@$(BIN)/python -m compileall -q skin_host emulator tests
-	@echo "on this host: broker, browser, the lane itself"
-	@$(BIN)/python -m pytest tests/system/native --require-mosquitto
-	@$(BIN)/python -m pytest tests -m mosquitto --require-mosquitto
-	@echo "in the lane: vcan and CUSE"
-	@tools/lane/run $(BIN)/python -m pytest $(wildcard tests/stack) tests/system/lane \
-		--bus=vcan --require-mosquitto -o faulthandler_timeout=300
+	@tools/timed "on this host: broker, browser, the lane itself" \
+		$(BIN)/python -m pytest tests/system/native --require-mosquitto $(AGAIN)
+	@tools/timed "on this host: the other tests with a broker" \
+		$(BIN)/python -m pytest tests -m mosquitto --require-mosquitto \
+		--numprocesses=3 --dist=loadfile $(AGAIN)
+	@tools/timed "in the lane: vcan and CUSE" \
+		tools/lane/run $(BIN)/python -m pytest tests/stack tests/system/lane \
+		--bus=vcan --require-mosquitto -o faulthandler_timeout=300 $(AGAIN)
+	@tools/timed "a Debian that boots: its disk" tools/lane/debian
+	@tools/timed "a Debian that boots: systemd and CAN cards" \
+		$(BIN)/python -m pytest tests/system/systemd --numprocesses=2 --dist=loadfile $(AGAIN)
+
+docs: .venv/docs.stamp  ## a site from docs/ with an API reference, in site/; every link is checked
+	@$(BIN)/mkdocs build --strict
+	@echo "site/index.html"
+
+simulate: .venv/dev.stamp  ## the whole system through faults, robot-hours by the seed: SEEDS=1000
+	@$(BIN)/skin simulate --seeds $(or $(SEEDS),100) --hours 1
 
 install:  ## the service on this machine, as root; DESTDIR stages it elsewhere
 	@PYTHON="$(PYTHON)" systemd/install install
@@ -44,16 +59,16 @@ format: .venv/dev.stamp  ## ruff, rewriting
 	@$(BIN)/ruff check --fix .
 
 clean:  ## the virtual environment, the lane's machine and caches
-	rm -rf .venv .lane .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv .lane site .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The stamps are newer than pyproject.toml once its dependencies are installed.
-.venv/dev.stamp: EXTRAS := dev
-.venv/fuzz.stamp: EXTRAS := fuzz
-.venv/demo.stamp: EXTRAS := demo
+.venv/dev.stamp: EXTRAS := [dev]
+.venv/fuzz.stamp: EXTRAS := [fuzz]
+.venv/docs.stamp: EXTRAS := [docs]
 .venv/%.stamp: pyproject.toml | .venv/bin/python
-	@echo "installing skin-host[$(EXTRAS)] into .venv"
-	@$(PIP) install --editable '.[$(EXTRAS)]'
+	@echo "installing skin-host$(EXTRAS) into .venv"
+	@$(PIP) install --editable '.$(EXTRAS)'
 	@touch $@
 
 .venv/bin/python:

@@ -1,1 +1,1 @@
-"""Hardware that is not there: chips, boards, foam and what presses on it."""
+"""Emulated hardware: chips, boards, foam and the objects that press on it."""

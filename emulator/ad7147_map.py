@@ -48,6 +48,7 @@ END_OF_MAP = 0x290
 DEVICE_ID_VALUE = 0x1471
 
 SW_RESET = 0x0400
+EXT_SOURCE = 0x1000
 CONV_RESET = 0x8000
 FORCED_CAL = 0x4000
 
@@ -59,7 +60,7 @@ RESET_VALUES = {
     DEVICE_ID: DEVICE_ID_VALUE,
 }
 
-#: Writable bits of Bank 1; what is not listed there is read-only or does not exist.
+#: Writable bits of Bank 1; addresses that are not listed are read-only or do not exist.
 #: Self-clearing bits (SW_RESET, CONV_RESET) and reserved bits read back 0.
 BANK_1_WRITABLE = {
     PWR_CONTROL: 0xFFFF & ~0x2000 & ~SW_RESET,
@@ -92,22 +93,24 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class PowerControl:
-    """PWR_CONTROL taken apart. `mode` is FULL_POWER, SHUTDOWN or LOW_POWER."""
+    """Fields of PWR_CONTROL. `mode` is FULL_POWER, SHUTDOWN or LOW_POWER."""
 
     mode: int
     n_stages: int
     decimation: int
     low_power_delay_ns: int
+    excited: bool = True
 
     @classmethod
     def of(cls, word: int) -> "PowerControl":
-        """Take `word` apart. Mode 3 is shutdown again; more than 12 stages are 12 [D]."""
+        """Decode `word`. Mode 3 is shutdown again; more than 12 stages are 12 [D]."""
         mode = word & 3
         return cls(
             mode=SHUTDOWN if mode == 3 else mode,
             n_stages=min(((word >> 4) & 0xF) + 1, N_STAGES),
             decimation=(word >> 8) & 3,
             low_power_delay_ns=LOW_POWER_DELAY_NS[(word >> 2) & 3],
+            excited=not word & EXT_SOURCE,
         )
 
     @property
@@ -151,7 +154,7 @@ def decode_stages(bank_2: Registers) -> tuple[Floats, Floats]:
         offset_ff float64[12]: what the two AFE DACs take off the positive input (fF). A DAC
             with its SWAP bit works on the other input, a disabled one on none.
 
-    SE_CONNECTION_SETUP (single-ended or differential) only says how the unused input is
+    SE_CONNECTION_SETUP (single-ended or differential) only determines how the unused input is
     terminated, so it does not enter [D].
     """
     words = bank_2.astype(np.int64)

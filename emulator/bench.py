@@ -1,10 +1,10 @@
 """The paper's test rig (section VI): a palm on a platform, a Cartesian robot, a load cell.
 
-The robot pushes flat round probes of 2 to 6 mm into the foam and reads, at 25 Hz, the force
-of the load cell and the palm's bytes, which are turned into femtofarads at 2.88 fF a unit. The
-foam, the pads and the arithmetic of the board are the emulator's own; nothing of a host is
-used. Every contact of a recording presses on a palm of its own, so thousands of positions can
-be worked out together, as the paper's robot had hours to let the foam recover between them.
+The robot pushes flat round probes of 2 to 6 mm into the foam and reads, at 25 Hz, the force of the
+load cell and the palm's bytes, which are converted to femtofarads at 2.88 fF a unit. The foam, the
+pads and the arithmetic of the board are the emulator's; no host is involved. Each contact of a
+recording presses on a separate palm, so that thousands of positions can be computed together, as
+the paper's robot had hours to let the foam recover between them.
 """
 
 from collections.abc import Sequence
@@ -45,7 +45,8 @@ Ints = NDArray[np.intp]
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """What happened under the probes: m times, c contacts, the k pads that they cover.
+    """True forces and capacitances under the probes: m times, c contacts, the k pads that they
+    cover.
 
     Attributes:
         t_s: float64[m].
@@ -62,7 +63,7 @@ class Motion:
     contact: Ints
 
     def at(self, t_s: Floats) -> "Motion":
-        """The same at other times, straight lines between."""
+        """Return the same at other times, interpolated linearly."""
         low = np.clip(np.searchsorted(self.t_s, t_s, side="right") - 1, 0, len(self.t_s) - 2)
         length_s = self.t_s[low + 1] - self.t_s[low]
         share = np.clip((t_s - self.t_s[low]) / length_s, 0.0, 1.0)[:, None]
@@ -121,7 +122,7 @@ class PalmRig:
             self.foam.e0_kpa[pad] = mean.e0_kpa[pad]
             self.foam.stiffening[pad] = STIFFENING[name] * mean.stiffening[pad]
         self._resting_ff = draw_resting_ff(n, self.rng)
-        self._noise_ff = draw_noise_ff(n, self.rng, bad_share=0.0)
+        self._noise_ff = draw_noise_ff(n, self.rng)
 
     def centre_mm(self, name: int) -> tuple[float, float]:
         """Where the pad called `name` in Fig. 11 lies on the palm."""
@@ -162,7 +163,7 @@ class PalmRig:
         return Motion(t_s, force_n, footprint.area_mm2, rise_ff, pad, contact)
 
     def record(self, motion: Motion) -> Recording:
-        """What the load cell and the palm say of a motion."""
+        """Readings of the load cell and the palm for a motion."""
         force_n = motion.force_n
         force_n = force_n + FORCE_NOISE_N * self.rng.standard_normal(force_n.shape)
         return Recording(

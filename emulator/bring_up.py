@@ -1,49 +1,43 @@
-"""What a careful host says to the boards before they stream, for robots without a host."""
+"""Commands of a careful host to the boards before they stream, for robots without a host."""
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 from skin_host.bus.protocol.commands import (
     Message,
     SetBoardConfig,
     SetTriangleConfig,
-    SetTxMode,
     TriangleFlags,
-    TxMode,
-    command_frame,
 )
-from skin_host.layout import BoardLayout, Layout
-
-if TYPE_CHECKING:
-    from emulator.robot import Robot
+from skin_host.layout import Layout
 
 #: An MTB3 takes commands between calibrations of two periods; chips convert in 37 ms.
 SETTLE_PERIODS = 4
 
 
-def bring_up(robot: "Robot") -> None:
-    """Configure and start all boards of a robot; a second or two pass, frames are dropped."""
-    boards = robot.layout.boards
+def set_up(
+    layout: Layout, send: Callable[[int, Message], None], wait: Callable[[float], object]
+) -> None:
+    """Configure all boards of a robot; this takes a second or two of emulated time.
 
-    def command(board: BoardLayout, message: Message) -> None:
-        can_id, data = command_frame(message, robot.boards[board.name].address)
-        robot.receive(board.settings.bus, can_id, data)
-
+    Args:
+        layout: the boards and their set-up.
+        send: sends a command to one of them, by its index in the layout.
+        wait: lets seconds pass.
+    """
+    boards = layout.boards
     settle_s = SETTLE_PERIODS * 1e-3 * max(board.settings.period_ms for board in boards)
-    for board in boards:
+    for number, board in enumerate(boards):
         own = board.settings
-        command(board, SetBoardConfig(own.skin_type, own.period_ms, own.no_load))
-    robot.step(settle_s)
-    set_ups = [triangle_set_ups(robot.layout, number) for number in range(len(boards))]
-    # Twice: the first one may take its baseline before the chips have converted anew.
+        send(number, SetBoardConfig(own.skin_type, own.period_ms, own.no_load))
+    wait(settle_s)
+    set_ups = [triangle_set_ups(layout, number) for number in range(len(boards))]
+    # Twice: the first one may take its baseline before the chips have converted again.
     for _ in range(2):
         for turn in range(max(map(len, set_ups))):
-            for board, own_set_ups in zip(boards, set_ups, strict=True):
+            for number, own_set_ups in enumerate(set_ups):
                 if turn < len(own_set_ups):
-                    command(board, own_set_ups[turn])
-            robot.step(settle_s)
-    robot.fingertips.start(robot.t_ns)
-    for board in boards:
-        command(board, SetTxMode(TxMode.START))
+                    send(number, own_set_ups[turn])
+            wait(settle_s)
 
 
 def triangle_set_ups(layout: Layout, board: int) -> list[SetTriangleConfig]:

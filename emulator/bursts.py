@@ -1,4 +1,4 @@
-"""The frames of boards that read their chips in the same millisecond, worked out together."""
+"""Computes together the frames of boards that read their chips in the same millisecond."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class _Known:
 
 
 class Bursts:
-    """What boards send, by any set of them that is due; gathered anew only if one has changed.
+    """What boards send, by any set of them that is due; gathered again only if one has changed.
 
     Args:
         boards: all of the robot, with chips at fidelity "signal".
@@ -47,10 +47,10 @@ class Bursts:
         self._known: dict[tuple[int, ...], _Known] = {}
 
     def frames(self, numbers: list[int], t_ns: int) -> Iterator[tuple[str, FrameBatch]]:
-        """By bus, what these boards send at `t_ns`.
+        """Yield, by bus, the frames of these boards at `t_ns`.
 
         Args:
-            numbers: of boards with one arithmetic, those of a bus one after the other.
+            numbers: of boards with the same arithmetic, those of a bus one after the other.
             t_ns: now.
         """
         known = self._of(numbers)

@@ -1,12 +1,13 @@
-"""Time of the emulator: real, accelerated, or stepped by whoever holds the clock.
+"""Time of the emulator: real, accelerated, or stepped by the owner of the clock.
 
-The cores of the emulator own no clock; they are told how much time has passed. A clock is
-only for loops that talk to the outside, such as `Robot.run`.
+The cores of the emulator have no clock; they are given the time that has passed. A clock is only
+for loops that communicate with the outside, such as `Robot.run`.
 """
 
 import asyncio
-import time
 from typing import Protocol
+
+from skin_host import clock
 
 NS = 1_000_000_000
 
@@ -19,33 +20,34 @@ class Clock(Protocol):
         ...
 
     async def sleep_until_ns(self, t_ns: int) -> None:
-        """Come back when `t_ns` has been reached; other tasks run meanwhile."""
+        """Return when `t_ns` has been reached; other tasks run meanwhile."""
         ...
 
 
 class RealClock:
-    """Emulated time goes as the machine's own monotonic time, or `speed` times as fast."""
+    """Emulated time runs as a clock's monotonic time, or `speed` times as fast."""
 
-    def __init__(self, speed: float = 1.0) -> None:
+    def __init__(self, speed: float = 1.0, clock: clock.Clock = clock.SYSTEM) -> None:
         if not speed > 0:
             raise ValueError(f"speed {speed}: wanted a number above 0")
         self._speed = speed
-        self._start_ns = time.monotonic_ns()
+        self._clock = clock
+        self._start_ns = clock.monotonic_ns()
 
     def now_ns(self) -> int:
         """Emulated time that has passed."""
-        return int((time.monotonic_ns() - self._start_ns) * self._speed)
+        return int((self._clock.monotonic_ns() - self._start_ns) * self._speed)
 
     async def sleep_until_ns(self, t_ns: int) -> None:
         """Sleep until `t_ns`; a time that has passed still lets other tasks run once."""
-        await asyncio.sleep(max(0, t_ns - self.now_ns()) / (NS * self._speed))
+        await self._clock.sleep(max(0, t_ns - self.now_ns()) / (NS * self._speed))
 
 
 class SteppedClock:
-    """Time moves only when somebody moves it: `advance`, or a sleeper where it runs freely.
+    """Time that moves only by `advance`, or by a sleeper if the clock runs freely.
 
     With `free` every sleep jumps straight to its end, so a loop runs as fast as the machine
-    can. Otherwise sleepers wait until `advance` has carried the time past their end.
+    can. Otherwise sleepers wait until `advance` has moved the time past their end.
     """
 
     def __init__(self, *, free: bool = False) -> None:

@@ -1,29 +1,41 @@
-"""The chips of a robot, each board's at the fidelity that was asked for.
+"""The chips of a robot, each board's at the chosen fidelity, and the wires to them.
 
 Fidelity "chip" has every register and transaction: an `AD7147` behind an `EmulatedSMBus` that
 the firmware drives over smbus2. Fidelity "signal" goes straight from capacitance to counts.
-Chips are numbered as the layout numbers its triangles.
+
+The behaviour of an AD7147 never depends on how often it is read, and both fidelities convert
+alike. So the results that firmware reads over intact wires are taken from `SignalSkin` at either
+fidelity, and the registers are updated to the present when any other reader accesses them. Once
+another program has written to a chip of a board, that board's results come over its bus.
+
+Over data lines with a fault, boards of either fidelity reach their chips bit by bit
+(`emulator.i2c_wire`). Chips are numbered as the layout numbers its triangles.
 """
 
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator import ad7147_map as reg
 from emulator.ad7147 import AD7147
 from emulator.firmware.arithmetic import ABSENT, TAXELS
 from emulator.firmware.chips import (
     ADDRESSES,
     CHIPS_PER_LINE,
     SLOTS,
+    BangedChips,
     Chips,
     I2cChips,
+    StageMap,
     Words,
 )
 from emulator.firmware.mtb4 import ERGO_HAND_SLOTS
-from emulator.i2c import Chip, EmulatedSMBus, build_lines
-from emulator.signal import SignalChips, SignalSkin
+from emulator.i2c import EmulatedSMBus, build_lines
+from emulator.i2c_wire import Chip, I2cWire
+from emulator.noise import ChipNoise, PadNoise
+from emulator.signal import SignalChips, SignalPort, SignalSkin
 from skin_host.errors import ConfigurationError
 from skin_host.layout import BoardLayout, Layout
 
@@ -57,7 +69,7 @@ def fidelities(layout: Layout, fidelity: str | Mapping[str, str]) -> dict[int, s
 
 
 def slot_of(board: BoardLayout, triangle: int) -> int:
-    """Where the chip of a triangle sits on its board: ergoCub hands have a map of their own."""
+    """Return the slot of a triangle's chip on its board: ergoCub hands have a separate map."""
     return ERGO_HAND_SLOTS[triangle] if board.settings.skin_type == 3 else triangle
 
 
@@ -66,9 +78,9 @@ class Converters:
 
     Args:
         layout: which chips there are.
-        noise_ff: float64[n_taxels], noise of each pad.
+        noise: of the pads of each triangle; None is no noise at all.
+        noise_ff: float64[n_taxels], its rms.
         seed: the same seed draws the same noise at either fidelity.
-        quiet: no noise at all.
         fidelity: of each board, by its index.
 
     Attributes:
@@ -76,27 +88,41 @@ class Converters:
         registers: the chips at fidelity "chip", by number.
         lines: the I2C lines of each board at fidelity "chip", by the board's index.
         chip_of_slot: for each board intp[20], the chip at each of its slots, -1 for none.
+        by_bus: let all boards at fidelity "chip" read over their buses, to compare with.
     """
 
     def __init__(
         self,
         layout: Layout,
+        noise: PadNoise | None,
         noise_ff: Floats,
         seed: int,
         *,
-        quiet: bool,
         fidelity: Mapping[int, str],
     ) -> None:
         self._layout = layout
         self._t_ns = 0
         noise_ff = noise_ff.reshape(-1, TAXELS)
         rngs = [np.random.default_rng([seed, 2, chip]) for chip in range(len(layout.triangles))]
-        self.signal = SignalSkin(rngs, noise_ff.copy(), Q_FF, quiet=quiet)
+        draws = None
+        if noise is not None:
+            draws = ChipNoise(np.array([rng.integers(1 << 62) for rng in rngs], np.intp), noise)
+        self.signal = SignalSkin(draws, noise_ff.copy(), Q_FF)
         self.registers: dict[int, AD7147] = {}
         self._synced_ns: dict[int, int] = {}
         self._on_line: dict[int, Chip] = {}
         self.lines: dict[int, list[EmulatedSMBus]] = {}
+        self._wires: list[I2cWire] = []
         self._boards: list[Chips] = []
+        self.by_bus = False
+        #: Boards with a chip that was set up by something other than their firmware.
+        self._strange: set[int] = set()
+        self._configuring = False
+        #: How often each board has read its chips without a bus.
+        self._reads = [0] * len(layout.boards)
+        #: Chips that answer at a slot which has its own chip, by that slot.
+        self._second: dict[tuple[int, int], int] = {}
+        self._brown_outs = np.random.default_rng([seed, 7])
         self.chip_of_slot: list[Ints] = []
         for number, board in enumerate(layout.boards):
             chip_of_slot = np.full(SLOTS, -1, np.intp)
@@ -104,19 +130,29 @@ class Converters:
                 if triangle.board == number:
                     chip_of_slot[slot_of(board, triangle.number)] = chip
             self.chip_of_slot.append(chip_of_slot)
+            n_lines = 5 if (chip_of_slot[16:] >= 0).any() else 4
+            rng = np.random.default_rng([seed, 6, number])
+            wire = I2cWire([{} for _ in range(n_lines)], rng)
+            self._wires.append(wire)
+            at_once = SignalChips(self.signal, chip_of_slot)
             if fidelity[number] == "signal":
-                self._boards.append(SignalChips(self.signal, chip_of_slot))
+                self._boards.append(_WiredChips(self, number, wire, at_once))
                 continue
             for chip in chip_of_slot[chip_of_slot >= 0]:
-                registers = AD7147(None if quiet else rngs[chip], q_ff=Q_FF)
+                registers = (
+                    AD7147(q_ff=Q_FF)
+                    if draws is None
+                    else AD7147(rngs[chip], q_ff=Q_FF, noise=draws.one(int(chip)))
+                )
                 registers.set_input_noise_ff(noise_ff[chip])
                 self.registers[int(chip)] = registers
                 self._synced_ns[int(chip)] = 0
-                self._on_line[int(chip)] = _InTime(registers, partial(self._sync, int(chip)))
-            n_slots = SLOTS if (chip_of_slot[16:] >= 0).any() else 16
-            self.lines[number] = build_lines([None] * n_slots)
+                self._on_line[int(chip)] = _InTime(self, number, int(chip))
+            self.lines[number] = build_lines(wire)
+            by_bus = I2cChips(self.lines[number])
+            self._boards.append(_WiredChips(self, number, wire, at_once, by_bus))
+        for number in self.lines:
             self._plug(number)
-            self._boards.append(I2cChips(self.lines[number]))
 
     @property
     def t_ns(self) -> int:
@@ -131,71 +167,181 @@ class Converters:
         """The chips of a board as its firmware sees them."""
         return self._boards[number]
 
-    def force(self, chip: int, word: int | None) -> None:
-        """Let a chip be gone: it takes nothing, and `word` is read instead; None mends it.
+    def i2c_wire(self, number: int) -> I2cWire:
+        """The data lines of a board, to let something go wrong there."""
+        if not self._wires[number].faulty:
+            self._plug(number)
+        return self._wires[number]
 
-        0xFFFF is what pulled-up lines read, 0 what a line reads that is held low.
+    def read_at_once(self, number: int) -> bool:
+        """Return whether a board may take its chips' results from `signal` now; this counts as
+        read.
+        """
+        if self._wires[number].faulty:
+            return False
+        if number in self.lines:
+            if self.by_bus or number in self._strange:
+                return False
+            self._reads[number] += 1
+        return True
+
+    @contextmanager
+    def configuring(self) -> Iterator[None]:
+        """While the firmware of a board sets its chips up: `signal` is set up alike."""
+        self._configuring = True
+        yield
+        self._configuring = False
+
+    def written(self, number: int) -> None:
+        """Registers of a chip of a board are written, over its bus."""
+        if not self._configuring:
+            self._strange.add(number)
+
+    def reads(self, number: int) -> int:
+        """How often a board has read its chips without a bus."""
+        return self._reads[number]
+
+    def brown_out(self, chip: int) -> None:
+        """Let the supply of a chip fail for a moment: registers at reset, RAM random."""
+        ram = self._brown_outs.integers(0, 1 << 16, reg.END_OF_MAP - reg.BANK_2).astype(np.uint16)
+        if chip in self.registers:
+            self.synced(chip).brown_out(ram)
+        self.signal.brown_out(chip, ram)
+
+    def answer_second(self, number: int, slot: int, chip: int | None) -> None:
+        """Let another chip answer at a slot of a board as well; None ends that."""
+        if chip is None:
+            del self._second[number, slot]
+        else:
+            self._second[number, slot] = chip
+        self._plug(number)
+
+    def force(self, chip: int, word: int | None) -> None:
+        """Remove a chip: it accepts nothing, and `word` is read instead; None ends that.
+
+        0xFFFF is read from pulled-up lines, 0 from a line that is held low.
         """
         self.signal.forced[chip] = -1 if word is None else word
         self._plug(self._layout.triangles[chip].board)
 
     def rewire(self, number: int, chip_of_slot: Ints) -> None:
-        """Put other chips at the slots of a board."""
+        """Connect other chips to the slots of a board."""
         self.chip_of_slot[number][:] = chip_of_slot
         self._plug(number)
 
     def _plug(self, number: int) -> None:
-        """Put the chips of a board on its I2C lines as they are wired now."""
-        for line, bus in enumerate(self.lines.get(number, [])):
+        """Connect the chips of a board to its I2C lines as they are wired now."""
+        for number_of_line, line in enumerate(self._wires[number].lines):
             chips: dict[int, Chip] = {}
             for index, address in enumerate(ADDRESSES):
-                chip = int(self.chip_of_slot[number][CHIPS_PER_LINE * line + index])
-                word = int(self.signal.forced[chip])
-                if chip >= 0 and word < 0:
-                    chips[address] = self._on_line[chip]
-                elif chip >= 0 and word != ABSENT:
-                    chips[address] = _Unpowered(word)
-            bus.chips = chips
+                slot = CHIPS_PER_LINE * number_of_line + index
+                chip = self._at_slot(int(self.chip_of_slot[number][slot]))
+                if chip is not None:
+                    chips[address] = chip
+                line.share(address, self._at_slot(self._second.get((number, slot), -1)))
+            line.chips = chips
+
+    def _at_slot(self, chip: int) -> Chip | None:
+        """Return the bus side of a chip as it is now; None if there is none, or it does not
+        answer.
+        """
+        if chip < 0:
+            return None
+        word = int(self.signal.forced[chip])
+        if word >= 0:
+            return None if word == ABSENT else _Unpowered(word)
+        if chip in self.registers:
+            return self._on_line[chip]
+        return SignalPort(self.signal, chip)
 
     def set_capacitance_ff(self, chips: Ints, values: Floats) -> None:
         """Change the pads of some chips from now on, float64[k, 12]."""
-        in_signal = chips
+        self.signal.set_capacitance_ff(chips, values)
         if self.registers:
-            registers = np.array([int(chip) in self.registers for chip in chips], bool)
-            in_signal, values_signal = chips[~registers], values[~registers]
-            for chip, row in zip(chips[registers], values[registers], strict=True):
-                self._sync(int(chip))
-                self.registers[int(chip)].set_capacitances_ff(row)
-            values = values_signal
-        if len(in_signal):
-            self.signal.set_capacitance_ff(in_signal, values)
+            for chip, row in zip(chips.tolist(), values, strict=True):
+                if chip in self.registers:
+                    self.synced(chip).set_capacitances_ff(row)
 
     def set_noise_ff(self, chip: int, values: Floats) -> None:
         """Change the noise of a chip's pads, float64[12] (fF rms)."""
         if chip in self.registers:
-            self._sync(chip)
-            self.registers[chip].set_input_noise_ff(values)
-        else:
-            self.signal.set_input_noise_ff(np.array([chip]), values[None])
+            self.synced(chip).set_input_noise_ff(values)
+        self.signal.set_input_noise_ff(np.array([chip]), values[None])
 
     def hold_results(self, chip: int, held: NDArray[np.bool_]) -> None:
         """Results bool[12] of a chip that show no noise at all, not even the converter's own."""
         if chip in self.registers:
-            self._sync(chip)
-            self.registers[chip].hold_results(held)
-        else:
-            self.signal.hold_results(chip, held)
+            self.synced(chip).hold_results(held)
+        self.signal.hold_results(chip, held)
 
-    def _sync(self, chip: int) -> None:
-        """Bring a chip to the present."""
+    def synced(self, chip: int) -> AD7147:
+        """A chip at fidelity "chip", brought to the present."""
+        registers = self.registers[chip]
         late_ns = self._t_ns - self._synced_ns[chip]
         if late_ns:
-            self.registers[chip].advance(late_ns * 1e-9)
+            registers.advance(late_ns * 1e-9)
             self._synced_ns[chip] = self._t_ns
+        return registers
+
+
+class _WiredChips:
+    """The chips of a board over its wires: at once, by messages, or bit by bit if they are faulty.
+
+    Args:
+        converters, number: the board.
+        wire: its data lines.
+        at_once: its chips without a bus.
+        by_bus: its chips on their buses, if they have registers.
+    """
+
+    def __init__(
+        self,
+        converters: Converters,
+        number: int,
+        wire: I2cWire,
+        at_once: SignalChips,
+        by_bus: I2cChips | None = None,
+    ) -> None:
+        self._converters = converters
+        self._number = number
+        self._wire = wire
+        self._at_once = at_once
+        self._by_bus = by_bus
+        self._banged = BangedChips(wire)
+
+    def configure(
+        self, slots: Iterable[int], stages: StageMap, cdc_offset: int, power_control: int
+    ) -> None:
+        faulty = self._wire.faulty
+        slots = list(slots)
+        banged = [slot for slot in slots if faulty >> slot // CHIPS_PER_LINE & 1]
+        sound = [slot for slot in slots if slot not in banged]
+        if self._by_bus is not None:
+            with self._converters.configuring():
+                self._by_bus.configure(sound, stages, cdc_offset, power_control)
+        self._at_once.configure(sound, stages, cdc_offset, power_control)
+        self._banged.configure(banged, stages, cdc_offset, power_control)
+
+    def read(self, without: int = 0) -> Words:
+        if self._converters.read_at_once(self._number):
+            return self._at_once.read(without)
+        faulty = self._wire.faulty
+        chips = self._by_bus or self._at_once
+        words = chips.read(faulty)
+        if not faulty:
+            return words
+        banged = self._banged.read(~faulty)
+        for line in range(SLOTS // CHIPS_PER_LINE):
+            if faulty >> line & 1:
+                own = slice(CHIPS_PER_LINE * line, CHIPS_PER_LINE * (line + 1))
+                words[own] = banged[own]
+        return words
 
 
 class _Unpowered:
-    """What answers where a line is held low: every word is the same."""
+    """Answers where a line is held low: every word is the same."""
+
+    pointer = 0
 
     def __init__(self, word: int) -> None:
         self._word = word.to_bytes(2)
@@ -208,19 +354,38 @@ class _Unpowered:
 
 
 class _InTime:
-    """A chip on its line, brought to the present before every message."""
+    """A chip on its line, updated to the present before every message."""
 
-    def __init__(self, chip: AD7147, sync: Callable[[], None]) -> None:
+    def __init__(self, converters: Converters, number: int, chip: int) -> None:
+        self._converters = converters
+        self._number = number
         self._chip = chip
-        self._sync = sync
+        self._reads = 0
+
+    @property
+    def pointer(self) -> int:
+        return self._now().pointer
+
+    @pointer.setter
+    def pointer(self, address: int) -> None:
+        self._now().pointer = address
 
     def write(self, data: bytes) -> int:
-        self._sync()
-        return self._chip.write(data)
+        if len(data) > 2:
+            self._converters.written(self._number)
+        return self._now().write(data)
 
     def read(self, length: int) -> bytes:
-        self._sync()
-        return self._chip.read(length)
+        return self._now().read(length)
+
+    def _now(self) -> AD7147:
+        chip = self._converters.synced(self._chip)
+        reads = self._converters.reads(self._number)
+        if reads != self._reads:
+            # The firmware has read all results since, though not over this bus.
+            self._reads = reads
+            chip.pointer = reg.DEVICE_ID
+        return chip
 
 
 def read_rows(signal: SignalSkin, chips: Ints, row: Ints) -> Words:

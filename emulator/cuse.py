@@ -1,12 +1,12 @@
-"""Emulated buses as real `/dev/i2c-N`, through CUSE: a character device answered by a process.
+"""Emulated buses as real `/dev/i2c-N`, through CUSE: a character device served by a process.
 
 Any driver, tool or language that opens an I2C device file works on it: `i2cdetect`,
 `i2ctransfer`, an unmodified `smbus2.SMBus(7)`, several programs at once. The kernel's module
-`cuse` must be loaded, and opening `/dev/cuse` takes root.
+`cuse` must be loaded, and opening `/dev/cuse` needs root.
 
-A CUSE server does not see its callers' memory. It names what it needs of it and is asked again
-with the bytes, which is why an I2C_RDWR takes up to four rounds. The kernel moves at most
-128 KiB in one round, so 42 messages of 8192 bytes, legal on real adapters, end in ENOMEM here.
+A CUSE server cannot read its callers' memory. It names the areas that it needs, and the request
+comes again with their bytes, which is why an I2C_RDWR takes up to four rounds. The kernel moves at
+most 128 KiB in one round, so 42 messages of 8192 bytes, legal on real adapters, end in ENOMEM here.
 Layouts are those of linux/fuse.h.
 """
 

@@ -1,7 +1,7 @@
 """The experiments of the paper's section VI, run on the rig of `emulator.bench`.
 
-Each answers plain arrays; what a host makes of them, and how they compare with the paper's
-figures, is told in `skin_host.evaluation`.
+Each returns plain arrays; their processing by a host, and the comparison with the paper's
+figures, is in `skin_host.evaluation`.
 """
 
 from dataclasses import dataclass
@@ -18,11 +18,11 @@ SCAN_MM_PER_S = 0.5
 DEEPEST_MM = 0.92 * FOAM_MM
 SCAN_PROBE_MM = 3.0
 WINDOW_KPA = (150.0, 160.0)
-#: The mechanics of a long hold is worked out in ever longer steps, up to this one.
+#: A long hold is computed in growing steps, up to this one.
 LONGEST_STEP_S = 10.0
 STEP_GROWTH = 1.1
 READ_TOGETHER = 20_000
-#: Contacts worked out together; more would not fit the caches.
+#: Contacts computed together; more would not fit the caches.
 TOGETHER = 500
 
 Floats = NDArray[np.float64]

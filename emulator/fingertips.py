@@ -1,16 +1,17 @@
-"""Fingertips on force/torque boards: what presses on them, as their boards measure it.
+"""Fingertips on force/torque boards: the load of probes, as their boards measure it.
 
-A probe of the scene presses along the inward normal at its place; where it is pulled along
-the surface too, an object hangs on it that sticks and slips (`fingertip_worlds`). The board
-measures force and torque about its own origin, along its own axes, with an offset.
+A probe of the scene presses along the inward normal at its place; where it is also pulled along
+the surface, it carries an object that sticks and slips (`held_objects`). The board measures force
+and torque about its own origin, along its own axes, with an offset.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.fingertip_worlds import Friction, HeldObjects
+from emulator.held_objects import Friction, HeldObjects
 from emulator.scene import Keyframes, Probe, Scene, resolve, tangents
 from emulator.strain import StrainBoard
 from skin_host.bus.protocol import FrameBatch
@@ -32,7 +33,7 @@ NEVER_NS = 1 << 62
 FULL_SCALE = (50.0, 50.0, 50.0, 1.0, 1.0, 1.0)
 #: Unloaded boards read up to this share of their full scale.
 OFFSET_SHARE = 0.01
-#: Of what the probe's pull hangs on.
+#: Mass of the object that the probe pulls.
 OBJECT_KG = 0.2
 SLIDING_SHARE = 0.85
 #: Inner step of its motion; the contact's spring swings at some 16 Hz.
@@ -49,7 +50,7 @@ class Fingertips:
 
     Attributes:
         boards: by name of the fingertip.
-        hung: names of those whose boards neither hear nor send.
+        hung: names of those whose boards neither receive nor send.
 
     Raises:
         ConfigurationError: a probe cannot be on its fingertip; the message names the key.
@@ -128,6 +129,9 @@ class Fingertips:
             for answer in board.handle(can_id, data, t_ns)
         ]
 
+    def _force_on_skin(self, number: int) -> float:
+        return self._skin_force_n().get(number, 0.0)
+
     def _press(
         self, number: int, name: str, tip: Fingertip, probe: Probe, layout: Layout
     ) -> "_Press":
@@ -137,13 +141,13 @@ class Fingertips:
             if probe.by_depth:
                 raise ConfigurationError("depth_mm: a fingertip without skin is driven by a force")
             point, normal = place_on(tip, probe)
-            return _Press(probe, point, normal, lambda: 0.0)
+            return _Press(probe, point, normal, partial(self._force_on_skin, number))
         point_m, normal = resolve(probe.at, probe.part, layout)
         return _Press(
             probe,
             1e3 * point_m,
             normal,
-            lambda: self._skin_force_n().get(number, 0.0),
+            partial(self._force_on_skin, number),
             on_skin=True,
         )
 

@@ -1,13 +1,13 @@
-"""Contact mechanics of the foam: how deep a probe sinks in, and what it feels.
+"""Contact mechanics of the foam: the depth of a probe and the force on it.
 
-The foam is a Winkler layer: each point answers to its own compression alone, which is what the
+The foam is a Winkler layer: each point responds only to its own compression, which is what the
 paper's Figs. 11-16 show (no crosstalk, 5 and 6 mm probes alike). Its law is
 
     sigma(x) = E0 x (1 + k x^2)      with a pole at x = 0.95 from x = 0.85 (about 200 kPa) on,
 
 fitted to the paper's eq. (1) below 130 kPa. With the viscoelastic truth of
 `emulator.viscoelastic` a taxel under strain x carries P = sigma(x) - relaxation, and never less
-than zero: where the foam has not yet recovered the probe has left it.
+than zero: where the foam has not yet recovered, the probe does not touch it.
 
 Quantities: strain x = depth / thickness; pressures in kPa; "elastic pressure" is sigma(x).
 """
@@ -25,6 +25,13 @@ STIFFENING = 2.07
 #: at 155 kPa (paper, Figs. 14-15), E0 hardly differs.
 STIFFENING_SD = 0.12
 E0_SD = 0.025
+
+#: Infinergy (expanded thermoplastic polyurethane) under air, 3 mm of it on pads of 2.2 mm radius:
+#: fitted to the median pad of the recorded insole `left_calibration`, with the Cole-Cole truth at
+#: `INFINERGY_LOSS` of its losses. It is over five times as stiff as the paper's foam.
+INFINERGY_E0_KPA = 521.0
+INFINERGY_STIFFENING = 3.06
+INFINERGY_LOSS = 0.464
 
 DENSE_STRAIN = 0.85
 POLE_STRAIN = 0.95
@@ -55,6 +62,14 @@ class Foam:
         stiffening = STIFFENING * np.exp(STIFFENING_SD * rng.standard_normal(n))
         e0_kpa = E0_KPA * np.exp(E0_SD * rng.standard_normal(n))
         return cls(e0_kpa, stiffening, np.broadcast_to(thickness_mm, n) + 0.0)
+
+    def infinergy(self) -> "Foam":
+        """The same layer, with its spread, of Infinergy instead of the paper's foam."""
+        return Foam(
+            self.e0_kpa * INFINERGY_E0_KPA / E0_KPA,
+            self.stiffening * INFINERGY_STIFFENING / STIFFENING,
+            self.thickness_mm,
+        )
 
     def __len__(self) -> int:
         return len(self.e0_kpa)
@@ -129,7 +144,7 @@ class Footprint:
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """What moves c rigid probes: arrays [c].
+    """How c rigid probes are driven: arrays [c].
 
     A probe is driven by force where `force_n` is a number. Where it is NaN, `depth_mm` is
     commanded (below the undeformed surface) and reached through a spring in series: load
@@ -156,7 +171,7 @@ class Drive:
 
 @dataclass(frozen=True, slots=True)
 class Felt:
-    """Strained foam after a step: arrays [k], the footprint's rows first, then imprints."""
+    """Strained foam after a step: arrays [k], the footprint's rows first, then residuals."""
 
     taxel: Ints
     strain: Floats
@@ -164,7 +179,7 @@ class Felt:
 
 
 class FoamLayer:
-    """The foam of n taxels over time, worked out only where something presses or has pressed.
+    """The foam of n taxels over time, computed only where something presses or has pressed.
 
     Args:
         foam: elastic law, n taxels.
@@ -177,8 +192,8 @@ class FoamLayer:
 
     #: Foam that nothing touches any more is followed in steps of this length.
     RECOVERY_STEP_S = 0.25
-    #: An imprint below this elastic pressure is over: a hundredth of one unit.
-    IMPRINT_OVER_KPA = 0.02
+    #: A residual below this elastic pressure is over: a hundredth of one unit.
+    RESIDUAL_OVER_KPA = 0.02
 
     def __init__(self, foam: Foam, truth: FoamTruth) -> None:
         self.foam = foam
@@ -191,6 +206,8 @@ class FoamLayer:
         self._touched = self._recovering = np.zeros(0, np.intp)
         self._waited_s = 0.0
         self._strain = np.zeros(0)
+        #: Those of the two steps before the last one.
+        self._strains_before = self._strain, self._strain
         self._mean_thickness_mm = float(foam.thickness_mm.mean()) if len(foam) else 1.0
         self._place(Footprint.empty(), 0.0)
 
@@ -209,7 +226,7 @@ class FoamLayer:
                 self._waited_s = 0.0
         rows = footprint
         strain = self._press(drive)[rows.contact] * rows.share
-        # Where the foam has not come back as far as the probe, they do not meet.
+        # Where the foam has not come back to the probe's depth, they do not touch.
         imprint = self.truth.relaxation_kpa[rows.taxel]
         elastic = np.maximum(self._law.elastic_kpa(strain), imprint)
         loose = elastic <= imprint
@@ -258,7 +275,10 @@ class FoamLayer:
             d[by_force] = Foam.uniform(len(by_force)).strain(pressed[by_force])
             b[bare] = 0.0
         imprint = self.truth.relaxation_kpa[rows.taxel]
-        strain = self._strain
+        # Start value: the contact continues nearly as in the last three steps.
+        last, before, earlier = self._strain, *self._strains_before
+        strain = 3 * (last - before) + earlier
+        strain = np.minimum(np.maximum(strain, 0.0), 0.5 * (last + POLE_STRAIN))
         for _ in range(60):
             value, slope = self._law.elastic_kpa_and_slope(strain[rows.contact])
             weight = np.where(value > imprint, self._weight, 0.0)
@@ -271,15 +291,16 @@ class FoamLayer:
             # Convergence is quadratic: what is left is far below the step just made.
             if np.abs(strain - last).max(initial=0.0) < 1e-5:
                 break
+        self._strains_before = self._strain, self._strains_before[0]
         self._strain = strain
         self.depth_mm = strain * self._thickness_mm
         return strain
 
     def _place(self, footprint: Footprint, dt_s: float) -> None:
-        """Take over a footprint: gather its foam, let go what it no longer covers."""
-        touched = np.unique(footprint.taxel)
+        """Take over a footprint: gather its foam, release what it no longer covers."""
         is_touched = np.zeros(len(self.foam), bool)
-        is_touched[touched] = True
+        is_touched[footprint.taxel] = True
+        touched = np.flatnonzero(is_touched)
         left = self._touched[~is_touched[self._touched]]
         met = is_touched[self._recovering]
         self._free(self._recovering[met], self._waited_s)
@@ -303,14 +324,15 @@ class FoamLayer:
         self._between = Foam.uniform(int(np.count_nonzero(~self._bears)))
         self._bears_n_per_kpa = rows.area_mm2 * rows.edge * 1e-3
         self._strain = np.full(n_contacts, 0.3)
+        self._strains_before = self._strain, self._strain
 
     def _free(self, taxels: Ints, dt_s: float) -> Ints:
-        """Let untouched foam come back for `dt_s`; answers what still shows an imprint."""
+        """Let untouched foam come back for `dt_s`; returns where a residual is left."""
         if not len(taxels):
             return taxels
         elastic = self.truth.step_pressure(np.zeros(len(taxels)), dt_s, taxels)
         self.pressure_kpa[taxels] = 0.0
         self._imprint_strain[taxels] = self.foam.take(taxels).strain(elastic)
-        shows = elastic >= self.IMPRINT_OVER_KPA
+        shows = elastic >= self.RESIDUAL_OVER_KPA
         self.truth.reset(taxels[~shows])
         return taxels[shows]

@@ -1,7 +1,7 @@
-"""What the kernel's i2c-dev does with an I2C device file, on an emulated bus.
+"""Behaviour of the kernel's i2c-dev with an I2C device file, on an emulated bus.
 
-Requests in, answers out, no input or output: `emulator.cuse` carries them. Layouts are those of
-linux/i2c.h and linux/i2c-dev.h on 64-bit machines.
+Takes requests and returns answers, without input or output: `emulator.cuse` carries them. Layouts
+are those of linux/i2c.h and linux/i2c-dev.h on 64-bit machines.
 """
 
 import errno
@@ -121,7 +121,6 @@ class I2cDevice:
         return self._opened
 
     def release(self, handle: int) -> None:
-        """Close it."""
         self._address.pop(handle, None)
 
     def read(self, handle: int, length: int) -> bytes:

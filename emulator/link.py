@@ -1,25 +1,29 @@
-"""The rim of the emulator: its side of a python-can bus."""
+"""The emulator's side of a python-can bus."""
 
 import logging
 from collections.abc import Iterator
 
 import can
+from can.interfaces.socketcan import SocketcanBus
 
 from skin_host.bus.protocol import FrameBatch, MessageClass
 
 log = logging.getLogger(__name__)
 
-#: Boards act on commands only; the frames of other boards are not for them.
-_COMMANDS: list[can.typechecking.CanFilter] = [
-    {"can_id": message_class << 8, "can_mask": 0x7F0, "extended": False}
-    for message_class in (MessageClass.ANALOG_COMMAND, MessageClass.MANAGEMENT)
+#: Boards act on commands only, which come from address 0: class and sender of an identifier.
+_COMMANDS = {
+    message_class << 4 for message_class in (MessageClass.ANALOG_COMMAND, MessageClass.MANAGEMENT)
+}
+#: The same for the kernel, so that it wakes the process only for these.
+_FILTERS: list[can.typechecking.CanFilter] = [
+    {"can_id": command << 4, "can_mask": 0x7F0, "extended": False} for command in _COMMANDS
 ]
 #: Frames kept for a controller that does not take them now.
 WAITING_FRAMES = 2000
 
 
 class Link:
-    """Sends what boards send, and gives what a host commands.
+    """Sends the frames of boards, and returns the commands of a host.
 
     Attributes:
         sent, lost: frames that the bus took, and that it did not (too slow, down, bus-off).
@@ -28,7 +32,10 @@ class Link:
     def __init__(self, name: str, bus: can.BusABC) -> None:
         self._name = name
         self._bus = bus
-        self._bus.set_filters(_COMMANDS)
+        if isinstance(bus, SocketcanBus):
+            # python-can's own filters are not used: with one set, `recv(0)` gives None for a frame
+            # that does not pass, as if no other waited.
+            bus.set_filters(_FILTERS)
         self._waiting: list[can.Message] = []
         self._failing = False
         self.sent = 0
@@ -44,11 +51,15 @@ class Link:
                 return
             if message is None:
                 return
-            if not (message.is_extended_id or message.is_remote_frame or message.is_error_frame):
+            data_frame = not (message.is_remote_frame or message.is_error_frame or message.is_fd)
+            standard = data_frame and not message.is_extended_id
+            if standard and message.arbitration_id >> 4 in _COMMANDS:
                 yield message.arbitration_id, bytes(message.data)
 
     def send(self, batch: FrameBatch) -> None:
-        """Send frames in their order; what the controller does not take waits, or is lost."""
+        """Send frames in their order; frames that the controller does not take wait, or are
+        lost.
+        """
         messages = self._waiting + [
             can.Message(
                 arbitration_id=can_id, data=data[:dlc].tobytes(), dlc=dlc, is_extended_id=False

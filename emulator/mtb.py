@@ -17,13 +17,13 @@ __all__ = ["Burst", "Chips", "Frame", "I2cChips", "Mtb", "join", "make_board"]
 def make_board(
     model: str, address: int, chips: Chips, random: np.random.Generator | None = None
 ) -> Mtb:
-    """A board as it comes out of power-up.
+    """Return a board in its state after power-up.
 
     Args:
         model: "mtb3", "mtb4" or "mtb4c".
         address: its stored CAN address, 1..14.
-        chips: how it reaches its chips: `I2cChips` over smbus2 buses, or an emulator's own.
-        random: where command 32 FF of the MTB4 takes a random address from.
+        chips: access to its chips: `I2cChips` over smbus2 buses, or an emulator's own.
+        random: source of the random address for command 32 FF of the MTB4.
 
     Raises:
         ValueError: there is no such model.

@@ -1,8 +1,8 @@
-"""Pads: what a contact covers of them, and the capacitance that makes.
+"""Pads: how much of them a contact covers, and the resulting capacitance.
 
 A pad with the conductive cover above it is a plate capacitor whose gap shrinks by the strain x
 of the foam: under the covered part of the pad the capacitance rises by C0 x / (1 - x). C0 is
-100 fF for a pad of 2.1 mm radius under 2 mm of foam, which puts the paper's Figs. 11-16 right.
+100 fF for a pad of 2.1 mm radius under 2 mm of foam, which reproduces the paper's Figs. 11-16.
 Without the cover only a grounded object, such as a hand, is felt: it is the other plate.
 """
 
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from emulator.foam import Felt, Footprint
+from emulator.noise import SENT_UNIT_FF
 
 C0_FF = 100.0
 C0_RADIUS_MM = 2.1
@@ -46,6 +47,11 @@ class Shape(Protocol):
         """Radius of the disc of this area."""
         ...
 
+    @property
+    def reach_mm(self) -> float:
+        """Radius of the disc around its middle that holds it."""
+        ...
+
     def covered_mm2(self, centre_mm: Floats, radius_mm: Floats) -> Floats:
         """Area common with round pads at `centre_mm` [k, 2] of `radius_mm` [k]."""
         ...
@@ -70,6 +76,11 @@ class Disc:
 
     @property
     def edge_radius_mm(self) -> float:
+        """Radius of the disc."""
+        return self.diameter_mm / 2
+
+    @property
+    def reach_mm(self) -> float:
         """Radius of the disc."""
         return self.diameter_mm / 2
 
@@ -104,19 +115,21 @@ class Rectangle:
         """Radius of the disc of this area."""
         return float(np.sqrt(self.area_mm2 / np.pi))
 
+    @property
+    def reach_mm(self) -> float:
+        """Half its diagonal."""
+        return float(np.hypot(self.width_mm, self.height_mm) / 2)
+
     def covered_mm2(self, centre_mm: Floats, radius_mm: Floats) -> Floats:
         """Area common with round pads, by 24-point quadrature across each pad (to 0.1 %)."""
-        local = self._local(centre_mm)
-        # Across the pad in x = r sin(u) the chord is 2 r cos(u) long.
-        side = np.stack([-self.width_mm / 2 - local[:, 0], self.width_mm / 2 - local[:, 0]])
-        start, stop = np.arcsin(np.clip(side / radius_mm, -1.0, 1.0))
-        u = start[:, None] + (stop - start)[:, None] * (_NODES + 1) / 2
-        half_chord = radius_mm[:, None] * np.cos(u)
-        top = np.minimum(half_chord, (self.height_mm / 2 - local[:, 1])[:, None])
-        bottom = np.maximum(-half_chord, (-self.height_mm / 2 - local[:, 1])[:, None])
-        strips = np.maximum(top - bottom, 0.0) * half_chord
-        area: Floats = strips @ _WEIGHTS * (stop - start) / 2
-        return area
+        k = len(centre_mm)
+        size_mm = np.broadcast_to([self.width_mm, self.height_mm], (k, 2))
+        return rectangle_area_mm2(
+            centre_mm - [self.x_mm, self.y_mm],
+            np.broadcast_to(radius_mm, k),
+            size_mm,
+            np.full(k, np.deg2rad(self.turn_deg)),
+        )
 
     def outside_mm(self, point_mm: Floats) -> Floats:
         """Distance of points [..., 2] from the rectangle, 0 inside."""
@@ -131,6 +144,33 @@ class Rectangle:
         moved = point_mm - [self.x_mm, self.y_mm]
         local: Floats = moved @ np.array([[cos, -sin], [sin, cos]])
         return local
+
+
+def rectangle_area_mm2(
+    centre_mm: Floats, radius_mm: Floats, size_mm: Floats, turn: Floats
+) -> Floats:
+    """Area common to k pads and a rectangle around the origin for each, float64[k].
+
+    By 24-point quadrature across each pad (to 0.1 %).
+
+    Args:
+        centre_mm: [k, 2]. radius_mm: [k]. size_mm: width and height [k, 2].
+        turn: of the rectangles [k], rad.
+    """
+    cos, sin = np.cos(turn), np.sin(turn)
+    x_mm = centre_mm[:, 0] * cos + centre_mm[:, 1] * sin
+    y_mm = centre_mm[:, 1] * cos - centre_mm[:, 0] * sin
+    half_mm = size_mm / 2
+    # Across the pad in x = r sin(u) the chord is 2 r cos(u) long.
+    side = np.stack([-half_mm[:, 0] - x_mm, half_mm[:, 0] - x_mm])
+    start, stop = np.arcsin(np.clip(side / radius_mm, -1.0, 1.0))
+    u = start[:, None] + (stop - start)[:, None] * (_NODES + 1) / 2
+    half_chord = radius_mm[:, None] * np.cos(u)
+    top = np.minimum(half_chord, (half_mm[:, 1] - y_mm)[:, None])
+    bottom = np.maximum(-half_chord, (-half_mm[:, 1] - y_mm)[:, None])
+    strips = np.maximum(top - bottom, 0.0) * half_chord
+    area: Floats = strips @ _WEIGHTS * (stop - start) / 2
+    return area
 
 
 def lens_area_mm2(apart_mm: Floats, radius_a_mm: ArrayLike, radius_b_mm: ArrayLike) -> Floats:
@@ -176,6 +216,7 @@ class Pads:
         self.area_mm2 = np.pi * self.radius_mm**2
         self.c0_ff = C0_FF * (self.radius_mm / C0_RADIUS_MM) ** 2 * C0_THICKNESS_MM / thickness
         self.cover = np.broadcast_to(cover, n).astype(bool)
+        self._is_covered = bool(self.cover.all())
         self.membrane_mm = membrane_mm
 
     def __len__(self) -> int:
@@ -242,7 +283,7 @@ class Pads:
         """
         under = felt.covered * self.c0_ff[felt.taxel]
         rise = under * felt.strain / (1 - felt.strain)
-        if not self.cover.all():
+        if not self._is_covered:
             is_grounded = np.zeros(len(felt.taxel), bool)
             contacts = np.broadcast_to(grounded, len(footprint.area_mm2))
             is_grounded[: len(footprint.taxel)] = contacts[footprint.contact]
@@ -256,11 +297,60 @@ def draw_resting_ff(n: int, rng: np.random.Generator) -> Floats:
     return RESTING_FF + RESTING_SD_FF * rng.standard_normal(n)
 
 
-def draw_noise_ff(n: int, rng: np.random.Generator, bad_share: float = 0.015) -> Floats:
-    """rms noise of n pads: 0.2-0.4 units; a few badly soldered ones 1-3 units."""
-    units = rng.uniform(0.2, 0.4, n)
-    bad = rng.random(n) < bad_share
-    return UNIT_FF * np.where(bad, rng.uniform(1.0, 3.0, n), units)
+def draw_noise_ff(n: int, rng: np.random.Generator) -> Floats:
+    """rms noise of n pads of the best skin: 0.2-0.4 units."""
+    return UNIT_FF * rng.uniform(0.2, 0.4, n)
+
+
+class Jumps:
+    """Pads that change to another level above some pressure, until it has fallen well below.
+
+    On the recorded insoles pads of some triangles jump by 15 to 40 units, most of them between
+    30 and 120 kPa, and come back at 0.6 of it: a contact or a membrane, not the pressure.
+
+    Args:
+        at_kpa: float64[n], where each pad jumps; infinite for one that does not.
+        by_ff: float64[n], how far.
+    """
+
+    #: Share of the pressure where a pad jumped at which it comes back.
+    BACK_SHARE = 0.6
+
+    def __init__(self, at_kpa: Floats, by_ff: Floats) -> None:
+        self._at_kpa = at_kpa
+        self._by_ff = by_ff
+        self._jumped = np.zeros(len(at_kpa), bool)
+        self.any = bool(np.isfinite(at_kpa).any())
+
+    @classmethod
+    def drawn(cls, n: int, per_triangle: int, rng: np.random.Generator) -> "Jumps":
+        """n pads, one triangle in twelve with jumping ones."""
+        triangles = n // per_triangle
+        at_kpa = np.where(rng.random(triangles) < 1 / 12, rng.uniform(30, 120, triangles), np.inf)
+        size = rng.uniform(15, 40, n) * SENT_UNIT_FF
+        return cls(np.repeat(at_kpa, per_triangle), size)
+
+    @classmethod
+    def none(cls, n: int) -> "Jumps":
+        """n pads that do not jump."""
+        return cls(np.full(n, np.inf), np.zeros(n))
+
+    def step_ff(self, pads: Ints, pressure_kpa: Floats) -> Floats:
+        """What the jumps add to some pads [k] that are under so much pressure now (fF)."""
+        at_kpa = self._at_kpa[pads]
+        at_kpa = np.where(self._jumped[pads], self.BACK_SHARE * at_kpa, at_kpa)
+        jumped = self._jumped[pads] = pressure_kpa > at_kpa
+        added: Floats = np.where(jumped, self._by_ff[pads], 0.0)
+        return added
+
+
+def draw_dead(n: int, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Which of n pads never move: one in two hundred [chosen].
+
+    The recorded insoles have whole dead triangles, one in nine to two in three of them, and
+    hardly a dead pad elsewhere; a dead chip is a fault of its own.
+    """
+    return rng.random(n) < 1 / 200
 
 
 def _pad_points(n: int) -> Floats:

@@ -1,7 +1,7 @@
 """Boards whose data is a recording: fidelity "replay".
 
-The firmware runs as ever (discovery, configuration, start and stop, periods); only what its
-data frames carry comes from a log, sweep by sweep, from the beginning again at the end.
+The firmware runs as usual (discovery, configuration, start and stop, periods); only the content of
+its data frames comes from a log, sweep by sweep, and starts again at the end of the log.
 """
 
 from collections.abc import Mapping

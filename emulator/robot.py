@@ -1,13 +1,12 @@
 """A whole robot below its PC: boards, chips, foam and scene from the host's own settings.
 
-`step` moves the robot on in time and gives the frames that its boards sent; `receive` takes
-commands. Nothing here knows the time of day; `run` is the only door to the outside.
+`step` moves the robot on in time and returns the frames that its boards sent; `receive` takes
+commands. Nothing here knows the time of day; only `run` communicates with the outside.
 """
 
 from collections.abc import Callable, Mapping
 from functools import partial
 from heapq import heappop, heappush
-from itertools import count
 from pathlib import Path
 
 import can
@@ -15,8 +14,8 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
-from emulator import faults
-from emulator.bring_up import bring_up
+from emulator import faults, state
+from emulator.bring_up import set_up
 from emulator.bursts import Bursts
 from emulator.clock import Clock, RealClock
 from emulator.converters import Converters, fidelities
@@ -27,18 +26,21 @@ from emulator.mtb import Mtb, make_board
 from emulator.recording import load_recordings
 from emulator.scene import Fault, Probe, Scene, check
 from emulator.skin import NEVER_NS, Skin
+from emulator.state import StateError
 from emulator.wire import Wire
 from skin_host.bus.protocol import FrameBatch
+from skin_host.bus.protocol.commands import Message, SetTxMode, TxMode, command_frame
 from skin_host.errors import ConfigurationError
+from skin_host.files import write_atomic
 from skin_host.layout import Layout
 from skin_host.settings import Settings
 
 NS = 1_000_000_000
-#: Boards that are due within the same millisecond are worked out together.
+#: Boards that are due within the same millisecond are computed together.
 TICK_NS = 1_000_000
 #: How often `run` looks at buses and boards.
 POLL_NS = 2_000_000
-#: A process that was held up for longer lets the time slip instead of catching up.
+#: A process that was stopped for longer skips the time instead of catching up.
 LONGEST_CATCH_UP_NS = 250_000_000
 
 Floats = NDArray[np.float64]
@@ -46,7 +48,7 @@ Ints = NDArray[np.intp]
 
 
 class Robot:
-    """A robot that is not there.
+    """An emulated robot.
 
     Args:
         settings, layout: as the host reads them from one configuration file.
@@ -85,15 +87,18 @@ class Robot:
         if seed is not None:
             scene = structs.replace(scene, seed=seed)
         check(scene)
+        self.settings = settings
         self.layout = layout
         self.t_ns = 0
         self.skin = Skin(layout, scene, settings.fingertips)
         self.fingertips = Fingertips(settings, layout, scene, self._skin_force_n)
         of_board = fidelities(layout, fidelity)
-        self._signal_boards = [of_board[number] == "signal" for number in of_board]
         self.converters = Converters(
-            layout, self.skin.noise_ff, scene.seed, quiet=not scene.noise, fidelity=of_board
+            layout, self.skin.noise, self.skin.noise_ff, scene.seed, fidelity=of_board
         )
+        held = ~np.isnan(self.skin.held_ff).reshape(-1, TAXELS)
+        for chip in np.flatnonzero(held.any(axis=1)).tolist():
+            self.converters.hold_results(chip, held[chip])
         self._skin_due_ns = 0
         self._felt_taxels = self._felt_chips = np.zeros(0, np.intp)
         chips = np.arange(len(layout.triangles))
@@ -122,7 +127,7 @@ class Robot:
         self.hung: set[int] = set()
         self.late_ns: dict[int, int] = {}
         self.jitter_ns: dict[int, float] = {}
-        self._plans = count()
+        self._planned = 0
         self._agenda: list[tuple[int, int, Callable[[], object]]] = []
         for number, fault in enumerate(scene.fault):
             try:
@@ -188,7 +193,7 @@ class Robot:
             self._pass_on(self._felt_chips)
 
     def _pass_on(self, chips: Ints) -> None:
-        """Tell chips what their pads measure."""
+        """Set what the pads of chips measure."""
         values = self.skin.capacitance_ff.reshape(-1, TAXELS)[chips]
         held = self.skin.held_ff.reshape(-1, TAXELS)[chips]
         self.converters.set_capacitance_ff(chips, np.where(np.isnan(held), values, held))
@@ -206,7 +211,7 @@ class Robot:
                 if board.next_ns is not None:
                     board.next_ns += self.late_ns.get(number, 0)
                 alone = board.alone or number in self.jitter_ns or number in self._recordings
-                if self._signal_boards[number] and not alone:
+                if not alone and self.converters.read_at_once(number):
                     together.setdefault(type(board).arithmetic, []).append(number)
                 else:
                     self.wires[bus].put(self._sample_alone(number, board))
@@ -241,8 +246,17 @@ class Robot:
             self.wires[bus].put(FrameBatch.of(frames))
 
     def bring_up(self) -> None:
-        """Configure and start all boards as a careful host does, for use without one."""
-        bring_up(self)
+        """Configure and start all boards as a careful host does, for use without one.
+
+        A second or two pass, of which frames are dropped.
+        """
+        set_up(self.layout, self._command, self.step)
+        self.fingertips.start(self.t_ns)
+        for number in range(len(self._boards)):
+            self._command(number, SetTxMode(TxMode.START))
+
+    def _command(self, number: int, message: Message) -> None:
+        self.receive(self._bus_of[number], *command_frame(message, self._boards[number].address))
 
     async def run(self, buses: Mapping[str, can.BusABC], clock: Clock | None = None) -> None:
         """Live on real or virtual buses until cancelled.
@@ -255,14 +269,21 @@ class Robot:
         links = {name: Link(name, bus) for name, bus in buses.items()}
         last_ns = clock.now_ns()
         while True:
-            for name, link in links.items():
-                for can_id, data in link.received():
-                    self.receive(name, can_id, data)
+            commands = [
+                (name, can_id, data)
+                for name, link in links.items()
+                for can_id, data in link.received()
+            ]
             now_ns = clock.now_ns()
             passed_ns = min(now_ns - last_ns, LONGEST_CATCH_UP_NS)
             last_ns = now_ns
-            for name, batch in self.step(passed_ns / NS).items():
-                links[name].send(batch)
+            # Commands came one after the other in this time: boards whose computer was busy
+            # must not get them all at once, chips convert between them.
+            for command in [*commands, None]:
+                for name, batch in self.step(passed_ns / (len(commands) + 1) / NS).items():
+                    links[name].send(batch)
+                if command is not None:
+                    self.receive(*command)
             await clock.sleep_until_ns(now_ns + POLL_NS)
 
     # ------------------------------------------------------------------ by hand
@@ -293,7 +314,8 @@ class Robot:
         return end
 
     def _plan(self, at_s: float, action: Callable[[], object]) -> None:
-        heappush(self._agenda, (round(at_s * NS), next(self._plans), action))
+        self._planned += 1
+        heappush(self._agenda, (round(at_s * NS), self._planned, action))
 
     def rewire(self, board: int, chip_of_slot: Ints) -> None:
         """Plug other chips into the slots of a board, intp[20]."""
@@ -301,12 +323,50 @@ class Robot:
         self._boards[board].version += 1
 
     def pass_on(self, taxels: slice) -> None:
-        """Tell the chips of some taxels at once that these measure something else."""
+        """Set what the chips of some taxels measure, at once."""
         self._pass_on(np.unique(self.layout.triangle_of[taxels]).astype(np.intp))
 
     def work_out_now(self) -> None:
         """Something changed that the mechanics must take up at once."""
         self._skin_due_ns = self.t_ns
+
+    # ------------------------------------------------------------------ save and restore
+
+    def save(self) -> bytes:
+        """The whole robot as it is now: two robots restored from it do the same from here on."""
+        return state.save(self, (self.settings, self.layout))
+
+    @staticmethod
+    def restore(data: bytes, settings: Settings, layout: Layout) -> "Robot":
+        """The robot that was saved, with the settings and layout that it had.
+
+        Raises:
+            StateError: not a saved robot, or one of another configuration or version.
+        """
+        robot = state.restore(data, (settings, layout))
+        if not isinstance(robot, Robot):
+            raise StateError("the state is not of a robot; save it again")
+        return robot
+
+    def write(self, path: Path) -> None:
+        """Save the robot to a file, whole or not at all.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        write_atomic(path, self.save())
+
+    @staticmethod
+    def read(path: Path, settings: Settings, layout: Layout) -> "Robot":
+        """The robot that was written to a file.
+
+        Raises:
+            StateError: as `restore`; the message names the file.
+        """
+        try:
+            return Robot.restore(state.read(path), settings, layout)
+        except StateError as error:
+            raise StateError(f"{path}: {error}") from None
 
     # ------------------------------------------------------------------ truth
 

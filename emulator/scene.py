@@ -105,6 +105,16 @@ class Probe(_Table):
         return self.depth_mm is not None
 
 
+class Air(_Table):
+    """Air that presses all pads of a part alike, by exactly one of a file and keyframes."""
+
+    part: str
+    #: A recorded course, `time_s,pressure_kpa` or .npz, beside the scene's own file.
+    file: str = ""
+    pressure_kpa: Keyframes = []
+    start_s: Seconds = 0.0
+
+
 class Temperature(_Table):
     """Temperature of the skin: degrees C over time, straight lines between, held outside."""
 
@@ -136,12 +146,15 @@ class Scene(_Table):
     #: Draw every pad, chip and piece of foam as different as real ones are.
     spread: bool = True
     noise: bool = True
+    #: Pads of the best skin (0.2 to 0.4 units of 2.88 fF) instead of what real robots have.
+    quiet: bool = False
     #: Viscoelastic truth of the foam, see `emulator.viscoelastic`.
-    foam: Literal["S", "A", "L", "H"] = "S"
+    foam: Literal["S", "A", "L", "H", "infinergy"] = "S"
     #: Decay length of the surface around a contact; 0 is a plain Winkler layer.
     membrane_mm: Annotated[float, Meta(ge=0)] = 0.0
     temperature: Temperature = field(default_factory=Temperature)
     probe: list[Probe] = []
+    air: list[Air] = []
     fault: list[Fault] = []
 
 
@@ -152,6 +165,9 @@ def load(path: Path) -> Scene:
         ConfigurationError: unreadable, not TOML, or wrong; the message names file and key.
     """
     scene = read_toml(path, Scene, {})
+    for air in scene.air:
+        if air.file:
+            air.file = str(path.parent / air.file)
     try:
         check(scene)
     except ConfigurationError as error:
@@ -160,7 +176,7 @@ def load(path: Path) -> Scene:
 
 
 def check(scene: Scene) -> None:
-    """Check what the types cannot say.
+    """Check properties that the types cannot express.
 
     Raises:
         ConfigurationError: names the key.
@@ -182,6 +198,15 @@ def check(scene: Scene) -> None:
             _check_times(f"{where}.slide_mm", [t_s for t_s, _, _ in probe.slide_mm])
         if probe.at.triangle is not None and probe.at.taxel is not None:
             raise ConfigurationError(f"{where}.at: has both `triangle` and `taxel`")
+    for number, air in enumerate(scene.air):
+        where = f"air[{number}]"
+        if bool(air.file) == bool(air.pressure_kpa):
+            raise ConfigurationError(f"{where}: wanted one of file and pressure_kpa")
+        _check_times(f"{where}.pressure_kpa", [t_s for t_s, _ in air.pressure_kpa])
+        if min((kpa for _, kpa in air.pressure_kpa), default=0.0) < 0:
+            raise ConfigurationError(f"{where}.pressure_kpa: air cannot pull; wanted >= 0")
+        if any(probe.part == air.part for probe in scene.probe):
+            raise ConfigurationError(f'{where}.part: "{air.part}" has probes too; wanted one')
     if not scene.temperature.keyframes_c:
         raise ConfigurationError("temperature.keyframes_c: is empty")
     _check_times("temperature.keyframes_c", [t_s for t_s, _ in scene.temperature.keyframes_c])

@@ -42,7 +42,7 @@ class StrainBoard:
         address: 1..14.
         load: gives force (N) and torque (N m) float64[6] on the sensor at a time in ns.
         rng: draws the noise.
-        full_scale: N and N m of each of the six channels; whole numbers are told.
+        full_scale: N and N m of each of the six channels; whole numbers are reported.
         noise_share: standard deviation of a channel, as a share of its full scale.
         torque_first: sends torque before force; the order is not promised.
     """

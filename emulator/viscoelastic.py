@@ -1,26 +1,34 @@
 """Viscoelastic truths of the foam: what the pressure really is, given how far it is squeezed.
 
 They are what compensators are measured against, so none of them is a compensator's model. All
-have seven modes over four decades of time and lose 28 % of their pressure in the end:
+lose 28 % of a small pressure in the end; but for F by seven modes over four decades of time:
 
     L  linear: the ordinary Prony solid.
     A  asymmetric: unloading 2.5 times slower, losses grow with amplitude, rates with overstress.
     H  as A, and three play operators: about 3 % of hysteresis at any speed.
     S  symmetric, but times shrink with compression: tau exp(-(C - 30 kPa) / 40 kPa). Slow
        unloading comes out of it without being put in. The default.
+    F  fractional: the Cole-Cole law, whose relaxation is a power of time at both ends and no
+       finite sum of exponentials; losses grow with amplitude.
+    M  softens and heals (Mullins effect): as L, and below the highest compression of late the
+       foam bears up to 3 % less, after Ogden and Roxburgh; that memory fades in 30 min.
 
 The numbers are chosen, not measured: no relaxation curve of the paper's foam is public.
+
+K. S. Cole, R. H. Cole, Journal of Chemical Physics 9, 341 (1941), eq. (5) and its spectrum; R. W.
+Ogden, D. G. Roxburgh, Proceedings of the Royal Society A 455, 2861 (1999), with a hyperbolic
+tangent for the error function.
 """
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
-TruthKind = Literal["S", "A", "L", "H"]
+TruthKind = Literal["S", "A", "L", "H", "F", "M"]
 
 TAU_S = np.geomspace(1.5, 6000.0, 7)
 BETA = np.full(7, 0.04)
@@ -34,6 +42,23 @@ PLAY_KPA = np.array([4.0, 12.0, 34.0])
 PLAY_SHARE = 0.03
 #: Rate-independent hysteresis fades below this pressure: foam at rest is foam at rest.
 PLAY_FADE_KPA = 10.0
+#: Exponent and time of the Cole-Cole law. Its spectrum is taken at four times a decade.
+COLE_EXPONENT = 0.5
+COLE_TAU_S = 100.0
+COLE_TAUS_S = np.geomspace(1e-4, 1e8, 49)
+#: Mullins effect: the share that is lost far below the highest compression, how far below that
+#: is, and how soon that compression is forgotten.
+SOFTENING = 0.03
+SOFTENING_KPA = 40.0
+HEALING_S = 1800.0
+
+
+def _cole_cole() -> Floats:
+    """Weights of `COLE_TAUS_S`: the spectrum of the Cole-Cole law, 28 % in all."""
+    away = np.log(COLE_TAUS_S / COLE_TAU_S)
+    density = 1.0 / (np.cosh(COLE_EXPONENT * away) + np.cos(np.pi * COLE_EXPONENT))
+    weights: Floats = BETA.sum() * density / density.sum()
+    return weights
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +68,9 @@ class _Law:
     overstress_per_kpa: float = 0.0
     time_shift: bool = False
     plays: bool = False
+    softens: bool = False
+    tau_s: Floats = field(default_factory=lambda: TAU_S)
+    beta: Floats = field(default_factory=lambda: BETA)
 
 
 _LAWS: dict[str, _Law] = {
@@ -50,7 +78,17 @@ _LAWS: dict[str, _Law] = {
     "A": _Law(unloading_ratio=2.5, amplitude_per_kpa=0.0015, overstress_per_kpa=0.01),
     "H": _Law(2.5, 0.0015, 0.01, plays=True),
     "S": _Law(time_shift=True),
+    "F": _Law(amplitude_per_kpa=0.0015, tau_s=COLE_TAUS_S, beta=_cole_cole()),
+    "M": _Law(softens=True),
 }
+
+
+class _States(NamedTuple):
+    """What k taxels remember: modes [k, modes], plays [k, 3], highest compression [k]."""
+
+    modes: Floats
+    plays: Floats
+    peak_kpa: Floats
 
 
 class FoamTruth:
@@ -62,24 +100,38 @@ class FoamTruth:
     (int[k], no repeats); time stands still for the others.
 
     Args:
-        kind: "S", "A", "L" or "H".
+        kind: one of `TruthKind`.
         n: number of taxels.
-        rng: if given, losses vary by 10 % from taxel to taxel.
+        rng: if given, losses vary from taxel to taxel.
+        loss: of this foam, as a multiple of 28 %.
+        spread: by how much losses vary if drawn, log-normal.
+        speed: of all that takes time, as a multiple: foam at another temperature.
 
     Attributes:
         elastic_kpa, pressure_kpa, relaxation_kpa: float64[n], after the last step.
     """
 
-    def __init__(self, kind: TruthKind, n: int, rng: np.random.Generator | None = None) -> None:
+    def __init__(
+        self,
+        kind: TruthKind,
+        n: int,
+        rng: np.random.Generator | None = None,
+        *,
+        loss: float = 1.0,
+        spread: float = STRENGTH_SD,
+        speed: float = 1.0,
+    ) -> None:
         self._law = _LAWS[kind]
+        self._speed = speed
         self.elastic_kpa = np.zeros(n)
         self.pressure_kpa = np.zeros(n)
         self.relaxation_kpa = np.zeros(n)
-        self._strength = np.ones(n)
+        self._strength = np.full(n, loss)
         if rng is not None:
-            self._strength = np.exp(STRENGTH_SD * rng.standard_normal(n))
-        self._modes = np.zeros((n, len(TAU_S)))
+            self._strength *= np.exp(spread * rng.standard_normal(n))
+        self._modes = np.zeros((n, len(self._law.tau_s)))
         self._plays = np.tile(-PLAY_KPA, (n, 1))
+        self._peak_kpa = np.zeros(n)
 
     def __len__(self) -> int:
         return len(self.elastic_kpa)
@@ -88,7 +140,7 @@ class FoamTruth:
         """Foam that was never touched."""
         self._modes[taxels] = 0
         self._plays[taxels] = -PLAY_KPA
-        for state in (self.elastic_kpa, self.pressure_kpa, self.relaxation_kpa):
+        for state in (self.elastic_kpa, self.pressure_kpa, self.relaxation_kpa, self._peak_kpa):
             state[taxels] = 0
 
     def step(
@@ -99,15 +151,14 @@ class FoamTruth:
         P may come out negative, for a probe glued to the foam.
         """
         elastic = np.asarray(elastic_kpa, np.float64)
-        modes, plays = self._stepped(elastic, dt_s, taxels)
-        return self._store(elastic, modes, plays, taxels)
+        return self._store(elastic, self._stepped(elastic, dt_s, taxels), taxels)
 
     def step_pressure(
         self, pressure_kpa: ArrayLike, dt_s: float, taxels: Ints | slice = slice(None)
     ) -> Floats:
         """Pressure-driven: find the C [k] that leaves P = `pressure_kpa` after `dt_s`.
 
-        With P = 0 it is free foam, and C its imprint.
+        With P = 0 it is free foam, and C its residual.
         """
         pressure = np.asarray(pressure_kpa, np.float64)
         return self._solve(pressure, 0.0, dt_s, taxels)
@@ -135,21 +186,22 @@ class FoamTruth:
         relaxation = self.relaxation_kpa[taxels]
         for _ in range(50):
             elastic = np.maximum(offset + (1 - pressed_share) * relaxation, relaxation)
-            modes, plays = self._stepped(elastic, dt_s, taxels)
-            last, relaxation = relaxation, self._relaxation(elastic, modes, plays, taxels)
+            states = self._stepped(elastic, dt_s, taxels)
+            last, relaxation = relaxation, self._relaxation(elastic, states, taxels)
             if np.abs(relaxation - last).max(initial=0.0) < 1e-7:
                 break
-        self._store(elastic, modes, plays, taxels)
+        self._store(elastic, states, taxels)
         return elastic
 
-    def _stepped(self, elastic: Floats, dt_s: float, taxels: Ints | slice) -> tuple[Floats, Floats]:
-        """States [k, 7] and plays [k, 3] after C went to `elastic`; nothing is stored."""
+    def _stepped(self, elastic: Floats, dt_s: float, taxels: Ints | slice) -> _States:
+        """The states after C went to `elastic`; nothing is stored."""
         law = self._law
         modes = self._modes[taxels]
+        dt_s *= self._speed
         # C in the middle of a straight line stands for the line: exact to second order.
         middle = 0.5 * (self.elastic_kpa[taxels] + elastic)[:, None]
         away = middle - modes
-        rate = dt_s / TAU_S
+        rate = dt_s / law.tau_s
         if law.time_shift:
             rate = rate * np.exp((np.minimum(middle, SHIFT_LIMIT_KPA) - 30.0) / 40.0)
         if law.unloading_ratio != 1.0:
@@ -160,26 +212,33 @@ class FoamTruth:
         plays = self._plays[taxels]
         if law.plays:
             plays = np.clip(plays, elastic[:, None] - PLAY_KPA, elastic[:, None] + PLAY_KPA)
-        return modes, plays
+        peak = self._peak_kpa[taxels]
+        if law.softens:
+            healed = peak + np.expm1(-dt_s / HEALING_S) * (peak - elastic)
+            peak = np.maximum(healed, elastic)
+        return _States(modes, plays, peak)
 
-    def _relaxation(
-        self, elastic: Floats, modes: Floats, plays: Floats, taxels: Ints | slice
-    ) -> Floats:
+    def _relaxation(self, elastic: Floats, states: _States, taxels: Ints | slice) -> Floats:
         law = self._law
+        modes = states.modes
         if law.amplitude_per_kpa:
             modes = modes * (1 + law.amplitude_per_kpa * modes)
-        relaxation: Floats = self._strength[taxels] * (modes @ BETA)
+        relaxation: Floats = self._strength[taxels] * (modes @ law.beta)
         if law.plays:
             # 0 while loading, twice the half width while unloading.
-            behind = (plays - elastic[:, None] + PLAY_KPA).sum(axis=1)
+            behind = (states.plays - elastic[:, None] + PLAY_KPA).sum(axis=1)
             relaxation += PLAY_SHARE * behind * elastic / (np.abs(elastic) + PLAY_FADE_KPA)
+        if law.softens:
+            below = (states.peak_kpa - elastic) / SOFTENING_KPA
+            relaxation += SOFTENING * np.maximum(elastic, 0.0) * np.tanh(below)
         return relaxation
 
-    def _store(self, elastic: Floats, modes: Floats, plays: Floats, taxels: Ints | slice) -> Floats:
-        relaxation = self._relaxation(elastic, modes, plays, taxels)
+    def _store(self, elastic: Floats, states: _States, taxels: Ints | slice) -> Floats:
+        relaxation = self._relaxation(elastic, states, taxels)
         pressure = elastic - relaxation
-        self._modes[taxels] = modes
-        self._plays[taxels] = plays
+        self._modes[taxels] = states.modes
+        self._plays[taxels] = states.plays
+        self._peak_kpa[taxels] = states.peak_kpa
         self.elastic_kpa[taxels] = elastic
         self.relaxation_kpa[taxels] = relaxation
         self.pressure_kpa[taxels] = pressure

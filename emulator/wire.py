@@ -1,7 +1,7 @@
 """One CAN bus: who sends when. Frames wait for the bus, the lowest identifier goes first.
 
 Boards have short queues. What does not fit is lost: an MTB4 drops the newest frames, an MTB3
-drops its whole stack and says so.
+drops its whole stack and reports that.
 """
 
 from collections.abc import Callable
@@ -52,7 +52,7 @@ class Wire:
         self.error_share = 0.0
 
     def babble(self, share: float, t_ns: int) -> None:
-        """From `t_ns` on somebody fills `share` of the bus with frames of identifier 0."""
+        """From `t_ns` on a node fills `share` of the bus with frames of identifier 0."""
         frame_ns = (OVERHEAD_BITS + STUFF_BITS + 64) * self._bit_ns
         self._babble_every_ns = round(frame_ns / share) if share else 0
         self._babbled_ns = t_ns

@@ -1,16 +1,17 @@
-"""Take a calibration without a daemon, and find the one that is kept."""
+"""Takes a calibration without a daemon, and finds the stored one."""
 
 import asyncio
 import contextlib
 import logging
-import time
+import os
 from collections.abc import Callable
-from datetime import UTC, datetime
 from pathlib import Path
 
 from skin_host import service
+from skin_host.clock import SYSTEM, Clock
 from skin_host.engine import Engine
 from skin_host.errors import CalibrationError, OtherSkinError, SkinError
+from skin_host.files import set_aside
 from skin_host.layout import Layout
 from skin_host.link import Link
 from skin_host.processing import calibration as calibrations
@@ -19,7 +20,7 @@ from skin_host.settings import Settings, skin_hash
 
 log = logging.getLogger(__name__)
 
-#: When nothing has come for so long, a calibration ends with what it has.
+#: If nothing was received for this long, a calibration ends with what it has.
 GRACE_S = 5.0
 
 
@@ -29,6 +30,7 @@ async def take_calibration(
     parts: list[int],
     seconds: float,
     progress: Callable[[float], None],
+    clock: Clock = SYSTEM,
 ) -> Calibration:
     """Bring up the boards of some parts and calibrate them.
 
@@ -37,23 +39,23 @@ async def take_calibration(
         SkinError: no board sent a sweep.
     """
     engine = Engine(settings, layout, parts)
-    link = Link(engine)
+    link = Link(engine, clock=clock)
     tasks = [
         asyncio.create_task(link.read(lambda _: None)),
-        asyncio.create_task(_supervise(link)),
+        asyncio.create_task(_supervise(link, clock)),
     ]
     try:
-        # A bus without any other node never takes the set-up; the time limit tells of it.
-        async with asyncio.timeout(GRACE_S):
+        # A bus without any other node never takes the set-up; the time limit reports that.
+        async with clock.timeout(GRACE_S):
             await link.bring_up()
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(GRACE_S):
-                while not link.all_alive():  # noqa: ASYNC110 (the boards tell nobody)
-                    await asyncio.sleep(0.05)
-        return await collect(engine, seconds, progress)
+            async with clock.timeout(GRACE_S):
+                while not link.all_alive():
+                    await clock.sleep(0.05)
+        return await collect(lambda: engine, seconds, progress, clock)
     except TimeoutError:
         raise SkinError(
-            "the boards could not be set up: nobody acknowledges on the bus; see with `skin scan` "
+            "the boards could not be set up: no node acknowledges; check with `skin scan` "
             "whether they are powered and answer"
         ) from None
     finally:
@@ -64,34 +66,43 @@ async def take_calibration(
         link.close()
 
 
-async def _supervise(link: Link) -> None:
-    """Boards that are late, or missed their set-up, are set up again."""
+async def _supervise(link: Link, clock: Clock) -> None:
+    """Set up boards again that are late, or missed their set-up."""
     while True:
-        await asyncio.sleep(0.5)
+        await clock.sleep(0.5)
         link.supervise()
 
 
 async def collect(
-    engine: Engine, seconds: float, progress: Callable[[float], None] = lambda _: None
+    engine: Callable[[], Engine],
+    seconds: float,
+    progress: Callable[[float], None] = lambda _: None,
+    clock: Clock = SYSTEM,
 ) -> Calibration:
-    """Let an engine that is being fed collect a calibration.
+    """Let a running engine collect a calibration.
+
+    Args:
+        engine: returns the engine in use, which may be replaced meanwhile.
+        seconds: how long.
+        progress: is called with the share that has been collected.
+        clock: for waiting.
 
     Raises:
         SkinError: no board sent a sweep.
     """
-    engine.begin_calibration(seconds)
-    grown_s = time.monotonic()
+    engine().begin_calibration(seconds)
+    grown_s = clock.monotonic_s()
     share = 0.0
-    while share < 1.0 and time.monotonic() - grown_s < GRACE_S:
-        await asyncio.sleep(0.02)
-        before, share = share, engine.calibration_progress()
+    while share < 1.0 and clock.monotonic_s() - grown_s < GRACE_S:
+        await clock.sleep(0.02)
+        before, share = share, engine().calibration_progress()
         if share > before:
-            grown_s = time.monotonic()
+            grown_s = clock.monotonic_s()
         progress(share)
-    found = engine.end_calibration(datetime.now(UTC).isoformat(timespec="seconds"))
+    found = engine().end_calibration(clock.today().isoformat(timespec="seconds"))
     if share == 0.0:
         raise SkinError(
-            "no calibration: no board sent a sweep; see with `skin scan` whether the boards are "
+            "no calibration: no board sent a sweep; check with `skin scan` whether the boards are "
             "powered and answer"
         )
     return found
@@ -104,15 +115,21 @@ def calibration_path(settings: Settings, node: str) -> Path:
 
 
 def stored_calibration(settings: Settings, layout: Layout, node: str) -> Calibration | None:
-    """The calibration that was kept, or None if there is none.
+    """Return the stored calibration, or None if there is none.
 
-    A damaged file is told of and counts as none: a service goes on without it.
+    An unreadable one counts as none, so that a service can continue without it. So does a damaged
+    one,
+    which is set aside.
 
     Raises:
-        OtherSkinError: it belongs to another configuration.
+        OtherSkinError: it belongs to another configuration or robot.
+        NewerFileError: a newer version has written it.
     """
     path = calibration_path(settings, node)
-    if not path.exists():
+    if not os.access(path, os.F_OK):
+        return None
+    if not os.access(path, os.R_OK):
+        log.error("%s: cannot be read: no permission; a new one is taken", path)
         return None
     try:
         return calibrations.load(path, layout, skin_hash(settings))
@@ -120,4 +137,5 @@ def stored_calibration(settings: Settings, layout: Layout, node: str) -> Calibra
         raise
     except CalibrationError as error:
         log.warning("%s", error)
+        set_aside(path)
         return None

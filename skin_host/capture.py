@@ -1,4 +1,4 @@
-"""Recording from outside the daemon: what a broker says, and what the buses bring.
+"""Records outside the daemon: messages of a broker, and frames of the buses.
 
 Both may go into one MCAP file; CAN frames alone also into the formats of python-can
 (candump .log, Vector .asc and .blf, .trc, .csv), chosen by the file's suffix.
@@ -15,11 +15,13 @@ from typing import Self
 
 import can
 
-from skin_host.bus.port import EXTENDED_FLAG, REMOTE_FLAG, Port, open_port
+from skin_host.bus.opening import open_port
+from skin_host.bus.port import EXTENDED_FLAG, REMOTE_FLAG, Port
 from skin_host.bus.protocol import FrameBatch
 from skin_host.errors import RequestError, SkinError
 from skin_host.publish.address import Broker
 from skin_host.publish.connection import Retry, connect, explain, first_error
+from skin_host.publish.payload import MAX_PACKET_BYTES
 from skin_host.publish.recording import SUFFIX, Recorder, recorded_topics
 from skin_host.settings import Settings
 
@@ -34,13 +36,13 @@ _log = logging.getLogger(__name__)
 
 
 class CanLog:
-    """CAN frames in a format of python-can; the file takes its name when it is closed.
+    """CAN frames in a format of python-can; the file gets its name when it is closed.
 
     Attributes:
         frames: recorded so far.
 
     Raises:
-        RequestError: the suffix is none of `CAN_SUFFIXES`.
+        RequestError: the suffix is not one of `CAN_SUFFIXES`.
         SkinError: the file cannot be made.
     """
 
@@ -99,9 +101,9 @@ class CanLog:
 
 
 async def capture_buses(settings: Settings, sink: CanSink, stop: asyncio.Event) -> int:
-    """Hand on what the configured buses bring until `stop` is set; return how much was lost.
+    """Pass frames of the configured buses to `sink` until `stop` is set; return how many were lost.
 
-    A bus may be read by others at the same time, such as the daemon (SocketCAN).
+    Other programs, such as the daemon, may read a bus at the same time (SocketCAN).
 
     Raises:
         BusError: a bus cannot be opened.
@@ -125,7 +127,7 @@ async def capture_buses(settings: Settings, sink: CanSink, stop: asyncio.Event) 
 async def capture_broker(
     recorder: Recorder, broker: Broker, base: str, robot: str, stop: asyncio.Event
 ) -> int:
-    """Record what a robot says until `stop` is set; return how often the broker was lost.
+    """Record a robot's messages until `stop` is set; return how often the broker was lost.
 
     Raises:
         SkinError: the recording cannot be written.
@@ -149,7 +151,10 @@ async def _listen(recorder: Recorder, broker: Broker, topics: list[str]) -> None
     while True:
         try:
             async with connect(
-                broker, identifier=identifier, max_incoming=MAX_INCOMING
+                broker,
+                identifier=identifier,
+                max_incoming=MAX_INCOMING,
+                max_packet=MAX_PACKET_BYTES,
             ) as connection:
                 for topic in topics:
                     await connection.subscribe(topic, qos=0 if topic.endswith("/frame") else 1)

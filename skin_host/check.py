@@ -1,11 +1,11 @@
-"""What a configuration describes, in numbers: `skin check`.
+"""Describes a configuration in numbers: `skin check`.
 
-The records are what `--json` prints; `table` is the same for people. Things that are
-allowed but are likely mistakes come as warnings, with their path in the file.
+`--json` prints the records; `table` formats them for people. Permitted values that are probably
+mistakes are listed as warnings, with their path in the file.
 """
 
 import math
-from itertools import groupby
+from itertools import combinations, groupby
 from typing import TypedDict
 
 import numpy as np
@@ -13,25 +13,27 @@ import numpy as np
 from skin_host.layout import TAXELS_PER_TRIANGLE, BoardLayout, Layout, PadKind
 from skin_host.settings import Settings, skin_hash
 
-#: Bits of a standard frame of eight bytes with its interframe space: without stuff bits, and
-#: with as many as there can be.
+#: Bits of a standard frame of eight bytes with its interframe space: without stuff bits, and with
+#: the most possible.
 FRAME_BITS = (111, 135)
 FRAMES_PER_TRIANGLE = 2
-#: The same of the two frames of six bytes that make one sample of force and torque.
+#: The same for the two frames of six bytes that make one sample of force and torque.
 WRENCH_BITS = (2 * 95, 2 * 115)
-#: A bus that is loaded higher has no room for commands and retransmissions.
+#: A bus with a higher load has no room for commands and retransmissions.
 WARN_LOAD = 0.8
 #: Twelve stages at decimation 256 take the chip this long (AD7147; MTB3's timer constants).
 CONVERSION_MS = 36.86
-#: Boards of these types take pad 6 as a thermometer (type 3: only from triangle 5 on).
+#: Boards of these types use pad 6 as a temperature pad (type 3: only from triangle 5 on).
 THERMOMETER_PAD = 6
 COMPENSATED_TYPES = {0: 0, 3: 5, 8: 0}
-#: Taxels of a part that are closer than this lie at one place.
+#: Taxels of a part that are closer than this are at the same place.
 SAME_PLACE_M = 1e-4
+#: Foam outside this range usually means a wrong unit.
+USUAL_FOAM_MM = (0.3, 30.0)
 
 
 class BusRecord(TypedDict):
-    """One bus. `load` is the share of its time that all configured boards take, least and most."""
+    """One bus. `load` is the share of its time for all configured boards, least and most."""
 
     name: str
     interface: str
@@ -43,7 +45,7 @@ class BusRecord(TypedDict):
 
 
 class BoardRecord(TypedDict):
-    """One board, and the parts that it feeds."""
+    """One board, and the parts it belongs to."""
 
     name: str
     bus: str
@@ -57,7 +59,7 @@ class BoardRecord(TypedDict):
 
 
 class PartRecord(TypedDict):
-    """One part; `thermal` of its taxels feel temperature."""
+    """One part; `thermal` of its taxels measure temperature."""
 
     name: str
     node: str
@@ -209,16 +211,25 @@ def _part(number: int, layout: Layout) -> PartRecord:
 
 
 def _bus_warnings(buses: list[BusRecord], used: set[str]) -> list[str]:
-    return [
-        f"buses.{bus['name']}: skin frames take {_load(bus)} of the bus; wanted at most "
-        f"{WARN_LOAD:.0%}: raise period_ms of its boards, or move boards to another bus"
-        for bus in buses
-        if bus["load"][1] > WARN_LOAD
-    ] + [
-        f"buses.{bus['name']}: no board is on this bus; it will be opened for nothing"
-        for bus in buses
-        if not bus["boards"] and bus["name"] not in used
-    ]
+    return (
+        [
+            f"buses.{bus['name']}: skin frames take {_load(bus)} of the bus; wanted at most "
+            f"{WARN_LOAD:.0%}: raise period_ms of its boards, or move boards to another bus"
+            for bus in buses
+            if bus["load"][1] > WARN_LOAD
+        ]
+        + [
+            f"buses.{bus['name']}: no board is on this bus; it will be opened for nothing"
+            for bus in buses
+            if not bus["boards"] and bus["name"] not in used
+        ]
+        + [
+            f"buses.{later['name']}.channel: {later['channel']} is that of buses.{bus['name']} "
+            "too; each receives the frames of both"
+            for bus, later in combinations(buses, 2)
+            if (bus["interface"], bus["channel"]) == (later["interface"], later["channel"])
+        ]
+    )
 
 
 def _board_warnings(layout: Layout) -> list[str]:
@@ -259,6 +270,12 @@ def _part_warnings(layout: Layout) -> list[str]:
     warnings = []
     n_neighbours = np.diff(layout.neighbour_start)
     for part in layout.parts:
+        low, high = USUAL_FOAM_MM
+        if not low <= part.foam_mm <= high:
+            warnings.append(
+                f"parts.{part.name}.foam_mm: {part.foam_mm:g}; foam is {low:g} to {high:g} mm "
+                "thick as a rule, and pressures are scaled by it: is it in mm?"
+            )
         taxels = slice(part.start, part.stop)
         pressure = layout.pad_kind[taxels] == PadKind.PRESSURE
         alone = int((n_neighbours[taxels][pressure] == 0).sum())
@@ -271,7 +288,7 @@ def _part_warnings(layout: Layout) -> list[str]:
         if shared:
             warnings.append(
                 f"parts.{part.name}: {shared} taxel(s) lie where another one lies; "
-                "contacts there cannot be told apart"
+                "contacts there cannot be distinguished"
             )
     return warnings
 
@@ -379,7 +396,7 @@ def _load(bus: BusRecord) -> str:
 
 
 def columns(heads: list[str], rows: list[list[str | int]]) -> str:
-    """Columns as wide as their longest entry; a head that starts with > is to the right."""
+    """Format columns as wide as their longest entry; a head that starts with > is right-aligned."""
     cells = [[head.removeprefix(">") for head in heads], *([str(x) for x in row] for row in rows)]
     widths = [max(len(row[column]) for row in cells) for column in range(len(heads))]
     return "\n".join(

@@ -1,30 +1,34 @@
-"""Commands to a running daemon: validated, carried out, answered.
+"""Commands to a running daemon: validates, carries out and answers requests.
 
-Requests come from the network. Each has a type; whatever does not fit it is refused with a
-line that says why. `docs/operations.md` lists the commands.
+Requests come from the network. Each has a type; a request that does not fit it is refused with a
+line that gives the reason. `docs/operations.md` lists the commands.
 """
 
+import asyncio
 import logging
 import re
 from collections.abc import Awaitable, Callable, Mapping
-from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import Annotated, Any, Protocol, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
 
 from skin_host import service
+from skin_host.clock import Clock
+from skin_host.engine import Engine
 from skin_host.errors import BusError, RequestError, SkinError
+from skin_host.explain import explain
+from skin_host.layout import Layout
 from skin_host.processing import calibration as calibrations
+from skin_host.processing.calibration import Calibration
+from skin_host.publish.mqtt import Publisher
 from skin_host.recorder import Recorder
+from skin_host.settings import Settings
 from skin_host.state import State, Thresholds
-
-if TYPE_CHECKING:
-    from skin_host.daemon import Daemon
 
 log = logging.getLogger(__name__)
 
-#: Only letters that cannot leave the folder of recordings.
+#: Only characters that cannot leave the folder of recordings.
 _FILE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 MAX_RECORDING_BYTES = 4 * 1024**3
 
@@ -67,14 +71,38 @@ class _Record(_Request):
 
 
 R = TypeVar("R", bound=_Request)
+#: Commands that change nothing unless the request has keys.
+_READING = frozenset({"status", "thresholds"})
+
+
+class _Node(Protocol):
+    """The interface that commands need; see `daemon.Daemon`."""
+
+    clock: Clock
+    settings: Settings
+    layout: Layout
+    engine: Engine
+    publisher: Publisher
+    thresholds: Thresholds
+    unkept: dict[str, str]
+
+    async def calibrate(self, seconds: float, boards: list[int] | None = None) -> Calibration: ...
+    async def configure(self, boards: list[int] | None = None) -> list[str]: ...
+    async def reload(self) -> None: ...
+    def disable(self, part: int) -> None: ...
+    def set_thresholds(self, thresholds: Thresholds) -> None: ...
+    def status(self) -> Mapping[str, Any]: ...
+    def keep(self, state: State) -> None: ...
 
 
 class Control:
     """Carries out commands on a daemon."""
 
-    def __init__(self, daemon: "Daemon") -> None:
+    def __init__(self, daemon: _Node) -> None:
         self._daemon = daemon
         self.recorder: Recorder | None = None
+        self._keeping = asyncio.Lock()
+        self._starting = asyncio.Lock()
         self._commands: dict[str, Callable[[bytes], Awaitable[Answer]]] = {
             "calibrate": self._calibrate,
             "configure": self._configure,
@@ -89,20 +117,25 @@ class Control:
         }
 
     async def handle(self, name: str, payload: bytes) -> Answer:
-        """Do what a request asks for and return its result.
+        """Carry out a request and return its result.
 
         Raises:
-            SkinError: it is refused, or failed; one line says why.
+            SkinError: it was refused, or failed; one line gives the reason.
         """
         command = self._commands.get(name)
         if command is None:
             raise RequestError(f'no command "{name}"; there are: {", ".join(self._commands)}')
-        return await command(payload)
+        if not payload and name not in _READING:
+            raise RequestError(
+                "an empty request is refused: it is also what clears a retained one; wanted {}"
+            )
+        return await command(payload or b"{}")
 
-    def close(self) -> None:
-        """End what still goes on."""
+    async def close(self) -> None:
+        """End a recording in progress."""
         if self.recorder is not None:
-            self.recorder.stop()
+            self.recorder.finish()
+            await self.recorder.finished()
 
     async def _calibrate(self, payload: bytes) -> Answer:
         request = _decode(payload, _Calibrate)
@@ -121,6 +154,7 @@ class Control:
             "id": found.id,
             "time": found.time,
             "verdicts": calibrations.summary(found, layout),
+            "kept": "calibration" not in daemon.unkept,
         }
 
     async def _status(self, payload: bytes) -> Answer:
@@ -135,12 +169,12 @@ class Control:
     async def _disable(self, payload: bytes) -> Answer:
         name = _decode(payload, _Parts).part
         self._daemon.disable(self._part(name))
-        return self._keep()
+        return await self._keep()
 
     async def _enable(self, payload: bytes) -> Answer:
         name = _decode(payload, _Parts).part
         self._daemon.engine.disabled.discard(self._part(name))
-        return self._keep()
+        return await self._keep()
 
     async def _set_thresholds(self, payload: bytes) -> Answer:
         request = _decode(payload, _Thresholds)
@@ -152,7 +186,7 @@ class Control:
             changes = msgspec.structs.asdict(request.set)
             wanted = known | {key: value for key, value in changes.items() if value is not None}
             daemon.set_thresholds(Thresholds(**wanted))
-        answer = dict(self._keep()) if request.reset or request.set is not None else {}
+        answer = dict(await self._keep()) if request.reset or request.set is not None else {}
         return answer | {"touch": msgspec.to_builtins(daemon.settings.processing.touch)}
 
     async def _configure(self, payload: bytes) -> Answer:
@@ -171,28 +205,34 @@ class Control:
 
     async def _record(self, payload: bytes) -> Answer:
         request = _decode(payload, _Record)
-        if self.recorder is not None and self.recorder.ended is None:
-            raise RequestError(f"{self.recorder.path.name} is being recorded already; stop it")
         name = request.file
         if name is None:
-            name = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ.log")
+            name = self._daemon.clock.today().strftime("%Y%m%dT%H%M%SZ.log")
         if not _FILE.fullmatch(name):
             raise RequestError(
                 f'file: "{name[:64]}": wanted a plain name of letters, digits, ".", "_" and "-"'
             )
-        folder = service.state_directory(self._daemon.settings.service.state_directory)
         if "." not in name:
             name += ".log"
-        self.recorder = Recorder(folder / "recordings" / name, request.seconds, request.max_bytes)
-        log.info("recording to %s for %g s", self.recorder.path, request.seconds)
-        return {"file": str(self.recorder.path), "seconds": request.seconds}
+        folder = service.state_directory(self._daemon.settings.service.state_directory)
+        clock = self._daemon.clock
+        path = folder / "recordings" / name
+        async with self._starting:
+            if self.recorder is not None and self.recorder.ended is None:
+                raise RequestError(f"{self.recorder.path.name} is being recorded already; stop it")
+            self.recorder = await clock.in_thread(
+                Recorder, path, request.seconds, request.max_bytes, clock
+            )
+        log.info("recording to %s for %g s", path, request.seconds)
+        return {"file": str(path), "seconds": request.seconds}
 
     async def _stop_recording(self, payload: bytes) -> Answer:
         _decode(payload, _Request)
         recorder = self.recorder
         if recorder is None:
             raise RequestError("nothing is being recorded")
-        recorder.stop()
+        recorder.finish()
+        await recorder.finished()
         return {
             "file": str(recorder.path),
             "frames": recorder.frames,
@@ -200,19 +240,20 @@ class Control:
             "ended": recorder.ended,
         }
 
-    def _keep(self) -> Answer:
-        """Keep what operators changed; say so if that failed."""
+    async def _keep(self) -> Answer:
+        """Store what operators changed; report it if that failed. The disk may be slow."""
         daemon = self._daemon
-        state = State(
-            disabled=[daemon.layout.parts[part].name for part in sorted(daemon.engine.disabled)],
-            thresholds=daemon.thresholds,
-        )
-        answer: dict[str, Any] = {"disabled": state.disabled, "kept": True}
-        try:
-            daemon.keep(state)
-        except OSError as error:
-            log.error("state not kept: %s", error.strerror)
-            answer["kept"] = False
+        async with self._keeping:  # the newest is written last
+            state = State(
+                disabled=[daemon.layout.parts[i].name for i in sorted(daemon.engine.disabled)],
+                thresholds=daemon.thresholds,
+            )
+            answer: dict[str, Any] = {"disabled": state.disabled, "kept": True}
+            try:
+                await daemon.clock.in_thread(daemon.keep, state)
+            except OSError as error:
+                log.error("state not kept: %s", error.strerror)
+                answer["kept"] = False
         return answer
 
     def _part(self, name: str) -> int:
@@ -231,5 +272,15 @@ class Control:
 def _decode(payload: bytes, kind: type[R]) -> R:
     try:
         return msgspec.json.decode(payload, type=kind)
+    except msgspec.ValidationError as error:
+        raise RequestError(f"the request: {_why(payload, error, kind)}") from None
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise RequestError(f"the request: {error}") from None
+
+
+def _why(payload: bytes, error: msgspec.ValidationError, kind: type[R]) -> str:
+    """What is wrong with a request; other parts of it may be wrong in ways that are not JSON."""
+    try:
+        return explain(msgspec.json.decode(payload), error, kind, {})
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return str(error)

@@ -1,40 +1,46 @@
-"""The composition root: opens the buses, wires the rooms, owns the loop, nothing else."""
+"""The composition root: opens the buses, connects the components, and owns the loop."""
 
 import asyncio
 import logging
-import time
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
 
 from skin_host import __version__, metrics, service
+from skin_host.bus.opening import open_port
 from skin_host.bus.protocol import FrameBatch
 from skin_host.calibrate import calibration_path, collect
+from skin_host.clock import SYSTEM, Clock
 from skin_host.control import Control
-from skin_host.engine import Engine, Step
+from skin_host.engine import Engine, Output
 from skin_host.errors import ConfigurationError, RequestError, SkinError
-from skin_host.fingertip.desk import FingertipDesk
 from skin_host.fingertip.health import FingertipRecord
+from skin_host.fingertip.publishing import FingertipPublisher
 from skin_host.health import Health, Record
-from skin_host.health.telling import Teller
+from skin_host.health.fault_log import FaultLog
 from skin_host.layout import Layout, build_layout, parts_of
-from skin_host.link import Link
+from skin_host.link import Link, OpenPort
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration
+from skin_host.publish.connection import connect
+from skin_host.publish.contact import PartContact
 from skin_host.publish.info import CalibrationInfo, NodeInfo, node_info
-from skin_host.publish.mqtt import Publisher
-from skin_host.settings import Settings, load, skin_hash
+from skin_host.publish.mqtt import Connect, Publisher
+from skin_host.settings import Settings, load, needs_restart, skin_hash
 from skin_host.state import State, Thresholds, load_state, save_state
 
 log = logging.getLogger(__name__)
 
-#: Health is looked at this often, and published at once when something changes ...
+#: Health is computed this often, and published at once when something changes ...
 LOOK_S = 0.1
-#: ... else this often.
+#: ... otherwise this often.
 HEALTH_S = 1.0
-#: What is no news while a calibration is being taken.
+#: Faults that are expected while a calibration is being taken.
 _UNTIL_CALIBRATED = {"part_not_calibrated", "fingertip_not_calibrated"}
-#: Readiness is told after the first sweeps, or after so long without.
+#: The time of day was set if it differs by more than this from the monotonic time.
+JUMP_NS = 50_000_000
+#: Readiness is reported after the first sweeps, or after this time without them.
 PATIENCE_S = 3.0
 
 
@@ -46,16 +52,21 @@ class Daemon:
         layout: its skin.
         node: which parts are ours.
         calibration: to start with; None takes one as soon as the boards send.
-        folder: where relative file names in the settings start.
+        folder: relative file names in the settings start from here.
         configuration: the file that `reload` reads again.
+        clock: for time, waiting and threads.
+        open_port: opens buses, see `bus.opening.open_port`.
+        connect: connects to the broker, see `publish.connection.connect`.
+        share: makes of a configuration that was read again the one of this daemon, see `sharing`.
 
     Attributes:
         settings, layout: in use, with the changes that operators made.
         thresholds: these changes.
+        unkept: what could not be written to the state directory (`calibration`, `state`), and why.
 
     Raises:
-        ConfigurationError: no part belongs to this node.
-        BusError: a bus cannot be opened.
+        ConfigurationError: no part belongs to this node, or python-can does not know the kind
+            of a bus.
     """
 
     def __init__(
@@ -66,38 +77,54 @@ class Daemon:
         calibration: Calibration | None = None,
         folder: Path = Path(),
         configuration: Path | None = None,
+        clock: Clock = SYSTEM,
+        open_port: OpenPort = open_port,
+        connect: Connect = connect,
+        share: Callable[[Settings], Settings] = lambda settings: settings,
     ) -> None:
+        self.clock = clock
+        self._share = share
         self.settings = settings
         self.layout = layout
         self._node = node
         self._configuration = configuration
         state = load_state(self._state_path())
-        self._configured_touch = settings.processing.touch
+        self._configured = settings
         self.thresholds = state.thresholds
-        settings.processing.touch = state.thresholds.over(self._configured_touch)
+        self.settings = settings = state.thresholds.over_settings(settings)
         self.engine = Engine(settings, layout, parts_of(layout, node), calibration)
         self.engine.disabled = {
             i for i in self.engine.parts if layout.parts[i].name in state.disabled
         }
-        self.engine.touch_only = {
-            i for i in self.engine.parts if not settings.parts[layout.parts[i].name].frames
-        }
+        self.engine.touch_only = _touch_only(settings, layout, self.engine.parts)
         self.health = Health(self.engine)
         self.control = Control(self)
         self.publisher = Publisher(
-            settings.mqtt, layout.robot, node, handler=self.control.handle, folder=folder
+            settings.mqtt,
+            layout.robot,
+            node,
+            handler=self.control.handle,
+            folder=folder,
+            clock=clock,
+            connect=connect,
         )
         self.publisher.put_info(self._info())
-        self.fingertips = FingertipDesk(self.engine.fingertips, self.publisher)
-        self.link = Link(self.engine)
+        self._contacts = {i: PartContact(layout, i) for i in self.engine.parts}
+        for i in self.engine.parts:
+            # The state that the broker retained from an earlier start is no longer known.
+            self.publisher.put_contact(layout.parts[i].name, "UNKNOWN")
+        self.fingertips = FingertipPublisher(self.engine.fingertips, self.publisher)
+        self.link = Link(self.engine, wait=True, open_port=open_port, clock=clock)
+        self.unkept: dict[str, str] = {}
         self._calibration_lock = asyncio.Lock()
         self._feed_s = service.watchdog_interval_s()
         self._fed_s = 0.0
         self._status_s = 0.0
-        self._teller = Teller()
+        self._fault_log = FaultLog()
+        self._clock_ahead_ns = self._clock_against_ns()
 
     async def run(self, stop: asyncio.Event, *, calibrate: bool = False) -> None:
-        """Work until `stop` is set; then end every touch, stop the boards, say goodbye.
+        """Run until `stop` is set; then end every touch, stop the boards and disconnect.
 
         Args:
             stop: set it to end.
@@ -107,7 +134,7 @@ class Daemon:
             async with self.publisher:
                 await self._work(stop, calibrate)
         finally:
-            self.control.close()
+            await self.control.close()
             self.link.close()
 
     async def _work(self, stop: asyncio.Event, calibrate: bool) -> None:
@@ -117,7 +144,7 @@ class Daemon:
             asyncio.create_task(self._housekeep(), name="housekeeping"),
         ]
         if self.settings.service.metrics_port:
-            serving = metrics.serve(self.settings.service.metrics_port, self.status)
+            serving = metrics.serve(self.settings.service.metrics_port, self.status, self.clock)
             tasks.append(asyncio.create_task(serving, name="metrics"))
         stopping = asyncio.create_task(stop.wait(), name="stop")
         try:
@@ -129,15 +156,15 @@ class Daemon:
             await asyncio.gather(*tasks, stopping, return_exceptions=True)
             for part in self.engine.parts:
                 self._end_contacts(part)
-            self.fingertips.end(time.time_ns())
+            self.fingertips.end(self.clock.now_ns())
             await self.link.stop()
 
     async def calibrate(self, seconds: float, boards: list[int] | None = None) -> Calibration:
-        """Take a calibration, use it from then on, and keep it.
+        """Take a calibration, use it from then on, and store it.
 
         Args:
-            seconds: how long to look at the untouched skin.
-            boards: indices of those whose taxels are calibrated; all if not given.
+            seconds: how long to observe the untouched skin.
+            boards: indices of those whose taxels are calibrated; all by default.
 
         Raises:
             SkinError: another one is being taken, or no data came.
@@ -146,7 +173,7 @@ class Daemon:
             raise SkinError("a calibration is being taken already; wait for it to end")
         async with self._calibration_lock:
             log.info("calibrating for %g s: keep the skin untouched", seconds)
-            found = await collect(self.engine, seconds)
+            found = await collect(lambda: self.engine, seconds, clock=self.clock)
             known = self.engine.calibration
             if known is not None:
                 chosen = self.engine.boards if boards is None else boards
@@ -155,31 +182,34 @@ class Daemon:
                 )
             path = calibration_path(self.settings, self._node)
             if known is None:
-                found = calibrations.with_gains_of(found, path, self.layout)
+                found = await self.clock.in_thread(
+                    calibrations.with_gains_of, found, path, self.layout
+                )
             self.engine.use(found, boards)
             try:
-                await asyncio.to_thread(calibrations.save, path, found, self.layout)
+                await self.clock.in_thread(calibrations.save, path, found, self.layout)
             except OSError as error:
-                # The calibration is in use all the same; a restart will need a new one.
-                log.error("calibration not kept: %s: %s", path, error.strerror)
+                # The calibration is in use anyway; a restart will need a new one.
+                self.unkept["calibration"] = f"{path}: {error.strerror}"
+                log.error("calibration not kept: %s", self.unkept["calibration"])
             else:
+                self.unkept.pop("calibration", None)
                 log.info("calibration %s kept in %s", found.id, path)
             self.publisher.put_info(self._info())
             return found
 
     def disable(self, part: int) -> None:
-        """Publish nothing of a part from now on but its health."""
+        """Publish only the health of a part from now on."""
         self.engine.disabled.add(part)
         self._end_contacts(part)
 
     def set_thresholds(self, thresholds: Thresholds) -> None:
-        """Decide touches by the configuration with these changes; baselines go on."""
+        """Apply these changes to the configured touch thresholds; baselines are kept."""
         self.thresholds = thresholds
-        self.settings.processing.touch = thresholds.over(self._configured_touch)
-        self._renew_processing()
+        self._swap(self._configured, self.layout)
 
     async def configure(self, boards: list[int] | None = None) -> list[str]:
-        """Send boards (indices; all if not given) their set-up again; return their names.
+        """Send boards (indices; all by default) their set-up again; return their names.
 
         Raises:
             BusError: a bus does not take frames.
@@ -191,42 +221,25 @@ class Daemon:
     async def reload(self) -> None:
         """Read the configuration file again and send it to the boards.
 
-        What concerns processing and the set-up of boards takes effect; the calibration stays.
+        Settings of processing and of the boards' set-up take effect; the calibration stays.
 
         Raises:
-            RequestError: the file is wrong, or changes what only a restart can change; then
-                everything goes on as before.
+            RequestError: the file is wrong, or changes what only a restart can change; then nothing
+                changes.
         """
         if self._configuration is None:
             raise RequestError("started without a configuration file: nothing to read again")
-        settings = load(self._configuration)
+        settings = self._share(await self.clock.in_thread(load, self._configuration))
         try:
-            layout = build_layout(settings, self._configuration.parent)
+            layout = await self.clock.in_thread(build_layout, settings, self._configuration.parent)
         except ConfigurationError as error:
             raise ConfigurationError(f"{self._configuration}: {error}") from None
-        for what, new, old in (
-            (
-                "robot, boards' addresses, parts or triangles",
-                skin_hash(settings),
-                self.engine.configuration,
-            ),
-            ("buses", settings.buses, self.settings.buses),
-            ("fingertips", settings.fingertips, self.settings.fingertips),
-            ("mqtt", settings.mqtt, self.settings.mqtt),
-            ("service", settings.service, self.settings.service),
-            ("receive", settings.receive, self.settings.receive),
-            (
-                "periods of boards",
-                [board.settings.period_ms for board in layout.boards],
-                [board.settings.period_ms for board in self.layout.boards],
-            ),
-        ):
-            if new != old:
-                raise RequestError(f"{self._configuration}: {what} changed; that needs a restart")
-        self._configured_touch = settings.processing.touch
-        self.settings.processing = settings.processing
-        self.set_thresholds(self.thresholds)
-        log.info("%s read again; the boards are set up anew", self._configuration)
+        what = needs_restart(self._configured, settings)
+        if what is not None:
+            raise RequestError(f"{self._configuration}: {what} changed; that needs a restart")
+        self._configured = settings
+        self._swap(settings, layout)
+        log.info("%s read again; the boards are set up again", self._configuration)
         await self.configure()
         self.publisher.put_info(self._info())
 
@@ -236,7 +249,13 @@ class Daemon:
         Raises:
             OSError: it cannot be written.
         """
-        save_state(self._state_path(), state)
+        path = self._state_path()
+        try:
+            save_state(path, state)
+        except OSError as error:
+            self.unkept["state"] = f"{path}: {error.strerror}"
+            raise
+        self.unkept.pop("state", None)
 
     def records(self) -> dict[str, Record]:
         """The health record of every part, as it is now."""
@@ -246,20 +265,25 @@ class Daemon:
         """The same with the fingertips on force/torque boards."""
         return {**self.records(), **self.fingertips.records(self.link.read_ns)}
 
-    def _renew_processing(self) -> None:
-        for part in self.engine.parts:
-            self._end_contacts(part)
-        self.engine.renew()
+    def _swap(self, configured: Settings, layout: Layout) -> None:
+        """Replace the engine by one with other settings, which continues its state."""
+        settings = self.thresholds.over_settings(configured)
+        engine = Engine(settings, layout, self.engine.parts, after=self.engine)
+        engine.touch_only = _touch_only(settings, layout, engine.parts)
+        self.settings, self.layout, self.engine = settings, layout, engine
+        self.link.use(engine)
+        self.health.use(engine)
 
     def _end_contacts(self, part: int) -> None:
-        for event in self.engine.end_part(part, time.time_ns()):
+        events = self.engine.end_part(part, self.clock.now_ns())
+        for event in events:
             self.publisher.put_touch(event)
-        self.publisher.put_contact(self.layout.parts[part].name, touched=False)
+        self.publisher.put_contact(self.layout.parts[part].name, self._contacts[part].stop(events))
 
     async def _start(self, calibrate: bool) -> None:
-        """Bring the boards up, then calibrate if need be."""
+        """Bring the boards up, then calibrate if necessary."""
         async with asyncio.TaskGroup() as group:
-            group.create_task(self._say_ready())
+            group.create_task(self._report_ready())
             await self.link.bring_up()
         while calibrate or self.engine.calibration is None:
             try:
@@ -269,62 +293,77 @@ class Daemon:
                 log.warning("%s", error)
         await asyncio.Event().wait()
 
-    async def _say_ready(self) -> None:
-        """Ready is: buses open, first sweeps or some patience. A dead bus is told by health."""
-        deadline_s = time.monotonic() + PATIENCE_S
+    async def _report_ready(self) -> None:
+        """Report readiness: buses open, and first sweeps or a timeout. Health reports a dead
+        bus.
+        """
+        deadline_s = self.clock.monotonic_s() + PATIENCE_S
         while not self.link.all_alive():
-            if time.monotonic() > deadline_s:
+            if self.clock.monotonic_s() > deadline_s:
                 break
-            await asyncio.sleep(0.05)
+            await self.clock.sleep(0.05)
         service.notify("READY=1")
 
-    def _deliver(self, steps: list[Step]) -> None:
-        self.fingertips.deliver()
-        self.health.note_sweeps(self.engine.sweeps)
-        # Touches first: they leave before the frames are encoded.
-        for step in steps:
+    def _deliver(self, output: Output) -> None:
+        self.fingertips.deliver(output.grasps)
+        # Touches first, so that they leave before the frames are encoded.
+        for step in output.steps:
             for event in step.events:
                 self.publisher.put_touch(event)
-        for step in steps:
-            self.health.note_step(step)
-            self.publisher.put_contact(step.frame.part, touched=bool(step.frame.touched.any()))
+        self.health.note(output)
+        self._follow_clock()
+        for step in output.steps:
+            state = self._contacts[step.part].step(step.frame, step.events)
+            self.publisher.put_contact(step.frame.part, state)
             if step.part not in self.engine.touch_only:
                 self.publisher.put_frame(step.frame)
-        # systemd's dog is fed here and nowhere else: after work that was done.
-        now_s = time.monotonic()
+        # Notify systemd's watchdog only here, after work that was done.
+        now_s = self.clock.monotonic_s()
         if self._feed_s is not None and now_s - self._fed_s > 0.5 * self._feed_s:
             self._fed_s = now_s
             service.notify("WATCHDOG=1")
+
+    def _clock_against_ns(self) -> int:
+        return self.clock.now_ns() - self.clock.monotonic_ns()
+
+    def _follow_clock(self) -> None:
+        """Notice that the time of day was set, by which nothing has gone unfelt."""
+        ahead_ns = self._clock_against_ns()
+        jump_ns = ahead_ns - self._clock_ahead_ns
+        if abs(jump_ns) > JUMP_NS:
+            self._clock_ahead_ns = ahead_ns
+            for contact in self._contacts.values():
+                contact.follow_clock(jump_ns)
 
     def _record(self, bus: str, batch: FrameBatch) -> None:
         if self.control.recorder is not None:
             self.control.recorder.put(self.settings.buses[bus].channel, batch)
 
     async def _housekeep(self) -> None:
-        """Look after the boards, publish health, tell of faults, set the status line."""
+        """Supervise the boards, publish health, log faults, set the status line."""
         said: dict[int, tuple[object, ...]] = {}
         said_s = dict.fromkeys(self.engine.parts, 0.0)
         while True:
-            await asyncio.sleep(LOOK_S)
+            await self.clock.sleep(LOOK_S)
             self.link.supervise()
-            now_s = time.monotonic()
+            now_s = self.clock.monotonic_s()
             self.health.tick(self.link.read_ns, self.link.ports, self.link.boards)
-            told = self.fingertips.tell(self.link.read_ns)
+            told = self.fingertips.publish_health(self.link.read_ns)
             for part in self.engine.parts:
-                await asyncio.sleep(0)  # the reader is not to wait for all parts
+                await self.clock.sleep(0)  # the reader must not wait for all parts
                 record = self._record_of(part)
                 told |= {
                     (fault["code"], fault["where"]): says
                     for fault, says in zip(record["faults"], record["sentences"], strict=True)
                 }
-                # Not the sentences: numbers in them change all the time.
+                # Without the sentences, because numbers in them change all the time.
                 state = (record["state"], {(one["code"], one["where"]) for one in record["faults"]})
                 if said.get(part) != state or now_s - said_s[part] >= HEALTH_S:
                     said[part], said_s[part] = state, now_s
                     self.publisher.put_health(self.layout.parts[part].name, record)
             if self.engine.calibrating:
                 told = {key: says for key, says in told.items() if key[0] not in _UNTIL_CALIBRATED}
-            self._teller.look(told, now_s)
+            self._fault_log.note(told, now_s)
             if now_s - self._status_s >= HEALTH_S:
                 self._status_s = now_s
                 service.notify("STATUS=" + self._status(len(told)))
@@ -332,7 +371,7 @@ class Daemon:
     def _record_of(self, part: int) -> Record:
         link = self.link
         output = msgspec.to_builtins(self.publisher.counters)
-        return self.health.record(part, link.read_ns, link.ports, link.boards, output)
+        return self.health.record(part, link.read_ns, link.ports, link.boards, output, self.unkept)
 
     def _status(self, faults: int) -> str:
         rates = self.health.rates()
@@ -363,8 +402,13 @@ class Daemon:
         return directory / f"{self.settings.robot}-{self._node}.state.json"
 
 
+def _touch_only(settings: Settings, layout: Layout, parts: list[int]) -> set[int]:
+    """Return those of some parts whose frames are not published."""
+    return {i for i in parts if not settings.parts[layout.parts[i].name].frames}
+
+
 async def _first_failure(tasks: list[asyncio.Task[None]], stopping: "asyncio.Task[bool]") -> None:
-    """Wait for the order to stop. A task that fails before it takes the daemon down with it."""
+    """Wait for the stop request. A task that fails before it ends the daemon."""
     done, _ = await asyncio.wait([*tasks, stopping], return_when=asyncio.FIRST_COMPLETED)
     for task in done:
         if task is not stopping:

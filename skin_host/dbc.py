@@ -1,8 +1,8 @@
-"""The frames of the boards as a DBC file, for cantools, SavvyCAN, Wireshark and their like.
+"""Writes the frames of the boards as a DBC file, for cantools, SavvyCAN, Wireshark and others.
 
-The two frames of a triangle share an identifier and are told apart by their first byte, and
-so are the commands and the answers of a board: in a DBC file that byte is a multiplexer.
-Force/torque boards send words; they are N and N m where the full scales are known.
+The two frames of a triangle share an identifier and differ in their first byte, and so do the
+commands and the answers of a board: in a DBC file that byte is a multiplexer. Force/torque boards
+send words; they are N and N m where the full scales are known.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -43,11 +43,11 @@ from skin_host.layout import Layout
 
 ADDRESSES = range(1, 15)
 _BYTES = {"B": 1, "H": 2, "I": 4}
-#: The commands' timer counts this (reference of the wire, command 4C).
+#: Unit of the commands' timer (reference of the wire, command 4C).
 _TIMER_US = 3.2
-#: The full scales of words that stay words.
+#: Full scales for words without a unit.
 _WORDS = (ZERO_WORD,) * 3
-#: What force/torque boards understand and say, beside their streams.
+#: Commands and answers of force/torque boards, besides their streams.
 _STRAIN_COMMANDS = (SetTxMode, SetTransmissionPeriod, GetFullScale)
 _STRAIN_ANSWERS = (FullScale,)
 
@@ -84,11 +84,11 @@ def dbc_text(
     bus: str | None = None,
     fingertips: Mapping[str, Fingertip] | None = None,
 ) -> str:
-    """Write a DBC file.
+    """Return a DBC file.
 
     Args:
-        layout: describe the boards and triangles of this skin; None is all that can be.
-        bus: of the layout's buses; None if there is but one.
+        layout: describe the boards and triangles of this skin; None for all possible ones.
+        bus: of the layout's buses; None if there is only one.
         fingertips: of the same robot, by name: those on force/torque boards.
 
     Raises:
@@ -147,7 +147,7 @@ def _chosen(bus: str | None, layout: Layout, tips: Mapping[str, Fingertip]) -> s
     used = [board.settings.bus for board in layout.boards] + [tip.bus for tip in tips.values()]
     buses = list(dict.fromkeys(used))
     if bus is None and len(buses) > 1:
-        raise RequestError(f"the configuration has several buses; say which: {', '.join(buses)}")
+        raise RequestError(f"the configuration has several buses; choose one: {', '.join(buses)}")
     bus = bus or buses[0]
     if bus not in buses:
         raise RequestError(f'no bus "{bus}"; there are: {", ".join(buses)}')
@@ -181,7 +181,7 @@ def _sensors_of(tips: Mapping[str, Fingertip], bus: str, taken: set[str]) -> lis
 
 
 def _symbol(name: str) -> str:
-    """A name as a DBC file takes it: an identifier, and two are taken."""
+    """Return a name as a DBC file accepts it: an identifier, and not one of two reserved ones."""
     name = name.replace("-", "_")
     return name if name[0].isalpha() and name not in ("host", "all") else f"board_{name}"
 
@@ -201,7 +201,7 @@ def _skin_signals() -> list[_Signal]:
 
 
 def _add_streams(sensor: _Sensor, lines: list[str], remarks: list[str]) -> None:
-    """Force and torque of a board, and the same before its own calibration."""
+    """Add force and torque of a board, and the same before its own calibration."""
     for kind in StrainType:
         can_id = identifier(MessageClass.ANALOG_STREAM, sensor.address, kind)
         quantity, unit = ("torque", "Nm") if kind & 1 else ("force", "N")
@@ -214,7 +214,7 @@ def _add_streams(sensor: _Sensor, lines: list[str], remarks: list[str]) -> None:
             )
             for axis, start, full in zip("xyz", (0, 16, 32), scales or _WORDS, strict=True)
         ]
-        # Sent by a saturated board alone: its frames are one byte longer.
+        # Only a saturated board sends this: its frames are one byte longer.
         signals.append(_Signal("saturated", 48, 8))
         lines += _message(
             can_id, f"{sensor.name}_{kind.name.lower()}", 7, sensor.name, "host", signals
@@ -261,7 +261,7 @@ def _fields(messages: Iterable[type[Message]]) -> Iterator[_Signal]:
     for kind in messages:
         start = 8
         formats = _formats(kind.LAYOUT.format)
-        # Attributes of the class itself, such as CODE, are no fields.
+        # Attributes of the class itself, such as CODE, are not fields.
         for name, size in zip((entry.name for entry in fields(kind)), formats, strict=True):
             unit = {"ms": "ms", "s": "s"}.get(name.rpartition("_")[2], "")
             factor = 1.0
@@ -269,7 +269,7 @@ def _fields(messages: Iterable[type[Message]]) -> Iterator[_Signal]:
                 unit, factor = "us", _TIMER_US
             signal = f"C{kind.CODE:02X}_{name}"
             big = kind.LAYOUT.format.startswith(">") and size > 1
-            # Of a big-endian field the highest bit is named, which is in its first byte.
+            # A big-endian field is placed by its highest bit, which is in its first byte.
             place = start + 7 if big else start
             yield _Signal(
                 signal, place, 8 * size, f"m{kind.CODE}", factor, unit=unit, big_endian=big

@@ -1,61 +1,86 @@
-"""`skin demo`: emulator, daemon, broker and live page, on a machine with nothing else."""
+"""`skin demo`: emulator, daemon, broker and live page on one machine without other software."""
 
 import asyncio
 import contextlib
 import json
 import logging
+import sys
 import tempfile
 from collections import Counter
 from collections.abc import AsyncIterator
 from importlib.metadata import files
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import can
+import numpy as np
 
 from skin_host.cli.common import load_skin
 from skin_host.cli.lines import event_line
 from skin_host.client import SkinClient
 from skin_host.daemon import Daemon
 from skin_host.errors import ConfigurationError, SkinError
-from skin_host.layout import Layout
+from skin_host.layout import Layout, PadKind, build_layout
 from skin_host.publish.broker import LocalBroker, local_broker
-from skin_host.settings import Bus, Settings
+from skin_host.settings import Bus, Mqtt, Settings, changed
 from skin_host.viewer.server import Viewer
+
+if TYPE_CHECKING:
+    from emulator.scene import Scene
 
 log = logging.getLogger(__name__)
 
 CALIBRATION_S = 3.0
 PAGE_PORT = 8080
 VCAN = "vcan0"
-#: So long may the last events be on their way through the broker.
+#: The last events may take this long to pass through the broker.
 LAST_EVENTS_S = 5.0
+#: Without a scene the parts are pressed one after the other, this often, starting after the
+#: calibration.
+PRESS_EVERY_S = 1.5
+FIRST_PRESS_S = 6.0
+PRESS_KPA = [(0.0, 0.0), (0.3, 45.0), (1.8, 40.0), (2.2, 0.0)]
+FINGERTIP_N = [(0.0, 0.0), (0.3, 2.0), (1.8, 2.0), (2.2, 0.0)]
 
 
-async def run(duration_s: float | None, stop: asyncio.Event, page_port: int | None) -> int:
+async def run(
+    duration_s: float | None,
+    stop: asyncio.Event,
+    page_port: int | None,
+    config: Path | None = None,
+    scene: Path | None = None,
+) -> int:
     """Run until `stop` or for `duration_s`; the last line on stdout is a JSON summary.
 
     Args:
-        duration_s: None runs on.
+        duration_s: None runs without end.
         stop: set it to end.
         page_port: where the live page is served on this machine; 0 is any free port, None
-            the usual one, or any if somebody has that.
+            the usual one, or any if that is taken.
+        config: of the robot to show; the demo's own by default.
+        scene: what happens to the skin; by default the demo's own, or on another robot a press
+            on one part after the other.
 
     Raises:
         SkinError: a broker, a bus or the emulator cannot be started.
     """
-    settings, layout = load_skin(configuration("demo.toml"))
-    _choose_bus(settings.buses["can0"])
+    settings, layout, happening = _prepared(config, scene)
     if duration_s is not None:
         asyncio.get_running_loop().call_later(duration_s, stop.set)
     touches: Counter[str] = Counter()
-    # The page and the listener find the broker too, which is no news.
+    # The page and the listener log that they found the broker, which is not of interest here.
     logging.getLogger("skin_host.client").setLevel(logging.WARNING)
     with tempfile.TemporaryDirectory(prefix="skin-demo-") as state:
-        settings.service.state_directory = state
-        settings.processing.calibration.seconds = CALIBRATION_S
-        async with local_broker() as broker, _robot(settings, layout):
-            settings.mqtt.host, settings.mqtt.port = broker.host, broker.port
-            settings.mqtt.protocol = broker.protocol
+        async with local_broker() as broker, _robot(settings, layout, happening):
+            settings = changed(
+                settings,
+                {
+                    "service.state_directory": state,
+                    "service.metrics_port": 0,
+                    "processing.calibration.seconds": CALIBRATION_S,
+                }
+                | broker.settings,
+            )
             viewer = Viewer(broker.url, robot=settings.robot)
             async with served(viewer, page_port) as page:
                 _explain(settings, broker, page)
@@ -74,19 +99,81 @@ async def run(duration_s: float | None, stop: asyncio.Event, page_port: int | No
         "frames_lost": lost + sum(counters.halves for counters in assemblers),
         "touches_begun": touches["begin"],
         "touches_ended": touches["end"],
-        "bus": settings.buses["can0"].interface,
+        "bus": next(iter(settings.buses.values())).interface,
         "broker": broker.kind,
     }
     print(json.dumps(summary))
     return 0
 
 
+def _prepared(config: Path | None, scene: Path | None) -> "tuple[Settings, Layout, Scene]":
+    """Return the robot of a configuration on buses of this process, as one node; and its scene."""
+    from emulator import scene as scenes
+
+    settings, _ = load_skin(config or configuration("demo.toml"))
+    buses = {
+        name: Bus(interface="virtual", channel=f"skin-demo-{name}", bitrate=bus.bitrate)
+        for name, bus in settings.buses.items()
+    }
+    if config is None and _is_up(VCAN):
+        buses = {name: Bus(interface="socketcan", channel=VCAN) for name in buses}
+    mqtt = Mqtt(encoding=settings.mqtt.encoding, frame_hz=settings.mqtt.frame_hz)
+    settings = changed(
+        settings,
+        {"buses": buses, "mqtt": mqtt}
+        | {f"parts.{name}.node": "main" for name in settings.parts}
+        | {f"fingertips.{name}.node": "main" for name in settings.fingertips},
+    )
+    folder = Path() if config is None else config.parent
+    layout = build_layout(settings, folder)
+    if scene is not None:
+        return settings, layout, scenes.load(scene)
+    if config is None:
+        return settings, layout, scenes.load(configuration("scenes/demo.toml"))
+    return settings, layout, presses(settings, layout)
+
+
+def presses(settings: Settings, layout: Layout) -> "Scene":
+    """A scene for any robot: a press in the middle of each part, one part after the other."""
+    from emulator.scene import Place, Probe, Scene
+
+    # A fingertip under an array of taxels is pressed through the array.
+    bare = [name for name, tip in settings.fingertips.items() if tip.array is None]
+    names = [part.name for part in layout.parts] + bare
+    every_s = max(8.0, PRESS_EVERY_S * len(names))
+    probes = []
+    for number, name in enumerate(names):
+        start_s = FIRST_PRESS_S + PRESS_EVERY_S * number
+        if name in settings.fingertips:
+            probes.append(Probe(part=name, force_n=FINGERTIP_N, start_s=start_s, repeat_s=every_s))
+            continue
+        part = layout.parts[number]
+        mine = slice(part.start, part.stop)
+        feels = np.flatnonzero(layout.pad_kind[mine] == PadKind.PRESSURE)
+        if not len(feels):
+            continue
+        places_m = layout.position_m[mine][feels]
+        middle = int(feels[np.argmin(np.linalg.norm(places_m - places_m.mean(axis=0), axis=1))])
+        probes.append(
+            Probe(
+                part=name,
+                at=Place(taxel=middle),
+                kind="disc" if settings.parts[name].covered else "grounded",
+                diameter_mm=12.0,
+                pressure_kpa=PRESS_KPA,
+                start_s=start_s,
+                repeat_s=every_s,
+            )
+        )
+    return Scene(about="One part after the other is pressed.", seed=8, probe=probes)
+
+
 @contextlib.asynccontextmanager
 async def served(viewer: Viewer, port: int | None) -> AsyncIterator[str]:
-    """Serve the page as `run` says; gives its URL.
+    """Serve the page on the port that `run` describes; yields its URL.
 
     Raises:
-        SkinError: the port cannot be had.
+        SkinError: the port is not available.
     """
     async with contextlib.AsyncExitStack() as stack:
         try:
@@ -100,7 +187,7 @@ async def served(viewer: Viewer, port: int | None) -> AsyncIterator[str]:
 
 
 def configuration(name: str) -> Path:
-    """A file of the project's `config/`, in a checkout or where the package installed it.
+    """Return the path of a file of the project's `config/`, in a checkout or an installed package.
 
     Raises:
         ConfigurationError: it is in neither place.
@@ -111,39 +198,42 @@ def configuration(name: str) -> Path:
     for file in files("skin-host") or ():
         if file.as_posix().endswith(f"share/skin-host/config/{name}"):
             return Path(str(file.locate())).resolve()
-    raise ConfigurationError(f"{here}: not there; run the demo from a checkout of the project")
+    raise ConfigurationError(f"{here}: not found; name a configuration: skin demo CONFIG")
 
 
-def _choose_bus(bus: Bus) -> None:
-    """A virtual CAN interface of the kernel if there is one, else one within this process."""
-    flags = Path("/sys/class/net", VCAN, "flags")
-    if flags.exists() and int(flags.read_text(), 16) & 1:
-        bus.interface, bus.channel = "socketcan", VCAN
+def _is_up(interface: str) -> bool:
+    """Whether the kernel has a CAN interface of this name that is up."""
+    flags = Path("/sys/class/net", interface, "flags")
+    return flags.exists() and bool(int(flags.read_text(), 16) & 1)
 
 
 def _explain(settings: Settings, broker: LocalBroker, page: str) -> None:
-    bus = settings.buses["can0"]
+    bus = next(iter(settings.buses.values()))
     if bus.interface == "virtual":
-        print(f"No interface {VCAN} here: emulator and daemon share python-can's virtual bus.")
+        print("Emulator and daemon share python-can's virtual bus: no CAN interface is needed.")
     else:
         print(f"Emulator and daemon meet on {bus.channel}.")
-    print(f"Broker: {broker.kind} on {broker.host}:{broker.port}. To listen along:")
-    print(f"    .venv/bin/skin listen --broker '{broker.url}'")
-    print(f"    mosquitto_sub -p {broker.port} -v -t 'skin/demo/+/touch'")
+    print(f"Broker: {broker.kind} on {broker.host}:{broker.port}. To listen to it:")
+    print(f"    {Path(sys.executable).parent / 'skin'} listen --broker '{broker.url}'")
+    print(
+        f"    mosquitto_sub -p {broker.port} -v -t '{settings.mqtt.base}/{settings.robot}/+/touch'"
+    )
     print(f"The live page: {page}")
     print(f"Calibrating for {CALIBRATION_S:g} s, then touches as they come:", flush=True)
 
 
 @contextlib.asynccontextmanager
-async def _robot(settings: Settings, layout: Layout) -> AsyncIterator[None]:
-    """The emulated robot on its bus, for as long as the block lasts."""
+async def _robot(settings: Settings, layout: Layout, scene: "Scene") -> AsyncIterator[None]:
+    """Run the emulated robot on its buses, for as long as the block lasts."""
     from emulator.robot import Robot
-    from emulator.scene import load
 
-    robot = Robot(settings, layout, load(configuration("scenes/demo.toml")))
-    bus = settings.buses["can0"]
-    with can.Bus(interface=bus.interface, channel=bus.channel) as opened:
-        living = asyncio.create_task(robot.run({"can0": opened}))
+    robot = Robot(settings, layout, scene)
+    with contextlib.ExitStack() as stack:
+        buses = {
+            name: stack.enter_context(can.Bus(interface=bus.interface, channel=bus.channel))
+            for name, bus in settings.buses.items()
+        }
+        living = asyncio.create_task(robot.run(buses))
         try:
             yield
         finally:
@@ -154,7 +244,7 @@ async def _robot(settings: Settings, layout: Layout) -> AsyncIterator[None]:
 
 
 async def _heard(touches: "Counter[str]", sent: int) -> None:
-    """Wait until the listener has all events, or they must be lost."""
+    """Wait until the listener has received all events, or they must be lost."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(LAST_EVENTS_S):
             while touches.total() < sent:  # noqa: ASYNC110
@@ -162,7 +252,7 @@ async def _heard(touches: "Counter[str]", sent: int) -> None:
 
 
 async def _listen(url: str, robot: str, touches: "Counter[str]") -> None:
-    """Be one more subscriber: count the touches and print those that begin and end."""
+    """Subscribe as another client: count the touches and print those that begin and end."""
     async with SkinClient(url, robot=robot) as skin:
         async for touch in skin.touches():
             touches[touch.event] += 1

@@ -5,12 +5,13 @@
     |  |- ConfigurationError  a configuration or layout file
     |  |- CalibrationError    a calibration file that is damaged or of another skin
     |  |  |- OtherSkinError   the latter
+    |  |- NewerFileError      a file that a newer version has written
     |  |- LogError            a recording that cannot be read
     |- BusError               the CAN interface: absent, down, refused
-    |- BrokerError            the MQTT broker: refused us, or answers nonsense
+    |- BrokerError            the MQTT broker: refused us, or sent an invalid answer
 
-A message is one line: what, where, what was seen, what was wanted, and the
-command that mends it. The command line prints it and exits with `exit_status`.
+A message is one line: what, where, the value seen, the value wanted, and the command that helps.
+The command line prints it and exits with `exit_status`.
 """
 
 
@@ -35,7 +36,11 @@ class CalibrationError(RequestError):
 
 
 class OtherSkinError(CalibrationError):
-    """A whole calibration file that belongs to another configuration."""
+    """An intact calibration file that belongs to another configuration."""
+
+
+class NewerFileError(RequestError):
+    """A file of the state directory that a newer version has written. It is not changed."""
 
 
 class LogError(RequestError):
@@ -47,4 +52,4 @@ class BusError(SkinError):
 
 
 class BrokerError(SkinError):
-    """The MQTT broker refused us in a way that waiting will not mend."""
+    """The MQTT broker refused us, and waiting does not help."""

@@ -1,4 +1,4 @@
-"""What is wrong in a configuration file, in words: the place first, then seen and wanted."""
+"""Explains an error in a configuration file: the place first, then the values seen and wanted."""
 
 import difflib
 import math
@@ -10,20 +10,24 @@ import msgspec
 from msgspec import Struct
 
 from skin_host.fields import Name
+from skin_host.relaxation_settings import RETIRED
 
 Table = type[Struct]
 Named = dict[str, Table]
+#: Longer values are shown by their beginning.
+LONGEST_VALUE = 40
 
 
 def explain(document: Any, error: msgspec.ValidationError, root: Table, named: Named) -> str:
-    """Say where in the file, then what.
+    """Return where in the file the error is, then what it is.
 
-    msgspec says "Expected `int`, got `str` - at `$.boards[...].address`": it does not tell
-    which board, so each named table is checked once more by itself.
+    msgspec's message is "Expected `int`, got `str` - at `$.boards[...].address`": it does not name
+    the
+    board, so each named table is checked once more separately.
 
     Args:
         document: the decoded file.
-        error: what msgspec said of it.
+        error: msgspec's error.
         root: the type of the whole file.
         named: the sections of the file that hold tables by name, and the type of these.
     """
@@ -42,17 +46,18 @@ def explain(document: Any, error: msgspec.ValidationError, root: Table, named: N
             try:
                 msgspec.convert(entry, table)
             except msgspec.ValidationError as inner:
-                return _readable(str(inner), f"{section}.{name}", table)
-    return _readable(str(error), "", root)
+                return _readable(str(inner), f"{section}.{name}", table, entry)
+    return _readable(str(error), "", root, document)
 
 
-def _readable(message: str, place: str, table: Table) -> str:
-    """Put the place first; say what an unknown key was meant to be, or which values there are.
+def _readable(message: str, place: str, table: Table, document: Any) -> str:
+    """Put the place first, then the value seen; suggest the probable key for an unknown one.
 
     Args:
         message: msgspec's own.
-        place: where in the file `table` stands.
+        place: where in the file `table` is.
         table: what was checked.
+        document: the same, decoded without its types.
     """
     text, _, inner = message.partition(" - at ")
     keys = inner.strip("`").removeprefix("$").removeprefix(".")
@@ -64,24 +69,48 @@ def _readable(message: str, place: str, table: Table) -> str:
         key = text.split("`")[1]
         near = difflib.get_close_matches(key, kind.__struct_fields__, n=1)
         text = f"unknown key `{key}`" + (f"; meant `{near[0]}`?" if near else "")
+        if key in RETIRED:
+            text = f"`{key}` is no longer there: {RETIRED[key]}"
     elif text.startswith("Invalid enum value"):
         known = ", ".join(str(value) for value in get_args(kind))
-        text = f"seen {text.removeprefix('Invalid enum value ')}, wanted one of: {known}"
+        seen = text.removeprefix("Invalid enum value ")
+        text = f"seen {seen}, wanted one of: {known}"
+        name = seen.strip("'")
+        if name in RETIRED:
+            text = f"`{name}` is no longer there: {RETIRED[name]}"
     else:
         text = text.replace("Object missing required field", "missing key")
-        text = text.replace("Expected", "wanted").replace("got", "seen")
+        wanted, _, got = text.replace("Expected", "wanted").partition(", got ")
+        seen = got if " of length " in wanted and got else _value(document, keys)
+        text = f"seen {seen}, {wanted}" if wanted.startswith("wanted") and seen else wanted
     return f"{place}: {text}" if place else text
 
 
+def _value(document: Any, keys: str) -> str:
+    """Return the value at a place such as `patches[0].shift`, shortened; empty if not known."""
+    value = document
+    for key in re.findall(r"[^.\[\]]+", keys):
+        if isinstance(value, list) and key.isdecimal() and int(key) < len(value):
+            value = value[int(key)]
+        elif isinstance(value, dict) and key in value:
+            value = value[key]
+        else:
+            return ""
+    text = repr(value)
+    return text if len(text) <= LONGEST_VALUE else text[: LONGEST_VALUE - 3] + "..."
+
+
 def _innermost(hint: Any) -> Any:
-    """The table or `Literal` within `list[Patch]`, `dict[Name, Bus]`, `X | None` and such."""
+    """Return the table or `Literal` within `list[Patch]`, `dict[Name, Bus]`, `X | None` and
+    such.
+    """
     while get_origin(hint) not in (None, Literal):
         hint = next(inner for inner in reversed(get_args(hint)) if inner is not type(None))
     return hint
 
 
 def not_finite(value: Any, where: str = "") -> Iterator[tuple[str, float]]:
-    """Where in a decoded file `nan` and `inf` stand."""
+    """Yield where in a decoded file `nan` and `inf` are."""
     if isinstance(value, dict):
         for key, inner in value.items():
             yield from not_finite(inner, f"{where}.{key}" if where else key)

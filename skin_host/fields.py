@@ -1,4 +1,4 @@
-"""What a single value of a file may be, where several files have such values."""
+"""Types of single values that several files use."""
 
 from typing import Annotated
 

@@ -1,12 +1,23 @@
-"""Files are written whole or not at all, and read as what they say they are."""
+"""Writes files completely or not at all, and checks the schema of files that are read."""
 
+import contextlib
+import logging
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Protocol, TypeVar
 
 import msgspec
+
+from skin_host.clock import SYSTEM
+from skin_host.errors import NewerFileError
+
+log = logging.getLogger(__name__)
+
+#: No valid document is larger: a calibration of 100 000 taxels has 20 MB.
+MAX_DOCUMENT_BYTES = 64 * 1024 * 1024
 
 
 class _WithSchema(Protocol):
@@ -16,6 +27,10 @@ class _WithSchema(Protocol):
 T = TypeVar("T", bound=_WithSchema)
 
 
+class _Head(msgspec.Struct):
+    schema: str = ""
+
+
 def read_document(
     path: Path, kind: type[T], schema: str, what: str, wrong: Callable[[str], Exception]
 ) -> T:
@@ -23,23 +38,132 @@ def read_document(
 
     Args:
         path: of the file.
-        kind: what it must hold.
-        schema: the one that is known.
-        what: the file is called in messages.
-        wrong: makes an error of what is wrong.
+        kind: type of its content.
+        schema: the supported one, `name/number`.
+        what: name of the file in messages.
+        wrong: makes an error from a message.
 
     Raises:
-        Exception: what `wrong` makes, if the file is unreadable, damaged or of another schema.
+        NewerFileError: a newer version has written it: its schema has a larger number, or a field
+            that is not known.
+        Exception: result of `wrong`, if the file is unreadable, damaged or of another schema.
     """
     try:
-        found = msgspec.json.decode(path.read_bytes(), type=kind)
+        with path.open("rb") as file:
+            data = file.read(MAX_DOCUMENT_BYTES + 1)
     except OSError as error:
         raise wrong(f"cannot be read: {error.strerror}") from None
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    if len(data) > MAX_DOCUMENT_BYTES:
+        raise wrong(f"not a {what} file: it has more than {MAX_DOCUMENT_BYTES} bytes")
+    _refuse_newer(path, data, schema, what)
+    try:
+        found = msgspec.json.decode(data, type=kind)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        if "unknown field" in str(error) and _is_whole(data):
+            raise _newer(path, what, str(error)) from None
         raise wrong(f"not a {what} file: {error}") from None
     if found.schema != schema:
         raise wrong(f'schema "{found.schema}", wanted "{schema}"')
     return found
+
+
+def _is_whole(data: bytes) -> bool:
+    try:
+        msgspec.json.decode(data)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return False
+    return True
+
+
+def refuse_newer(path: Path, schema: str, what: str) -> None:
+    """Protect a file that a newer version has written from being replaced.
+
+    Raises:
+        NewerFileError: `path` is such a file.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_DOCUMENT_BYTES + 1)
+    except OSError:
+        return
+    _refuse_newer(path, data, schema, what)
+
+
+def _refuse_newer(path: Path, data: bytes, schema: str, what: str) -> None:
+    try:
+        seen = msgspec.json.decode(data, type=_Head).schema
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return  # damaged, which others report
+    name, _, number = schema.partition("/")
+    seen_name, _, seen_number = seen.partition("/")
+    if seen_name == name and seen_number.isdecimal() and int(seen_number[:9]) > int(number):
+        raise _newer(path, what, f'schema "{seen[:64]}", known is "{schema}"')
+
+
+def _newer(path: Path, what: str, why: str) -> NewerFileError:
+    return NewerFileError(
+        f"{path}: a {what} file of a newer version ({why}); start that version, or move the file "
+        f"away with: mv {path} {path}.newer"
+    )
+
+
+def set_aside(path: Path) -> None:
+    """Give a damaged file another name, so that nothing overwrites it."""
+    aside = path.with_name(f"{path.name}.damaged-{SYSTEM.today():%Y%m%dT%H%M%SZ}")
+    try:
+        os.replace(path, aside)
+    except OSError as error:
+        log.error("%s: damaged, and cannot be set aside: %s", path, error.strerror)
+    else:
+        log.warning("%s: damaged; set aside as %s", path, aside.name)
+
+
+class Disk:
+    """The steps in which a file is replaced. To test a power failure between any two of them, tests
+    and `skin simulate` replace this object by `on_disk`.
+    """
+
+    def create(self, path: Path, data: bytes) -> Path:
+        """Write a temporary file beside `path`; return its name."""
+        descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        try:
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(data)
+        except BaseException:
+            os.unlink(temporary)
+            raise
+        return Path(temporary)
+
+    def sync(self, path: Path) -> None:
+        """Force a file, or the names in a folder, to the disk."""
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+    def rename(self, temporary: Path, path: Path) -> None:
+        """Let a temporary file take the place of `path`."""
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+
+    def remove(self, temporary: Path) -> None:
+        """Remove a temporary file that is not needed."""
+        os.unlink(temporary)
+
+
+_DISK = Disk()
+_disk: ContextVar[Disk | None] = ContextVar("disk", default=None)
+
+
+@contextlib.contextmanager
+def on_disk(disk: Disk) -> Iterator[None]:
+    """The code inside, and tasks started there, write to this disk."""
+    token = _disk.set(disk)
+    try:
+        yield
+    finally:
+        _disk.reset(token)
 
 
 def write_atomic(path: Path, data: bytes) -> None:
@@ -51,20 +175,13 @@ def write_atomic(path: Path, data: bytes) -> None:
     Raises:
         OSError: the folder is read-only, the disk is full, ...; `path` is then unchanged.
     """
+    disk = _disk.get() or _DISK
     path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    temporary = disk.create(path, data)
     try:
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
+        disk.sync(temporary)
+        disk.rename(temporary, path)
     except BaseException:
-        os.unlink(temporary)
+        disk.remove(temporary)
         raise
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    disk.sync(path.parent)

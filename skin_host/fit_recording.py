@@ -1,4 +1,4 @@
-"""Parameters from recordings: the foam's relaxation, and the pressure curve of each taxel.
+"""Fits parameters to recordings: the foam's relaxation, and the pressure curve of each taxel.
 
 The recording begins with some seconds of untouched skin, which serve as its calibration.
 """
@@ -16,33 +16,43 @@ from numpy.typing import NDArray
 from skin_host.engine import Engine
 from skin_host.errors import LogError, RequestError
 from skin_host.files import write_atomic
-from skin_host.layout import Layout
-from skin_host.processing.calibration import Calibration, with_gains
+from skin_host.layout import Layout, PadKind
+from skin_host.load_table import check_course, on_clock_of
+from skin_host.processing.calibration import Calibration, Verdict, with_curves, with_gains
+from skin_host.processing.course_fitting import (
+    Course,
+    activations,
+    find_lag,
+    fit_course,
+    median_of_moving,
+)
+from skin_host.processing.curves import Curves
 from skin_host.processing.fitting import Fit, HoldRecord, fit, merge
 from skin_host.processing.gains import GainFit, fit_gains
 from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.relaxation import make_model, parameters_of
 from skin_host.relaxation_settings import RELAXATION_SCHEMA
-from skin_host.replay import calibrate_from_log, replay
+from skin_host.replay import calibrate_from_log, steps
 from skin_host.settings import Settings
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-#: A taxel takes part in a hold if it reads this share of what the strongest reads.
+#: A taxel takes part in a hold if its reading is at least this share of the strongest.
 TAKES_PART = 0.6
-#: What a taxel reads in its pressed time: the recording may be mostly rest.
+#: Quantile of a taxel's readings that represents its pressed time: the recording may be mostly
+#: rest.
 PRESSED_QUANTILE = 0.95
-#: Less than this is no hold, nor is what is pressed for less than this share of its time.
+#: A hold has at least this pressure, for at least this share of its time.
 LEAST_KPA = 10.0
 HELD_SHARE = 0.98
-#: Pressure that changes by more than this share of the hold's from one sample to the next moves.
+#: Pressure moves if it changes by more than this share of the hold's from one sample to the next.
 MOVING_SHARE = 0.1
-#: A plateau of known pressure lasts at least so long, and is steady to this share of itself.
+#: A plateau of known pressure lasts at least this long, and is steady to this share of itself.
 PLATEAU_S = 1.0
 STEADY_SHARE = 0.05
 STEADY_KPA = 3.5
-#: Less than this, or than this share of what was pressed before, is the imprint of it.
+#: Less than this, or than this share of the earlier press, is the residual of that press.
 PRESSED_KPA = 4.0
 IMPRINT_SHARE = 0.07
 #: The first part of a plateau, in which the pressure settles, is left out.
@@ -55,10 +65,11 @@ class Samples:
 
     Attributes:
         dt_s: distance of the samples.
-        start_s: time of the first sample, as the recording counts it.
-        raw: uint8[t, n]; the last known value where none came.
+        start_s: time of the first sample, on the recording's clock.
+        raw: uint8[t, n]; the last known value where none was received.
         zero: float64[n], the untouched reading.
-        usable: bool[n], taxels that can be believed.
+        received: bool[n], taxels that were received at all.
+        usable: bool[n], usable taxels.
         calibration: of the untouched skin at the beginning.
     """
 
@@ -66,6 +77,7 @@ class Samples:
     start_s: float
     raw: NDArray[np.uint8]
     zero: Floats
+    received: Mask
     usable: Mask
     calibration: Calibration
 
@@ -86,19 +98,19 @@ def read_samples(
 
     Args:
         log: the recording.
-        settings, layout: of the skin that it is of.
+        settings, layout: of its skin.
         seconds: how long it is untouched.
-        progress: is told now and then how many minutes have been read.
+        progress: called now and then with the number of minutes read.
 
     Raises:
-        LogError: unreadable, or with next to nothing of this skin in it.
+        LogError: unreadable, or with too little of this skin in it.
     """
     calibration = calibrate_from_log(log, settings, layout, seconds)
     engine = Engine(settings, layout, list(range(len(layout.parts))), calibration)
     times_ns: list[list[int]] = [[] for _ in layout.parts]
     raws: list[list[NDArray[np.uint8]]] = [[] for _ in layout.parts]
     valids: list[list[Mask]] = [[] for _ in layout.parts]
-    for step in replay(log, engine):
+    for step in steps(log, engine):
         times_ns[step.part].append(step.frame.t_ns)
         raws[step.part].append(step.frame.raw)
         valids[step.part].append(step.frame.valid)
@@ -120,7 +132,8 @@ def read_samples(
         raw[:, mine] = _held(np.array(raws[part]), valid)[index]
         usable[mine] = calibration.usable[mine] & (valid.mean(axis=0) > 0.5)
     zero = layout.no_load - calibration.baseline
-    return Samples(step_ns * 1e-9, first_ns * 1e-9, raw, zero, usable, calibration)
+    received = ~np.isin(calibration.verdict, (Verdict.ABSENT, Verdict.TOO_FEW))
+    return Samples(step_ns * 1e-9, first_ns * 1e-9, raw, zero, received, usable, calibration)
 
 
 def hold_record(
@@ -134,14 +147,14 @@ def hold_record(
     Args:
         samples: of the recording.
         curve: of its taxels.
-        load: a load cell's times (s, as the recording counts them or from its start) and
+        load: a load cell's times (s, on the recording's clock or from its start) and
             pressures (kPa), if there was one.
         weight_kpa: the pressure of a dead weight that was laid on and taken off again.
 
     Raises:
-        RequestError: nothing was pressed for long, or more than once, or it was not let go.
+        RequestError: nothing was pressed for long, or more than once, or it was not released.
     """
-    # Some thousand samples tell who takes part; the whole is looked at for those alone.
+    # Some thousand samples show which taxels take part; only for those the whole is used.
     thin = slice(None, None, max(len(samples.raw) // 4000, 1))
     everyone = np.ones_like(samples.usable)
     strongest = np.quantile(curve.kpa(samples.units(thin, everyone)), PRESSED_QUANTILE, axis=0)
@@ -174,7 +187,7 @@ def hold_record(
             now_s += samples.start_s
         inside = (now_s >= time_s[0]) & (now_s <= time_s[-1])
         pressure = np.where(inside, np.interp(now_s, time_s, load_kpa), pressure)
-    # While it moves, reading and load cell are not of the same moment.
+    # During movement, reading and load cell are not of the same moment.
     moving = np.abs(np.diff(momentary)) > MOVING_SHARE * strongest[chosen].mean()
     pressure[:-1][moving] = np.nan
     pressure[1:][moving] = np.nan
@@ -193,7 +206,7 @@ def fit_relaxation(record: HoldRecord, models: Sequence[str]) -> list[Fit]:
 
 
 def save_relaxation(path: Path, found: Fit, settings: Settings, record: HoldRecord) -> None:
-    """Write a file for the configuration's `processing.relaxation.file`, whole or not at all."""
+    """Write a file for `processing.relaxation.file`, completely or not at all."""
     chosen = found.parameters
     document: dict[str, Any] = {
         "schema": RELAXATION_SCHEMA,
@@ -204,7 +217,6 @@ def save_relaxation(path: Path, found: Fit, settings: Settings, record: HoldReco
         "tau_s": list(chosen.tau_s),
         "beta_unload": list(chosen.beta_unload),
         "tau_unload_s": list(chosen.tau_unload_s),
-        "clock_kpa": _finite(float(np.ravel(chosen.clock_kpa)[0])),
         "rms_hold_kpa": _finite(found.rms_hold_kpa),
         "rms_rest_kpa": _finite(found.rms_rest_kpa),
         "hold_s": record.hold_s,
@@ -246,16 +258,53 @@ def fit_pressures(
     return with_gains(samples.calibration, result.gain, result.bend), result
 
 
-def plateaus(pressure_kpa: Floats, dt_s: float) -> list[slice]:
-    """Where a pressed skin is steady.
+def fit_curves(
+    samples: Samples,
+    settings: Settings,
+    layout: Layout,
+    load: tuple[Floats, Floats],
+    path: Path,
+) -> tuple[Calibration, Curves]:
+    """Fit a curve to every pad, and the foam's memory, from any course of known pressure.
 
     Args:
-        pressure_kpa: float64[t], what presses a typical taxel; with relaxation taken off, or
-            the imprint of a high pressure is taken for a low one.
+        samples: of the recording.
+        settings, layout: of its skin.
+        load: times in s, and pressures in kPa on all pads alike.
+        path: of the table that they were read from, for messages.
+
+    Raises:
+        RequestError: the table is no course of pressure, not of this recording, or nothing is
+            pressed.
+    """
+    time_s, kpa = load
+    check_course(path, time_s, kpa)
+    end_s = samples.start_s + samples.dt_s * len(samples.raw)
+    time_s = on_clock_of(time_s, samples.start_s, end_s, path)
+    pads = samples.received & (layout.pad_kind == PadKind.PRESSURE)
+    course = Course(samples.dt_s, samples.raw, samples.zero, pads, np.zeros(len(samples.raw)))
+    units, _ = activations(course)
+    now_s: Floats = samples.start_s + samples.dt_s * np.arange(len(samples.raw), dtype=np.float64)
+    try:
+        lag_s = find_lag(median_of_moving(units[:, pads], samples.dt_s), now_s, (time_s, kpa))
+        pressure = np.interp(now_s + lag_s, time_s, kpa)
+        course = replace(course, pressure_kpa=pressure, lag_s=lag_s)
+        curves = fit_course(course, settings.processing.pressure.smoothing_s)
+    except RequestError as error:
+        raise RequestError(f"{path}: {error}") from None
+    return with_curves(samples.calibration, curves), curves
+
+
+def plateaus(pressure_kpa: Floats, dt_s: float) -> list[slice]:
+    """Return where a pressed skin is steady.
+
+    Args:
+        pressure_kpa: float64[t], pressure on a typical taxel, corrected for relaxation; otherwise
+            the residual of a high pressure would be taken for a low one.
         dt_s: distance of the samples.
 
     Returns:
-        The plateaus in their order; what settles at the beginning of each is left out.
+        The plateaus in their order, without the settling time at the beginning of each.
     """
     length = max(round(PLATEAU_S / dt_s), 2)
     if len(pressure_kpa) <= length:
@@ -270,7 +319,7 @@ def plateaus(pressure_kpa: Floats, dt_s: float) -> list[slice]:
     pieces: list[tuple[int, int]] = []
     for first, last in edges.reshape(-1, 2):
         begin, end = int(first), int(last) + length - 1
-        # A moment of noise does not part a plateau: it goes on at the same pressure.
+        # A moment of noise does not divide a plateau: it continues at the same pressure.
         if pieces and begin - pieces[-1][1] <= length:
             earlier = float(pressure_kpa[slice(*pieces[-1])].mean())
             if abs(float(pressure_kpa[begin:end].mean()) - earlier) <= limit[first]:
@@ -280,7 +329,7 @@ def plateaus(pressure_kpa: Floats, dt_s: float) -> list[slice]:
 
 
 def _typical_kpa(samples: Samples, curve: PressureCurve, settings: Settings) -> Floats:
-    """Pressure [t] on a taxel in the middle of all, its relaxation taken off."""
+    """Return the pressure [t] on the median taxel, corrected for relaxation."""
     curve = curve.part(samples.usable)
     blocks = [slice(row, row + 1000) for row in range(0, len(samples.raw), 1000)]
     momentary = np.concatenate(
@@ -297,7 +346,9 @@ def _typical_kpa(samples: Samples, curve: PressureCurve, settings: Settings) -> 
 def _kept_shares(
     samples: Samples, curve: PressureCurve, settings: Settings, parts: list[slice]
 ) -> list[Floats]:
-    """Mean share [n] of the momentary pressure that relaxation has left, for each plateau."""
+    """Return the mean share [n] of the momentary pressure that remains after relaxation, for each
+    plateau.
+    """
     chosen = settings.processing.relaxation
     n = samples.raw.shape[1]
     model = make_model(chosen.model, n, parameters_of(chosen))

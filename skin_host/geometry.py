@@ -1,4 +1,4 @@
-"""Where the pads of a unit come to lie: tiled, placed by hand, or read from a file."""
+"""Positions of a unit's pads: tiled, placed manually, or read from a file."""
 
 import warnings
 from dataclasses import dataclass
@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 from skin_host.errors import ConfigurationError
 from skin_host.settings import Kind, Place
 
-#: Pads closer than this many pitches touch the same thing: they are neighbours.
+#: Pads closer than this many pitches touch the same object: they are neighbours.
 NEIGHBOUR_PITCHES = 1.6
-#: So many triangles at most make a row where a patch without places is tiled.
+#: A tiled patch without places has at most this many triangles in a row.
 TILED_IN_A_ROW = 8
 
 Floats = NDArray[np.float64]
 
 
 def tile(kind: Kind, n_units: int, shelf_mm: float) -> tuple[list[Place], float]:
-    """Places side by side: triangles as a mesh, other shapes with a gap that parts them."""
+    """Return places side by side: triangles as a mesh, other shapes with a gap between them."""
     outline = np.array(kind.outline_mm)
     low, high = outline.min(axis=0), outline.max(axis=0)
     width_mm, height_mm = high - low
@@ -28,7 +28,7 @@ def tile(kind: Kind, n_units: int, shelf_mm: float) -> tuple[list[Place], float]
         n_rows = -(-n_units // TILED_IN_A_ROW)
         for i in range(n_units):
             row, column = divmod(i, -(-n_units // n_rows))
-            # Every second triangle stands on its tip, its centroid a third higher.
+            # Every second triangle is upside down, with its centroid a third higher.
             on_tip = (row + column) % 2 == 1
             places.append(
                 Place(
@@ -76,7 +76,7 @@ def _rotation_from_z(normal: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """Where a flat unit lies: `origin_m` [3], its x and y `axes` [3, 2], and how well it fits."""
+    """Position of a flat unit: `origin_m` [3], its x and y `axes` [3, 2], and how well it fits."""
 
     origin_m: Floats
     axes: Floats
@@ -89,10 +89,10 @@ class Fit:
 
 
 def fit_unit(pads_mm: Floats, position_m: Floats, normal: Floats) -> Fit:
-    """Lay a flat unit so that its pads [k, 2] come closest to known places [k, 3].
+    """Fit a flat unit so that its pads [k, 2] come closest to known places [k, 3].
 
-    Least squares over turns and shifts (Kabsch); the unit may come out mirrored, as some
-    are fitted. Where the places are too few to tell, `normal` [3] decides.
+    Least squares over rotations and shifts (Kabsch); the result may be mirrored, as some units are.
+    Where the places are too few to decide, `normal` [3] decides.
     """
     centre_m, middle_m = position_m.mean(axis=0), pads_mm.mean(axis=0) * 1e-3
     flat = pads_mm * 1e-3 - middle_m
@@ -128,7 +128,7 @@ def read_positions(where: str, path: Path, n: int) -> tuple[Floats, Floats]:
     """
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # numpy warns of an empty file; the shape tells
+            warnings.simplefilter("ignore")  # numpy warns of an empty file; its shape is checked
             table = np.loadtxt(path, ndmin=2)
     except OSError as error:
         reason = error.strerror or "not found"

@@ -1,7 +1,7 @@
-"""The skin as arrays: parts, boards, triangles, taxels, and where they are.
+"""The skin as arrays: parts, boards, triangles, taxels, and their positions.
 
 A part's taxels lie side by side in the flat arrays, in the order of its patches and
-their triangles, twelve a triangle. All later rooms index by this order.
+their triangles, twelve a triangle. All other packages index by this order.
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ TAXELS_PER_TRIANGLE = 12
 
 
 class PadKind(IntEnum):
-    """What a pad feels."""
+    """Quantity that a pad measures."""
 
     PRESSURE = 0
     THERMAL = 1
@@ -63,7 +63,7 @@ class BoardLayout:
 
 @dataclass(frozen=True, slots=True)
 class PartLayout:
-    """One part: flat taxels `start:stop`, the boards that feed it."""
+    """One part: flat taxels `start:stop`, and its boards."""
 
     name: str
     node: str
@@ -307,7 +307,7 @@ def _patch_columns(
 
 
 def _check_kind(name: str, kind: Kind) -> None:
-    """Check what a type cannot say about a user's own kind."""
+    """Check properties of a user's own kind that types cannot express."""
     n = len(kind.pads_mm)
     if n == 0 or n % TAXELS_PER_TRIANGLE:
         raise ConfigurationError(f"kinds.{name}.pads_mm: {n} pads; wanted a multiple of 12")

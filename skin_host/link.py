@@ -3,56 +3,98 @@
 import asyncio
 import contextlib
 import logging
-import time
 from collections.abc import Callable
+from itertools import chain
+from typing import Protocol
 
 from skin_host.bus.boards import Boards
-from skin_host.bus.port import Port, open_port
+from skin_host.bus.opening import open_port
+from skin_host.bus.port import Port
 from skin_host.bus.protocol import FrameBatch
 from skin_host.bus.wake import WakeUp
-from skin_host.engine import Engine, Step
+from skin_host.clock import SYSTEM, Clock
+from skin_host.engine import Engine, Output
 from skin_host.errors import BusError, SkinError
 from skin_host.fingertip.boards import StrainBoards
+from skin_host.settings import Bus, Receive
 
 log = logging.getLogger(__name__)
 
-#: Sweeps and samples that wait are looked at this often.
-EXPIRE_S = 0.02
-#: A pause between two reads counts for no more than this: after a longer one there is no saying
-#: yet who has been silent. Planned pauses are shorter.
-LONGEST_PAUSE_NS = 100_000_000
+#: Waiting sweeps and samples are checked this often.
+EXPIRE_NS = 20_000_000
 #: A bus that does not take the set-up of its boards is tried again after this.
 RETRY_S = 2.0
 STOP_S = 1.0
 
 
+class OpenPort(Protocol):
+    """How buses are opened."""
+
+    def __call__(
+        self, name: str, bus: Bus, receive: Receive, *, wait: bool = False, clock: Clock = SYSTEM
+    ) -> Port:
+        """See `bus.opening.open_port`."""
+
+
 class Link:
     """Connects an engine to the buses that it needs.
+
+    Args:
+        engine: processes the frames.
+        wait: wait for a bus that cannot be opened, as for one that was unplugged.
+        open_port: opens a bus, see `bus.opening.open_port`.
+        clock: for waiting.
 
     Attributes:
         ports, boards: by name of the bus.
         force_torque: the boards of fingertips, by name of the bus.
-        read_ns: everything that had come by then has been read, on the clock of the frames'
-            time stamps. Ages are told from here, not from now: what waits unread is not silent.
+        read_ns: everything received up to then has been read, on the clock of the frames' time
+            stamps. Ages count from here, not from now: a board whose frames wait unread has not
+            timed out.
 
     Raises:
-        BusError: a bus cannot be opened; those already open are closed again.
+        ConfigurationError: python-can has no such kind of interface.
+        BusError: a bus cannot be opened, and `wait` is not set.
+            Those already open are closed again.
     """
 
-    def __init__(self, engine: Engine) -> None:
+    def __init__(
+        self,
+        engine: Engine,
+        *,
+        wait: bool = False,
+        open_port: OpenPort = open_port,
+        clock: Clock = SYSTEM,
+    ) -> None:
+        self._clock = clock
         self._engine = engine
-        self.read_ns = time.time_ns()
-        self._attended_ns = 0
-        self._longest_ns = LONGEST_PAUSE_NS + int(engine.settings.receive.poll_ms * 1e6)
-        self._read_at_ns = time.monotonic_ns()
+        self.read_ns = clock.now_ns()
         self.ports: dict[str, Port] = {}
         self.boards: dict[str, Boards] = {}
         self.force_torque: dict[str, StrainBoards] = {}
         fingertips = engine.fingertips
         settings, layout = engine.settings, engine.layout
+        periods_ns = {i: layout.boards[i].settings.period_ms * 1_000_000 for i in engine.boards}
+        if fingertips is not None:
+            # Negative keys never collide with board indices.
+            for tip in fingertips.tips.values():
+                periods_ns[~tip.number] = tip.settings.period_ms * 1_000_000
+        alone = [(key,) for key in periods_ns if key < 0]
+        fastest_ns = [
+            min(periods_ns[one] for one in layout.parts[part].boards) for part in engine.parts
+        ]
+        fastest_ns += [periods_ns[key] for (key,) in alone]
+        self._wake_up = WakeUp(
+            settings.receive,
+            periods_ns,
+            clock,
+            lambda: chain(self._engine.missing(), alone),
+            sum(1e9 / period_ns for period_ns in fastest_ns),
+        )
+        self._expired_ns = 0
         try:
             for bus in engine.assemblers:
-                port = open_port(bus, settings.buses[bus], settings.receive)
+                port = open_port(bus, settings.buses[bus], settings.receive, wait=wait, clock=clock)
                 self.ports[bus] = port
                 mine = [
                     (i, layout.boards[i])
@@ -64,86 +106,95 @@ class Link:
                     port,
                     mine,
                     layout.triangles,
-                    settings.receive.silent_periods,
-                    engine.rezero,
-                    self.attended_ns,
+                    engine.ledger,
+                    self._zeroed,
+                    clock,
                 )
                 if fingertips is not None and (tips := fingertips.on_bus(bus)):
-                    self.force_torque[bus] = StrainBoards(bus, port, tips, self.attended_ns)
+                    self.force_torque[bus] = StrainBoards(
+                        bus, port, tips, lambda: engine.ledger.now_ns
+                    )
         except SkinError:
             self.close()
             raise
 
+    def use(self, engine: Engine) -> None:
+        """Continue with another engine, which has the ledger of the one before."""
+        self._engine = engine
+
+    def _zeroed(self, board: int, believed: bool) -> None:
+        self._engine.rezero(board, believed)
+
     async def read(
         self,
-        deliver: Callable[[list[Step]], None],
+        deliver: Callable[[Output], None],
         record: Callable[[str, FrameBatch], None] = lambda *_: None,
     ) -> None:
-        """Read all buses for ever; hand what comes of it to `deliver`, often nothing.
+        """Read all buses for ever; pass the results to `deliver`.
 
         Args:
-            deliver: called after each batch, and some times a second.
-            record: called with each batch as it came.
+            deliver: called after each batch, and several times a second.
+            record: called with each received batch.
         """
-        engine = self._engine
         loop = asyncio.get_running_loop()
-        periods_ns = {
-            i: engine.layout.boards[i].settings.period_ms * 1_000_000 for i in engine.boards
-        }
-        fingertips = engine.fingertips
-        if fingertips is not None:
-            # Beside the indices of boards, which are not negative.
-            for tip in fingertips.tips.values():
-                periods_ns[~tip.number] = tip.settings.period_ms * 1_000_000
-        wake_up = WakeUp(engine.settings.receive, periods_ns)
-        expire_at_s = 0.0
 
         def work() -> None:
-            nonlocal expire_at_s
-            now_ns = time.time_ns()
-            drained = True
-            for bus, port in self.ports.items():
-                batch = port.read()
-                if not len(batch):
-                    continue
-                drained &= len(batch) < port.capacity
-                record(bus, batch)
-                boards = self.boards[bus]
-                boards.feed(batch)
-                if bus in self.force_torque:
-                    self.force_torque[bus].claim(boards.strangers)
-                steps = engine.feed(bus, batch)
-                for sweep in engine.sweeps:
-                    boards.note_sweep(sweep.board, sweep.present, sweep.t_ns)
-                    wake_up.sweep_ended(sweep.board, sweep.t_ns)
-                if fingertips is not None:
-                    for number, t_ns in fingertips.sampled:
-                        wake_up.sweep_ended(~number, t_ns)
-                deliver(steps)
-            # After what was delivered has been sent.
-            loop.call_soon(engine.judge)
-            if not drained:
-                return
-            self.read_ns = now_ns
-            self._attend()
-            now_s = time.monotonic()
-            if now_s >= expire_at_s:
-                expire_at_s = now_s + EXPIRE_S
-                deliver(engine.expire(now_ns))
+            self.turn(self._clock.now_ns(), deliver, record)
+            # After the delivered results have been sent.
+            loop.call_soon(self._engine.judge)
 
-        await wake_up.run(work)
+        await self._wake_up.run(work)
 
-    def attended_ns(self) -> int:
-        """Time that the reader has spent looking; it stands still while this process does."""
-        return self._attended_ns
+    def turn(
+        self,
+        now_ns: int,
+        deliver: Callable[[Output], None],
+        record: Callable[[str, FrameBatch], None] = lambda *_: None,
+    ) -> None:
+        """Read every bus once.
 
-    def _attend(self) -> None:
-        now_ns = time.monotonic_ns()
-        self._attended_ns += min(now_ns - self._read_at_ns, self._longest_ns)
-        self._read_at_ns = now_ns
+        Args:
+            now_ns: the time, on the clock of the frames' time stamps.
+            deliver, record: see `read`.
+        """
+        drained = True
+        for bus, port in self.ports.items():
+            batch = port.read()
+            if not len(batch):
+                continue
+            drained &= len(batch) < port.capacity
+            record(bus, batch)
+            output = self._engine.feed(bus, batch)
+            if output.answers:
+                self._note_answers(bus, output.answers)
+            self._note(output)
+            deliver(output)
+        if not drained:
+            return
+        self.read_ns = now_ns
+        self._engine.ledger.look(now_ns)
+        if not 0 <= now_ns - self._expired_ns < EXPIRE_NS:
+            self._expired_ns = now_ns
+            output = self._engine.expire(now_ns)
+            self._note(output)
+            deliver(output)
+
+    def _note(self, output: Output) -> None:
+        """Note that the next sweep of a board is one period later."""
+        for sweep in output.sweeps:
+            self._wake_up.sweep_ended(sweep.board, sweep.t_ns)
+        for number, t_ns in output.samples:
+            self._wake_up.sweep_ended(~number, t_ns)
+
+    def _note_answers(self, bus: str, answers: list[tuple[int, bytes]]) -> None:
+        self.boards[bus].note_answers(answers)
+        if bus in self.force_torque:
+            self.force_torque[bus].claim(self.boards[bus].strangers)
 
     async def bring_up(self) -> None:
-        """Set up and start the boards of every bus; a bus that cannot is tried again for ever."""
+        """Set up and start the boards of every bus; a bus where that fails is tried again for
+        ever.
+        """
         await asyncio.gather(*(self._bring_up(boards) for boards in self._all_boards()))
 
     async def set_up(self, boards: list[int]) -> None:
@@ -157,7 +208,7 @@ class Link:
         await asyncio.gather(*(self.boards[one.bus].set_up(one.address) for one in chosen))
 
     def supervise(self) -> None:
-        """Look after the boards: silent ones, and those that lost their set-up."""
+        """Supervise the boards: those that timed out, and those that lost their set-up."""
         for boards in self._all_boards():
             boards.supervise()
 
@@ -166,35 +217,35 @@ class Link:
         fingertips = self._engine.fingertips
         if fingertips is not None and not all(tip.frames for tip in fingertips.tips.values()):
             return False
-        return all(
-            record.last_sweep_ns
-            for boards in self.boards.values()
-            for record in boards.records.values()
-        )
+        return bool(self._engine.ledger.sweeps.all())
 
     async def stop(self) -> None:
-        """Tell the boards to stop, as far as their buses still work."""
+        """Command the boards to stop, as far as their buses still work."""
         for boards in self._all_boards():
             with contextlib.suppress(BusError, TimeoutError):
-                await asyncio.wait_for(boards.stop(), STOP_S)
+                async with self._clock.timeout(STOP_S):
+                    await boards.stop()
 
     def close(self) -> None:
-        """Give the interfaces back."""
+        """Close the interfaces."""
         for port in self.ports.values():
             port.close()
 
     def _all_boards(self) -> list[Boards | StrainBoards]:
         return [*self.boards.values(), *self.force_torque.values()]
 
-    @staticmethod
-    async def _bring_up(boards: Boards | StrainBoards) -> None:
+    async def _bring_up(self, boards: Boards | StrainBoards) -> None:
         told = ""
         while True:
             try:
-                await boards.bring_up()
+                if isinstance(boards, Boards):
+                    # Touches cannot be detected without a calibration.
+                    await boards.bring_up(listen=self._engine.calibration is not None)
+                else:
+                    await boards.bring_up()
                 return
             except BusError as error:
                 if str(error) != told:
                     log.warning("%s", error)
                     told = str(error)
-                await asyncio.sleep(RETRY_S)
+                await self._clock.sleep(RETRY_S)

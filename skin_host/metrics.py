@@ -6,11 +6,16 @@ and time. Names follow Prometheus' conventions: base units, `_total` for counter
 
 import asyncio
 import contextlib
+import logging
+import os
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+from skin_host.clock import SYSTEM, Clock
 from skin_host.fingertip.health import FingertipRecord
 from skin_host.health import Record
+
+log = logging.getLogger(__name__)
 
 #: Of parts, and of fingertips on force/torque boards, by name.
 Records = Mapping[str, Record | FingertipRecord]
@@ -18,39 +23,41 @@ Records = Mapping[str, Record | FingertipRecord]
 MAX_REQUEST_BYTES = 8192
 TIMEOUT_S = 2.0
 MAX_CONNECTIONS = 8
+#: A port that is taken is tried again after this time.
+RETRY_S = 10.0
 
 _PART = {
     "frames": ("skin_frames_total", "counter", "Frames of pressure with a valid taxel"),
     "rate_hz": ("skin_frame_rate_hertz", "gauge", "Frames of pressure a second"),
     "taxels": ("skin_taxels", "gauge", "Taxels that feel pressure"),
-    "valid_taxels": ("skin_valid_taxels", "gauge", "Taxels that can be believed now"),
-    "age_ms": ("skin_age_milliseconds", "gauge", "Time since the last valid frame"),
+    "valid_taxels": ("skin_valid_taxels", "gauge", "Taxels that are valid now"),
+    "age_ms": ("skin_age_seconds", "gauge", "Time since the last valid frame"),
 }
 _BUS = {
     "frames": ("skin_bus_frames_total", "counter", "CAN frames read"),
-    "sweeps": ("skin_bus_sweeps_total", "counter", "Sweeps put together"),
+    "sweeps": ("skin_bus_sweeps_total", "counter", "Sweeps assembled"),
     "incomplete": ("skin_bus_incomplete_total", "counter", "Sweeps without an awaited triangle"),
-    "halves": ("skin_bus_halves_total", "counter", "Triangles with one half only"),
+    "halves": ("skin_bus_halves_total", "counter", "Triangles of which only one frame arrived"),
     "missed": ("skin_bus_missed_periods_total", "counter", "Periods without any frame"),
     "dropped": ("skin_bus_dropped_total", "counter", "Frames lost for want of buffer"),
     "error_frames": ("skin_bus_error_frames_total", "counter", "Error frames"),
 }
 _BOARD = {
     "alive": ("skin_board_alive", "gauge", "Whether the board sends"),
-    "period_seen_ms": ("skin_board_period_milliseconds", "gauge", "Period seen"),
+    "period_seen_ms": ("skin_board_period_seconds", "gauge", "Period seen"),
     "configurations": ("skin_board_configurations_total", "counter", "Times it was set up"),
-    "resets": ("skin_board_resets_total", "counter", "Times it started anew by itself"),
+    "resets": ("skin_board_resets_total", "counter", "Times it restarted by itself"),
 }
 _FINGERTIP = {
     "samples": ("skin_fingertip_samples_total", "counter", "Samples of force and torque"),
     "rate_hz": ("skin_fingertip_rate_hertz", "gauge", "Samples a second"),
-    "lone": ("skin_fingertip_lone_total", "counter", "Force without torque, or the other way"),
+    "lone": ("skin_fingertip_lone_total", "counter", "Force without torque, or the reverse"),
     "saturated": ("skin_fingertip_saturated_total", "counter", "Saturated samples"),
-    "silences": ("skin_fingertip_silences_total", "counter", "Times its board fell silent"),
+    "silences": ("skin_fingertip_silences_total", "counter", "Times its board timed out"),
     "touched": ("skin_fingertip_touched", "gauge", "Whether it is touched"),
 }
 _OUTPUT = {
-    "connected": ("skin_broker_connected", "gauge", "Whether the broker is there"),
+    "connected": ("skin_broker_connected", "gauge", "Whether the broker is connected"),
     "frames_sent": ("skin_mqtt_frames_total", "counter", "Frames sent to the broker"),
     "frames_skipped": ("skin_mqtt_frames_skipped_total", "counter", "Frames never sent"),
     "touches_sent": ("skin_mqtt_touches_total", "counter", "Touch events acknowledged"),
@@ -66,14 +73,20 @@ def exposition(records: Records) -> str:
         for key, head in table.items():
             value = source.get(key)
             if value is not None:
-                samples.setdefault(head, {})[labels] = float(value)
+                unit = 1e-3 if key.endswith("_ms") else 1.0
+                # A time stamp may be a little newer than the time of this record.
+                samples.setdefault(head, {})[labels] = max(0.0, float(value) * unit)
 
     every: Mapping[str, Mapping[str, Any]] = records
     for name, record in sorted(every.items()):
         part = _label("part", name)
         put(_FINGERTIP if record.get("kind") == "fingertip" else _PART, record, part)
-        faults = ("skin_faults", "gauge", "Faults that are told of now")
+        faults = ("skin_faults", "gauge", "Faults that are reported now")
         samples.setdefault(faults, {})[part] = float(len(record.get("faults", ())))
+        fault = ("skin_fault", "gauge", "1 for each fault that is reported now")
+        for one in record.get("faults", ()):
+            where = _labels(part=name, code=one["code"], where=one["where"])
+            samples.setdefault(fault, {})[where] = 1.0
         for bus in record.get("buses", ()):
             put(
                 _BUS,
@@ -94,16 +107,19 @@ def _lines(samples: dict[tuple[str, str, str], dict[str, float]]) -> Iterator[st
 
 
 def _label(key: str, value: str) -> str:
-    escaped = value.replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n")
-    return f'{{{key}="{escaped}"}}'
+    return _labels(**{key: value})
 
 
-async def serve(port: int, records: Callable[[], Records]) -> None:
-    """Answer `GET /metrics` on 127.0.0.1 until cancelled.
+def _labels(**values: str) -> str:
+    pairs = []
+    for key, value in values.items():
+        escaped = value.replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n")
+        pairs.append(f'{key}="{escaped}"')
+    return "{" + ",".join(pairs) + "}"
 
-    Raises:
-        OSError: the port is taken.
-    """
+
+async def serve(port: int, records: Callable[[], Records], clock: Clock = SYSTEM) -> None:
+    """Answer `GET /metrics` on 127.0.0.1 until cancelled. Waits for a port that is taken."""
     busy = 0
 
     async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -111,18 +127,29 @@ async def serve(port: int, records: Callable[[], Records]) -> None:
         busy += 1
         try:
             if busy <= MAX_CONNECTIONS:
-                async with asyncio.timeout(TIMEOUT_S):
+                async with clock.timeout(TIMEOUT_S):
                     writer.write(_response(await reader.readuntil(b"\r\n\r\n"), records))
                     await writer.drain()
         except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
-            pass  # whoever asked badly gets no answer
+            pass  # an invalid request gets no answer
         finally:
             busy -= 1
             writer.close()
             with contextlib.suppress(OSError):
                 await writer.wait_closed()
 
-    server = await asyncio.start_server(answer, "127.0.0.1", port, limit=MAX_REQUEST_BYTES)
+    said = False
+    while True:
+        try:
+            server = await asyncio.start_server(answer, "127.0.0.1", port, limit=MAX_REQUEST_BYTES)
+        except OSError as error:
+            if not said:
+                said = True
+                why = os.strerror(error.errno) if error.errno else str(error)
+                log.warning("no metrics: 127.0.0.1:%d: %s; trying again", port, why)
+            await clock.sleep(RETRY_S)
+        else:
+            break
     async with server:
         await server.serve_forever()
 

@@ -1,4 +1,4 @@
-"""Recordings played again: onto a CAN interface, or to a broker and so into the live page."""
+"""Plays recordings again: onto a CAN interface, or to a broker and so into the live page."""
 
 import asyncio
 import time
@@ -11,14 +11,15 @@ import can
 from skin_host import __version__
 from skin_host.bus.port import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
 from skin_host.bus.protocol import FrameBatch
-from skin_host.engine import Engine, Step
+from skin_host.engine import Engine, Output
 from skin_host.errors import BusError, LogError
-from skin_host.fingertip.desk import FingertipDesk
+from skin_host.fingertip.publishing import FingertipPublisher
 from skin_host.publish.address import Broker
 from skin_host.publish.connection import connect
+from skin_host.publish.contact import PartContact
 from skin_host.publish.info import node_info
 from skin_host.publish.mqtt import Publisher
-from skin_host.publish.recording import read_said
+from skin_host.publish.recording import read_messages_of
 from skin_host.publish.topics import OFFLINE
 from skin_host.replay import read_buses
 from skin_host.settings import Settings, skin_hash
@@ -30,7 +31,7 @@ T = TypeVar("T")
 
 
 async def paced(items: Iterable[T], t_ns: Callable[[T], int], speed: float) -> AsyncIterator[T]:
-    """The items at their own pace times `speed`; what is late is not waited for."""
+    """Yield the items at their own pace times `speed`; late items follow at once."""
     start: tuple[float, int] | None = None
     for item in items:
         now_s = time.monotonic()
@@ -80,7 +81,7 @@ async def play_on_buses(
     return sent
 
 
-async def play_said(
+async def play_messages(
     recording: Path, broker: Broker, speed: float = 1.0, robot: str | None = None
 ) -> int:
     """Publish the messages of an MCAP recording again, byte for byte; return how many.
@@ -99,7 +100,7 @@ async def play_said(
     n = 0
     async with connect(broker, identifier="skin-play") as connection:
         try:
-            async for said in paced(read_said(recording), lambda said: said.t_ns, speed):
+            async for said in paced(read_messages_of(recording), lambda said: said.t_ns, speed):
                 topic = said.topic if robot is None else _renamed(said.topic, robot)
                 kind = topic.rpartition("/")[2]
                 if kind == "status":
@@ -109,7 +110,7 @@ async def play_said(
                 )
                 n += 1
         finally:
-            # What is played is over, and must not look alive.
+            # A recording that was played is over, and its nodes must not look alive.
             for topic in nodes:
                 await connection.publish(topic, OFFLINE, qos=1, retain=True)
     if not n:
@@ -118,10 +119,11 @@ async def play_said(
 
 
 def _renamed(topic: str, robot: str) -> str:
-    """The topic of the same thing of another robot: skin/<robot>/... with any base."""
+    """Return the same topic for another robot: skin/<robot>/... with any base."""
     words = topic.split("/")
-    # Before the end stand <robot>/<part>/<kind>, or <robot>/nodes/<node>/<kind>.
-    at = -4 if words[-3] == "nodes" else -3
+    # Before the end stand <robot>/<part>/<kind>, or <robot>/nodes/<node>/<kind>, or, of an info in
+    # pieces, <robot>/nodes/<node>/<piece>/info.
+    at = -4 if words[-3] == "nodes" else -5 if words[-4:-3] == ["nodes"] else -3
     words[at] = robot
     return "/".join(words)
 
@@ -129,12 +131,12 @@ def _renamed(topic: str, robot: str) -> str:
 async def play_processed(
     log: Path, engine: Engine, broker_settings: Settings, speed: float = 1.0, node: str = "main"
 ) -> int:
-    """Put a recording of CAN frames through the pipeline and publish what comes of it.
+    """Process a recording of CAN frames with the pipeline and publish the results.
 
     Args:
         log: any recording that `skin replay` reads.
         engine: calibrated already.
-        broker_settings: its table `mqtt` says where to.
+        broker_settings: its table `mqtt` gives the broker.
         speed: 2 is twice as fast as recorded.
         node: as which node.
 
@@ -159,16 +161,18 @@ async def play_processed(
         def last_ns(item: tuple[str, FrameBatch]) -> int:
             return int(item[1].t_ns[-1])
 
-        fingertips = FingertipDesk(engine.fingertips, publisher)
+        fingertips = FingertipPublisher(engine.fingertips, publisher)
+        contacts = {part: PartContact(engine.layout, part) for part in engine.parts}
 
-        def publish(steps: list[Step]) -> int:
-            fingertips.deliver()
-            for step in steps:
+        def publish(output: Output) -> int:
+            fingertips.deliver(output.grasps)
+            for step in output.steps:
                 publisher.put_frame(step.frame)
                 for event in step.events:
                     publisher.put_touch(event)
-                publisher.put_contact(step.frame.part, touched=bool(step.frame.touched.any()))
-            return len(steps)
+                state = contacts[step.part].step(step.frame, step.events)
+                publisher.put_contact(step.frame.part, state)
+            return len(output.steps)
 
         async for bus, batch in paced(read_buses(log, settings), last_ns, speed):
             n += publish(engine.feed(bus, batch))

@@ -5,14 +5,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skin_host.errors import RequestError, SkinError
 from skin_host.export import PartSeries, Series
 from skin_host.files import write_atomic
 from skin_host.layout import Layout, PadKind
 from skin_host.processing.calibration import Calibration, Verdict
+from skin_host.processing.curves import KNOTS_UNITS, Curves, CurveVerdict
 
-#: So many lines are told apart by their colours.
+#: This many lines are distinguishable by their colours.
 MOST_LINES = 7
 SUFFIXES = (".png", ".svg", ".pdf")
 #: Okabe and Ito's colours, for colour-blind readers.
@@ -20,16 +22,18 @@ COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#0
 VERDICT_COLOURS = {
     Verdict.OK: "#56b4e9",
     Verdict.NOISY: "#e69f00",
+    Verdict.SATURATES: "#f0e442",
     Verdict.TOUCHED: "#009e73",
     Verdict.STUCK: "#d55e00",
     Verdict.OUT_OF_RANGE: "#cc79a7",
+    Verdict.TOO_NOISY: "#8c510a",
     Verdict.ABSENT: "#999999",
     Verdict.TOO_FEW: "#333333",
 }
 
 
 def plot_pressure(series: Series, output: Path, part: str, taxels: list[int] | None = None) -> None:
-    """Pressure over time: the named taxels, or those that felt most; contacts as bars below.
+    """Draw pressure over time: the named taxels, or the strongest ones; contacts as bars below.
 
     Raises:
         RequestError: no such part or taxel.
@@ -67,16 +71,16 @@ def plot_pressure(series: Series, output: Path, part: str, taxels: list[int] | N
 
 
 def plot_map(series: Series, output: Path, part: str, at_s: float | None = None) -> None:
-    """The part seen from above at an instant, or when it felt most.
+    """Draw the part from above at an instant, or when its pressure was highest.
 
     Raises:
-        RequestError: no such part, or the recording does not say where its taxels lie.
+        RequestError: no such part, or the recording has no positions of its taxels.
         SkinError: matplotlib is not installed, or the picture cannot be written.
     """
     one = _part(series, part)
     shape = series.shapes.get(part)
     if shape is None or len(shape.pads) != one.pressure_kpa.shape[1]:
-        raise RequestError(f"{part}: the recording does not say where its taxels lie")
+        raise RequestError(f"{part}: the recording has no positions of its taxels")
     felt = np.nan_to_num(one.pressure_kpa, nan=0.0)
     row = int(felt.sum(axis=1).argmax())
     if at_s is not None:
@@ -125,17 +129,23 @@ def plot_map(series: Series, output: Path, part: str, at_s: float | None = None)
 
 
 def plot_calibration(calibration: Calibration, layout: Layout, output: Path) -> None:
-    """Quality of a calibration: baseline, noise and threshold of each taxel, and its verdict.
+    """Draw the quality of a calibration: baseline, noise and threshold of each taxel, and its
+    verdict.
 
     Raises:
         SkinError: matplotlib is not installed, or the picture cannot be written.
     """
     pressure = layout.pad_kind == PadKind.PRESSURE
-    n_parts = len(layout.parts)
+    n_parts, curves = len(layout.parts), calibration.curves
+    columns = 2 if curves is None else 3
     figure, rows = _pyplot().subplots(
-        n_parts, 2, figsize=(11, 1.2 + 2.1 * n_parts), squeeze=False, layout="constrained"
+        n_parts,
+        columns,
+        figsize=(11 if curves is None else 15, 1.2 + 2.1 * n_parts),
+        squeeze=False,
+        layout="constrained",
     )
-    for part, (left, right) in zip(layout.parts, rows, strict=True):
+    for part, (left, right, *more) in zip(layout.parts, rows, strict=True):
         mine = slice(part.start, part.stop)
         taxel = np.arange(part.n_taxels)
         feels = pressure[mine]
@@ -153,13 +163,36 @@ def plot_calibration(calibration: Calibration, layout: Layout, output: Path) -> 
         left.set_ylabel(f"{part.name}\nbaseline / units")
         left.legend(fontsize="x-small", loc="best")
         right.set_ylabel("noise / units")
-        for axes in (left, right):
+        for axes in (left, right, *more):
             axes.grid(alpha=0.3)
+        if curves is not None:
+            _draw_curves(more[0], curves, mine, feels)
     rows[0][1].set_title("noise; grey: 95th percentile above the baseline", fontsize="small")
     rows[0][0].set_title(f"calibration {calibration.id}, {calibration.time}", fontsize="small")
-    for axes in rows[-1]:
+    for axes in rows[-1][:2]:
         axes.set_xlabel("taxel")
+    if curves is not None:
+        plays = ", ".join(f"{kpa:.0f}" for kpa in curves.memory.radius_kpa) or "none"
+        rows[0][2].set_title(f"own curves; plays of {plays} kPa", fontsize="small")
+        rows[-1][2].set_xlabel("activation / units")
     _write(figure, output)
+
+
+def _draw_curves(axes: Any, curves: Curves, mine: slice, feels: NDArray[np.bool_]) -> None:
+    """Draw the measured curves of a part, and how many of its pads got each verdict."""
+    own = np.flatnonzero(curves.own[mine]) + mine.start
+    for taxel in own:
+        inside = curves.beyond_units[taxel] + 1.0 >= KNOTS_UNITS
+        axes.plot(
+            KNOTS_UNITS[inside], curves.kpa[taxel, inside], color=COLOURS[0], lw=0.5, alpha=0.5
+        )
+    counts = {
+        verdict.name.lower(): int(np.sum(feels & (curves.verdict[mine] == verdict)))
+        for verdict in CurveVerdict
+    }
+    text = "\n".join(f"{count} {name}" for name, count in counts.items() if count)
+    axes.text(0.03, 0.97, text, transform=axes.transAxes, va="top", fontsize="x-small")
+    axes.set_ylabel("pressure / kPa")
 
 
 def _part(series: Series, part: str) -> PartSeries:
@@ -169,7 +202,7 @@ def _part(series: Series, part: str) -> PartSeries:
 
 
 def _contacts(series: Series, part: PartSeries) -> list[tuple[float, float]]:
-    """From when to when (s) each contact of a part lasted."""
+    """Return begin and end (s) of each contact of a part."""
     begun: dict[int, float] = {}
     spans = []
     for touch in series.touches:
@@ -185,7 +218,7 @@ def _contacts(series: Series, part: PartSeries) -> list[tuple[float, float]]:
 
 
 def _face_on(normal: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """Axes [3, 3] that look at a part from where most of it faces; the identity if it is flat."""
+    """Return axes [3, 3] in which most of the part faces the viewer; the identity if it is flat."""
     eye = normal.sum(axis=0)
     length = float(np.linalg.norm(eye))
     if length < 1e-9 or eye[2] / length > 0.999:

@@ -1,4 +1,6 @@
-"""A recording through the whole pipeline: deterministic, the same bytes at every run."""
+"""Processes a recording with the whole pipeline: deterministic, with the same bytes at every
+run.
+"""
 
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -6,19 +8,23 @@ from pathlib import Path
 
 from skin_host.bus.logs import read_channels
 from skin_host.bus.protocol import FrameBatch
-from skin_host.engine import Engine, Step
+from skin_host.engine import Engine, Output, Step
 from skin_host.errors import LogError
 from skin_host.layout import Layout
+from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration
 from skin_host.publish.recording import SUFFIX, read_can
-from skin_host.settings import Settings
+from skin_host.settings import Settings, skin_hash
+
+#: A recording without a calibration file begins with this time of untouched skin.
+UNTOUCHED_S = 5.0
 
 
 def read_buses(log: Path, settings: Settings) -> Iterator[tuple[str, FrameBatch]]:
-    """Batches of a recording with the name of the configured bus they belong to.
+    """Yield batches of a recording with the name of the configured bus they belong to.
 
-    With one bus in the configuration everything is taken for it, whatever the recording
-    calls its channel. With several, channels go by name; others are passed over.
+    With one bus in the configuration all frames belong to it, whatever the recording calls its
+    channel. With several, channels go by name; others are ignored.
 
     Raises:
         LogError: see `logs.read_channels`; or several buses, and none of their channels in it.
@@ -41,6 +47,32 @@ def read_buses(log: Path, settings: Settings) -> Iterator[tuple[str, FrameBatch]
             f"{log}: its channels are {', '.join(sorted(seen)) or 'unnamed'}; "
             f"the configuration's are {', '.join(bus_of)}"
         )
+
+
+def calibration_for(
+    log: Path, settings: Settings, layout: Layout, file: Path | None, seconds: float | None
+) -> Calibration:
+    """Return the calibration with which a recording is processed.
+
+    Args:
+        log: the recording.
+        settings, layout: of its skin.
+        file: a calibration file, or None.
+        seconds: how much of the recording's beginning is untouched and gives the zero; if None, the
+            file's zero is used, or without a file `UNTOUCHED_S`. With both, curves, gains and the
+            foam's memory come from the file, as at the start of a daemon that calibrates.
+
+    Raises:
+        LogError: see `calibrate_from_log`.
+        CalibrationError: the file is damaged, or of another skin.
+    """
+    known = None
+    if file is not None:
+        known = calibrations.load(file, layout, skin_hash(settings))
+        if seconds is None:
+            return known
+    zero = calibrate_from_log(log, settings, layout, seconds or UNTOUCHED_S)
+    return zero if known is None else calibrations.with_pressures_of(zero, known)
 
 
 def calibrate_from_log(
@@ -73,12 +105,22 @@ def calibrate_from_log(
     return engine.end_calibration(time)
 
 
-def replay(log: Path, engine: Engine) -> Iterator[Step]:
-    """Everything that comes of a recording, step by step.
+def replay(log: Path, engine: Engine) -> Iterator[Output]:
+    """Yield the results of a recording, batch by batch.
 
     Raises:
-        LogError: the recording cannot be read, or breaks off damaged.
+        LogError: the recording cannot be read, or ends with damage.
     """
     for bus, batch in read_buses(log, engine.settings):
-        yield from engine.feed(bus, batch)
-    yield from engine.flush()
+        yield engine.feed(bus, batch)
+    yield engine.flush()
+
+
+def steps(log: Path, engine: Engine) -> Iterator[Step]:
+    """Yield the samples of parts in a recording, in their order.
+
+    Raises:
+        LogError: see `replay`.
+    """
+    for output in replay(log, engine):
+        yield from output.steps

@@ -1,10 +1,10 @@
-"""Who is on a CAN bus."""
+"""Lists the boards on a CAN bus."""
 
 import asyncio
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from skin_host.bus.port import open_port
+from skin_host.bus.opening import open_port
 from skin_host.bus.protocol import BROADCAST_ADDRESS, find_skin_frames
 from skin_host.bus.protocol.answers import Discovered, DiscoveredBootloader, parse_answer
 from skin_host.bus.protocol.commands import BoardType, Discover, command_frame
@@ -24,7 +24,7 @@ class Found:
     triangles: list[int]
 
     def as_record(self) -> dict[str, Any]:
-        """As JSON would have it."""
+        """Return the board as a JSON record."""
         return asdict(self)
 
 
@@ -38,7 +38,7 @@ async def scan(bus: Bus) -> list[Found]:
     found: dict[int, Found] = {}
     triangles: dict[int, set[int]] = {}
     try:
-        # Listen before asking: an MTB3 that streams falls silent when it is asked.
+        # Listen before asking: an MTB3 that streams stops sending when it is asked.
         for asked in (False, True):
             if asked:
                 await port.send([command_frame(Discover(), BROADCAST_ADDRESS)])

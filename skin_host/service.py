@@ -1,13 +1,25 @@
-"""systemd: readiness, watchdog, status line, state directory, credentials."""
+"""systemd: readiness, watchdog, status line, directories, priorities in its journal."""
 
+import logging
 import os
 import socket
-import time
+import sys
 from pathlib import Path
+
+from skin_host.clock import SYSTEM, Clock
+
+#: Python's levels, highest first, and the priorities of syslog(3).
+_PRIORITIES = (
+    (logging.CRITICAL, 2),
+    (logging.ERROR, 3),
+    (logging.WARNING, 4),
+    (logging.INFO, 6),
+    (logging.NOTSET, 7),
+)
 
 
 def notify(message: str) -> None:
-    """Tell systemd something (sd_notify's protocol); without systemd, do nothing."""
+    """Send a message to systemd (sd_notify's protocol); without systemd, do nothing."""
     address = os.environ.get("NOTIFY_SOCKET")
     if not address:
         return
@@ -17,17 +29,39 @@ def notify(message: str) -> None:
         try:
             sock.sendto(message.encode(), socket.MSG_DONTWAIT, address)
         except OSError:
-            # systemd is busy, restarts or is gone: nothing that the skin should wait for.
+            # systemd is busy, restarts or is gone: the skin must not wait for it.
             return
 
 
-def notify_reloading() -> None:
-    """Tell systemd that a reload has begun; READY=1 ends it."""
-    notify(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
+def notify_reloading(clock: Clock = SYSTEM) -> None:
+    """Report to systemd that a reload has begun; READY=1 ends it."""
+    notify(f"RELOADING=1\nMONOTONIC_USEC={clock.monotonic_ns() // 1000}")
+
+
+def to_journal() -> bool:
+    """Whether stderr is a stream of systemd's journal."""
+    try:
+        stderr = os.fstat(sys.stderr.fileno())
+    except (OSError, ValueError):
+        return False
+    return os.environ.get("JOURNAL_STREAM") == f"{stderr.st_dev}:{stderr.st_ino}"
+
+
+def with_priority(text: str, level: int) -> str:
+    """Add to each line the priority in the form that the journal reads (sd-daemon(3))."""
+    priority = next(number for least, number in _PRIORITIES if level >= least)
+    return "\n".join(f"<{priority}>{line}" for line in text.split("\n"))
+
+
+class JournalFormatter(logging.Formatter):
+    """Lines with priorities; the journal adds time and name."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return with_priority(super().format(record), record.levelno)
 
 
 def watchdog_interval_s() -> float | None:
-    """How often systemd wants to be fed, half its limit; None where it does not."""
+    """Return how often to notify systemd's watchdog, half its limit; None without a watchdog."""
     usec = os.environ.get("WATCHDOG_USEC", "")
     pid = os.environ.get("WATCHDOG_PID", "")
     if not usec.isdigit() or (pid and pid != str(os.getpid())):
@@ -36,7 +70,7 @@ def watchdog_interval_s() -> float | None:
 
 
 def state_directory(configured: str | None) -> Path:
-    """Where calibrations live: as configured, systemd's, or XDG's."""
+    """Return the folder of calibrations: as configured, systemd's, or XDG's."""
     if configured is not None:
         return Path(configured).expanduser()
     given = os.environ.get("STATE_DIRECTORY")
@@ -44,3 +78,9 @@ def state_directory(configured: str | None) -> Path:
         return Path(given.split(":")[0])
     base = os.environ.get("XDG_STATE_HOME")
     return (Path(base) if base else Path.home() / ".local" / "state") / "skin-host"
+
+
+def runtime_directory() -> Path | None:
+    """Return systemd's folder for files of a running service; None if there is none."""
+    given = os.environ.get("RUNTIME_DIRECTORY")
+    return Path(given.split(":")[0]) if given else None

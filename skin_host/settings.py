@@ -7,29 +7,31 @@ name the file and the path inside it. `docs/configuration.md` explains every key
 """
 
 import hashlib
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct, field
 
-from skin_host.errors import ConfigurationError
+from skin_host.errors import ConfigurationError, RequestError
 from skin_host.explain import Named, explain, not_finite
 from skin_host.fields import Name, NotNegative, Positive
 from skin_host.fingertip.settings import Fingertip as Fingertip  # noqa: PLC0414 (for others too)
-from skin_host.fingertip.settings import wrong_references
 from skin_host.relaxation_settings import Relaxation, with_file, wrong_parameters
 
 Byte = Annotated[int, Meta(ge=0, le=255)]
 T = TypeVar("T", bound=Struct)
 TRIANGLES_PER_BOARD = 16
+#: host, host:port or [IPv6]:port
+_ADDRESS = r"^([A-Za-z0-9_.-]+|\[[0-9A-Fa-f:.]+\])(:[0-9]{1,5})?$"
 
 
-class _Table(Struct, forbid_unknown_fields=True, kw_only=True):
-    pass
+class _Table(Struct, forbid_unknown_fields=True, kw_only=True, frozen=True):
+    """Settings never change; `changed` makes others."""
 
 
-class Bus(_Table):
+class Bus(_Table, frozen=True):
     """One CAN bus, opened by python-can."""
 
     interface: str = "socketcan"
@@ -37,16 +39,16 @@ class Bus(_Table):
     bitrate: int = 1_000_000
     #: Further keyword arguments for `can.Bus`, as python-can's own documentation names them.
     options: dict[str, str | int | float | bool] = {}
-    #: Leave the frames of other classes (motors, ...) to others: they are not read, nor counted.
+    #: Ignore frames of other classes (motors, ...): they are neither read nor counted.
     skin_only: bool = False
 
 
-class Board(_Table):
+class Board(_Table, frozen=True):
     """One MTB. Sources: reference of the wire, commands 4D (SET_BRD_CFG)."""
 
     bus: Name
     address: Annotated[int, Meta(ge=1, le=14)]
-    #: Sets the pitfalls that are worked around on bring-up, and what the emulator imitates.
+    #: Selects the board's known problems to work around on bring-up, and the emulated firmware.
     model: Literal["mtb3", "mtb4", "mtb4c"] = "mtb4"
     period_ms: Annotated[int, Meta(ge=10, le=209)] = 50
     #: 0 with temperature compensation, 1 palm and fingertips, 2 without, 3 ergoHand, 7 raw, 8 V2.
@@ -54,10 +56,10 @@ class Board(_Table):
     no_load: Byte = 240
 
 
-class Place(_Table):
-    """Where one triangle lies: its origin, its turn, and the normal of its plane.
+class Place(_Table, frozen=True):
+    """Where one triangle lies: its origin, its rotation, and the normal of its plane.
 
-    The triangle's own frame is turned about its z axis by `turn_deg`, then its z axis is
+    The triangle's own frame is rotated about its z axis by `turn_deg`, then its z axis is
     laid along `normal` by the shortest rotation, then moved to (x, y, z).
     """
 
@@ -69,8 +71,8 @@ class Place(_Table):
     mirror: bool = False
 
 
-class Patch(_Table):
-    """Some triangles of one board, all of one kind and set up alike (command 50)."""
+class Patch(_Table, frozen=True):
+    """Some triangles of one board, all of one kind and with the same set-up (command 50)."""
 
     board: Name
     #: Triangle numbers of the board, in the order of the part's taxels: "0-4,8".
@@ -84,7 +86,7 @@ class Patch(_Table):
     positions: str | None = None
 
 
-class Kind(_Table):
+class Kind(_Table, frozen=True):
     """A kind of sensor unit: 12 pads, or 24, 36, 48 where triangles are cut as one."""
 
     about: str
@@ -96,35 +98,36 @@ class Kind(_Table):
     thermal: list[int] = []
 
 
-class Part(_Table):
+class Part(_Table, frozen=True):
     """A part of the body: one topic, one array of taxels."""
 
     patches: Annotated[list[Patch], Meta(min_length=1)]
     #: The daemon that reads this part, see `skin run --node`.
     node: Name = "main"
-    #: Kinds of object that the skin feels: any, or only grounded ones (no cover).
+    #: Which objects the skin feels: any, or only grounded ones (no cover).
     covered: bool = True
     foam_mm: Positive = 3.0
-    #: Whether frames of pressure are published. Without them, touches are told all the same,
-    #: and a part that nothing touches costs next to nothing.
+    #: Whether frames of pressure are published. Without them, touches are still reported, and a
+    #: part that nothing touches costs almost nothing.
     frames: bool = True
-    #: Where in a contact, see `processing.localization`. All but `centroid` also tell several
-    #: contacts in one touched patch apart.
+    #: How a contact is located, see `processing.localization`. All but `centroid` also separate
+    #: several contacts in one touched patch.
     localization: Literal["centroid", "half_maximum", "peak", "template"] = "centroid"
-    #: For `template`: diameters of what may touch. One is sharper if it is the right one.
+    #: For `template`: diameters of touching objects. A single one is more precise if it is the
+    #: right one.
     probe_mm: Annotated[list[Positive], Meta(min_length=1)] = field(
         default_factory=lambda: [6.0, 8.0, 10.0, 12.0]
     )
 
 
-class Calibration(_Table):
+class Calibration(_Table, frozen=True):
     """How a calibration is taken (paper, section V-A)."""
 
     seconds: Positive = 5.0
     percentile: Annotated[float, Meta(gt=0, le=1)] = 0.95
 
 
-class Pressure(_Table):
+class Pressure(_Table, frozen=True):
     """Counts to kPa. The defaults are the paper's equation (1) and its 2.88 fF at shift 3.
 
     Other pads and foams are scaled to the pad that the equation was measured on, as plate
@@ -137,22 +140,25 @@ class Pressure(_Table):
     #: The palm of the paper: 2 mm of foam; the radius follows from its Figs. 11 to 13.
     pad_radius_mm: Positive = 2.1
     foam_mm: Positive = 2.0
+    #: Noise in pressures of pads with their own curve is smoothed over this time; larger steps pass
+    #: at once. Touches are decided before that. 0 smooths nothing.
+    smoothing_s: NotNegative = 0.5
 
 
-class Touch(_Table):
+class Touch(_Table, frozen=True):
     """The touch decision (paper, section V-B), in units of the 8-bit value."""
 
     margin_units: NotNegative = 2.0
     minimum_threshold_units: NotNegative = 1.0
     hysteresis_units: NotNegative = 0.5
-    #: A taxel is touched when so many of its last three samples say so. Of two, both must be
-    #: above what noise does; else a third is needed.
+    #: A touch begins and ends with at least this many measurements; noise or a weak press need
+    #: more.
     votes_of_3: Literal[1, 2, 3] = 2
     #: `move` events are sent at most this often for a contact.
     move_hz: Positive = 50.0
 
 
-class Drift(_Table):
+class Drift(_Table, frozen=True):
     """Baseline tracking (paper, section V-C, and the proportional rule of deployed hosts)."""
 
     rule: Literal["none", "paper", "proportional"] = "proportional"
@@ -165,7 +171,7 @@ class Drift(_Table):
     frozen_report_s: Positive = 600.0
 
 
-class Processing(_Table):
+class Processing(_Table, frozen=True):
     """Sweeps to pressure to contacts."""
 
     calibration: Calibration = field(default_factory=Calibration)
@@ -175,15 +181,17 @@ class Processing(_Table):
     drift: Drift = field(default_factory=Drift)
 
 
-class Mqtt(_Table):
-    """The broker. The password never stands here: it is read from a file or credential."""
+class Mqtt(_Table, frozen=True):
+    """The broker. The password is never stored here: it is read from a file or credential."""
 
     host: str = "localhost"
     port: Annotated[int, Meta(ge=1, le=65535)] = 1883
+    #: Instead of `host`: nodes of a cluster or independent brokers, as "host" or "host:port".
+    brokers: Annotated[list[Annotated[str, Meta(pattern=_ADDRESS)]], Meta(max_length=16)] = []
     protocol: Literal["5", "3.1.1"] = "5"
     base: str = "skin"
     username: str | None = None
-    #: A file with the password; else systemd's credential `mqtt-password`.
+    #: A file with the password; otherwise systemd's credential `mqtt-password`.
     password_file: str | None = None
     tls: bool = False
     ca_file: str | None = None
@@ -194,30 +202,30 @@ class Mqtt(_Table):
     frame_hz: Annotated[float, Meta(ge=0)] = 0.0
     event_queue: Annotated[int, Meta(ge=16, le=1_000_000)] = 10_000
     commands: bool = True
-    #: Tell Home Assistant of the parts below this prefix, "homeassistant" as a rule.
+    #: Publish the parts to Home Assistant below this prefix, usually "homeassistant".
     discovery_prefix: Annotated[str, Meta(pattern=r"^[a-zA-Z0-9_/-]+$")] | None = None
 
 
-class Receive(_Table):
+class Receive(_Table, frozen=True):
     """The receive path, see docs/receive.md."""
 
     poll_ms: Annotated[float, Meta(gt=0, le=1000)] = 4.0
     buffer_bytes: Annotated[int, Meta(ge=65536)] = 4_194_304
-    #: A sweep whose triangles have not all come is closed after this many periods.
+    #: A sweep with missing triangles is closed after this many periods.
     close_periods: Positive = 0.9
     silent_periods: Positive = 4.0
 
 
-class Service(_Table):
+class Service(_Table, frozen=True):
     """The daemon as a whole."""
 
-    #: Calibrations and recordings; default: systemd's $STATE_DIRECTORY, else XDG state.
+    #: Calibrations and recordings; default: systemd's $STATE_DIRECTORY, otherwise XDG state.
     state_directory: str | None = None
     #: Prometheus text on this port of localhost; 0 is off.
     metrics_port: Annotated[int, Meta(ge=0, le=65535)] = 0
 
 
-class Settings(_Table):
+class Settings(_Table, frozen=True):
     """A whole configuration file."""
 
     robot: Name
@@ -249,7 +257,7 @@ def parse_triangles(text: str) -> list[int]:
         if max(low, high) >= TRIANGLES_PER_BOARD:
             raise ValueError(f'"{text}": a board has triangles 0 to {TRIANGLES_PER_BOARD - 1}')
         if high < low:
-            raise ValueError(f'"{text}": the range "{item.strip()}" runs backwards')
+            raise ValueError(f'"{text}": the range "{item.strip()}" is reversed')
         numbers.extend(range(low, high + 1))
     if len(set(numbers)) != len(numbers):
         raise ValueError(f'"{text}": a triangle is named twice')
@@ -278,6 +286,8 @@ def read_toml(path: Path, table: type[T], named: Named) -> T:
         raise ConfigurationError(f"{path}: {what}") from None
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{path}: not TOML: {error}") from None
+    except RecursionError:
+        raise ConfigurationError(f"{path}: not a configuration: nested too deep") from None
     for where, number in not_finite(msgspec.toml.decode(data)):
         raise ConfigurationError(f"{path}: {where}: seen {number}, wanted a finite number")
     return found
@@ -343,19 +353,117 @@ def _check_references(path: Path, settings: Settings) -> None:
     unused = set(settings.boards) - {board for board, _ in used}
     if unused:
         raise wrong(f"boards.{min(unused)}", "no part uses this board; remove it or add a patch")
-    for where, what in wrong_references(settings):
-        raise wrong(where, what)
+    _check_fingertips(settings, wrong)
     misfit = wrong_parameters(settings.processing.relaxation)
     if misfit is not None:
         raise wrong("processing.relaxation", misfit)
+
+
+def _check_fingertips(settings: Settings, wrong: Callable[[str, str], ConfigurationError]) -> None:
+    addresses = {
+        (board.bus, board.address): f'board "{name}"' for name, board in settings.boards.items()
+    }
+    nodes = {part.node for part in settings.parts.values()}
+    for name, tip in settings.fingertips.items():
+        where = f"fingertips.{name}"
+        if name in settings.parts or name == "nodes":
+            raise wrong(where, "the name is taken by another's topics; choose another")
+        if tip.bus not in settings.buses:
+            raise wrong(f"{where}.bus", f'no bus "{tip.bus}"; {_known(settings.buses)}')
+        twin = addresses.setdefault((tip.bus, tip.address), where)
+        if twin != where:
+            what = f'{tip.address} on bus "{tip.bus}" is already that of {twin}'
+            raise wrong(f"{where}.address", what)
+        if tip.array is not None and tip.array not in settings.parts:
+            raise wrong(f"{where}.array", f'no part "{tip.array}"; {_known(settings.parts)}')
+        if tip.array is not None and settings.parts[tip.array].node != tip.node:
+            raise wrong(f"{where}.node", f'"{tip.node}", but its array belongs to another node')
+        if tip.node not in nodes:
+            raise wrong(f"{where}.node", f'no part belongs to node "{tip.node}"')
+        for key, what in tip.wrong_values():
+            raise wrong(f"{where}.{key}", what)
 
 
 def _known(table: dict[str, Any]) -> str:
     return "there are: " + ", ".join(table)
 
 
+def changed(settings: T, values: Mapping[str, Any]) -> T:
+    """Return a copy of settings with other values, by their keys: {"mqtt.port": 1883}.
+
+    Raises:
+        KeyError: there is no such key.
+    """
+    for path, value in values.items():
+        settings = _changed(settings, path.split("."), value)
+    return settings
+
+
+def _changed(table: Any, keys: list[str], value: Any) -> Any:
+    key, *rest = keys
+    known = table if isinstance(table, dict) else msgspec.structs.asdict(table)
+    if key not in known:
+        raise KeyError(key)
+    inner = _changed(known[key], rest, value) if rest else value
+    if isinstance(table, dict):
+        return table | {key: inner}
+    return msgspec.structs.replace(table, **{key: inner})
+
+
+#: Settings of parts that a running node can change, besides `processing`.
+_OF_PARTS = ("covered", "foam_mm", "frames", "localization", "probe_mm")
+_OF_PATCHES = ("places", "positions")
+
+
+def load_running(path: Path) -> Settings:
+    """Return a daemon's configuration, from the JSON that it wrote at its start.
+
+    Raises:
+        RequestError: it is absent or damaged.
+    """
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=Settings)
+    except OSError as error:
+        raise RequestError(
+            f"{path}: {error.strerror}; a daemon that runs under systemd writes it"
+        ) from None
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise RequestError(f"{path}: damaged: {error}; restart the daemon") from None
+
+
+def needs_restart(old: Settings, new: Settings) -> str | None:
+    """Return the first key that differs and that a running node cannot change.
+
+    All keys that are not listed here as changeable must be equal, and in the same order.
+    """
+    same = changed(new, {"processing": old.processing})
+    for name, part in old.parts.items():
+        if name not in new.parts or len(new.parts[name].patches) != len(part.patches):
+            return f"parts.{name}"
+        taken = {key: getattr(part, key) for key in _OF_PARTS}
+        patches = [
+            msgspec.structs.replace(its, **{key: getattr(mine, key) for key in _OF_PATCHES})
+            for mine, its in zip(part.patches, new.parts[name].patches, strict=True)
+        ]
+        part = msgspec.structs.replace(new.parts[name], patches=patches, **taken)  # noqa: PLW2901
+        same = changed(same, {f"parts.{name}": part})
+    return _first_difference(msgspec.to_builtins(old), msgspec.to_builtins(same))
+
+
+def _first_difference(old: Any, new: Any, where: str = "") -> str | None:
+    if not isinstance(old, dict) or not isinstance(new, dict):
+        return where if old != new else None
+    if list(old) != list(new):
+        return where or "the tables"
+    for key in old:
+        found = _first_difference(old[key], new[key], f"{where}.{key}" if where else key)
+        if found is not None:
+            return found
+    return None
+
+
 def skin_hash(settings: Settings) -> str:
-    """Identify what a calibration belongs to: the boards, their set-up, parts and fingertips.
+    """Return a hash of what a calibration belongs to: boards, their set-up, parts and fingertips.
 
     Twelve hexadecimal digits. Processing, publishing and channel names do not count, so
     a calibration survives a change of the threshold or a move to another interface.

@@ -1,10 +1,11 @@
-"""What a node keeps over a restart, beside its calibration: what operators have changed.
+"""State that a node keeps over a restart, besides its calibration: changes by operators.
 
-A file of the state directory, written whole or not at all. A damaged one is set aside and
-told of; it never keeps the service from starting.
+It is a file of the state directory, written completely or not at all. A damaged one is set aside
+and reported, so that the service can always start.
 """
 
 import logging
+import os
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,17 +13,16 @@ import msgspec
 from msgspec import Meta, Struct, field
 
 from skin_host.fields import Name
-from skin_host.files import write_atomic
-from skin_host.settings import Touch
+from skin_host.files import read_document, set_aside, write_atomic
+from skin_host.settings import Settings, Touch, changed
 
 log = logging.getLogger(__name__)
 
 SCHEMA = "skin.state/1"
-MAX_BYTES = 1_000_000
 
 
 class Thresholds(Struct, forbid_unknown_fields=True, omit_defaults=True):
-    """Changes to the touch decision; None where the configuration's number stands."""
+    """Changes to the touch decision; None where the configuration's number applies."""
 
     margin_units: Annotated[float, Meta(ge=0, le=255)] | None = None
     minimum_threshold_units: Annotated[float, Meta(ge=0, le=255)] | None = None
@@ -30,14 +30,19 @@ class Thresholds(Struct, forbid_unknown_fields=True, omit_defaults=True):
     votes_of_3: Literal[1, 2, 3] | None = None
 
     def over(self, touch: Touch) -> Touch:
-        """The settings with these changes."""
+        """Return the settings with these changes."""
         changes = msgspec.structs.asdict(self)
         known = {key: value for key, value in changes.items() if value is not None}
         return msgspec.structs.replace(touch, **known)
 
+    def over_settings(self, settings: Settings) -> Settings:
+        """Return a whole configuration with these changes."""
+        touch = self.over(settings.processing.touch)
+        return changed(settings, {"processing.touch": touch})
+
 
 class State(Struct, forbid_unknown_fields=True):
-    """What operators have changed since the configuration was written."""
+    """Changes by operators since the configuration was written."""
 
     schema: str = SCHEMA
     disabled: list[Name] = []
@@ -45,28 +50,28 @@ class State(Struct, forbid_unknown_fields=True):
 
 
 def load_state(path: Path) -> State:
-    """Read the state of a node; a missing or damaged file gives an unchanged one."""
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
+    """Read the state of a node.
+
+    A missing or unreadable file gives an unchanged one; so does a damaged one, which is set aside.
+
+    Raises:
+        NewerFileError: a newer version has written it.
+    """
+    if not os.access(path, os.F_OK):
         return State()
-    except OSError as error:
-        log.error("%s: cannot be read: %s; starting without it", path, error.strerror)
+    if not os.access(path, os.R_OK):
+        log.error("%s: cannot be read: no permission; starting without it", path)
         return State()
     try:
-        if len(data) > MAX_BYTES:
-            raise ValueError(f"{len(data)} bytes")
-        state = msgspec.json.decode(data, type=State)
-        if state.schema != SCHEMA:
-            raise ValueError(f'schema "{state.schema}"')
-    except (msgspec.DecodeError, ValueError, RecursionError) as error:
+        return read_document(path, State, SCHEMA, "state", ValueError)
+    except ValueError as error:
         log.error("%s: damaged (%s); starting without it", path, error)
+        set_aside(path)
         return State()
-    return state
 
 
 def save_state(path: Path, state: State) -> None:
-    """Keep the state of a node.
+    """Store the state of a node.
 
     Raises:
         OSError: it cannot be written; the old one is unchanged.

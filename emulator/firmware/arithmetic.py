@@ -28,8 +28,8 @@ def transmit_32(
     """Values and status words of k triangles as the MTB4 family computes them.
 
     Args:
-        raw: uint16[k, 12], what the chips say now.
-        base: int32[k, 12], what they said at the last calibration.
+        raw: uint16[k, 12], present words of the chips.
+        base: int32[k, 12], their words at the last calibration.
         shift, no_load: int32[k].
         gain: int32[k, 12], temperature gains x128.
         thermal: intp[k], the taxel that stands for the temperature.

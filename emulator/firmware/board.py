@@ -1,7 +1,7 @@
-"""What all MTB boards have in common: state, bursts of data frames, identification.
+"""Common parts of all MTB boards: state, bursts of data frames, identification.
 
-A board is a pure core. `handle` takes a frame from the bus and gives the answers; `advance`
-brings it to a time and says whether its sampling tick has come; `step` does the whole tick.
+A board is a pure core. `handle` takes a frame from the bus and returns the answers; `advance`
+brings it to a time and returns whether its sampling tick has come; `step` does the whole tick.
 Robots of many boards take the burst of all boards that are due at once from one `Burst`.
 """
 
@@ -35,7 +35,7 @@ Frame = tuple[int, bytes]
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What a firmware says of itself."""
+    """Identity that a firmware reports."""
 
     board_type: BoardType
     firmware: tuple[int, int, int]
@@ -76,11 +76,11 @@ class Mtb(ABC):
 
     @abstractmethod
     def reset(self, t_ns: int) -> None:
-        """Start the application anew: everything but address and info is forgotten."""
+        """Restart the application: everything except address and info is forgotten."""
 
     @abstractmethod
     def handle(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
-        """Take a frame that came over the bus at `t_ns`; give what the board sends back."""
+        """Take a frame that was on the bus at `t_ns`; return the board's answers."""
 
     @abstractmethod
     def advance(self, t_ns: int) -> bool:
@@ -89,7 +89,7 @@ class Mtb(ABC):
     @property
     @abstractmethod
     def due_ns(self) -> int | None:
-        """When `advance` has something to do, unless a frame comes before; None is never."""
+        """Return when `advance` must be called next, unless a frame comes before; None is never."""
 
     @abstractmethod
     def count_no_ack(self, triangles: int) -> None:
@@ -120,7 +120,7 @@ class Mtb(ABC):
         return int(self.shift[triangle])
 
     def thermal(self, triangle: int) -> tuple[tuple[int, ...], int]:
-        """Temperature gains x128 of a triangle, and the taxel that tells the temperature.
+        """Temperature gains x128 of a triangle, and the taxel that measures the temperature.
 
         Source: `computedrift` of embot_app_application_theSkin.cpp.
         """
@@ -158,7 +158,7 @@ class Mtb(ABC):
         self.version += 1
 
     def _take_baseline(self) -> None:
-        """One snapshot of all chips becomes the zero of every taxel; nothing is averaged."""
+        """Store one snapshot of all chips as the zero of every taxel; nothing is averaged."""
         self.base[:] = self.chips.read()
         self.version += 1
 
@@ -189,7 +189,8 @@ def join(batches: Sequence[FrameBatch]) -> FrameBatch:
 
 
 class Burst:
-    """What some boards of one arithmetic send at a tick, gathered once until they change.
+    """The frames of some boards with the same arithmetic at a tick, gathered once until they
+    change.
 
     Attributes:
         boards: the boards, in the order of their frames.

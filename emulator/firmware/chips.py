@@ -1,8 +1,10 @@
-"""How the firmware reaches its chips: set-up words, burst reads, four or five data lines.
+"""Access of the firmware to its chips: set-up words, burst reads, four or five data lines.
 
 A board has one I2C clock and four data lines (five on newer boards) with four chips each,
-at 0x2C to 0x2F. Slot s of the arrays below sits on line s // 4 at address 0x2C + s % 4.
-Sources: AD7147-Configuration.c of the MTB3, AD7147.c and I2C_Multi_SDA.c of the MTB4.
+at 0x2C to 0x2F. Slot s of the arrays below is on line s // 4 at address 0x2C + s % 4.
+Sources: AD7147-Configuration.c of the MTB3, AD7147.c and I2C_Multi_SDA.c of the MTB4. The
+firmwares bang the lines in parallel and check neither acknowledges nor the clock, as
+`BangedChips` does; the others do the same at less cost as long as all wires are sound.
 """
 
 from collections.abc import Iterable, Sequence
@@ -14,6 +16,7 @@ from numpy.typing import NDArray
 from smbus2 import SMBus, i2c_msg
 
 from emulator.firmware.arithmetic import ABSENT, TAXELS
+from emulator.i2c_wire import BitMaster, I2cWire
 
 ADDRESSES = (0x2C, 0x2D, 0x2E, 0x2F)
 CHIPS_PER_LINE = len(ADDRESSES)
@@ -54,11 +57,15 @@ class Chips(Protocol):
     def configure(
         self, slots: Iterable[int], stages: StageMap, cdc_offset: int, power_control: int
     ) -> None:
-        """Write the whole set-up of the chips at `slots`; absent ones take no notice."""
+        """Write the whole set-up of the chips at `slots`; absent ones ignore it."""
         ...
 
-    def read(self) -> Words:
-        """The twelve results of every slot, uint16[20, 12]; 0xFFFF where nothing answers."""
+    def read(self, without: int = 0) -> Words:
+        """The twelve results of every slot, uint16[20, 12]; 0xFFFF where nothing answers.
+
+        Args:
+            without: data lines that are left out, as bits; what is answered for them is undefined.
+        """
         ...
 
 
@@ -84,11 +91,17 @@ def set_up_bursts(
     return [*bursts, (0x000, control), (_STAGE_CAL_EN, (0x0FFF,))]
 
 
+def _set_up_messages(stages: StageMap, cdc_offset: int, power_control: int) -> list[bytes]:
+    return [
+        first.to_bytes(2) + b"".join(word.to_bytes(2) for word in words)
+        for first, words in set_up_bursts(stages, cdc_offset, power_control)
+    ]
+
+
 class I2cChips:
     """Chips behind smbus2 buses, one per data line: emulated ones, or /dev/i2c-N.
 
-    The firmwares bang the lines in parallel and never look at an acknowledge; here the lines
-    follow each other, and a chip that does not answer (OSError) reads as all ones.
+    The lines follow each other, and a chip that does not answer (OSError) reads as all ones.
     """
 
     def __init__(self, lines: Sequence[SMBus]) -> None:
@@ -97,15 +110,15 @@ class I2cChips:
         self._pointer = [i2c_msg.write(address, RESULTS.to_bytes(2)) for address in ADDRESSES]
         self._results = [i2c_msg.read(address, 2 * TAXELS) for address in ADDRESSES]
 
+    def __reduce__(self) -> tuple[type["I2cChips"], tuple[Sequence[SMBus]]]:
+        """Messages hold addresses of memory; a saved board makes its own again."""
+        return I2cChips, (self._lines,)
+
     def configure(
         self, slots: Iterable[int], stages: StageMap, cdc_offset: int, power_control: int
     ) -> None:
         """Write the set-up burst by burst."""
-        bursts = set_up_bursts(stages, cdc_offset, power_control)
-        messages = [
-            first.to_bytes(2) + b"".join(word.to_bytes(2) for word in words)
-            for first, words in bursts
-        ]
+        messages = _set_up_messages(stages, cdc_offset, power_control)
         for slot in slots:
             line, index = divmod(slot, CHIPS_PER_LINE)
             if line >= len(self._lines):
@@ -116,10 +129,12 @@ class I2cChips:
                 except OSError:
                     break
 
-    def read(self) -> Words:
+    def read(self, without: int = 0) -> Words:
         """One combined read of twelve words from every chip of every line."""
         self._registers[:] = ABSENT
         for number, line in enumerate(self._lines):
+            if without >> number & 1:
+                continue
             for index in range(CHIPS_PER_LINE):
                 results = self._results[index]
                 try:
@@ -130,3 +145,51 @@ class I2cChips:
                     bytes(results), ">u2"
                 )
         return self._registers.astype(np.uint16)
+
+
+class BangedChips:
+    """Chips on a wire that is driven bit by bit, all lines together, as the boards do.
+
+    Args:
+        wire: with one data line for every four slots.
+    """
+
+    def __init__(self, wire: I2cWire) -> None:
+        self._wire = wire
+
+    def configure(
+        self, slots: Iterable[int], stages: StageMap, cdc_offset: int, power_control: int
+    ) -> None:
+        """Write the set-up burst by burst, a line at a time."""
+        messages = _set_up_messages(stages, cdc_offset, power_control)
+        for slot in slots:
+            line, index = divmod(slot, CHIPS_PER_LINE)
+            if line >= len(self._wire.lines):
+                continue
+            master = BitMaster(self._wire, 1 << line)
+            for message in messages:
+                _send(master, ADDRESSES[index], message)
+                master.stop()
+
+    def read(self, without: int = 0) -> Words:
+        """One combined read of twelve words at each address, on all lines at once."""
+        n_lines = len(self._wire.lines)
+        lines = ((1 << n_lines) - 1) & ~without
+        registers = np.full((SLOTS, TAXELS), ABSENT, np.uint16)
+        master = BitMaster(self._wire, lines)
+        for index, address in enumerate(ADDRESSES):
+            _send(master, address, RESULTS.to_bytes(2))
+            master.start()
+            master.put(address << 1 | 1)
+            taken = [master.get(acknowledge=at < 2 * TAXELS - 1) for at in range(2 * TAXELS)]
+            master.stop()
+            of_lines = np.array(taken, np.uint8).T.copy().view(">u2")
+            registers[index : CHIPS_PER_LINE * n_lines : CHIPS_PER_LINE] = of_lines
+        return registers
+
+
+def _send(master: BitMaster, address: int, message: bytes) -> None:
+    """A write message without its STOP; nobody checks who acknowledges it."""
+    master.start()
+    for byte in (address << 1, *message):
+        master.put(byte)

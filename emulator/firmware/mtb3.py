@@ -55,7 +55,7 @@ TIMERS = {
     StageMap.FINGERTIP: (0x3D1C, 0x2D00, 0x3D1C),
     StageMap.ALL: (0x1A00, 0x1A00, 0x1A00),
 }
-#: Five entries, of which the index never reaches the last.
+#: Five entries, but the index never reaches the last.
 RECEIVE_ENTRIES = 4
 NO_ACKS_TO_CALIBRATE = 5
 #: Reading 16 chips at 300 kHz and waiting for 32 frames: the loop is never faster (ns).
@@ -168,7 +168,7 @@ class Mtb3(Mtb):
             self._calibrate_at_tick = True
 
     def answers(self) -> list[Frame]:
-        """What the main loop has answered since the last call."""
+        """Return the answers of the main loop since the last call."""
         answers, self._answers = self._answers, []
         return answers
 
@@ -211,7 +211,7 @@ class Mtb3(Mtb):
             self._baseline_ns = None
             self._take_baseline()
         if self._back_ns is not None and t_ns >= self._back_ns:
-            # The flag is tested inverted: the stream goes on by itself after command 50.
+            # The flag is tested inverted: after command 50 the stream continues by itself.
             self._sending |= self._starts_after_calibration
             self.next_ns = self._back_ns + self.period_ns if self._timer_wanted() else None
             self._back_ns = None
@@ -224,7 +224,7 @@ class Mtb3(Mtb):
     def handle(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
         """Put a frame that passes the filters on the stack; run it if the loop is free.
 
-        The filters take 0x2xN, 0x7xN and 0x7xF; the broadcast 0x2xF is not heard. All eight
+        The filters take 0x2xN, 0x7xN and 0x7xF; the broadcast 0x2xF is ignored. All eight
         bytes of the mailbox are copied, so those that were not sent are old ones.
         """
         match can_id & ANY_SENDER:

@@ -193,7 +193,7 @@ class Mtb4(Mtb):
                 self._start(t_ns)
 
     def _start(self, t_ns: int) -> None:
-        """Start the timer anew; one of period 0 never ticks."""
+        """Restart the timer; one of period 0 never ticks."""
         self.next_ns = t_ns + self.period_ns if self.period_ns else None
 
     def _set_up_chips(self) -> None:

@@ -1,1 +1,1 @@
-"""Bytes on CAN to sweeps of the skin, and commands back to its boards."""
+"""CAN: turns received frames into sweeps of the skin, and sends commands to its boards."""

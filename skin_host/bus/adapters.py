@@ -1,43 +1,42 @@
-"""Any other interface of python-can (virtual, udp_multicast, slcan, pcan, kvaser ...).
+"""Port for every other interface of python-can (virtual, udp_multicast, slcan, pcan, kvaser ...).
 
-Frames are taken one by one, which costs some microseconds each, and put into the same
-arrays as SocketCAN's.
+Frames are read one by one, which costs some microseconds each, into the same arrays as SocketCAN's.
 """
 
-import time
-from concurrent.futures import Future, ThreadPoolExecutor
+import os
+import socket
+from concurrent.futures import Future
+from importlib.util import find_spec
 
 import can
 import numpy as np
 
-from skin_host.bus.port import (
-    ERROR_FLAG,
-    EXTENDED_FLAG,
-    REMOTE_FLAG,
-    SKIN_CLASSES,
-    LinkState,
-    Port,
-)
+from skin_host.bus.port import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, SKIN_CLASSES, LinkState, Port
 from skin_host.bus.protocol import FrameBatch
-from skin_host.errors import BusError
+from skin_host.clock import SYSTEM, Clock, Executor
+from skin_host.errors import BusError, ConfigurationError
 from skin_host.settings import Bus
 
-#: One read takes at most so many frames, so that a flood cannot hold the loop.
+#: One read takes at most this many frames, so that a flood cannot block the event loop.
 CAPACITY = 1024
 #: A time stamp farther from now than this is an uptime or a counter, not a time of day.
 _PLAUSIBLE_S = 3600.0
+MULTICAST = "udp_multicast"
+#: Options of Linux sockets (in.h, in6.h) that Python does not name.
+IP_MULTICAST_ALL = 49
+IPV6_MULTICAST_ALL = 29
 
 
 def nanoseconds(seconds: float) -> int:
-    """A time stamp of python-can as integer nanoseconds, to the microsecond.
+    """Convert a time stamp of python-can to integer nanoseconds, to the microsecond.
 
-    Today's seconds in a float resolve 0.24 us, so that only whole microseconds are exact.
+    A float of today's seconds resolves 0.24 us, so that only whole microseconds are exact.
     """
     return round(seconds * 1e6) * 1000
 
 
 def identifier(message: can.Message) -> int:
-    """A message's identifier with SocketCAN's flags."""
+    """Return a message's identifier with SocketCAN's flags."""
     return (
         message.arbitration_id
         | message.is_extended_id * EXTENDED_FLAG
@@ -47,7 +46,7 @@ def identifier(message: can.Message) -> int:
 
 
 def one_line(error: Exception) -> str:
-    """What a library's error says, in one line."""
+    """Return the message of a library's error on one line."""
     return (str(error).splitlines() or [type(error).__name__])[0]
 
 
@@ -56,9 +55,11 @@ class AdapterPort(Port):
 
     capacity = CAPACITY
 
-    def __init__(self, name: str, settings: Bus, bus: can.BusABC) -> None:
-        super().__init__(name, settings, bus)
-        self._opener: ThreadPoolExecutor | None = None
+    def __init__(
+        self, name: str, settings: Bus, bus: can.BusABC | None, clock: Clock = SYSTEM
+    ) -> None:
+        super().__init__(name, settings, bus, clock)
+        self._opener: Executor | None = None
         self._opening: Future[can.BusABC] | None = None
         self._id = np.zeros(CAPACITY, np.uint32)
         self._dlc = np.zeros(CAPACITY, np.uint8)
@@ -66,7 +67,6 @@ class AdapterPort(Port):
         self._t_ns = np.zeros(CAPACITY, np.int64)
 
     def read(self) -> FrameBatch:
-        """See `Port.read`."""
         n = 0
         errors = False
         if self._bus is None:
@@ -87,20 +87,19 @@ class AdapterPort(Port):
         batch = FrameBatch(self._id[:n], self._dlc[:n], self._data[:n], self._t_ns[:n])
         if errors:
             self._note_errors(batch)
-        if self.state is not self._told:
-            self._tell()
+        if self.state is not self._logged_state:
+            self._log_state()
         return batch
 
     def close(self) -> None:
-        """See `Port.close`."""
         super().close()
         if self._opener is not None:
-            self._opener.shutdown(wait=False, cancel_futures=True)
+            self._opener.close()
             self._opener = None
 
     def _wanted(self, message: can.Message) -> bool:
-        # python-can's own filters are not used: with one set, `recv(0)` gives None for a frame
-        # that does not pass, as if no other waited.
+        # python-can's own filters are not used: with a filter, `recv(0)` returns None for a frame
+        # that does not pass, even if others wait.
         if message.is_fd:
             return False
         return (
@@ -113,7 +112,7 @@ class AdapterPort(Port):
         self._id[row] = identifier(message)
         self._dlc[row] = message.dlc
         self._data[row, : len(message.data)] = message.data
-        now_s = time.time()
+        now_s = self._clock.now_ns() * 1e-9
         stamp_s = message.timestamp
         if abs(stamp_s - now_s) > _PLAUSIBLE_S:
             stamp_s = now_s
@@ -132,7 +131,7 @@ class AdapterPort(Port):
         if self._opening is None:
             if self._time_to_check():
                 if self._opener is None:
-                    self._opener = ThreadPoolExecutor(1, f"open-{self.name}")
+                    self._opener = self._clock.executor(f"open-{self.name}")
                 self._opening = self._opener.submit(open_bus, self.name, self._settings)
         elif self._opening.done():
             opening, self._opening = self._opening, None
@@ -143,19 +142,39 @@ class AdapterPort(Port):
 
 
 def open_bus(name: str, settings: Bus) -> can.BusABC:
-    """See `port.open_bus`."""
     options = {"bitrate": settings.bitrate} | settings.options
     where = f'bus "{name}": {settings.interface} {settings.channel}'
     if settings.interface not in can.VALID_INTERFACES:
         known = ", ".join(sorted(can.VALID_INTERFACES))
-        raise BusError(f"{where}: python-can has no such interface; it has {known}")
+        raise ConfigurationError(f"{where}: python-can has no such interface; it has {known}")
     try:
-        return can.Bus(
+        bus = can.Bus(
             interface=settings.interface,
             channel=settings.channel,
             ignore_config=True,
             **options,  # type: ignore[arg-type]
         )
     except Exception as error:
-        # Each adapter's library has errors of its own; to the user they are all one.
-        raise BusError(f"{where}: cannot be opened: {one_line(error)}") from None
+        # Each adapter's library has its own errors; the user gets one kind.
+        why = one_line(error)
+        if settings.interface == MULTICAST and find_spec("msgpack") is None:
+            why = "the package msgpack is not installed; mend it with: "
+            why += "pip install 'skin-host[multicast]'"
+        raise BusError(f"{where}: cannot be opened: {why}") from None
+    if settings.interface == MULTICAST:
+        _leave_other_groups(bus, settings.channel)
+    return bus
+
+
+def _leave_other_groups(bus: can.BusABC, group: str) -> None:
+    """Receive what is sent to this bus's own group alone.
+
+    By default Linux delivers each group that any program of the machine has joined to every
+    socket of the port, so that one bus would carry the frames of all others.
+    """
+    family = socket.AF_INET6 if ":" in group else socket.AF_INET
+    level = socket.IPPROTO_IPV6 if family == socket.AF_INET6 else socket.IPPROTO_IP
+    option = IPV6_MULTICAST_ALL if family == socket.AF_INET6 else IP_MULTICAST_ALL
+    # A copy of the descriptor: the socket itself belongs to python-can.
+    with socket.socket(family, socket.SOCK_DGRAM, fileno=os.dup(bus.fileno())) as copy:
+        copy.setsockopt(level, option, 0)

@@ -1,13 +1,13 @@
-"""Frames to sweeps: one assembler a bus.
+"""Assembles frames into sweeps: one assembler per bus.
 
-A sweep is one board's values of one period. The wire has no sequence number and no
-guaranteed order, so a sweep is bounded by what can be told: a slot (triangle and half)
-that comes twice, a pause, or the age of the sweep's first frame starts a new one. It is
-handed on as soon as every triangle that is awaited has come whole. A triangle that has
-been missing for a while is no longer awaited, so that it costs no delay; when it comes
-back, it is.
+A sweep is one board's values of one period. The frames have no sequence number and no guaranteed
+order, so the end of a sweep is inferred: a slot (triangle and half) that comes twice, a pause, or
+the age of the sweep's first frame starts a new one. A sweep is returned as soon as every awaited
+triangle is complete. A triangle that has been missing for a while is no longer awaited, so that it
+causes no delay, until it sends again.
 """
 
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -27,14 +27,14 @@ from skin_host.bus.protocol import (
 )
 from skin_host.layout import BoardLayout
 
-#: A board's frames follow each other within a burst; a pause of this share of the period,
-#: measured on one board, lies between two sweeps.
+#: A board sends the frames of a sweep in a burst; a pause of this share of the period, measured on
+#: one board, separates two sweeps.
 PAUSE_PERIODS = 0.5
-#: A triangle is awaited until it was missing in so many sweeps in a row.
+#: A triangle is awaited until it was missing in this many sweeps in a row.
 PATIENCE_SWEEPS = 3
-#: What a triangle's bit in a mask of triangles makes in a mask of halves: its A and its B.
+#: Expands a triangle's bit in a mask of triangles to its A and B bits in a mask of halves.
 _BOTH = 1 << TRIANGLES | 1
-#: What a frame brings behind its header, and two of them together.
+#: The bytes of a frame after its header, and of two frames together.
 _NOTHING = bytes(7)
 _TRIANGLE = np.dtype([("raw", np.uint8, TAXELS), ("status", ">u2")])
 _SMALLEST_DLC_B = 6
@@ -44,6 +44,10 @@ _CLASSES = {
     HEADER_A: (MessageClass.SKIN_STREAM, MessageClass.ANALOG_STREAM),
     HEADER_B: (MessageClass.SKIN_STREAM, MessageClass.ANALOG_STREAM, MessageClass.BATTERY_STREAM),
 }
+
+
+#: Classes in which boards answer.
+_ANSWERS = (MessageClass.ANALOG_COMMAND, MessageClass.MANAGEMENT)
 
 
 class Sweep(NamedTuple):
@@ -66,12 +70,24 @@ class Sweep(NamedTuple):
     missed: int
 
 
+class Assembled(NamedTuple):
+    """Sweeps and answers from the frames of a batch.
+
+    Attributes:
+        sweeps: those that were completed; for each board in order of time.
+        answers: (identifier, payload) of frames of the classes in which boards answer.
+    """
+
+    sweeps: list[Sweep]
+    answers: list[tuple[int, bytes]]
+
+
 @dataclass(slots=True)
 class AssemblerCounters:
-    """Everything that came and did not become part of a sweep, and what was missing."""
+    """Counts all frames that did not become part of a sweep, and everything that was missing."""
 
     frames: int = 0
-    #: Not of the skin stream: answers, other sensors, strangers.
+    #: Frames outside the skin stream: answers, other sensors, unconfigured nodes.
     other: int = 0
     #: Of the configured force/torque boards.
     force_torque: int = 0
@@ -83,10 +99,12 @@ class AssemblerCounters:
     unknown_triangle: int = 0
     #: Frames of a triangle that was no longer awaited, too late for their sweep.
     late: int = 0
+    #: Frames that came twice in a row.
+    doubled: int = 0
     sweeps: int = 0
-    #: Sweeps handed on without a triangle that was awaited.
+    #: Sweeps returned without a triangle that was awaited.
     incomplete: int = 0
-    #: Triangles with one half only.
+    #: Triangles of which only one frame arrived.
     halves: int = 0
     #: Whole periods without a frame from a board that had been sending.
     missed: int = 0
@@ -98,9 +116,9 @@ class _BoardState:
 
     Attributes:
         wanted: halves that the configured triangles send.
-        awaited: those without which a sweep is not complete.
-        missing: those of `awaited` that have not come; 0 between sweeps.
-        values: what came of each triangle, A and B in turn.
+        awaited: halves without which a sweep is not complete.
+        missing: halves of `awaited` that have not arrived; 0 between sweeps.
+        values: received bytes of each triangle, A and B in turn.
     """
 
     index: int
@@ -116,17 +134,24 @@ class _BoardState:
     sent: int = 0
     sent_first_ns: int = -(1 << 62)
     sent_last_ns: int = 0
+    last_place: int = -1
     values: list[bytes] = field(default_factory=lambda: [_NOTHING] * 2 * TRIANGLES)
     absent_for: list[int] = field(default_factory=lambda: [0] * TRIANGLES)
 
 
 class Assembler:
-    """Pairs the frames of one bus's boards into sweeps.
+    """Assembles the frames of one bus's boards into sweeps.
 
     Args:
         boards: (index in `Layout.boards`, board) of the boards on this bus.
-        close_periods: a sweep is closed when its first frame is so many periods old.
+        close_periods: a sweep is closed when its first frame is this many periods old.
         force_torque: identifiers of the data of the configured force/torque boards.
+
+    Attributes:
+        stranger_id: the most frequent identifier among motor frames, when these were last more than
+            half of a batch; otherwise None.
+        crowded: per board, sweeps that began within half a period of the previous one with a frame
+            that was already in it: no board sends like that, but two at one address do.
     """
 
     def __init__(
@@ -136,10 +161,12 @@ class Assembler:
         force_torque: frozenset[int] = frozenset(),
     ) -> None:
         self.counters = AssemblerCounters()
+        self.stranger_id: int | None = None
+        self.crowded: Counter[int] = Counter()
         self._force_torque = force_torque
         self._states: dict[int, _BoardState] = {}
-        # By identifier << 8 | header byte of each frame that a configured triangle may send:
-        # the board, the place among its values, and the bit in its masks.
+        # For identifier << 8 | header byte of each frame that a configured triangle may send: the
+        # board, the place among its values, and the bit in its masks.
         self._slots: dict[int, tuple[_BoardState, int, int]] = {}
         for index, board in boards:
             period_ns = board.settings.period_ms * 1_000_000
@@ -158,38 +185,47 @@ class Assembler:
             for triangle in board.triangles:
                 self._add_slots(board.settings.address, triangle, state)
 
-    def feed(self, batch: FrameBatch) -> list[Sweep]:
-        """Take the frames of a batch, hand on the sweeps that they complete.
-
-        Sweeps of one board come in order of time.
-        """
-        # One frame after the other. With the thirty to hundred frames that a read brings, this
-        # costs less than masks and scatters over arrays, and a batch may span several sweeps.
+    def feed(self, batch: FrameBatch) -> Assembled:
+        """Process the frames of a batch; this is the only loop over them."""
+        # One frame after the other: for the thirty to hundred frames of a read, this costs less
+        # than masks and scatters over arrays, and a batch may span several sweeps.
         self.counters.frames += len(batch)
         sweeps: list[Sweep] = []
+        answers: list[tuple[int, bytes]] = []
+        motors: list[int] = []
         slots = self._slots
         for seconds, nanoseconds, identifier, dlc, header, payload in batch.frames():
             slot = slots.get(identifier << 8 | header)
             if slot is None or dlc < 8:
                 if not self._usable(identifier, dlc, header):
+                    message_class = identifier >> 8
+                    if message_class in _ANSWERS:
+                        answers.append((identifier, (bytes((header,)) + payload)[:dlc]))
+                    elif message_class < MessageClass.ANALOG_COMMAND:
+                        motors.append(identifier)
                     continue
                 assert slot is not None
-                # Old firmware: no status; what lies behind the DLC is not defined.
+                # Old firmware sends no status; the bytes after the DLC are not defined.
                 payload = payload[: TAXELS - VALUES_A] + b"\0\0"  # noqa: PLW2901
             t_ns = seconds * NS_PER_S + nanoseconds
             state, place, bit = slot
+            if place == state.last_place and self._is_doubled(state, bit, payload, t_ns):
+                continue
             if (bit & state.missing and t_ns <= state.certain_until_ns) or self._belongs(
                 state, bit, t_ns, sweeps
             ):
                 state.values[place] = payload
+                state.last_place = place
                 state.last_ns = t_ns
                 state.missing ^= bit
                 if not state.missing:
                     self._close(state, sweeps)
-        return sweeps
+        if 2 * len(motors) > len(batch):
+            ((self.stranger_id, _),) = Counter(motors).most_common(1)
+        return Assembled(sweeps, answers)
 
     def expire(self, now_ns: int) -> list[Sweep]:
-        """Hand on the sweeps whose time has passed, with what has come of them.
+        """Return the sweeps whose time has passed, complete or not.
 
         Args:
             now_ns: the time, on the clock of the frames' time stamps.
@@ -201,7 +237,7 @@ class Assembler:
         return sweeps
 
     def flush(self) -> list[Sweep]:
-        """Hand on everything, at the end of a recording."""
+        """Return all sweeps in progress, at the end of a recording."""
         return self.expire(1 << 62)
 
     def _add_slots(self, address: int, triangle: int, state: _BoardState) -> None:
@@ -212,9 +248,9 @@ class Assembler:
                 self._slots[identifier << 8 | header] = state, 2 * triangle + half, bit
 
     def _usable(self, identifier: int, dlc: int, header: int) -> bool:
-        """Count a frame that is not a whole one of a configured triangle.
+        """Count a frame that is not a complete one of a configured triangle.
 
-        Returns whether it is a configured triangle's B frame that merely lacks its status.
+        Returns whether it is a configured triangle's B frame that only lacks its status.
         """
         counters = self.counters
         message_class = identifier >> 8
@@ -244,11 +280,25 @@ class Assembler:
         else:
             self.counters.unknown_board += 1
 
-    def _belongs(self, state: _BoardState, bit: int, t_ns: int, sweeps: list[Sweep]) -> bool:
-        """Make room for a frame that is not plainly the next one of a sweep in progress.
+    def _is_doubled(self, state: _BoardState, bit: int, payload: bytes, t_ns: int) -> bool:
+        """Count the frame that the board sent last, if it comes once more.
 
-        It may begin a sweep, which ends the one before, or be of a triangle that was not
-        awaited. Returns False if it came too late for its sweep.
+        A receiver that saw an error in the last bit of a frame gets it again, as do two
+        gateways in parallel. The board itself sends the same slot a period later.
+        """
+        first_ns = state.first_ns if state.missing else state.sent_first_ns
+        same = not bit & state.missing and state.values[state.last_place] == payload
+        if not same or not 0 <= t_ns - first_ns <= state.pause_ns:
+            return False
+        self.counters.doubled += 1
+        return True
+
+    def _belongs(self, state: _BoardState, bit: int, t_ns: int, sweeps: list[Sweep]) -> bool:
+        """Handle a frame that is not the next one of a sweep in progress.
+
+        It may begin a sweep, which ends the one before, or belong to a triangle that was not
+        awaited.
+        Returns False if it came too late for its sweep.
         """
         if state.missing and (
             state.awaited & ~state.missing & bit
@@ -265,9 +315,11 @@ class Assembler:
                 state.missing |= both
         if not state.missing:
             if not bit & state.sent and t_ns - state.sent_first_ns <= state.pause_ns:
-                # It was not awaited, so its sweep went without it.
+                # The triangle was not awaited, so its sweep was returned without it.
                 self.counters.late += 1
                 return False
+            if bit & state.sent and 0 < 2 * (t_ns - state.sent_first_ns) < state.period_ns:
+                self.crowded[state.index] += 1
             state.missing = state.awaited
             state.first_ns = t_ns
         state.certain_until_ns = min(t_ns + state.pause_ns, state.first_ns + state.close_ns)

@@ -1,15 +1,14 @@
-"""One CAN bus as a source of `FrameBatch` and a paced way to send.
+"""One CAN bus as a source of `FrameBatch`, with paced sending.
 
-Two kinds stand behind one interface: SocketCAN, read in batches (`socketcan`), and every
-other interface that python-can knows (`adapters`). A port that has been opened never
-raises on reading and never gives up: an interface that goes down, disappears or is
-bus-off is a state, counted and told in one log line per change.
+There are two implementations: SocketCAN, read in batches (`socketcan`), and every other interface
+that python-can supports (`adapters`). Reading from an open port never raises: an interface that
+goes down, disappears or is bus-off is a state, which is counted and logged in one line per change,
+and the port waits for it to return.
 """
 
 import asyncio
 import errno
 import logging
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -17,29 +16,30 @@ from enum import StrEnum
 
 import can
 import numpy as np
-from can.interfaces.socketcan import SocketcanBus
 
 from skin_host.bus.protocol import FrameBatch, MessageClass
+from skin_host.clock import SYSTEM, Clock
 from skin_host.errors import BusError
-from skin_host.settings import Bus, Receive
+from skin_host.settings import Bus
 
 log = logging.getLogger(__name__)
 
-#: A port that is not up looks for its interface this often.
+#: A port that is not up checks its interface this often.
 CHECK_S = 0.25
-#: After bus-off the kernel may take so long to say that the carrier is gone.
+#: After bus-off the kernel may need this long to report that the carrier is gone.
 _CARRIER_S = 1.5
-#: A frame that the interface does not take within this time is given up.
+#: A frame that the interface does not take within this time is dropped.
 SEND_DEADLINE_S = 1.0
 _SEND_RETRY_S = 0.002
-#: A flapping link writes at most one log line in this time, which doubles up to the last.
+#: An unstable link writes at most one log line in the first of these times, which doubles up to the
+#: last.
 _QUIET_S = 1.0
 _LONGEST_QUIET_S = 60.0
 
 EXTENDED_FLAG = 0x80000000
 REMOTE_FLAG = 0x40000000
 ERROR_FLAG = 0x20000000
-#: What boards of the skin and force/torque sensors send.
+#: Classes of the frames that skin boards and force/torque sensors send.
 SKIN_CLASSES = (
     MessageClass.ANALOG_COMMAND,
     MessageClass.ANALOG_STREAM,
@@ -57,27 +57,27 @@ _CONTROLLER_ACTIVE = 0x40
 
 
 class LinkState(StrEnum):
-    """What is known of the interface."""
+    """State of the interface, as far as it is known."""
 
     UP = "up"
-    #: Errors abound on the wire, frames still pass.
+    #: There are many errors on the wire, but frames still pass.
     ERROR_PASSIVE = "error_passive"
     #: The controller left the bus after too many errors.
     BUS_OFF = "bus_off"
     DOWN = "down"
-    #: The device was removed, or its driver failed; it is looked for under the same name.
+    #: The device was removed, or its driver failed; the port looks for it under the same name.
     GONE = "gone"
 
 
 @dataclass(slots=True)
 class PortCounters:
-    """What a port has seen since it was opened.
+    """Counters of a port since it was opened.
 
     Attributes:
         frames: frames read, error frames included.
         dropped: frames lost because the socket's buffer was full (counted by the kernel).
-        controller_overflows: times the controller lost frames; how many, it does not say.
-        buffer_bytes: size of the socket's buffer that was granted, 0 where there is none.
+        controller_overflows: how often the controller lost frames; it does not report how many.
+        buffer_bytes: size of the socket's buffer that was granted, 0 without a socket.
     """
 
     frames: int = 0
@@ -106,38 +106,44 @@ class Port(ABC):
 
     capacity: int
 
-    def __init__(self, name: str, settings: Bus, bus: can.BusABC) -> None:
+    def __init__(
+        self, name: str, settings: Bus, bus: can.BusABC | None, clock: Clock = SYSTEM
+    ) -> None:
         self.name = name
+        self._clock = clock
         self.channel = settings.channel
-        self.state = LinkState.UP
+        self.state = LinkState.GONE if bus is None else LinkState.UP
         self.counters = PortCounters()
         self._settings = settings
         self._bus: can.BusABC | None = bus
         self._send_lock = asyncio.Lock()
         self._reason = ""
-        self._told = LinkState.UP
+        self._logged_state = self.state
         self._told_at_s = -2 * _LONGEST_QUIET_S
         self._quiet_s = _QUIET_S
         self._check_at_s = 0.0
 
     @abstractmethod
     def read(self) -> FrameBatch:
-        """Everything that is waiting, at most the port's capacity. Never blocks nor raises.
+        """Return the frames that wait, at most the port's capacity. Never blocks or raises.
 
-        The arrays are reused: they hold until the next read.
+        The arrays are reused: they are valid until the next read.
         """
 
     def fileno(self) -> int | None:
-        """A descriptor that is readable when frames wait, or None; it changes on reopening."""
+        """Return a descriptor that is readable when frames wait, or None; it changes on
+        reopening.
+        """
         try:
             return self._bus.fileno() if self._bus is not None else None
         except NotImplementedError:
             return None
 
     async def send(self, frames: Iterable[tuple[int, bytes]], gap_s: float = 0.002) -> None:
-        """Send standard data frames, with a pause after each: the boards' mailboxes are shallow.
+        """Send standard data frames, with a pause after each because the boards' mailboxes are
+        small.
 
-        A full transmit queue is waited for.
+        Waits while the transmit queue is full.
 
         Raises:
             BusError: the interface is down or gone, or its queue stayed full.
@@ -145,9 +151,9 @@ class Port(ABC):
         async with self._send_lock:
             for identifier, data in frames:
                 message = can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
-                deadline_s = time.monotonic() + SEND_DEADLINE_S
+                deadline_s = self._clock.monotonic_s() + SEND_DEADLINE_S
                 while not self._try_send(message):
-                    if time.monotonic() > deadline_s:
+                    if self._clock.monotonic_s() > deadline_s:
                         raise BusError(
                             f'bus "{self.name}": {self.channel}: the transmit queue stayed full '
                             f"for {SEND_DEADLINE_S:g} s; no other node acknowledges: check power, "
@@ -155,12 +161,12 @@ class Port(ABC):
                             f"{self.channel}`)"
                         )
                     self.counters.send_retries += 1
-                    await asyncio.sleep(_SEND_RETRY_S)
+                    await self._clock.sleep(_SEND_RETRY_S)
                 self.counters.sent += 1
-                await asyncio.sleep(gap_s)
+                await self._clock.sleep(gap_s)
 
     def close(self) -> None:
-        """Give the interface back."""
+        """Close the interface."""
         if self._bus is not None:
             self._bus.shutdown()
             self._bus = None
@@ -171,14 +177,14 @@ class Port(ABC):
         try:
             self._bus.send(message)
         except can.CanOperationError as error:
-            # Without a code, an adapter says no more than that it could not.
+            # An error without a code only means that the adapter could not send.
             if error.error_code in {None, errno.ENOBUFS, errno.EAGAIN}:
                 return False
             raise BusError(f'bus "{self.name}": {self.channel}: cannot send: {error}') from None
         return True
 
     def _enter(self, state: LinkState, reason: str = "") -> None:
-        """Note a change of state; count it."""
+        """Note and count a change of state."""
         if state is self.state:
             return
         self.state = state
@@ -187,17 +193,17 @@ class Port(ABC):
             case LinkState.BUS_OFF:
                 self.counters.bus_offs += 1
                 # The flags of the interface follow the controller with a delay.
-                self._check_at_s = time.monotonic() + _CARRIER_S
+                self._check_at_s = self._clock.monotonic_s() + _CARRIER_S
             case LinkState.DOWN:
                 self.counters.link_downs += 1
             case LinkState.GONE:
                 self.counters.removals += 1
 
-    def _tell(self) -> None:
-        """Log the state if it is not the one logged last."""
-        now_s = time.monotonic()
+    def _log_state(self) -> None:
+        """Log the state if it differs from the last logged one."""
+        now_s = self._clock.monotonic_s()
         since_s = now_s - self._told_at_s
-        if self.state is self._told or since_s < self._quiet_s:
+        if self.state is self._logged_state or since_s < self._quiet_s:
             return
         calm = since_s >= 2 * _LONGEST_QUIET_S
         self._quiet_s = _QUIET_S if calm else min(2 * self._quiet_s, _LONGEST_QUIET_S)
@@ -208,20 +214,20 @@ class Port(ABC):
             self.channel,
             self.state,
             self._reason,
-            self._told,
+            self._logged_state,
         )
-        self._told = self.state
+        self._logged_state = self.state
         self._told_at_s = now_s
 
     def _time_to_check(self) -> bool:
-        now_s = time.monotonic()
+        now_s = self._clock.monotonic_s()
         if now_s < self._check_at_s:
             return False
         self._check_at_s = now_s + CHECK_S
         return True
 
     def _note_errors(self, batch: FrameBatch) -> None:
-        """Count a batch's error frames and take the link's state from them."""
+        """Count a batch's error frames and derive the link's state from them."""
         # In an extended identifier this bit belongs to the number.
         kind = batch.id & np.uint32(EXTENDED_FLAG | ERROR_FLAG)
         for row in np.flatnonzero(kind == ERROR_FLAG).tolist():
@@ -237,41 +243,3 @@ class Port(ABC):
                 self._enter(LinkState.BUS_OFF)
             if error & _ERROR_RESTARTED:
                 self._enter(LinkState.UP)
-
-
-def open_port(name: str, bus: Bus, receive: Receive) -> Port:
-    """Open a bus by python-can.
-
-    Args:
-        name: of the bus in the configuration, for messages.
-        bus: interface and channel.
-        receive: size of the buffer.
-
-    Raises:
-        BusError: the interface is absent, down, not CAN, not permitted, or not supported.
-    """
-    from skin_host.bus import adapters, socketcan
-
-    opened = open_bus(name, bus)
-    if bus.interface == "socketcan":
-        return socketcan.SocketCanPort(
-            name, bus, receive, opened, lambda: socketcan.open_present(name, bus)
-        )
-    if isinstance(opened, SocketcanBus):
-        return socketcan.SocketCanPort(
-            name, bus, receive, opened, lambda: adapters.open_bus(name, bus)
-        )
-    return adapters.AdapterPort(name, bus, opened)
-
-
-def open_bus(name: str, bus: Bus) -> can.BusABC:
-    """Open a bus for someone who uses python-can directly, as the emulator does.
-
-    Raises:
-        BusError: as `open_port`.
-    """
-    from skin_host.bus import adapters, socketcan
-
-    if bus.interface == "socketcan":
-        return socketcan.open_checked(name, bus)
-    return adapters.open_bus(name, bus)

@@ -25,12 +25,13 @@ from numpy.typing import NDArray
 from skin_host.bus.interfaces import can_interfaces
 from skin_host.bus.port import SKIN_CLASSES, LinkState, Port
 from skin_host.bus.protocol import NS_PER_S, FrameBatch
+from skin_host.clock import SYSTEM, Clock
 from skin_host.errors import BusError
 from skin_host.settings import Bus, Receive
 
 log = logging.getLogger(__name__)
 
-#: One read takes at most so many frames: 0.5 s of a full bus.
+#: One read takes at most this many frames: 0.5 s of a full bus.
 CAPACITY = 4096
 
 # Numbers of Linux that Python 3.11's socket module does not name (asm-generic/socket.h,
@@ -46,7 +47,7 @@ _IFF_UP = 0x1
 _IFF_RUNNING = 0x40
 
 #: What the kernel writes for one frame: the ancillary data, which are a time stamp (struct
-#: timespec) and, once it counts, the drop counter; then struct can_frame (linux/can.h).
+#: timespec) and, after the first loss, the drop counter; then struct can_frame (linux/can.h).
 _CMSG_HEADER = socket.CMSG_LEN(0)
 _LONG = "q" if struct.calcsize("@l") == 8 else "i"
 _STAMP_SIZE = socket.CMSG_SPACE(struct.calcsize("@ll"))
@@ -107,7 +108,7 @@ _recvmmsg.argtypes = [
 
 
 class _ReceivedBatch(FrameBatch):
-    """Records as the kernel wrote them; arrays of them are made when they are asked for."""
+    """Records as the kernel wrote them; each array is made when it is first read."""
 
     __slots__ = ("_bytes", "_records")
 
@@ -133,7 +134,6 @@ class _ReceivedBatch(FrameBatch):
         return array
 
     def frames(self) -> Iterator[tuple[int, int, int, int, int, bytes]]:
-        """See `FrameBatch.frames`."""
         return _RECORD.iter_unpack(self._bytes)
 
 
@@ -173,10 +173,10 @@ class BatchReceiver:
         self._flags = self._bytes[_FLAGS_AT :: _RECORD_ARRAY.itemsize]
 
     def read(self) -> FrameBatch:
-        """Take what waits, without blocking; the batch holds until the next read.
+        """Return the frames that wait, without blocking; the batch is valid until the next read.
 
         Raises:
-            OSError: the socket's pending error, once: the link went down, the device is gone.
+            OSError: the socket's pending error, once: the link went down, or the device is gone.
         """
         n: int = _recvmmsg(self._fileno, self._headers, self._capacity, socket.MSG_DONTWAIT, None)
         if n <= 0:
@@ -185,17 +185,19 @@ class BatchReceiver:
                 raise OSError(code, os.strerror(code))
             n = 0
         dropped = self._newly_dropped(n)
-        # The kernel wrote the lengths it used; the next read offers the whole room again.
+        # The kernel wrote the lengths it used; reset them to the whole buffer for the next read.
         self._control_length[:n] = _CONTROL_SIZE
         size = n * _RECORD_ARRAY.itemsize
         return _ReceivedBatch(self._records[:n], self._bytes[:size], dropped)
 
     def saw_flags(self, n: int) -> bool:
-        """Whether any of the `n` frames just read is not a standard data frame."""
+        """Return whether any of the `n` frames just read is not a standard data frame."""
         return any(self._flags[:n])
 
     def _newly_dropped(self, n: int) -> int:
-        """The counter comes with the frames queued after a loss; in silence it is asked for."""
+        """Return newly dropped frames; the kernel sends its counter only with frames after a loss,
+        so it is queried when no frames arrive.
+        """
         if n == 0:
             size = 4 * (_MEMINFO_DROPS + 1)
             memory = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, size)
@@ -216,7 +218,7 @@ def _addresses(array: NDArray[np.void]) -> NDArray[np.uintp]:
 
 
 def _grow_buffer(sock: socket.socket, wanted: int) -> int:
-    """Enlarge the receive buffer; past net.core.rmem_max this takes CAP_NET_ADMIN."""
+    """Enlarge the receive buffer; beyond net.core.rmem_max this needs CAP_NET_ADMIN."""
     try:
         sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, wanted)
     except PermissionError:
@@ -226,7 +228,12 @@ def _grow_buffer(sock: socket.socket, wanted: int) -> int:
 
 
 class SocketCanPort(Port):
-    """A SocketCAN interface. `reopen` gives a new bus when the device is back."""
+    """A SocketCAN interface.
+
+    Args:
+        bus: opened; None where the device is absent.
+        reopen: returns a new bus when the device is present; raises BusError until then.
+    """
 
     capacity = CAPACITY
 
@@ -235,14 +242,16 @@ class SocketCanPort(Port):
         name: str,
         settings: Bus,
         receive: Receive,
-        bus: can.BusABC,
+        bus: can.BusABC | None,
         reopen: Callable[[], can.BusABC],
+        clock: Clock = SYSTEM,
     ) -> None:
-        super().__init__(name, settings, bus)
+        super().__init__(name, settings, bus, clock)
         self._buffer_bytes = receive.buffer_bytes
         self._reopen = reopen
         self._nothing = FrameBatch.of([])
-        self._use(bus)
+        if bus is not None:
+            self._use(bus)
 
     def _use(self, bus: can.BusABC) -> None:
         self._bus = bus
@@ -261,7 +270,6 @@ class SocketCanPort(Port):
             )
 
     def read(self) -> FrameBatch:
-        """See `Port.read`."""
         if self.state is LinkState.GONE:
             self._look_for_device()
             return self._nothing
@@ -280,23 +288,25 @@ class SocketCanPort(Port):
                 self._note_errors(batch)
         if self.state is not LinkState.UP and self._time_to_check():
             self._check_link()
-        if self.state is not self._told:
-            self._tell()
+        if self.state is not self._logged_state:
+            self._log_state()
         return batch
 
     def _note_failure(self, error: OSError) -> None:
         if error.errno == errno.ENETDOWN:
             self._enter(LinkState.DOWN)
         else:
-            # ENODEV: the device was removed and this socket will stay silent for ever. Of any
-            # other error no more is known than that a new socket may do better.
+            # After ENODEV (the device was removed) this socket never receives again. For any other
+            # error a new socket may help.
             self.close()
             self._enter(LinkState.GONE, os.strerror(error.errno or 0))
         self._time_to_check()
-        self._tell()
+        self._log_state()
 
     def _check_link(self) -> None:
-        """A raw socket is not told when its link comes up again: ask."""
+        """Query the state of the link, because a raw socket gets no notice when it comes up
+        again.
+        """
         try:
             flags = _ask_interface(self._socket, self.channel, _SIOCGIFFLAGS)
         except OSError:
@@ -314,10 +324,10 @@ class SocketCanPort(Port):
             except (BusError, OSError):
                 return  # the next check tries again
             self.counters.reopened += 1
-            # Whether it is up will be known by its flags, or by the first frame.
+            # Whether it is up is known from its flags, or from the first frame.
             self.state = LinkState.DOWN
             self._check_link()
-        self._tell()
+        self._log_state()
 
 
 def _interface_exists(channel: str) -> bool:
@@ -329,14 +339,14 @@ def _interface_exists(channel: str) -> bool:
 
 
 def _ask_interface(sock: socket.socket, channel: str, request: int) -> int:
-    """One 16-bit answer about a network interface (netdevice(7)); any socket serves to ask."""
+    """Query 16 bits about a network interface (netdevice(7)); any socket serves for this."""
     answer = fcntl.ioctl(sock.fileno(), request, struct.pack("16s24x", channel.encode()))
     value: int = struct.unpack_from("H", answer, 16)[0]
     return value
 
 
 def _check_interface(name: str, settings: Bus) -> None:
-    """Say what is wrong with an interface, and what mends it, before it is opened."""
+    """Check an interface before it is opened; the error names the problem and its remedy."""
     channel = settings.channel
     where = f'bus "{name}": {channel}'
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
@@ -358,19 +368,19 @@ def _check_interface(name: str, settings: Bus) -> None:
 
 
 def open_checked(name: str, settings: Bus) -> can.BusABC:
-    """Open an interface that is there, is CAN and is up; see `port.open_bus`."""
+    """Open an interface that is present, is CAN and is up; see `opening.open_bus`."""
     _check_interface(name, settings)
     return open_present(name, settings)
 
 
 def open_present(name: str, settings: Bus) -> can.BusABC:
-    """Open an interface that is there, up or down.
+    """Open an interface that is present, up or down.
 
     Raises:
         BusError: it is absent, or cannot be opened.
     """
     if not _interface_exists(settings.channel):
-        # Asked first, because python-can logs an error of its own.
+        # Checked first, because python-can logs an error itself.
         raise BusError(f'bus "{name}": {settings.channel}: no such network interface')
     try:
         return can.Bus(

@@ -1,28 +1,67 @@
-"""`skin ...`: one script. Each module of this room holds a few related commands.
+"""The command `skin`. Each module of this package holds a few related commands.
 
-Exit status: 0 done, 1 failed while running, 2 the request itself was wrong. An error is
-one line on stderr; a user's mistake never shows a traceback. Heavy imports wait until a
-command needs them.
+Exit status: 0 done, 1 failed while running, 2 the request itself was wrong. An error is one line on
+stderr; a user's mistake never shows a traceback. Heavy imports wait until a command needs them.
 """
 
 import argparse
 import contextlib
+import difflib
+import logging
 import os
+import re
 import signal
 import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from skin_host import __version__
-from skin_host.cli import completion, emulation, files, measure, operate, recordings, watch
+from skin_host import __version__, emulator_path, service
+from skin_host.cli import (
+    completion,
+    emulation,
+    files,
+    measure,
+    operate,
+    recordings,
+    simulation,
+    watch,
+)
 from skin_host.errors import SkinError
 
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        """One line instead of the usage text."""
+        """Print one line instead of the usage text; for a mistyped word it suggests the probable
+        one.
+        """
+        choice = re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message)
+        unknown = re.match(r"unrecognized arguments: (--[\w-]+)", message)
+        typed, known = "", list[str]()
+        if choice is not None:
+            typed, known = choice[1], re.findall(r"[\w-]+", choice[2])
+        elif unknown is not None:
+            typed, known = unknown[1], self._options_of_all()
+        near = difflib.get_close_matches(typed, known, n=1)
+        message += f"; meant {near[0]}?" if near else ""
         print(f"{self.prog}: {message} (see `{self.prog} --help`)", file=sys.stderr)
         raise SystemExit(2)
+
+    def _options_of_all(self) -> list[str]:
+        """The options of this command and of its sub-commands."""
+        own = [option for action in self._actions for option in action.option_strings]
+        inner = [
+            option
+            for action in self._actions
+            if isinstance(action, argparse._SubParsersAction)
+            for parser in action.choices.values()
+            for option in parser._options_of_all()
+        ]
+        return own + inner
+
+
+def _complain(line: str) -> None:
+    line = service.with_priority(line, logging.ERROR) if service.to_journal() else line
+    print(line, file=sys.stderr)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -36,16 +75,17 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(
         title="commands", metavar="COMMAND", required=True, parser_class=_Parser
     )
-    for room in (operate, watch, files, recordings, emulation, measure, completion):
+    for room in (operate, watch, files, recordings, emulation, simulation, measure, completion):
         room.add_commands(commands)
     return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
-    # numpy, imported later, would else start threads that spin: on a busy machine they make a
+    # numpy, imported later, would otherwise start threads that spin: on a busy machine they make a
     # product of 100 000 taxels take seven times as long, and never help one of a few thousand.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    emulator_path.provide()
     parser = build_parser()
     completion.complete_if_asked(parser)
     arguments = parser.parse_args(argv)
@@ -54,16 +94,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         status: int = arguments.run(arguments)
         sys.stdout.flush()
     except SkinError as error:
-        print(f"{name}: {error}", file=sys.stderr)
+        _complain(f"{name}: {error}")
         return error.exit_status
     except BrokenPipeError:
-        # The reader of our output left (`| head`). Keep Python from saying so at exit.
+        # The reader of our output has closed it (`| head`). Keep Python from reporting that at
+        # exit.
         with contextlib.suppress(OSError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        print(f"{name}: {where}{error.strerror or error}", file=sys.stderr)
+        _complain(f"{name}: {where}{error.strerror or error}")
         return 1
     except KeyboardInterrupt:
         return 128 + signal.SIGINT

@@ -1,13 +1,16 @@
-"""What several commands share."""
+"""Helpers shared by several commands."""
 
 import argparse
 import asyncio
 import json
 import logging
+import os
 import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from skin_host import service
 
 if TYPE_CHECKING:
     from skin_host.layout import Layout
@@ -17,7 +20,7 @@ Commands = Any  # argparse's own type of sub-parser collections is private
 
 
 def add_command(commands: Commands, name: str, about: str, example: str) -> argparse.ArgumentParser:
-    """A sub-command with its one-line description and an example at the end of its help."""
+    """Add a sub-command with its one-line description and an example at the end of its help."""
     parser: argparse.ArgumentParser = commands.add_parser(
         name,
         help=about,
@@ -34,24 +37,37 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("config", metavar="CONFIG", type=Path, help="configuration file (TOML)")
 
 
+def positive(text: str) -> float:
+    """A number above 0, for argparse."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value < 1e9:
+        raise argparse.ArgumentTypeError(f"seen {text}, wanted a number above 0")
+    return value
+
+
 def add_log_level(parser: argparse.ArgumentParser) -> None:
-    """`--verbose` for commands that run for long."""
+    """Add `--verbose`, for long-running commands."""
     parser.add_argument("--verbose", "-v", action="store_true", help="log more")
 
 
 def set_up_logging(verbose: bool) -> None:
-    """Log to stderr; under systemd the journal adds time and name itself."""
-    logging.basicConfig(
-        level=logging.DEBUG if verbose else logging.INFO,
-        format="%(levelname)-7s %(message)s",
-        stream=sys.stderr,
+    """Log to stderr, for people or for systemd's journal."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(
+        service.JournalFormatter("%(message)s")
+        if service.to_journal()
+        else logging.Formatter("%(levelname)-7s %(message)s")
     )
+    logging.basicConfig(level=logging.DEBUG if verbose else logging.INFO, handlers=[handler])
     for noisy in ("can", "mqtt", "asyncio"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
 
 
 def load_skin(config: Path) -> "tuple[Settings, Layout]":
-    """Settings and layout of a configuration file.
+    """Return settings and layout of a configuration file.
 
     Raises:
         ConfigurationError: see `settings.load` and `layout.build_layout`.
@@ -73,8 +89,16 @@ def print_json(document: object) -> None:
     print(json.dumps(document, indent=2, ensure_ascii=False))
 
 
+def warn(text: str) -> None:
+    """Print one line on stderr, in yellow on a terminal."""
+    line = f"warning: {text}"
+    if sys.stderr.isatty() and not os.environ.get("NO_COLOR"):
+        line = f"\033[33m{line}\033[0m"
+    print(line, file=sys.stderr)
+
+
 class Progress:
-    """A line that tells how far long work is, on a terminal only."""
+    """A progress line for long work, on a terminal only."""
 
     def __init__(self, what: str) -> None:
         self._what = what

@@ -1,4 +1,4 @@
-"""What a shell needs to complete our command line: commands, options, files, names.
+"""Shell completion of the command line: commands, options, files, names.
 
 argcomplete reads the parser itself, so nothing here repeats it. It is imported only when a
 shell asks, or by the command `completion`.
@@ -19,17 +19,17 @@ if TYPE_CHECKING:
 
 Completer = Callable[..., Iterable[str]]
 
-#: A shell that waits for a broker for longer feels broken.
+#: A shell should not wait longer than this for a broker.
 PATIENCE_S = 1.0
 RECORDINGS = ("mcap", "log", "blf", "asc", "trc", "csv")
 
 
 def add_commands(commands: Commands) -> None:
-    """Add this room's command to the parser."""
+    """Add the commands of this module to the parser."""
     completion = add_command(
         commands,
         "completion",
-        "print what makes a shell complete `skin`",
+        "print the shell code that completes `skin`",
         'skin completion bash, in ~/.bashrc: eval "$(skin completion bash)"',
     )
     completion.add_argument(
@@ -39,7 +39,7 @@ def add_commands(commands: Commands) -> None:
 
 
 def complete_if_asked(parser: argparse.ArgumentParser) -> None:
-    """Answer the shell that asks what may come next, and end; else do nothing."""
+    """Answer a shell that asks for completions, and exit; otherwise do nothing."""
     if "_ARGCOMPLETE" not in os.environ:
         return
     import argcomplete
@@ -56,7 +56,7 @@ def _completion(arguments: argparse.Namespace) -> int:
 
 
 def _completers() -> dict[str, Completer]:
-    """By the name of the argument; the others complete their choices, or any file."""
+    """Completers by the name of the argument; the others complete their choices, or any file."""
     from argcomplete.completers import FilesCompleter
 
     toml, recording = FilesCompleter(("toml",)), FilesCompleter(RECORDINGS)
@@ -86,28 +86,28 @@ def _attach(parser: argparse.ArgumentParser, completers: dict[str, Completer]) -
 
 def _parts(parsed_args: argparse.Namespace, **_: Any) -> set[str]:
     settings = _settings(parsed_args)
-    return set(settings.parts) if settings is not None else _told(parsed_args, "parts")
+    return set(settings.parts) if settings is not None else _names_at(parsed_args, "parts")
 
 
 def _boards(parsed_args: argparse.Namespace, **_: Any) -> set[str]:
     settings = _settings(parsed_args)
-    return set(settings.boards) if settings is not None else _told(parsed_args, "boards")
+    return set(settings.boards) if settings is not None else _names_at(parsed_args, "boards")
 
 
 def _nodes(parsed_args: argparse.Namespace, **_: Any) -> set[str]:
     settings = _settings(parsed_args)
     if settings is None:
-        return _told(parsed_args, "nodes")
+        return _names_at(parsed_args, "nodes")
     return {part.node for part in settings.parts.values()}
 
 
 def _channels(**_: Any) -> list[str]:
-    """CAN interfaces of this machine."""
+    """Return the CAN interfaces of this machine."""
     return can_interfaces()
 
 
 def _settings(parsed_args: argparse.Namespace) -> "Settings | None":
-    """Those of the configuration that stands on the line already."""
+    """Return the settings of the configuration that is already on the command line."""
     from skin_host.errors import ConfigurationError
     from skin_host.settings import load
 
@@ -119,8 +119,8 @@ def _settings(parsed_args: argparse.Namespace) -> "Settings | None":
     return None
 
 
-def _told(parsed_args: argparse.Namespace, what: str) -> set[str]:
-    """Names that the nodes of a robot tell the broker that the line speaks of."""
+def _names_at(parsed_args: argparse.Namespace, what: str) -> set[str]:
+    """Return names that the nodes of a robot publish at the broker given on the command line."""
     from skin_host.client import SkinClient
     from skin_host.errors import SkinError
 

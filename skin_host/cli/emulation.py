@@ -1,4 +1,4 @@
-"""Commands of the hardware that is not there: emulate, demo."""
+"""Commands for emulated hardware: emulate, demo."""
 
 import argparse
 import asyncio
@@ -15,6 +15,7 @@ from skin_host.cli.common import (
     add_config,
     add_log_level,
     load_skin,
+    positive,
     set_up_logging,
     stop_on_signals,
 )
@@ -29,16 +30,16 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-#: Lives on open python-can buses, by name, until cancelled.
+#: Runs on open python-can buses, by name, until cancelled.
 Work = Callable[[dict[str, "can.BusABC"]], Coroutine[Any, Any, None]]
 
 
 def add_commands(commands: Commands) -> None:
-    """Add this room's commands to the parser."""
+    """Add the commands of this module to the parser."""
     emulate = add_command(
         commands,
         "emulate",
-        "be the robot on a CAN bus; faults are taken from stdin, see docs/scenes.md",
+        "emulate the robot on a CAN bus; faults are read from stdin, see docs/scenes.md",
         "skin emulate config/icub_hand.toml --channel vcan0",
     )
     add_config(emulate)
@@ -47,15 +48,23 @@ def add_commands(commands: Commands) -> None:
         "--fidelity", choices=("signal", "chip"), default="signal", help="how deep the chips go"
     )
     emulate.add_argument("--seed", type=int, help="replaces the scene's seed")
-    emulate.add_argument("--speed", type=float, default=1.0, help="times real time")
+    emulate.add_argument(
+        "--state",
+        type=Path,
+        metavar="FILE",
+        help="continue from FILE if it exists, with its scene; save the robot to it at the end",
+    )
+    emulate.add_argument("--speed", type=positive, default=1.0, help="times real time")
     emulate.add_argument("--interface", help="replaces that of every bus in CONFIG")
     emulate.add_argument("--channel", help="replaces that of the only bus in CONFIG")
-    emulate.add_argument("--duration", type=float, metavar="S", help="end after so many seconds")
+    emulate.add_argument(
+        "--duration", type=positive, metavar="S", help="end after this many seconds"
+    )
     emulate.add_argument("--board", metavar="NAME", help="only this board; see the next two")
     emulate.add_argument(
         "--i2c",
         metavar="DEVICES",
-        help="be --board on real chips: its I2C lines, such as /dev/i2c-1,/dev/i2c-2",
+        help="run --board on real chips: its I2C lines, such as /dev/i2c-1,/dev/i2c-2",
     )
     emulate.add_argument(
         "--i2c-dev",
@@ -72,7 +81,11 @@ def add_commands(commands: Commands) -> None:
         "emulator, daemon, broker and live page together, on this machine alone",
         "skin demo --duration 15",
     )
-    demo.add_argument("--duration", type=float, metavar="S", help="end after so many seconds")
+    demo.add_argument(
+        "config", metavar="CONFIG", nargs="?", type=Path, help="any robot; the demo's own without"
+    )
+    demo.add_argument("--scene", type=Path, help="what happens to the skin (TOML)")
+    demo.add_argument("--duration", type=positive, metavar="S", help="end after this many seconds")
     demo.add_argument(
         "--page-port",
         type=int,
@@ -84,7 +97,8 @@ def add_commands(commands: Commands) -> None:
 
 
 def _emulate(arguments: argparse.Namespace) -> int:
-    from skin_host.bus.port import open_bus
+    from skin_host.bus.opening import open_bus
+    from skin_host.settings import changed
 
     set_up_logging(arguments.verbose)
     settings, layout = load_skin(arguments.config)
@@ -98,9 +112,12 @@ def _emulate(arguments: argparse.Namespace) -> int:
         raise RequestError(f'--board: no board "{arguments.board}"; there are: {known}')
     if (arguments.i2c or arguments.i2c_dev is not None) and arguments.board is None:
         raise RequestError("--i2c and --i2c-dev need --board NAME")
-    for bus in settings.buses.values():
-        bus.interface = arguments.interface or bus.interface
-        bus.channel = arguments.channel or bus.channel
+    for name, bus in settings.buses.items():
+        chosen = {
+            "interface": arguments.interface or bus.interface,
+            "channel": arguments.channel or bus.channel,
+        }
+        settings = changed(settings, {f"buses.{name}": changed(bus, chosen)})
     wanted = settings.buses
     if arguments.i2c:
         only = settings.boards[arguments.board].bus
@@ -148,7 +165,12 @@ def _on_emulated_chips(
     fidelity: str | dict[str, str] = arguments.fidelity
     if arguments.i2c_dev is not None:
         fidelity = dict.fromkeys(settings.boards, arguments.fidelity) | {arguments.board: "chip"}
-    robot = Robot(settings, layout, scene, fidelity=fidelity, seed=arguments.seed)
+    if arguments.state is not None and arguments.state.exists():
+        robot = Robot.read(arguments.state, settings, layout)
+    else:
+        robot = Robot(settings, layout, scene, fidelity=fidelity, seed=arguments.seed)
+    if arguments.state is not None:
+        opened.callback(robot.write, arguments.state)
     devices: list[CuseBus] = []
     if arguments.i2c_dev is not None:
         number = list(settings.boards).index(arguments.board)
@@ -159,7 +181,7 @@ def _on_emulated_chips(
         loop = asyncio.get_running_loop()
         for device in devices:
             loop.add_reader(device.fileno(), device.handle)
-        # A file or /dev/null cannot be waited for; then nobody gives commands.
+        # A file or /dev/null cannot be waited for; then there are no commands.
         with contextlib.suppress(PermissionError, ValueError, AttributeError):
             loop.add_reader(sys.stdin.fileno(), take_command, robot, {})
         await robot.run(buses, RealClock(arguments.speed))
@@ -172,7 +194,7 @@ def take_command(robot: "Robot", mends: dict[str, Callable[[], None]]) -> None:
 
     Args:
         robot: to which it happens.
-        mends: what ends the faults that were given, by their lines.
+        mends: functions that end the given faults, by their lines.
     """
     from emulator import faults
 
@@ -218,6 +240,8 @@ def _demo(arguments: argparse.Namespace) -> int:
     async def work() -> int:
         stop = asyncio.Event()
         stop_on_signals(stop)
-        return await demo.run(arguments.duration, stop, arguments.page_port)
+        return await demo.run(
+            arguments.duration, stop, arguments.page_port, arguments.config, arguments.scene
+        )
 
     return asyncio.run(work())

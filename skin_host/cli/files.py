@@ -1,13 +1,8 @@
 """Commands that work on files: check, replay, import."""
 
 import argparse
-import contextlib
-import os
 import sys
-import tempfile
-from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
 
 from skin_host.cli.common import (
     Commands,
@@ -17,12 +12,12 @@ from skin_host.cli.common import (
     load_skin,
     print_json,
 )
-from skin_host.cli.recordings import add_onto, play, positive
-from skin_host.errors import RequestError
+from skin_host.cli.recordings import add_calibration, add_onto, play
+from skin_host.errors import RequestError, SkinError
 
 
 def add_commands(commands: Commands) -> None:
-    """Add this room's commands to the parser."""
+    """Add the commands of this module to the parser."""
     check = add_command(
         commands,
         "check",
@@ -31,26 +26,38 @@ def add_commands(commands: Commands) -> None:
     )
     add_config(check)
     check.add_argument("--json", action="store_true", help="one JSON document")
+    check.add_argument(
+        "--running",
+        type=Path,
+        metavar="FILE",
+        help="check only whether the daemon that wrote FILE could take it without a restart",
+    )
     check.set_defaults(run=_check)
 
     replay = add_command(
         commands,
         "replay",
-        "put a recording of CAN frames through the whole pipeline",
+        "process a recording of CAN frames with the whole pipeline",
         "skin replay grasp.log --config config/icub_hand.toml --output grasp.jsonl",
     )
     replay.add_argument(
-        "log", metavar="LOG", type=Path, help="candump, ASC, BLF, MCAP, ... recording"
+        "logs",
+        metavar="LOG",
+        nargs="+",
+        type=Path,
+        help="candump, ASC, BLF, MCAP, ... recording; several are processed side by side",
     )
     replay.add_argument("--config", type=Path, help="configuration file (TOML)")
-    replay.add_argument("--output", default="-", help="file of JSON lines, - is stdout")
-    replay.add_argument("--calibration", type=Path, help="use this calibration file")
     replay.add_argument(
-        "--calibrate-seconds",
-        type=positive,
-        default=5.0,
-        help="else calibrate on the first seconds of the recording",
+        "--output", default="-", help="file of JSON lines, - is stdout; of several LOGs, a folder"
     )
+    replay.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="process on the Dask cluster with this scheduler, such as tcp://host:8786; "
+        "its workers must see the files under the same paths",
+    )
+    add_calibration(replay)
     add_onto(replay)
     replay.set_defaults(run=_replay)
 
@@ -75,8 +82,14 @@ def add_commands(commands: Commands) -> None:
 
 def _check(arguments: argparse.Namespace) -> int:
     from skin_host import check
+    from skin_host.settings import load_running, needs_restart
 
     settings, layout = load_skin(arguments.config)
+    if arguments.running is not None:
+        what = needs_restart(load_running(arguments.running), settings)
+        if what is not None:
+            raise RequestError(f"{arguments.config}: {what} changed; that needs a restart")
+        return 0
     description = check.describe(settings, layout)
     if arguments.json:
         print_json(description)
@@ -86,45 +99,75 @@ def _check(arguments: argparse.Namespace) -> int:
 
 
 def _replay(arguments: argparse.Namespace) -> int:
-    from skin_host.engine import Engine
-    from skin_host.fingertip.health import FingertipHealth
-    from skin_host.health import Health
-    from skin_host.processing import calibration
-    from skin_host.publish.lines import EventLines, frame_line, health_line
-    from skin_host.replay import calibrate_from_log, replay
-    from skin_host.settings import skin_hash
-
     if arguments.onto is not None:
+        if len(arguments.logs) > 1:
+            raise RequestError("--onto plays one LOG at a time")
+        (arguments.log,) = arguments.logs
         return play(arguments)
     if arguments.config is None:
         raise RequestError("the following arguments are required: --config")
-    settings, layout = load_skin(arguments.config)
-    if arguments.calibration is not None:
-        found = calibration.load(arguments.calibration, layout, skin_hash(settings))
-    else:
-        found = calibrate_from_log(arguments.log, settings, layout, arguments.calibrate_seconds)
-    engine = Engine(settings, layout, list(range(len(layout.parts))), found)
-    health = Health(engine)
-    tips = engine.fingertips
-    lines = EventLines()
+    if len(arguments.logs) > 1 or arguments.scheduler is not None:
+        return _replay_all(arguments)
+    from skin_host.batch import Task, process, write_lines
+    from skin_host.engine import Engine
+    from skin_host.replay import calibration_for
+
+    (log,) = arguments.logs
     progress = Progress("replay")
-    with _output(arguments.output) as output:
-        for number, step in enumerate(replay(arguments.log, engine)):
-            health.note_sweeps(engine.sweeps)
-            health.note_step(step)
-            output.write(frame_line(step.frame))
-            told = step.events if tips is None else [*step.events, *tips.take()]
-            output.writelines(map(lines.line, told))
-            if number % 200 == 0:
-                progress.update(0.0, f"{number} frames")
-        for part in engine.parts:
-            output.write(health_line(health.replayed(part)))
-        if tips is not None:
-            output.writelines(map(lines.line, tips.take()))
-            for record in FingertipHealth(tips).records(None).values():
-                output.write(health_line(record))
+
+    def told(number: int) -> None:
+        progress.update(0.0, f"{number} frames")
+
+    seconds = arguments.calibrate_seconds
+    if arguments.output != "-":
+        output = Path(arguments.output)
+        process(Task(log, arguments.config, output, arguments.calibration, seconds), told)
+    else:
+        settings, layout = load_skin(arguments.config)
+        found = calibration_for(log, settings, layout, arguments.calibration, seconds)
+        engine = Engine(settings, layout, list(range(len(layout.parts))), found)
+        write_lines(log, engine, sys.stdout.buffer, told)
     progress.close()
     return 0
+
+
+def _replay_all(arguments: argparse.Namespace) -> int:
+    """Process several recordings, each into its own file in the folder OUTPUT."""
+    from skin_host.batch import Task, process_all
+
+    if arguments.output == "-":
+        raise RequestError("several LOGs go into a folder: wanted --output FOLDER")
+    folder = Path(arguments.output)
+    # Absolute paths, because workers of a cluster have other working directories.
+    tasks = [
+        Task(
+            log.absolute(),
+            arguments.config.absolute(),
+            (folder / f"{log.stem}.jsonl").absolute(),
+            arguments.calibration and arguments.calibration.absolute(),
+            arguments.calibrate_seconds,
+        )
+        for log in arguments.logs
+    ]
+    outputs = [task.output for task in tasks]
+    twice = next((one for one in outputs if outputs.count(one) > 1), None)
+    if twice is not None:
+        raise RequestError(f"{twice}: two LOGs of that name; process them one folder at a time")
+    load_skin(arguments.config)
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise RequestError(f"--output {folder}: {error.strerror}") from None
+    progress = Progress("replay")
+    worst = 0
+    for number, (task, result) in enumerate(process_all(tasks, arguments.scheduler), 1):
+        if isinstance(result, SkinError):
+            progress.close()
+            print(f"skin replay: {result}", file=sys.stderr)
+            worst = max(worst, result.exit_status)
+        progress.update(number / len(tasks), task.log.name)
+    progress.close()
+    return worst
 
 
 def _import(arguments: argparse.Namespace) -> int:
@@ -147,21 +190,3 @@ def _import(arguments: argparse.Namespace) -> int:
     for path in written:
         print(path)
     return 0
-
-
-@contextlib.contextmanager
-def _output(name: str) -> Iterator[BinaryIO]:
-    """Standard output, or a file that appears whole or not at all."""
-    if name == "-":
-        yield sys.stdout.buffer
-        return
-    path = Path(name)
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            yield file
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise

@@ -10,17 +10,15 @@ from skin_host.errors import RequestError
 from skin_host.relaxation_settings import FITTED
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from skin_host import fit_recording
     from skin_host.layout import Layout
+    from skin_host.processing.curves import Curves
     from skin_host.processing.fitting import Fit, HoldRecord
     from skin_host.settings import Settings
 
 
 def add_arguments(calibrate: argparse.ArgumentParser) -> None:
-    """The options of `skin calibrate` that work on a recording in place of the skin."""
+    """Add the options of `skin calibrate` that work on a recording instead of the skin."""
     log = calibrate.add_mutually_exclusive_group()
     log.add_argument(
         "--relaxation",
@@ -32,7 +30,8 @@ def add_arguments(calibrate: argparse.ArgumentParser) -> None:
         "--pressure",
         type=Path,
         metavar="LOG",
-        help="fit each taxel's pressure curve to recorded levels of uniform pressure",
+        help="fit each taxel's pressure curve to a recording under uniform pressure, untouched at "
+        "first: any course of it, with --load, or a few --levels",
     )
     calibrate.add_argument(
         "--model", choices=FITTED, default=None, help="with --relaxation: keep this one's fit"
@@ -41,7 +40,8 @@ def add_arguments(calibrate: argparse.ArgumentParser) -> None:
         "--load",
         type=Path,
         metavar="CSV",
-        help="with --relaxation: the load cell, lines of time in s and pressure in kPa",
+        help="the known pressure, lines of time in s (of the recording, or from its start) and "
+        "kPa: time_s,pressure_kpa",
     )
     calibrate.add_argument(
         "--weight-kpa",
@@ -54,35 +54,34 @@ def add_arguments(calibrate: argparse.ArgumentParser) -> None:
         type=float,
         nargs="+",
         metavar="KPA",
-        help="with --pressure: the known pressures in the order in which they were given",
+        help="with --pressure, without --load: the known pressures in kPa in their order",
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Fit what was asked for and keep it."""
+    """Run the requested fit and keep the result."""
     return _relaxation(arguments) if arguments.relaxation is not None else _pressure(arguments)
 
 
 def _relaxation(arguments: argparse.Namespace) -> int:
     from skin_host import fit_recording
+    from skin_host.load_table import read_table
     from skin_host.processing.pressure import PressureCurve
 
     settings, layout = load_skin(arguments.config)
-    load = None if arguments.load is None else _read_load(arguments.load)
+    load = None if arguments.load is None else read_table(arguments.load)
     if load is not None and arguments.weight_kpa is not None:
         raise RequestError("--load and --weight-kpa exclude each other")
     model = arguments.model or settings.processing.relaxation.model
     if model == "none":
-        raise RequestError('the configured model is "none"; say which to fit with --model')
+        raise RequestError('the configured model is "none"; choose one to fit with --model')
     samples = _read_samples(arguments.relaxation, settings, layout, arguments.seconds)
     pressure = settings.processing.pressure
     curve = PressureCurve(
         layout.unit_ff / layout.sensitivity, 1.0, pressure.a_kpa_per_ff2, pressure.b_kpa_per_ff
     )
     record = fit_recording.hold_record(samples, curve, load, arguments.weight_kpa)
-    # With and without bleed the published model has the same parameters.
-    models = [name for name in FITTED if name != "published_bleed" or name == model]
-    fits = fit_recording.fit_relaxation(record, models)
+    fits = fit_recording.fit_relaxation(record, FITTED)
     (chosen,) = [found for found in fits if found.model == model]
     path = arguments.output or arguments.config.with_suffix(".relaxation.json")
     fit_recording.save_relaxation(path, chosen, settings, record)
@@ -110,8 +109,15 @@ def _pressure(arguments: argparse.Namespace) -> int:
     from skin_host.calibrate import calibration_path
     from skin_host.processing import calibration as calibrations
 
-    if not arguments.levels or min(arguments.levels) <= 0.0:
-        raise RequestError("--pressure needs --levels: the known pressures in kPa, above 0")
+    if (arguments.load is None) == (not arguments.levels):
+        raise RequestError(
+            "--pressure needs --load CSV, the pressure throughout the recording, or --levels, the "
+            "steady pressures in kPa in their order; one of the two"
+        )
+    if arguments.load is not None:
+        return _course(arguments)
+    if min(arguments.levels) <= 0.0:
+        raise RequestError(f"--levels: {min(arguments.levels):g} kPa; wanted pressures above 0")
     settings, layout = load_skin(arguments.config)
     samples = _read_samples(arguments.pressure, settings, layout, arguments.seconds)
     found, fit = fit_recording.fit_pressures(samples, settings, layout, arguments.levels)
@@ -135,7 +141,7 @@ def _pressure(arguments: argparse.Namespace) -> int:
         return 0
     gains = fit.gain[fit.fitted]
     print(
-        f"{counts['fitted']} taxels fitted, {counts['bent']} of them with a bend of their own, "
+        f"{counts['fitted']} taxels fitted, {counts['bent']} of them with their own bend, "
         f"{counts['not_fitted']} could not be"
     )
     if len(gains):
@@ -145,6 +151,106 @@ def _pressure(arguments: argparse.Namespace) -> int:
         )
     print(f"calibration {found.id} kept in {path}")
     return 0
+
+
+def _course(arguments: argparse.Namespace) -> int:
+    import numpy as np
+
+    from skin_host import fit_recording
+    from skin_host.calibrate import calibration_path
+    from skin_host.load_table import check_course, read_table
+    from skin_host.processing import calibration as calibrations
+    from skin_host.processing.curves import CurveVerdict
+
+    settings, layout = load_skin(arguments.config)
+    load = read_table(arguments.load)
+    check_course(arguments.load, *load)
+    samples = _read_samples(arguments.pressure, settings, layout, arguments.seconds)
+    found, curves = fit_recording.fit_curves(samples, settings, layout, load, arguments.load)
+    path = arguments.output or calibration_path(settings, arguments.node)
+    calibrations.save(path, found, layout)
+    verdicts = curve_verdicts(curves, layout)
+    counts = {
+        verdict.name.lower(): sum(len(taxels[verdict.name.lower()]) for taxels in verdicts.values())
+        for verdict in CurveVerdict
+    }
+    error = curves.error_kpa[curves.own]
+    middle, worst = np.quantile(error, (0.5, 0.95)).tolist() if len(error) else (None, None)
+    if arguments.json:
+        print_json(
+            {
+                "file": str(path),
+                "id": found.id,
+                "lag_s": curves.lag_s,
+                "highest_kpa": curves.highest_kpa,
+                "memory": {
+                    "radius_kpa": list(curves.memory.radius_kpa),
+                    "weight": list(curves.memory.weight),
+                },
+                "counts": counts,
+                "median_error_kpa": middle,
+                "p95_error_kpa": worst,
+                "parts": {
+                    part.name: {
+                        "verdict": [
+                            CurveVerdict(number).name.lower()
+                            for number in curves.verdict[part.start : part.stop]
+                        ],
+                        "error_kpa": [
+                            _number(float(kpa)) for kpa in curves.error_kpa[part.start : part.stop]
+                        ],
+                    }
+                    for part in layout.parts
+                },
+            }
+        )
+        return 0
+    plays = ", ".join(
+        f"{weight:.2f} within {radius:.0f} kPa"
+        for radius, weight in zip(curves.memory.radius_kpa, curves.memory.weight, strict=True)
+    )
+    print(f"0 to {curves.highest_kpa:.0f} kPa; the table's clock is {curves.lag_s:+.2f} s ahead")
+    print(f"hysteresis of the foam: {plays or 'none'}")
+    print(", ".join(f"{count} {name}" for name, count in counts.items() if count))
+    if len(error):
+        print(f"expected error of the good: median {middle:.1f} kPa, 95 % below {worst:.1f} kPa")
+    for part, taxels in verdicts.items():
+        for name, numbers in taxels.items():
+            if name not in ("good", "unknown") and numbers:
+                print(f"{part}: {name}: taxels {ranges(numbers)}")
+    print(f"calibration {found.id} kept in {path}")
+    return 0
+
+
+def curve_verdicts(curves: "Curves", layout: "Layout") -> dict[str, dict[str, list[int]]]:
+    """Numbers of the pressure taxels of each part, by the verdict on their curve."""
+    import numpy as np
+
+    from skin_host.layout import PadKind
+    from skin_host.processing.curves import CurveVerdict
+
+    pressure = layout.pad_kind == PadKind.PRESSURE
+    return {
+        part.name: {
+            verdict.name.lower(): np.flatnonzero(
+                (curves.verdict == verdict)[part.start : part.stop]
+                & pressure[part.start : part.stop]
+            ).tolist()
+            for verdict in CurveVerdict
+        }
+        for part in layout.parts
+    }
+
+
+def ranges(numbers: list[int]) -> str:
+    """Rising numbers as text: 1-3, 7."""
+    pieces: list[list[int]] = []
+    for number in numbers:
+        if pieces and number == pieces[-1][1] + 1:
+            pieces[-1][1] = number
+        else:
+            pieces.append([number, number])
+    return ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in pieces)
 
 
 def _read_samples(
@@ -163,23 +269,6 @@ def _read_samples(
         )
     finally:
         progress.close()
-
-
-def _read_load(path: Path) -> tuple["NDArray[np.float64]", "NDArray[np.float64]"]:
-    import numpy as np
-
-    wanted = "rising times in s and pressures in kPa, parted by commas"
-    try:
-        table = np.loadtxt(path, delimiter=",", ndmin=2, comments=("#", "t"))
-    except OSError as error:
-        raise RequestError(f"{path}: {error.strerror}; wanted {wanted}") from None
-    except ValueError as error:
-        raise RequestError(f"{path}: {error}; wanted {wanted}") from None
-    if table.shape[1] != 2 or len(table) < 2 or np.any(np.diff(table[:, 0]) <= 0.0):
-        raise RequestError(
-            f"{path}: {table.shape[0]} lines of {table.shape[1]} numbers; wanted {wanted}"
-        )
-    return table[:, 0], table[:, 1]
 
 
 def _describe(fits: list["Fit"], model: str, record: "HoldRecord") -> str:

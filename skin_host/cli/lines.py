@@ -5,7 +5,7 @@ import json
 from skin_host.publish.grasping import Over, Slip
 from skin_host.publish.messages import Touch
 
-#: What told a slip first.
+#: What first indicated a slip.
 _CAUSES = {
     "rate": "by how fast the tangential force changes",
     "friction": "at the limit of friction",
@@ -14,7 +14,7 @@ _CAUSES = {
 
 
 def event_line(event: Touch | Slip | Over) -> str:
-    """One readable line of an event."""
+    """Return one readable line for an event."""
     match event:
         case Touch():
             return _touch_line(event)
@@ -50,7 +50,7 @@ def _touch_line(touch: Touch) -> str:
 
 
 def missed_line(event: Touch | Slip | Over, *, as_json: bool) -> str:
-    """Say how many events were lost before this one."""
+    """Return a line that reports how many events were lost before this one."""
     kind = type(event).__name__.lower()
     if as_json:
         return json.dumps({"missed": event.missed, "part": event.part, "kind": kind})

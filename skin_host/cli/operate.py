@@ -9,6 +9,8 @@ import signal
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from skin_host import service
 from skin_host.cli import fit
 from skin_host.cli.common import (
@@ -18,20 +20,27 @@ from skin_host.cli.common import (
     add_config,
     add_log_level,
     load_skin,
+    positive,
     print_json,
     set_up_logging,
     stop_on_signals,
+    warn,
 )
-from skin_host.errors import RequestError, SkinError
+from skin_host.errors import OtherSkinError, RequestError, SkinError
 
 if TYPE_CHECKING:
     from skin_host.daemon import Daemon
+    from skin_host.settings import Settings
 
 log = logging.getLogger(__name__)
 
+#: Configuration of a running daemon, in systemd's folder for it: `skin check --running` compares
+#: with it.
+RUNNING = "configuration.json"
+
 
 def add_commands(commands: Commands) -> None:
-    """Add this room's commands to the parser."""
+    """Add the commands of this module to the parser."""
     run = add_command(
         commands,
         "run",
@@ -41,7 +50,14 @@ def add_commands(commands: Commands) -> None:
     add_config(run)
     run.add_argument("--node", default="main", help="which parts are this daemon's")
     run.add_argument("--calibrate", action="store_true", help="take a calibration first")
-    run.add_argument("--duration", type=float, metavar="S", help="end after so many seconds")
+    run.add_argument("--duration", type=positive, metavar="S", help="end after so many seconds")
+    run.add_argument(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="share the buses among so many processes, each a node: NODE-1, NODE-2, ...",
+    )
+    run.add_argument("--share", help=argparse.SUPPRESS)
     add_log_level(run)
     run.set_defaults(run=_run)
 
@@ -53,9 +69,12 @@ def add_commands(commands: Commands) -> None:
     )
     add_config(calibrate)
     calibrate.add_argument("--node", default="main", help="which parts to calibrate")
-    calibrate.add_argument("--seconds", type=float, default=5.0, help="how long to look")
+    calibrate.add_argument("--seconds", type=positive, default=5.0, help="how long to look")
     calibrate.add_argument("--output", type=Path, metavar="FILE", help="keep it here instead")
     calibrate.add_argument("--json", action="store_true", help="one JSON document")
+    calibrate.add_argument(
+        "--strict", action="store_true", help="exit status 1 if the skin was touched meanwhile"
+    )
     fit.add_arguments(calibrate)
     add_log_level(calibrate)
     calibrate.set_defaults(run=_calibrate)
@@ -84,7 +103,7 @@ def add_commands(commands: Commands) -> None:
     command.add_argument("--node", help="which daemon, if the robot has several")
     command.add_argument("--part", help="calibrate, disable, enable: this part")
     command.add_argument("--board", help="calibrate, configure: this board only")
-    command.add_argument("--seconds", type=float, help="calibrate, raw, record: how long")
+    command.add_argument("--seconds", type=positive, help="calibrate, raw, record: how long")
     command.add_argument("--file", help="record: name of the file in the state directory")
     command.add_argument(
         "--set", action="append", default=[], metavar="KEY=NUMBER", help="thresholds: a change"
@@ -94,7 +113,7 @@ def add_commands(commands: Commands) -> None:
     command.set_defaults(run=_command)
 
 
-#: What a daemon can be asked for.
+#: Commands to a running daemon.
 COMMANDS = {
     "calibrate": "calibrate all, a part or a board",
     "configure": "send the boards their set-up again",
@@ -110,11 +129,11 @@ COMMANDS = {
 
 
 def reload_on_hangup(daemon: "Daemon") -> None:
-    """Read the configuration again on SIGHUP; a wrong one is told of and changes nothing."""
+    """Read the configuration again on SIGHUP; a wrong one is reported and changes nothing."""
     reloading: set[asyncio.Task[None]] = set()
 
     async def reload() -> None:
-        service.notify_reloading()
+        service.notify_reloading(daemon.clock)
         try:
             await daemon.reload()
         except SkinError as error:
@@ -133,12 +152,36 @@ def reload_on_hangup(daemon: "Daemon") -> None:
 def _run(arguments: argparse.Namespace) -> int:
     from skin_host.calibrate import stored_calibration
     from skin_host.daemon import Daemon
+    from skin_host.layout import build_layout
+    from skin_host.settings import Settings
+    from skin_host.sharing import share_name, share_of
 
     set_up_logging(arguments.verbose)
     settings, layout = load_skin(arguments.config)
-    calibration = (
-        None if arguments.calibrate else stored_calibration(settings, layout, arguments.node)
-    )
+    if arguments.workers is not None:
+        return _run_workers(arguments, settings)
+    nodes = [arguments.node]
+
+    def ours(settings: Settings) -> Settings:
+        """A configuration as this process has it: of one share, or as it is."""
+        if arguments.share is None:
+            return settings
+        number, _, n = arguments.share.partition("/")
+        return share_of(settings, arguments.node, int(number), int(n))
+
+    if arguments.share is not None:
+        nodes.insert(0, share_name(arguments.node, int(arguments.share.partition("/")[0])))
+        settings = ours(settings)
+        layout = build_layout(settings, arguments.config.parent)
+    calibration = None
+    try:
+        for node in nodes:  # a share without one has that of the whole
+            calibration = calibration or stored_calibration(settings, layout, node)
+    except OtherSkinError:
+        if not arguments.calibrate:
+            raise
+    if arguments.calibrate:
+        calibration = None  # gains come from the file later
 
     async def work() -> None:
         stop = asyncio.Event()
@@ -146,25 +189,56 @@ def _run(arguments: argparse.Namespace) -> int:
         daemon = Daemon(
             settings,
             layout,
-            arguments.node,
+            nodes[0],
             calibration,
             arguments.config.parent,
             configuration=arguments.config,
+            share=ours,
         )
         reload_on_hangup(daemon)
+        if (runtime := service.runtime_directory()) is not None and arguments.share is None:
+            (runtime / RUNNING).write_bytes(msgspec.json.encode(settings))
         # The collector would look through all that is loaded by now for 30 ms, again and again.
         gc.freeze()
         if arguments.duration is not None:
-            asyncio.get_running_loop().call_later(arguments.duration, stop.set)
+            daemon.clock.call_later(arguments.duration, stop.set)
         await daemon.run(stop, calibrate=arguments.calibrate)
 
     asyncio.run(work())
     return 0
 
 
+def _run_workers(arguments: argparse.Namespace, settings: "Settings") -> int:
+    from skin_host import workers
+    from skin_host.sharing import share_name, share_out
+
+    node, n = arguments.node, arguments.workers
+    if n < 1:
+        raise RequestError(f"--workers {n}: wanted 1 or more")
+    shares = share_out(settings, node, n)
+    if not shares:
+        raise RequestError(f'{arguments.config}: no part belongs to node "{node}"')
+    if len(shares) < n:
+        log.info("%d workers: no more of the buses can be read apart", len(shares))
+    if (runtime := service.runtime_directory()) is not None:
+        (runtime / RUNNING).write_bytes(msgspec.json.encode(settings))
+    options = ["--calibrate"] * arguments.calibrate + ["--verbose"] * arguments.verbose
+    if arguments.duration is not None:
+        options += ["--duration", str(arguments.duration)]
+    commands = {
+        share_name(node, number): [
+            *("run", str(arguments.config), "--node", node),
+            *("--share", f"{number}/{len(shares)}", *options),
+        ]
+        for number in range(1, len(shares) + 1)
+    }
+    return asyncio.run(workers.run(commands))
+
+
 def _calibrate(arguments: argparse.Namespace) -> int:
     from skin_host.calibrate import calibration_path, take_calibration
     from skin_host.cli import verdicts
+    from skin_host.files import refuse_newer
     from skin_host.layout import parts_of
     from skin_host.processing import calibration as calibrations
 
@@ -173,6 +247,8 @@ def _calibrate(arguments: argparse.Namespace) -> int:
         return fit.run(arguments)
     settings, layout = load_skin(arguments.config)
     parts = parts_of(layout, arguments.node)
+    path = arguments.output or calibration_path(settings, arguments.node)
+    refuse_newer(path, calibrations.SCHEMA, "calibration")
     progress = Progress("calibrating, keep the skin untouched")
     try:
         found = asyncio.run(
@@ -180,7 +256,6 @@ def _calibrate(arguments: argparse.Namespace) -> int:
         )
     finally:
         progress.close()
-    path = arguments.output or calibration_path(settings, arguments.node)
     found = calibrations.with_gains_of(found, path, layout)
     calibrations.save(path, found, layout)
     triangles = verdicts.triangle_verdicts(found, layout, parts)
@@ -205,7 +280,13 @@ def _calibrate(arguments: argparse.Namespace) -> int:
         for name, zeroed in tips.items():
             print(f"{name}: " + ("zero taken" if zeroed else "its board sent nothing; no zero"))
         print(f"calibration {found.id} kept in {path}")
-    return 0
+    touched = verdicts.touched(triangles)
+    if touched:
+        warn(
+            f"the skin was touched while it was calibrated: {touched}; take away what touches it "
+            "and repeat: these read too little until then"
+        )
+    return 1 if touched and arguments.strict else 0
 
 
 def _scan(arguments: argparse.Namespace) -> int:

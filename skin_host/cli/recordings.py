@@ -11,6 +11,7 @@ from skin_host.cli.common import (
     Commands,
     add_command,
     load_skin,
+    positive,
     print_json,
     stop_on_signals,
 )
@@ -28,7 +29,7 @@ def add_commands(commands: Commands) -> None:
     record = add_command(
         commands,
         "record",
-        "record what a robot says (MCAP), what its buses bring, or both",
+        "record a robot's messages (MCAP), the frames of its buses, or both",
         "skin record grasp.mcap --seconds 60",
     )
     record.add_argument(
@@ -44,11 +45,17 @@ def add_commands(commands: Commands) -> None:
     export = add_command(
         commands,
         "export",
-        "write a recording as arrays (.npz) or as a folder of CSV tables",
+        "write a recording for other tools: .npz, .parquet, Foxglove (.mcap), Rerun (.rrd), CSV",
         "skin export grasp.mcap grasp.npz",
     )
     _add_recording(export)
-    export.add_argument("output", metavar="OUTPUT", type=Path, help="file .npz, or a folder")
+    export.add_argument(
+        "output",
+        metavar="OUTPUT",
+        type=Path,
+        help="file .npz, .parquet, .mcap or .rrd; or a folder",
+    )
+    export.add_argument("--lerobot", action="store_true", help="the folder is a LeRobot data set")
     export.set_defaults(run=_export)
 
     plot = add_command(
@@ -80,21 +87,13 @@ def add_commands(commands: Commands) -> None:
 
 
 def add_onto(parser: argparse.ArgumentParser) -> None:
-    """The options of `skin replay` that play a recording elsewhere."""
+    """Add the options of `skin replay` that play a recording elsewhere."""
     parser.add_argument(
         "--onto", choices=("can", "broker"), help="play it on CONFIG's buses, or to a broker"
     )
     parser.add_argument("--speed", type=positive, default=1.0, help="2 is twice as fast")
     parser.add_argument("--broker", default=LOCAL, metavar="URL", help="for --onto broker")
     parser.add_argument("--robot", help="a name in place of the recorded one")
-
-
-def positive(text: str) -> float:
-    """A number above 0, for argparse."""
-    value = float(text)
-    if not 0 < value < 1e9:
-        raise argparse.ArgumentTypeError(f"{text}: wanted a number above 0")
-    return value
 
 
 def play(arguments: argparse.Namespace) -> int:
@@ -107,7 +106,7 @@ def play(arguments: argparse.Namespace) -> int:
 
     if arguments.onto == "can":
         if arguments.config is None:
-            raise RequestError("--onto can needs --config, which says on which buses")
+            raise RequestError("--onto can needs --config, which gives the buses")
         return asyncio.run(_play_on_buses(arguments))
     if arguments.config is None and arguments.log.suffix != SUFFIX:
         raise RequestError(f"{arguments.log}: CAN frames need --config to be processed")
@@ -116,16 +115,24 @@ def play(arguments: argparse.Namespace) -> int:
     return asyncio.run(_play_said(arguments))
 
 
-def _add_recording(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", metavar="FILE", type=Path, help="recording, or calibration")
-    parser.add_argument("--config", type=Path, help="process the CAN frames of FILE with it")
-    parser.add_argument("--calibration", type=Path, help="with this calibration file")
+def add_calibration(parser: argparse.ArgumentParser) -> None:
+    """Add the options that choose how a recording of CAN frames is calibrated."""
+    parser.add_argument(
+        "--calibration", type=Path, metavar="FILE", help="use this calibration file"
+    )
     parser.add_argument(
         "--calibrate-seconds",
         type=positive,
-        default=5.0,
-        help="else calibrate on the first seconds of FILE",
+        metavar="S",
+        help="take the zero from the recording's first seconds, 5 without a calibration file; "
+        "with both, curves and gains come from the file",
     )
+
+
+def _add_recording(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recording", metavar="FILE", type=Path, help="recording, or calibration")
+    parser.add_argument("--config", type=Path, help="process the CAN frames of FILE with it")
+    add_calibration(parser)
 
 
 def _numbers(text: str) -> list[int]:
@@ -155,7 +162,7 @@ def _record(arguments: argparse.Namespace) -> int:
     if arguments.config is not None and not told.get("frames", told.get("messages", {}).get("can")):
         print(
             f"no CAN frame came on the buses of {arguments.config}; is the bus up? "
-            "(An interface `virtual` is heard by its own program alone.)",
+            "(An interface `virtual` reaches only its own program.)",
             file=sys.stderr,
         )
     if arguments.json:
@@ -172,7 +179,7 @@ def _plain(value: Any) -> str:
 
 
 async def _capture(arguments: argparse.Namespace, recorder: Any, log: Any = None) -> dict[str, Any]:
-    """Record until a signal comes or the time is over; say what was lost."""
+    """Record until a signal comes or the time is over; report what was lost."""
     from skin_host.capture import capture_broker, capture_buses
 
     stop = asyncio.Event()
@@ -203,7 +210,7 @@ async def _capture(arguments: argparse.Namespace, recorder: Any, log: Any = None
 
 
 async def _robot(url: str, robot: str | None) -> tuple["Broker", str, str]:
-    """The broker behind a URL, the base of its topics, and whose skin is meant."""
+    """Return the broker behind a URL, the base of its topics, and the robot."""
     from skin_host.client import SkinClient
     from skin_host.publish.address import Broker
 
@@ -214,31 +221,29 @@ async def _robot(url: str, robot: str | None) -> tuple["Broker", str, str]:
 
 def _series(arguments: argparse.Namespace) -> "Series":
     from skin_host.export import read_frames, read_messages
-    from skin_host.processing import calibration
     from skin_host.publish.recording import SUFFIX
-    from skin_host.settings import skin_hash
+    from skin_host.replay import calibration_for
 
     if arguments.config is None:
         if arguments.recording.suffix != SUFFIX:
             raise RequestError(f"{arguments.recording}: CAN frames need --config to be processed")
         return read_messages(arguments.recording)
     settings, layout = load_skin(arguments.config)
-    found = None
-    if arguments.calibration is not None:
-        found = calibration.load(arguments.calibration, layout, skin_hash(settings))
-    return read_frames(
-        arguments.recording,
-        settings,
-        layout,
-        calibration=found,
-        calibrate_seconds=arguments.calibrate_seconds,
+    found = calibration_for(
+        arguments.recording, settings, layout, arguments.calibration, arguments.calibrate_seconds
     )
+    return read_frames(arguments.recording, settings, layout, found)
 
 
 def _export(arguments: argparse.Namespace) -> int:
     from skin_host.export import export
 
-    for path in export(_series(arguments), arguments.output):
+    if arguments.output.exists() and arguments.output.samefile(arguments.recording):
+        raise RequestError(f"{arguments.output}: is the recording itself; choose another name")
+    written = export(
+        _series(arguments), arguments.output, arguments.recording, lerobot=arguments.lerobot
+    )
+    for path in written:
         print(path)
     return 0
 
@@ -258,7 +263,7 @@ def _plot(arguments: argparse.Namespace) -> int:
         series = _series(arguments)
         part = arguments.part or next(iter(series.parts))
         if arguments.part is None and len(series.parts) > 1:
-            raise RequestError(f"say which --part; there are: {', '.join(series.parts)}")
+            raise RequestError(f"choose one with --part; there are: {', '.join(series.parts)}")
         if arguments.what == "pressure":
             plots.plot_pressure(series, arguments.output, part, arguments.taxels)
         else:
@@ -285,7 +290,7 @@ def _dbc(arguments: argparse.Namespace) -> int:
 
 
 async def _play_on_buses(arguments: argparse.Namespace) -> int:
-    from skin_host.bus.port import open_bus
+    from skin_host.bus.opening import open_bus
     from skin_host.playback import play_on_buses
 
     settings, _ = load_skin(arguments.config)
@@ -301,19 +306,23 @@ async def _play_on_buses(arguments: argparse.Namespace) -> int:
 async def _play_processed(arguments: argparse.Namespace) -> int:
     from skin_host.engine import Engine
     from skin_host.playback import play_processed
-    from skin_host.processing import calibration
     from skin_host.publish.address import Broker
-    from skin_host.replay import calibrate_from_log
-    from skin_host.settings import skin_hash
+    from skin_host.replay import calibration_for
+    from skin_host.settings import changed
 
     settings, layout = load_skin(arguments.config)
     broker, base = Broker.from_url(arguments.broker)
-    settings.mqtt.host, settings.mqtt.port = broker.host, broker.port
-    settings.mqtt.base = base or settings.mqtt.base
-    if arguments.calibration is not None:
-        found = calibration.load(arguments.calibration, layout, skin_hash(settings))
-    else:
-        found = calibrate_from_log(arguments.log, settings, layout, arguments.calibrate_seconds)
+    settings = changed(
+        settings,
+        {
+            "mqtt.host": broker.host,
+            "mqtt.port": broker.port,
+            "mqtt.base": base or settings.mqtt.base,
+        },
+    )
+    found = calibration_for(
+        arguments.log, settings, layout, arguments.calibration, arguments.calibrate_seconds
+    )
     engine = Engine(settings, layout, list(range(len(layout.parts))), found)
     n = await play_processed(arguments.log, engine, settings, arguments.speed)
     print(f"{n} frames played")
@@ -323,13 +332,13 @@ async def _play_processed(arguments: argparse.Namespace) -> int:
 async def _play_said(arguments: argparse.Namespace) -> int:
     from aiomqtt import MqttError
 
-    from skin_host.playback import play_said
+    from skin_host.playback import play_messages
     from skin_host.publish.address import Broker
     from skin_host.publish.connection import explain
 
     broker, _ = Broker.from_url(arguments.broker)
     try:
-        n = await play_said(arguments.log, broker, arguments.speed, arguments.robot)
+        n = await play_messages(arguments.log, broker, arguments.speed, arguments.robot)
     except MqttError as error:
         raise BrokerError(f"broker {broker}: {explain(error)}") from None
     print(f"{n} messages played")

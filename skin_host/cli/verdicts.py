@@ -1,9 +1,10 @@
-"""What a calibration says of each triangle, for `skin calibrate`."""
+"""Summarises a calibration by triangle, for `skin calibrate`."""
 
 from itertools import groupby
 from typing import TypedDict
 
 from skin_host.check import columns, format_triangles
+from skin_host.health.diagnosis import named
 from skin_host.layout import TAXELS_PER_TRIANGLE, Layout, PadKind
 from skin_host.processing.calibration import Calibration, Verdict
 
@@ -11,7 +12,7 @@ from skin_host.processing.calibration import Calibration, Verdict
 class TriangleVerdict(TypedDict):
     """One triangle of `pressure_taxels`: `verdict` is the worst; `taxels` are those not ok.
 
-    These are numbered within their part, by their own verdicts.
+    The taxels have their numbers within the part, grouped by their own verdicts.
     """
 
     part: str
@@ -54,7 +55,7 @@ def triangle_verdicts(
 
 
 def table(verdicts: list[TriangleVerdict]) -> str:
-    """A line for each triangle that is not ok, and one for those of a board that are."""
+    """Return a line for each triangle that is not ok, and one for those of a board that are."""
     rows: list[list[str | int]] = []
     for (part, board), triangles in groupby(verdicts, lambda one: (one["part"], one["board"])):
         mine = list(triangles)
@@ -63,6 +64,16 @@ def table(verdicts: list[TriangleVerdict]) -> str:
             rows.append([part, board, format_triangles(well), "ok"])
         rows += [[part, board, one["triangle"], _words(one)] for one in mine if one["taxels"]]
     return columns(["part", "board", "triangles", "verdict"], rows)
+
+
+def touched(verdicts: list[TriangleVerdict]) -> str:
+    """Return which taxels were touched, by part: "taxels 3-5, 9 of left_hand"; empty if none
+    was.
+    """
+    by_part: dict[str, list[int]] = {}
+    for one in verdicts:
+        by_part.setdefault(one["part"], []).extend(one["taxels"].get("touched", []))
+    return "; ".join(f"{named(taxels)} of {part}" for part, taxels in by_part.items() if taxels)
 
 
 def _words(triangle: TriangleVerdict) -> str:

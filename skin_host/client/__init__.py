@@ -1,15 +1,16 @@
-"""Hear what a robot's skin publishes, from a program of one's own.
+"""Receives what a robot's skin publishes, for other programs.
 
     async with SkinClient("mqtt://localhost", robot="demo") as skin:
         async for touch in skin.touches(part="left_hand"):
             print(touch.event, touch.id, touch.peak_kpa, "kPa")
 
-The client finds the broker again by itself. What was lost meanwhile is told by the field
-`missed` of the next touch or frame. `SkinCallbacks` is the same without asyncio.
+The client reconnects by itself. The field `missed` of the next touch or frame reports what was
+lost meanwhile. `SkinCallbacks` is the same without asyncio.
 """
 
 from skin_host.client.callbacks import SkinCallbacks
-from skin_host.client.heard import Contact, Health
+from skin_host.client.heard import Health
+from skin_host.client.presence import Contact
 from skin_host.client.session import CommandError, Node, SkinClient
 from skin_host.client.streams import Stream
 from skin_host.publish.address import Broker

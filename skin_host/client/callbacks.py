@@ -1,16 +1,18 @@
-"""The client for programs without asyncio: a thread of its own listens and calls back."""
+"""The client for programs without asyncio: a separate thread receives and calls back."""
 
 import asyncio
 import logging
 import threading
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from concurrent.futures import Future
 from functools import partial
-from typing import Any, Self, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
-from skin_host.client.heard import Contact, Health
+from skin_host.client.heard import Health
+from skin_host.client.presence import Contact
 from skin_host.client.session import SkinClient
 from skin_host.client.streams import Stream
+from skin_host.publish.address import Broker
 from skin_host.publish.frames import Frame
 from skin_host.publish.grasping import Over, Slip
 from skin_host.publish.info import NodeInfo
@@ -21,21 +23,38 @@ _log = logging.getLogger(__name__)
 
 
 class SkinCallbacks:
-    """Calls functions with what is heard. Takes the arguments of `SkinClient`.
+    """Calls functions with received messages. Takes the arguments of `SkinClient`.
 
         with SkinCallbacks("mqtt://localhost", robot="demo") as skin:
             skin.on_touch(lambda touch: print(touch.part, touch.event))
             input("Enter ends it")
 
-    The functions run one after the other in one thread that is not the caller's: what they
-    share with it needs a lock, and while one of them works nothing else is heard. An
-    exception in one of them is logged and passed over.
+    The functions run one after the other in one thread, which is not the caller's: data that they
+    share with it needs a lock, and while one of them runs nothing else is received. An exception in
+    one of them is logged, and the next ones are called.
 
     Raises (on entering): see `SkinClient`.
     """
 
-    def __init__(self, *arguments: Any, **keywords: Any) -> None:
-        self._make = partial(SkinClient, *arguments, **keywords)
+    def __init__(
+        self,
+        broker: str | Broker | Sequence[str | Broker] = "mqtt://localhost",
+        *,
+        robot: str | None = None,
+        base: str | None = None,
+        protocol: Literal["5", "3.1.1"] = "5",
+        patience_s: float = 10.0,
+        stale_s: float = 3.0,
+    ) -> None:
+        self._make = partial(
+            SkinClient,
+            broker,
+            robot=robot,
+            base=base,
+            protocol=protocol,
+            patience_s=patience_s,
+            stale_s=stale_s,
+        )
         self._ready: Future[tuple[SkinClient, asyncio.AbstractEventLoop]] = Future()
         self._end = asyncio.Event()
         self._calls: set[asyncio.Task[None]] = set()
@@ -60,20 +79,37 @@ class SkinCallbacks:
         self._on(lambda: self._skin.frames(part), call)
 
     def on_contact(self, call: Callable[[Contact], object], part: str | None = None) -> None:
-        """Call when a part is touched, or no longer; once at first, as it is now."""
+        """Call when a part's contact state changes; first with the present state."""
         self._on(lambda: self._skin.contacts(part), call)
 
+    def on_unknown(self, call: Callable[[Contact], object], part: str | None = None) -> None:
+        """Call when a part's contact state becomes unknown; see `Contact.why`."""
+
+        def call_unknown(contact: Contact) -> None:
+            if not contact.known:
+                call(contact)
+
+        self._on(lambda: self._skin.contacts(part), call_unknown)
+
+    def present(self, part: str | None = None) -> list[Touch]:
+
+        async def found() -> list[Touch]:
+            return self._skin.present(part)
+
+        return self._wait_for(found())
+
     def on_health(self, call: Callable[[Health], object], part: str | None = None) -> None:
-        """Call with each record of a part's health, or of all parts'."""
+        """Call with each record of a part's health, or of all parts' health."""
         self._on(lambda: self._skin.health(part), call)
 
     def info(self, timeout_s: float = 5.0) -> dict[str, NodeInfo]:
-        """See `SkinClient.info`."""
         return self._wait_for(self._skin.info(timeout_s))
 
-    def command(self, name: str, **keywords: Any) -> dict[str, Any]:
-        """See `SkinClient.command`."""
-        return self._wait_for(self._skin.command(name, **keywords))
+    def command(
+        self, name: str, *, node: str | None = None, timeout_s: float = 10.0, **arguments: Any
+    ) -> dict[str, Any]:
+        asked = self._skin.command(name, node=node, timeout_s=timeout_s, **arguments)
+        return self._wait_for(asked)
 
     def __enter__(self) -> Self:
         self._thread.start()

@@ -1,27 +1,42 @@
-"""What a part says, as objects: the payloads of its topics, read."""
+"""Received messages of a part as objects: decodes the payloads of its topics."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, cast
 
+from skin_host.client.presence import Contact
 from skin_host.publish.frames import Frame, decode_frame
 from skin_host.publish.grasping import Over, Slip, decode_over, decode_slip
 from skin_host.publish.messages import Touch, decode_contact, decode_health, decode_touch
 from skin_host.publish.payload import MessageError
 from skin_host.publish.topics import PartTopic
 
-
-class Contact(NamedTuple):
-    """Whether anything touches a part."""
-
-    part: str
-    touched: bool
+if TYPE_CHECKING:
+    from skin_host.health.record import Record
 
 
 class Health(NamedTuple):
-    """How a part is; `docs/operations.md` explains the keys of `record`."""
+    """Health of a part; `docs/operations.md` explains the keys of `record`.
+
+    A fingertip on a force/torque board has only some of them, and others.
+    """
 
     part: str
-    record: dict[str, Any]
+    record: "Record"
+
+    @property
+    def state(self) -> str:
+        """Return `ok`, `warning`, `degraded`, ...; reasons for any but `ok` are in `sentences`."""
+        return self.record["state"]
+
+    @property
+    def codes(self) -> set[str]:
+        """Return the codes of all present faults."""
+        return {fault["code"] for fault in self.record.get("faults", [])}
+
+    @property
+    def sentences(self) -> list[str]:
+        """Return the faults as sentences."""
+        return self.record.get("sentences", [])
 
 
 _EVENTS: dict[str, Callable[[bytes], Touch | Slip | Over]] = {
@@ -34,10 +49,10 @@ _EVENTS: dict[str, Callable[[bytes], Touch | Slip | Over]] = {
 def read(
     kind: PartTopic, part: str, payload: bytes
 ) -> Touch | Slip | Over | Frame | Contact | Health | None:
-    """Read what was said of a part; None says that a retained message was deleted.
+    """Decode a message of a part; None means that a retained message was deleted.
 
     Raises:
-        MessageError: it is not what the topic promises.
+        MessageError: the payload does not fit the topic.
     """
     if kind in _EVENTS:
         event = _EVENTS[kind](payload)
@@ -50,4 +65,4 @@ def read(
         return None
     if kind == "contact":
         return Contact(part, decode_contact(payload))
-    return Health(part, decode_health(payload))
+    return Health(part, cast("Record", decode_health(payload)))

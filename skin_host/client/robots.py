@@ -39,7 +39,7 @@ async def only_robot(connection: Connection, broker: Broker, base: str) -> str:
     meant = online or known
     if not meant:
         raise RequestError(
-            f'broker {broker}: no robot has said anything below "{base}"; is `skin run` running?'
+            f'broker {broker}: no robot has published below "{base}"; is `skin run` running?'
         )
     if len(meant) > 1:
         names = ", ".join(sorted(meant)[:20])

@@ -1,15 +1,19 @@
-"""The client itself: one connection that keeps what its streams ask for."""
+"""The client itself: receives for its streams, from all brokers of the robot."""
 
 import asyncio
 import itertools
 import logging
+import re
 import secrets
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal, Self, TypeVar
 from weakref import WeakSet
 
-from skin_host.client.heard import Contact, Health, read
+from skin_host.client.heard import Health, read
+from skin_host.client.links import Link
+from skin_host.client.order import EventOrder, Newest
+from skin_host.client.presence import Contact, Presence
 from skin_host.client.robots import RETAINED_S, only_robot
 from skin_host.client.streams import Stream
 from skin_host.errors import BrokerError, RequestError, SkinError
@@ -19,56 +23,65 @@ from skin_host.publish.connection import (
     Connection,
     Message,
     MqttError,
-    Retry,
-    connect,
     explain,
-    first_error,
-    is_refusal,
     message_properties,
 )
 from skin_host.publish.frames import Frame
 from skin_host.publish.grasping import Over, Slip
-from skin_host.publish.info import NodeInfo, decode_info
+from skin_host.publish.info import NodeInfo, decode_info, join_pieces
 from skin_host.publish.messages import Touch
+from skin_host.publish.order import run_of, stamp_of
 from skin_host.publish.payload import JSON_TYPE
 from skin_host.publish.topics import ONLINE, PartTopic, Topics
 
-MAX_INCOMING = 10_000
-#: The broker keeps touch events for us for so long while we are away (MQTT 5).
-SESSION_S = 60
+#: An event waits this long for an earlier one, which may come from another broker.
+HOLD_S = 1.0
+#: Timeouts are checked this often.
+WATCH_S = 0.25
+#: Further topics that a stream needs: a contact state is valid only while its part lives.
+_NEEDED: dict[PartTopic, tuple[PartTopic, ...]] = {"contact": ("contact", "health", "touch")}
+
+_WORD = re.compile(r"[a-z0-9_-]{1,64}")
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
 
 
 class CommandError(SkinError):
-    """A node refused a command, failed, or did not answer; the message says why."""
+    """A node refused a command, failed, or did not answer; the message gives the reason."""
 
 
 @dataclass
 class Node:
-    """A daemon of the robot. `online` is None until it has been heard of."""
+    """A daemon of the robot. `online` is None until its status was received."""
 
     online: bool | None = None
     info: NodeInfo | None = None
+    #: Brokers from which its newest status came.
+    over: set[int] = field(default_factory=set, repr=False)
+    #: Pieces of its info, by number.
+    pieces: dict[int, NodeInfo] = field(default_factory=dict, repr=False)
 
 
 class SkinClient:
-    """One robot's skin, heard over MQTT.
+    """One robot's skin, received over MQTT.
 
     Args:
         broker: `mqtt://[user[:password]@]host[:port][/base][?protocol=3.1.1]`, `mqtts://...`, or
-            a `Broker`.
-        robot: its name; without one the only robot that the broker knows, or that is online.
-        base: of the topics; "skin" unless the URL or this says otherwise.
+            a `Broker`. Or several, nodes of a cluster or not: messages are received from whichever
+            the robot publishes to, each event once and in order. They need MQTT 5, and `robot`.
+        robot: its name; by default the only robot that the broker knows, or that is online.
+        base: of the topics; "skin" unless the URL or this states otherwise.
         protocol: of MQTT, for a broker given by URL.
-        patience_s: how long entering waits for a broker that is not there.
+        patience_s: how long entering waits for a broker that cannot be reached.
+        stale_s: a part that was not received for this long is UNKNOWN to `contacts`.
 
     Attributes:
-        nodes: the robot's daemons by name, as far as they have been heard of.
-        connections: how often the broker was found; more than 1 says that it was lost.
-        last_error: why it was lost, or not found.
-        unreadable: messages that did not hold what their topic promises.
+        nodes: the robot's daemons by name, as far as they have been received.
+        connections: how often a broker was found; more than the number of brokers means that one
+            was lost.
+        last_error: why one was lost, or not found.
+        unreadable: messages whose payload did not fit their topic.
 
     Raises (on entering):
         BrokerError: no broker, or one that refuses us.
@@ -77,17 +90,23 @@ class SkinClient:
 
     def __init__(
         self,
-        broker: str | Broker = "mqtt://localhost",
+        broker: str | Broker | Sequence[str | Broker] = "mqtt://localhost",
         *,
         robot: str | None = None,
         base: str | None = None,
         protocol: Literal["5", "3.1.1"] = "5",
         patience_s: float = 10.0,
+        stale_s: float = 3.0,
     ) -> None:
-        if isinstance(broker, str):
-            broker, path = Broker.from_url(broker, protocol)
-            base = base or path
-        self._broker = broker
+        brokers: list[Broker] = []
+        for one in [broker] if isinstance(broker, str | Broker) else broker:
+            if isinstance(one, str):
+                found, path = Broker.from_url(one, protocol)
+                base = base or path
+            else:
+                found = one
+            brokers.append(found)
+        _check_several(brokers, robot)
         self._base = base or "skin"
         self._topics = None if robot is None else Topics(self._base, robot)
         self._robot = robot
@@ -96,29 +115,36 @@ class SkinClient:
         self._numbers = itertools.count(1)
         self._asked: dict[str, asyncio.Future[Result]] = {}
         self._streams: WeakSet[Stream[Any]] = WeakSet()
-        self._latest: dict[tuple[PartTopic, str], Contact | Health] = {}
-        self._connection: Connection | None = None
+        self._latest: dict[str, Health] = {}
+        self._presence = Presence(stale_s)
+        self._order = EventOrder(HOLD_S if len(brokers) > 1 else 0.0)
+        self._newest = Newest()
         self._news = asyncio.Event()
-        self._since_s = 0.0
-        self._streams_changed = asyncio.Event()
-        self._subscribed: set[str] = set()
-        self._kept: set[str] = set()  # subscriptions of which the broker may know still
-        self._failure: SkinError | None = None
-        self._task: asyncio.Task[None] | None = None
+        self._stopping = False
+        self._tasks: list[asyncio.Task[None]] = []
+        # Nodes of a cluster share clients' names, so each link has its own.
+        self._links = [
+            Link(i, one, self._identifier + f"-{i}" * (len(brokers) > 1), self)
+            for i, one in enumerate(brokers)
+        ]
         self.nodes: dict[str, Node] = {}
-        self.connections = 0
         self.last_error = ""
         self.unreadable = 0
 
     @property
     def robot(self) -> str:
-        """Whose skin it is."""
+        """Return the name of the robot."""
         return self._robot or ""
 
     @property
     def connected(self) -> bool:
-        """Whether the broker is there now."""
-        return self._connection is not None
+        """Return whether the broker, or one of them, is connected now."""
+        return any(link.connection for link in self._links)
+
+    @property
+    def connections(self) -> int:
+        """How often a broker was found."""
+        return sum(link.connections for link in self._links)
 
     def touches(self, part: str | None = None) -> Stream[Touch]:
         """Touch events of a part, or of all."""
@@ -129,11 +155,11 @@ class SkinClient:
         return self._stream(part, "slip")
 
     def overs(self, part: str | None = None) -> Stream[Over]:
-        """When a fingertip, or any, begins or ends to press too hard."""
+        """Excesses: when a fingertip, or any, begins or ends to press too hard."""
         return self._stream(part, "over")
 
     def events(self, part: str | None = None) -> Stream[Touch | Slip | Over]:
-        """Touches, slips and excesses of a part, or of all, in the order in which they come."""
+        """Touches, slips and excesses of a part, or of all, in the order in which they arrive."""
         return self._stream(part, "touch", "slip", "over")
 
     def frames(self, part: str | None = None) -> Stream[Frame]:
@@ -141,24 +167,40 @@ class SkinClient:
         return self._stream(part, "frame")
 
     def contacts(self, part: str | None = None) -> Stream[Contact]:
-        """Whether parts are touched: as it is now, and each change."""
+        """Contact states of parts: the present one, and each change.
+
+        UNKNOWN is an item of its own: when the node cannot feel all of the part, when the part was
+        not
+        received for `stale_s`, when its node stops or the broker is lost.
+        """
         return self._stream(part, "contact")
 
+    def present(self, part: str | None = None) -> list[Touch]:
+        """Return the last event of each contact that lasts now, as far as known.
+
+        They are followed while a stream of `contacts` or `touches` exists.
+        """
+        return self._presence.touches(part, _now_s())
+
     def health(self, part: str | None = None) -> Stream[Health]:
-        """How parts are: as it is now, and each change."""
+        """Health of parts: the present one, and each change."""
         return self._stream(part, "health")
 
     async def ready(self) -> None:
-        """Wait until all that was asked for so far has reached the broker."""
-        await self._until(
-            lambda: self._topics and self._subscribed >= set(self._wanted(self._topics))
-        )
+        """Wait until all subscriptions so far have reached the broker."""
+
+        def is_ready() -> bool:
+            want = set(self.wanted())
+            made = [link for link in self._links if link.connection]
+            return bool(made) and all(link.has(want) for link in made)
+
+        await self._until(is_ready)
 
     async def info(self, timeout_s: float = 5.0) -> dict[str, NodeInfo]:
-        """What the robot's nodes are: their parts, taxels, places. Waits for the first.
+        """Return the descriptions of the robot's nodes: parts, taxels, places. Waits for the first.
 
         Raises:
-            BrokerError: none has said so within `timeout_s`.
+            BrokerError: none was received within `timeout_s`.
         """
 
         def known() -> dict[str, NodeInfo]:
@@ -169,18 +211,18 @@ class SkinClient:
                 return await self._until(known)
         except TimeoutError:
             raise BrokerError(
-                f'broker {self._broker}: no node of robot "{self.robot}" has said what it is; '
+                f'broker {self._where}: no node of robot "{self.robot}" published its info; '
                 "is `skin run` running?"
             ) from None
 
     async def command(
         self, name: str, *, node: str | None = None, timeout_s: float = 10.0, **arguments: Any
     ) -> dict[str, Any]:
-        """Ask a node to do something and return its result.
+        """Send a command to a node and return its result.
 
         Args:
             name: of the command.
-            node: whom to ask; without it the robot's only node.
+            node: which one; by default the robot's only node.
             timeout_s: how long to wait for the answer.
             arguments: of the command.
 
@@ -188,6 +230,10 @@ class SkinClient:
             CommandError: the node refused, failed, or did not answer in time.
             RequestError: it is not clear which node is meant.
         """
+        if not _WORD.fullmatch(name) or not (node is None or _WORD.fullmatch(node)):
+            raise RequestError(
+                "a command and a node have names of up to 64 of the characters a-z 0-9 _ -"
+            )
         number = f"{self._identifier}-{next(self._numbers)}"
         answer = self._asked[number] = asyncio.get_running_loop().create_future()
         try:
@@ -201,7 +247,7 @@ class SkinClient:
                 f"{timeout_s:g} s; is `skin run` running there?"
             ) from None
         except MqttError as error:
-            raise CommandError(f"broker {self._broker}: {explain(error)}") from None
+            raise CommandError(f"broker {self._where}: {explain(error)}") from None
         finally:
             del self._asked[number]
         if not result.ok:
@@ -209,35 +255,59 @@ class SkinClient:
         return result.result or {}
 
     async def __aenter__(self) -> Self:
-        self._task = asyncio.create_task(self._run(), name="skin client")
+        self._tasks = [
+            asyncio.create_task(link.run(), name=f"skin client {link.broker}")
+            for link in self._links
+        ]
+        self._tasks.append(asyncio.create_task(self._watch(), name="skin client's watch"))
+        failure: SkinError | None = None
         try:
             async with asyncio.timeout(self._patience_s):
-                await self._until(lambda: self._connection or self._failure)
+                await self._until(lambda: self._is_settled)
         except TimeoutError:
-            why = self.last_error or "it does not answer"
-            if self._broker.v5 and "does not answer" in why:
-                why += "; if it speaks MQTT 3.1.1 alone, end its URL with ?protocol=3.1.1"
-            self._failure = BrokerError(f"broker {self._broker}: cannot connect: {why}")
+            if not self.connected:
+                failure = self._absence()
         except BaseException:
             await self._stop()
             raise
-        if self._failure is not None:
+        if not self.connected:
+            failure = failure or self._links[0].failure
+        if failure is not None:
             await self._stop()
-            raise self._failure
+            raise failure
         return self
+
+    @property
+    def _is_settled(self) -> bool:
+        """Return whether it is known which brokers can be reached, and at least one can."""
+        if all(link.failure for link in self._links):
+            return True
+        return self.connected and all(link.tried for link in self._links)
+
+    def _absence(self) -> BrokerError:
+        link = next((link for link in self._links if not link.failure), self._links[0])
+        why = link.last_error or "it does not answer"
+        if link.broker.v5 and "does not answer" in why:
+            why += "; if it speaks MQTT 3.1.1 alone, end its URL with ?protocol=3.1.1"
+        return BrokerError(f"broker {self._where}: cannot connect: {why}")
+
+    @property
+    def _where(self) -> str:
+        return ", ".join(str(link.broker) for link in self._links)
 
     async def __aexit__(self, *_: object) -> None:
         await self._stop()
 
     async def _stop(self) -> None:
-        assert self._task is not None
-        self._task.cancel()
-        await asyncio.gather(self._task, return_exceptions=True)
+        self._stopping = True
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
         for stream in list(self._streams):
             stream.close()
 
     async def _until(self, condition: Callable[[], T]) -> T:
-        """Wait until `condition` holds, and return what it said."""
+        """Wait until `condition` holds, and return its result."""
         while not (found := condition()):
             self._news.clear()
             await self._news.wait()
@@ -246,16 +316,25 @@ class SkinClient:
     def _stream(self, part: str | None, *kinds: PartTopic) -> Stream[Any]:
         stream: Stream[Any] = Stream(part, *kinds)
         self._streams.add(stream)
-        for (known_kind, known_part), state in self._latest.items():
-            if known_kind in kinds and part in (None, known_part):
-                stream.put(state)
-        self._streams_changed.set()
+        if "health" in kinds:
+            for name, health in self._latest.items():
+                if part in (None, name):
+                    stream.put(health)
+        if "contact" in kinds:
+            for contact in self._presence.reported():
+                if part in (None, contact.part):
+                    stream.put(contact)
+        self._ask_again()
         return stream
 
+    def _ask_again(self) -> None:
+        for link in self._links:
+            link.again.set()
+
     async def _only_node(self) -> str:
-        await self._until(lambda: self._connection)
-        # By then all that is retained has come: there are no more nodes than these.
-        age_s = asyncio.get_running_loop().time() - self._since_s
+        await self._until(lambda: self.connected)
+        # By then all retained messages have been received: there are no more nodes than these.
+        age_s = _now_s() - max(link.since_s for link in self._links)
         await asyncio.sleep(max(0.0, RETAINED_S - age_s))
         online = sorted(name for name, node in self.nodes.items() if node.online)
         if len(online) == 1:
@@ -267,117 +346,124 @@ class SkinClient:
         )
 
     async def _ask(self, node: str, name: str, arguments: dict[str, Any]) -> None:
-        connection = await self._until(lambda: self._connection)
+        connection = await self._until(lambda: self._way_to(node))
         assert connection is not None and self._topics is not None
-        properties = message_properties(self._broker, JSON_TYPE)
+        properties = message_properties(self._links[0].broker, JSON_TYPE)
         if properties is not None:
             properties.ResponseTopic = self._topics.reply(node, self._identifier)
         await connection.publish(
             self._topics.command(node, name), encode_request(arguments), 1, properties=properties
         )
 
-    async def _run(self) -> None:
-        retry = Retry()
-        loop = asyncio.get_running_loop()
-        while self._failure is None:
-            since_s: float | None = None
-            try:
-                async with connect(
-                    self._broker,
-                    identifier=self._identifier,
-                    max_incoming=MAX_INCOMING,
-                    session_s=SESSION_S,
-                    resume=self.connections > 0,
-                ) as connection:
-                    since_s = loop.time()
-                    await self._talk(connection)
-            except* Exception as group:
-                self._note_loss(first_error(group))
-            finally:
-                self._connection = None
-                self._kept |= self._subscribed
-                self._subscribed = set()
-            await asyncio.sleep(retry.delay_s(0.0 if since_s is None else loop.time() - since_s))
+    def _way_to(self, node: str) -> Connection | None:
+        """Return the connection to a broker where a node is; a request must not reach it twice."""
+        over = self.nodes[node].over if node in self.nodes else set()
+        for link in self._links:
+            if link.connection and (link.number in over or len(self._links) == 1):
+                return link.connection
+        return None
 
-    def _note_loss(self, error: BaseException) -> None:
-        why = explain(error)
-        if self.connections and why != self.last_error:
-            unknown = None if isinstance(error, MqttError) else error
-            _log.warning("broker %s: %s; trying again", self._broker, why, exc_info=unknown)
-        self.last_error = why
-        if not self.connections:
-            if isinstance(error, SkinError):
-                self._failure = error
-            elif is_refusal(error):
-                self._failure = BrokerError(f"broker {self._broker}: refuses us: {why}")
-            self._news.set()
-
-    async def _talk(self, connection: Connection) -> None:
+    async def prepare(self, connection: Connection, broker: Broker) -> None:
         if self._topics is None:
-            self._robot = await only_robot(connection, self._broker, self._base)
+            self._robot = await only_robot(connection, broker, self._base)
             self._topics = Topics(self._base, self._robot)
-        async with asyncio.TaskGroup() as group:
-            group.create_task(self._keep_subscribed(connection, self._topics))
-            async for message in connection.messages:
-                self._take(message, self._topics)
 
-    async def _keep_subscribed(self, connection: Connection, topics: Topics) -> None:
-        while True:
-            self._streams_changed.clear()
-            want = set(self._wanted(topics))
-            for topic in want - self._subscribed:
-                await connection.subscribe(topic, qos=0 if topic.endswith("/frame") else 1)
-            for topic in (self._subscribed | self._kept) - want:
-                await connection.unsubscribe(topic)
-                # What is no longer followed is no longer known.
-                kinds = {place.kind} if (place := topics.parse(topic)) else set()
-                self._latest = {k: v for k, v in self._latest.items() if k[0] not in kinds}
-            self._subscribed, self._kept = want, set()
-            self._news.set()
-            if self._connection is None:
-                self._connection = connection
-                self.connections += 1
-                self._since_s = asyncio.get_running_loop().time()
-                _log.info("broker %s: connected", self._broker)
-            await self._streams_changed.wait()
+    def note(self, link: Link) -> None:
+        if link.last_error:
+            self.last_error = link.last_error
+        if link.connection is None:
+            self._presence.take_loss(link.number)
+            for node in self.nodes.values():
+                node.over.discard(link.number)
+            if not self._stopping:
+                self._report_contacts()
+        self._news.set()
 
-    def _wanted(self, topics: Topics) -> Iterator[str]:
-        """Topics to subscribe to; none lies within another, or messages would come twice."""
+    def unfollow(self, topic: str) -> None:
+        """Forget the state of a topic that is no longer subscribed."""
+        assert self._topics is not None
+        place = self._topics.parse(topic)
+        if place is None:
+            return
+        if place.kind == "health":
+            self._latest.clear()
+        elif place.kind == "contact":
+            self._presence.forget()
+        self._newest.forget(place.kind)
+
+    def wanted(self) -> Iterator[str]:
+        """Yield the topics to subscribe to; none contains another, or messages would come twice."""
+        topics = self._topics
+        if topics is None:
+            return
         yield topics.node("status", "+")
-        yield topics.node("info", "+")
-        if self._broker.v5:
+        yield topics.info("+")
+        yield topics.info("+", "+")
+        if self._links[0].broker.v5:
             yield topics.reply("+", self._identifier)
         else:
             yield topics.result("+", "+")
-        asked = {(kind, stream.part) for stream in self._streams for kind in stream.kinds}
+        asked: set[tuple[PartTopic, str | None]] = {
+            (kind, stream.part)
+            for stream in self._streams
+            for asked_kind in stream.kinds
+            for kind in _NEEDED.get(asked_kind, (asked_kind,))
+        }
         for kind, part in asked:
             if part is None or (kind, None) not in asked:
                 yield topics.part(kind, part or "+")
 
-    def _take(self, message: Message, topics: Topics) -> None:
-        place = topics.parse(message.topic.value)
+    def take(self, link: Link, message: Message) -> None:
+        assert self._topics is not None
+        place = self._topics.parse(message.topic.value)
         payload = message.payload if isinstance(message.payload, bytes) else b""
         if place is None:
             return
-        kind, name = place
+        kind, name, piece = place
         try:
-            if kind == "status" or kind == "info":  # noqa: PLR1714
-                self._take_node(kind, name, payload)
+            if kind == "status":
+                self._take_status(name, payload, link, self._newness(kind, name, message))
+            elif kind == "info":
+                if self._newness(kind, f"{name}/{piece}", message) is not False:
+                    self._take_info(name, piece, payload)
             elif kind == "answer":
                 self._take_answer(decode_result(payload))
             else:
-                self._take_part(kind, name, payload)
+                self._take_part(kind, name, payload, link, message)
         except SkinError as error:
             self.unreadable += 1
             if self.unreadable == 1:
                 _log.warning("%s: %s; such messages are passed over", message.topic, error)
 
-    def _take_node(self, kind: str, name: str, payload: bytes) -> None:
+    def _newness(self, kind: str, name: str, message: Message) -> bool | None:
+        """Return whether a retained message is newer than the known one; None: the same again."""
+        if len(self._links) == 1:
+            return True
+        if not message.payload:
+            self._newest.forget(kind, name)
+            return True
+        return self._newest.take(kind, name, stamp_of(message.properties))
+
+    def _take_status(self, name: str, payload: bytes, link: Link, newness: bool | None) -> None:
+        if newness is False:
+            return
         node = self.nodes.setdefault(name, Node())
-        if kind == "status":
-            node.online = payload == ONLINE if payload else None
+        node.over = {link.number} if newness else node.over | {link.number}
+        node.online = payload == ONLINE if payload else None
+        self._presence.take_node(name, node.online)
+        self._report_contacts()
+        self._news.set()
+
+    def _take_info(self, name: str, piece: int, payload: bytes) -> None:
+        node = self.nodes.setdefault(name, Node())
+        if payload:
+            node.pieces[piece] = decode_info(payload)
         else:
-            node.info = decode_info(payload) if payload else None
+            node.pieces.pop(piece, None)
+        node.info = join_pieces(node.pieces)
+        if node.info is not None:
+            self._presence.take_info(name, [*node.info.parts, *node.info.fingertips])
+        self._report_contacts()
         self._news.set()
 
     def _take_answer(self, result: Result) -> None:
@@ -385,20 +471,83 @@ class SkinClient:
         if answer is not None and not answer.done():
             answer.set_result(result)
 
-    def _take_part(self, kind: PartTopic, part: str, payload: bytes) -> None:
-        streams = [
-            stream
-            for stream in self._streams
-            if kind in stream.kinds and stream.part in (None, part)
-        ]
-        if not streams:
-            self._streams_changed.set()  # nobody reads it any more
+    def _take_part(
+        self, kind: PartTopic, part: str, payload: bytes, link: Link, message: Message
+    ) -> None:
+        here = [stream for stream in self._streams if stream.part in (None, part)]
+        needed = {one for stream in here for k in stream.kinds for one in _NEEDED.get(k, (k,))}
+        if kind not in needed:
+            self._ask_again()  # nobody reads it any more
             return
         item = read(kind, part, payload)
-        if item is None:
-            self._latest.pop((kind, part), None)
-            return
-        if isinstance(item, Contact | Health):
-            self._latest[kind, part] = item
-        for stream in streams:
-            stream.put(item)
+        now_s = _now_s()
+        if isinstance(item, Touch | Slip | Over):
+            run = run_of(message.properties)
+            for event in self._order.take(item, run, now_s):
+                self._pass_on(event)
+        elif isinstance(item, Frame):
+            if self._order.take_frame(item, run_of(message.properties)):
+                self._presence.take_sign(part, now_s)
+                self._put(kind, item)
+        elif kind == "contact":
+            assert item is None or isinstance(item, Contact)
+            newness = self._newness(kind, part, message)
+            if newness is not False:
+                state = None if item is None else item.state
+                again = newness is None
+                self._presence.take_state(part, state, now_s, link.number, again=again)
+        elif self._newness(kind, part, message):
+            if not message.retain:
+                self._presence.take_sign(part, now_s)
+            if item is None:
+                self._latest.pop(part, None)
+            else:
+                assert isinstance(item, Health)
+                self._latest[part] = item
+                self._put(kind, item)
+        self._report_contacts()
+
+    def _pass_on(self, event: Touch | Slip | Over) -> None:
+        kind: PartTopic = "touch"
+        if isinstance(event, Touch):
+            self._presence.take_touch(event, _now_s())
+        else:
+            kind = "slip" if isinstance(event, Slip) else "over"
+            self._presence.take_sign(event.part, _now_s())
+        self._put(kind, event)
+
+    def _put(self, kind: PartTopic, item: Touch | Slip | Over | Frame | Health) -> None:
+        for stream in self._streams:
+            if kind in stream.kinds and stream.part in (None, item.part):
+                stream.put(item)
+
+    def _report_contacts(self) -> None:
+        for contact in self._presence.changes(_now_s()):
+            for stream in self._streams:
+                if "contact" in stream.kinds and stream.part in (None, contact.part):
+                    stream.put(contact)
+
+    async def _watch(self) -> None:
+        """Detect timeouts."""
+        while True:
+            await asyncio.sleep(WATCH_S)
+            for event in self._order.expire(_now_s()):
+                self._pass_on(event)
+            self._report_contacts()
+
+
+def _check_several(brokers: list[Broker], robot: str | None) -> None:
+    if not brokers:
+        raise RequestError("no broker is named")
+    if len(brokers) == 1:
+        return
+    if robot is None:
+        raise RequestError("with several brokers name the robot")
+    if not all(one.v5 for one in brokers):
+        raise RequestError(
+            "several brokers need MQTT 5, which distinguishes new messages from old ones"
+        )
+
+
+def _now_s() -> float:
+    return asyncio.get_running_loop().time()

@@ -1,4 +1,4 @@
-"""What a client hears, one kind at a time, and what it did not hear."""
+"""Streams of received messages, one kind at a time, with the number of lost ones."""
 
 import asyncio
 from collections import deque
@@ -12,7 +12,7 @@ from skin_host.publish.grasping import Over, Slip
 from skin_host.publish.messages import Touch
 from skin_host.publish.topics import PartTopic
 
-#: What is held for a reader that is slow; then the oldest goes, and is missed.
+#: How many items a stream holds for a slow reader; then the oldest is dropped and counted.
 HELD = {
     "touch": 10_000,
     "slip": 10_000,
@@ -21,14 +21,14 @@ HELD = {
     "contact": 1000,
     "health": 1000,
 }
-#: An event that the broker got twice comes again within so many events.
+#: An event that the broker got twice comes again within this many events.
 DUPLICATE_SPAN = 64
 
 T = TypeVar("T")
 
 
 class Stream(AsyncIterator[T], Generic[T]):
-    """All of some kinds from the moment of asking on; made by `SkinClient`, ends with it."""
+    """Items of some kinds from the request on; made by `SkinClient`, ends with it."""
 
     def __init__(self, part: str | None, *kinds: PartTopic) -> None:
         self.part = part
@@ -36,16 +36,16 @@ class Stream(AsyncIterator[T], Generic[T]):
         self._items: deque[T] = deque(maxlen=max(HELD[kind] for kind in kinds))
         self._wake = asyncio.Event()
         self._closed = False
-        #: By kind and part; each has numbers of its own.
+        #: By kind and part; each has separate numbers.
         self._last: dict[tuple[type, str], tuple[int, int]] = {}
 
     def put(self, item: T) -> None:
-        """Add what was heard."""
+        """Add a received item."""
         self._items.append(item)
         self._wake.set()
 
     def close(self) -> None:
-        """End after what is held."""
+        """End after the held items."""
         self._closed = True
         self._wake.set()
 
@@ -65,15 +65,15 @@ class Stream(AsyncIterator[T], Generic[T]):
             else:
                 return cast(T, item)
             if missed is not None:
-                # Other streams hold the same object, and may have missed less.
+                # Other streams hold the same object, and may have missed fewer.
                 return cast(T, replace(item, missed=missed) if missed else item)
 
     def _missed(self, item: Touch | Slip | Over | Frame, number: int) -> int | None:
-        """How many numbers were passed over; None for one that was heard before."""
+        """Return how many numbers are missing before this one; None if it was received before."""
         kind = type(item), item.part
         last, last_ns = self._last.get(kind, (number - 1, item.t_ns))
         if number <= last and item.t_ns <= last_ns and last - number < DUPLICATE_SPAN:
             return None
         self._last[kind] = number, item.t_ns
-        # A smaller number at a later time says that the node was started anew.
+        # A smaller number at a later time means that the node was restarted.
         return max(0, number - last - 1)

@@ -1,8 +1,8 @@
-"""`skin bench emulator`: simulated seconds per second, against boards, fidelity and touch.
+"""`skin bench emulator`: simulated seconds per second, by boards, fidelity and touch.
 
-Real time is what every row compares itself with: `times_real` is simulated time over the time
-that one core was busy, so other work on the machine does not count. The mechanics is timed
-apart, where it matters whether one taxel is touched or a thousand.
+Every row is relative to real time: `times_real` is simulated time over the time that one core was
+busy, so other work on the machine does not count. The mechanics is timed separately for one touched
+taxel and for a thousand.
 """
 
 import time
@@ -24,6 +24,8 @@ Row = dict[str, Any]
 
 SWEEP_S = 0.05
 REPEATS = 3
+#: Instead of a number of touched pads: one on each triangle of a board, as a grasping hand.
+HAND = -1
 
 
 def run(*, quick: bool = False) -> list[Row]:
@@ -40,8 +42,10 @@ def run(*, quick: bool = False) -> list[Row]:
             (1, 16, "signal", 0, 20.0),
             (3, 11, "chip", 10, 5.0),
             (3, 11, "signal", 10, 20.0),
-            (30, 11, "chip", 0, 2.0),
+            (30, 11, "chip", 0, 10.0),
+            (30, 11, "chip", HAND, 4.0),
             (30, 11, "signal", 0, 20.0),
+            (30, 11, "signal", HAND, 10.0),
             (30, 11, "signal", 1, 10.0),
             (30, 11, "signal", 1000, 5.0),
         )
@@ -52,7 +56,7 @@ def run(*, quick: bool = False) -> list[Row]:
 
 
 def robot_of(boards: int, triangles: int) -> tuple[Settings, Layout]:
-    """Settings and layout of a robot with one part of so many triangles a board."""
+    """Return settings and layout of a robot with one part and this many triangles per board."""
     wiring = wired(boards)
     document = {
         "robot": "bench",
@@ -69,23 +73,34 @@ def robot_of(boards: int, triangles: int) -> tuple[Settings, Layout]:
 def moving_presses(layout: Layout, n: int) -> list[Probe]:
     """Probes of 4 mm on n pads of a robot of `robot_of`, pressing harder and softer for ever."""
     return [
-        Probe(
-            part=part.name,
-            at=Place(taxel=taxel),
-            diameter_mm=4.0,
-            pressure_kpa=[(0.0, 20.0), (0.5, 60.0), (1.0, 20.0)],
-            repeat_s=1.0,
-        )
+        _moving_press(part.name, taxel)
         for part, taxel in [
             (part, taxel) for taxel in range(layout.n_taxels) for part in layout.parts
         ][:n]
     ]
 
 
+def grasp(layout: Layout) -> list[Probe]:
+    """Such a probe on each triangle of the first board."""
+    hand = layout.parts[0]
+    return [_moving_press(hand.name, first) for first in range(0, hand.stop - hand.start, 12)]
+
+
+def _moving_press(part: str, taxel: int) -> Probe:
+    return Probe(
+        part=part,
+        at=Place(taxel=taxel),
+        diameter_mm=4.0,
+        pressure_kpa=[(0.0, 20.0), (0.5, 60.0), (1.0, 20.0)],
+        repeat_s=1.0,
+    )
+
+
 def _scale(boards: int, triangles: int, fidelity: str, touched: int, seconds: float) -> Row:
     settings, layout = robot_of(boards, triangles)
-    scene = Scene(probe=moving_presses(layout, touched))
-    robot = Robot(settings, layout, scene, fidelity=fidelity)
+    hand = touched == HAND
+    probes = grasp(layout) if hand else moving_presses(layout, touched)
+    robot = Robot(settings, layout, Scene(probe=probes), fidelity=fidelity)
     robot.bring_up()
     robot.step(1.0)
     frames = 0
@@ -101,7 +116,8 @@ def _scale(boards: int, triangles: int, fidelity: str, touched: int, seconds: fl
         "boards": boards,
         "taxels": layout.n_taxels,
         "fidelity": fidelity,
-        "touched": touched,
+        "touched": len(probes),
+        "on_one_board": hand,
         "simulated_s": round(seconds, 1),
         "frames": frames,
         "times_real": round(seconds / spent_s, 1),
@@ -157,6 +173,7 @@ def _agreement(seconds: float) -> Row:
     sent = []
     for fidelity in ("signal", "chip"):
         robot = Robot(settings, layout, Scene(probe=moving_presses(layout, 50)), fidelity=fidelity)
+        robot.converters.by_bus = True
         robot.bring_up()
         sent.append(robot.step(seconds)["can0"])
     signal, chip = sent
@@ -188,6 +205,7 @@ def describe(rows: list[Row]) -> str:
     lines += [
         f"  {row['boards']:3d} boards {row['taxels']:5d} taxels  {row['fidelity']:6s} "
         f"{row['touched']:5d} touched  {row['times_real']:7.1f}"
+        + ("  (one board: a hand)" if row["on_one_board"] else "")
         for row in rows
         if row["part"] == "scale"
     ]

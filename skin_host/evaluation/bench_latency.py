@@ -1,27 +1,22 @@
-"""`skin bench latency`: from the last CAN frame of a sweep to the touch in a subscriber's hands.
+"""`skin bench latency`: from the last CAN frame of a sweep to the touch at a subscriber.
 
 Four processes, as on a robot: a sender that fills a bus with the frames of seven boards, one of
 which is pressed and released; the daemon at its default settings; mosquitto; a subscriber. The
-delay is the time at which the message was received less its `t_ns`, the kernel's time stamp of
+delay is the time at which the message was received minus its `t_ns`, the kernel's time stamp of
 the frame that completed the sweep. All share one clock.
 
-Beside it, in the same run and at the same load: how long a message of that size takes from
-another program to that subscriber, which is what no daemon could do without.
+For comparison, in the same run and at the same load: how long a message of that size takes from
+another program to that subscriber, which no daemon can avoid.
 """
 
 import asyncio
 import gc
-import json
 import logging
 import multiprocessing
 import tempfile
-import time
-from collections import defaultdict
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-import aiomqtt
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,18 +24,15 @@ from skin_host.bus.protocol import TAXELS, TRIANGLES
 from skin_host.daemon import Daemon
 from skin_host.errors import BrokerError, SkinError
 from skin_host.evaluation.can_stream import FULL_BUS_FRAMES_PER_S, Stream, Wire, send
+from skin_host.evaluation.touch_listener import PLAIN_TOPIC, collected, listen, publish_plain
 from skin_host.layout import build_layout
 from skin_host.publish.broker import find_mosquitto, mosquitto_broker
+from skin_host.settings import changed
 
-#: The daemon must have set itself up and calibrated by then; the lane's processor is slow.
+#: The daemon must have set itself up and calibrated by then; the test machine's processor is slow.
 _READY_S = 150.0
 _CALIBRATION_S = 1.0
 _PRESSED_TRIANGLE, _PRESSED_TAXELS = 7, slice(2, 6)
-
-#: Messages of another program: so far apart, and about as long as a touch.
-_PLAIN_S = 0.028
-_PLAIN_TOPIC = "skin/bench/plain/touch"
-_PLAIN_BYTES = 300
 
 Document = dict[str, Any]
 
@@ -102,7 +94,7 @@ async def _measure(program: str, stream: Stream, seconds: float) -> Document:
         sender_end, sender_child_end = context.Pipe()
         listener_end, listener_child_end = context.Pipe()
         processes = [
-            context.Process(target=_listen, args=(listener_child_end, broker.port), daemon=True),
+            context.Process(target=listen, args=(listener_child_end, broker.port), daemon=True),
             context.Process(target=_daemon, args=(wire, stream, broker.port), daemon=True),
             context.Process(
                 target=send,
@@ -118,9 +110,9 @@ async def _measure(program: str, stream: Stream, seconds: float) -> Document:
             listener_end.recv()
             sender_end.send(1)
             await asyncio.sleep(seconds)
-            touches_ns = await _collected(listener_end)
-            await _publish_plain(broker.port, seconds)
-            plain_ns = (await _collected(listener_end))[_PLAIN_TOPIC]
+            touches_ns = await collected(listener_end)
+            await publish_plain(broker.port, seconds)
+            plain_ns = (await collected(listener_end))[PLAIN_TOPIC]
         finally:
             for process in processes:
                 process.terminate()
@@ -148,23 +140,6 @@ def _row(delays_ns: list[int]) -> Document:
     }
 
 
-async def _collected(listener: Connection) -> dict[str, list[int]]:
-    """The delays (ns) of what the subscriber has heard since it was asked last, by topic."""
-    listener.send(None)
-    delays_ns: dict[str, list[int]] = await asyncio.to_thread(listener.recv)
-    return delays_ns
-
-
-async def _publish_plain(broker_port: int, seconds: float) -> None:
-    """Publish messages that say when they were sent, as a touch does."""
-    filling = "-" * _PLAIN_BYTES
-    async with aiomqtt.Client("127.0.0.1", broker_port, timeout=10.0) as client:
-        for _ in range(round(seconds / _PLAIN_S)):
-            document = {"event": "plain", "t_ns": time.time_ns(), "filling": filling}
-            await client.publish(_PLAIN_TOPIC, json.dumps(document), qos=1)
-            await asyncio.sleep(_PLAIN_S)
-
-
 def _scenes(stream: Stream) -> list[NDArray[np.uint8]]:
     """An untouched skin; and one that something presses and leaves, once in 40 periods."""
     shape = (40, stream.boards, TRIANGLES, TAXELS)
@@ -180,38 +155,16 @@ def _daemon(wire: Wire, stream: Stream, broker_port: int) -> None:
     """Process: `skin run`."""
     logging.disable(logging.WARNING)  # no board of this stream answers commands
     settings = stream.settings(wire.bus())
-    settings.mqtt.host, settings.mqtt.port = "127.0.0.1", broker_port
-    settings.processing.calibration.seconds = _CALIBRATION_S
     with tempfile.TemporaryDirectory(prefix="skin-bench-") as state:
-        settings.service.state_directory = state
+        settings = changed(
+            settings,
+            {
+                "mqtt.host": "127.0.0.1",
+                "mqtt.port": broker_port,
+                "processing.calibration.seconds": _CALIBRATION_S,
+                "service.state_directory": state,
+            },
+        )
         daemon = Daemon(settings, build_layout(settings, Path()))
         gc.freeze()  # as `skin run` does
         asyncio.run(daemon.run(asyncio.Event(), calibrate=True))
-
-
-def _listen(parent: Connection, broker_port: int) -> None:
-    """Process: tell the parent that there is a calibration; then collect delays for it."""
-    asyncio.run(_collect(parent, broker_port))
-
-
-async def _collect(parent: Connection, broker_port: int) -> None:
-    delays_ns: defaultdict[str, list[int]] = defaultdict(list)
-
-    def answer() -> None:
-        parent.recv()
-        parent.send(dict(delays_ns))
-        delays_ns.clear()
-
-    asyncio.get_running_loop().add_reader(parent.fileno(), answer)
-    told = False
-    async with aiomqtt.Client("127.0.0.1", broker_port, timeout=10.0) as client:
-        await client.subscribe("skin/bench/+/touch", qos=1)
-        await client.subscribe("skin/bench/nodes/+/info", qos=1)
-        async for message in client.messages:
-            now_ns = time.time_ns()
-            document = json.loads(message.payload)
-            if "event" in document:
-                delays_ns[str(message.topic)].append(now_ns - document["t_ns"])
-            elif not told and document["calibration"] is not None:
-                told = True
-                parent.send(None)

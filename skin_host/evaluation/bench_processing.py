@@ -3,7 +3,8 @@
 from typing import Any
 
 from skin_host.evaluation import speed
-from skin_host.evaluation.report import machine, select
+from skin_host.evaluation.machine import machine
+from skin_host.evaluation.report import select
 
 Row = dict[str, Any]
 

@@ -1,7 +1,10 @@
 """What messages cost: frames of many sizes to a real broker, beside an empty publish.
 
 `skin bench publish` needs mosquitto on the PATH. CPU seconds are of this process and of the
-broker's; the reference in the same run is a message of one byte.
+broker's; the reference in the same run is a message of one byte. The last rows show what a frame
+message that is encoded already costs in a turn of the loop that publishes anyway, by three ways:
+`aiomqtt`, its `publish`; `paho`, `Connection.send`, by which everything that is acknowledged goes;
+`bytes`, `Connection.write_now`, by which frames go.
 """
 
 import asyncio
@@ -20,12 +23,21 @@ import numpy as np
 
 from skin_host.errors import RequestError
 from skin_host.processing.pipeline import PressureFrame
+from skin_host.publish.address import Broker
+from skin_host.publish.connection import Connection, PackedProperties, connect, message_properties
 from skin_host.publish.frames import encode_frame
 from skin_host.publish.mqtt import Publisher
+from skin_host.publish.packets import publish_head, publish_packet
+from skin_host.publish.payload import JSON_TYPE
 from skin_host.settings import Mqtt
 
 TAXELS = (192, 816, 2000)
 RATE_HZ = 50.0
+WAYS = ("aiomqtt", "paho", "bytes")
+#: Messages in a turn: what the second costs above the first is that of messages.
+_TURNS_OF = (1, 33)
+_PAYLOAD_BYTES = 813
+_TOPIC = "skin/bench/part/frame"
 
 
 def run(*, quick: bool = False) -> dict[str, Any]:
@@ -37,10 +49,11 @@ def run(*, quick: bool = False) -> dict[str, Any]:
             with _subscribers(port, subscribers):
                 row = asyncio.run(_row(port, pid, taxels, seconds))
             rows.append(row | {"subscribers": subscribers})
+        in_turn = asyncio.run(_in_turn(port, 100 if quick else 400))
     reference = rows[0]["host_us"]
     for row in rows:
         row["times_one_byte"] = round(row["host_us"] / max(reference, 1e-9), 2)
-    return {"rate_hz": RATE_HZ, "rows": rows}
+    return {"rate_hz": RATE_HZ, "rows": rows, "in_turn": in_turn}
 
 
 def describe(document: dict[str, Any]) -> str:
@@ -56,6 +69,8 @@ def describe(document: dict[str, Any]) -> str:
         for row in document["rows"]
     ]
     lines.append("us: CPU time a message; ratio: host's against a frame of one taxel")
+    lines.append(f"one more message of {_PAYLOAD_BYTES} bytes in a turn that publishes anyway:")
+    lines += [f"  {row['way']:8} {row['message_us']:7.1f} us" for row in document["in_turn"]]
     return "\n".join(lines)
 
 
@@ -89,6 +104,52 @@ async def _row(port: int, pid: int, taxels: int, seconds: float) -> dict[str, An
         "host_us": round(own_s / max(sent, 1) * 1e6, 1),
         "broker_us": round(broker_s / max(sent, 1) * 1e6, 1),
     }
+
+
+async def _in_turn(port: int, turns: int) -> list[dict[str, Any]]:
+    """CPU time of one more message in a turn, by each way; the ways take turns, too."""
+    broker = Broker("127.0.0.1", port)
+    properties = PackedProperties.of(message_properties(broker, JSON_TYPE))
+    assert properties is not None
+    head = publish_head(_TOPIC, properties.pack())
+    payload = b"1" * _PAYLOAD_BYTES
+    took_s: dict[tuple[str, int], list[float]] = {(w, n): [] for w in WAYS for n in _TURNS_OF}
+    async with connect(broker, identifier="bench") as connection:
+        for _ in range(turns):
+            for (way, n), times_s in took_s.items():
+                await asyncio.sleep(0.002)
+                began_s = time.thread_time()
+                await _publish(connection, way, n, head, payload, properties)
+                times_s.append(time.thread_time() - began_s)
+    few, many = _TURNS_OF
+    medians_us = {key: float(np.median(times_s)) * 1e6 for key, times_s in took_s.items()}
+    return [
+        {
+            "way": way,
+            "turn_us": round(medians_us[way, few], 1),
+            "message_us": round((medians_us[way, many] - medians_us[way, few]) / (many - few), 1),
+        }
+        for way in WAYS
+    ]
+
+
+async def _publish(
+    connection: Connection,
+    way: str,
+    n: int,
+    head: bytes,
+    payload: bytes,
+    properties: PackedProperties,
+) -> None:
+    """Publish `n` messages in one turn of the loop."""
+    if way == "bytes":
+        connection.write_now([publish_packet(head, payload) for _ in range(n)])
+    elif way == "paho":
+        written = [connection.send(_TOPIC, payload, properties=properties) for _ in range(n)]
+        await asyncio.wait(written)
+    else:
+        for _ in range(n):
+            await connection.publish(_TOPIC, payload, properties=properties)
 
 
 @contextlib.contextmanager

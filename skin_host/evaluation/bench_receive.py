@@ -1,15 +1,15 @@
-"""`skin bench receive`: what reading a bus costs, by python-can's ways and by ours.
+"""`skin bench receive`: the cost of reading a bus, by python-can's methods and by ours.
 
-Three programs read the same stream and do the same job, each in a process of its own: a
-sweep of every board, as an array of 16 triangles of 12 taxels, handed over when its last
-frame is there.
+Three programs read the same stream and do the same job, each in a separate process: they return a
+sweep of every board, as an array of 16 triangles of 12 taxels, when its last frame has arrived.
 
 - notifier_async: python-can's Notifier on the event loop with an AsyncBufferedReader;
 - notifier_callback: the Notifier on the event loop with a callback;
 - batch: this project's port, assembler and plan of wake-ups, as the daemon runs them.
 
-Beside them runs what no program could do without: sleep, and have the kernel copy the frames.
-At last the whole way from frames to touches runs at the highest rate, to see what is lost.
+For comparison, the part that no program can avoid is measured: sleep, and let the kernel copy the
+frames. At the end the whole pipeline from frames to touches runs at the highest rate, to count
+losses.
 """
 
 import asyncio
@@ -26,7 +26,7 @@ import can
 import numpy as np
 
 from skin_host.bus.assembler import Assembler, Sweep
-from skin_host.bus.port import open_bus, open_port
+from skin_host.bus.opening import open_bus, open_port
 from skin_host.bus.protocol import (
     HEADER_A,
     HEADER_B,
@@ -45,7 +45,7 @@ from skin_host.settings import Settings
 PATHS = ("notifier_async", "notifier_callback", "batch")
 #: Frames a second; 0 is as fast as the sender can.
 RATES = (2000, 8000, 32000, 0)
-#: The paths run so long before the measurement begins; the whole way takes a calibration first.
+#: Warm-up time of each path before the measurement; the whole pipeline takes a calibration first.
 _WARM_UP_S = dict.fromkeys(PATHS, 0.5) | {"kernel": 0.5, "pipeline": 3.0}
 _CALIBRATION_S = 1.0
 #: Frames that have not come within this time after the last are lost.
@@ -58,7 +58,7 @@ def run(*, quick: bool = False) -> dict[str, Any]:
     """Measure every path at every rate, one after the other.
 
     Args:
-        quick: 1 s for each instead of 5 s, and 5 s instead of 60 s for the whole way.
+        quick: 1 s for each instead of 5 s, and 5 s instead of 60 s for the whole pipeline.
     """
     wire = Wire.here()
     seconds, long_s = (1.0, 5.0) if quick else (5.0, 60.0)
@@ -107,7 +107,7 @@ def measure(wire: Wire, path: str, frames_per_s: int, seconds: float) -> Row:
         seconds: of the measurement, after warming up.
     """
     stream = Stream.of(frames_per_s)
-    # Four periods of an untouched skin's noise: what is touched is not the question here.
+    # Four periods of an untouched skin's noise, because the result does not depend on touches.
     shape = (4, stream.boards, TRIANGLES, TAXELS)
     quiet = np.random.default_rng(0).integers(239, 242, shape).astype(np.uint8)
     context = multiprocessing.get_context("spawn")
@@ -137,7 +137,7 @@ def measure(wire: Wire, path: str, frames_per_s: int, seconds: float) -> Row:
 
 @dataclass(slots=True)
 class _Meter:
-    """What a path has done: frames taken, and the delay of each sweep in ns."""
+    """Results of a path: frames taken, and the delay of each sweep in ns."""
 
     frames: int = 0
     delays_ns: list[int] = field(default_factory=list)
@@ -165,12 +165,12 @@ class _Meter:
 
 
 def _read(parent: Connection, wire: Wire, path: str, stream: Stream) -> None:
-    """Process: read by one path, as the parent orders."""
+    """Process: read by one path, on the parent's commands."""
     asyncio.run(_PATHS[path](parent, wire, stream))
 
 
 async def _obey(parent: Connection, meter: _Meter) -> None:
-    """Measure between the parent's orders; then wait for the last frames, and answer."""
+    """Measure between the parent's commands; then wait for the last frames, and answer."""
     parent.send("ready")
     orders: asyncio.Queue[Any] = asyncio.Queue()
     loop = asyncio.get_running_loop()
@@ -189,7 +189,7 @@ async def _obey(parent: Connection, meter: _Meter) -> None:
 
 
 class _PerFrameDecoder:
-    """The same sweeps as the assembler's, as one writes it for one message at a time."""
+    """The same sweeps as the assembler's, in the usual way of one message at a time."""
 
     _ALL = (1 << 2 * TRIANGLES) - 1
 
@@ -252,7 +252,7 @@ async def _batch(parent: Connection, wire: Wire, stream: Stream) -> None:
     settings = stream.settings(wire.bus())
     boards = list(enumerate(build_layout(settings, Path()).boards))
     assembler = Assembler(boards, settings.receive.close_periods)
-    await _read_batches(parent, settings, meter, assembler.feed)
+    await _read_batches(parent, settings, meter, lambda batch: assembler.feed(batch).sweeps)
 
 
 async def _kernel(parent: Connection, wire: Wire, stream: Stream) -> None:
@@ -266,7 +266,7 @@ async def _kernel(parent: Connection, wire: Wire, stream: Stream) -> None:
             time.sleep(settings.receive.poll_ms * 1e-3)
             meter.frames += len(port.read())
 
-    # In a thread, so that no event loop stands between the sleep and the read.
+    # In a thread, so that there is no event loop between the sleep and the read.
     reading = threading.Thread(target=read)
     reading.start()
     await _obey(parent, meter)
@@ -282,8 +282,7 @@ async def _pipeline(parent: Connection, wire: Wire, stream: Stream) -> None:
     engine.begin_calibration(_CALIBRATION_S)
 
     def feed(batch: FrameBatch) -> list[Sweep]:
-        engine.feed(BUS, batch)
-        sweeps = engine.sweeps
+        sweeps = engine.feed(BUS, batch).sweeps
         if engine.calibrating and engine.calibration_progress() >= 1.0:
             engine.use(engine.end_calibration(""))
         return sweeps

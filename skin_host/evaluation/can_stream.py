@@ -1,7 +1,7 @@
-"""A stream of skin frames, sent at an exact pace by a process of its own.
+"""A stream of skin frames, sent at an exact pace by a separate process.
 
-Boards of sixteen triangles send their bursts one after the other, evenly over the period, at
-the spacing of a full 1 Mbit/s bus (8000 frames a second), or closer where more is asked for.
+Boards of sixteen triangles send their bursts one after the other, evenly over the period, at the
+spacing of a full 1 Mbit/s bus (8000 frames a second), or closer for higher rates.
 """
 
 import socket
@@ -26,12 +26,12 @@ FRAMES_PER_SWEEP = 2 * TRIANGLES
 #: With this period seven boards fill a bus (about the fastest an AD7147 can be read).
 _PERIOD_S = 0.028
 _MOST_BOARDS = 14
-_CAN_FRAME = struct.Struct("=IB3x8s")
+CAN_FRAME = struct.Struct("=IB3x8s")
 
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """What is sent. `frames_per_s` 0 means as fast as the sender can.
+    """The sent stream. `frames_per_s` 0 means as fast as the sender can.
 
     Attributes:
         boards: how many, at addresses 1, 2, ...
@@ -82,7 +82,7 @@ class Stream:
             )
             start_s = board * self.period_ms * 1e-3 / self.boards
             frames += [
-                (start_s + i * spacing_s, _CAN_FRAME.pack(identifier, 8, row.tobytes()))
+                (start_s + i * spacing_s, CAN_FRAME.pack(identifier, 8, row.tobytes()))
                 for i, (identifier, row) in enumerate(zip(ids.tolist(), data, strict=True))
             ]
         return sorted(frames, key=lambda frame: frame[0])
@@ -116,7 +116,7 @@ class Wire:
         return "vcan" if self.vcan else "stand-in"
 
     def bus(self) -> Bus:
-        """What a configuration says to receive from this wire; to be called in each process."""
+        """Bus of a configuration that receives from this wire; to be called in each process."""
         if self.vcan:
             return Bus(channel=self.vcan)
         register()
@@ -132,14 +132,14 @@ class Wire:
         receiver, sender = self.ports
         sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         sock.bind((HOST, sender))
-        # Not connected: as on a bus, it is no error that nobody listens.
+        # Not connected: as on a bus, a missing receiver is not an error.
         return lambda frame: sock.sendto(frame, (HOST, receiver))
 
 
 def send(
     parent: Connection, wire: Wire, stream: Stream, seconds: float, scenes: list[NDArray[np.uint8]]
 ) -> None:
-    """Process: send for `seconds`; tell the parent when it begins and how much it was.
+    """Process: send for `seconds`; report to the parent the begin and the number of frames.
 
     Args:
         parent: gets None at the begin, the number of frames at the end. A number from it
@@ -163,7 +163,7 @@ def send(
             scene = periods[parent.recv()]
         period = scene[number % len(scene)]
         if stream.frames_per_s:
-            # A sleep would be late; the sender has a core to itself and spins.
+            # A sleep would be late; the sender has its own core and spins.
             period_at_s = start_s + elapsed_s
             for offset_s, frame in period:
                 while now() < period_at_s + offset_s:

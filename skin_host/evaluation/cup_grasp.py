@@ -1,9 +1,9 @@
-"""The grasp of the paper's section VII: fingers close on a fragile cup, felt or not.
+"""The grasp of the paper's section VII: fingers close on a fragile cup, with or without feedback.
 
 Everything between skin and hand is real: the emulated hand sends its frames on CAN, a daemon
-calibrates, decides and publishes over MQTT, and the hand listens for touches. Each finger
-closes at a steady speed until a taxel of its tip is touched. The cup's wall gives way like a
-spring and buckles above a force; without feedback the fingers close to where the paper's did.
+calibrates, decides and publishes over MQTT, and the hand subscribes to touches. Each finger closes
+at a steady speed until a taxel of its tip is touched. The cup's wall yields like a spring and
+buckles above a force; without feedback the fingers close as far as the paper's did.
 """
 
 import asyncio
@@ -15,12 +15,12 @@ import can
 import numpy as np
 
 from emulator.robot import LiveProbe, Robot
-from emulator.scene import Place, Probe
+from emulator.scene import Place, Probe, Scene
 from skin_host.client import SkinClient
 from skin_host.daemon import Daemon
 from skin_host.layout import TAXELS_PER_TRIANGLE, Layout
 from skin_host.publish.broker import local_broker
-from skin_host.settings import Settings
+from skin_host.settings import Settings, changed
 
 HAND = "left_hand"
 #: Triangles of the part: index, middle, thumb.
@@ -32,7 +32,7 @@ CLOSING_MM_PER_S = 10.0
 CUP_MM_PER_N = 0.5
 BUCKLES_N = 4.0
 FINGERTIP_MM = 9.0
-#: Blind, the fingers close so far beyond the wall.
+#: Without feedback, the fingers close this far beyond the wall.
 BLIND_MM = 6.0
 #: The paper's threshold is about 2.6 units, 6 kPa.
 FELT_KPA = 6.0
@@ -62,13 +62,13 @@ class Grasp:
 
     @property
     def intact(self) -> bool:
-        """Whether the cup is whole."""
+        """Return whether the cup is intact."""
         return max(self.peak_n) < BUCKLES_N
 
 
 @dataclass(slots=True)
 class _Felt:
-    """What the hand has heard from the skin: contacts that have not ended, by their id."""
+    """Contacts received from the skin that have not ended, by their id."""
 
     contacts: dict[int, set[int]] = field(default_factory=dict)
     free: asyncio.Event = field(default_factory=asyncio.Event)
@@ -81,7 +81,7 @@ class _Felt:
 
 
 async def run(settings: Settings, layout: Layout, grasps: int) -> list[Grasp]:
-    """Grasp cups, the first one blind, the others with feedback.
+    """Grasp cups, the first one without feedback, the others with it.
 
     Args:
         settings: a robot with a part `left_hand` whose triangles 0 to 4 are fingertips; its
@@ -93,15 +93,20 @@ async def run(settings: Settings, layout: Layout, grasps: int) -> list[Grasp]:
         SkinError: no broker, or the daemon fails.
     """
     (name,) = settings.buses
-    settings.buses[name].interface, settings.buses[name].channel = "virtual", "cup-grasp"
-    settings.processing.calibration.seconds = CALIBRATION_S
-    robot = Robot(settings, layout)
+    settings = changed(
+        settings,
+        {
+            f"buses.{name}.interface": "virtual",
+            f"buses.{name}.channel": "cup-grasp",
+            "processing.calibration.seconds": CALIBRATION_S,
+        },
+    )
+    robot = Robot(settings, layout, Scene(quiet=True))
     stop = asyncio.Event()
     async with contextlib.AsyncExitStack() as stack:
-        settings.service.state_directory = stack.enter_context(tempfile.TemporaryDirectory())
+        state = stack.enter_context(tempfile.TemporaryDirectory())
         broker = await stack.enter_async_context(local_broker())
-        settings.mqtt.host, settings.mqtt.port = broker.host, broker.port
-        settings.mqtt.protocol = broker.protocol
+        settings = changed(settings, {"service.state_directory": state} | broker.settings)
         bus = stack.enter_context(can.Bus(interface="virtual", channel="cup-grasp"))
         living = asyncio.create_task(robot.run({name: bus}))
         daemon = Daemon(settings, layout)
@@ -171,8 +176,8 @@ class _Hand:
         ]
 
     async def grasp(self, felt: _Felt, rng: np.random.Generator, *, feedback: bool) -> Grasp:
-        """Close the fingers, hold, let go and rest."""
-        # Each finger starts at some distance of its own from the wall.
+        """Close the fingers, hold, release and rest."""
+        # Each finger starts at a different distance from the wall.
         closed_mm = -rng.uniform(1.0, 4.0, len(FINGERS))
         n = len(FINGERS)
         result = Grasp(feedback, [0.0] * n, [0.0] * n, [0] * n, 0.0)

@@ -1,13 +1,13 @@
-"""Loading histories, and what the emulator's foam makes of them.
+"""Loading histories, and the response of the emulator's foam to them.
 
-The histories are those that a compensator must stand: the paper's calibration record and
-its hardest test, and what a robot's hand does all day. A position is commanded, given as
-the pressure C that the foam would show without relaxation, and reached through the load
-cell's compliance; the foam's truth answers with the C it shows and the pressure P it bears.
+The histories are difficult ones for a compensator: the paper's calibration record and its hardest
+test, and the daily work of a robot's hand. A position is commanded, given as the pressure C that
+the foam would show without relaxation, and reached through the load cell's compliance; the foam's
+truth responds with the C it shows and the pressure P it bears.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,11 @@ from emulator.viscoelastic import FoamTruth, TruthKind
 Floats = NDArray[np.float64]
 #: A commanded change takes this long: the robot's fastest move over the foam.
 RAMP_S = 0.08
-#: The truth is worked out this finely after a change, and ever more coarsely in a hold.
+#: The truth is computed in steps of the first length after a change, growing up to the second in a
+#: hold.
 FINE_S, COARSE_S, GROWTH = 0.04, 1.0, 1.12
 SAMPLE_HZ = 25.0
-TRUTHS: tuple[TruthKind, ...] = ("A", "S", "L", "H")
+TRUTHS: tuple[TruthKind, ...] = ("F", "M", "H", "S", "A", "L")
 
 Holds = list[tuple[float, float]]
 
@@ -31,8 +32,8 @@ class Record:
 
     Attributes:
         dt_s: distance of the samples.
-        momentary_kpa: C, what a perfect reading would be converted to, [t].
-        pressure_kpa: P, what the load cell would show, [t].
+        momentary_kpa: C, what a perfect reading would be converted to, [t] or [t, pads].
+        pressure_kpa: P, what a load cell would show, alike.
         resting: whether nothing presses, [t].
     """
 
@@ -102,18 +103,24 @@ HISTORIES: dict[str, Callable[[float], Holds]] = {
 
 
 def record(kind: TruthKind, holds: Holds, sample_hz: float = SAMPLE_HZ) -> Record:
-    """Play a history to the truth `kind` and sample what comes of it."""
-    truth = FoamTruth(kind, 1)
+    """Play a history to the truth `kind` under one pad; arrays are [t]."""
+    played = play(FoamTruth(kind, 1), holds, sample_hz)
+    momentary, pressure = played.momentary_kpa[:, 0], played.pressure_kpa[:, 0]
+    return replace(played, momentary_kpa=momentary, pressure_kpa=pressure)
+
+
+def play(truth: FoamTruth, holds: Holds, sample_hz: float = SAMPLE_HZ) -> Record:
+    """Play a history to foam that was never touched; arrays are [t, pads]."""
     now_s, level = 0.0, 0.0
-    times, momentary, pressure = [0.0], [0.0], [0.0]
+    times, momentary, pressure = [0.0], [truth.elastic_kpa.copy()], [truth.pressure_kpa.copy()]
 
     def go(command: float, dt_s: float) -> None:
         nonlocal now_s
         now_s += dt_s
-        truth.step_held(np.array([command]), dt_s)
+        truth.step_held(np.full(len(truth), command), dt_s)
         times.append(now_s)
-        momentary.append(float(truth.elastic_kpa[0]))
-        pressure.append(float(truth.pressure_kpa[0]))
+        momentary.append(truth.elastic_kpa.copy())
+        pressure.append(truth.pressure_kpa.copy())
 
     for target, seconds in holds:
         end_s = now_s + seconds
@@ -132,7 +139,12 @@ def record(kind: TruthKind, holds: Holds, sample_hz: float = SAMPLE_HZ) -> Recor
     phase = np.minimum(np.searchsorted(ends_s, sampled_s), len(holds) - 1)
     return Record(
         dt_s,
-        np.interp(sampled_s, times, momentary),
-        np.maximum(np.interp(sampled_s, times, pressure), 0.0),
+        _sampled(sampled_s, times, momentary),
+        np.maximum(_sampled(sampled_s, times, pressure), 0.0),
         ~pressed[phase],
     )
+
+
+def _sampled(at_s: Floats, times: list[float], values: list[Floats]) -> Floats:
+    columns = np.array(values).T
+    return np.stack([np.interp(at_s, times, column) for column in columns], axis=1)

@@ -23,10 +23,10 @@ NEIGHBOUR_MM = 1.6 * PITCH_MM
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What presses: probe, activation of a pad that it covers, noise, and the foam's cover.
+    """A press: probe, activation of a pad that it covers, noise, and the foam's cover.
 
-    `membrane_mm` is how far the foam's surface is drawn down around the probe; 0 is springs
-    side by side, as the template takes them to be.
+    `membrane_mm` is how far the foam's surface is drawn down around the probe; 0 is a layer of
+    independent springs, as the template assumes.
     """
 
     probe_mm: float
@@ -37,7 +37,7 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """Radial errors and said standard errors [n] of one method, mm, and its time per contact."""
+    """Radial errors and estimated standard errors [n] of a method, mm; its time per contact."""
 
     error_mm: Floats
     said_mm: Floats
@@ -116,7 +116,7 @@ class PressedSkin:
         groups = []
         while left:
             group = [left.pop()]
-            for taxel in group:  # grows while it is walked
+            for taxel in group:  # grows during the loop
                 near = left.intersection(self.neighbours[taxel])
                 left -= near
                 group.extend(near)
@@ -193,7 +193,7 @@ def _cost_ns(
 def separation(
     rng: np.random.Generator, apart_mm: float, presses: int, probe_mm: float = 8.0
 ) -> tuple[float, float]:
-    """Two probes side by side, and one alone: shares of presses told as two.
+    """Two probes side by side, and one alone: shares of presses reported as two.
 
     The second probe presses at 70 % of the first's activation, in a random direction.
     """

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from emulator.noise import SampledNoise
 from skin_host.layout import Layout, build_layout
 from skin_host.processing.calibration import Calibrator
 from skin_host.processing.pipeline import Pipeline, PressureFrame
@@ -59,7 +60,8 @@ class Rig:
 
     Args:
         boards: of 192 pads.
-        noise_units: standard deviation of a reading before it is rounded.
+        noise_units: standard deviation of a reading before it is rounded; None for noise as
+            it was measured on real skin, conversions that are sent again included.
         seed: of everything random.
         hz: sweeps a second.
         kind: of the triangles.
@@ -70,7 +72,7 @@ class Rig:
     def __init__(
         self,
         boards: int,
-        noise_units: float,
+        noise_units: float | None,
         *,
         seed: int = 0,
         hz: float = 25.0,
@@ -82,13 +84,15 @@ class Rig:
         self.n = self.layout.n_taxels
         self.dt_s = 1.0 / hz
         self._dt_ns = round(1e9 / hz)
-        self._noise = np.float32(noise_units)
+        self._noise = np.float32(noise_units or 0.0)
+        self._measured = SampledNoise(16 * boards, seed) if noise_units is None else None
         self._rng = np.random.default_rng(seed)
         self._present = np.ones(self.n, dtype=np.bool_)
         self._resting = self._rng.uniform(200.0, 240.0, self.n).astype(np.float32)
         self.t_ns = 0
         calibrator = Calibrator(self.layout)
         for _ in range(round(calibrate_s * hz)):
+            self.t_ns += self._dt_ns
             calibrator.add(0, self.read(0.0), self._present)
         self.calibration = calibrator.finish("rig", "1970-01-01T00:00:00Z")
         self.pipeline = Pipeline(self.layout, self.settings.processing, self.calibration)
@@ -98,6 +102,8 @@ class Rig:
         level = self._resting - np.asarray(activation_units, dtype=np.float32)
         if self._noise > 0.0:
             level = level + self._noise * self._rng.standard_normal(self.n, dtype=np.float32)
+        if self._measured is not None:
+            level = level + self._measured.at(self.t_ns).astype(np.float32)
         return np.asarray(np.clip(np.rint(level), 0.0, 255.0), dtype=np.uint8)
 
     def step(self, activation_units: ArrayLike) -> PressureFrame:

@@ -1,17 +1,50 @@
-"""Pictures of `skin report --rig`, one for each figure of the paper's section VI."""
+"""Recordings of `skin report --rig` and their pictures, one for each figure of section VI."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from emulator.bench import NAMED_PADS, PalmRig
-from skin_host.evaluation.rig_report import Corrected, Results
+from emulator.experiments import Presses, Scan
+from skin_host.evaluation.cup_grasp import Grasp
+
+Floats = NDArray[np.float64]
 
 #: One hue for each pad or model, dark enough for print.
 COLOURS = ("#1b5e9e", "#c4541a", "#2e7d4f", "#7a4f9a", "#5f5f5f")
 PROBES_MM = (2.0, 3.0, 4.0, 5.0, 6.0)
 PALM_PITCH_MM = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Corrected:
+    """A long recording and what the host makes of it, in steps of a second.
+
+    Attributes:
+        t_s, momentary_kpa, true_kpa: float64[m], time, C and P*.
+        corrected_kpa: by model, float64[m], C - relax.
+    """
+
+    t_s: Floats
+    momentary_kpa: Floats
+    true_kpa: Floats
+    corrected_kpa: dict[str, Floats]
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    """All recordings of a report."""
+
+    area: Scan
+    line: Scan
+    presses: Presses
+    fig_17: Corrected
+    fig_18: Corrected
+    hour_s: float
+    grasps: list[Grasp]
 
 
 def plot(results: Results, output: Path) -> list[str]:

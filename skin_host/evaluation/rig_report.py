@@ -8,7 +8,6 @@ section VII goes through a daemon over CAN and MQTT.
 
 import asyncio
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +21,11 @@ from skin_host.cli.common import load_skin
 from skin_host.demo import configuration
 from skin_host.evaluation.cup_grasp import Grasp
 from skin_host.evaluation.cup_grasp import run as grasp_cups
+from skin_host.evaluation.rig_plots import Corrected, Results, plot
 from skin_host.processing.fitting import fit, merge
 from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.relaxation import make_model
+from skin_host.relaxation_settings import FITTED
 
 Row = dict[str, Any]
 Floats = NDArray[np.float64]
@@ -33,38 +34,9 @@ PRESS_KPA = 155.0
 #: Fig. 17: one hour at about 65 kPa and 75 minutes of rest.
 HOUR_DEPTH_MM = 1.05
 HOUR: list[tuple[float, float]] = [(HOUR_DEPTH_MM, 3600.0), (0.0, 4500.0)]
-MODELS = ("published", "asymmetric", "asymmetric_clock")
 #: The relaxation models see means of this length; the paper's own averages are as long.
 MEAN_S = 1.0
 SAMPLES_PER_MEAN = 25
-
-
-@dataclass(frozen=True, slots=True)
-class Corrected:
-    """A long recording and what the host makes of it, in steps of a second.
-
-    Attributes:
-        t_s, momentary_kpa, true_kpa: float64[m], time, C and P*.
-        corrected_kpa: by model, float64[m], C - relax.
-    """
-
-    t_s: Floats
-    momentary_kpa: Floats
-    true_kpa: Floats
-    corrected_kpa: dict[str, Floats]
-
-
-@dataclass(frozen=True, slots=True)
-class Results:
-    """All recordings of a report."""
-
-    area: Scan
-    line: Scan
-    presses: Presses
-    fig_17: Corrected
-    fig_18: Corrected
-    hour_s: float
-    grasps: list[Grasp]
 
 
 def run(*, quick: bool = False, output: Path | None = None) -> list[Row]:
@@ -77,7 +49,6 @@ def run(*, quick: bool = False, output: Path | None = None) -> list[Row]:
     results = measure(quick=quick)
     rows = facts(results)
     if output is not None:
-        from skin_host.evaluation.rig_plots import plot
         from skin_host.files import write_atomic
 
         output.mkdir(parents=True, exist_ok=True)
@@ -127,11 +98,11 @@ def _correct(hour: Hold, steps: Hold, hold_s: float) -> tuple[Corrected, Correct
     momentary = [curve.kpa((one.s_ff / UNIT_FF)[:, None])[:, 0] for one in (hour, steps)]
     release = round(hold_s / MEAN_S) * SAMPLES_PER_MEAN
     record = merge(MEAN_S / SAMPLES_PER_MEAN, momentary[0], hour.pressure_kpa, 0, release)
-    fits = {model: fit(model, record).parameters for model in MODELS}
+    fits = {model: fit(model, record).parameters for model in FITTED}
     corrected = []
     for one, c_kpa in zip((hour, steps), momentary, strict=True):
         c_mean, p_mean, t_mean = (_means(values) for values in (c_kpa, one.pressure_kpa, one.t_s))
-        by_model = {}
+        by_model: dict[str, Floats] = {}
         for name, parameters in fits.items():
             model = make_model(name, 1, parameters)
             relax = np.array(

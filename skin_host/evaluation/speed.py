@@ -6,6 +6,7 @@ least of several repeats counts: what is above it is other programs.
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,10 @@ from numpy.typing import NDArray
 
 from skin_host.evaluation.accuracy import VARIANTS
 from skin_host.evaluation.rig import Rig
-from skin_host.processing.relaxation import make_model, stand_in
+from skin_host.processing.curves import KNOTS_UNITS, Curves, CurveVerdict, Memory
+from skin_host.processing.pipeline import Pipeline
+from skin_host.processing.pressure import PressureCurve
+from skin_host.processing.relaxation import OWN_MEANS, make_model, stand_in
 
 Row = dict[str, Any]
 
@@ -40,23 +44,26 @@ def models(seconds: float, sizes: tuple[int, ...] = TAXELS) -> list[Row]:
 
             rows.append(_row("memory_copy", 0.0, dtype, n, _ns(copy, n, seconds), 0))
             for variant in VARIANTS:
-                if variant.dtype != "float64":
-                    continue  # both types are timed anyway
+                own_means = variant.model in OWN_MEANS
                 model = make_model(
                     variant.model,
                     n,
                     stand_in(variant.model, "mid"),
-                    update_s=variant.update_s,
+                    held=own_means and variant.update_s > 0.0,
                     dtype=dtype,
                 )
+                # The pipeline takes the means of a window anyway, and steps the model by them.
+                windowed = variant.update_s > 0.0 and not own_means
+                every = round(variant.update_s * HZ) if windowed else 1
 
                 def run(
                     step_once: Callable[..., Any] = model.step,
                     samples: NDArray[Any] = samples,
                     out: NDArray[Any] = out,
+                    every: int = every,
                 ) -> None:
-                    for step in range(STEPS):
-                        step_once(samples[step % 8], STEPS_S[step % 4], out)
+                    for step in range(0, STEPS, every):
+                        step_once(samples[step % 8], every * STEPS_S[step % 4], out)
 
                 ns = _ns(run, n, seconds)
                 row = _row(variant.model, variant.update_s, dtype, n, ns, model.bytes_per_taxel)
@@ -105,6 +112,59 @@ def pipeline(seconds: float, sizes: tuple[int, ...] = (1, 10)) -> list[Row]:
                         "ns_per_taxel_step": _ns(run, n, seconds),
                     }
                 )
+    return rows
+
+
+def own_curves(seconds: float, boards: int = 10) -> list[Row]:
+    """ns per taxel-step from bytes to kPa: pads with equation (1), and with curves of their own.
+
+    Pads with their own curves have the foam's memory from the same recording, here three plays,
+    in place of the configured model, and their noise is smoothed.
+
+    Args:
+        seconds: spent on each figure.
+        boards: of 192 taxels.
+    """
+    rows: list[Row] = []
+    for touched in (0, 12):
+        rig = Rig(boards, 0.4, seed=2, hz=HZ)
+        n = rig.n
+        knots_kpa = PressureCurve(2.88).kpa(KNOTS_UNITS[:, np.newaxis])[:, 0]
+        curves = Curves(
+            kpa=np.tile(knots_kpa, (n, 1)),
+            beyond_units=np.full(n, 60.0),
+            noise_units=np.full(n, 0.4),
+            error_kpa=np.full(n, 1.0),
+            verdict=np.full(n, CurveVerdict.GOOD, np.uint8),
+            highest_kpa=150.0,
+            lag_s=0.0,
+            memory=Memory((5.0, 20.0, 60.0), (0.1, 0.1, 0.05)),
+        )
+        settings = rig.settings.processing
+        pipelines = {
+            "equation (1)": rig.pipeline,
+            "own curves": Pipeline(rig.layout, settings, replace(rig.calibration, curves=curves)),
+        }
+        activation = np.where(np.arange(n) < touched, 20.0, 0.0)
+        sweeps = [rig.read(activation) for _ in range(STEPS)]
+        present = np.ones(n, dtype=np.bool_)
+        times = np.cumsum(np.resize(STEPS_S, STEPS) * 1e9).astype(np.int64).tolist()
+        for name, pipeline in pipelines.items():
+            start_ns = [0]
+
+            def run(
+                pipeline: Pipeline = pipeline,
+                sweeps: list[NDArray[np.uint8]] = sweeps,
+                start_ns: list[int] = start_ns,
+                times: list[int] = times,
+                present: NDArray[np.bool_] = present,
+            ) -> None:
+                for sweep, t_ns in zip(sweeps, times, strict=True):
+                    pipeline.step(0, sweep, present, start_ns[0] + t_ns)
+                start_ns[0] += times[-1]
+
+            ns = _ns(run, n, seconds)
+            rows.append({"taxels": n, "touched": touched, "curve": name, "ns_per_taxel_step": ns})
     return rows
 
 

@@ -30,7 +30,11 @@ class StandInBus(SocketcanBus):
         receive, _, peer = channel.partition("-")
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-        self.socket.bind((HOST, int(receive)))
+        try:
+            self.socket.bind((HOST, int(receive)))
+        except OSError:
+            self.socket.close()
+            raise
         self.port: int = self.socket.getsockname()[1]
         self.channel = channel
         self.channel_info = f"stand-in channel '{channel}'"

@@ -1,34 +1,109 @@
 """The tables of the report: a head, and rows of cells as they are printed."""
 
-from dataclasses import astuple
 from typing import Any
 
-from skin_host.evaluation.accuracy import FAMILY, PERFECT, VARIANTS, Variant
+from skin_host.evaluation.accuracy import (
+    FAMILY,
+    FITTED_FOAM,
+    HELD_OUT,
+    HINDSIGHT,
+    JUDGED_HISTORIES,
+    NOISE_UNITS,
+    PERFECT,
+    SCENARIOS,
+    VARIANTS,
+    Variant,
+)
 from skin_host.evaluation.histories import HISTORIES
+
+#: RMSE of a pad over a recording, then over usable pads; RMS of the mean over usable pads.
+ERRORS_KPA = ("median_rmse_kpa", "p95_rmse_kpa", "skin_rms_kpa")
 
 Row = dict[str, Any]
 Report = dict[str, Any]
 Table = tuple[list[str], list[list[str]]]
 
-#: The variants but for their numbers' type.
-ALONE = [variant for variant in VARIANTS if variant.dtype == "float64"]
-#: What happens to it at every press and release, its plays, is in no model.
-STRANGER = "H"
 IN_COMMON = {"law": "its law", "cause": "a cause", "none": "nothing"}
+
+
+def real(document: Report) -> Table:
+    """What was measured on recordings of real skin, and below it what others reach."""
+    head = ["recording", "live", "usable", "false begins in 10 s", "at 60 kPa", "at 40 kPa"]
+    head += ["begins a pad", "median kPa", "95 % kPa", "mean of the skin kPa", "valid"]
+    head += ["lag s", "with it: median", "95 %", "mean"]
+    rows = [
+        [
+            row["recording"],
+            str(row["pads_live"]),
+            str(row["pads_usable"]),
+            str(row["touches_begun_10s"]),
+            _number(row["detected_60kpa"], "{:.1%}"),
+            _number(row["detected_40kpa"], "{:.1%}"),
+            _number(row["begins_per_pad"], "{:.2f}"),
+            *(_number(row[name], "{:.1f}") for name in ERRORS_KPA),
+            _number(row["valid_share"], "{:.1%}"),
+            _number(row["lag_s"], "{:.2f}"),
+            *(_number(row[f"lagged_{name}"], "{:.1f}") for name in ERRORS_KPA),
+        ]
+        for row in document["real"]
+    ]
+    return head, rows
+
+
+def emulated(document: Report) -> Table:
+    """Emulated pads beside recorded ones."""
+    rows = [
+        [row["figure"], row["unit"], _number(row["recorded"], "{:.2f}"), f"{row['emulated']:.2f}"]
+        for row in document["emulated"]
+    ]
+    return ["figure", "unit", "recorded", "emulated"], rows
+
+
+def published(document: Report) -> Table:
+    """What others reach on the same recordings."""
+    rows = [
+        [
+            row["method"],
+            row["recording"],
+            str(row["pads"]),
+            f"{row['median_rmse_kpa']:.1f}",
+            f"{row['p95_rmse_kpa']:.1f}",
+            row["source"],
+        ]
+        for row in document["published"]
+    ]
+    return ["method", "recording", "pads", "median kPa", "95 % kPa", "source"], rows
+
+
+def as_text(head: list[str], rows: list[list[str]]) -> str:
+    """A table for a terminal: a line for each row, columns as wide as they need."""
+    widths = [max(len(cells[column]) for cells in [head, *rows]) for column in range(len(head))]
+    return "\n".join(
+        "  ".join(
+            cell.ljust(width) if column == 0 else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(cells, widths, strict=True))
+        )
+        for cells in [head, *rows]
+    )
+
+
+def _number(value: float | None, form: str) -> str:
+    return "" if value is None else form.format(value)
 
 
 def summary(report: Report) -> Table:
     """Error and cost of each variant, the Pareto front starred."""
-    head = ["model", "states", "type", "RMS kPa", "worst RMS", "with noise", "ns", "bytes", ""]
+    names = [scenario.name for scenario in SCENARIOS]
+    head = ["model", "states", "type", *names, "worst RMS", "with noise", "ns", "bytes", ""]
     rows = [
         [
             line["model"],
             _states(line["update_s"]),
             line["dtype"],
-            f"{line['rms_kpa']:.2f}",
+            *(_number(line["scenarios"].get(name), "{:.2f}") for name in names),
             f"{line['worst_rms_kpa']:.2f}",
             f"{line['noisy_rms_kpa']:.2f}",
-            f"{line['ns_per_taxel_step']:.1f}",
+            f"{line['ns_per_taxel_step']:.2f}",
             str(line["bytes_per_taxel"]),
             "*" if line["pareto"] else "",
         ]
@@ -38,12 +113,12 @@ def summary(report: Report) -> Table:
 
 
 def goals(report: Report) -> Table:
-    """What was set out to reach, and what was measured."""
+    """Return the goals and the measured values."""
     rows = [
         [
             goal["figure"],
-            f"{goal['measured']:.3g}",
-            f"{goal['must']:g}",
+            "not measured" if goal["measured"] is None else f"{goal['measured']:.3g}",
+            f"{'at least ' if goal['at_least'] else ''}{goal['must']:g}",
             f"{goal['aim']:g}",
             "aim reached" if goal["aim_reached"] else "reached" if goal["reached"] else "missed",
         ]
@@ -53,29 +128,24 @@ def goals(report: Report) -> Table:
 
 
 def errors(report: Report, noise: float, measure: str) -> Table:
-    """One measure of the errors of all variants on all truths and histories."""
-    truths = list(dict.fromkeys(row["truth"] for row in report["rows"]))
+    """One measure of the errors of all variants on all truths and histories, foam as fitted."""
+    truths = _truths(report)
     histories = [name for name in HISTORIES if measure != "rest_rms_kpa" or name != "walk"]
     head = ["model", "states"] + [f"{truth} {name}" for truth in truths for name in histories]
     found = {
-        (row["model"], row["update_s"], row["dtype"], row["truth"], row["history"]): row[measure]
+        (row["model"], row["update_s"], row["truth"], row["history"]): row[measure]
         for row in report["rows"]
-        if row["noise_units"] == noise
+        if row["noise_units"] == noise and row["scenario"] == FITTED_FOAM.name
     }
     rows = []
-    for model, update_s, dtype in [("perfect", 0.0, "float64")] + [
-        (variant.model, variant.update_s, variant.dtype) for variant in VARIANTS
-    ]:
-        if dtype != "float64":
-            continue
+    for variant in (PERFECT, *VARIANTS):
         cells = [
-            found.get((model, update_s, dtype, truth, name))
+            found.get((variant.model, variant.update_s, truth, name))
             for truth in truths
             for name in histories
         ]
-        rows.append(
-            [model, _states(update_s)] + ["" if cell is None else f"{cell:.2f}" for cell in cells]
-        )
+        numbers = ["" if cell is None else f"{cell:.2f}" for cell in cells]
+        rows.append([variant.model, _states(variant.update_s), *numbers])
     return head, rows
 
 
@@ -83,36 +153,18 @@ def family(report: Report) -> Table:
     """RMS over the judged histories on each truth, and what model and truth have in common."""
     truths = _truths(report)
     rows = []
-    for variant in ALONE:
+    for variant in VARIANTS:
         cells = []
         for truth in truths:
             cells += [
                 f"{_rms(report, variant, truth):.2f}",
                 IN_COMMON[FAMILY[variant.model][truth]],
             ]
-        overall = f"{_rms(report, variant, *truths):.2f}"
-        rows.append([variant.model, _states(variant.update_s), *cells, overall])
+        rows.append([variant.model, _states(variant.update_s), *cells])
     head = ["model", "states"]
     for truth in truths:
         head += [f"{truth}: kPa RMS", "shares"]
-    return [*head, "all"], rows
-
-
-def verdict_of_strangers(report: Report) -> str:
-    """In a sentence, how the default stands on the truth that no model is kin to."""
-    truths = _truths(report)
-    if STRANGER not in truths:
-        return f"Truth {STRANGER} is left out of a quick report."
-    default = Variant(report["default"]["model"], report["default"]["update_s"])
-    others = [variant for variant in ALONE if variant.update_s == default.update_s]
-    best = min(others, key=lambda variant: _rms(report, variant, STRANGER))
-    said = f"On {STRANGER} the default leaves {_rms(report, default, STRANGER):.2f} kPa RMS"
-    if best == default:
-        return said + ", less than any other with states as often."
-    return said + (
-        f" and `{best.model}` {_rms(report, best, STRANGER):.2f}; over all truths it is "
-        f"{_rms(report, default, *truths):.2f} and {_rms(report, best, *truths):.2f}."
-    )
+    return head, rows
 
 
 def _truths(report: Report) -> list[str]:
@@ -120,47 +172,67 @@ def _truths(report: Report) -> list[str]:
 
 
 def _rms(report: Report, variant: Variant, *truths: str) -> float:
-    """RMS over the judged histories on some truths, exact readings."""
+    """RMS over the judged histories on some truths, exact readings, foam as fitted."""
     squares = [
         row["rms_kpa"] ** 2
         for row in report["rows"]
-        if (row["model"], row["update_s"], row["dtype"]) == astuple(variant)
+        if (row["model"], row["update_s"]) == (variant.model, variant.update_s)
         and row["truth"] in truths
+        and row["scenario"] == FITTED_FOAM.name
         and row["noise_units"] == 0.0
-        and row["history"] not in ("hold", "walk")
+        and row["history"] in JUDGED_HISTORIES
     ]
     return float((sum(squares) / len(squares)) ** 0.5)
+
+
+def scenarios(report: Report) -> Table:
+    """What the default leaves on each truth that no model is kin to, foam by foam."""
+    default = report["default"]
+    truths = [truth for truth in _truths(report) if truth in HELD_OUT]
+    rows = []
+    for scenario in SCENARIOS:
+        for truth in truths:
+            mine = [
+                row
+                for row in report["rows"]
+                if row["truth"] == truth and row["scenario"] == scenario.name
+            ]
+            cells = [scenario.name, truth]
+            none, perfect = {"model": "none", "update_s": 1.0}, {"model": PERFECT.model}
+            for key in (default, none, perfect, {"model": HINDSIGHT.model}):
+                for noise in (0.0, NOISE_UNITS):
+                    found = [
+                        row["rms_kpa"] ** 2
+                        for row in mine
+                        if all(row[name] == value for name, value in key.items())
+                        and row["noise_units"] == noise
+                        and row["history"] in JUDGED_HISTORIES
+                    ]
+                    if found:
+                        cells.append(f"{(sum(found) / len(found)) ** 0.5:.2f}")
+            rows.append(cells)
+    head = ["foam", "truth", "default", "with noise", "no model", "with noise"]
+    return [*head, "perfect model", "with noise", "best factor a pad"], rows
 
 
 def cycles(report: Report) -> Table:
     """Errors after ever more cycles; first the relaxation of the truths themselves."""
     marks = sorted({row["cycles"] for row in report["cycles"]})
-    found: dict[tuple[Any, ...], dict[int, float]] = {}
+    found: dict[tuple[str, str], dict[int, float]] = {}
     for row in report["cycles"]:
         true = row["model"] == PERFECT.model
-        key = (row["truth"], row["model"], row["update_s"], row["dtype"])
         value = row["relaxation_kpa"] if true else row["unclamped_error_kpa"]
-        found.setdefault(key, {})[row["cycles"]] = value
+        found.setdefault((row["truth"], row["model"]), {})[row["cycles"]] = value
     rows = [
-        [
-            truth,
-            "relaxation of the truth" if model == PERFECT.model else model,
-            "" if model == PERFECT.model else _states(update_s),
-            "" if model == PERFECT.model else dtype,
-        ]
+        [truth, "relaxation of the truth" if model == PERFECT.model else model]
         + [f"{values[mark]:.2f}" if mark in values else "" for mark in marks]
-        for (truth, model, update_s, dtype), values in found.items()
+        for (truth, model), values in found.items()
     ]
-    head = ["truth", "model", "states", "type"] + [f"{mark:,}" for mark in marks]
-    return head, sorted(rows, key=lambda row: "ASLH".index(row[0]))
+    return ["truth", "model"] + [f"{mark:,}" for mark in marks], rows
 
 
 def cycle_evidence(report: Report) -> Table:
     """Why the default's error moves with the cycles."""
-
-    def kpa(value: float | None) -> str:
-        return "" if value is None else f"{value:.4f}"
-
     rows = []
     for row in report["cycle_evidence"]:
         true, error = row["true_relaxation_kpa"], row["error_kpa"]
@@ -172,15 +244,11 @@ def cycle_evidence(report: Report) -> Table:
                 f"{true[0]:.2f} to {true[1]:.2f}",
                 f"{error[0]:.3f} to {error[1]:.3f}",
                 f"{shares[0]:.1f} to {shares[1]:.1f} %",
-                kpa(row["change_since_settled_kpa"]),
-                kpa(row["change_by_float32_and_1_hz_kpa"]),
-                kpa(row["fits_differ_kpa"]),
-                " and ".join(f"{rms:.2f}" for rms in row["fits_rms_kpa"]),
+                _number(row["change_since_settled_kpa"], "{:.4f}"),
             ]
         )
     head = ["truth", "last cycle", "relaxation of the truth, 100 to last", "error", "share of it"]
-    head += ["change after 10,000", "by float32 and 1 Hz", "two equal fits differ", "their RMS"]
-    return head, rows
+    return [*head, "change after 10,000"], rows
 
 
 def speed(report: Report) -> Table:
@@ -224,18 +292,50 @@ def pipeline(report: Report) -> Table:
     return head, rows
 
 
+def own_curves(report: Report) -> Table:
+    """Cost of the whole pipeline with curves of the pads' own."""
+    rows = [
+        [
+            row["curve"],
+            f"{row['taxels']:,}",
+            f"{row['touched']:,}",
+            f"{row['ns_per_taxel_step']:.2f}",
+        ]
+        for row in report["own_curves"]
+    ]
+    return ["pressure by", "taxels", "touched", "ns per taxel-step"], rows
+
+
 def false_touches(report: Report) -> Table:
-    """False touches against noise and votes."""
-    votes = sorted({row["votes"] for row in report["false_touches"]})
+    """False touches against white noise and votes."""
+    white = [row for row in report["false_touches"] if row["noise_units"] is not None]
+    votes = sorted({row["votes"] for row in white})
     rows = []
-    for noise in sorted({row["noise_units"] for row in report["false_touches"]}):
-        mine = {row["votes"]: row for row in report["false_touches"] if row["noise_units"] == noise}
+    for noise in sorted({row["noise_units"] for row in white}):
+        mine = {row["votes"]: row for row in white if row["noise_units"] == noise}
         rows.append(
             [f"{noise:g}"]
             + [f"{mine[vote]['touches_per_taxel_hour']:.3g}" for vote in votes]
             + [f"{mine[votes[0]]['taxel_hours']:.0f}"]
         )
     return ["noise"] + [f"{vote} of 3" for vote in votes] + ["taxel-hours"], rows
+
+
+def measured_noise(report: Report) -> Table:
+    """False touches with noise as it was measured on real skin, by rate."""
+    rows = [
+        [
+            f"{row['hz']:g}",
+            f"{row['touches_per_taxel_hour']:.3g}",
+            f"{row['samples_per_taxel_hour']:.3g}",
+            f"{row['usable_share']:.1%}",
+            f"{row['taxel_hours']:.0f}",
+        ]
+        for row in report["false_touches"]
+        if row["noise_units"] is None
+    ]
+    head = ["sweeps a second", "touches begun per taxel-hour", "touched samples per taxel-hour"]
+    return [*head, "usable taxels", "taxel-hours"], rows
 
 
 def detection(report: Report) -> Table:
@@ -250,7 +350,7 @@ def detection(report: Report) -> Table:
         ]
         for row in report["detection"]
     ]
-    return ["units", "kPa", "told within 2 s", "median sweeps", "95 % within sweeps"], rows
+    return ["units", "kPa", "reported within 2 s", "median sweeps", "95 % within sweeps"], rows
 
 
 def drift(report: Report) -> Table:
@@ -264,7 +364,7 @@ def drift(report: Report) -> Table:
         ]
         for row in report["drift"]
     ]
-    return ["rule", "units per s", "lag, units", "share told as touched"], rows
+    return ["rule", "units per s", "lag, units", "share reported as touched"], rows
 
 
 def holds(report: Report) -> Table:
@@ -286,10 +386,10 @@ def holds(report: Report) -> Table:
         "truth",
         "case",
         "pressed",
-        "told",
+        "reported",
         "RMS kPa",
         "error at end",
-        "ghost s",
+        "false contact s",
         "rest RMS kPa",
     ]
     return head, rows
@@ -319,13 +419,12 @@ def fits(report: Report) -> Table:
             numbers(row["tau_s"], 1),
             numbers(row["beta_unload"], 3) if row["model"].startswith("published") else "",
             numbers(row["tau_unload_s"], 1),
-            "" if row["clock_kpa"] is None else f"{row['clock_kpa']:.0f}",
             " ".join(row["uncertain"]),
         ]
         for row in report["fits"]
     ]
     head = ["model", "truth", "RMS hold / rest", "beta", "tau s", "beta unload", "tau unload s"]
-    return [*head, "clock kPa", "not known"], rows
+    return [*head, "not known"], rows
 
 
 def _states(update_s: float) -> str:

@@ -6,11 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.viscoelastic import TruthKind
-from skin_host.evaluation.accuracy import fits_of
+from skin_host.evaluation.accuracy import DEFAULT, relaxation_table
 from skin_host.evaluation.histories import Holds, record
 from skin_host.evaluation.rig import Rig
 from skin_host.processing.pressure import PressureCurve
-from skin_host.relaxation_settings import Relaxation
 
 Row = dict[str, Any]
 
@@ -18,6 +17,7 @@ NOISES = (0.2, 0.4, 0.6, 0.8, 1.0, 1.5, 2.0, 3.0)
 HEIGHTS = (2.0, 2.5, 3.0, 3.5, 4.0, 5.0, 6.0, 8.0, 12.0, 20.0)
 RATES = (0.001, 0.004, 0.01, 0.03, 0.05, 0.09, 0.11)
 HOLD_KPA = 65.0
+LONGEST_CASE = "8 h, 0.001 units/s"
 #: A skin of 10 boards: enough taxels for rare events, as many as a robot has.
 BOARDS = 10
 
@@ -25,21 +25,24 @@ BOARDS = 10
 def false_touches(
     hours: float,
     votes: tuple[int, ...] = (1, 2, 3),
-    noises: tuple[float, ...] = NOISES,
+    noises: tuple[float | None, ...] = NOISES,
     boards: int = BOARDS,
+    hz: float = 25.0,
 ) -> list[Row]:
     """False touches of untouched skin per taxel-hour, against noise and votes.
 
     Args:
-        hours: simulated, at 25 Hz.
+        hours: simulated.
         votes: of three samples.
-        noises: in units.
+        noises: in units; None is noise as it was measured on real skin.
         boards: of 192 taxels each.
+        hz: sweeps a second.
     """
     rows = []
     for noise in noises:
         for needed in votes:
-            rig = Rig(boards, noise, seed=3, processing={"touch": {"votes_of_3": needed}})
+            table = {"touch": {"votes_of_3": needed}}
+            rig = Rig(boards, noise, seed=3, hz=hz, processing=table)
             before = np.zeros(rig.n, dtype=np.bool_)
             begun = samples = 0
             for _ in range(round(hours * 3600.0 / rig.dt_s)):
@@ -52,8 +55,10 @@ def false_touches(
             rows.append(
                 {
                     "noise_units": noise,
+                    "hz": hz,
                     "votes": needed,
                     "taxel_hours": taxel_hours,
+                    "usable_share": float(np.mean(rig.calibration.usable)),
                     "touches_per_taxel_hour": begun / taxel_hours,
                     "samples_per_taxel_hour": samples / taxel_hours,
                 }
@@ -62,7 +67,7 @@ def false_touches(
 
 
 def detection_delays(noise_units: float = 0.4, hz: float = 25.0, boards: int = BOARDS) -> list[Row]:
-    """How long a sudden press of so many units takes to be told, one taxel in four pressed."""
+    """Time until a sudden press of this many units is reported, one taxel in four pressed."""
     rows = []
     for height in HEIGHTS:
         rig = Rig(boards, noise_units, seed=5, hz=hz)
@@ -118,14 +123,14 @@ def drift_lags(minutes: float, rule: str) -> list[Row]:
 
 def hold_cases(quick: bool) -> list[tuple[TruthKind, str, float, float, float, bool]]:
     """The long holds that are asked for, as arguments of `long_hold`; the longest first."""
-    kinds: tuple[TruthKind, ...] = ("A", "S") if quick else ("A", "S", "L", "H")
+    kinds: tuple[TruthKind, ...] = ("F",) if quick else ("F", "M", "H")
     cases: list[tuple[str, float, float, float]] = [
         ("10 min, 0.004 units/s", 600.0, 0.004, 10.0 if quick else 25.0)
     ]
     if not quick:
         cases = [
             ("8 h, no drift", 28800.0, 0.0, 5.0),
-            ("8 h, 0.001 units/s", 28800.0, 0.001, 5.0),
+            (LONGEST_CASE, 28800.0, 0.001, 5.0),
             ("10 min, no drift", 600.0, 0.0, 25.0),
             ("10 min, 0.001 units/s", 600.0, 0.001, 25.0),
             *cases,
@@ -133,26 +138,10 @@ def hold_cases(quick: bool) -> list[tuple[TruthKind, str, float, float, float, b
     return [(kind, *case, alone) for kind in kinds for case in cases for alone in (False, True)]
 
 
-def fitted_table(kind: TruthKind, model: str) -> dict[str, Any]:
-    """The configuration table `processing.relaxation` fitted to a truth's calibration hold."""
-    found = fits_of(kind)[model].parameters
-    table: dict[str, Any] = {
-        "model": model,
-        "beta": list(found.beta),
-        "tau_s": list(found.tau_s),
-        "beta_unload": list(found.beta_unload),
-        "tau_unload_s": list(found.tau_unload_s),
-    }
-    clock_kpa = float(found.clock_kpa)
-    if np.isfinite(clock_kpa):
-        table["clock_kpa"] = clock_kpa
-    return table
-
-
 def long_hold(
     kind: TruthKind, name: str, hold_s: float, rate: float, hz: float, alone: bool
 ) -> Row:
-    """What is said during and after a long press at 65 kPa, while everything drifts.
+    """What is reported during and after a long press at 65 kPa, while everything drifts.
 
     Args:
         kind: the truth; the default model is fitted to its calibration hold.
@@ -160,10 +149,10 @@ def long_hold(
         hold_s: length of the press.
         rate: drift in units per s.
         hz: sweeps a second.
-        alone: whether all taxels are pressed, so that no untouched one tells of drift.
+        alone: whether all taxels are pressed, so that no untouched one shows the drift.
     """
     rest_s = 900.0
-    relaxation = fitted_table(kind, Relaxation().model)
+    relaxation = relaxation_table(DEFAULT, kind, fitted=True)
     holds: Holds = [(0.0, 30.0), (HOLD_KPA, hold_s), (0.0, rest_s)]
     played = record(kind, holds, hz)
     rig = Rig(1, 0.4, seed=11, hz=hz, processing={"relaxation": relaxation})
@@ -180,7 +169,7 @@ def long_hold(
         if pressed_at + 2 * hz <= sweep < release:
             held += int(np.count_nonzero(frame.touched[pressed]))
             error.append(frame.pressure_kpa[pressed] - true_kpa)
-        elif sweep >= release + 3:  # two samples of three need this long to say it is over
+        elif sweep >= release + 3:  # two samples of three need this long to end it
             rest_error.append(frame.pressure_kpa[pressed].astype(np.float64))
             still = int(np.count_nonzero(frame.touched[pressed]))
             ghosts += still

@@ -1,4 +1,4 @@
-"""The force/torque boards of one bus: set up, started, watched, set up again, stopped."""
+"""Sets up, starts, supervises and stops the force/torque boards of one bus."""
 
 import asyncio
 import logging
@@ -26,13 +26,13 @@ class _Known:
 
 
 class StrainBoards:
-    """Bring-up and supervision.
+    """Sets up and supervises the force/torque boards of one bus.
 
     Args:
         bus: its name, for messages.
         port: where commands are sent.
         tips: the fingertips whose boards are on this bus.
-        clock: time in ns that stands still while nobody reads the bus.
+        clock: time in ns that stands still while the bus is not read.
     """
 
     def __init__(
@@ -54,12 +54,12 @@ class StrainBoards:
             await self._set_up(board)
 
     def claim(self, strangers: dict[int, int]) -> None:
-        """Take our boards out of those that answered discovery and are no boards of skin."""
+        """Remove our boards from the boards that answered discovery and are not skin boards."""
         for board in self._boards:
             strangers.pop(board.state.settings.address, None)
 
     def supervise(self) -> None:
-        """Look after every board; what is to be done takes place beside everything else."""
+        """Supervise every board; set-ups run as separate tasks, so this does not wait for them."""
         now_ns = self._clock()
         for board in self._boards:
             if board.state.frames != board.frames:
@@ -72,7 +72,7 @@ class StrainBoards:
                 self._busy = asyncio.create_task(self._mend(board))
 
     async def stop(self) -> None:
-        """Tell every board to stop sending.
+        """Command every board to stop sending.
 
         Raises:
             BusError: the bus does not take frames.

@@ -1,7 +1,8 @@
-"""All fingertips of one node: CAN frames and the skin's contacts in, events out. Pure."""
+"""All fingertips of one node: takes CAN frames and the skin's contacts, returns events. Pure."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +22,12 @@ from skin_host.fingertip.strain_protocol import (
 from skin_host.fingertip.tip import Tip
 from skin_host.layout import Layout
 from skin_host.processing.calibration import Zero
-from skin_host.processing.contacts import TouchEvent
+from skin_host.processing.events import TouchEvent
 from skin_host.settings import Settings
 
 Floats = NDArray[np.float64]
 
-#: A zero needs so many samples.
+#: A zero is the mean of at least this many samples.
 FEWEST_SAMPLES = 10
 
 
@@ -35,18 +36,18 @@ class TipState:
     """One fingertip with its board.
 
     Attributes:
-        number: among those of the configuration.
-        told_scale: float64[6], the full scales that the board told; 0 where it has not.
+        number: among the fingertips of the configuration.
+        reported_scale: float64[6], the full scales that the board reported; 0 where it has not.
         assembler: of its samples; None until the full scales are known.
-        saturated_ns: when a sample was last saturated, 0 never.
-        silenced: times that the board fell silent.
+        saturated_ns: when a sample was last saturated, 0 if never.
+        silenced: how often the board has timed out.
     """
 
     name: str
     number: int
     settings: Fingertip
     tip: Tip
-    told_scale: Floats = field(default_factory=lambda: np.zeros(CHANNELS))
+    reported_scale: Floats = field(default_factory=lambda: np.zeros(CHANNELS))
     assembler: WrenchAssembler | None = None
     last_ns: int = 0
     frames: int = 0
@@ -57,13 +58,25 @@ class TipState:
 
     @property
     def scale_differs(self) -> bool:
-        """Whether the board told other full scales than the configuration."""
+        """Whether the board reported other full scales than the configuration has."""
         if self.settings.full_scale is None:
             return False
-        known = self.told_scale > 0.0
-        # A board tells whole numbers.
-        off = np.abs(self.told_scale - np.array(self.settings.full_scale))
+        known = self.reported_scale > 0.0
+        # A board reports whole numbers.
+        off = np.abs(self.reported_scale - np.array(self.settings.full_scale))
         return bool((off[known] > 0.5).any())
+
+
+class Felt(NamedTuple):
+    """Samples and events from a batch of frames.
+
+    Attributes:
+        samples: number of the fingertip and time of each force/torque sample.
+        events: of the fingertips.
+    """
+
+    samples: list[tuple[int, int]]
+    events: list[FingertipEvent]
 
 
 class FingertipEngine:
@@ -77,17 +90,14 @@ class FingertipEngine:
     Attributes:
         tips: by name.
         held_report_ns: a contact that lasts for longer is reported.
-        sampled: number of the fingertip and time of each sample that the last `feed` completed.
     """
 
     def __init__(self, settings: Settings, layout: Layout, parts: list[int]) -> None:
         nodes = {layout.parts[part].node for part in parts}
         self.tips: dict[str, TipState] = {}
-        self.sampled: list[tuple[int, int]] = []
         self.held_report_ns = int(settings.processing.drift.frozen_report_s * 1e9)
         self._of_address: dict[str, dict[int, TipState]] = {}
         self._of_part: dict[int, TipState] = {}
-        self._events: list[FingertipEvent] = []
         self._zeroing = False
         for number, (name, table) in enumerate(settings.fingertips.items()):
             if table.node not in nodes:
@@ -104,6 +114,12 @@ class FingertipEngine:
                 self._of_part[array] = state
             if table.full_scale is not None:
                 self._assemble(state, np.array(table.full_scale))
+
+    def renew(self, settings: Settings) -> None:
+        """Apply new settings that fingertips share with the skin's processing."""
+        self.held_report_ns = int(settings.processing.drift.frozen_report_s * 1e9)
+        for state in self.tips.values():
+            state.tip.move_hz = settings.processing.touch.move_hz
 
     @property
     def buses(self) -> set[str]:
@@ -122,22 +138,17 @@ class FingertipEngine:
             for kind in StrainType
         )
 
-    def take(self) -> list[FingertipEvent]:
-        """What has happened since the last call."""
-        events, self._events = self._events, []
-        return events
-
-    def feed(self, bus: str, batch: FrameBatch) -> None:
-        """Take a batch of frames of one bus."""
-        self.sampled = []
+    def feed(self, bus: str, batch: FrameBatch) -> Felt:
+        """Process a batch of frames of one bus."""
+        felt = Felt([], [])
         here = self._of_address.get(bus)
         if here is None:
-            return
+            return felt
         for row in np.flatnonzero(batch.id >> 8 == MessageClass.ANALOG_COMMAND).tolist():
             self._note_answer(here, int(batch.id[row]), batch.data[row, : batch.dlc[row]].tobytes())
         frames = parse_strain(batch)
         if not len(frames.row) and not frames.wrong_length:
-            return
+            return felt
         for address, state in here.items():
             mine = np.flatnonzero((frames.board == address) & (frames.type >= StrainType.FORCE))
             if not len(mine):
@@ -147,35 +158,38 @@ class FingertipEngine:
             state.alive = True
             if state.assembler is not None:
                 for wrench in state.assembler.take(frames, batch.t_ns):
-                    self._note_sample(state, wrench)
+                    felt.samples.append((state.number, wrench.t_ns))
+                    felt.events.extend(self._step(state, wrench))
+        return felt
 
     def note_skin(self, part: int, events: Iterable[TouchEvent], t_ns: int) -> None:
-        """A frame of a part (index in the layout) was processed."""
+        """Take in the contacts of a processed frame of a part (index in the layout)."""
         state = self._of_part.get(part)
         if state is not None:
             state.tip.note_skin(events, t_ns)
 
-    def expire(self, now_ns: int) -> None:
-        """Look for boards that have fallen silent, on the clock of the frames' time stamps."""
+    def expire(self, now_ns: int) -> list[FingertipEvent]:
+        """Find boards that have timed out, on the clock of the frames' time stamps."""
+        events: list[FingertipEvent] = []
         for state in self.tips.values():
             if state.alive and now_ns - state.last_ns > SILENT_NS:
                 state.alive = False
                 state.silenced += 1
-            self._events += state.tip.expire(now_ns)
+            events += state.tip.expire(now_ns)
+        return events
 
-    def end_all(self, t_ns: int) -> None:
-        """End every contact: the daemon stops, or begins anew."""
-        for state in self.tips.values():
-            self._events += state.tip.end_all(t_ns)
+    def end_all(self, t_ns: int) -> list[FingertipEvent]:
+        """End every contact, because the daemon stops."""
+        return [event for state in self.tips.values() for event in state.tip.end_all(t_ns)]
 
     def begin_zero(self) -> None:
-        """Collect samples of the unloaded fingertips from now on."""
+        """Start to collect samples of the unloaded fingertips."""
         self._zeroing = True
         for state in self.tips.values():
             state.zeroing.clear()
 
     def end_zero(self) -> dict[str, Zero]:
-        """The zeros that the collected samples give, of those fingertips that sent enough."""
+        """Return the zeros from the collected samples, for each fingertip with enough samples."""
         self._zeroing = False
         found = {}
         for name, state in self.tips.items():
@@ -185,19 +199,23 @@ class FingertipEngine:
             state.zeroing.clear()
         return found
 
-    def use(self, zeros: dict[str, Zero]) -> None:
-        """Work with these zeros from now on; a fingertip without one says nothing."""
-        for name, state in self.tips.items():
-            self._events += state.tip.end_all(state.last_ns)
-            state.tip.use(zeros.get(name))
+    def use(self, zeros: dict[str, Zero]) -> list[FingertipEvent]:
+        """Use these zeros from now on; a fingertip without a zero publishes nothing.
 
-    def _note_sample(self, state: TipState, wrench: Wrench) -> None:
-        self.sampled.append((state.number, wrench.t_ns))
+        Returns the events that end the present contacts.
+        """
+        events: list[FingertipEvent] = []
+        for name, state in self.tips.items():
+            events += state.tip.end_all(state.last_ns)
+            state.tip.use(zeros.get(name))
+        return events
+
+    def _step(self, state: TipState, wrench: Wrench) -> list[FingertipEvent]:
         if wrench.saturated:
             state.saturated_ns = wrench.t_ns
         if self._zeroing and not wrench.saturated:
             state.zeroing.append(np.concatenate([wrench.force_n, wrench.torque_nm]))
-        self._events += state.tip.step(wrench)
+        return state.tip.step(wrench)
 
     def _note_answer(self, here: dict[int, TipState], can_id: int, payload: bytes) -> None:
         found = parse_full_scale(can_id, payload)
@@ -207,9 +225,9 @@ class FingertipEngine:
         state = here.get(address)
         if state is None:
             return
-        state.told_scale[answer.channel] = answer.value
-        if state.assembler is None and (state.told_scale > 0.0).all():
-            self._assemble(state, state.told_scale.copy())
+        state.reported_scale[answer.channel] = answer.value
+        if state.assembler is None and (state.reported_scale > 0.0).all():
+            self._assemble(state, state.reported_scale.copy())
 
     @staticmethod
     def _assemble(state: TipState, full_scale: Floats) -> None:

@@ -1,21 +1,21 @@
-"""What a fingertip says beside its touches: that it slips, that it presses too hard."""
+"""Events of a fingertip besides touches: it slips, or it presses too hard."""
 
 from dataclasses import dataclass
 from typing import Literal
 
-from skin_host.processing.contacts import TouchEvent
+from skin_host.processing.events import TouchEvent
 
-#: What told of a slip.
+#: What indicated a slip.
 Cause = Literal["rate", "friction", "fall"]
 
 
 @dataclass(frozen=True, slots=True)
 class SlipEvent:
-    """A fingertip begins or ends to slip.
+    """A fingertip begins or stops to slip.
 
     Attributes:
         id: of the contact, as in its touches.
-        cause: what told it: the rate of the tangential force, its share of the known limit of
+        cause: what indicated it: the rate of the tangential force, its share of the known limit of
             friction, or its abrupt fall.
         force_n, shear_n, shear_rate_n_s: normal force, tangential force and the latter's rate.
     """
@@ -32,7 +32,7 @@ class SlipEvent:
 
 @dataclass(frozen=True, slots=True)
 class OverEvent:
-    """A fingertip begins or ends to press harder than `over_n`."""
+    """A fingertip begins or stops to press harder than `over_n`."""
 
     event: Literal["begin", "end"]
     id: int

@@ -1,10 +1,9 @@
 """Flags of a grasping hand, and the finger speed that follows from them (Ohka et al., 3.3).
 
-SEARCH: fingers approach until something touches. MOVE: the hand manipulates. TOUCH: the
-normal force of an element is above F1, or it slips. SLIP: |dFs/dt| of an element is above
-dr. OVER: the normal force of an element is above F2 (the text says F1 in one place, a slip
-of the pen). A slip adds a re-compression along the inward normal of the element with the
-largest normal force, unless OVER.
+SEARCH: fingers approach until something touches. MOVE: the hand manipulates. TOUCH: the normal
+force of an element is above F1, or it slips. SLIP: |dFs/dt| of an element is above dr. OVER: the
+normal force of an element is above F2 (the text has F1 in one place, a misprint). A slip adds a
+re-compression along the inward normal of the element with the largest normal force, unless OVER.
 """
 
 from dataclasses import dataclass
@@ -29,23 +28,23 @@ class Flags(IntFlag):
 
 @dataclass(frozen=True, slots=True)
 class Thresholds:
-    """F1, F2 and dr of Ohka et al., and the times its text leaves open."""
+    """F1, F2 and dr of Ohka et al., and the times that the paper does not give."""
 
     touch_n: float = 0.2
     over_n: float = 2.0
     slip_n_s: float = 5.0
-    #: SLIP stays up so long after the last crossing: a stick-slip train is one slip.
+    #: SLIP stays set this long after the last crossing, so that a stick-slip series is one slip.
     slip_hold_s: float = 0.03
-    #: MOVE ends so long after the last touch.
+    #: MOVE ends this long after the last touch.
     lost_s: float = 0.2
 
 
 def analyse(
     normal_n: Floats, shear_rate_n_s: Floats, thresholds: Thresholds, *, slips: bool = False
 ) -> Flags:
-    """TOUCH, SLIP and OVER of one finger from its elements [n] (Fig. 15).
+    """Return TOUCH, SLIP and OVER of one finger from its elements [n] (Fig. 15).
 
-    `slips` says that it slips by another sign than the rate of the shear force.
+    `slips`: another sign than the rate of the shear force shows that it slips.
     """
     flags = Flags(0)
     largest = float(normal_n.max(initial=0.0))
@@ -59,7 +58,7 @@ def analyse(
 
 
 def next_mode(mode: Flags, *, touch: bool, lost: bool, done: bool) -> Flags:
-    """SEARCH or MOVE, from the mode before: the truth table.
+    """Return SEARCH or MOVE, from the mode before; the truth table:
 
     | mode   | touch | lost | done | next   |
     |--------|-------|------|------|--------|
@@ -73,7 +72,7 @@ def next_mode(mode: Flags, *, touch: bool, lost: bool, done: bool) -> Flags:
         mode: `Flags.SEARCH` or `Flags.MOVE`.
         touch: every finger of the hand touches.
         lost: none has touched for `Thresholds.lost_s`.
-        done: the motion asked for is finished.
+        done: the requested motion is finished.
     """
     if mode == Flags.MOVE:
         return Flags.SEARCH if done or lost else Flags.MOVE
@@ -82,7 +81,7 @@ def next_mode(mode: Flags, *, touch: bool, lost: bool, done: bool) -> Flags:
 
 @dataclass(frozen=True, slots=True)
 class GraspEvent:
-    """A finger begins or ends to slip, or to press too hard.
+    """A finger begins or stops to slip, or to press too hard.
 
     `value` is what crossed its threshold: N/s for `slip`, N for `over`; 0 at the end.
     """
@@ -112,15 +111,15 @@ class FingerFlags:
         others_touch: bool = True,
         done: bool = False,
     ) -> list[GraspEvent]:
-        """Bring the flags up to date; return what began or ended.
+        """Update the flags; return what began or ended.
 
         Args:
             normal_n: float64[n], normal force on each element.
             shear_rate_n_s: float64[n], see `slip.ShearRate`.
             t_ns: time of the sample.
-            slips: it slips by another sign than the rate of the shear force.
+            slips: another sign than the rate of the shear force shows that it slips.
             others_touch: the other fingers of the hand touch.
-            done: the motion asked for is finished.
+            done: the requested motion is finished.
         """
         seen = analyse(normal_n, shear_rate_n_s, self._thresholds, slips=slips)
         if seen & Flags.SLIP:

@@ -1,7 +1,7 @@
-"""How the force/torque boards of fingertips are: a record each, and what is wrong.
+"""Health of the force/torque boards of fingertips: a record for each, and its faults.
 
 The record is published as `<fingertip>/health`, with the same schema, `state`, `faults` and
-`sentences` as that of a part of skin; `docs/operations.md` explains the rest.
+`sentences` as that of a part of skin; `docs/operations.md` explains the other keys.
 """
 
 from collections import deque
@@ -14,9 +14,9 @@ from skin_host.health.record import FaultName
 
 #: Rates are means over about this time.
 RATE_NS = 2_000_000_000
-#: Saturation and losses are told for so long after they were last seen.
+#: Saturation and losses stay in the record for this long after they were last seen.
 HOLD_NS = 3_000_000_000
-#: Frames without their other half within `RATE_NS` that are told: so many, and this share.
+#: Lone frames within `RATE_NS` are a fault from this number on, and from this share on.
 FEW_LONE = 3
 LONE_SHARE = 0.01
 
@@ -24,9 +24,10 @@ LONE_SHARE = 0.01
 class FingertipRecord(TypedDict):
     """One fingertip. Counters count from the start of the daemon.
 
-    `lone` are frames whose other half did not come, `silences` times that the board fell
-    silent, `full_scale` N and N m of its channels, `threshold_n` the least force of a contact,
-    which noise may raise.
+    `lone` are frames whose other half did not arrive, `silences` counts how often the board timed
+    out, `full_scale` is N and N m of its channels, `threshold_n` the least force of a contact,
+    which
+    noise may raise.
     """
 
     part: str
@@ -58,7 +59,7 @@ class FingertipHealth:
         self._lossy_ns: dict[str, int] = {}
 
     def tick(self, now_ns: int) -> None:
-        """Look at the counters; to be called some times a second."""
+        """Read the counters; to be called several times a second."""
         for name, state in self._engine.tips.items():
             past = self._past[name]
             if past and now_ns < past[-1][0]:
@@ -73,7 +74,7 @@ class FingertipHealth:
                 self._lossy_ns[name] = now_ns
 
     def records(self, now_ns: int | None) -> dict[str, FingertipRecord]:
-        """What there is to say of each fingertip; without a time (a replay) no ages."""
+        """Return the record of each fingertip; without a time (a replay) without ages."""
         return {name: self._record(state, now_ns) for name, state in self._engine.tips.items()}
 
     def _record(self, state: TipState, now_ns: int | None) -> FingertipRecord:
@@ -100,7 +101,7 @@ class FingertipHealth:
             "touched": state.tip.touched,
             "flags": state.tip.flag_names,
             "faults": [{"code": fault.code, "where": fault.where} for fault in faults],
-            "sentences": [fault.says for fault in faults],
+            "sentences": [fault.sentence for fault in faults],
         }
         if now_ns is not None:
             age_ms = (now_ns - state.last_ns) / 1e6
@@ -108,12 +109,12 @@ class FingertipHealth:
         return record
 
     def _faults(self, state: TipState, now_ns: int | None) -> Iterator[Fault]:
-        """The cause before its consequences: the first one names the state."""
+        """Each cause before its consequences: the first fault gives the state."""
         name, table = state.name, state.settings
         here = f"the force/torque board of {name} (bus {table.bus}, address {table.address})"
 
-        def fault(code: str, says: str) -> Fault:
-            return Fault(f"fingertip_{code}", name, says)
+        def fault(code: str, sentence: str) -> Fault:
+            return Fault(f"fingertip_{code}", name, sentence)
 
         if not state.frames:
             yield fault("absent", f"{here} has not sent anything yet; check power and address")
@@ -124,19 +125,19 @@ class FingertipHealth:
         if state.frames and state.assembler is None:
             yield fault(
                 "not_configured",
-                f"{here} does not tell its full scales; give them as fingertips.{name}.full_scale",
+                f"{here} does not report its full scales; set fingertips.{name}.full_scale",
             )
         if state.scale_differs:
-            told = ", ".join(f"{value:g}" for value in state.told_scale)
+            reported = ", ".join(f"{value:g}" for value in state.reported_scale)
             yield fault(
                 "scale",
-                f"{here} tells other full scales ({told}) than fingertips.{name}.full_scale, "
+                f"{here} reports other full scales ({reported}) than fingertips.{name}.full_scale, "
                 "which is used",
             )
         if state.assembler is not None and not state.tip.zeroed:
             yield fault(
                 "not_calibrated",
-                f"{name} has no zero: no contact is told; calibrate it unloaded: "
+                f"{name} has no zero: no contact is reported; calibrate it unloaded: "
                 "skin command calibrate",
             )
         if now_ns is None:
@@ -146,7 +147,7 @@ class FingertipHealth:
         if abs(now_ns - self._lossy_ns.get(name, -HOLD_NS)) < HOLD_NS and self._lossy_ns.get(name):
             yield fault(
                 "loses_frames",
-                f"{here}: force comes without torque, or the other way: frames are lost or late; "
+                f"{here}: force comes without torque, or the reverse: frames are lost or late; "
                 "the bus is overloaded or badly terminated",
             )
         if state.tip.touched_for_ns(now_ns) > self._engine.held_report_ns:

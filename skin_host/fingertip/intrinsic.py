@@ -1,4 +1,4 @@
-"""Intrinsic contact sensing: where a fingertip is touched, from force and torque alone.
+"""Intrinsic contact sensing: the point of contact from force and torque alone.
 
 A single push through one point has a line of action, and the line enters the fingertip's
 surface at the contact (Bicchi and Dario; Son et al.). Forces in N, torques in N mm about
@@ -20,12 +20,12 @@ PUBLISHED_FRICTION_FACTOR = {0.1: 1.08, 0.3: 1.62, 0.5: 2.30}
 
 
 class Verdict(IntEnum):
-    """What a sample of force and torque says about the contact."""
+    """Result of locating one sample of force and torque."""
 
     CONTACT = 0
-    TOO_LIGHT = 1  #: the force is below the threshold (Son et al., section 4.4)
-    NO_SINGLE_CONTACT = 2  #: no one push on this surface gives this force and torque
-    SEVERAL_CONTACTS = 3  #: a twist about the force that one point cannot carry
+    TOO_LIGHT = 1  # force below the threshold (Son et al., section 4.4)
+    NO_SINGLE_CONTACT = 2  # no single push on this surface gives this load
+    SEVERAL_CONTACTS = 3  # a twist about the force that one point cannot carry
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class Quadric:
     Attributes:
         semi_axes_mm: three lengths; infinite along the axis of a cylinder.
         centre_mm: of the body.
-        half_length_mm: a cylinder's surface ends so far from the centre on its axis.
+        half_length_mm: a cylinder's surface ends at this distance from the centre, along its axis.
     """
 
     semi_axes_mm: tuple[float, float, float]
@@ -43,7 +43,7 @@ class Quadric:
     half_length_mm: float = np.inf
 
     def enter(self, origin_mm: Floats, direction: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Where lines of unit `direction` [n, 3] come in from outside: distance, and whether."""
+        """Return where lines of unit `direction` [n, 3] enter the surface: distance, whether."""
         weight = self._weight
         start = origin_mm - self.centre_mm
         a = (weight * direction**2).sum(axis=1)
@@ -95,7 +95,7 @@ class Plane:
     reach_mm: float = np.inf
 
     def enter(self, origin_mm: Floats, direction: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Where lines of unit `direction` [n, 3] come in from outside: distance, and whether."""
+        """Return where lines of unit `direction` [n, 3] enter the face: distance, and whether."""
         outward = np.array(self.outward)
         slope = direction @ outward
         found = slope < -1e-12  # a push has a component into the face
@@ -116,7 +116,7 @@ Surface = Quadric | Plane
 
 @dataclass(frozen=True, slots=True)
 class IntrinsicContact:
-    """What force and torque say, one row a sample. Rows without a contact hold NaN.
+    """Contacts located from force and torque, one row per sample; NaN where there is none.
 
     Attributes:
         verdict: uint8[n], see `Verdict`.
@@ -142,22 +142,22 @@ def locate(
     minimum_force_n: float = 0.1,
     pitch_limit_mm: float = 1.0,
 ) -> IntrinsicContact:
-    """Contact point, normal and force components (Bicchi and Dario, eqs. 1-2).
+    """Return contact point, normal and force components (Bicchi and Dario, eqs. 1-2).
 
     Args:
         force_n: [n, 3], force that the touched object exerts on the fingertip.
         torque_nmm: [n, 3], its torque about the origin.
         surface: of the fingertip.
-        minimum_force_n: below it the answer is `TOO_LIGHT`; 0.1 N is the least force that
+        minimum_force_n: below it the result is `TOO_LIGHT`; 0.1 N is the least force that
             Bicchi and Dario detect.
         pitch_limit_mm: a soft pad under friction can carry some twist about the force;
-            beyond this much it must be several contacts. (Two pushes through the centre of
-            a sphere have no twist: no force sensor tells them from one.)
+            beyond this much there must be several contacts. (Two pushes through the centre of
+            a sphere have no twist: force and torque cannot distinguish them from one push.)
     """
     force = np.atleast_2d(np.asarray(force_n, np.float64))
     torque = np.atleast_2d(np.asarray(torque_nmm, np.float64))
     size = np.linalg.norm(force, axis=1)
-    heavy = size >= max(minimum_force_n, 1e-300)  # a NaN is not heavy
+    heavy = size >= max(minimum_force_n, 1e-300)  # False for NaN
     safe = np.where(heavy, size, np.nan)[:, None]
     direction = force / safe
     arm = _cross(direction, torque / safe)
@@ -178,7 +178,7 @@ def locate(
 
 
 def sensitivity(force_n: ArrayLike, torque_nmm: ArrayLike, contact: IntrinsicContact) -> Floats:
-    """First-order change of the contact point with force and torque, float64[n, 3, 6].
+    """Return the first-order change of the contact point with the load, float64[n, 3, 6].
 
     The point is r0 + lambda f with r0 = f x m / |f|^2, and moves along the surface:
     n . dc = 0 fixes d lambda. Columns: fx fy fz (mm/N), mx my mz (1/N).
@@ -189,7 +189,7 @@ def sensitivity(force_n: ArrayLike, torque_nmm: ArrayLike, contact: IntrinsicCon
     arm = _cross(f, m) / squared
     reach = ((contact.point_mm - arm) * f).sum(axis=1)[:, None] / squared
     change = np.empty((len(f), 3, 6))
-    # d(f x m) = df x m + f x dm, and the reach along f as |f| changes.
+    # d(f x m) = df x m + f x dm, and the distance along f changes with |f|.
     change[:, :, :3] = -_times(m) - 2.0 * arm[:, :, None] * f[:, None, :]
     change[:, :, 3:] = _times(f)
     change /= squared[:, :, None]
@@ -226,13 +226,13 @@ def point_covariance(
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
-    """a x b of rows [n, 3]; numpy's own takes five times as long over a single row."""
+    """Cross product of rows [n, 3]; numpy's own takes five times as long for a single row."""
     product: Floats = a[:, _NEXT] * b[:, _AFTER] - a[:, _AFTER] * b[:, _NEXT]
     return product
 
 
 def _times(a: Floats) -> Floats:
-    """Matrices [n, 3, 3] that turn b into a x b."""
+    """Matrices [n, 3, 3] whose product with b is a x b."""
     matrix = np.zeros((len(a), 3, 3))
     matrix[:, _AFTER, _NEXT] = a
     matrix[:, _NEXT, _AFTER] = -a
@@ -245,7 +245,7 @@ def sphere_error_bound(radius_mm: float, relative_error: float, friction: float 
     2 R Ef f(q): the interval bound of first order of the closed form, for a push with
     tangential force over normal force = tan q = `friction` and all of it in one plane.
     The printed factors 1.08, 1.62, 2.30 at 0.1, 0.3, 0.5 are up to 8 % above this
-    derivation (1.07, 1.52, 2.13); the scan does not show why.
+    derivation (1.07, 1.52, 2.13); the scan of the paper does not show the reason.
     """
     sin2 = friction**2 / (1.0 + friction**2)
     cos2 = 1.0 - sin2

@@ -1,7 +1,7 @@
-"""Where a fingertip is touched: force and torque, joined with its skin if there is one.
+"""Joins the contact from force and torque with the contact of the skin, if there is skin.
 
-Both tell a place with its error; the estimate weights each by what it knows, along the
-surface. On planar fingertips with a calibration by hand `fusion` does more.
+Both give a place and its error; the estimate weights each by its precision, along the surface. On
+planar fingertips with a manual calibration `fusion` does more.
 """
 
 import math
@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.fingertip.intrinsic import IntrinsicContact, Surface, point_covariance
-from skin_host.processing.contacts import TouchEvent
+from skin_host.processing.events import TouchEvent
 
 Floats = NDArray[np.float64]
 
-#: A calibrated sensor is this good (the multi-axial study: +-1 %).
+#: Relative error of a calibrated sensor (the multi-axial study: +-1 %).
 RELATIVE_ERROR = 0.01
-#: How far a real fingertip lies off its geometrical form.
+#: Distance of a real fingertip's surface from its geometrical form.
 SURFACE_SD_MM = 0.05
 
 
@@ -37,14 +37,14 @@ def locate_with_skin(
     noise: Floats,
     felt: TouchEvent | None,
 ) -> Place:
-    """The place of the contact of one sample.
+    """Return the place of the contact of one sample.
 
     Args:
         load: float64[6], force (N) and torque (N mm) on the fingertip.
-        contact: what `intrinsic.locate` made of it.
+        contact: result of `intrinsic.locate` for it.
         surface: of the fingertip.
         noise: float64[6, 6], covariance of the load.
-        felt: the contact of the skin now, in the same frame, if there is one.
+        felt: the present contact of the skin, in the same frame, if there is one.
     """
     force, torque = load[:3], load[3:]
     sizes = np.repeat([np.linalg.norm(force), np.linalg.norm(torque)], 3)
@@ -59,11 +59,11 @@ def locate_with_skin(
     if felt is not None and felt.centroid_m is not None and felt.sigma_m:
         along = np.eye(3) - np.outer(normal, normal)
         covariance = along @ covariance @ along
-        # A radial standard error is that of two directions.
+        # A radial standard error covers two directions.
         of_skin = along * (1e3 * felt.sigma_m) ** 2 / 2.0
         gain = covariance @ np.linalg.pinv(covariance + of_skin, hermitian=True)
         joined = point + gain @ along @ (1e3 * np.array(felt.centroid_m) - point)
-        # Back onto the surface, which bends away below the tangent plane.
+        # Move the point back to the surface, which bends away below the tangent plane.
         distance, found = surface.enter((joined + normal)[None], -normal[None])
         if found[0]:
             point = joined + (1.0 - distance[0]) * normal

@@ -1,4 +1,4 @@
-"""Is it slipping? Three detectors over contacts or elements, one sample at a time.
+"""Three slip detectors over contacts or elements, one sample at a time.
 
 `friction_used` needs to know the friction; `RatioDrop` and `ShearRate` do not. Forces in
 N; normal forces are not negative. All arrays have one entry a contact.
@@ -16,10 +16,10 @@ Mask = NDArray[np.bool_]
 def friction_used(
     normal_n: ArrayLike, shear_n: ArrayLike, friction: float, *, minimum_n: float = 0.1
 ) -> Floats:
-    """Share of the friction limit that is used, float64[n]; slip is due at 1.
+    """Return the share of the friction limit that is used, float64[n]; slip is expected at 1.
 
-    Ft / (mu Fn) (Bicchi and Dario, Fig. 6, first strategy). Contacts lighter than
-    `minimum_n` say nothing and return 0.
+    Ft / (mu Fn) (Bicchi and Dario, Fig. 6, first strategy). 0 for contacts lighter than
+    `minimum_n`.
 
     Args:
         normal_n: [n].
@@ -35,19 +35,20 @@ def friction_used(
 
 
 class RatioDrop:
-    """Abrupt fall of the ratio Ft / Fn: static friction gave way to sliding friction.
+    """Detects an abrupt fall of the ratio Ft / Fn: static friction became sliding friction.
 
-    For unknown friction (Bicchi and Dario, Fig. 6, second strategy). The ratio's mean over
-    a short window is compared with that of the window before; the fall must exceed what
-    noise makes of it. Where sliding friction is no lower than static, the ratio does not fall
-    and this detector is blind.
+    For unknown friction (Bicchi and Dario, Fig. 6, second strategy). The ratio's mean over a short
+    window is compared with that of the window before; the fall must exceed the effect of noise. If
+    sliding friction is no lower than static friction, the ratio does not fall and this detector
+    finds
+    nothing.
 
     Args:
         contacts: n.
         window: samples in each of the two windows.
         drop: least fall of the ratio.
-        force_sd_n: noise of one force reading; the fall must exceed 6 of its effect.
-        minimum_n: contacts with less normal force say nothing.
+        force_sd_n: noise of one force reading; the fall must exceed 6 times its effect.
+        minimum_n: contacts with less normal force are ignored.
     """
 
     def __init__(
@@ -66,7 +67,7 @@ class RatioDrop:
         self._minimum_n = minimum_n
 
     def step(self, normal_n: ArrayLike, shear_n: ArrayLike) -> Mask:
-        """bool[n]: slips, from normal forces [n] and tangential forces [n, 2]."""
+        """Return which contacts slip, bool[n], from normal [n] and tangential forces [n, 2]."""
         normal = np.asarray(normal_n, np.float64)
         tangential = np.linalg.norm(np.asarray(shear_n, np.float64), axis=-1)
         heavy = normal >= self._minimum_n
@@ -118,9 +119,9 @@ class ShearRate:
         return known
 
     def threshold(self, force_sd_n: float, false_alarms_per_hour: float, rate_hz: float) -> float:
-        """Least threshold, N/s, that noise alone crosses no more often than wished.
+        """Return the least threshold, N/s, that noise alone crosses at most this often.
 
-        The two components are Gaussian, so the size of their sum crosses t with
+        The two components are Gaussian, so the magnitude of their vector crosses t with
         probability exp(-t^2 / 2 s^2) per sample.
         """
         deviation = force_sd_n * float(np.linalg.norm(self._weight))

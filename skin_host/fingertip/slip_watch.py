@@ -1,4 +1,4 @@
-"""Does a fingertip slip? The detectors of `slip` on the load of one contact."""
+"""Applies the detectors of `slip` to the load of one contact."""
 
 from dataclasses import dataclass
 
@@ -11,13 +11,13 @@ from skin_host.fingertip.slip import RatioDrop, ShearRate, friction_used
 
 Floats = NDArray[np.float64]
 
-#: Noise alone is to cross the threshold of the rate no more often than this.
+#: Noise alone crosses the threshold of the rate no more often than this.
 FALSE_ALARMS_PER_HOUR = 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """Normal and tangential force (N), rate of the latter (N/s), and what tells of a slip."""
+    """Normal and tangential force (N), rate of the latter (N/s), and the sign of a slip, if any."""
 
     normal_n: float
     shear_n: float = 0.0
@@ -49,11 +49,11 @@ class SlipWatch:
         """Take in a sample.
 
         Args:
-            load: float64[6], as it came, not smoothed.
+            load: float64[6], not smoothed.
             normal: float64[3], of the surface at the contact, if it has a place.
-            settled: the contact is not new; before, its force may build up at any rate.
+            settled: the contact is not new; the force of a new contact may build up at any rate.
         """
-        # Of the whole force, as its tangential axes turn with the place.
+        # Rate of the whole force, because its tangential axes turn with the place of the contact.
         change = self._derivative.derivative(load[None, :3])[0]
         if normal is None:
             return Seen(float(np.linalg.norm(load[:3])))
@@ -69,7 +69,7 @@ class SlipWatch:
         if rate > self.threshold_n_s:
             cause = "rate"
         elif self._friction is None:
-            # Pressing harder lowers the ratio too; then the shear itself does not fall.
+            # Pressing harder lowers the ratio too, but then the shear force itself does not fall.
             if fell and float(change @ shear) < 0.0:
                 cause = "fall"
         else:

@@ -1,7 +1,7 @@
 """Force/torque boards (STRAIN, STRAIN2) on the robot's CAN: streams, commands, pairing.
 
 Force and torque of one sample are two frames of class 3, ID 0x300 | board<<4 | type, each
-with three little-endian words around 0x8000. Nothing numbers them: they are paired by
+with three little-endian words around 0x8000. They have no sequence number and are paired by
 arrival. Source: icub-main's CanBusFtSensor.cpp and iCubCanProto_analogSensorMessages.h.
 """
 
@@ -20,11 +20,11 @@ Floats = NDArray[np.float64]
 
 ZERO_WORD = 0x8000
 CHANNELS = 6
-#: A host calls the sensor silent when nothing has come for so long.
+#: The sensor has timed out when nothing was received for this long.
 SILENT_NS = 100_000_000
 
 
-#: Frames of one sample come together; the next one's are a period later.
+#: Time in which the two frames of a sample must arrive, per ms of period.
 PAIR_NS_PER_MS = 750_000
 
 
@@ -48,7 +48,7 @@ class StrainMode(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class GetFullScale(Analog):
-    """18: ask the full scale of a channel: 0-2 force (N), 3-5 torque (N m)."""
+    """18: query the full scale of a channel: 0-2 force (N), 3-5 torque (N m)."""
 
     CODE: ClassVar[int] = 0x18
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("<B")
@@ -57,7 +57,7 @@ class GetFullScale(Analog):
 
 @dataclass(frozen=True, slots=True)
 class FullScale(Analog):
-    """Answer to 18. The only number here with its high byte first."""
+    """Answer to 18. The only number in this protocol with its high byte first."""
 
     CODE: ClassVar[int] = 0x18
     LAYOUT: ClassVar[struct.Struct] = struct.Struct(">BH")
@@ -66,14 +66,14 @@ class FullScale(Analog):
 
 
 def start_frames(board: int, period_ms: int) -> list[tuple[int, bytes]]:
-    """Frames that set a board up: ask all full scales, set the period, start it."""
+    """Return the frames that set a board up: query all full scales, set the period, start it."""
     asked: list[Analog] = [GetFullScale(channel) for channel in range(CHANNELS)]
     asked += [SetTransmissionPeriod(period_ms), SetTxMode(StrainMode.CALIBRATED)]
     return [command_frame(command, board) for command in asked]
 
 
 def parse_full_scale(can_id: int, payload: bytes) -> tuple[int, FullScale] | None:
-    """Board and full scale in an answer to `GetFullScale`; None if it is something else."""
+    """Return board and full scale of an answer to `GetFullScale`; None for any other frame."""
     board = can_id >> 4 & 0xF
     if can_id != identifier(MessageClass.ANALOG_COMMAND, board, HOST_ADDRESS) or board == 0:
         return None
@@ -104,7 +104,7 @@ class StrainFrames:
 
 
 def parse_strain(batch: FrameBatch) -> StrainFrames:
-    """Pick the force/torque frames out of a batch."""
+    """Return the force/torque frames of a batch."""
     kind = batch.id & 0xF
     mine = (
         (batch.id >> 8 == MessageClass.ANALOG_STREAM)
@@ -129,7 +129,7 @@ def parse_strain(batch: FrameBatch) -> StrainFrames:
 def encode_strain(
     board: int, kind: StrainType, value: ArrayLike, *, overflow: int = 0
 ) -> tuple[int, bytes]:
-    """One frame: identifier and payload, of three values in -32768..32767.
+    """Return one frame (identifier and payload) with three values in -32768..32767.
 
     Raises:
         ValueError: a value does not fit its word.
@@ -153,13 +153,13 @@ class Wrench:
 
 @dataclass(slots=True)
 class StrainCounters:
-    """What one board's stream has seen.
+    """Counters of one board's stream.
 
     Attributes:
         samples: pairs found.
-        lone: frames whose other half did not come in time.
+        lone: frames whose other half did not arrive in time.
         saturated: samples with a saturated channel.
-        wrong_length: frames that were no force and no torque.
+        wrong_length: frames that were neither force nor torque.
     """
 
     samples: int = 0
@@ -172,9 +172,10 @@ class StrainCounters:
 class WrenchAssembler:
     """Pairs the force and torque frames of one board, in either order.
 
-    Two frames belong together if they are of different types and came within three quarters
-    of a period of each other; a frame whose other half is late is counted and dropped, so that
-    force is never joined with the torque of another sample.
+    Two frames belong together if they are of different types and arrived within three quarters of a
+    period. A frame whose other half is late is counted and dropped, so that force is never joined
+    with
+    the torque of another sample.
 
     Args:
         board: its address.
@@ -189,11 +190,11 @@ class WrenchAssembler:
     _half: tuple[int, int, NDArray[np.int32], bool] | None = None
 
     def add(self, batch: FrameBatch) -> list[Wrench]:
-        """Take a batch of the bus; give the samples that it completes."""
+        """Take a batch of the bus; return the samples that it completes."""
         return self.take(parse_strain(batch), batch.t_ns)
 
     def take(self, frames: StrainFrames, t_ns_of: NDArray[np.int64]) -> list[Wrench]:
-        """The same of frames that were picked out already, and the batch's times [n]."""
+        """As `add`, for frames that were picked out already and the batch's times [n]."""
         self.counters.wrong_length += frames.wrong_length
         mine = (frames.board == self.board) & (frames.type >= StrainType.FORCE)
         samples = []

@@ -1,8 +1,8 @@
-"""One fingertip on a force/torque board: samples in, contacts, slips and excess out. Pure.
+"""One fingertip on a force/torque board: takes samples, returns contacts, slips and excess. Pure.
 
-Force and torque give one contact (Bicchi and Dario; Son et al.), and the flags of Ohka et
-al. Where skin covers the fingertip its contact and this one are joined, each weighted by
-what it knows. Times are those of the frames, ns.
+Force and torque give one contact (Bicchi and Dario; Son et al.), and the flags of Ohka et al.
+Where skin covers the fingertip, its contact is joined with this one, each weighted by its
+precision. Times are those of the frames, ns.
 """
 
 import math
@@ -22,28 +22,22 @@ from skin_host.fingertip.slip_watch import SlipWatch
 from skin_host.fingertip.strain_protocol import SILENT_NS, Wrench
 from skin_host.fingertip.wrench import Butterworth2
 from skin_host.processing.calibration import Zero
-from skin_host.processing.contacts import (
-    ALIVE_NS,
-    LOST_NS,
-    MOVED_M,
-    PRESSED_SHARE,
-    Load,
-    TouchEvent,
-)
+from skin_host.processing.contacts import ALIVE_NS, LOST_NS, MOVED_M, PRESSED_SHARE
+from skin_host.processing.events import Load, Reason, TouchEvent
 
 Floats = NDArray[np.float64]
 
 #: A contact ends at this share of the force at which it begins.
-LET_GO = 0.7
-#: Slips are not looked for while the force of a new contact still builds up.
+RELEASE = 0.7
+#: Slips are not detected while the force of a new contact builds up.
 SETTLING_NS = 100_000_000
-#: Contacts lighter than so many times the noise of the force say nothing, whatever is configured.
+#: Contacts lighter than this multiple of the force noise are ignored, whatever is configured.
 LEAST_NOISES = 6.0
-#: A twist about the force (mm) is that of several contacts beyond this, and so many times what
-#: noise makes of it.
+#: A twist about the force (mm) larger than this, and larger than this multiple of its noise, means
+#: several contacts.
 PITCH_LIMIT_MM = 1.0
 PITCH_NOISES = 4.0
-#: A skin's contact is joined while it is no older than so many of its periods.
+#: A contact of the skin is joined while it is at most this many of the skin's periods old.
 FRESH_PERIODS = 2.5
 
 Told = Literal["contact", "no_single_contact", "several_contacts", "saturated"]
@@ -66,12 +60,14 @@ class Tip:
     Attributes:
         threshold_n: least force of a contact; noise may raise the configured one.
         samples: how many have been taken in since the zero was known.
+        feels: the zero is known, and samples arrive.
     """
 
     def __init__(
         self, name: str, settings: Fingertip, move_hz: float, array_period_ns: int = 0
     ) -> None:
         self.samples = 0
+        self.feels = False
         self.threshold_n = settings.threshold_n
         self._name = name
         self._settings = settings
@@ -79,15 +75,15 @@ class Tip:
         self._matrix = np.eye(6) if settings.matrix is None else np.array(settings.matrix)
         self._sensor_mm = np.array(settings.sensor_mm)
         self._rate_hz = 1000.0 / settings.period_ms
-        self._shortest_ns = int(1e9 / move_hz)
+        self.move_hz = move_hz
         self._fresh_ns = int(FRESH_PERIODS * array_period_ns)
         self._skin: dict[int, TouchEvent] = {}
         self._skin_ns = 0
         self._zero: Zero | None = None
         self._next_id = 1
-        self._said: TouchEvent | None = None
+        self._reported: TouchEvent | None = None
         self._begun_ns = 0
-        self._looked_ns = 0
+        self._located_ns = 0
         self._contact: IntrinsicContact | None = None
         self._last_ns = 0
         self._cause: Cause = "rate"
@@ -98,32 +94,33 @@ class Tip:
 
     @property
     def flags(self) -> Flags:
-        """Of the finger now, see `grasp.Flags`."""
+        """The present flags of the finger, see `grasp.Flags`."""
         return self._finger.flags
 
     @property
     def flag_names(self) -> list[str]:
-        """The flags as they are published."""
+        """The names of the flags, as they are published."""
         return _names(self.flags)
 
     @property
     def zeroed(self) -> bool:
-        """Whether it is known what the unloaded board sends; nothing comes out before."""
+        """Whether the load of the unloaded board is known; before that there is no output."""
         return self._zero is not None
 
     @property
     def touched(self) -> bool:
-        """Whether a contact lasts."""
-        return self._said is not None
+        """Whether something touches the fingertip."""
+        return self._reported is not None
 
     def touched_for_ns(self, now_ns: int) -> int:
         """How long the contact has lasted; 0 without one."""
         return now_ns - self._begun_ns if self.touched else 0
 
     def use(self, zero: Zero | None) -> None:
-        """Work with this zero from now on. Contacts must have been ended before."""
+        """Use this zero from now on. All contacts must have been ended before."""
         self._zero = zero
         self.samples = 0
+        self.feels = False
         if zero is not None:
             per_channel = self._moved(np.eye(6))
             self._covariance = per_channel.T @ np.diag(zero.noise**2) @ per_channel
@@ -132,7 +129,7 @@ class Tip:
         self._forget()
 
     def note_skin(self, events: Iterable[TouchEvent], t_ns: int) -> None:
-        """A frame of the skin on the fingertip brought these events."""
+        """Take in the contact events of a frame of the skin on the fingertip."""
         self._skin_ns = t_ns
         for event in events:
             if event.event == "end":
@@ -141,61 +138,65 @@ class Tip:
                 self._skin[event.id] = event
 
     def step(self, wrench: Wrench) -> list[FingertipEvent]:
-        """Take a sample; return what happened."""
+        """Take in a sample; return its events."""
         if self._zero is None:
             return []
         if abs(wrench.t_ns - self._last_ns) > SILENT_NS and self.samples:
-            # What comes after a pause is not the continuation of what was before.
+            # A sample after a pause does not continue the samples before it.
             self._restart()
         self._last_ns = wrench.t_ns
         self.samples += 1
+        self.feels = True
         measured = np.concatenate([wrench.force_n, wrench.torque_nm]) - self._zero.offset
         load = self._moved(measured[None])[0]
-        least_n = self.threshold_n * (1.0 if self._said is None else LET_GO)
+        least_n = self.threshold_n * (1.0 if self._reported is None else RELEASE)
         touches = wrench.saturated or float(np.linalg.norm(load[:3])) >= least_n
-        if self._said is None:
+        if self._reported is None:
             if not touches and self.flags == Flags.SEARCH:
                 return []
             if touches:
-                self._restart()  # what was before is of no contact
+                self._restart()  # the samples before belong to no contact
         smooth = self._filter.step(load)
         if touches and np.linalg.norm(smooth[:3]) < least_n:
             smooth = load
-        # A place is worked out when it may be told; slips are looked for at every sample.
-        looks = self._said is None or not 0 <= wrench.t_ns - self._looked_ns < self._shortest_ns
+        # The place is computed only when it may be reported; slips are detected at every sample.
+        locates = (
+            self._reported is None or not 0 <= wrench.t_ns - self._located_ns < 1e9 / self.move_hz
+        )
         if not touches or wrench.saturated:
             self._contact = None
-        elif looks:
+        elif locates:
             self._contact = self._locate(smooth, least_n)
         events = self._grasp(load, self._contact, wrench.t_ns, touches=touches)
         if touches:
-            if looks:
-                self._looked_ns = wrench.t_ns
+            if locates:
+                self._located_ns = wrench.t_ns
                 events += self._touch(smooth, wrench.t_ns)
-        elif self._said is not None:
+        elif self._reported is not None:
             events += self._end(wrench.t_ns)
         return events
 
     def expire(self, now_ns: int) -> list[FingertipEvent]:
-        """End a contact of which nothing has been heard for long."""
-        if self._said is None or now_ns - self._last_ns < LOST_NS:
+        """End a contact whose samples have stopped for too long."""
+        if now_ns - self._last_ns < LOST_NS:
             return []
-        return self.end_all(now_ns)
+        self.feels = False
+        if self._reported is None:
+            return []
+        return self.end_all(now_ns, "lost")
 
-    def end_all(self, t_ns: int) -> list[FingertipEvent]:
-        """End what lasts: the fingertip will not be heard of for a while."""
+    def end_all(self, t_ns: int, reason: Reason = "stopped") -> list[FingertipEvent]:
+        """End all contacts, because the fingertip will not send for a while."""
         events: list[FingertipEvent] = []
         if self.flags & Flags.SLIP:
             number = self._ids["slip"]
             events.append(SlipEvent("end", number, t_ns, self._name, self._cause, 0.0, 0.0, 0.0))
         if self.flags & Flags.OVER:
             events.append(OverEvent("end", self._ids["over"], t_ns, self._name, 0.0))
-        if self._said is not None:
-            events += self._end(t_ns)
+        if self._reported is not None:
+            events += self._end(t_ns, reason)
         self._forget()
         return events
-
-    # ------------------------------------------------------------------ within
 
     def _forget(self) -> None:
         self._restart()
@@ -208,12 +209,14 @@ class Tip:
         )
 
     def _restart(self) -> None:
-        """Forget the samples before; contact and flags go on."""
+        """Forget the earlier samples, but keep contact and flags."""
         self._filter = Butterworth2(self._settings.filter_hz, self._rate_hz, 6)
         self._watch = SlipWatch(self._settings, self._rate_hz, self._noise_n)
 
     def _moved(self, measured: Floats) -> Floats:
-        """Rows of what the board sends (N, N m) as force (N) and torque (N mm) on the fingertip."""
+        """Convert rows of the board's values (N, N m) to force (N) and torque (N mm) on the
+        fingertip.
+        """
         load: Floats = measured @ self._matrix.T
         load[:, 3:] *= 1e3
         if self._sensor_mm.any():
@@ -232,32 +235,32 @@ class Tip:
         )
 
     def _felt(self) -> list[TouchEvent]:
-        """Contacts of the skin, as long as it sends."""
+        """Return the contacts of the skin, if it still sends."""
         fresh = abs(self._last_ns - self._skin_ns) <= self._fresh_ns
         return list(self._skin.values()) if fresh else []
 
     def _grasp(
         self, load: Floats, contact: IntrinsicContact | None, t_ns: int, *, touches: bool
     ) -> list[FingertipEvent]:
-        """Bring the flags up to date by a sample as it came, not smoothed."""
-        settled = self._said is not None and t_ns - self._begun_ns > SETTLING_NS
+        """Update the flags from a sample that is not smoothed."""
+        settled = self._reported is not None and t_ns - self._begun_ns > SETTLING_NS
         located = contact is not None and contact.verdict[0] == Verdict.CONTACT
         normal = contact.normal[0] if contact is not None and located else None
         seen = self._watch.step(load, normal, settled=settled)
         normal_n = seen.normal_n if touches else 0.0
         if seen.cause is not None and not self.flags & Flags.SLIP:
             self._cause = seen.cause
-        told = self._finger.step(
+        changes = self._finger.step(
             np.array([normal_n]),
             np.array([seen.rate_n_s]),
             t_ns,
             slips=seen.cause is not None,
         )
         events: list[FingertipEvent] = []
-        for one in told:
+        for one in changes:
             if one.event == "begin":
-                # The contact may begin with this very sample.
-                self._ids[one.kind] = self._next_id if self._said is None else self._said.id
+                # The contact may begin with this same sample.
+                self._ids[one.kind] = self._next_id if self._reported is None else self._reported.id
             number = self._ids[one.kind]
             if one.kind == "over":
                 events.append(OverEvent(one.event, number, t_ns, self._name, normal_n))
@@ -267,18 +270,18 @@ class Tip:
         return events
 
     def _touch(self, load: Floats, t_ns: int) -> list[FingertipEvent]:
-        before = self._said
-        told = self._described(load, self._contact, t_ns)
+        before = self._reported
+        touch = self._described(load, self._contact, t_ns)
         if before is None:
             self._next_id += 1
             self._begun_ns = t_ns
-        elif not self._worth_saying(before, told):
+        elif not self._worth_reporting(before, touch):
             return []
-        self._said = told
-        return [told]
+        self._reported = touch
+        return [touch]
 
     def _described(self, load: Floats, contact: IntrinsicContact | None, t_ns: int) -> TouchEvent:
-        """The contact as it is now; one without a location is saturated."""
+        """Return the contact as it is now; one without a location is saturated."""
         felt = self._felt()
         skin = felt[0] if len(felt) == 1 else None
         verdict: Told = "saturated"
@@ -294,7 +297,7 @@ class Tip:
             normal_n = max(0.0, -float(load[:3] @ place.normal))
             shear = (load[:3] + normal_n * place.normal).tolist()
         torque_nm = (1e-3 * load[3:]).tolist()
-        before = self._said
+        before = self._reported
         return TouchEvent(
             "begin" if before is None else "move",
             self._next_id if before is None else before.id,
@@ -312,14 +315,14 @@ class Tip:
             Load(verdict, load[:3].tolist(), torque_nm, shear, self.flag_names),
         )
 
-    def _end(self, t_ns: int) -> list[FingertipEvent]:
-        last, self._said = self._said, None
+    def _end(self, t_ns: int, reason: Reason = "released") -> list[FingertipEvent]:
+        last, self._reported = self._reported, None
         assert last is not None and last.load is not None
         zero = [0.0, 0.0, 0.0]
         load = Load(last.load.verdict, zero, zero, zero, self.flag_names)
-        return [replace(last.ended(self.samples, t_ns), load=load)]
+        return [replace(last.ended(self.samples, t_ns, reason), load=load)]
 
-    def _worth_saying(self, said: TouchEvent, now: TouchEvent) -> bool:
+    def _worth_reporting(self, said: TouchEvent, now: TouchEvent) -> bool:
         assert said.load is not None and now.load is not None
         if now.t_ns - said.t_ns >= ALIVE_NS:
             return True

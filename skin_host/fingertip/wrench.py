@@ -1,9 +1,8 @@
-"""What must be done to a force/torque signal before a contact is read from it (Son et al.).
+"""Prepares a force/torque signal for the location of contacts (Son et al.).
 
-The mass between sensor and contact answers accelerations: its inertial force is taken
-out where the acceleration is known, and the time is marked as unsure where it is not.
-Noise is taken down by a two-pole Butterworth filter; contacts lighter than a threshold
-are not localised.
+The mass between sensor and contact responds to accelerations: its inertial force is removed where
+the acceleration is known, and otherwise the time is marked as uncertain. A two-pole Butterworth
+filter reduces the noise; contacts lighter than a threshold are not localised.
 """
 
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class FingertipMass:
-    """The part of the finger beyond the force sensor: mass, and where its centre is."""
+    """The part of the finger beyond the force sensor: its mass, and the position of its centre."""
 
     mass_kg: float
     centre_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -54,7 +53,7 @@ class Butterworth2:
         self._resting = True
 
     def step(self, value: ArrayLike) -> Floats:
-        """Filtered values float64[channels] of one sample. A NaN leaves the state as it was."""
+        """Return filtered values float64[channels]. A NaN leaves the state unchanged."""
         x = np.broadcast_to(np.asarray(value, np.float64), self._z1.shape)
         if self._resting:
             if not np.isfinite(x).all():

@@ -1,16 +1,15 @@
-"""One record of everything that can go wrong, part by part.
+"""Health of each part: counters, faults and their explanation in one record.
 
-Counters come from where the losses happen; `watch` notes what they gained and who was heard
-when, `describe` makes the record of a part from that, and `diagnosis` names what is wrong.
-The record is published as `<part>/health` and shown by `skin status`.
+The modules that can lose data count their losses. `watch` notes how the counters grow and when
+each board was last received, `describe` builds the record of a part from that, and `diagnosis`
+finds the faults. The record is published as `<part>/health` and shown by `skin status`.
 """
 
 from typing import Any
 
-from skin_host.bus.assembler import Sweep
 from skin_host.bus.boards import Boards
 from skin_host.bus.port import Port
-from skin_host.engine import Engine, Step
+from skin_host.engine import Engine, Output
 from skin_host.health.describe import Describer
 from skin_host.health.diagnosis import Fault, diagnose
 from skin_host.health.record import Record
@@ -18,8 +17,16 @@ from skin_host.health.watch import Watch
 
 __all__ = ["Health", "Record"]
 
-#: Faults that come and go by nature: told for so long after they were last seen.
+#: An intermittent fault stays in the record for this long after it was last seen.
 HOLD_NS = 3_000_000_000
+#: A longer pause between two calls of `tick` means that this computer stalled.
+STALL_NS = 300_000_000
+#: For this long after a stall, lateness and losses may be caused by this computer, so no board or
+#: bus is blamed for them.
+STALLED_NS = 4_000_000_000
+#: Losses of the output are reported as faults for this long after they happened.
+LATELY_NS = 60_000_000_000
+_ACCUSING = {"board_jitter", "board_period", "bus_loses_frames"}
 _PASSING = {
     "board_jitter",
     "board_overflows",
@@ -37,25 +44,35 @@ _PASSING = {
 class Health:
     """Watches what passes through the daemon and describes it on request.
 
-    Every time is on the clock of the frames' time stamps, and should be the one by which
-    everything that came had been read: what waits unread is not silent.
+    All times are on the clock of the frames' time stamps. The time passed in should be the time up
+    to which all received frames have been read: a board whose frames wait unread has not timed out.
     """
 
     def __init__(self, engine: Engine) -> None:
         self._watch = Watch(engine)
         self._describer = Describer(engine, self._watch)
         self._held: dict[int, dict[tuple[str, str], tuple[Fault, int]]] = {}
+        self._ticked_ns = 0
+        self._stall_ns = 0
+        self._stalled_ns = -STALLED_NS
+        self._output: dict[str, int] = {}
+        self._output_ns: dict[str, int] = {}
 
-    def note_sweeps(self, sweeps: list[Sweep]) -> None:
-        """Sweeps that came."""
-        self._watch.note_sweeps(sweeps)
+    def use(self, engine: Engine) -> None:
+        """Continue with another engine, after a reload."""
+        self._watch.use(engine)
+        self._describer = Describer(engine, self._watch)
 
-    def note_step(self, step: Step) -> None:
-        """A sample that was processed."""
-        self._watch.note_step(step)
+    def note(self, output: Output) -> None:
+        """Take in one output of the core."""
+        self._watch.note(output)
 
     def tick(self, now_ns: int, ports: dict[str, Port], boards: dict[str, Boards]) -> None:
-        """Look at all counters; to be called some times a second."""
+        """Read all counters; to be called ten times a second."""
+        pause_ns = now_ns - self._ticked_ns
+        if self._ticked_ns and STALL_NS < pause_ns < LATELY_NS:
+            self._stall_ns, self._stalled_ns = pause_ns, now_ns
+        self._ticked_ns = now_ns
         self._watch.tick(now_ns, ports, boards)
 
     def record(
@@ -65,37 +82,73 @@ class Health:
         ports: dict[str, Port],
         boards: dict[str, Boards],
         output: dict[str, Any] | None = None,
+        unkept: dict[str, str] | None = None,
     ) -> Record:
-        """What there is to say of a part, its faults by name and in sentences.
+        """Return the health record of a part, with its faults as codes and as sentences.
 
         Args:
             part: index in the layout.
             now_ns: the time.
             ports, boards: by name of the bus.
             output: the counters of the publisher, if there is one.
+            unkept: what the daemon could not write to its state directory, and why.
         """
         record = self._describer.part(part, now_ns, ports, boards)
         if output is not None:
             record["output"] = output
-        faults = self._hold(part, diagnose(record), now_ns)
+        if unkept:
+            record["unkept"] = dict(unkept)
+        if output is not None:
+            self._note_output(output, now_ns)
+        found = diagnose(record, [name for name, at_ns in self._output_ns.items() if at_ns])
+        faults = self._hold(part, self._without_own_stalls(found, now_ns), now_ns)
+        if record["state"] == "ok" and faults:
+            record["state"] = "warning"
         record["faults"] = [{"code": fault.code, "where": fault.where} for fault in faults]
-        record["sentences"] = [fault.says for fault in faults]
+        record["sentences"] = [fault.sentence for fault in faults]
         return record
 
     def replayed(self, part: int) -> Record:
-        """What there is to say of a part at the end of a replay: no ages, and no judgement."""
+        """Return the record of a part at the end of a replay, without ages and without faults."""
         return self._describer.part(part, None, {}, {})
 
     def rates(self) -> dict[str, float]:
-        """Frames and sweeps a second over all buses and boards."""
+        """Return frames and sweeps per second, summed over all buses and boards."""
         gained = [bus.gained for bus in self._watch.buses.values() if bus.gained]
         return {
             f"{what}_hz": sum(one[what] / max(one["seconds"], 0.1) for one in gained)
             for what in ("frames", "sweeps")
         }
 
+    def _note_output(self, output: dict[str, Any], now_ns: int) -> None:
+        """Note which losses have grown within the last minute."""
+        for name in ("touches_dropped", "refused"):
+            if output[name] > self._output.get(name, 0):
+                self._output_ns[name] = now_ns
+            self._output[name] = output[name]
+        self._output_ns = {
+            name: at_ns
+            for name, at_ns in self._output_ns.items()
+            if abs(now_ns - at_ns) < LATELY_NS
+        }
+
+    def _without_own_stalls(self, faults: list[Fault], now_ns: int) -> list[Fault]:
+        """Drop the faults that a stall of this computer can cause, and add the stall itself."""
+        if abs(now_ns - self._stalled_ns) > STALLED_NS:
+            return faults
+        sentence = (
+            f"this computer did not look at the buses for {self._stall_ns / 1e6:.0f} ms: other "
+            "work held it up, or its clock was set; for some seconds neither periods "
+            "nor losses are judged"
+        )
+        for held in self._held.values():
+            for key in [key for key in held if key[0] in _ACCUSING]:
+                del held[key]
+        kept = [fault for fault in faults if fault.code not in _ACCUSING]
+        return [Fault("host_stalls", "host", sentence), *kept]
+
     def _hold(self, part: int, faults: list[Fault], now_ns: int) -> list[Fault]:
-        """Those there are, and passing ones for a while longer."""
+        """Add intermittent faults that were seen within the last `HOLD_NS`."""
         held = self._held.setdefault(part, {})
         for fault in faults:
             held[fault.code, fault.where] = (fault, now_ns)

@@ -1,6 +1,5 @@
-"""From what was watched to what is told: the health record of a part."""
+"""Builds the health record of a part from what `watch` has noted."""
 
-from itertools import pairwise
 from statistics import fmean, median
 from typing import cast
 
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 
 from skin_host.bus.boards import Boards
 from skin_host.bus.port import Port
-from skin_host.bus.protocol import TRIANGLES, StatusError, out_of_range, status_error
+from skin_host.bus.protocol import TRIANGLES, StatusError
 from skin_host.bus.protocol.commands import SKIN_BOARD_TYPES
 from skin_host.engine import Engine
 from skin_host.health.record import (
@@ -18,39 +17,44 @@ from skin_host.health.record import (
     BusHealth,
     LastSecond,
     Record,
+    Temperatures,
     TriangleHealth,
-    Warmth,
 )
-from skin_host.health.watch import BoardWatch, Watch
-from skin_host.layout import PadKind
+from skin_host.health.watch import Watch
+from skin_host.layout import TAXELS_PER_TRIANGLE, PadKind
 from skin_host.processing.calibration import Verdict
-from skin_host.processing.intake import FAR_PADS, lifted
+from skin_host.processing.masks import Mask
+from skin_host.processing.validity import FAR_PADS, lifted
 
-#: An event of a board is told for so long.
+#: An event of a board stays in the record for this long.
 LATELY_NS = 60_000_000_000
-#: Bits of a frame of 8 bytes on the wire, stuff bits and pause included.
+#: Length of a frame of 8 bytes on the wire in bits, with stuff bits and the pause after it.
 FRAME_BITS = 121
-#: Intervals between sweeps that are enough to judge a board's period.
+#: The period of a board is judged from this many intervals between sweeps or more.
 FEWEST_INTERVALS = 8
-#: Standard deviation over median deviation of a normal distribution.
+#: Ratio of standard deviation to median absolute deviation, for a normal distribution.
 SIGMA = 1.4826
-#: A triangle is missing when it has not come in so many sweeps in a row.
+#: A shift of the whole part is measured on this many untouched taxels or more.
+FEWEST_RESTING = 12
+#: A triangle is missing when it was absent from this many sweeps in a row.
 ABSENT_SWEEPS = 3
-#: A baseline that has moved by more than this share of its limit drifts.
+#: A baseline counts as drifting when it has moved by more than this share of its limit.
 DRIFTING_SHARE = 0.25
 
 
 class Describer:
-    """Describes the parts of an engine, with the ports and boards that there are.
+    """Builds the health records of an engine's parts.
 
-    Every time is on the clock of the frames' time stamps; without a time (a replay) no ages.
+    All times are on the clock of the frames' time stamps. Without a time (a replay) the records
+    have
+    no ages.
     """
 
     def __init__(self, engine: Engine, watch: Watch) -> None:
         self._engine = engine
         self._layout = engine.layout
         self._watch = watch
-        #: Of each part, the triangles that each board gives it.
+        #: For each part: the triangles that belong to it, by board.
         self._fitted: dict[int, dict[int, list[int]]] = {part: {} for part in engine.parts}
         for triangle in self._layout.triangles:
             if triangle.part in self._fitted:
@@ -60,7 +64,7 @@ class Describer:
     def part(
         self, part: int, now_ns: int | None, ports: dict[str, Port], boards: dict[str, Boards]
     ) -> Record:
-        """What there is to say of a part."""
+        """Return the health record of a part."""
         watch = self._watch.parts[part]
         layout = self._layout.parts[part]
         pressure = self._layout.pad_kind[layout.start : layout.stop] == PadKind.PRESSURE
@@ -78,6 +82,7 @@ class Describer:
             "beyond_range": _listed(watch.beyond),
             "triangles": self._triangles(part),
             "taxel_verdicts": self._verdicts(part, pressure),
+            "decides_kpa": self._decides_kpa(part),
             "taxel_faults": self._taxel_faults(part, pressure),
             "boards": [self._board(i, now_ns, boards) for i in layout.boards],
             "buses": [self._bus(name, now_ns, ports, boards) for name in buses],
@@ -105,7 +110,7 @@ class Describer:
         return "ok" if watch.valid[pressure].all() else "degraded"
 
     def _triangles(self, part: int) -> list[TriangleHealth]:
-        """The triangles of a part that are not well, and why."""
+        """Return the triangles of a part that have a fault."""
         unwell: list[TriangleHealth] = []
         for board, numbers in self._fitted[part].items():
             if self._all_well(board):
@@ -118,40 +123,48 @@ class Describer:
         return unwell
 
     def _all_well(self, board: int) -> bool:
-        """As nearly always: everything has come, nothing is reported, everything lives."""
-        watch = self._watch.boards[board]
-        sweep = watch.sweep
-        return (
-            sweep is not None
-            and not watch.silent
-            and not self._layout.boards[board].enabled & ~sweep.present
-            and not sweep.status.any()
-            and not self._engine.liveness[board].unproven.any()
+        """Whether no triangle of the board can have a fault: the common case, checked first."""
+        ledger = self._engine.ledger
+        row = ledger.row[board]
+        return bool(
+            ledger.sweeps[row]
+            and ledger.complete(row)
+            and not ledger.is_silent(row)
+            and not ledger.flagged[row]
+            and not self._of_board(self._engine.validity.liveness.unproven, row).any()
         )
 
+    @staticmethod
+    def _of_board(of_triangles: Mask, row: int) -> Mask:
+        """One board's share of an array over all triangles."""
+        mine: Mask = of_triangles[TRIANGLES * row : TRIANGLES * (row + 1)]
+        return mine
+
     def _triangle_fault(self, board: int, number: int) -> str | None:
-        watch = self._watch.boards[board]
-        sweep = watch.sweep
-        if sweep is None or watch.silent:
+        ledger = self._engine.ledger
+        row = ledger.row[board]
+        sweep = ledger.last[row]
+        if sweep is None or ledger.is_silent(row):
             return "missing"
-        if not sweep.present >> number & 1:
-            # A single frame that was lost is told with its bus.
-            return "missing" if watch.absent[number] >= ABSENT_SWEEPS else None
-        status = sweep.status[number : number + 1]
-        error = int(status_error(status)[0])
+        if not ledger.present[row, number]:
+            # One lost frame is a fault of the bus, not of the triangle.
+            return "missing" if ledger.absent[row, number] >= ABSENT_SWEEPS else None
+        error = int(ledger.error[row, number])
         if error & StatusError.NOT_CONNECTED:
             return "not connected"
         if error & StatusError.NO_ACK:
             return "no ack"
-        liveness = self._engine.liveness[board]
-        if liveness.frozen[number]:
-            return "silenced" if watch.error[number] else "frozen"
-        if liveness.unproven[number]:
-            return "silenced" if watch.error[number] else "constant"
-        # Single pads are told with the taxels; here it is the whole triangle.
-        far = out_of_range(status)
+        liveness = self._engine.validity.liveness
+        triangle = TRIANGLES * row + number
+        if liveness.frozen[triangle]:
+            return "silenced" if liveness.silenced[triangle] else "frozen"
+        if liveness.unproven[triangle]:
+            return "silenced" if liveness.silenced[triangle] else "constant"
+        # Single pads are listed with the taxels; only a whole triangle counts here. Pads that were
+        # pressed while their board was zeroed are reported as `board_in_doubt`.
+        far = ledger.far[row, number] & ~self._engine.in_doubt(board)[number]
         many = np.count_nonzero(far) >= FAR_PADS
-        other = lifted(sweep.raw[number : number + 1], far)[0]
+        other = lifted(sweep.raw[number], far)
         return "out of range" if many or other else None
 
     def _taxel_faults(self, part: int, pressure: NDArray[np.bool_]) -> dict[str, list[int]]:
@@ -162,12 +175,16 @@ class Describer:
         for index in layout.boards:
             taxels = self._layout.boards[index].taxel_index
             mine = (taxels >= layout.start) & (taxels < layout.stop)
-            liveness = self._engine.liveness[index]
-            sweep = self._watch.boards[index].sweep
-            masks = {"stuck": liveness.stuck, "noisy": liveness.noisy}
-            if sweep is not None and sweep.status.any():
-                answered = (status_error(sweep.status) == 0)[:, None]
-                masks["out_of_range"] = out_of_range(sweep.status) & answered
+            ledger, liveness = self._engine.ledger, self._engine.validity.liveness
+            row = ledger.row[index]
+            masks = {
+                "stuck": self._of_board(liveness.stuck, row),
+                "noisy": self._of_board(liveness.noisy, row),
+            }
+            if ledger.flagged[row]:
+                answered = (ledger.error[row] == 0)[:, None]
+                far = ledger.far[row] & ~self._engine.in_doubt(index)
+                masks["out_of_range"] = far & answered
             for kind, mask in masks.items():
                 found[kind][taxels[mine & mask] - layout.start] = True
         pipeline, calibration = self._engine.pipeline, self._engine.calibration
@@ -182,7 +199,7 @@ class Describer:
             if (mask & pressure).any()
         }
 
-    def _warmth(self, part: int, pressure: NDArray[np.bool_]) -> Warmth | None:
+    def _warmth(self, part: int, pressure: NDArray[np.bool_]) -> Temperatures | None:
         pipeline, calibration = self._engine.pipeline, self._engine.calibration
         watch = self._watch.parts[part]
         if pipeline is None or calibration is None or watch.raw is None or watch.valid is None:
@@ -191,13 +208,17 @@ class Describer:
         span = slice(layout.start, layout.stop)
         units = self._layout.no_load[span].astype(np.float64) - watch.raw
         heard = watch.raw > 0
+        # A triangle whose pressures are not valid has no valid temperature either.
+        lives = watch.valid.reshape(-1, TAXELS_PER_TRIANGLE).any(axis=1)
         thermal = ~pressure & heard & calibration.usable[span]
-        warmth: Warmth = {"thermal_units": None, "common_units": 0.0}
+        thermal &= np.repeat(lives, TAXELS_PER_TRIANGLE)
+        warmth: Temperatures = {"thermal_units": None, "common_units": 0.0}
         if thermal.any():
             shift = units[thermal] - calibration.baseline[span][thermal]
             warmth["thermal_units"] = round(float(np.median(shift)), 1)
-        if watch.valid.any():
-            shift = (units - pipeline.baseline[span])[watch.valid]
+        rests = watch.valid if watch.touched is None else watch.valid & ~watch.touched
+        if np.count_nonzero(rests) >= FEWEST_RESTING:
+            shift = (units - pipeline.baseline[span])[rests]
             warmth["common_units"] = round(float(np.median(shift)), 1)
         return warmth
 
@@ -214,25 +235,32 @@ class Describer:
             if kind != Verdict.OK and (pressure & (verdict == kind)).any()
         }
 
+    def _decides_kpa(self, part: int) -> float | None:
+        """Return the pressure above which every usable taxel decides within a second."""
+        pipeline = self._engine.pipeline
+        return None if pipeline is None else round(pipeline.decides_kpa(part), 1)
+
     def _board(self, index: int, now_ns: int | None, boards: dict[str, Boards]) -> BoardHealth:
         board = self._layout.boards[index]
         watch = self._watch.boards[index]
-        sweep = watch.sweep
-        period_seen_ms, jitter_ms = _period(watch, board.settings.period_ms)
+        ledger = self._engine.ledger
+        row = ledger.row[index]
+        sweep = ledger.last[row]
+        period_seen_ms, jitter_ms = _period(ledger.intervals_ns(row), board.settings.period_ms)
         record: BoardHealth = {
             "name": board.name,
             "bus": board.settings.bus,
             "address": board.settings.address,
             "skin_type": board.settings.skin_type,
-            "alive": watch.alive,
-            "sweeps": watch.sweeps,
+            "alive": sweep is not None and not ledger.is_silent(row),
+            "sweeps": int(ledger.sweeps[row]),
             "fitted": list(board.triangles),
             "triangles_present": 0 if sweep is None else _count(sweep.present, board.triangles),
             "triangles": len(board.triangles),
             "period_ms": board.settings.period_ms,
             "period_seen_ms": period_seen_ms,
             "jitter_ms": jitter_ms,
-            "rezeros": self._engine.rezeros[index],
+            "rezeros": int(ledger.rezeros[row]),
             "in_doubt": int(np.count_nonzero(self._engine.in_doubt(index))),
         }
         manager = boards.get(board.settings.bus)
@@ -245,10 +273,10 @@ class Describer:
                 "firmware": known.firmware,
                 "in_bootloader": known.in_bootloader,
                 "configurations": known.configurations,
-                "silences": known.silences,
-                "resets": known.resets,
-                "lost_set_ups": known.lost_set_ups,
-                "tx_overflows": known.tx_overflows,
+                "silences": int(ledger.silences[row]),
+                "resets": int(ledger.resets[row]),
+                "lost_set_ups": int(ledger.lost_set_ups[row]),
+                "tx_overflows": int(ledger.tx_overflows[row]),
             }
         if now_ns is not None:
             record["age_ms"] = _age_ms(now_ns, None if sweep is None else sweep.t_ns)
@@ -257,6 +285,7 @@ class Describer:
                 for name, at_ns in watch.event_ns.items()
                 if abs(now_ns - at_ns) < LATELY_NS
             }
+            record["twice"] = watch.is_twice(now_ns)
         return record
 
     def _bus(
@@ -276,8 +305,9 @@ class Describer:
         manager = boards.get(name)
         if manager is not None:
             record["strangers"] = dict(manager.strangers)
-            if manager.stranger_id is not None:
-                record["stranger"] = f"0x{manager.stranger_id:x}"
+            stranger_id = self._engine.assemblers[name].stranger_id
+            if stranger_id is not None:
+                record["stranger"] = f"0x{stranger_id:x}"
         watch = self._watch.buses[name]
         if watch.gained and now_ns is not None:
             record["last_second"] = _last_second(watch.gained, bus.bitrate)
@@ -285,16 +315,16 @@ class Describer:
         return record
 
 
-def _period(watch: BoardWatch, wanted_ms: int) -> tuple[float | None, float | None]:
+def _period(intervals_ns: NDArray[np.int64], wanted_ms: int) -> tuple[float | None, float | None]:
     """Mean period and its scatter in ms, None until there are enough sweeps."""
-    if len(watch.times_ns) <= FEWEST_INTERVALS:
+    if len(intervals_ns) < FEWEST_INTERVALS:
         return None, None
-    # Of so few numbers lists are done sooner than arrays.
-    intervals_ms = [(late - early) / 1e6 for early, late in pairwise(watch.times_ns)]
+    # For so few numbers lists are faster than arrays.
+    intervals_ms = [interval_ns / 1e6 for interval_ns in intervals_ns.tolist()]
     usual = [interval_ms for interval_ms in intervals_ms if interval_ms < 1.6 * wanted_ms]
     if len(usual) < FEWEST_INTERVALS:
         usual = intervals_ms
-    # From the median deviation: one late sweep of many is no jitter.
+    # From the median deviation, because one late sweep among many is not jitter.
     middle = median(usual)
     jitter_ms = SIGMA * median([abs(interval_ms - middle) for interval_ms in usual])
     return round(fmean(usual), 2), round(jitter_ms, 2)

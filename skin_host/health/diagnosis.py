@@ -1,7 +1,7 @@
-"""What is wrong, by name and in a sentence, from a health record. Pure: a record in, faults out.
+"""Finds the faults in a health record. Pure: takes a record, returns faults.
 
-A fault has a code that programs compare, the place where it is, and a sentence that a person
-can act on. `docs/operations.md` lists the codes and what to do about each.
+A fault has a code for programs, the place where it is, and a sentence that a person can act on.
+`docs/operations.md` lists the codes and what to do about each.
 """
 
 from collections import defaultdict
@@ -12,23 +12,24 @@ from msgspec import Struct
 
 from skin_host.health.record import BoardHealth, BusHealth, Record
 
-#: Share of a bus that strangers' frames may take before they are called babble.
+#: Frames of unconfigured nodes that take more than this share of a bus are a fault.
 BABBLE_LOAD = 0.4
-#: A period off by more than this share of itself is told.
+#: A period that is off by more than this share is a fault.
 PERIOD_SHARE = 0.05
-#: Intervals that scatter by more than this share of the period (by the median deviation) are told.
+#: Intervals that scatter by more than this share of the period (median deviation) are a fault.
 JITTER_SHARE = 0.06
-#: Triangles with one half only, in the last second.
+#: Tolerated number of lone frames (one of a pair) in the last second.
 FEW_HALVES = 2
-#: Pads that jumped for one sweep and back, all over a bus, in the last second.
+#: Tolerated number of pads on a bus that jumped for one sweep and back, in the last second.
 FEW_SPIKES = 2
-#: Mean shift of the thermal pads since the calibration, in units.
+#: Limit of the mean shift of the temperature pads since the calibration, in units.
 THERMAL_UNITS = 8.0
-#: Without thermal pads: median shift of all untouched taxels from their baselines, in units.
+#: Limit of the median shift of all untouched taxels from their baselines, in units; used without
+#: temperature pads.
 COMMON_UNITS = 1.5
-#: Chips that share one data line.
+#: Number of chips that share one data line.
 LINE = 4
-#: Where the triangles of an ergoCub hand (skin type 3) sit on the data lines.
+#: Order of the triangles of an ergoCub hand (skin type 3) along the data lines.
 _ERGO_HAND_SLOTS = (0, 4, 8, 12, 16, 9, 10, 11, 13, 15, 1, 2, 3, 5, 6, 7)
 
 _BUS_STATES = {
@@ -40,36 +41,46 @@ _BUS_STATES = {
     "down": ("bus_down", "is down; set it up with `ip link set {channel} up`"),
     "gone": ("bus_gone", "is gone; plug the adapter in again, it is found by its name"),
 }
-_TRIANGLE_SAYS = {
-    "missing": "does not come, though its board sends; is it enabled there?",
+_TRIANGLE_SENTENCES = {
+    "missing": "is missing although its board sends; check that it is enabled there",
     "not connected": "is not connected: its chip does not answer; check cable and address",
     "no ack": "does not acknowledge on I2C: its chip or its data line is dead",
-    "silenced": (
-        "stopped answering; its board has taken a new zero since and sends a constant for it"
-    ),
+    "silenced": ("stopped answering; its board was zeroed since then and sends a constant for it"),
     "frozen": "repeats the same bytes for longer than chance allows: its chip has stopped",
-    "constant": "did not move once while it was calibrated and has not moved since",
+    "constant": "did not change during the calibration and has not changed since",
     "out of range": "reads far outside its range on all pads",
 }
 
 
 class Fault(Struct, frozen=True):
-    """Something that is wrong.
+    """A fault.
 
     Attributes:
-        code: what, for programs.
+        code: what is wrong, for programs.
         where: the bus, board, triangle (`board/3`), or part.
-        says: the same for people.
+        sentence: what is wrong, as a sentence for people.
     """
 
     code: str
     where: str
-    says: str
+    sentence: str
 
 
-def diagnose(record: Record) -> list[Fault]:
-    """All that is wrong with a part, the cause before its consequences."""
-    faults = [fault for bus in record["buses"] for fault in _bus(bus)]
+def diagnose(record: Record, lost_lately: Collection[str] = ()) -> list[Fault]:
+    """Return all faults of a part, each cause before its consequences.
+
+    Args:
+        record: of the part.
+        lost_lately: counters of `output` that have risen within the last minute.
+    """
+    doubled = {board["bus"] for board in record["boards"] if board.get("twice")}
+    faults = [
+        fault
+        for bus in record["buses"]
+        for fault in _bus(bus)
+        # Frames of two boards at one address cut each other's sweeps.
+        if not (fault.code == "bus_loses_frames" and bus["name"] in doubled)
+    ]
     quiet = {fault.where for fault in faults if fault.code in _SILENT}
     silent: set[str] = set()
     for board in record["boards"]:
@@ -83,8 +94,30 @@ def diagnose(record: Record) -> list[Fault]:
     faults += _triangles(record, silent)
     faults += _taxels(record)
     faults += _part(record)
-    faults += _output(record.get("output"))
+    if record["state"] == "degraded" and not any(map(_invalidates, faults)):
+        faults.append(
+            Fault(
+                "taxel_unproven",
+                record["part"],
+                f"{named(record['invalid'])} of {record['part']}: not valid: the pad failed when "
+                "calibrated under pressure, jumps, or has not yet shown that it works",
+            )
+        )
+    faults += _output(record.get("output"), lost_lately)
+    for what, why in record.get("unkept", {}).items():
+        sentence = f"the {what} is in use but not kept: {why}; it is lost at a restart"
+        faults.append(Fault("state_not_kept", what, sentence))
     return faults
+
+
+def _invalidates(fault: Fault) -> bool:
+    """Whether a fault is a reason for which taxels are not valid."""
+    return fault.code.startswith(("bus_", "board_", "triangle_")) or fault.code in {
+        "taxel_stuck",
+        "taxel_noisy",
+        "taxel_out_of_range",
+        "taxel_refused",
+    }
 
 
 _SILENT = {"bus_off", "bus_down", "bus_gone", "bus_silent"}
@@ -94,13 +127,13 @@ def _bus(bus: BusHealth) -> Iterator[Fault]:
     name = bus["name"]
     state = bus.get("state", "up")
     if state in _BUS_STATES:
-        code, says = _BUS_STATES[state]
-        yield Fault(code, name, f"bus {name} " + says.format(channel=bus.get("channel", name)))
+        code, sentence = _BUS_STATES[state]
+        yield Fault(code, name, f"bus {name} " + sentence.format(channel=bus.get("channel", name)))
     elif bus.get("silent"):
         yield Fault(
             "bus_silent",
             name,
-            f"bus {name}: no frame comes at all; check its plug, the boards' power and bit rate",
+            f"bus {name}: no frames are received; check its plug, the boards' power and bit rate",
         )
     recent = bus.get("last_second")
     if recent is None:
@@ -109,8 +142,8 @@ def _bus(bus: BusHealth) -> Iterator[Fault]:
         yield Fault(
             "bus_babbling",
             name,
-            f"bus {name}: frames that are none of the skin's take {recent['other_load']:.0%} of it"
-            + (f", most with identifier {bus['stranger']}" if bus.get("stranger") else "")
+            f"bus {name}: frames of other devices take {recent['other_load']:.0%} of it"
+            + (f", mostly with identifier {bus['stranger']}" if bus.get("stranger") else "")
             + "; find the node that sends them",
         )
     if recent["dropped"]:
@@ -153,13 +186,13 @@ def _board(board: BoardHealth) -> Iterator[Fault]:
     name = board["name"]
     here = f"board {name} (address {board['address']})"
     if board.get("in_bootloader"):
-        yield Fault("board_in_bootloader", name, f"{here} waits in its bootloader for a firmware")
+        yield Fault("board_in_bootloader", name, f"{here} is in its bootloader: no firmware runs")
     elif not board["alive"]:
         if board["sweeps"]:
             yield Fault(
                 "board_silent",
                 name,
-                f"{here} has stopped sending; it is asked and set up again; check its power",
+                f"{here} has stopped sending and is being set up again; check its power",
             )
         else:
             yield Fault(
@@ -169,32 +202,39 @@ def _board(board: BoardHealth) -> Iterator[Fault]:
         yield Fault(
             "board_wrong_type",
             name,
-            f"{here} says that it is of type {board['board_type']}, which is no skin board",
+            f"{here} reports type {board['board_type']}, which is no skin board",
         )
     events = board.get("lately", {})
     if events.get("resets"):
-        yield Fault("board_reset", name, f"{here} started anew by itself and was set up again")
+        yield Fault("board_reset", name, f"{here} restarted by itself and was set up again")
     if events.get("lost_set_ups"):
         yield Fault(
             "board_lost_set_up",
             name,
-            f"{here} sent something else than it was set up to, and was set up again",
+            f"{here} did not send what it was set up to send, and was set up again",
         )
     if events.get("rezeros"):
         yield Fault(
             "board_rezeroed",
             name,
-            f"{here} has taken a new zero; its baselines were moved after it",
+            f"{here} zeroed itself; its baselines were corrected for that",
         )
     if board.get("in_doubt"):
         yield Fault(
             "board_in_doubt",
             name,
-            f"{here} took its zero while it was touched (taxels: {board['in_doubt']}); those are "
+            f"{here} was zeroed while it was touched (taxels: {board['in_doubt']}); those are "
             f"not valid until calibrated: skin command calibrate --board {name}",
         )
     if events.get("tx_overflows"):
         yield Fault("board_overflows", name, f"{here} could not send all its frames: bus too full")
+    if board.get("twice"):
+        yield Fault(
+            "board_twice",
+            name,
+            f"{here}: two boards send at this address; give one of them another",
+        )
+        return
     wanted, seen, jitter_ms = board["period_ms"], board["period_seen_ms"], board["jitter_ms"]
     if board["alive"] and seen is not None and jitter_ms is not None:
         if abs(seen - wanted) > PERIOD_SHARE * wanted:
@@ -205,7 +245,7 @@ def _board(board: BoardHealth) -> Iterator[Fault]:
             yield Fault(
                 "board_jitter",
                 name,
-                f"{here} sends unevenly: its {wanted} ms scatter by {jitter_ms:.1f} ms",
+                f"{here} sends irregularly: its {wanted} ms scatter by {jitter_ms:.1f} ms",
             )
 
 
@@ -221,7 +261,7 @@ def _triangles(record: Record, silent: set[str]) -> Iterator[Fault]:
         if one["board"] not in silent:
             line = _line_of(boards[one["board"]], one["triangle"])
             of_line[one["board"], line][one["triangle"]] = one["fault"]
-    told: set[tuple[str, int]] = set()
+    reported: set[tuple[str, int]] = set()
     for name, board in boards.items():
         lines = {line: faults for (owner, line), faults in of_line.items() if owner == name}
         fitted: dict[int, set[int]] = defaultdict(set)
@@ -230,7 +270,7 @@ def _triangles(record: Record, silent: set[str]) -> Iterator[Fault]:
         whole = [line for line, faults in lines.items() if set(faults) == fitted[line]]
         for line in whole:
             if len(fitted[line]) > 1 and set(lines[line].values()) <= {"no ack", "silenced"}:
-                told.add((name, line))
+                reported.add((name, line))
                 yield Fault(
                     "line_shorted",
                     f"{name}/line{line}",
@@ -240,10 +280,10 @@ def _triangles(record: Record, silent: set[str]) -> Iterator[Fault]:
         mixed = [
             line
             for line in whole
-            if (name, line) not in told and set(lines[line].values()) & {"out of range"}
+            if (name, line) not in reported and set(lines[line].values()) & {"out of range"}
         ]
         if len(mixed) == 2:
-            told |= {(name, line) for line in mixed}
+            reported |= {(name, line) for line in mixed}
             yield Fault(
                 "lines_swapped",
                 f"{name}/line{mixed[0]}+{mixed[1]}",
@@ -252,53 +292,80 @@ def _triangles(record: Record, silent: set[str]) -> Iterator[Fault]:
                 "data lines swapped? Put them right, or calibrate and change the configuration",
             )
     for (name, line), faults in of_line.items():
-        if (name, line) in told:
+        if (name, line) in reported:
             continue
         for triangle, fault in sorted(faults.items()):
-            says = _TRIANGLE_SAYS[fault]
+            sentence = _TRIANGLE_SENTENCES[fault]
             if fault == "not connected" and len(faults) > 1:
-                says += " (another triangle of the same line reads wrong too: has it this address?)"
+                sentence += " (another one on its line reads wrong too: does it have this address?)"
             code = "triangle_" + fault.replace(" ", "_")
-            yield Fault(code, f"{name}/{triangle}", f"triangle {triangle} of board {name} {says}")
+            yield Fault(
+                code, f"{name}/{triangle}", f"triangle {triangle} of board {name} {sentence}"
+            )
 
 
 def _taxels(record: Record) -> Iterator[Fault]:
     part = record["part"]
-    says = {
-        "stuck": "the same byte for too long in a triangle that is otherwise alive; not valid",
-        "noisy": "up and down far more than when calibrated; not valid",
+    sentence = {
+        "stuck": "the same byte for too long in a triangle that otherwise works; not valid",
+        "noisy": "much noisier than when calibrated; not valid",
         "out_of_range": "far out of range; not valid",
-        "drifting": "far from the calibration by now; calibrate when nothing touches",
+        "drifting": "has moved far from its calibration; calibrate when nothing touches the skin",
     }
-    for kind, what in says.items():
+    for kind, what in sentence.items():
         taxels = record["taxel_faults"].get(kind)
         if taxels:
-            yield Fault(f"taxel_{kind}", part, f"{_named(taxels)} of {part}: {what}")
+            yield Fault(f"taxel_{kind}", part, f"{named(taxels)} of {part}: {what}")
     verdicts = record["taxel_verdicts"]
-    # What a triangle that is told of did not send, was absent because of that.
-    kinds = ["stuck", "out_of_range"] + ["absent", "too_few"] * (not record["triangles"])
+    noisy = verdicts.get("noisy")
+    if noisy:
+        yield Fault(
+            "taxel_decides_late",
+            part,
+            f"{named(noisy)} of {part}: noisy when calibrated; they need up to "
+            f"{record['decides_kpa']:g} kPa to decide within a second",
+        )
+    if verdicts.get("saturates"):
+        yield Fault(
+            "taxel_saturates",
+            part,
+            f"{named(verdicts['saturates'])} of {part}: rest so near 0 that a "
+            "press is cut off; set the boards up again, then calibrate",
+        )
+    if verdicts.get("touched"):
+        yield Fault(
+            "taxel_pressed",
+            part,
+            f"{named(verdicts['touched'])} of {part}: touched when calibrated; calibrate when "
+            "nothing touches",
+        )
+    # If the triangle is already reported as missing, its taxels were absent because of that.
+    kinds = ["stuck", "out_of_range", "too_noisy"] + ["absent", "too_few"] * (
+        not record["triangles"]
+    )
     refused = {taxel for kind in kinds for taxel in verdicts.get(kind, ())}
     refused &= set(record["invalid"])
     if refused:
         yield Fault(
             "taxel_refused",
             part,
-            f"{_named(refused)} of {part}: stuck, out of range, absent or heard too rarely when "
-            "calibrated; not valid until a calibration says better",
+            f"{named(refused)} of {part}: stuck, out of range, too noisy, absent or received too "
+            "rarely when calibrated; not valid until a better calibration",
         )
     if record["baseline_at_limit"]:
-        at_limit = _named(record["baseline_at_limit"])
+        at_limit = named(record["baseline_at_limit"])
         yield Fault(
             "taxel_at_limit",
             part,
             f"{at_limit} of {part}: the baseline cannot follow any farther; calibrate",
         )
     if record["baseline_frozen"]:
-        held = _named(record["baseline_frozen"])
+        held = named(record["baseline_frozen"])
         yield Fault(
             "taxel_held",
             part,
-            f"{held} of {part}: touched for so long that the zero is uncertain",
+            f"{held} of {part}: touched for so long, or with so much drift during the touch, "
+            "that the zero is uncertain",
         )
 
 
@@ -317,7 +384,7 @@ def _part(record: Record) -> Iterator[Fault]:
             "part_temperature",
             part,
             f"{part}: its thermal pads read {warmth['thermal_units']:+.0f} units since the "
-            "calibration: its temperature has changed; pressures are corrected, less surely",
+            "calibration: its temperature has changed; pressures are corrected, less precisely",
         )
     elif abs(warmth["common_units"]) > COMMON_UNITS:
         yield Fault(
@@ -328,24 +395,40 @@ def _part(record: Record) -> Iterator[Fault]:
         )
 
 
-def _output(output: dict[str, Any] | None) -> Iterator[Fault]:
+def _output(output: dict[str, Any] | None, lost_lately: Collection[str]) -> Iterator[Fault]:
     if output is None:
         return
     if not output["connected"]:
         why = output.get("last_error") or "not yet reached"
         yield Fault("broker_away", "broker", f"the broker is away: {why}")
-    if output["touches_dropped"]:
+    if "touches_dropped" in lost_lately:
         yield Fault(
             "touches_dropped",
             "broker",
-            f"{output['touches_dropped']} touch events were lost since the start: the broker was "
-            "away for too long",
+            f"touch events were lost within the last minute ({output['touches_dropped']} since the "
+            "start): the broker was away for too long, or did not take them",
         )
-    if output["refused"]:
+    if output.get("withheld"):
+        topics = ", ".join(output["withheld"])
+        yield Fault(
+            "broker_rejects",
+            "broker",
+            f"the broker does not take what is published at {topics}; check its packet limit and "
+            "its access rules",
+        )
+    if output.get("name_taken"):
+        yield Fault(
+            "node_name_taken",
+            "broker",
+            "the broker ends every connection within seconds: does a second daemon run as the same "
+            "robot and node? Give one of them another --node",
+        )
+    if "refused" in lost_lately:
         yield Fault("broker_refuses", "broker", f"the broker refuses: {output['last_error']}")
 
 
-def _named(taxels: Collection[int]) -> str:
+def named(taxels: Collection[int]) -> str:
+    """Taxels in words: "taxels 1, 4-7, 9"; the first eight runs of many."""
     return f"{'taxel' if len(taxels) == 1 else 'taxels'} {_list(taxels)}"
 
 

@@ -1,8 +1,8 @@
-"""What the health record of a part holds, key by key: the payload of `<part>/health`.
+"""Keys of the health record of a part, which is the payload of `<part>/health`.
 
-Plain dictionaries, because they go out as they are. Counters count from the start of the
-daemon. Keys that are not required are left out where nobody can tell: in a replay, which has
-no clock, and where there is no port or no board to ask.
+The records are plain dictionaries because they are published as they are. Counters count from
+the start of the daemon. Keys marked as not required are left out where they are unknown: in a
+replay, which has no clock, and without a port or board managers.
 """
 
 from typing import Any, NotRequired, TypedDict
@@ -11,9 +11,10 @@ from typing import Any, NotRequired, TypedDict
 class LastSecond(TypedDict):
     """What a bus has gained in about the last second.
 
-    `load` and `other_load` are shares of the bus: of all frames, and of those that are none of
-    the skin's. The others are counts; `wrong` are frames with a wrong header or too few bytes,
-    `spikes` single bytes that were off for one sweep.
+    `load` and `other_load` are shares of the bus: of all frames, and of the frames of other
+    devices.
+    The others are counts; `wrong` are frames with a wrong header or too few bytes, `spikes` single
+    bytes that were off for one sweep.
     """
 
     frames_hz: int
@@ -29,10 +30,10 @@ class LastSecond(TypedDict):
 
 
 class BusHealth(TypedDict):
-    """One bus: the counters of `AssemblerCounters`, and what its port knows.
+    """One bus: the counters of `AssemblerCounters`, and those of its port.
 
-    `port` are `PortCounters`, `strangers` boards that are not configured (type by address),
-    `stranger` the identifier that strangers' frames have most.
+    `port` are `PortCounters`. Unconfigured boards are given by type and address, and by the most
+    frequent identifier among the frames of unconfigured nodes.
     """
 
     name: str
@@ -45,6 +46,7 @@ class BusHealth(TypedDict):
     unknown_board: int
     unknown_triangle: int
     late: int
+    doubled: int
     sweeps: int
     incomplete: int
     halves: int
@@ -61,8 +63,9 @@ class BoardHealth(TypedDict):
     """One board.
 
     `period_seen_ms` and `jitter_ms` come from the kernel's time stamps of its last sweeps;
-    `in_doubt` counts taxels whose zero nobody knows; `lately` has the counters among
-    `resets`, `lost_set_ups`, `tx_overflows` and `rezeros` that rose within the last minute.
+    `in_doubt` counts taxels whose zero is unknown; `lately` has the counters among `resets`,
+    `lost_set_ups`, `tx_overflows` and `rezeros` that rose within the last minute; `twice`: two
+    boards send at its address.
     """
 
     name: str
@@ -90,18 +93,19 @@ class BoardHealth(TypedDict):
     tx_overflows: NotRequired[int]
     age_ms: NotRequired[float | None]
     lately: NotRequired[dict[str, int]]
+    twice: NotRequired[bool]
 
 
 class TriangleHealth(TypedDict):
-    """A triangle that is not well, and why."""
+    """A triangle with a fault."""
 
     board: str
     triangle: int
     fault: str
 
 
-class Warmth(TypedDict):
-    """How far thermal pads, and all untouched taxels together, read from what was calibrated."""
+class Temperatures(TypedDict):
+    """Mean shift of the temperature pads, and of all untouched taxels, since the calibration."""
 
     thermal_units: float | None
     common_units: float
@@ -115,14 +119,14 @@ class CalibrationName(TypedDict):
 
 
 class FaultName(TypedDict):
-    """What is wrong, for programs: `diagnosis` gives the codes."""
+    """A fault, for programs: `diagnosis` lists the codes."""
 
     code: str
     where: str
 
 
 class Record(TypedDict):
-    """One part. Taxels are told by their number within it; `output` are `PublisherCounters`."""
+    """One part. Taxels are given by their number in the part; `output` are `PublisherCounters`."""
 
     part: str
     frames: int
@@ -133,15 +137,17 @@ class Record(TypedDict):
     beyond_range: list[int]
     triangles: list[TriangleHealth]
     taxel_verdicts: dict[str, list[int]]
+    decides_kpa: float | None
     taxel_faults: dict[str, list[int]]
     boards: list[BoardHealth]
     buses: list[BusHealth]
-    warmth: Warmth | None
+    warmth: Temperatures | None
     baseline_frozen: list[int]
     baseline_at_limit: list[int]
     calibration: CalibrationName | None
     state: str
     age_ms: NotRequired[float | None]
     output: NotRequired[dict[str, Any]]
+    unkept: NotRequired[dict[str, str]]
     faults: NotRequired[list[FaultName]]
     sentences: NotRequired[list[str]]

@@ -1,7 +1,7 @@
-"""What passes through the daemon, noted: who was heard when, and what counters gained.
+"""Notes when each part and bus last sent, and how the counters grow.
 
-Every time is on the clock of the frames' time stamps, and tells what had been read by then:
-while nobody looks (a stopped process, a suspended computer) nobody grows silent.
+All times are on the clock of the frames' time stamps and mean "everything received up to then has
+been read": while nothing is read (a stopped process, a suspended computer) nothing times out.
 """
 
 from collections import deque
@@ -10,28 +10,23 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.bus.assembler import Sweep
 from skin_host.bus.boards import Boards
 from skin_host.bus.port import Port
-from skin_host.bus.protocol import TRIANGLES, status_error
-from skin_host.engine import Engine, Step
+from skin_host.engine import Engine, Output, Step
 
 #: Rates are means over about this time.
 RATE_S = 2.0
-#: What is told of "the last second".
+#: Length of "the last second" in records.
 RECENT_NS = 1_000_000_000
-#: After a longer pause between two looks, or a step of the clock, silence is measured anew.
-LONGEST_PAUSE_NS = 1_000_000_000
-#: Taken for the period of a bus without boards of skin: its force/torque boards are faster.
+#: Two boards at one address are reported when sweeps have come too soon for this long.
+TWICE_NS = 2_000_000_000
+#: Assumed period of a bus without skin boards: its force/torque boards are faster.
 ALONE_NS = 50_000_000
-#: Intervals that are enough to judge a board's period.
-PERIOD_SWEEPS = 16
-_TRIANGLES = np.arange(TRIANGLES)
 
 
 @dataclass(slots=True)
 class PartWatch:
-    """What became of a part's samples; the arrays are those of the last one."""
+    """Counters of a part's samples, and arrays of the last sample."""
 
     last_ns: int = 0
     frames: int = 0
@@ -39,17 +34,19 @@ class PartWatch:
     rate_since_ns: int = 0
     rate_frames: int = 0
     valid: NDArray[np.bool_] | None = None
+    touched: NDArray[np.bool_] | None = None
     beyond: NDArray[np.bool_] | None = None
     raw: NDArray[np.uint8] | None = None
 
     def note(self, step: Step) -> None:
-        """A sample that was processed."""
+        """Take in a processed sample."""
         frame = step.frame
         if frame.valid.any():
             self.last_ns = frame.t_ns
             self.frames += 1
             self.rate_frames += 1
         self.valid = frame.valid
+        self.touched = frame.touched
         self.beyond = frame.beyond_range
         self.raw = frame.raw
         if not self.rate_since_ns:
@@ -64,50 +61,28 @@ class PartWatch:
 
 @dataclass(slots=True)
 class BoardWatch:
-    """What came of a board.
+    """Counters of rare events of a board, and when they last rose."""
 
-    Attributes:
-        sweep: the last one.
-        heard_ns: when it came, or when silence began to be measured anew.
-        silent: nothing has come since for too long.
-        absent: int64[16], in how many sweeps in a row each triangle has been missing.
-        error: uint8[16], the last error of each triangle that has not shown since that it lives.
-        events, event_ns: counters of rare events, and when they last rose.
-    """
-
-    silent_after_ns: int
-    sweep: Sweep | None = None
-    sweeps: int = 0
-    heard_ns: int = 0
-    silent: bool = False
-    times_ns: deque[int] = field(default_factory=lambda: deque(maxlen=PERIOD_SWEEPS + 1))
-    absent: NDArray[np.int64] = field(default_factory=lambda: np.zeros(TRIANGLES, np.int64))
-    error: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(TRIANGLES, np.uint8))
     events: dict[str, int] = field(default_factory=dict)
     event_ns: dict[str, int] = field(default_factory=dict)
+    crowded: int = 0
+    crowded_since_ns: int = 0
+    crowded_ns: int = 0
 
-    @property
-    def alive(self) -> bool:
-        """It sends."""
-        return self.sweep is not None and not self.silent
+    def is_twice(self, now_ns: int) -> bool:
+        """Whether two boards send at this address: for longer than after a stall of ours."""
+        lasted_ns = self.crowded_ns - self.crowded_since_ns
+        return lasted_ns >= TWICE_NS and 0 <= now_ns - self.crowded_ns < RECENT_NS
 
-    def note(self, sweep: Sweep, unproven: NDArray[np.bool_]) -> None:
-        """A sweep that came; bool[16] says which triangles have yet to show that they live."""
-        self.sweep = sweep
-        self.sweeps += 1
-        self.heard_ns = sweep.t_ns
-        self.silent = False
-        if self.times_ns and not 0 < sweep.t_ns - self.times_ns[-1] < LONGEST_PAUSE_NS:
-            self.times_ns.clear()  # a pause, or the clock was set: no period
-        self.times_ns.append(sweep.t_ns)
-        here = sweep.present >> _TRIANGLES & 1
-        self.absent = (self.absent + 1) * (here == 0)
-        if sweep.status.any() or self.error.any():
-            error = status_error(sweep.status)
-            np.copyto(self.error, error, where=(error != 0) | ~unproven)
+    def note_crowded(self, count: int, now_ns: int) -> None:
+        """Take in how many sweeps came too soon after the one before."""
+        if count != self.crowded:
+            if not 0 <= now_ns - self.crowded_ns < RECENT_NS:
+                self.crowded_since_ns = now_ns
+            self.crowded, self.crowded_ns = count, now_ns
 
-    def note_events(self, counts: dict[str, int], now_ns: int) -> None:
-        """See which counters have risen."""
+    def note(self, counts: dict[str, int], now_ns: int) -> None:
+        """Note which counters have risen."""
         for name, count in counts.items():
             if count > self.events.get(name, 0):
                 self.event_ns[name] = now_ns
@@ -116,26 +91,27 @@ class BoardWatch:
 
 @dataclass(slots=True)
 class BusWatch:
-    """What came of a bus: the last count of frames, and what all counters gained lately.
+    """The last frame count of a bus, and what all its counters gained in the last second.
 
     Attributes:
-        gained: in about the last second, with its true length under "seconds"; empty before
-            the first look.
+        gained: in about the last second, with its true length under "seconds"; empty before the
+            first call of `note`.
+        received_ns: when a frame was last received, on the ledger's clock.
     """
 
     silent_after_ns: int
     frames: int = -1
-    heard_ns: int = 0
+    received_ns: int = 0
     silent: bool = False
     gained: dict[str, float] = field(default_factory=dict)
     _past: deque[tuple[int, dict[str, int]]] = field(default_factory=deque)
 
-    def note(self, now_ns: int, totals: dict[str, int]) -> None:
-        """Take in all counters."""
+    def note(self, now_ns: int, ledger_ns: int, totals: dict[str, int]) -> None:
+        """Take in all counters, with the time of the time stamps and of the ledger."""
         if totals["frames"] != self.frames:
             self.frames = totals["frames"]
-            self.heard_ns = now_ns
-            self.silent = False
+            self.received_ns = ledger_ns
+        self.silent = ledger_ns - self.received_ns > self.silent_after_ns
         past = self._past
         if past and now_ns < past[-1][0]:
             past.clear()  # the clock was set back
@@ -157,16 +133,13 @@ class Watch:
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
-        self._looked_ns = 0
         periods = engine.settings.receive.silent_periods
         period_ns = {
             board: engine.layout.boards[board].settings.period_ms * 1_000_000
             for board in engine.boards
         }
         self.parts = {part: PartWatch() for part in engine.parts}
-        self.boards = {
-            board: BoardWatch(int(periods * period_ns[board])) for board in engine.boards
-        }
+        self.boards = {board: BoardWatch() for board in engine.boards}
         self.buses = {
             bus: BusWatch(
                 int(periods * max((period_ns[i] for i in self._boards_of(bus)), default=ALONE_NS))
@@ -174,32 +147,28 @@ class Watch:
             for bus in engine.assemblers
         }
 
-    def note_sweeps(self, sweeps: list[Sweep]) -> None:
-        """Sweeps that came."""
-        for sweep in sweeps:
-            unproven = self._engine.liveness[sweep.board].unproven
-            self.boards[sweep.board].note(sweep, unproven)
+    def use(self, engine: Engine) -> None:
+        """Continue with another engine, after a reload."""
+        self._engine = engine
 
-    def note_step(self, step: Step) -> None:
-        """A sample that was processed."""
-        self.parts[step.part].note(step)
+    def note(self, output: Output) -> None:
+        """Take in one output of the core."""
+        for step in output.steps:
+            self.parts[step.part].note(step)
 
     def tick(self, now_ns: int, ports: dict[str, Port], boards: dict[str, Boards]) -> None:
-        """Look at all counters; to be called some times a second."""
+        """Read all counters; to be called several times a second."""
         for bus, bus_watch in self.buses.items():
-            bus_watch.note(now_ns, self._totals(bus, ports.get(bus)))
+            bus_watch.note(now_ns, self._engine.ledger.now_ns, self._totals(bus, ports.get(bus)))
         for index, watch in self.boards.items():
-            watch.note_events(self._events(index, watch, boards), now_ns)
-        watches: list[BusWatch | BoardWatch] = [*self.buses.values(), *self.boards.values()]
-        if not 0 <= now_ns - self._looked_ns <= LONGEST_PAUSE_NS:
-            for one in watches:
-                one.heard_ns = now_ns
-        self._looked_ns = now_ns
-        for one in watches:
-            one.silent |= now_ns - one.heard_ns > one.silent_after_ns
+            watch.note(self._events(index, watch, boards), now_ns)
+            bus = self._engine.layout.boards[index].settings.bus
+            watch.note_crowded(self._engine.assemblers[bus].crowded[index], now_ns)
 
     def _totals(self, bus: str, port: Port | None) -> dict[str, int]:
         counters = self._engine.assemblers[bus].counters
+        ledger = self._engine.ledger
+        rows = [ledger.row[i] for i in self._boards_of(bus)]
         return {
             "frames": counters.frames,
             "sweeps": counters.sweeps,
@@ -208,24 +177,26 @@ class Watch:
             "halves": counters.halves,
             "missed": counters.missed,
             "unknown": counters.unknown_board + counters.unknown_triangle,
-            "spikes": sum(int(self._engine.liveness[i].spikes) for i in self._boards_of(bus)),
+            "spikes": int(self._engine.validity.liveness.spikes[rows].sum()),
             "dropped": 0 if port is None else port.counters.dropped,
             "error_frames": 0 if port is None else port.counters.error_frames,
         }
 
     def _events(self, index: int, watch: BoardWatch, boards: dict[str, Boards]) -> dict[str, int]:
-        events = {"rezeros": self._engine.rezeros[index]}
+        ledger = self._engine.ledger
+        row = ledger.row[index]
+        events = {"rezeros": int(ledger.rezeros[row])}
         settings = self._engine.layout.boards[index].settings
         manager = boards.get(settings.bus)
         if manager is not None:
             known = manager.records[settings.address]
             events |= {
-                "resets": known.resets,
-                "lost_set_ups": known.lost_set_ups,
-                "tx_overflows": known.tx_overflows,
+                "resets": int(ledger.resets[row]),
+                "lost_set_ups": int(ledger.lost_set_ups[row]),
+                "tx_overflows": int(ledger.tx_overflows[row]),
             }
-            if known.configurations <= 1 and not watch.sweeps:
-                watch.events["rezeros"] = events["rezeros"]  # everyone's first zero is no event
+            if known.configurations <= 1 and not ledger.sweeps[row]:
+                watch.events["rezeros"] = events["rezeros"]  # a first zero is no event
         return events
 
     def _boards_of(self, bus: str) -> list[int]:

@@ -1,1 +1,1 @@
-"""Files of the iCub's world turned into a configuration of ours: `skin import`."""
+"""`skin import`: turns files of the iCub software into a skin-host configuration."""

@@ -1,4 +1,4 @@
-"""Devices of skinSpec files as buses, boards and parts of a configuration."""
+"""Turns devices of skinSpec files into buses, boards and parts of a configuration."""
 
 from itertools import groupby
 from pathlib import Path
@@ -11,7 +11,7 @@ from skin_host.importing.report import Findings
 from skin_host.importing.skinspec import BoardSpec, Device, read_device
 from skin_host.settings import Board, Bus, Part, Patch, Settings
 
-#: Boards of these types correct by a thermal pad: their triangles are those of ten pads.
+#: Boards of these types correct their values with a temperature pad: their triangles have ten pads.
 TEN_PAD_TYPES = (0, 3, 8)
 
 
@@ -21,7 +21,7 @@ def import_boards(files: list[Path], base: Settings | None, findings: Findings) 
     Args:
         files: the XML files.
         base: a configuration to add to, or None.
-        findings: takes the remarks.
+        findings: receives the remarks.
 
     Raises:
         ConfigurationError: a file cannot be read or describes no board.
@@ -38,7 +38,7 @@ def import_boards(files: list[Path], base: Settings | None, findings: Findings) 
                 "includes it, which names the CAN addresses, or add sets of triangles"
             )
         if device.name in parts:
-            raise ConfigurationError(f'{file}: there is a part "{device.name}" already')
+            raise ConfigurationError(f'{file}: a part of this name exists: "{device.name}"')
         patches = []
         for number, specs in device.patches.items():
             bus = device.name if len(device.patches) == 1 else f"{device.name}_{number}"
@@ -76,7 +76,7 @@ def _robot(device: Device) -> str:
 
 
 def _patches(board: str, spec: BoardSpec) -> list[Patch]:
-    """Patches of triangles that are set up alike, in the order of their numbers."""
+    """Return patches of consecutive triangles that have the same set-up."""
     kind = "triangle_10pad" if spec.skin_type in TEN_PAD_TYPES else "triangle"
     ordered = sorted(spec.triangles.items())
     patches = []

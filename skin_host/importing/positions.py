@@ -1,10 +1,10 @@
-"""Files of taxel positions in three dimensions, in both of their forms.
+"""Reads files of taxel positions in three dimensions, in both of their forms.
 
 The newer form has a head (`name`, `spatial_sampling`, `taxel2Repr ( ... )`, `[calibration]`)
-before the rows `x y z nx ny nz`; the older has only rows. There are 192 rows a board, zeros
-where nothing is. In many triangles only some taxels were ever measured: the others repeat the
-place of the one that represents them, and thermal pads have none. These are laid by fitting
-the flat unit to the measured ones, and each such triangle is reported.
+before the rows `x y z nx ny nz`; the older form has only rows. There are 192 rows per board, with
+zeros where there is no taxel. In many triangles only some taxels were ever measured: the others
+repeat the position of the taxel that represents them, and temperature pads have no position. These
+get positions by fitting the flat unit to the measured taxels, and each such triangle is reported.
 """
 
 import re
@@ -33,11 +33,11 @@ from skin_host.settings import (
 
 LARGEST_FILE = 20_000_000
 TAXELS_PER_BOARD = TAXELS_PER_TRIANGLE * TRIANGLES_PER_BOARD
-#: Pads of the triangle with ten pads that feel temperature.
+#: Temperature pads of the triangle with ten pads.
 THERMAL_PADS = (6, 10)
-#: A fit worse than this is remarked upon: the skin is bent, or the order is another one.
+#: A fit worse than this is reported: the skin is bent, or its taxels are in another order.
 LARGE_RMS_M = 2.5e-3
-#: Farther than this (cosine) from the plane of its taxels a normal is remarked upon.
+#: A normal farther than this (cosine) from the plane of its taxels is reported.
 OBLIQUE = 0.5
 
 Floats = NDArray[np.float64]
@@ -53,7 +53,7 @@ class Table:
     represented_by: NDArray[np.int64] | None
 
     def present(self, triangle: int) -> bool:
-        """Whether the file has a place for any taxel of a triangle of the part."""
+        """Whether the file has a position for any taxel of this triangle of the part."""
         mine = slice(TAXELS_PER_TRIANGLE * triangle, TAXELS_PER_TRIANGLE * (triangle + 1))
         return bool(np.any(self.rows[mine, :3]))
 
@@ -103,7 +103,7 @@ def read_table(path: Path, findings: Findings) -> Table:
 
 
 def _row(path: Path, number: int, words: list[str], findings: Findings) -> list[float]:
-    """Six numbers; zeros, with a finding, where there are none."""
+    """Return six numbers; zeros, with a finding, where the row does not hold six numbers."""
     try:
         row = [float(word) for word in words]
     except ValueError:
@@ -118,23 +118,24 @@ def _row(path: Path, number: int, words: list[str], findings: Findings) -> list[
 def import_positions(
     files: list[Path], base: Settings | None, part: str | None, folder: str, findings: Findings
 ) -> tuple[Settings, dict[str, bytes]]:
-    """Give the triangles of `base` the places of the files, one file a part.
+    """Give the triangles of `base` the positions in the files, one file per part.
 
     Args:
         files: positions files.
-        base: the configuration whose parts they describe, or None to make one of them.
-        part: which part, if there is one file; else told by the beginning of its name.
-        folder: where the positions files will lie, beside the configuration.
-        findings: takes the remarks.
+        base: the configuration whose parts they describe, or None to make one from the files.
+        part: which part, for a single file; by default the part whose name the file name begins
+            with.
+        folder: where the positions files will be, beside the configuration.
+        findings: receives the remarks.
 
     Returns:
         The settings, and the positions files that they refer to, by name.
 
     Raises:
-        ConfigurationError: a file cannot be read, or its part cannot be told.
+        ConfigurationError: a file cannot be read, or its part is not known.
     """
     if part is not None and len(files) > 1:
-        raise ConfigurationError(f"one part ({part}) for {len(files)} files; import them singly")
+        raise ConfigurationError(f"one part ({part}) for {len(files)} files; import each alone")
     settings = base or Settings(robot="robot", buses={}, boards={}, parts={})
     written: dict[str, bytes] = {}
     for file in files:
@@ -152,19 +153,19 @@ def import_positions(
 
 
 def _part_of(file: Path, settings: Settings) -> str:
-    """The part whose name the file's begins with, the longest one."""
+    """Return the part whose name the file name begins with; the longest, if there are several."""
     stem = file.stem.lower()
     names = [name for name in settings.parts if stem.startswith(name) or f"_{name}" in stem]
     if not names:
         known = ", ".join(settings.parts)
         raise ConfigurationError(
-            f"{file}: no part's name is in the file's; say which with --part, there are: {known}"
+            f"{file}: no part's name is in the file's; choose one with --part, there are: {known}"
         )
     return max(names, key=len)
 
 
 def _with_boards(settings: Settings, name: str, table: Table, findings: Findings) -> Settings:
-    """Make a bus, boards and a part of the triangles that have places."""
+    """Make a bus, boards and a part for the triangles that have positions."""
     n_boards = -(-len(table.rows) // TAXELS_PER_BOARD)
     boards: dict[str, Board] = {}
     patches = []
@@ -194,7 +195,7 @@ def _with_boards(settings: Settings, name: str, table: Table, findings: Findings
 
 
 def _kind(table: Table, triangles: list[int]) -> str:
-    """Of ten pads where the pads that feel temperature have no place."""
+    """Return the kind of unit: ten pads, if exactly the temperature pads have no position."""
     pads = [TAXELS_PER_TRIANGLE * t + pad for t in triangles for pad in THERMAL_PADS]
     return "triangle" if np.any(table.rows[pads, :3]) else "triangle_10pad"
 
@@ -207,14 +208,14 @@ def _locate(
     written: dict[str, bytes],
     findings: Findings,
 ) -> Settings:
-    """Replace the patches of a part by ones with positions, where the file has them."""
+    """Replace the patches of a part by patches with positions, where the file has them."""
     part = settings.parts[name]
     kinds = builtin_kinds() | settings.kinds
     boards = list(dict.fromkeys(patch.board for patch in part.patches))
     placed = [patch.board for patch in part.patches if patch.places or patch.positions]
     n_boards = -(-len(table.rows) // TAXELS_PER_BOARD)
     if n_boards != len(boards):
-        boards = list(dict.fromkeys(placed))  # without leftovers that no display places
+        boards = list(dict.fromkeys(placed))  # drops boards without any position
     if n_boards != len(boards):
         raise ConfigurationError(
             f'{table.file}: {len(table.rows)} rows are {n_boards} board(s), part "{name}" has '
@@ -282,7 +283,7 @@ def _locate(
 
 
 def _unit(table: Table, slots: list[int], kind: Kind, patch: Patch, findings: Findings) -> Floats:
-    """The rows [n, 6] of one unit: measured places kept, the others fitted."""
+    """Return the rows [n, 6] of one unit: measured positions kept, the others fitted."""
     index = np.concatenate(
         [np.arange(TAXELS_PER_TRIANGLE) + TAXELS_PER_TRIANGLE * slot for slot in slots]
     )
@@ -306,20 +307,20 @@ def _unit(table: Table, slots: list[int], kind: Kind, patch: Patch, findings: Fi
     remarks = []
     if n_fitted:
         how = f"{n_fitted} taxels without a place, fitted to the other {n_measured}"
-        remarks.append(how if n_measured >= 3 else how + ", too few to be sure of the turn")
+        remarks.append(how if n_measured >= 3 else how + ", too few to determine the rotation")
     if n_measured >= 3:
         if n_fitted or fit.rms_m > LARGE_RMS_M:
             remarks.append(f"rms {fit.rms_m * 1e3:.1f} mm from a flat {patch.kind}")
         across = np.cross(fit.axes[:, 0], fit.axes[:, 1])
         if abs(across @ normal) < OBLIQUE:
-            remarks.append("its normal lies oblique to the plane of its taxels")
+            remarks.append("its normal is oblique to the plane of its taxels")
     if remarks:
         findings.odd(table.file, line, f"{label}: {'; '.join(remarks)}")
     return rows
 
 
 def _own_places(table: Table, index: NDArray[np.intp], rows: Floats) -> NDArray[np.bool_]:
-    """Which rows hold a place of their own, not a copy of their representative's."""
+    """Return which rows hold a measured position, not a copy of the representative's position."""
     if table.represented_by is not None:
         by = table.represented_by[index]
         valid = (by >= 0) & (by < len(table.rows))
@@ -330,7 +331,7 @@ def _own_places(table: Table, index: NDArray[np.intp], rows: Floats) -> NDArray[
     _, first, place, copies = np.unique(
         rows[:, :3], axis=0, return_index=True, return_inverse=True, return_counts=True
     )
-    # Which of several at one place it belongs to cannot be told, so long as there are others.
+    # When several taxels share one position, it is unknown which of them was measured.
     own = copies[place] == 1
     if not own.any():
         own[first] = True

@@ -1,4 +1,4 @@
-"""What an import found: every oddity with its file and line, nothing passed over in silence."""
+"""Remarks on an import: each irregularity with its file and line."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -6,9 +6,9 @@ from typing import Literal
 
 Grade = Literal["odd", "assumed", "dropped"]
 GRADES: dict[Grade, str] = {
-    "odd": "wrong or strange in the files, and what was made of it",
+    "odd": "wrong or unusual in the files, and how it was read",
     "assumed": "not in the files, filled in",
-    "dropped": "in the files, without a counterpart here",
+    "dropped": "in the files, but not supported here",
 }
 
 
@@ -33,19 +33,19 @@ class Findings:
     items: list[Finding] = field(default_factory=list)
 
     def odd(self, file: Path, line: int, text: str) -> None:
-        """Note something wrong or strange, and what was made of it."""
+        """Note something wrong or unusual, and how it was read."""
         self.items.append(Finding("odd", file, line, text))
 
     def assumed(self, file: Path, line: int, text: str) -> None:
-        """Note something that the files do not say."""
+        """Note a value that is missing in the files and was assumed."""
         self.items.append(Finding("assumed", file, line, text))
 
     def dropped(self, file: Path, line: int, text: str) -> None:
-        """Note something that has no counterpart."""
+        """Note something that has no counterpart here."""
         self.items.append(Finding("dropped", file, line, text))
 
     def table(self) -> str:
-        """All remarks as text, by grade; empty where there are none."""
+        """Return all remarks as text, by grade; empty if there are none."""
         sections = []
         for grade, title in GRADES.items():
             lines = [f"  {item}" for item in self.items if item.grade == grade]

@@ -1,7 +1,7 @@
-"""The XML of robot descriptions, as far as it can be read: groups of named params.
+"""Reads the XML of robot descriptions: groups of named params, as far as it is readable.
 
-Comments end at the first -->, as the robot's own reader ends them; everything in such files
-that is not what it should be is reported with its line.
+Comments end at the first -->, as in the robot's own reader; every irregularity in such files is
+reported with its line.
 """
 
 import re
@@ -17,7 +17,7 @@ LARGEST_FILE = 4_000_000
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One `param`: where it stands and what it holds."""
+    """One `param`: its position in the file and its content."""
 
     file: Path
     line: int
@@ -50,7 +50,7 @@ class Document:
         return self.groups.get(name, [])
 
     def find(self, group: str, name: str) -> Entry | None:
-        """A param of a group by its name, the first of that name."""
+        """Return the first param of this name in a group."""
         return next((entry for entry in self.group(group) if entry.name == name), None)
 
     def _read(self) -> None:
@@ -61,7 +61,7 @@ class Document:
         if len(data) > LARGEST_FILE:
             raise ConfigurationError(f"{self.path}: larger than {LARGEST_FILE} bytes")
         text = self._without_comments(data.decode("utf-8", errors="replace"))
-        # A text that is decoded already must not name another encoding.
+        # The text is already decoded, so it must not name another encoding.
         text = re.sub(r"^\s*<\?xml[^>]*\?>", "", text)
         parser = expat.ParserCreate()
         parser.StartElementHandler = self._start
@@ -75,7 +75,7 @@ class Document:
             self.findings.odd(
                 self.path,
                 error.lineno,
-                f"no XML any more from here: {expat.ErrorString(error.code)}; the rest is not read",
+                f"not valid XML from here: {expat.ErrorString(error.code)}; the rest is not read",
             )
 
     def _without_comments(self, text: str) -> str:
@@ -87,7 +87,7 @@ class Document:
             end = text.find("-->", start + 4)
             line = text.count("\n", 0, start) + 1
             if end < 0:
-                self.findings.odd(self.path, line, "a comment that never ends; the rest is in it")
+                self.findings.odd(self.path, line, "a comment without an end; it takes the rest")
                 return "".join(result)
             inner = text.find("<!--", start + 4, end)
             if inner >= 0:
@@ -107,7 +107,7 @@ class Document:
         return "".join(result)
 
     def _entity(self, *_declaration: object) -> None:
-        # No such file needs one, and a few that name each other fill the memory.
+        # No such file needs entities, and a few that refer to each other can fill the memory.
         raise ConfigurationError(f"{self.path}: declares entities; such files are not read")
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:

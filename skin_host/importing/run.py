@@ -33,14 +33,14 @@ def import_files(
     config: Path | None = None,
     part: str | None = None,
 ) -> list[Path]:
-    """Turn files of the iCub's world into the configuration `output`.
+    """Turn files of the iCub software into the configuration `output`.
 
     Args:
-        source: what the files are.
+        source: the kind of files.
         files: at least one.
         output: the configuration to write; the positions files of `robot.toml` go to the folder
             `robot-positions` beside it.
-        findings: takes every remark, also those made before an error.
+        findings: receives every remark, also those made before an error.
         config: a configuration to add to; may be `output` itself. Its comments are lost.
         part: the part that a positions file describes.
 
@@ -48,13 +48,14 @@ def import_files(
         The files written; nothing is written if anything is wrong.
 
     Raises:
-        ConfigurationError: a file cannot be read, or what comes out is no configuration.
+        ConfigurationError: a file cannot be read, or the result is not a valid configuration.
     """
     folder = output.parent
     base = None
     if config is not None:
         base = configuration.load(config)
-        # Names of files count from the configuration's own folder, which may be another one.
+        # Paths of positions files are relative to the configuration's folder, which may be another
+        # one here.
         base = _with_positions(base, lambda name: os.path.relpath(config.parent / name, folder))
     written: dict[str, bytes] = {}
     if source == "skinspec":
@@ -77,7 +78,7 @@ def import_files(
 
 
 def _with_positions(settings: Settings, renamed: Callable[[str], str]) -> Settings:
-    """The same settings with other names of positions files."""
+    """Return the same settings with renamed positions files."""
 
     def changed(patch: Patch) -> Patch:
         if patch.positions is None:
@@ -92,10 +93,10 @@ def _with_positions(settings: Settings, renamed: Callable[[str], str]) -> Settin
 
 
 def _check(text: str, written: dict[str, bytes], output: Path) -> None:
-    """Read back what is about to be written, in a folder of its own.
+    """Read the new configuration back in a temporary folder before it is written.
 
     Raises:
-        ConfigurationError: it is no sound configuration.
+        ConfigurationError: it is not a valid configuration.
     """
     with tempfile.TemporaryDirectory() as folder:
         trial = Path(folder) / output.name
@@ -111,5 +112,5 @@ def _check(text: str, written: dict[str, bytes], output: Path) -> None:
         except ConfigurationError as error:
             what = str(error).removeprefix(f"{trial}: ")
             raise ConfigurationError(
-                f"{output}: what the files say makes no configuration: {what}"
+                f"{output}: the files do not give a valid configuration: {what}"
             ) from None

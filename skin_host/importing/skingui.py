@@ -1,8 +1,8 @@
-"""The skin display's ini files: which kinds of unit lie where, in two dimensions.
+"""Reads the skin display's ini files: the kind and the place of each unit, in two dimensions.
 
-A line is `type id x y orientation gain lrMirror layoutNum`; `id` counts triangles through
-the boards of the part, 16 each. The file's `cardid` names the boards' addresses, but is
-stale in many files, so it is checked against the boards of the configuration.
+A line is `type id x y orientation gain lrMirror layoutNum`; `id` counts triangles through the
+boards of the part, 16 each. The file's `cardid` names the boards' addresses, but is out of date in
+many files, so it is checked against the boards of the configuration.
 """
 
 import math
@@ -28,7 +28,7 @@ from skin_host.settings import (
 )
 
 LARGEST_FILE = 1_000_000
-#: The display takes ids below this.
+#: The display accepts ids below this.
 MAX_ID = 128
 KINDS = {
     "triangle": "triangle",
@@ -42,15 +42,15 @@ KINDS = {
     "palmL": "palml",
     "palmR": "palmr",
 }
-#: The display draws these unmirrored, whatever the file says.
+#: The display never mirrors these, whatever the file states.
 NEVER_MIRRORED = ("fingertip2R", "fingertip3R")
-#: Known keys before the units; all but the first two say how a window looks.
+#: Known keys before the units; all but the first two describe the window.
 KEYS = ("robotPart", "cardid")
 
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """One unit: its slot counts triangles through the part's boards."""
+    """One unit; `slot` is its triangle number, counted through the part's boards."""
 
     line: int
     slot: int
@@ -59,7 +59,7 @@ class Unit:
 
     @property
     def n_triangles(self) -> int:
-        """How many triangles it takes."""
+        """Return how many triangles the unit covers."""
         return len(builtin_kinds()[self.kind].pads_mm) // TAXELS_PER_TRIANGLE
 
 
@@ -74,12 +74,12 @@ class Display:
 
     @property
     def n_boards(self) -> int:
-        """How many boards the units take."""
+        """Return how many boards the units cover."""
         last = max(unit.slot + unit.n_triangles for unit in self.units)
         return -(-last // TRIANGLES_PER_BOARD)
 
     def slots_of(self, board: int) -> set[int]:
-        """The triangle numbers that are placed on the part's board of this number."""
+        """Return the triangle numbers that are placed on this board of the part, counted from 0."""
         every = {unit.slot + i for unit in self.units for i in range(unit.n_triangles)}
         return {
             slot % TRIANGLES_PER_BOARD for slot in every if slot // TRIANGLES_PER_BOARD == board
@@ -121,7 +121,7 @@ def read_display(path: Path, findings: Findings) -> Display:
             taken |= dict.fromkeys(slots, number)
             units.append(unit)
     if not units:
-        raise ConfigurationError(f"{path}: places no unit; wanted lines after [SENSORS]")
+        raise ConfigurationError(f"{path}: contains no unit; wanted lines after [SENSORS]")
     if gains:
         findings.dropped(path, 0, f"gain {', '.join(sorted(gains))}: brightness of the display")
     part = (keys.get("robotPart") or [path.stem])[0].lower().replace(" ", "_")
@@ -134,7 +134,7 @@ def _key(
 ) -> None:
     if words[0] in KEYS:
         if words[0] in keys:
-            findings.odd(path, number, f"{words[0]} a second time; the first one is taken")
+            findings.odd(path, number, f"{words[0]} a second time; the first one is used")
         keys.setdefault(words[0], words[1:])
     else:
         findings.dropped(path, number, f"{words[0]}: of the display's window or its CAN card")
@@ -145,7 +145,7 @@ def _unit(
 ) -> Unit | None:
     """One line of [SENSORS], or None with a finding."""
     if words[0] not in KINDS:
-        findings.odd(path, number, f'"{words[0]}" is no kind of unit known here; not read')
+        findings.odd(path, number, f'"{words[0]}" is not a known kind of unit; not read')
         return None
     numbers = [_float(word) for word in words[1:]]
     if len(numbers) < 4 or None in numbers:
@@ -160,7 +160,7 @@ def _unit(
         return None
     if layout == 1:
         findings.odd(
-            path, number, "layoutNum 1 reverses the taxels, which has no counterpart; not reversed"
+            path, number, "layoutNum 1 reverses the taxels, which is not supported; not reversed"
         )
     mirrored = mirror == 1
     if mirrored and words[0] in NEVER_MIRRORED:
@@ -181,11 +181,12 @@ def _float(word: str) -> float | None:
 def import_places(files: list[Path], base: Settings | None, findings: Findings) -> Settings:
     """Place the triangles of `base` as the display does; each file gives a part.
 
-    A triangle moves from the part that it was in to the part that the file names. Without
-    `base` the boards are made from `cardid`, with default set-up.
+    A triangle moves from its part to the part that the file names. Without `base` the boards are
+    made
+    from `cardid`, with default set-up.
 
     Raises:
-        ConfigurationError: a file cannot be read, or its boards cannot be told.
+        ConfigurationError: a file cannot be read, or its boards are not known.
     """
     settings = base or Settings(robot="robot", buses={}, boards={}, parts={})
     for file in files:
@@ -200,7 +201,7 @@ def import_places(files: list[Path], base: Settings | None, findings: Findings) 
 
 
 def _with_boards(settings: Settings, display: Display, findings: Findings) -> Settings:
-    """Add the boards that a file names, all its units on, set up by default."""
+    """Add the boards that a file names, with all units on and default set-up."""
     n = display.n_boards
     addresses = display.addresses[:n]
     if len(addresses) < n or len(set(addresses)) < n or not all(1 <= a <= 14 for a in addresses):
@@ -275,7 +276,7 @@ def _place(settings: Settings, display: Display, boards: list[str], findings: Fi
 
 
 def _append(patches: list[Patch], old: Patch, numbers: list[int], unit: Unit) -> None:
-    """Add a unit to the last patch where that is set up alike, else to a new one."""
+    """Add a unit to the last patch if that has the same set-up, otherwise to a new one."""
     last = patches[-1] if patches else None
     if (
         last is not None
@@ -301,7 +302,7 @@ def _append(patches: list[Patch], old: Patch, numbers: list[int], unit: Unit) ->
 def _without(
     parts: dict[str, Part], placed: set[tuple[str, int]], display: Display, findings: Findings
 ) -> dict[str, Part]:
-    """The parts without the placed triangles; what is left of their boards is reported."""
+    """Return the parts without the placed triangles, and report what is left of their boards."""
     touched = {board for board, _ in placed}
     result = {}
     for name, part in parts.items():
@@ -331,12 +332,15 @@ def _without(
 
 
 def _boards(settings: Settings, display: Display, findings: Findings) -> list[str]:
-    """The boards that a file's ids count through, best guess first.
+    """Return the boards that a file's ids count through, the most probable choice.
 
-    Those of one bus that `cardid` names, in the order of the configuration (which is that of
-    the values on the robot's own ports), in the order of `cardid` or in reverse; or those of
-    the part of the same name. The bus whose name begins most like the part's counts, and on
-    it the order that fits the triangles that are on and not yet placed.
+    The candidates are the boards of one bus that `cardid` names, in the order of the configuration
+    (the order of the values on the robot's own ports), in the order of `cardid` or reversed; and
+    the
+    boards of the part of the same name. The choice is the bus whose name shares the longest
+    beginning
+    with the part's name, and on it the order that fits the triangles that are on and not yet
+    placed.
     """
     n = display.n_boards
     free: dict[str, set[int]] = {}
@@ -376,6 +380,6 @@ def _boards(settings: Settings, display: Display, findings: Findings) -> list[st
 
 
 def _common(first: str, second: str) -> int:
-    """How many characters two names have in common from the start."""
+    """Return the length of the common beginning of two names."""
     pairs = zip(first, second, strict=False)
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))

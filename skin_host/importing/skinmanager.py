@@ -1,4 +1,4 @@
-"""The skin manager's ini files: thresholds and gains of the iCub's host."""
+"""Reads the skin manager's ini files: thresholds and gains of the iCub software."""
 
 import re
 from pathlib import Path
@@ -10,32 +10,32 @@ from skin_host.importing.report import Findings
 from skin_host.settings import Settings
 
 LARGEST_FILE = 1_000_000
-#: What has no counterpart, and why.
+#: Keys without a counterpart here, and why.
 DROPPED = {
     "name": "of its ports",
     "inputPorts": "of its ports",
     "outputPorts": "of its ports",
-    "minBaseline": "drift has a limit of its own, processing.drift.limit_units",
-    "contactCompensationGain": "baselines of touched taxels follow what the others share",
+    "minBaseline": "drift has a separate limit, processing.drift.limit_units",
+    "contactCompensationGain": "baselines of touched taxels follow the common drift of the others",
     "smoothFilter": "touch is decided by votes, pressure is not smoothed",
     "smoothFactor": "touch is decided by votes, pressure is not smoothed",
     "binarization": "pressure is always published; ON and OFF are the topic contact",
     "maxNeighborDist": "neighbours follow from the pitch of the kinds of unit",
     "skinParts": "numbers of the parts in its events",
 }
-#: Its compensator takes steps of 0.02 times the gain, whatever its period.
+#: The skin manager's compensator takes steps of 0.02 times the gain, whatever its period is.
 STEP = 0.02
 
 
 def import_manager(files: list[Path], base: Settings | None, findings: Findings) -> Settings:
-    """Take what has a counterpart into `base`.
+    """Add the settings that have a counterpart to `base`.
 
     Raises:
         ConfigurationError: there is no `base`, or a file cannot be read.
     """
     if base is None:
         raise ConfigurationError(
-            f"{files[0]}: holds no boards; import skinspec first and add this with --config"
+            f"{files[0]}: contains no boards; import skinspec first and add this with --config"
         )
     touch, drift = base.processing.touch, base.processing.drift
     for file in files:
@@ -77,10 +77,10 @@ def import_manager(files: list[Path], base: Settings | None, findings: Findings)
 
 
 def _entries(file: Path, findings: Findings) -> list[tuple[int, str, list[str]]]:
-    """The keys of a file with their line and words; lists may run over several lines.
+    """Return the keys of a file with their line and words; lists may span several lines.
 
-    A list is meant to be continued by a backslash at the end of a line; where one is missing,
-    the robot's own reader ends the list. Here it ends with its parenthesis.
+    A list is meant to be continued by a backslash at the end of a line; where one is missing, the
+    robot's own reader ends the list. Here it ends with its parenthesis.
     """
     try:
         text = file.read_bytes()[:LARGEST_FILE].decode("utf-8", errors="replace")
@@ -125,10 +125,10 @@ def _number(words: list[str]) -> float | None:
 
 
 def _check_files(file: Path, number: int, words: list[str], findings: Findings) -> None:
-    """Say how to import the positions files that are named, and which are not there."""
+    """Report how to import the positions files that are named, and which of them do not exist."""
     for word in words:
         path = file.parent / word
         if path.exists():
             findings.dropped(file, number, f"{word}: `skin import positions {path}` brings it")
         else:
-            findings.odd(file, number, f"{word}: not there")
+            findings.odd(file, number, f"{word}: not found")

@@ -1,12 +1,12 @@
-"""The robot descriptions' skinSpec files: boards, triangles, their set-up.
+"""Reads the robot descriptions' skinSpec files: boards, triangles and their set-up.
 
-Two files belong together: the device's own (`left_arm-...-skin.xml`: groups of CAN
-addresses, one a bus) and the specification that it includes (`...-skinSpec.xml`: defaults
-and sets). Either may be given; a specification that is included is found beside it.
+Two files belong together: the device's own (`left_arm-...-skin.xml`: groups of CAN addresses, one
+per bus) and the specification that it includes (`...-skinSpec.xml`: defaults and sets). Either may
+be given; a specification that is included is looked for beside the device file.
 
-What such files are like in the wild: comments within comments, `fasle`, set names used
-twice, more sets than announced or than the robot's own hosts read (20), sets that have been
-commented out, templates with prose instead of values.
+Known irregularities of such files: comments within comments, `fasle`, set names used twice, more
+sets than announced or than the robot's own hosts read (20), sets that have been commented out,
+templates with prose instead of values.
 """
 
 import re
@@ -16,7 +16,7 @@ from pathlib import Path
 from skin_host.importing.report import Findings
 from skin_host.importing.robot_xml import Document, Entry, integer
 
-#: The robot's own hosts drop special sets beyond these numbers with a mere warning.
+#: The robot's own hosts ignore special sets beyond these numbers, with only a warning.
 HOSTS_READ_TRIANGLE_SETS = 20
 TRIANGLES = range(16)
 ADDRESSES = range(1, 15)
@@ -27,7 +27,7 @@ SHIFTS = range(9)
 
 @dataclass(slots=True)
 class BoardSpec:
-    """One board: its set-up and (shift, CDC offset) of each triangle that is on."""
+    """One board: its set-up, and (shift, CDC offset) of each triangle that is on."""
 
     address: int
     period_ms: int = 50
@@ -38,7 +38,7 @@ class BoardSpec:
 
 @dataclass(slots=True)
 class Device:
-    """What one device describes: `patches` are its buses, by number, with their boards."""
+    """One device: `patches` are its buses, by number, with their boards."""
 
     name: str
     robot: str
@@ -58,7 +58,7 @@ def read_device(path: Path, findings: Findings) -> Device:
         if not included.name.lower().endswith("skinspec.xml"):
             findings.dropped(path, line, f'includes "{href}"; only skinSpec files are read')
         elif not included.exists():
-            findings.odd(path, line, f'includes "{href}", which is not there')
+            findings.odd(path, line, f'includes "{href}", which was not found')
         else:
             document.take(Document(included, findings))
     device = Device(_name(path), document.robot, path)
@@ -69,7 +69,7 @@ def read_device(path: Path, findings: Findings) -> Device:
 
 
 def _name(path: Path) -> str:
-    """Which limb: "left_arm-eb24-j4_7-skinSpec.xml" is left_arm."""
+    """Return the limb: for "left_arm-eb24-j4_7-skinSpec.xml" it is left_arm."""
     stem = path.stem.lower()
     limb = re.search(r"(left|right)_[a-z]+|torso", stem)
     text = limb[0] if limb else stem.split("-")[0].removesuffix("skinspec")
@@ -77,7 +77,7 @@ def _name(path: Path) -> str:
 
 
 def _boards(document: Document, findings: Findings) -> dict[int, list[BoardSpec]]:
-    """The boards of each patch (bus), set up."""
+    """Return the boards of each patch (bus), with their set-up."""
     patches = _addresses(document, findings)
     default = BoardSpec(
         0,
@@ -156,7 +156,7 @@ def _list(boards: list[BoardSpec]) -> str:
 
 
 def _addresses(document: Document, findings: Findings) -> dict[int, list[int]]:
-    """The addresses of each patch, from skinCanAddrsPatchN, or skinCanIds of a CAN card."""
+    """Return the addresses of each patch, from skinCanAddrsPatchN, or skinCanIds of a CAN card."""
     patches: dict[int, list[int]] = {}
     card = document.find("", "canDeviceNum")
     number = (integer(card.words[0]) if card and card.words else None) or 1
@@ -200,9 +200,9 @@ def _number(
 
 
 def _enabled(document: Document, findings: Findings) -> bool | None:
-    """Whether triangles are on by default; whatever is not true counts as false.
+    """Return whether triangles are on by default; any value but true counts as false.
 
-    None where the file has neither defaults nor sets: the oldest form, where all are on.
+    None if the file has neither defaults nor sets: the oldest form, where all are on.
     """
     entry = document.find("defaultCfgTriangle", "enabled")
     if entry is None:
@@ -221,7 +221,7 @@ def _enabled(document: Document, findings: Findings) -> bool | None:
 def _sets(
     document: Document, group: str, prefix: str, columns: int, findings: Findings
 ) -> list[tuple[Entry, list[int]]]:
-    """The numbered sets of a group, those that can be read."""
+    """Return the readable numbered sets of a group."""
     announced = document.find(group, "numOfSets")
     limit = integer(announced.words[0]) if announced and announced.words else None
     first: dict[str, int] = {}
@@ -236,7 +236,7 @@ def _sets(
             findings.odd(
                 entry.file,
                 entry.line,
-                f"{entry.name} is there already, line {first[entry.name]}; both are taken, "
+                f"{entry.name} exists already, line {first[entry.name]}; both are taken, "
                 "the robot's own host reads the first alone",
             )
         first.setdefault(entry.name, entry.line)

@@ -1,7 +1,7 @@
-"""Settings as the text of a configuration file.
+"""Writes settings as the text of a configuration file.
 
-Only what differs from the defaults is written. (No TOML writer among the libraries at hand
-keeps places on one line each, or writes comments.)
+Only values that differ from the defaults are written. (The available TOML writers do not keep each
+place on one line and cannot write comments.)
 """
 
 import json
@@ -39,7 +39,7 @@ def configuration_text(settings: Settings, comment: str = "") -> str:
 def _table(
     head: str, table: Struct, *, empty: bool = False, without: tuple[str, ...] = ()
 ) -> list[str]:
-    """A table with what differs from the defaults; nothing where that is nothing."""
+    """Return a table with the values that differ from the defaults; empty if there are none."""
     entries = [
         f"{key} = {_value(value)}" for key, value in _changed(table).items() if key not in without
     ]
@@ -60,7 +60,7 @@ def _patch(part: str, patch: Patch) -> list[str]:
 
 
 def _changed(table: Struct) -> dict[str, Any]:
-    """The entries of a table that are required or differ from their defaults."""
+    """Return the entries of a table that are required or differ from their defaults."""
     changed = {}
     for entry in msgspec.structs.fields(table):
         value = getattr(table, entry.name)
@@ -83,7 +83,7 @@ def _value(value: Any) -> str:
     if isinstance(value, int | float):
         return repr(value)
     if isinstance(value, str):
-        # A JSON string is a TOML basic string, but for DEL.
+        # A JSON string is a valid TOML basic string, except for DEL.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, dict):
         return _inline({_value(key): inner for key, inner in value.items()})

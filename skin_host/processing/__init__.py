@@ -1,1 +1,1 @@
-"""Sweeps to pressure to contacts. Pure: arrays and time in, arrays out."""
+"""Sweeps to pressure to contacts. Pure: takes arrays and times, returns arrays."""

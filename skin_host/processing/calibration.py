@@ -1,14 +1,15 @@
-"""What each taxel reads when nothing touches it, and whether it can be trusted.
+"""The untouched reading of each taxel, its noise, and whether the taxel is usable.
 
-The paper (section V-A) takes some seconds of untouched skin and keeps, per taxel, the
-mean and the 95th percentile. The readings are bytes, so a histogram of 256 counts holds
-all there is to know, at a constant size whatever the length.
+The paper (section V-A) takes some seconds of untouched skin and keeps, per taxel, the mean and the
+95th percentile. The readings are bytes, so a histogram of 256 counts keeps their whole
+distribution, at a constant size for any length.
 
-An activation is `no_load - raw`: it rises with pressure. All numbers here are in units
-of the transmitted byte.
+An activation is `no_load - raw`: it rises with pressure. All numbers here are in units of the
+transmitted byte.
 """
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from pathlib import Path
@@ -17,47 +18,81 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.errors import CalibrationError, OtherSkinError
+from skin_host.errors import CalibrationError, NewerFileError, OtherSkinError
 from skin_host.files import read_document, write_atomic
 from skin_host.layout import Layout, PadKind
+from skin_host.processing.conversions import Conversions
+from skin_host.processing.curves import KNOTS_UNITS, Curves, CurveVerdict, Memory, rising
+from skin_host.processing.masks import Mask
+from skin_host.processing.touch import levels
+from skin_host.settings import Touch
 
 SCHEMA = "skin.calibration/1"
-#: A taxel with more noise than this is told of; its threshold rises with its noise.
-NOISY_UNITS = 1.5
+#: A taxel is noisy if a decision within a second needs more than this multiple of the touch margin,
+#: ...
+NOISY_MARGINS = 1.5
+#: ... and unusable if it needs more than this multiple: 16 units are half the scale of real skin.
+USELESS_MARGINS = 8.0
 #: With more than this share of its samples at the ends of the scale, a taxel is out of range.
 SATURATED_SHARE = 0.05
-#: Fewer samples than this say neither where a taxel rests nor how noisy it is.
+#: With fewer samples than this, neither rest position nor noise of a taxel is known.
 FEWEST_SAMPLES = 10
-#: Samples whose means are compared to see a touch come or go during calibration.
-BLOCK = 10
-#: A step from sample to sample is a touch that comes or goes, not noise, if it is larger than
-#: this and than so many times the median step (four standard deviations).
-JUMP_UNITS = 8
-JUMP_MEDIANS = 6
-#: The means of blocks may differ by this much, and by five standard errors.
+#: The course of a calibration is kept as means of this many samples, ...
+BLOCK = 4
+#: ... and at most this many means: when they are full, pairs are joined.
+MOST_BLOCKS = 128
+#: This many means are joined to measure how long noise lasts.
+JOINED = 4
+#: Three signs of a touch in the means: they differ by more than this and five standard errors, ...
 STEADY_UNITS = 1.5
+STEADY_ERRORS = 5.0
+#: ... most of the variance is that of joined blocks (for white noise a sixteenth, for conversions
+#: sent three times a sixth), ...
+BETWEEN_SHARE = 0.5
+#: ... and they rise and fall once, or together with another taxel of the triangle.
+PRESS_SWITCHES = 2
+SHARED_CORRELATION = 0.8
+#: A taxel that rests this much nearer to pressure than its triangle and its part was pressed.
+PRESSED_UNITS = 8.0
+#: Noise below this is rounding, from which the duration of noise cannot be measured.
+ROUNDING_VARIANCE = 0.1
+FEWEST_BLOCKS = 4
+#: A histogram is smoothed with this share of its variance.
+SMOOTHED_SHARE = 0.25
+#: Upper limit of the exponents, and number of bisections to find one.
+LARGEST_EXPONENT = 40.0
+BISECTIONS = 24
+#: A pad with this much noise does not send the same byte for seconds.
+LIVELY_UNITS = 0.6
 
-#: Of a force/torque board.
+#: Channels of a force/torque board.
 CHANNELS = 6
 
 Floats = NDArray[np.float64]
 
 
 class Verdict(IntEnum):
-    """What the calibration says of a taxel. From STUCK on its readings are not used."""
+    """Result of the calibration of a taxel. The readings of STUCK and the following are not used.
+
+    NOISY decides slowly, and on more pressure than others (`levels`). SATURATES rests so near 0
+    that a press is cut off before its pressure curve ends. TOUCHED was touched for a part of the
+    calibration, or for all of it. TOO_NOISY is not used: no realistic press would be detected.
+    """
 
     OK = 0
     NOISY = 1
-    TOUCHED = 2
-    STUCK = 3
-    OUT_OF_RANGE = 4
-    ABSENT = 5
-    TOO_FEW = 6
+    SATURATES = 2
+    TOUCHED = 3
+    STUCK = 4
+    OUT_OF_RANGE = 5
+    TOO_NOISY = 6
+    ABSENT = 7
+    TOO_FEW = 8
 
 
 @dataclass(frozen=True, slots=True)
 class Zero:
-    """What an unloaded force/torque board sends: mean and sd, float64[6], N and N m."""
+    """Load that an unloaded force/torque board sends: mean and sd, float64[6], N and N m."""
 
     offset: Floats
     noise: Floats
@@ -72,12 +107,15 @@ class Calibration:
         id: identifies the numbers; equal numbers, equal id.
         time: when it was taken, ISO 8601 in UTC.
         baseline: float64[n], mean activation.
-        percentile: float64[n], its 95th percentile (or what was asked for).
-        noise: float64[n], standard deviation.
+        percentile: float64[n], its 95th percentile (or the requested one).
+        noise: float64[n], standard deviation of a measurement.
+        spread: float64[n], the same derived from sums of measurements: larger where noise lasts for
+            several measurements, and an upper limit after a short calibration.
         gain: float64[n], pressure of the taxel over that of the common curve.
-        bend: float64[n], its quadratic part over that of the common curve, the gain apart.
+        bend: float64[n], its quadratic part over that of the common curve, without the gain.
         verdict: uint8[n], see `Verdict`.
         zeros: of the fingertips on force/torque boards, by name.
+        curves: of the pads and their foam, from a recording under known pressure, if there was one.
     """
 
     configuration: str
@@ -86,54 +124,79 @@ class Calibration:
     baseline: Floats
     percentile: Floats
     noise: Floats
+    spread: Floats
     gain: Floats
     bend: Floats
     verdict: NDArray[np.uint8]
     zeros: dict[str, Zero] = field(default_factory=dict)
+    curves: Curves | None = None
 
     @property
     def usable(self) -> NDArray[np.bool_]:
-        """Which taxels [n] may be believed."""
-        return self.verdict < Verdict.STUCK
+        """Return which taxels [n] are usable."""
+        usable: NDArray[np.bool_] = self.verdict < Verdict.STUCK
+        return usable if self.curves is None else usable & self.curves.usable
 
 
 class Calibrator:
-    """Collects sweeps of untouched skin; `finish` turns them into a calibration."""
+    """Collects sweeps of untouched skin; `finish` turns them into a calibration.
 
-    def __init__(self, layout: Layout, percentile: float = 0.95) -> None:
+    Args:
+        layout: the skin.
+        percentile: of the readings, kept beside their mean.
+        touch: the touch decision by which noise is judged.
+        range_units: float64[n], activation at which the pressure curve of each taxel ends; no limit
+            by default.
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        percentile: float = 0.95,
+        touch: Touch | None = None,
+        range_units: Floats | None = None,
+    ) -> None:
         n = layout.n_taxels
         self._layout = layout
         self._percentile = percentile
+        self._touch = touch or Touch()
+        self._range_units = np.full(n, np.inf) if range_units is None else range_units
+        self._received = np.zeros(n, dtype=np.int64)
         self._counts = np.zeros((n, 256), dtype=np.int64)
-        self._last = np.full(n, -1, dtype=np.int16)
-        self._steps = np.zeros((n, 256), dtype=np.int32)
-        self._block_sum = np.zeros(n)
-        self._block_count = np.zeros(n, dtype=np.int64)
-        self._lowest = np.full(n, np.inf)
-        self._highest = np.full(n, -np.inf)
+        self._course = _Course(n)
+        self._conversions = [Conversions(part.n_taxels) for part in layout.parts]
+        self._at_ns: list[int | None] = [None] * len(layout.parts)
 
-    def add(self, part_index: int, raw: NDArray[np.uint8], present: NDArray[np.bool_]) -> None:
-        """Count one sweep of a part: bytes [m], and which of them [m] were received."""
+    def add(
+        self,
+        part_index: int,
+        raw: NDArray[np.uint8],
+        present: NDArray[np.bool_],
+        t_ns: int | None = None,
+    ) -> None:
+        """Add one sweep of a part.
+
+        Args:
+            part_index: which part.
+            raw: uint8[m], the bytes.
+            present: bool[m], which of them were received.
+            t_ns: time of the sweep; without it, every byte counts as a new measurement.
+        """
         part = self._layout.parts[part_index]
-        taxels = np.arange(part.start, part.stop)[present]
-        seen = raw[present]
-        self._counts[taxels, seen] += 1
-        value = seen.astype(np.int16)
-        known = self._last[taxels] >= 0
-        self._steps[taxels[known], np.abs(value - self._last[taxels])[known]] += 1
-        self._last[taxels] = value
-        self._block_sum[taxels] += value
-        self._block_count[taxels] += 1
-        full = taxels[self._block_count[taxels] == BLOCK]
-        mean = self._block_sum[full] / BLOCK
-        self._lowest[full] = np.minimum(self._lowest[full], mean)
-        self._highest[full] = np.maximum(self._highest[full], mean)
-        self._block_sum[full] = 0.0
-        self._block_count[full] = 0
+        taxels = np.arange(part.start, part.stop)
+        received = taxels[present]
+        self._received[received] += 1
+        self._course.add(received, raw[present])
+        new = present
+        if t_ns is not None:
+            before, self._at_ns[part_index] = self._at_ns[part_index], t_ns
+            dt_s = 0.0 if before is None else max((t_ns - before) * 1e-9, 0.0)
+            new = present & ~self._conversions[part_index].step(raw.copy(), dt_s)
+        self._counts[taxels[new], raw[new]] += 1
 
     def finish(self, configuration: str, time: str) -> Calibration:
-        """Return the calibration of what has been added, at `time` (ISO 8601, UTC)."""
-        counts = self._counts
+        """Return the calibration from the added sweeps, at `time` (ISO 8601, UTC)."""
+        counts, received = self._counts, self._received
         samples = counts.sum(axis=1)
         some = np.maximum(samples, 1)
         codes = np.arange(256.0)
@@ -147,44 +210,259 @@ class Calibrator:
         from_top = np.argmax(cumulative >= wanted[:, np.newaxis], axis=1)
         percentile = no_load - (255.0 - from_top)
         noise = np.sqrt(variance)
+        lasting = self._lasting(variance, received / some)
 
-        steady_noise = _steady_noise(self._steps)
-        moved = np.where(np.isfinite(self._lowest), self._highest - self._lowest, 0.0)
-        touched = moved > STEADY_UNITS + 5.0 * steady_noise / np.sqrt(BLOCK)
-        # The least activation seen is the nearest to an untouched taxel that there is.
-        baseline = np.where(touched, no_load - self._highest, baseline)
+        course = self._course
+        touched = self._touched(variance)
+        steady_noise = course.error * np.sqrt(course.length * samples / np.maximum(received, 1))
+        # The lowest activation is the best estimate of the untouched one.
+        baseline = np.where(touched, no_load - course.highest, baseline)
         percentile = np.where(touched, baseline + 1.645 * steady_noise, percentile)
         noise = np.where(touched, steady_noise, noise)
+        upward = np.where(touched, noise**2, _upward_variance(counts, variance, self._touch))
+        spread = np.sqrt(upward * np.where(touched, 1.0, lasting))
 
+        rest = no_load - baseline
+        margin = self._touch.margin_units
+        decides = levels(percentile - baseline, spread, self._touch).decides
+        cut_off = (rest < self._range_units) & np.isfinite(self._range_units)
         ends = counts[:, 0] + counts[:, 255]
         verdict = np.full(len(samples), Verdict.OK, dtype=np.uint8)
-        verdict[noise > NOISY_UNITS] = Verdict.NOISY
-        verdict[touched] = Verdict.TOUCHED
+        verdict[decides > NOISY_MARGINS * margin] = Verdict.NOISY
+        verdict[cut_off] = Verdict.SATURATES
+        verdict[touched | self._pressed(baseline, samples > 0)] = Verdict.TOUCHED
+        verdict[decides > USELESS_MARGINS * margin] = Verdict.TOO_NOISY
         verdict[ends > SATURATED_SHARE * samples] = Verdict.OUT_OF_RANGE
         verdict[(counts[:, 0] == samples) | (counts[:, 255] == samples)] = Verdict.STUCK
-        verdict[samples < FEWEST_SAMPLES] = Verdict.TOO_FEW
-        verdict[samples == 0] = Verdict.ABSENT
-        absent = samples == 0
-        for array in (baseline, percentile, noise):
+        verdict[received < FEWEST_SAMPLES] = Verdict.TOO_FEW
+        absent = received == 0
+        verdict[absent] = Verdict.ABSENT
+        for array in (baseline, percentile, noise, spread):
             array[absent] = 0.0
         return _identified(
             Calibration(
                 configuration,
                 "",
                 time,
-                baseline,
-                percentile,
-                noise,
-                np.ones(len(samples)),
-                np.ones(len(samples)),
-                verdict,
+                baseline=baseline,
+                percentile=percentile,
+                noise=noise,
+                spread=spread,
+                gain=np.ones(len(samples)),
+                bend=np.ones(len(samples)),
+                verdict=verdict,
             )
         )
+
+    def _lasting(self, variance: Floats, repeats: Floats) -> Floats:
+        """Return for how many measurements [n] noise lasts: 1 where each is independent of the
+        last.
+
+        The variance of block means is larger by this factor. How conversions fall into sweeps is
+        the same
+        for all taxels of a part, so their median counts; for a single taxel the difference must be
+        beyond
+        chance.
+
+        Args:
+            variance: float64[n], of a measurement.
+            repeats: float64[n], samples a measurement.
+        """
+        course = self._course
+        blocks = course.number // JOINED
+        found = course.joined_variance * course.length * JOINED
+        found /= np.maximum(repeats * variance, 1e-9)
+        known = (variance > ROUNDING_VARIANCE) & (blocks >= FEWEST_BLOCKS)
+        found = np.where(known, np.maximum(found, 1.0), 1.0)
+        chance = 1.0 + 2.0 * np.sqrt(2.0 / np.maximum(blocks - 1, 1))
+        lasting = np.maximum(found / chance, 1.0)
+        for part in self._layout.parts:
+            mine = slice(part.start, part.stop)
+            if known[mine].any():
+                common = np.median(found[mine][known[mine]])
+                lasting[mine] = np.maximum(lasting[mine], common)
+        return lasting
+
+    def _touched(self, variance: Floats) -> Mask:
+        """Return the taxels [n] that were touched for a part of the time.
+
+        Not those that jump between levels: such noise has no course, or one that goes up and down
+        more
+        often than a press does and that no other pad shares.
+        """
+        course = self._course
+        moved = course.highest - course.lowest > STEADY_UNITS + STEADY_ERRORS * course.error
+        moved &= course.joined_variance > BETWEEN_SHARE * variance
+        pressed = moved & (course.switches <= PRESS_SWITCHES)
+        unclear = moved & ~pressed
+        for taxel in np.flatnonzero(unclear):
+            number = course.number[taxel]
+            same = self._layout.triangle_of == self._layout.triangle_of[taxel]
+            same &= moved & (course.number == number)
+            same[taxel] = False
+            own = course.means[taxel, :number]
+            for other in np.flatnonzero(same):
+                shared = np.corrcoef(own, course.means[other, :number])[0, 1]
+                pressed[taxel] |= shared > SHARED_CORRELATION
+        return pressed
+
+    def _pressed(self, baseline: Floats, known: Mask) -> Mask:
+        """Return the taxels [n] that were pressed all the time: they rest far from all other
+        pads.
+        """
+        layout = self._layout
+        found = np.zeros(len(baseline), np.bool_)
+        known = known & (layout.pad_kind == PadKind.PRESSURE)
+        for triangle in np.unique(layout.triangle_of[known]):
+            mine = known & (layout.triangle_of == triangle)
+            found[mine] = baseline[mine] - np.median(baseline[mine]) > PRESSED_UNITS
+        for part in layout.parts:
+            span = slice(part.start, part.stop)
+            if known[span].any():
+                usual = np.median(baseline[span][known[span]])
+                found[span] &= baseline[span] - usual > PRESSED_UNITS
+        return found
+
+
+def _upward_variance(counts: NDArray[np.int64], variance: Floats, touch: Touch) -> Floats:
+    """Return the variance [n] of the normal noise that gives as much evidence of a touch as this.
+
+    Noise with occasional jumps towards pressure gives more evidence than its variance suggests, and
+    noise with jumps the other way gives less. The exponent x of the decay of evidence solves
+    E exp(x (reading - mean - margin)) = 1 (Cramer and Lundberg); for a normal variable it is
+    2 margin / variance. The histogram is smoothed, because a short one has no tails.
+
+    Args:
+        counts: int64[n, 256], how often each byte was measured.
+        variance: float64[n], of the bytes.
+        touch: the touch decision.
+    """
+    samples = np.maximum(counts.sum(axis=1), 1)
+    # Plus twice the standard error of a variance, because a short calibration may underestimate it.
+    surely = variance * (1.0 + 2.0 * np.sqrt(2.0 / samples))
+    codes = np.flatnonzero(counts.any(axis=0))
+    share = counts[:, codes] / samples[:, None]
+    reading = (share @ codes)[:, None] - codes
+    margin = max(touch.margin_units - touch.hysteresis_units / 2, 1.0)
+    low, high = np.zeros(len(counts)), np.full(len(counts), LARGEST_EXPONENT)
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        growth = np.exp(np.minimum(middle[:, None] * (reading - margin), 99.0))
+        moment = np.sum(share * growth, axis=1)
+        moment *= np.exp(np.minimum(middle**2 * SMOOTHED_SHARE * variance / 2, 99.0))
+        thins = moment < 1.0
+        low, high = np.where(thins, middle, low), np.where(thins, high, middle)
+    found = 2 * margin / np.maximum(low, margin / 1e4)
+    third = np.sum(share * reading**3, axis=1)
+    skewness = third / np.maximum(variance, ROUNDING_VARIANCE) ** 1.5
+    # The skewness of normal noise is estimated within sqrt(6 / samples).
+    away = skewness < -3.0 * np.sqrt(6.0 / samples)
+    upward: Floats = np.where(away, np.minimum(found, surely), np.maximum(found, surely))
+    return upward
+
+
+class _Course:
+    """The course of n taxels over a calibration of any length, as means of blocks of samples."""
+
+    def __init__(self, n: int) -> None:
+        self._sum = np.zeros(n)
+        self._count = np.zeros(n, np.int64)
+        #: Samples per block, so far.
+        self.length = np.full(n, BLOCK)
+        #: How many blocks are full, and their means; entries beyond are undefined.
+        self.number = np.zeros(n, np.int64)
+        self.means = np.zeros((n, MOST_BLOCKS))
+
+    def add(self, taxels: NDArray[np.intp], raw: NDArray[np.uint8]) -> None:
+        """Add one byte for each of some taxels."""
+        self._sum[taxels] += raw
+        self._count[taxels] += 1
+        full = taxels[self._count[taxels] == self.length[taxels]]
+        if not len(full):
+            return
+        self.means[full, self.number[full]] = self._sum[full] / self.length[full]
+        self.number[full] += 1
+        self._sum[full] = 0.0
+        self._count[full] = 0
+        joined = full[self.number[full] == MOST_BLOCKS]
+        if len(joined):
+            pairs = self.means[joined].reshape(len(joined), -1, 2).mean(axis=2)
+            self.means[joined, : MOST_BLOCKS // 2] = pairs
+            self.number[joined] = MOST_BLOCKS // 2
+            self.length[joined] *= 2
+
+    @property
+    def _full(self) -> Mask:
+        full: Mask = np.arange(MOST_BLOCKS) < self.number[:, None]
+        return full
+
+    @property
+    def highest(self) -> Floats:
+        """Largest mean [n]; 0 where there is none."""
+        found: Floats = self.means.max(axis=1, where=self._full, initial=0.0)
+        return found
+
+    @property
+    def lowest(self) -> Floats:
+        """Smallest mean [n]; 0 where there is none."""
+        found: Floats = self.means.min(axis=1, where=self._full, initial=255.0)
+        return np.where(self.number > 0, found, 0.0)
+
+    @property
+    def joined_variance(self) -> Floats:
+        """Return the variance [n] of joined blocks; 0 where there are fewer than two."""
+        means = self.means.reshape(len(self.means), -1, JOINED).mean(axis=2)
+        number = self.number // JOINED
+        full = np.arange(MOST_BLOCKS // JOINED) < number[:, None]
+        mean = means.sum(axis=1, where=full) / np.maximum(number, 1)
+        squares = np.square(means - mean[:, None]).sum(axis=1, where=full)
+        found: Floats = squares / np.maximum(number - 1, 1)
+        return found
+
+    @property
+    def error(self) -> Floats:
+        """Return the standard error of a mean [n], from the median step between neighbours: a press
+        makes few large steps.
+        """
+        steps = np.abs(np.diff(self.means, axis=1))
+        steps[~self._full[:, 1:]] = np.inf
+        steps.sort(axis=1)
+        count = np.maximum(self.number - 1, 0)
+        median = steps[np.arange(len(steps)), count // 2]
+        return np.where(count > 0, median / (0.6745 * np.sqrt(2.0)), 0.0)
+
+    @property
+    def switches(self) -> NDArray[np.int64]:
+        """Return how often the means [n] change between the lowest and the highest third of their
+        range.
+        """
+        low, high = self.lowest, self.highest
+        third = (high - low) / 3.0
+        state = np.zeros(len(low), np.int64)
+        found = np.zeros(len(low), np.int64)
+        for mean, full in zip(self.means.T, self._full.T, strict=True):
+            now = np.where(mean > high - third, 1, np.where(mean < low + third, -1, state))
+            found += full & (state != 0) & (now != state)
+            state = np.where(full, now, state)
+        return found
 
 
 def with_gains(calibration: Calibration, gain: Floats, bend: Floats) -> Calibration:
     """Return the calibration with gains and bends [n] fitted to known pressures."""
     return _identified(replace(calibration, gain=gain, bend=bend))
+
+
+def with_curves(calibration: Calibration, curves: Curves | None) -> Calibration:
+    """Return the calibration with these curves, or without any.
+
+    A pad that was noisy under pressure and now always sends the same byte is stuck.
+    """
+    verdict = calibration.verdict
+    if curves is not None:
+        frozen = curves.own & (curves.noise_units > LIVELY_UNITS) & (calibration.noise == 0.0)
+        stuck = np.uint8(Verdict.STUCK)
+        verdict = np.where(frozen & (verdict < stuck), stuck, verdict).astype(np.uint8)
+    return _identified(replace(calibration, curves=curves, verdict=verdict))
 
 
 def with_zeros(calibration: Calibration, zeros: dict[str, Zero]) -> Calibration:
@@ -193,51 +471,44 @@ def with_zeros(calibration: Calibration, zeros: dict[str, Zero]) -> Calibration:
 
 
 def with_gains_of(calibration: Calibration, path: Path, layout: Layout) -> Calibration:
-    """Return the calibration with the gains of the one in `path`, if there is one that fits.
+    """Return the calibration with gains and curves of the one in `path`, if one fits.
 
-    Zero and noise are taken anew at every start; gains belong to pad and foam, and stay.
+    Zero and noise are measured at every start; gains and curves belong to pad and foam, and remain
+    valid.
     """
     try:
         before = load(path, layout, calibration.configuration)
-    except CalibrationError:
+    except (CalibrationError, NewerFileError):
         return calibration
-    return with_gains(calibration, before.gain, before.bend)
+    return with_pressures_of(calibration, before)
+
+
+def with_pressures_of(calibration: Calibration, before: Calibration) -> Calibration:
+    """Return the calibration with gains and curves of another one of this skin."""
+    return with_curves(with_gains(calibration, before.gain, before.bend), before.curves)
 
 
 def merge(
     old: Calibration, new: Calibration, renewed: NDArray[np.bool_], *, zeros: bool = True
 ) -> Calibration:
-    """Return `old` with the taxels `renewed` [n] taken from `new`; their gains stay.
+    """Return `old` with the taxels `renewed` [n] taken from `new`; their gains and curves stay.
 
-    Zeros of fingertips are taken from `new`, if so wished, as far as it has them.
+    With `zeros`, zeros of fingertips are taken from `new`, as far as it has them.
     """
-    return _identified(
+    merged = _identified(
         replace(
             new,
             baseline=np.where(renewed, new.baseline, old.baseline),
             percentile=np.where(renewed, new.percentile, old.percentile),
             noise=np.where(renewed, new.noise, old.noise),
+            spread=np.where(renewed, new.spread, old.spread),
             gain=old.gain,
             bend=old.bend,
             verdict=np.where(renewed, new.verdict, old.verdict),
             zeros=old.zeros | new.zeros if zeros else old.zeros,
         )
     )
-
-
-def _steady_noise(steps: NDArray[np.int32]) -> Floats:
-    """Standard deviation [n] that steps from sample to sample tell, a touch's left out.
-
-    Args:
-        steps: int32[n, 256], how often each size of step was seen.
-    """
-    sizes = np.arange(256.0)
-    cumulative = np.cumsum(steps, axis=1)
-    median = np.argmax(2 * cumulative >= cumulative[:, -1:], axis=1)
-    noise = sizes <= np.maximum(JUMP_UNITS, JUMP_MEDIANS * median)[:, np.newaxis]
-    squares = np.sum(steps * sizes**2, axis=1, where=noise)
-    variance: Floats = squares / np.maximum(cumulative[:, -1], 1) / 2.0
-    return np.sqrt(variance)
+    return merged if old.curves is None else with_curves(merged, old.curves)
 
 
 def _identified(calibration: Calibration) -> Calibration:
@@ -246,6 +517,7 @@ def _identified(calibration: Calibration) -> Calibration:
         calibration.baseline,
         calibration.percentile,
         calibration.noise,
+        calibration.spread,
         calibration.gain,
         calibration.bend,
         calibration.verdict,
@@ -253,6 +525,10 @@ def _identified(calibration: Calibration) -> Calibration:
         digest.update(np.ascontiguousarray(array).tobytes())
     for name, zero in sorted(calibration.zeros.items()):
         digest.update(name.encode() + zero.offset.tobytes() + zero.noise.tobytes())
+    if (curves := calibration.curves) is not None:
+        for array in curves.arrays().values():
+            digest.update(np.ascontiguousarray(array).tobytes())
+        digest.update(np.array([curves.memory.radius_kpa, curves.memory.weight]).tobytes())
     return replace(calibration, id=digest.hexdigest()[:12])
 
 
@@ -274,13 +550,34 @@ class _PartFile(msgspec.Struct, forbid_unknown_fields=True):
     noise: list[float]
     gain: list[float]
     verdict: list[str]
-    #: Files from before it was fitted have none.
+    #: Files of older versions do not have it.
     bend: list[float] | None = None
+    spread: list[float] | None = None
 
 
 class _ZeroFile(msgspec.Struct, forbid_unknown_fields=True):
     offset: list[float]
     noise: list[float]
+
+
+class _PartCurves(msgspec.Struct, forbid_unknown_fields=True):
+    """Curves of the taxels of one part; null where a taxel has no own curve."""
+
+    kpa: list[list[float] | None]
+    beyond_units: list[float | None]
+    noise_units: list[float]
+    error_kpa: list[float | None]
+    verdict: list[str]
+
+
+class _CurvesFile(msgspec.Struct, forbid_unknown_fields=True):
+    #: Activations at which the curves are given.
+    units: list[float]
+    highest_kpa: float
+    lag_s: float
+    radius_kpa: list[float]
+    weight: list[float]
+    parts: dict[str, _PartCurves]
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
@@ -291,10 +588,11 @@ class _File(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
     configuration: str
     parts: dict[str, _PartFile]
     fingertips: dict[str, _ZeroFile] = {}
+    curves: _CurvesFile | None = None
 
 
 def save(path: Path, calibration: Calibration, layout: Layout) -> None:
-    """Write a calibration file, whole or not at all (JSON, schema skin.calibration/1).
+    """Write a calibration file, completely or not at all (JSON, schema skin.calibration/1).
 
     Raises:
         OSError: it cannot be written.
@@ -308,10 +606,11 @@ def save(path: Path, calibration: Calibration, layout: Layout) -> None:
             noise=_rounded(calibration.noise[mine]),
             gain=_rounded(calibration.gain[mine]),
             bend=_rounded(calibration.bend[mine]),
+            spread=_rounded(calibration.spread[mine]),
             verdict=[Verdict(number).name.lower() for number in calibration.verdict[mine]],
         )
     zeros = {
-        # Forces of coarse and of fine boards alike: not rounded.
+        # Not rounded, so that it serves for coarse and fine boards.
         name: _ZeroFile(zero.offset.tolist(), zero.noise.tolist())
         for name, zero in calibration.zeros.items()
     }
@@ -323,8 +622,35 @@ def save(path: Path, calibration: Calibration, layout: Layout) -> None:
         calibration.configuration,
         parts,
         zeros,
+        None if calibration.curves is None else _curves_file(calibration.curves, layout),
     )
     write_atomic(path, msgspec.json.format(msgspec.json.encode(content), indent=1) + b"\n")
+
+
+def _curves_file(curves: Curves, layout: Layout) -> _CurvesFile:
+    parts = {}
+    for part in layout.parts:
+        mine = range(part.start, part.stop)
+        own = curves.own
+        parts[part.name] = _PartCurves(
+            kpa=[_rounded(curves.kpa[taxel]) if own[taxel] else None for taxel in mine],
+            beyond_units=[_finite(curves.beyond_units[taxel]) for taxel in mine],
+            noise_units=_rounded(curves.noise_units[part.start : part.stop]),
+            error_kpa=[_finite(curves.error_kpa[taxel]) for taxel in mine],
+            verdict=[CurveVerdict(curves.verdict[taxel]).name.lower() for taxel in mine],
+        )
+    return _CurvesFile(
+        KNOTS_UNITS.tolist(),
+        curves.highest_kpa,
+        curves.lag_s,
+        list(curves.memory.radius_kpa),
+        list(curves.memory.weight),
+        parts,
+    )
+
+
+def _finite(value: float) -> float | None:
+    return round(float(value), 6) if np.isfinite(value) else None
 
 
 def _rounded(values: Floats) -> list[float]:
@@ -333,25 +659,27 @@ def _rounded(values: Floats) -> list[float]:
 
 
 def load(path: Path, layout: Layout, configuration: str) -> Calibration:
-    """Read a calibration file of this very skin.
+    """Read a calibration file of this skin.
 
     Raises:
-        CalibrationError: unreadable, damaged, of another schema or configuration; one line
-            that ends with the command that mends it.
+        CalibrationError: unreadable, damaged, of another schema, configuration or robot; one
+            line that ends with the command that helps.
+        NewerFileError: a newer version has written it.
     """
 
     def refused(what: str) -> CalibrationError:
         return CalibrationError(f"{path}: {what}; take a new one with: skin calibrate CONFIG")
 
     content = read_document(path, _File, SCHEMA, "calibration", refused)
-    if content.configuration != configuration:
+    if (content.configuration, content.robot) != (configuration, layout.robot):
         raise OtherSkinError(
             f"{path}: belongs to configuration {content.configuration} "
-            f'(robot "{content.robot}"), this one is {configuration}; take a new one with: '
-            "skin calibrate CONFIG"
+            f'of robot "{content.robot}", this is {configuration} of robot "{layout.robot}"; '
+            "take a new one with: skin calibrate CONFIG"
         )
     n = layout.n_taxels
-    arrays = {name: np.zeros(n) for name in ("baseline", "percentile", "noise", "gain", "bend")}
+    names = ("baseline", "percentile", "noise", "spread", "gain", "bend")
+    arrays = {name: np.zeros(n) for name in names}
     verdict = np.full(n, Verdict.ABSENT, dtype=np.uint8)
     for part in layout.parts:
         stored = content.parts.get(part.name)
@@ -359,11 +687,10 @@ def load(path: Path, layout: Layout, configuration: str) -> Calibration:
             raise refused(f'no part "{part.name}"')
         mine = slice(part.start, part.stop)
         for name, array in arrays.items():
-            values = (
-                np.ones(part.n_taxels)
-                if stored.bend is None and name == "bend"
-                else np.array(getattr(stored, name))
-            )
+            given = getattr(stored, name)
+            if given is None:
+                given = stored.noise if name == "spread" else np.ones(part.n_taxels)
+            values = np.array(given)
             if values.shape != (part.n_taxels,) or not np.all(np.isfinite(values)):
                 raise refused(f"parts.{part.name}.{name}: wanted {part.n_taxels} finite numbers")
             array[mine] = values
@@ -381,6 +708,67 @@ def load(path: Path, layout: Layout, configuration: str) -> Calibration:
         if not fits or not np.isfinite([offset, noise]).all() or (noise < 0.0).any():
             raise refused(f"fingertips.{name}: wanted twice {CHANNELS} finite numbers")
         zeros[name] = Zero(offset, noise)
+    curves = None
+    if content.curves is not None:
+        curves = _curves_of(content.curves, layout, refused)
     return Calibration(
-        content.configuration, content.id, content.time, verdict=verdict, zeros=zeros, **arrays
+        content.configuration,
+        content.id,
+        content.time,
+        verdict=verdict,
+        zeros=zeros,
+        curves=curves,
+        **arrays,
+    )
+
+
+def _curves_of(
+    content: _CurvesFile, layout: Layout, refused: Callable[[str], CalibrationError]
+) -> Curves:
+    """Return the curves of a file; errors are raised through `refused`."""
+    memory = np.array([*content.radius_kpa, *content.weight])
+    lengths_agree = len(content.radius_kpa) == len(content.weight)
+    if not lengths_agree or not np.isfinite(memory).all() or np.any(memory <= 0.0):
+        raise refused("curves: wanted as many radii as weights, all positive")
+    if content.units != KNOTS_UNITS.tolist() or not 0.0 < content.highest_kpa < np.inf:
+        raise refused("curves.units: not the activations that this version knows")
+    n = layout.n_taxels
+    kpa = np.zeros((n, len(KNOTS_UNITS)))
+    beyond, noise = np.full(n, np.inf), np.zeros(n)
+    error = np.full(n, np.nan)
+    verdict = np.full(n, CurveVerdict.UNKNOWN, np.uint8)
+    for part in layout.parts:
+        stored = content.parts.get(part.name)
+        where = f"curves.parts.{part.name}"
+        if stored is None:
+            raise refused(f'curves: no part "{part.name}"')
+        if any(len(values) != part.n_taxels for values in msgspec.structs.astuple(stored)):
+            raise refused(f"{where}: wanted {part.n_taxels} entries of each kind")
+        mine = slice(part.start, part.stop)
+        try:
+            verdict[mine] = [CurveVerdict[name.upper()] for name in stored.verdict]
+        except KeyError as unknown:
+            raise refused(f"{where}.verdict: {unknown}") from None
+        for taxel, curve in enumerate(stored.kpa, part.start):
+            if curve is not None:
+                if len(curve) != len(KNOTS_UNITS) or not np.isfinite(curve).all():
+                    raise refused(f"{where}.kpa: wanted {len(KNOTS_UNITS)} finite numbers a curve")
+                kpa[taxel] = curve
+            elif verdict[taxel] == CurveVerdict.GOOD:
+                raise refused(f"{where}.kpa: a good taxel without a curve")
+        beyond[mine] = [np.inf if units is None else units for units in stored.beyond_units]
+        error[mine] = [np.nan if kpa is None else kpa for kpa in stored.error_kpa]
+        noise[mine] = stored.noise_units
+    wild = not np.isfinite(noise).all() or np.any(noise < 0.0)
+    if wild or np.any(np.diff(kpa) < 0.0) or not np.all(beyond > 0.0):
+        raise refused("curves: a curve falls, or a noise is negative")
+    return Curves(
+        rising(kpa),
+        beyond,
+        noise,
+        error,
+        verdict,
+        content.highest_kpa,
+        content.lag_s,
+        Memory(tuple(content.radius_kpa), tuple(content.weight)),
     )

@@ -1,18 +1,19 @@
-"""Touched taxels that lie together are one contact, and a contact has a life."""
+"""Groups touched taxels into contacts and follows the contacts over time."""
 
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
-from typing import Literal
+from dataclasses import dataclass
+from itertools import accumulate, chain, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.layout import Layout, PadKind
+from skin_host.processing.events import Reason, TouchEvent
 from skin_host.processing.localization import Localizer, make_localizer, separate
 from skin_host.processing.localization_centroid import GEOMETRY_PITCHES
+from skin_host.processing.patches import Patches
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.processing.pressure import PressureCurve
 from skin_host.settings import Settings
@@ -20,94 +21,51 @@ from skin_host.settings import Settings
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-#: What must change before another `move` is worth a message.
+#: Smallest change for another `move` event.
 MOVED_M = 0.2e-3
 PRESSED_KPA = 2.0
 PRESSED_SHARE = 0.1
-#: A contact in which nothing changes says so this often: it is still there.
+#: A contact without changes is reported this often, so that subscribers know that it lasts.
 ALIVE_NS = 1_000_000_000
-#: Below this peak a contact is all but gone, and where it is only noise would tell; above it
-#: an untouched taxel may be about to be touched.
+#: Below this peak a contact has almost ended and its place is mostly noise; above it an untouched
+#: taxel may become touched soon.
 FELT_KPA = 2.0
-#: Pieces of a contact are contacts of their own when they have been apart for so long.
+#: Pieces of a contact become separate contacts when they have been apart for this long.
 PARTED_NS = 150_000_000
-#: A touched taxel of which nothing is heard for less than this is taken to be touched still.
+#: A piece that feels less than this share of what the contact felt is a remainder of it: noisy
+#: taxels release late. The contact's own value fades in the second time.
+PIECE_SHARE = 0.2
+FADES_NS = 2_000_000_000
+#: Contacts that have grown together become one after this time: a taxel between two may flicker.
+MERGED_NS = 1_000_000_000
+#: A touched taxel that is not received for less than this time still counts as touched.
 LOST_NS = 500_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class Load:
-    """What a force/torque board says of the contact on its fingertip.
-
-    Attributes:
-        verdict: whether one push on the surface gives this force and torque.
-        force_n, torque_nm: of what touches on the fingertip, about the origin of its frame.
-        shear_n: the share of the force along the surface; None without a place.
-        flags: of the finger, see `fingertip.grasp.Flags`, in lower case.
-    """
-
-    verdict: Literal["contact", "no_single_contact", "several_contacts", "saturated"]
-    force_n: list[float]
-    torque_nm: list[float]
-    shear_n: list[float] | None
-    flags: list[str]
-
-
-@dataclass(frozen=True, slots=True)
-class TouchEvent:
-    """A contact begins, moves or ends.
-
-    Taxels are numbered within their part. Positions are in the part's frame. `sigma_m` is the
-    radial standard error of `centroid_m`, in the skin; None where the place is not known. `end`
-    tells where the contact was last, and its pressures are 0. Without skin, on a fingertip that
-    has nothing but a force/torque board, area and pressures are NaN; `load` is told there only.
-    """
-
-    event: Literal["begin", "move", "end"]
-    id: int
-    seq: int
-    t_ns: int
-    part: str
-    taxels: list[int]
-    centroid_m: list[float] | None
-    normal: list[float] | None
-    area_mm2: float
-    peak_kpa: float
-    mean_kpa: float
-    force_n: float
-    sigma_m: float | None = None
-    load: Load | None = None
-
-    def ended(self, seq: int, t_ns: int) -> "TouchEvent":
-        """The contact's end: where it was last; what is known of its pressures is 0."""
-        nothing_kpa = math.nan if math.isnan(self.area_mm2) else 0.0
-        return replace(
-            self,
-            event="end",
-            seq=seq,
-            t_ns=t_ns,
-            peak_kpa=nothing_kpa,
-            mean_kpa=nothing_kpa,
-            force_n=0.0,
-        )
 
 
 @dataclass(slots=True)
 class _Contact:
     taxels: frozenset[int]
+    #: The same in rising order, intp.
+    order: NDArray[np.intp]
     said: TouchEvent
     heard_ns: int
+    #: The recent highest pressure.
+    firm_kpa: float
     #: Since when it has been in pieces.
     parted_ns: int | None = None
+    #: Since when it has been connected with another contact.
+    merged_ns: int | None = None
 
 
 class ContactTracker:
     """Finds the contacts of one part in each frame and follows them over time.
 
-    With the part's `localization` left at `centroid`, a connected patch of touched taxels is
-    one contact at its mean weighted by force. With any other, a patch with several clear
-    maxima is several contacts, and each is located from activations. The template's table of
-    a pad is laid down when it is first the strongest, which once takes some 30 ms.
+    With the part's `localization` left at `centroid`, a connected patch of touched taxels is one
+    contact at its mean weighted by force. With any other, a patch with several clear maxima is
+    several
+    contacts, and each is located from activations. The template's table of a pad is computed when
+    the
+    pad is first the strongest, which takes some 30 ms once.
     """
 
     def __init__(self, layout: Layout, part_index: int, settings: Settings) -> None:
@@ -117,6 +75,7 @@ class ContactTracker:
         start = layout.neighbour_start[part.start : part.stop + 1].tolist()
         neighbour = (layout.neighbour - part.start).tolist()
         self._neighbours = [neighbour[begin:end] for begin, end in pairwise(start)]
+        self._patches = Patches(self._neighbours)
         self._position_m = layout.position_m[mine]
         self._normal = layout.normal[mine]
         self._area_mm2 = layout.area_mm2[mine]
@@ -127,78 +86,76 @@ class ContactTracker:
             self._places = _Places(layout, part_index, settings)
         self._contacts: dict[int, _Contact] = {}
         self._next_id = 1
+        self._t_ns = 0
+        self._known = _Grouping.of([], [], _Homes({}, 0), self._area_mm2)
+        self._seen: bytes | None = None
+
+    def go_on(self, before: "ContactTracker") -> None:
+        """Continue with the contacts of another tracker of this part, which ends."""
+        self._contacts = before._contacts
+        self._next_id = before._next_id
+        self._t_ns = before._t_ns
+        self._seen = None
 
     def step(self, frame: PressureFrame) -> list[TouchEvent]:
-        """Return what happened since the last frame: ends first, then moves and begins."""
+        """Return the events since the last frame: ends first, then moves and begins."""
         if not self._contacts and not np.count_nonzero(frame.touched):
             return []
-        groups = self._joined(self._groups(self._touched(frame)), frame)
-        if self._places is not None:
-            groups = self._places.look(frame, groups, self._neighbours)
-        groups = self._kept_whole(groups, frame)
-        names = self._identify(groups)
+        found = self._grouping(frame)
+        known = set(found.names)
         events = [
-            self._closed(name, frame.seq, frame.t_ns)
+            self._closed(name, frame.seq, frame.t_ns, self._reason(name, frame))
             for name in list(self._contacts)
-            if name not in names
+            if name not in known
         ]
-        for name, taxels in zip(names, groups, strict=True):
-            known = self._contacts.get(name)
-            event = self._described(name, taxels, frame, None if known is None else known.said)
-            if known is None:
-                self._contacts[name] = _Contact(taxels, event, frame.t_ns)
-                events.append(event)
-                continue
-            known.taxels = taxels
-            heard = frame.valid[event.taxels]
-            if heard.all():
-                known.heard_ns = frame.t_ns
-            if heard.any() and self._worth_saying(known.said, event):
-                known.said = event
-                events.append(event)
-        return events
+        return events + self._reported(found, frame)
 
     def end_all(self, seq: int, t_ns: int) -> list[TouchEvent]:
-        """End every contact: the part will not be heard of for a while."""
-        return [self._closed(name, seq, t_ns) for name in list(self._contacts)]
+        """End every contact, because no data of the part will come for a while."""
+        self._seen = None
+        return [self._closed(name, seq, t_ns, "stopped") for name in list(self._contacts)]
 
-    def _touched(self, frame: PressureFrame) -> list[int]:
-        """Touched taxels in order, with those of a contact of which nothing was received.
+    def _grouping(self, frame: PressureFrame) -> "_Grouping":
+        """Return the contacts of this frame, or those of the last frame if nothing has changed."""
+        seen = frame.touched.tobytes()
+        if seen == self._seen and np.all(frame.valid[self._known.order]):
+            return self._known
+        touched = self._touched(frame)
+        groups = self._patches.find(touched)
+        as_before = self._are_as_before(groups)
+        groups = self._joined(groups, frame)
+        if self._places is not None:
+            groups = self._places.look(frame, groups, self._neighbours)
+        home = _Homes(self._contacts, len(self._neighbours))
+        if len(groups) == 1:
+            home.note(groups[0], touched)
+        groups = self._kept_whole(self._kept_apart(groups, home, frame.t_ns), home, frame)
+        self._known = _Grouping.of(self._identify(groups, home), groups, home, self._area_mm2)
+        # Whether contacts are kept together or apart, or are split by pressure, can change with any
+        # frame.
+        decided = as_before and self._places is None and np.all(frame.valid[self._known.order])
+        self._seen = seen if decided else None
+        return self._known
+
+    def _touched(self, frame: PressureFrame) -> NDArray[np.intp]:
+        """Return touched taxels in order, including those of a contact that were not received.
 
         A lost frame is not the end of a touch.
         """
-        touched: list[int] = np.flatnonzero(frame.touched).tolist()
-        silent = {
-            taxel
-            for contact in self._contacts.values()
-            if 0 <= frame.t_ns - contact.heard_ns < LOST_NS
-            for taxel in contact.taxels
-            if not frame.valid[taxel]
-        }
-        return sorted(silent.union(touched)) if silent else touched
-
-    def _groups(self, touched: list[int]) -> list[frozenset[int]]:
-        """Connected sets of touched taxels, in the order of their lowest number."""
-        left = set(touched)
-        groups = []
-        for first in touched:
-            if first not in left:
-                continue
-            left.remove(first)
-            group = [first]
-            for taxel in group:  # grows while it is walked
-                for other in self._neighbours[taxel]:
-                    if other in left:
-                        left.remove(other)
-                        group.append(other)
-            groups.append(frozenset(group))
-        return groups
+        if frame.valid.all():
+            return np.flatnonzero(frame.touched)
+        touched = frame.touched.copy()
+        for contact in self._contacts.values():
+            if 0 <= frame.t_ns - contact.heard_ns < LOST_NS:
+                touched[contact.order[~frame.valid[contact.order]]] = True
+        return np.flatnonzero(touched)
 
     def _joined(self, groups: list[frozenset[int]], frame: PressureFrame) -> list[frozenset[int]]:
-        """The groups, with each new one joined to those that it will grow together with.
+        """Return the groups; a new group is joined with those that it will grow together with.
 
-        What lands on the skin passes the thresholds of its taxels one by one. Those between
-        two that have passed feel something already.
+        When an object lands on the skin, the taxels pass their thresholds one by one. Those between
+        two
+        that have passed already feel some pressure.
         """
         if len(groups) < 2 or self._are_as_before(groups):
             return groups
@@ -220,39 +177,68 @@ class ContactTracker:
         return sorted(joined, key=min)
 
     def _are_as_before(self, groups: list[frozenset[int]]) -> bool:
-        """Whether each group is a contact that had the same taxels."""
+        """Return whether each group is a contact that had the same taxels."""
         return {contact.taxels for contact in self._contacts.values()}.issuperset(groups)
 
     def _reach(self, group: frozenset[int], among: set[int]) -> set[int]:
-        """Taxels that a group is connected with through others of a set."""
+        """Return the taxels that a group is connected with through others of a set."""
         reached = set(group)
         way = list(group)
-        for taxel in way:  # grows while it is walked
+        for taxel in way:  # grows during the loop
             for other in self._neighbours[taxel]:
                 if other in among and other not in reached:
                     reached.add(other)
                     way.append(other)
         return reached
 
-    def _kept_whole(
-        self, groups: list[frozenset[int]], frame: PressureFrame
+    def _kept_apart(
+        self, groups: list[frozenset[int]], home: "_Homes", t_ns: int
     ) -> list[frozenset[int]]:
-        """The groups, with pieces of one contact taken together that have just come apart.
+        """Return the groups, with contacts kept apart that have only just grown together.
 
-        As a contact begins or lets go its taxels pass their thresholds one by one, and for a
-        moment it is an archipelago. Pieces that hardly feel anything never become contacts.
+        New taxels belong to the contact with most taxels; each other contact keeps its own.
+        """
+        if self._are_as_before(groups):
+            return groups
+        kept = []
+        for group in groups:
+            largest, *others = [name for name, _ in home.overlaps(group)] or [0]
+            if not others:
+                if largest:
+                    self._contacts[largest].merged_ns = None
+                kept.append(group)
+                continue
+            rest = group
+            for name in (largest, *others):
+                contact = self._contacts[name]
+                if contact.merged_ns is None:
+                    contact.merged_ns = t_ns
+                if name != largest and 0 <= t_ns - contact.merged_ns < MERGED_NS:
+                    own = group & contact.taxels
+                    rest -= own
+                    kept.append(own)
+            kept.append(rest)
+        return sorted(kept, key=min) if len(kept) > 1 else kept
+
+    def _kept_whole(
+        self, groups: list[frozenset[int]], home: "_Homes", frame: PressureFrame
+    ) -> list[frozenset[int]]:
+        """Return the groups, with the pieces of one contact joined that have only just come apart.
+
+        While a contact begins or releases, its taxels pass their thresholds one by one, and for a
+        moment
+        it is in pieces. Pieces that feel very little never become contacts.
         """
         if self._are_as_before(groups):
             for contact in self._contacts.values():
                 contact.parted_ns = None
             return groups
-        home = {taxel: name for name, contact in self._contacts.items() for taxel in contact.taxels}
         pieces: dict[int, list[frozenset[int]]] = {name: [] for name in self._contacts}
         kept = []
         for group in groups:
-            overlaps = Counter(home[taxel] for taxel in sorted(group) if taxel in home)
+            overlaps = home.overlaps(group)
             if overlaps:
-                pieces[overlaps.most_common(1)[0][0]].append(group)
+                pieces[overlaps[0][0]].append(group)
             else:
                 kept.append(group)
         for name, parts in pieces.items():
@@ -263,99 +249,253 @@ class ContactTracker:
                 continue
             if contact.parted_ns is None:
                 contact.parted_ns = frame.t_ns
-            strong = [part for part in parts if frame.pressure_kpa[list(part)].max() >= FELT_KPA]
+            least_kpa = max(FELT_KPA, PIECE_SHARE * contact.firm_kpa)
+            strong = [part for part in parts if frame.pressure_kpa[list(part)].max() >= least_kpa]
             if 0 <= frame.t_ns - contact.parted_ns < PARTED_NS or len(strong) < 2:
                 kept.append(frozenset().union(*parts))
             else:
                 strong.sort(key=len)
                 kept += [*strong[:-1], strong[-1].union(*(set(parts) - set(strong)))]
-        return sorted(kept, key=min)
+        return sorted(kept, key=min) if len(kept) > 1 else kept
 
-    def _identify(self, groups: list[frozenset[int]]) -> list[int]:
+    def _identify(self, groups: list[frozenset[int]], home: "_Homes") -> list[int]:
         """Give each group the name of the contact that it continues, or a new one.
 
-        The largest overlap decides; of equal ones the older contact. A group next to
-        where a contact was continues it too, if nothing overlaps it: it slid.
+        The largest overlap decides; among equal ones the older contact. A group next to the place
+        of a
+        contact continues it too, if nothing overlaps that contact: it slid.
         """
-        claims = []
-        for number, group in enumerate(groups):
-            reach = group.union(*(self._neighbours[taxel] for taxel in group))
-            for name, contact in self._contacts.items():
-                overlap = len(group & contact.taxels)
-                near = overlap or len(reach & contact.taxels)
-                if near:
-                    claims.append((not overlap, -near, name, number))
         names: dict[int, int] = {}
-        for _, _, name, number in sorted(claims):
-            if number not in names and name not in names.values():
-                names[number] = name
+        for slid in (False, True):
+            claims = []
+            for number, group in enumerate(groups):
+                if number in names:
+                    continue
+                taxels = group
+                if slid:
+                    taxels = group.union(*(self._neighbours[taxel] for taxel in group))
+                claims += [(-count, name, number) for name, count in home.overlaps(taxels)]
+            taken = set(names.values())
+            for _, name, number in sorted(claims):
+                if number not in names and name not in taken:
+                    names[number] = name
+                    taken.add(name)
         for number in range(len(groups)):
             if number not in names:
                 names[number] = self._next_id
                 self._next_id += 1
         return [names[number] for number in range(len(groups))]
 
-    def _described(
-        self, name: int, taxels: frozenset[int], frame: PressureFrame, before: TouchEvent | None
-    ) -> TouchEvent:
-        index = sorted(taxels)
-        pressure = frame.pressure_kpa[index].astype(np.float64)
-        area = self._area_mm2[index]
-        area_mm2 = float(area.sum())
-        weight = pressure * area
-        total = float(weight.sum())
-        peak = float(pressure.max())
-        centroid = normal = sigma = None
-        if before is not None and peak < FELT_KPA:
-            centroid, normal, sigma = before.centroid_m, before.normal, before.sigma_m
-        elif total > 0.0:
-            if self._places is not None:
-                centroid, sigma = self._places.locate(index)
+    def _reported(self, found: "_Grouping", frame: PressureFrame) -> list[TouchEvent]:
+        """Return the events of the contacts of a frame, and update the contacts."""
+        if not found.names:
+            return []
+        order, starts = found.order, found.starts
+        pressure = frame.pressure_kpa[order].astype(np.float64)
+        weight = pressure * self._area_mm2[order]
+        total = np.add.reduceat(weight, starts)
+        moment = np.add.reduceat(weight[:, None] * self._position_m[order], starts)
+        centroids = (moment / np.maximum(total, 1e-300)[:, None]).tolist()
+        peaks = np.maximum.reduceat(pressure, starts).tolist()
+        valid = frame.valid[order]
+        heard = np.logical_or.reduceat(valid, starts).tolist()
+        all_heard = np.logical_and.reduceat(valid, starts).tolist()
+        totals = total.tolist()
+        elapsed_ns = min(max(frame.t_ns - self._t_ns, 0), FADES_NS)
+        fading = math.exp(-elapsed_ns / FADES_NS)
+        self._t_ns = frame.t_ns
+        events = []
+        for number, (name, taxels) in enumerate(zip(found.names, found.groups, strict=True)):
+            known = self._contacts.get(name)
+            before = None
+            if known is not None:
+                known.taxels, known.order = taxels, found.order[found.span(number)]
+                if all_heard[number]:
+                    known.heard_ns = frame.t_ns
+                before = known.said
+                known.firm_kpa = max(peaks[number], known.firm_kpa * fading)
+                if not heard[number] or 0 <= frame.t_ns - before.t_ns < self._shortest_ns:
+                    continue
+            peak = peaks[number]
+            index = found.taxels[number]
+            centroid, sigma = None, None
+            kept = before is not None and peak < FELT_KPA
+            if before is not None and kept:
+                centroid, sigma = before.centroid_m, before.sigma_m
+            elif totals[number] > 0.0:
+                if self._places is not None:
+                    centroid, sigma = self._places.locate(index)
+                else:
+                    centroid = centroids[number]
+                    # Noise adds little to the uncertainty from the coarse pads.
+                    sigma = GEOMETRY_PITCHES * self._pitch_m / math.sqrt(len(index))
+            if before is not None and not _worth_reporting(
+                before, frame.t_ns, index, peak, centroid
+            ):
+                continue
+            normal = before.normal if before is not None and kept else None
+            if not kept and totals[number] > 0.0:
+                span = found.span(number)
+                normal = self._mean_normal(weight[span], found.order[span], totals[number])
+            area_mm2 = found.area_mm2[number]
+            event = TouchEvent(
+                "begin" if before is None else "move",
+                name,
+                frame.seq,
+                frame.t_ns,
+                self._name,
+                index,
+                centroid,
+                normal,
+                area_mm2,
+                peak,
+                totals[number] / area_mm2,
+                totals[number] * 1e-3,  # kPa mm2 is mN
+                sigma,
+            )
+            events.append(event)
+            if known is None:
+                own = found.order[found.span(number)]
+                self._contacts[name] = _Contact(taxels, own, event, frame.t_ns, peak)
             else:
-                centroid = (weight @ self._position_m[index] / total).tolist()
-                # Noise adds little to what the coarse pads leave open.
-                sigma = GEOMETRY_PITCHES * self._pitch_m / math.sqrt(len(index))
-            direction = weight @ self._normal[index]
-            length = float(np.linalg.norm(direction))
-            normal = (direction / length).tolist() if length > 1e-9 * total else None
-        return TouchEvent(
-            "begin" if before is None else "move",
-            name,
-            frame.seq,
-            frame.t_ns,
-            self._name,
-            index,
-            centroid,
-            normal,
-            area_mm2,
-            peak,
-            total / area_mm2,
-            total * 1e-3,  # kPa mm2 is mN
-            sigma,
-        )
+                known.said = event
+        return events
 
-    def _closed(self, name: int, seq: int, t_ns: int) -> TouchEvent:
-        return self._contacts.pop(name).said.ended(seq, t_ns)
+    def _mean_normal(
+        self, weight: Floats, taxels: NDArray[np.intp], total: float
+    ) -> list[float] | None:
+        direction = weight @ self._normal[taxels]
+        length = float(np.linalg.norm(direction))
+        found: list[float] = (direction / length).tolist()
+        return found if length > 1e-9 * total else None
 
-    def _worth_saying(self, said: TouchEvent, now: TouchEvent) -> bool:
-        if 0 <= now.t_ns - said.t_ns < self._shortest_ns:
-            return False
-        if now.taxels != said.taxels or now.t_ns - said.t_ns >= ALIVE_NS:
-            return True
-        change = abs(now.peak_kpa - said.peak_kpa)
-        if change > max(PRESSED_KPA, PRESSED_SHARE * said.peak_kpa):
-            return True
-        if now.centroid_m is None or said.centroid_m is None:
-            return now.centroid_m is not said.centroid_m
-        moved = np.subtract(now.centroid_m, said.centroid_m)
-        return float(np.linalg.norm(moved)) > MOVED_M
+    def _reason(self, name: int, frame: PressureFrame) -> Reason:
+        """A contact is released only if all its taxels are valid and none is touched."""
+        known = frame.valid[list(self._contacts[name].taxels)].all()
+        return "released" if known else "lost"
+
+    def _closed(self, name: int, seq: int, t_ns: int, reason: Reason) -> TouchEvent:
+        return self._contacts.pop(name).said.ended(seq, t_ns, reason)
+
+
+class _Homes:
+    """Which contact each taxel of a part was in.
+
+    Args:
+        contacts: by their names, which are above 0.
+        n: taxels of the part.
+    """
+
+    #: A group of more is taken as an array.
+    _MANY = 48
+
+    def __init__(self, contacts: dict[int, _Contact], n: int) -> None:
+        self._names = np.zeros(n, np.int64)
+        for name, contact in contacts.items():
+            self._names[contact.order] = name
+        self._listed: list[int] = self._names.tolist()
+        self._orders: dict[frozenset[int], NDArray[np.intp]] = {}
+
+    def overlaps(self, group: frozenset[int]) -> list[tuple[int, int]]:
+        """Contacts that a group shares taxels with, and how many.
+
+        Those with most come first; of equal ones that with the lowest taxel.
+        """
+        if len(group) <= self._MANY:
+            names = [name for one in group if (name := self._listed[one])]
+            if not names or names.count(names[0]) == len(names):
+                return [(names[0], len(names))] if names else []
+            names = [name for one in sorted(group) if (name := self._listed[one])]
+            return Counter(names).most_common()
+        found = self._names[self._order(group)]
+        found = found[found > 0]
+        if len(found) and (found == found[0]).all():
+            return [(int(found[0]), len(found))]
+        names_found, first, counts = np.unique(found, return_index=True, return_counts=True)
+        ranked = np.lexsort((first, -counts))
+        return list(zip(names_found[ranked].tolist(), counts[ranked].tolist(), strict=True))
+
+    def sorted(self, group: frozenset[int]) -> list[int]:
+        """The taxels of a group in rising order."""
+        if len(group) <= self._MANY:
+            return sorted(group)
+        taxels: list[int] = self._order(group).tolist()
+        return taxels
+
+    def note(self, group: frozenset[int], order: NDArray[np.intp]) -> None:
+        """The taxels of a group in rising order, if they are known already."""
+        if len(group) == len(order):
+            self._orders[group] = order
+
+    def order(self, groups: list[frozenset[int]]) -> NDArray[np.intp]:
+        """The taxels of groups, one group after the other."""
+        if len(groups) == 1:
+            return self._order(groups[0])
+        return np.fromiter(chain.from_iterable(map(self.sorted, groups)), np.intp)
+
+    def _order(self, group: frozenset[int]) -> NDArray[np.intp]:
+        order = self._orders.get(group)
+        if order is None:
+            order = self._orders[group] = np.fromiter(group, np.intp, len(group))
+            order.sort()
+        return order
+
+
+@dataclass(frozen=True, slots=True)
+class _Grouping:
+    """The k contacts of a frame, as lists and as flat arrays.
+
+    Attributes:
+        names: of the contacts.
+        groups: the taxels of each.
+        taxels: the same, in order.
+        order, starts: intp, all taxels contact by contact, and the index of the first of each.
+        area_mm2: of each contact.
+    """
+
+    names: list[int]
+    groups: list[frozenset[int]]
+    taxels: list[list[int]]
+    order: NDArray[np.intp]
+    starts: NDArray[np.intp]
+    area_mm2: list[float]
+
+    @classmethod
+    def of(
+        cls, names: list[int], groups: list[frozenset[int]], home: "_Homes", area_mm2: Floats
+    ) -> "_Grouping":
+        taxels = [home.sorted(group) for group in groups]
+        order = home.order(groups)
+        ends = list(accumulate(map(len, taxels)))
+        starts = np.array([0, *ends[:-1]] if ends else [], np.intp)
+        areas = np.add.reduceat(area_mm2[order], starts).tolist() if ends else []
+        return cls(names, groups, taxels, order, starts, areas)
+
+    def span(self, number: int) -> slice:
+        """Return the slice of `order` with the taxels of a contact."""
+        start = int(self.starts[number])
+        return slice(start, start + len(self.taxels[number]))
+
+
+def _worth_reporting(
+    said: TouchEvent, t_ns: int, taxels: list[int], peak_kpa: float, centroid_m: list[float] | None
+) -> bool:
+    """Return whether a contact has changed since its last event, or its next event is due."""
+    if taxels != said.taxels or t_ns - said.t_ns >= ALIVE_NS:
+        return True
+    if abs(peak_kpa - said.peak_kpa) > max(PRESSED_KPA, PRESSED_SHARE * said.peak_kpa):
+        return True
+    if centroid_m is None or said.centroid_m is None:
+        return centroid_m is not said.centroid_m
+    return math.dist(centroid_m, said.centroid_m) > MOVED_M
 
 
 class _Places:
-    """Contacts of one part told apart and located by the method that it is configured with.
+    """Separates and locates the contacts of one part with its configured method.
 
-    Pressures are turned back into activations of one and the same pad, the part's median:
-    pads of other sizes, shifts and strengths then read alike where they are covered alike.
+    Pressures are converted back into activations of one standard pad, the part's median: pads of
+    other
+    sizes, shifts and strengths then read alike where they are covered alike.
     """
 
     def __init__(self, layout: Layout, part_index: int, settings: Settings) -> None:

@@ -1,64 +1,95 @@
-"""Baselines that follow slow drift while nothing touches (paper, section V-C).
+"""Baselines that follow drift (paper, section V-C).
 
-An untouched taxel is followed by itself. A touched one cannot be, yet it drifts all the
-same, and a drift beyond the threshold during one contact would leave it touched for ever.
-Three things prevent that, from the surest to the last resort:
+Once a window each taxel is in one of four states. Its baseline follows what the untouched
+taxels of its part have in common, and a part of what its own reading has beyond that:
 
-1. Its triangle's thermal pads, where there are any: they feel what drifts, not what presses.
-   How much each taxel follows them is learnt while it is untouched.
-2. The untouched taxels of its part, whose median change it shares (the first version of the
-   paper's authors took the mean).
-3. A doubt that grows with the time in touch. When a contact has let go and what is left is
-   small, still, and no more than may have drifted meanwhile, it is taken for drift.
+| state | when | own reading |
+|---|---|---|
+| idle | nothing touches the part | by the rule |
+| disturbed | something touches the part elsewhere or loads it; or fallen | `ALONE_UNITS_PER_S` |
+| touched | touched, or not received | a slow rise, up to `SLOW_UNITS_PER_S` |
+| recovering | `SETTLE_S` after a touch; or fallen for so long | by the rule; the whole fall |
 
-A touch also stirs the taxels around it: where a hand closes, its skin bulges, and taxels
-that nothing touches read several units less as long as it holds. Followed, they would read
-as touched when it opens. So while a part is touched, its taxels follow what they have in
-common, and hardly what one has alone; and a sudden fall is never followed quickly.
+| in common | when | is followed |
+|---|---|---|
+| drift | the part moves alike, and rises by less than `QUICK_UNITS_PER_S` | at once |
+| perhaps a load | otherwise | up to `SLOW_UNITS_PER_S` |
+
+What the readings can distinguish, and what they cannot:
+
+- A load only raises a reading, so a fall of all taxels alike is drift or a release, at any
+  rate. An even load of the whole part that rises slowly reads like drift, and is taken for it.
+- A touch makes the skin around it bulge: untouched taxels read several units less while it
+  lasts. If they were followed, they would read as touched afterwards.
+- A hand warms what it holds, within minutes. A slow rise of a touched taxel is taken for that;
+  where it becomes much, the zero is reported as uncertain. A slow fall is left alone: a grip
+  that relaxes reads the same.
+- Thermal pads respond to what drifts and not to what presses. How much each taxel follows those of
+  its triangle is learnt while it is untouched.
+- Foam that is late after a press reads too much for seconds: pauses of a grip are no time to
+  recover. What reads more and more after a touch is a grip that was eased, against which the
+  foam pushes back: it is not followed, and what was taken for drift at the release is given back.
+- What remains of a released contact, and a return to where the baseline was before a fall, is
+  no touch: nothing latches.
 """
 
 import math
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.processing.masks import Mask
 from skin_host.settings import Drift
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
-#: With fewer untouched taxels than this nobody speaks for the touched ones.
-WITNESSES = 4
-#: More than these add nothing but time.
-ENOUGH_WITNESSES = 256
-#: What has this much of the untouched taxels within this distance of their median is drift ...
-AGREEING_SHARE = 0.8
-AGREEING_UNITS = 0.5
-#: ... else something stirs them: what is common to those near their baselines is followed
-#: slowly, and what one of them has alone hardly at all.
-NEAR_UNITS = 1.0
-STIRRED_UNITS_PER_S = 0.01
+#: Fewer untouched taxels than this do not represent the others.
+REFERENCES = 4
+#: A part moves alike when this share of its taxels stays within the tolerance of their median.
+#: On an evenly pressed insole 52 to 75 % do, on drifting pads with noise of 1 unit 98 %.
+ALIKE_SHARE = 0.8
+#: Means of a window that differ by no more are the same: five times their noise on good pads.
+TOLERANCE_UNITS = 0.5
+#: Drift that skinManager follows reaches 0.2; air in the insole presses at 0.4 to 1.5.
+QUICK_UNITS_PER_S = 0.4
+#: Drift that a load may hide: 10 degrees in 10 minutes are 0.008.
+SLOW_UNITS_PER_S = 0.01
+#: A bulge of any depth that lasts for ten minutes does not become a touch.
 ALONE_UNITS_PER_S = 0.0005
-#: A reading so far below its baseline did not get there by drift; it is followed slowly.
+#: Normal drift never goes this far below the baseline: the skin bulges, or was loaded before.
 FALLEN_UNITS = -2.5
-FALLEN_UNITS_PER_S = 0.005
+#: Bulges without a touch are shorter, and so are the pauses of a flickering touch.
+SETTLE_S = 5.0
+#: A taxel recovers until the stored time in touch has faded to this.
+RECOVERED_S = 1.0
+#: Slow changes are detected in means over this time, because a byte resolves them poorly.
+SMOOTHING_S = 10.0
+#: A load that suddenly falls below this share of its value is eased.
+EASED_SHARE = 0.8
+#: A contact has released when less than this share of its largest reading remains ...
+RELEASED_SHARE = 0.4
+#: ... and at most this much of it can be drift that was not followed.
+UNSEEN_UNITS = 3.5
+#: For so long that is found to be a load if the reading rises.
+REGRET_S = 60.0
+#: For how long it counts that a load was eased when it is felt no more.
+EASED_S = 60.0
+#: A zero that is uncertain by more than the paper's resolution (5 kPa) is reported.
+UNCERTAIN_UNITS = 2.0
+#: For this long a baseline may return after a fall, and thermal evidence lasts.
+MEMORY_S = 3600.0
 #: Thermal evidence, in units^2 s, that weighs as much as the assumption of no relation.
 THERMAL_PRIOR = 100.0
-#: Thermal evidence older than this fades.
-THERMAL_MEMORY_S = 3600.0
-#: A byte resolves temperature poorly: the pads are smoothed over this time.
-THERMAL_SMOOTHING_S = 10.0
-#: Unseen drift to be expected in a touch: quick at first, up to a limit, then slow.
-DOUBT_UNITS_PER_S = 0.005
-DOUBT_LIMIT_UNITS = 3.5
-SLOW_DOUBT_UNITS_PER_S = 1e-4
-#: Seen untouched again, a taxel is less and less in doubt, and below this no longer.
-RELIEF_S = 5.0
-DOUBTED_S = 1.0
-#: A contact has let go when less than this share of its largest reading is left ...
-LET_GO_SHARE = 0.4
-#: ... and is still when its mean changes by less than this from window to window.
-STILL_UNITS = 0.3
+
+
+class State(IntEnum):
+    """What a baseline follows, see the module's table."""
+
+    IDLE = 0
+    DISTURBED = 1
+    TOUCHED = 2
+    RECOVERING = 3
 
 
 def paper_step(units: Array, dt_s: float, rate_units_per_s: float, dead_band_units: float) -> Array:
@@ -72,37 +103,31 @@ def paper_step(units: Array, dt_s: float, rate_units_per_s: float, dead_band_uni
     return change
 
 
-def proportional_step(
-    units: Array, dt_s: float, gain_per_s: float, rate_units_per_s: float
-) -> Array:
+def proportional_step(units: Array, dt_s: float, gain_per_s: float) -> Array:
     """Return the change of baseline [n] that closes the share gain x dt of the distance.
 
-    The rule of the deployed iCub host, exact for any dt, but never faster than the paper's
-    rate: when a hand closes, its skin bulges and untouched taxels fall by several units for
-    a second. That is no drift, and a rule that follows it sees a touch when they come back.
+    The rule of the deployed iCub host, exact for any dt.
     """
-    limit = rate_units_per_s * dt_s
     change: Array = -math.expm1(-gain_per_s * dt_s) * units
-    np.fmin(change, limit, out=change)
-    np.fmax(change, -limit, out=change)
     return change
 
 
 class BaselineTracker:
     """The baselines of the n taxels of one part.
 
-    The readings that it follows must be corrected for relaxation: the imprint that a touch
-    leaves in the foam is no drift, and would otherwise be taken for it.
+    The readings that it follows must be corrected for relaxation: the residual that a touch leaves
+    in
+    the foam is not drift.
 
     Args:
         baseline: float64[n] in units, as calibrated; moved in place.
-        usable: bool[n], taxels that feel pressure and are to be believed.
+        usable: bool[n], taxels that measure pressure and are valid.
         triangle: int[n], the triangle of each taxel, any numbering.
-        thermal: bool[n], pads that feel temperature.
+        thermal: bool[n], pads that measure temperature.
         settings: the rule and its numbers.
 
     Attributes:
-        frozen_s: float64[n], for how long each taxel has been touched without a break.
+        calibrated: float64[n], the baselines before any drift.
     """
 
     def __init__(
@@ -115,177 +140,377 @@ class BaselineTracker:
     ) -> None:
         n = len(baseline)
         self.baseline = baseline
-        self._calibrated = baseline.copy()
-        self._low = self._calibrated - settings.limit_units
-        self._high = self._calibrated + settings.limit_units
-        self._usable = usable
-        self._settings = settings
-        self._thermometer = _Thermometer(triangle, thermal) if np.any(thermal) else None
-        self.frozen_s: Array = np.zeros(n)
-        self._stirred_s = 0.0
-        self._doubt_s: Array = np.zeros(n)
-        self._peak: Array = np.zeros(n)
-        self._level: Array = np.zeros(n)
+        self.calibrated = baseline.copy()
+        self._configure(usable, settings)
+        self._thermal = _ThermalReference(triangle, thermal) if np.any(thermal) else None
+        #: Whether something may press on the whole part without any of its taxels being touched
+        #: yet.
+        self._loaded = False
+        #: Whether any taxel is not idle.
+        self._unsettled = False
+        self._fallen_s: Array = np.zeros(n)
+        self._former: Array = np.zeros(n)
+        self._former_s: Array = np.zeros(n)
+        self._last: Array = np.zeros(n)
+        #: For how long each taxel has been free of touch, and its lowest reading since.
+        self._free_s: Array = np.full(n, np.inf)
+        self._lowest: Array = np.full(n, np.inf)
+        #: Where a reading was taken for unseen drift when a touch was released: the baseline
+        #: before, for how long it may yet go back, and the reading, relaxation included.
+        self._before: Array = np.zeros(n)
+        self._taken_s: Array = np.zeros(n)
+        self._taken_level: Array = np.zeros(n)
+        self._touches = _Touches(n)
 
     def step(
-        self, units: Array, touched: Mask, missing: Mask, dt_s: float
+        self,
+        units: Array,
+        touched: Mask,
+        missing: Mask,
+        dt_s: float,
+        relaxed_units: Array | float = 0.0,
     ) -> NDArray[np.intp] | None:
         """Move the baselines, in place.
 
         Args:
             units: mean activation [n] above the baseline in the last dt_s seconds. Entries
-                of thermal pads count too.
+                of temperature pads count too.
             touched: taxels [n] that were touched at any time in it.
             missing: taxels [n] that were not received at some time in it.
             dt_s: that time.
+            relaxed_units: the relaxation [n] that units was corrected for.
 
         Returns:
-            Numbers of taxels whose touch has turned out to be drift, or None.
-            Their baselines have moved up to their readings.
+            Numbers of taxels whose touch was recognised as drift, or None. Their baselines have
+            moved
+            up to their readings.
         """
         if self._settings.rule == "none":
             return None
-        held = self._usable & (touched | missing)
-        free = self._usable & ~held
+        touched = touched & self._usable
+        hidden = self._usable & (touched | missing)
+        free = self._usable & ~hidden
+        recovering = free & (self._touches.touched_s > RECOVERED_S)
         forecast = None
-        if self._thermometer is not None:
-            forecast = self._thermometer.step(units, self.baseline, free, dt_s)
+        if self._thermal is not None:
+            forecast = self._thermal.step(units, self.baseline, free, dt_s)
             units = units - forecast
-        if self._settings.rule == "paper":
-            change = paper_step(
-                units, dt_s, self._settings.rate_units_per_s, self._settings.dead_band_units
-            )
-        else:
-            change = proportional_step(
-                units, dt_s, self._settings.gain_per_s, self._settings.rate_units_per_s
-            )
-        ghosts = None
-        touched = touched & held
-        if np.count_nonzero(touched):
-            ghosts = self._hold(change, units, free, touched, dt_s)
-        else:
-            np.fmax(change, -FALLEN_UNITS_PER_S * dt_s, out=change, where=units < FALLEN_UNITS)
-            if np.count_nonzero(held):
-                change[held] = self._common(change, units, free, dt_s)
-            self._relieve(dt_s)
+            self._former += forecast
+
+        common = self._common(units, free & ~recovering, dt_s)
+        if self._is_calm(units, common, hidden, dt_s):
+            change = self._own(units - common, self._settings.rate_units_per_s * dt_s, dt_s)
+            self._move(change + common, forecast)
+            return None
+        state = self._states(units, touched, hidden, recovering, dt_s)
+        state[recovering & ~self._remains(units, hidden, dt_s)] = State.DISTURBED
+        change = self._followed(units, common, state, dt_s)
+        fallen = self._fallen_s >= SETTLE_S
+        change[fallen] = units[fallen]
+        self._expect_back(fallen if common > FALLEN_UNITS else free)
+        if abs(common) <= QUICK_UNITS_PER_S * dt_s:
+            self._former += common
+
+        level = self.baseline + units + relaxed_units
+        still = (np.abs(level - self._last) < TOLERANCE_UNITS) & ~missing
+        self._last = level
+        change += self._touches.step(units, touched, dt_s)
+        released = still & self._touches.released(units, touched)
+        change[released] = units[released]
+        change += self._given_back(units, level, released, dt_s)
+        back = still & self._back(level, dt_s)
+        change[back] = (self._former - self.baseline)[back]
+        self._move(change, forecast)
+        self._unsettled = self._touches.fading or bool(
+            np.count_nonzero(self._fallen_s)
+            or np.count_nonzero(self._former_s > 0.0)
+            or np.count_nonzero(self._taken_s > 0.0)
+        )
+        found = np.flatnonzero((released | back) & touched)
+        return found if len(found) else None
+
+    def pass_gap(self, gap_s: float) -> None:
+        """Nothing was received for this time: a touch after it is a new touch."""
+        self._touches.fade(math.exp(-gap_s / SETTLE_S))
+
+    def forget(self, taxels: Mask) -> None:
+        """Start again with some taxels, bool[n]: their baselines are new."""
+        touched_s = self._touches.touched_s
+        for memory in (self._fallen_s, self._former_s, self._taken_s, touched_s):
+            memory[taxels] = 0.0
+
+    def renew(self, usable: Mask, zeroed: Mask, settings: Drift) -> None:
+        """Continue with other settings, and from new baselines of the taxels `zeroed`, bool[n]."""
+        np.copyto(self.calibrated, self.baseline, where=zeroed)
+        self._configure(usable, settings)
+        self.forget(zeroed)
+
+    def _configure(self, usable: Mask, settings: Drift) -> None:
+        self._usable = usable
+        self._n_usable = int(np.count_nonzero(usable))
+        self._settings = settings
+        self._low = self.calibrated - settings.limit_units
+        self._high = self.calibrated + settings.limit_units
+        rates = {
+            State.IDLE: settings.rate_units_per_s,
+            State.DISTURBED: ALONE_UNITS_PER_S,
+            State.TOUCHED: 0.0,
+            State.RECOVERING: settings.rate_units_per_s,
+        }
+        self._own_rate = np.array([rates[state] for state in State])
+
+    @property
+    def frozen(self) -> Mask:
+        """Return taxels [n] whose zero is uncertain: touched for long, or with much drift
+        meanwhile.
+        """
+        long = self._touches.touched_s >= self._settings.frozen_report_s
+        return long | (self._touches.drifted > UNCERTAIN_UNITS)
+
+    @property
+    def at_limit(self) -> Mask:
+        """Return taxels [n] whose baseline is at its greatest permitted distance from the
+        calibration.
+        """
+        edge = (self.baseline <= self._low) | (self.baseline >= self._high)
+        return edge & self._usable
+
+    def _common(self, units: Array, free: Mask, dt_s: float) -> float:
+        """Return how much of the untouched taxels' common change is followed."""
+        self._loaded = False
+        reading = units[free]
+        if len(reading) < REFERENCES:
+            return 0.0
+        median = _median(reading)
+        self._loaded = median > QUICK_UNITS_PER_S * dt_s
+        alike = np.count_nonzero(np.abs(reading - median) < TOLERANCE_UNITS)
+        if alike >= ALIKE_SHARE * self._n_usable and not self._loaded:
+            return median
+        reading = reading[reading > FALLEN_UNITS]
+        if len(reading) < REFERENCES:
+            return 0.0
+        limit = SLOW_UNITS_PER_S * dt_s
+        return min(max(_median(reading), -limit), limit)
+
+    def _is_calm(self, units: Array, common: float, hidden: Mask, dt_s: float) -> bool:
+        """Whether all taxels are idle, and none needs more than its own rule."""
+        return not (
+            self._unsettled
+            or self._loaded
+            or abs(common) > self._settings.rate_units_per_s * dt_s
+            or np.count_nonzero(hidden)
+            or np.count_nonzero((units < FALLEN_UNITS) & self._usable)
+        )
+
+    def _move(self, change: Array, forecast: Array | None) -> None:
+        """Move the baselines, within their limits."""
         if forecast is not None:
             change += forecast
         change *= self._usable
         np.add(self.baseline, change, out=self.baseline)
         np.fmax(self.baseline, self._low, out=self.baseline)
         np.fmin(self.baseline, self._high, out=self.baseline)
-        return ghosts
 
-    @property
-    def frozen(self) -> Mask:
-        """Taxels [n] touched for so long that it is told."""
-        return self.frozen_s >= self._settings.frozen_report_s
+    def _remains(self, units: Array, hidden: Mask, dt_s: float) -> Mask:
+        """Which taxels [n] read what remains of a touch: for long enough, and not more and more."""
+        self._free_s += dt_s
+        self._free_s[hidden] = 0.0
+        level = self.baseline + units
+        np.fmin(self._lowest, level, out=self._lowest)
+        self._lowest[hidden] = np.inf
+        calm = level < self._lowest + 2.0 * TOLERANCE_UNITS
+        remains: Mask = calm & (self._free_s > SETTLE_S)
+        return remains
 
-    @property
-    def at_limit(self) -> Mask:
-        """Taxels [n] whose baseline has gone as far from its calibration as it may."""
-        edge = (self.baseline <= self._low) | (self.baseline >= self._high)
-        return edge & self._usable
+    def _given_back(self, units: Array, level: Array, released: Mask, dt_s: float) -> Array | float:
+        """Return the change [n] of baselines that took a load that had been eased for drift.
 
-    def _common(self, change: Array, units: Array, free: Mask, dt_s: float) -> float:
-        """What the untouched taxels have in common, 0 if there are too few of them."""
-        untouched = np.flatnonzero(free)
-        if len(untouched) < WITNESSES:
+        Foam that is free comes back: its reading falls, relaxation included (`level` [n]). Where
+        that stays and the corrected reading rises, the foam pushes back against a load.
+        """
+        self._before[released] = self.baseline[released]
+        self._taken_level[released] = level[released]
+        self._taken_s[released] = REGRET_S
+        if not np.count_nonzero(self._taken_s > 0.0):
             return 0.0
-        asked = untouched[:: max(len(untouched) // ENOUGH_WITNESSES, 1)]
-        reading, change = units[asked], change[asked]
-        agreeing = np.abs(reading - _median(reading)) < AGREEING_UNITS
-        if np.count_nonzero(agreeing) >= AGREEING_SHARE * len(asked):
-            return _median(change)
-        near = change[np.abs(reading) < NEAR_UNITS]
-        if len(near) < WITNESSES:
+        load = (self._taken_s > 0.0) & (units > 2.0 * TOLERANCE_UNITS) & ~released
+        load &= level > self._taken_level - TOLERANCE_UNITS
+        given = np.where(load, np.minimum(self._before - self.baseline, 0.0), 0.0)
+        self._taken_s -= dt_s
+        self._taken_s[load] = 0.0
+        return given
+
+    def _states(
+        self, units: Array, touched: Mask, hidden: Mask, recovering: Mask, dt_s: float
+    ) -> NDArray[np.int8]:
+        """Return the state of each taxel, and update for how long each has been fallen."""
+        touching = bool(np.count_nonzero(touched))
+        disturbed = touching or self._loaded
+        state = np.full(len(units), State.DISTURBED if disturbed else State.IDLE, np.int8)
+        fallen = units < FALLEN_UNITS
+        state[fallen] = State.DISTURBED
+        state[recovering] = State.RECOVERING
+        state[hidden] = State.TOUCHED
+        # A bulge lasts as long as the touch beside it, and relaxation is overestimated after a
+        # touch, so that time does not count.
+        self._fallen_s += 0.0 if touching else dt_s
+        self._fallen_s *= fallen & self._usable & ~hidden & ~recovering
+        return state
+
+    def _followed(self, units: Array, common: float, state: NDArray[np.int8], dt_s: float) -> Array:
+        """Return the change of each baseline: the common change, and what a reading has beyond
+        it.
+        """
+        # An undisturbed taxel that differs from the others moves no farther than its reading.
+        differs = (np.abs(units - common) > TOLERANCE_UNITS) & (
+            (state == State.IDLE) | (state == State.RECOVERING)
+        )
+        shared = np.full(len(units), common)
+        np.clip(units, min(common, 0.0), max(common, 0.0), out=shared, where=differs)
+        change = self._own(units - shared, self._own_rate[state] * dt_s, dt_s)
+        change += shared
+        return change
+
+    def _own(self, beyond: Array, limit: Array | float, dt_s: float) -> Array:
+        """Return the change by the rule, within a limit, for what readings have beyond the common
+        change.
+        """
+        settings = self._settings
+        if settings.rule == "paper":
+            change = paper_step(beyond, dt_s, settings.rate_units_per_s, settings.dead_band_units)
+        else:
+            change = proportional_step(beyond, dt_s, settings.gain_per_s)
+        np.fmin(change, limit, out=change)
+        np.fmax(change, np.negative(limit), out=change)
+        return change
+
+    def _expect_back(self, fallen: Mask) -> None:
+        """Store the baselines of some taxels before they follow a fall."""
+        new = fallen & (self._former_s <= 0.0)
+        if np.count_nonzero(new):
+            self._former[new] = self.baseline[new]
+            self._former_s[new] = MEMORY_S
+
+    def _back(self, level: Array, dt_s: float) -> Mask:
+        """Return which taxels [n] read again as they did before a fall."""
+        self._former_s -= dt_s
+        rise = self._former - self.baseline
+        near = np.abs(level - self._former) < 2.0 * TOLERANCE_UNITS
+        return (self._former_s > 0.0) & (rise > -FALLEN_UNITS) & near
+
+
+class _Touches:
+    """History of n taxels since they were touched.
+
+    Attributes:
+        touched_s: for how long; it fades after the touch, because the touch may only flicker.
+        drifted: how many units their baselines have followed a slow rise during the touch.
+    """
+
+    def __init__(self, n: int) -> None:
+        self.touched_s: Array = np.zeros(n)
+        self.drifted: Array = np.zeros(n)
+        self._peak: Array = np.zeros(n)
+        #: The smoothed reading, and its lowest value while the load was steady.
+        self._level: Array = np.zeros(n)
+        self._lowest: Array = np.zeros(n)
+        self._before: Mask = np.zeros(n, np.bool_)
+        #: The highest level that a load was suddenly eased from.
+        self._eased: Array = np.zeros(n)
+        self._fading_s = 0.0
+
+    def step(self, units: Array, touched: Mask, dt_s: float) -> Array | float:
+        """Return the slow rise [n] that the baselines of touched taxels follow."""
+        if np.count_nonzero(touched):
+            self._fading_s = 10.0 * SETTLE_S
+        elif self._fading_s <= 0.0:
             return 0.0
-        limit = STIRRED_UNITS_PER_S * dt_s
-        return min(max(_median(near), -limit), limit)
+        self._fading_s -= dt_s
+        self.fade(
+            np.where(touched, 1.0, math.exp(-dt_s / SETTLE_S) if self._fading_s > 0.0 else 0.0)
+        )
+        self.touched_s += dt_s * touched
+        np.fmax(self._peak, units, out=self._peak, where=touched)
 
-    def _hold(
-        self, change: Array, units: Array, free: Mask, touched: Mask, dt_s: float
-    ) -> NDArray[np.intp] | None:
-        """Replace the changes by what is common to the untouched; return what was no touch."""
-        common = self._common(change, units, free, dt_s)
-        alone = ALONE_UNITS_PER_S * dt_s
-        # What was in touch a moment ago is followed by its own rule: it may have drifted unseen.
-        recovering = free & (self._doubt_s > DOUBTED_S)
-        own = change[recovering]
-        np.clip(change - common, -alone, alone, out=change)
-        change[~free] = 0.0
-        change += common
-        change[recovering] = own
-        ghosts = self._ghosts(units, touched, dt_s)
-        if ghosts is not None:
-            change[ghosts] = units[ghosts]
-        return ghosts
+        share = -math.expm1(-dt_s / SMOOTHING_S)
+        distance = units - self._level
+        changed = ~self._before | (np.abs(distance) > 2.0 * TOLERANCE_UNITS)
+        # Foam that was pressed harder before pushes back more and more: that rise is a load.
+        np.fmax(self._eased, self._level, out=self._eased, where=units < EASED_SHARE * self._level)
+        self._eased *= np.where(self._before, 1.0, math.exp(-dt_s / EASED_S))
+        self._before = touched
+        self._level += np.where(changed, distance, share * distance)
+        # So is a rise that is too fast for the baselines.
+        changed |= self._level - self._lowest > 3.0 * TOLERANCE_UNITS
+        self._lowest = np.where(changed, self._level, np.minimum(self._lowest, self._level))
+        rise = self._level - self._lowest - TOLERANCE_UNITS
+        rise = np.clip(rise, 0.0, SLOW_UNITS_PER_S * dt_s) * touched
+        rise *= self._level > EASED_SHARE * self._eased
+        self._level -= rise
+        self.drifted += rise
+        return rise
 
-    def _relieve(self, dt_s: float) -> None:
-        """Nothing is touched: forget, but not at once, for a touch may flicker."""
-        if self._stirred_s <= 0.0:
-            return
-        self.frozen_s.fill(0.0)
-        self._stirred_s -= dt_s
-        kept = math.exp(-dt_s / RELIEF_S) if self._stirred_s > 0.0 else 0.0
-        self._doubt_s *= kept
+    def fade(self, kept: Array | float) -> None:
+        """Forget all but this share [n] of what is known."""
+        self.touched_s *= kept
+        self.drifted *= kept
         self._peak *= kept
 
-    def _ghosts(self, units: Array, touched: Mask, dt_s: float) -> NDArray[np.intp] | None:
-        """Which of the touched taxels read no more than drift may have brought."""
-        self._stirred_s = 5.0 * RELIEF_S
-        who = np.flatnonzero(touched)
-        reading = units[who]
-        kept = math.exp(-dt_s / RELIEF_S)
-        frozen_s, doubt_s = self.frozen_s[who] + dt_s, self._doubt_s[who] + dt_s
-        peak = np.maximum(self._peak[who], reading)
-        self.frozen_s.fill(0.0)
-        self._doubt_s *= kept
-        self._peak *= kept
-        self.frozen_s[who], self._doubt_s[who], self._peak[who] = frozen_s, doubt_s, peak
-        still = np.abs(reading - self._level[who]) < STILL_UNITS
-        np.copyto(self._level, units)
-        slow = SLOW_DOUBT_UNITS_PER_S * doubt_s
-        quick = np.minimum(DOUBT_UNITS_PER_S * doubt_s, DOUBT_LIMIT_UNITS)
-        let_go = reading < LET_GO_SHARE * peak
-        ghosts = who[still & (reading < slow + np.where(let_go, quick, 0.0))]
-        return ghosts if len(ghosts) else None
+    @property
+    def fading(self) -> bool:
+        """Whether any touch is still remembered."""
+        return self._fading_s > 0.0
+
+    def released(self, units: Array, touched: Mask) -> Mask:
+        """Return which touched taxels [n] read no more than a released contact and drift can
+        leave.
+        """
+        unseen = np.minimum(SLOW_UNITS_PER_S * self.touched_s, UNSEEN_UNITS)
+        return touched & (units < RELEASED_SHARE * self._peak) & (units < unseen)
 
 
 def _median(values: Array) -> float:
-    """The upper median; numpy's own costs five times as much for so few."""
+    """Return the upper median; numpy's own takes five times as long for so few values."""
     middle = len(values) // 2
     return float(np.partition(values, middle)[middle])
 
 
-class _Thermometer:
-    """What the thermal pads foretell: the drift of each taxel since the last step."""
+class _ThermalReference:
+    """The drift of each taxel since the last step, as far as the temperature pads predict it."""
 
     def __init__(self, triangle: NDArray[np.int32], thermal: Mask) -> None:
         n = len(triangle)
         self._triangle = triangle = np.unique(triangle, return_inverse=True)[1].astype(np.intp)
         self._pads = np.flatnonzero(thermal)
         self._pads_of = np.bincount(triangle[self._pads], minlength=int(triangle.max()) + 1)
-        self._warmth: Array | None = None
-        #: Sums over time while untouched: 1, warmth, reading, and their products.
+        self._temperature: Array | None = None
+        #: Sums over time while untouched: 1, temperature, reading, and their products.
         self._sums: Array = np.zeros((5, n))
 
     def step(self, units: Array, baseline: Array, free: Mask, dt_s: float) -> Array:
-        """Return the foretold change [n] of the baselines; learn from the untouched taxels."""
+        """Return the predicted change [n] of the baselines; learn from the untouched taxels."""
         sums = np.bincount(
             self._triangle[self._pads], units[self._pads], minlength=len(self._pads_of)
         )
         now = (sums / np.maximum(self._pads_of, 1))[self._triangle]
-        if self._warmth is None:
-            self._warmth = now
+        if self._temperature is None:
+            self._temperature = now
             return np.zeros(len(baseline))
-        change = -math.expm1(-dt_s / THERMAL_SMOOTHING_S) * (now - self._warmth)
-        warmth = self._warmth = self._warmth + change
+        change = -math.expm1(-dt_s / SMOOTHING_S) * (now - self._temperature)
+        temperature = self._temperature = self._temperature + change
         reading = baseline + units
-        new = np.array([np.ones(len(free)), warmth, reading, warmth * reading, warmth * warmth])
-        kept = math.exp(-dt_s / THERMAL_MEMORY_S)
+        new = np.array(
+            [
+                np.ones(len(free)),
+                temperature,
+                reading,
+                temperature * reading,
+                temperature * temperature,
+            ]
+        )
+        kept = math.exp(-dt_s / MEMORY_S)
         np.copyto(self._sums, kept * self._sums + dt_s * new, where=free)
-        # Least squares: how much each untouched taxel follows the warmth.
+        # Least squares: how much each untouched taxel follows the temperature.
         time_s, warm, read, cross, square = self._sums
         time_s = np.maximum(time_s, dt_s)
         slope = (cross - warm * read / time_s) / (square - warm**2 / time_s + THERMAL_PRIOR)

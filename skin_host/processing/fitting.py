@@ -1,8 +1,8 @@
-"""Parameters of the relaxation models from one recording: a hold and a release.
+"""Fits the relaxation models to one recording: a hold and a release.
 
-The paper's recipe (section VI-G): press quickly, hold for an hour, let go, watch for 75
-minutes more, and choose the parameters so that the corrected pressure matches the load
-cell. What one such record cannot show is told with the result.
+The paper's recipe (section VI-G): press quickly, hold for an hour, release, record for 75 minutes
+more, and choose the parameters so that the corrected pressure matches the load cell. The result
+also states what one such record cannot show.
 """
 
 from collections.abc import Callable
@@ -13,24 +13,23 @@ from numpy.typing import NDArray
 
 from skin_host.processing.relaxation import ParameterSet, make_model, stand_in
 from skin_host.processing.relaxation.base import Parameters
-from skin_host.processing.relaxation.sets import shared_cause
 from skin_host.relaxation_settings import FITTED
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-#: Samples after a sudden change are kept one by one for so long, then merged ever more.
+#: Samples after a sudden change are kept one by one for this long, then merged more and more.
 FINE_S = 1.0
 GROWTH = 1.1
 COARSE_S = 60.0
-#: Doubt about the pressure at any time, and about a parameter before anything is seen (as the
-#: logarithm of a factor). Together they keep what the record does not show near the stand-in.
-DOUBT_KPA = 0.3
+#: Uncertainty of the pressure at any time, and of a parameter before the fit (as the logarithm of a
+#: factor). Together they keep parameters that the record does not show near the start values.
+UNCERTAINTY_KPA = 0.3
 DOUBT_FACTOR = np.log(4.0)
-#: A parameter that the record narrows down to worse than this factor is not known from it.
+#: A parameter whose uncertainty in the record is worse than this factor is reported as uncertain.
 UNKNOWN_FACTOR = 2.0
 MAXIMUM_ITERATIONS = 60
-#: How much slower unloading is taken to be before anything is seen.
+#: How much slower than loading unloading is assumed to be before the fit.
 START_RATIO = 2.0
 
 
@@ -43,8 +42,8 @@ class HoldRecord:
         momentary_kpa: float64[t], mean of C over each step.
         pressure_kpa: float64[t], true pressure at the end of each step, NaN where unknown.
         released: index of the first step after the release.
-        unit_rms_kpa: what readings in whole units leave of an error at the hold's level, if no
-            noise blurs them; 0 for exact readings.
+        unit_rms_kpa: error from readings in whole units at the hold's level, if no noise blurs
+            them; 0 for exact readings.
     """
 
     dt_s: Floats
@@ -71,16 +70,16 @@ class HoldRecord:
 
 @dataclass(frozen=True)
 class Fit:
-    """A model's parameters for one foam, and how far to trust them.
+    """A model's parameters for one foam, and their reliability.
 
     Attributes:
         model: its name.
         parameters: as `make_model` takes them.
-        rms_hold_kpa, rms_rest_kpa: what is left of the error in the record, each moment of
-            the logarithm of time counting alike; NaN where the pressure is unknown.
+        rms_hold_kpa, rms_rest_kpa: remaining error in the record, with equal weight for each
+            moment of the logarithm of time; NaN where the pressure is unknown.
         uncertain: names of parameters that the record does not show, with the factor within
             which they are known.
-        remarks: what this record cannot tell, in words.
+        remarks: limits of this record, as sentences.
     """
 
     model: str
@@ -122,22 +121,23 @@ def _edges(dt_s: float, samples: int) -> NDArray[np.intp]:
 
 
 class _Shape:
-    """How a model's parameters come from a vector of logarithms, and back."""
+    """Converts a model's parameters to and from a vector of logarithms.
 
-    def __init__(self, model: str, level_kpa: float) -> None:
-        self._model = model
-        self._level_kpa = level_kpa
-        start = stand_in("asymmetric_log" if model == "asymmetric_clock" else model, "mid")
+    The modes of `asymmetric` are evenly spaced in the logarithm of time: their shares are free,
+    and one ratio of unloading to loading times. A branch of `published` has free times.
+    """
+
+    def __init__(self, model: str) -> None:
+        start = stand_in(model, "mid")
         self._tau_s = np.reshape(np.asarray(start.tau_s, dtype=np.float64), (-1, 1))
         self._modes = len(self._tau_s)
-        self._free_tau = model in ("prony", "asymmetric")
-        self._has_ratio = model != "prony"
+        self._free_tau = model == "published"
         self.names = [f"beta_{k + 1}" for k in range(self._modes)]
         first = [*np.ravel(start.beta)]
         if self._free_tau:
             self.names += [f"tau_{k + 1}" for k in range(self._modes)]
             first += [*np.ravel(start.tau_s)]
-        if self._has_ratio:
+        else:
             self.names.append("unload_ratio")
             first.append(START_RATIO)
         self.start: Floats = np.log(np.array(first, dtype=np.float64))
@@ -145,15 +145,11 @@ class _Shape:
     def parameters(self, vectors: Floats) -> ParameterSet:
         """Parameters [modes, k] of vectors [k, p]."""
         values = np.exp(vectors).T
-        modes = self._modes
-        beta = values[:modes]
-        tau = np.repeat(self._tau_s, values.shape[1], axis=1)
+        beta = values[: self._modes]
         if self._free_tau:
-            tau = values[modes : 2 * modes]
-        if not self._has_ratio:
+            tau = values[self._modes :]
             return ParameterSet(beta, tau, beta, tau)
-        if self._model == "asymmetric_clock":
-            return shared_cause(beta, tau, values[-1], self._level_kpa)
+        tau = np.repeat(self._tau_s, values.shape[1], axis=1)
         return ParameterSet(beta, tau, beta, tau * values[-1])
 
 
@@ -165,9 +161,9 @@ def fit(model: str, record: HoldRecord) -> Fit:
     """
     if model not in FITTED:
         raise ValueError(f'no parameters to fit in a model "{model}"')
-    if model.startswith("published"):
-        return _fit_published(model, record)
-    shape = _Shape(model, record.level_kpa)
+    if model == "published":
+        return _fit_published(record)
+    shape = _Shape(model)
 
     def relaxation(vectors: Floats) -> Floats:
         return _simulate(model, shape.parameters(vectors), record)
@@ -178,9 +174,9 @@ def fit(model: str, record: HoldRecord) -> Fit:
     return _judged(model, best, record, uncertain)
 
 
-def _fit_published(model: str, record: HoldRecord) -> Fit:
-    """The paper's order: the loading branch on the hold, then the other one on the rest."""
-    shape = _Shape("prony", record.level_kpa)
+def _fit_published(record: HoldRecord) -> Fit:
+    """Fit in the paper's order: the loading branch on the hold, then the other one on the rest."""
+    shape = _Shape("published")
 
     def loading(vectors: Floats) -> Floats:
         chosen = shape.parameters(vectors)
@@ -200,11 +196,11 @@ def _fit_published(model: str, record: HoldRecord) -> Fit:
     best = ParameterSet(load.beta, load.tau_s, unload.beta, unload.tau_s)
     uncertain = _uncertain(shape.names, load_spread)
     uncertain |= _uncertain([f"{name}_unload" for name in shape.names], unload_spread)
-    return _judged(model, best, record, uncertain)
+    return _judged("published", best, record, uncertain)
 
 
 def _simulate(model: str, parameters: ParameterSet, record: HoldRecord) -> Floats:
-    """Relaxation [t, k] of k sets of parameters: each set is a taxel of its own."""
+    """Return the relaxation [t, k] for k sets of parameters: each set is a separate taxel."""
     k = 1 if np.ndim(parameters.beta) == 1 else np.shape(parameters.beta)[1]
     simulated = make_model(model, k, parameters)
     result = np.empty((len(record.dt_s), k))
@@ -216,7 +212,7 @@ def _simulate(model: str, parameters: ParameterSet, record: HoldRecord) -> Float
 def _least_squares(
     relaxation: Callable[[Floats], Floats], start: Floats, record: HoldRecord, part: slice
 ) -> tuple[Floats, Floats]:
-    """Levenberg-Marquardt in the logarithms; return the best vector and its spread."""
+    """Levenberg-Marquardt on the logarithms; return the best vector and its uncertainty."""
     wanted = (record.momentary_kpa - record.pressure_kpa)[part]
     known = np.isfinite(wanted)
     n = len(start)
@@ -224,7 +220,7 @@ def _least_squares(
     def residuals(vectors: Floats) -> Floats:
         error = relaxation(vectors)[part][known] - wanted[known, np.newaxis]
         prior = (vectors - start).T / DOUBT_FACTOR
-        return np.concatenate([error / DOUBT_KPA, prior])
+        return np.concatenate([error / UNCERTAINTY_KPA, prior])
 
     vector, damping, nudge = start.copy(), 1e-2, 1e-4
     for _ in range(MAXIMUM_ITERATIONS):
@@ -251,7 +247,7 @@ def _least_squares(
         vector, damping = candidates[best], float(max(trials[best], 1e-9))
         if gain < 1e-5 * costs[best]:
             break
-    # Where the record is worse than was assumed, so is what it tells.
+    # Where the record fits worse than was assumed, its information counts for less.
     worse = max(1.0, _rms(here[: np.count_nonzero(known)]))
     spread = worse * np.sqrt(np.diag(np.linalg.inv(normal)))
     return vector, spread
@@ -267,7 +263,7 @@ def _uncertain(names: list[str], spread: Floats) -> dict[str, float]:
 
 
 def _single(parameters: ParameterSet) -> ParameterSet:
-    """The first set of several, as plain numbers."""
+    """Return the first of several sets, as plain numbers."""
 
     def column(values: Parameters) -> tuple[float, ...]:
         return tuple(float(value) for value in np.asarray(values)[:, 0])
@@ -277,7 +273,6 @@ def _single(parameters: ParameterSet) -> ParameterSet:
         column(parameters.tau_s),
         column(parameters.beta_unload),
         column(parameters.tau_unload_s),
-        float(np.ravel(parameters.clock_kpa)[0]),
     )
 
 
@@ -288,11 +283,11 @@ def _judged(
     error = relaxation - (record.momentary_kpa - record.pressure_kpa)
     remarks = []
     if not np.any(np.isfinite(error[: record.released])):
-        remarks.append("the pressure of the hold is unknown: loading times rest on the stand-in")
+        remarks.append("the pressure of the hold is unknown: loading times are start values")
     longest = max(np.max(parameters.tau_s), np.max(parameters.tau_unload_s))
     if longest > 0.5 * record.rest_s:
         remarks.append(
-            f"the slowest mode ({longest:.0f} s) is hardly told from a constant in "
+            f"the slowest mode ({longest:.0f} s) is hardly distinguishable from a constant in "
             f"{record.rest_s:.0f} s of rest: longer holds are extrapolated"
         )
     remarks.append(

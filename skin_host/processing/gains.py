@@ -1,8 +1,8 @@
-"""The pressure curve of each taxel, from known uniform pressures on all of them.
+"""Fits the pressure curve of each taxel to known uniform pressures on all of them.
 
-A bag of compressed air on the skin (seed 002) presses every taxel alike. Each then gets a
-gain on the common curve; where several and large enough pressures were given, also a bend
-of its own, since pads on denser foam differ little at low pressure and much at high.
+A bag of compressed air on the skin (seed 002) presses every taxel equally. Each taxel then gets a
+gain on the common curve; with several and large enough pressures also its own bend, because pads
+on denser foam differ little at low pressure and much at high pressure.
 """
 
 from dataclasses import dataclass
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-#: Doubt about one reading: a unit of quantisation and what relaxation leaves.
-DOUBT_KPA = 1.0
-#: A bend is believed when its standard error is below this, and if it is not absurd.
+#: Uncertainty of one reading: a unit of quantisation and the remaining relaxation.
+UNCERTAINTY_KPA = 1.0
+#: A bend is used when its standard error is below this, and if it is plausible.
 BEND_ERROR = 0.25
 BEND_RANGE = (0.2, 3.0)
 #: Below this highest level the parabola of equation (1) is a straight line.
@@ -28,9 +28,9 @@ class GainFit:
     """C = gain (bend a S^2 + b S) for each taxel [n], and how well it fits.
 
     Attributes:
-        gain, bend: float64[n]; 1 where nothing could be said.
-        fitted: bool[n], whether the taxel has a gain of its own.
-        bent: bool[n], whether it has a bend of its own.
+        gain, bend: float64[n]; 1 where they could not be fitted.
+        fitted: bool[n], whether the taxel has its own gain.
+        bent: bool[n], whether it has its own bend.
         rms_before_kpa, rms_after_kpa: error over all levels and fitted taxels.
     """
 
@@ -47,9 +47,9 @@ def fit_gains(levels_kpa: Floats, linear_kpa: Floats, square_kpa: Floats, usable
 
     Args:
         levels_kpa: known pressures [k].
-        linear_kpa: the linear part of the common curve at each level and taxel [k, n], what
-            relaxation has taken off left out.
-        square_kpa: its quadratic part, alike.
+        linear_kpa: the linear part of the common curve at each level and taxel [k, n], after
+            correction for relaxation.
+        square_kpa: its quadratic part, likewise.
         usable: taxels [n] that may be fitted.
 
     Raises:
@@ -94,7 +94,9 @@ def _two_parts(level: Floats, linear: Floats, square: Floats) -> tuple[Floats, F
     gain = (ss * lp - ls * sp) / safe
     curvature = (ll * sp - ls * lp) / safe
     safe_gain = np.where(gain > 0.0, gain, 1.0)
-    error = np.where(possible, DOUBT_KPA * np.sqrt(np.maximum(ll / safe, 0.0)) / safe_gain, np.inf)
+    error = np.where(
+        possible, UNCERTAINTY_KPA * np.sqrt(np.maximum(ll / safe, 0.0)) / safe_gain, np.inf
+    )
     return np.where(possible, gain, 0.0), curvature / safe_gain, error
 
 

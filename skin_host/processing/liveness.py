@@ -1,27 +1,26 @@
-"""Is a triangle that sends still alive, and is a taxel that reads still a sensor?
+"""Detects triangles whose chip has died although they send, and noisy pads.
 
-A chip that died can go on sending for ever: after it, the board's firmware sends one
-constant value with no error in its status word (reference of the wire, section 4.5). What
-tells it from an untouched triangle is noise. The least noise of a working pad moves its
-byte now and then, twelve pads move some byte nearly every time, and a byte that repeats for
-so long that chance does not explain it comes from no sensor.
+A chip that died can go on sending for ever: after it died, the board's firmware sends one constant
+value with no error in its status word (reference of the wire, section 4.5). It differs from an
+untouched triangle in its noise. The least noise of a working pad changes its byte now and then,
+twelve pads change some byte nearly every time, and a byte that repeats for longer than chance
+explains does not come from a working chip.
 
-How often a byte moves is known from the calibration and followed afterwards, because it
-depends on where between two bytes the reading lies: a warm hour moves a lively taxel into
-the quiet middle of a byte. The question is then one of odds. After c changes in n samples
-a run of k without one has the probability B(c, n - c + k) / B(c, n - c), the beta-binomial
-of Bayes' rule, which is (1 - c/n)^k where n is large. At odds of one in `TRIANGLE_ODDS`
-nobody believes in the run any more. A quiet triangle is given longer than a noisy one, by
-just so much.
+How often a byte changes is known from the calibration and followed afterwards, because it depends
+on where between two bytes the reading lies: an hour of warming moves a lively taxel into the quiet
+middle of a byte. The decision is then one of probability. After c changes in n samples a run of k
+without one has the probability B(c, n - c + k) / B(c, n - c), the beta-binomial of Bayes' rule,
+which is (1 - c/n)^k where n is large. At a probability of one in `TRIANGLE_ODDS` the run is no
+longer taken for chance. A quiet triangle is therefore given more time than a noisy one.
 
-What holds still may have a reason. While an iCub's hand holds an object its bytes repeat much
-longer than those of the open hand (the IROS 2012 recordings: some pads for 44 sweeps, a whole
+There are other reasons for repeated bytes. While an iCub's hand holds an object its bytes repeat
+much longer than those of the open hand (the IROS 2012 recordings: some pads for 44 sweeps, a whole
 fingertip for 19), so repeats count for less while the board feels a touch.
 
 Single pads are judged in `stuck`.
 
 Only conversions count: a chip needs 36.9 ms for its twelve stages (AD7147, decimation 256),
-and a board that sends more often repeats itself.
+and a board that sends more often repeats its values.
 """
 
 import math
@@ -31,10 +30,11 @@ from numpy.typing import NDArray
 
 from skin_host.bus.protocol.compensation import NO_GAIN
 from skin_host.processing.masks import Mask, any_of
-from skin_host.processing.repeats import Repeats
+from skin_host.processing.repeats import Encoding, Repeats
 from skin_host.processing.stuck import (
     MOST_RATE,
     TOUCHED_PACE,
+    Rows,
     StuckPads,
     inside,
     longest_run,
@@ -47,37 +47,40 @@ PADS = 12
 CONVERSION_S = 0.0369
 #: A run of repeats with a probability below 1/odds is not chance.
 TRIANGLE_ODDS = 1e9
-#: However lively it was, a triangle is not given up in less than nine conversions (0.45 s at
+#: However lively it was, a triangle is not called frozen in less than nine conversions (0.45 s at
 #: 20 Hz).
 MOST_TRIANGLE_RATE = 0.9
-#: A triangle that the calibration saw move at all is expected to move so often at least.
+#: A triangle that changed at all during the calibration is expected to change at least this often.
 LEAST_TRIANGLE_RATE = 0.02
-#: Rates follow what is seen over about this time, in steps of about this many samples.
+#: Rates follow the observed ones over about this time, in steps of about this many samples.
 RATE_MEMORY_S = 10.0
-#: So much of it a calibration is taken for.
+#: A calibration counts as this much observation.
 CALIBRATED_S = 5.0
 RATE_SAMPLES = 20
-#: So many changes make what was frozen, or had an error, believable again.
+#: After this many changes a triangle that was frozen, or had an error, is valid again.
 PROBATION_CHANGES = 3
-#: Without a calibration, pads are taken to have this much noise (units).
+#: Assumed noise of the pads (units) before the calibration.
 USUAL_NOISE_UNITS = 0.5
-#: A byte jumps when it goes up and down by more than this many units, and more than so many
-#: times the noise that was calibrated.
+#: A byte jumps when it goes up and down by more than this many units, and more than this multiple
+#: of the calibrated noise.
 NOISY_UNITS = 3.0
 NOISY_SIGMAS = 5.0
-#: A taxel is noisy when its jumps, as multiples of that and at most so large, are this in the
-#: mean over all samples; and calm again below that. Large ones are rarer by chance than many.
+#: A taxel is noisy when its jumps, as multiples of that limit (at most this large), exceed this on
+#: average over all samples; and calm again below. Large jumps are rarer by chance than many.
 MOST_JUMP = 2.0
 NOISY_MEAN = 0.4
 CALM_MEAN = 0.1
 NOISE_MEMORY_SAMPLES = 8
-#: A spike is one sweep off by more than this many units, and so many times the noise.
+#: A pad has jumped lately while that mean is above this: for some 25 samples.
+LATELY_MEAN = 0.01
+#: A spike is one sweep off by more than this many units, and this multiple of the noise. A spike
+#: of a pad that has jumped lately is a fault of the pad, not of the bus.
 SPIKE_UNITS = 7.0
 SPIKE_SIGMAS = 8.0
 
 
 def change_rate(noise_units: Floats) -> Floats:
-    """How often successive bytes differ, given their standard deviation in units.
+    """Return how often successive bytes differ, given their standard deviation in units.
 
     Up to half a unit the byte has two values and differs in 2 variance of all cases; above,
     the collision probability of a normal distribution is 1 / (2 sqrt(pi) sigma).
@@ -88,46 +91,53 @@ def change_rate(noise_units: Floats) -> Floats:
 
 
 class Liveness:
-    """Watches the bytes of the k triangles of one board, 12 pads each.
+    """Watches the bytes of the k triangles of some boards, 12 pads each, all at once.
 
     Args:
-        k: triangles of the board.
-        noise_units: float64[k, 12], calibrated noise, or None where nothing is calibrated.
-            All zeros in a triangle mean that it was constant already when calibrated: it
-            has to prove itself first.
-        period_s: how often the board sends.
-        repeats: tells which pads say something new; without it, those whose byte changes.
+        k: triangles, those of one board after those of another, equally many of each.
+        noise_units: float64[k, 12], calibrated noise, or None without a calibration. All zeros in
+            a triangle mean that it was constant during the calibration: it is not valid before
+            it changes.
+        period_s: how often each board sends, [boards] or the same for all.
+        repeats: finds which pads send something new; without it, those whose byte changes.
+        boards: how many boards.
 
     Attributes:
-        frozen: bool[k], triangles that repeat themselves beyond chance.
-        unproven: bool[k], triangles that had an error, or were frozen, and have not shown
-            since that they live.
+        frozen: bool[k], triangles that repeat their bytes for longer than chance explains.
+        unproven: bool[k], triangles that had an error, or were frozen, and have not changed
+            enough since.
+        silenced: bool[k], those of them whose last reason was an error.
         noisy: bool[k, 12], pads that jump up and down much more than when calibrated.
-        doubted: bool[k, 12], pads that are not to be believed, or None if all are.
-        spikes: how often a single pad of a triangle was off for one sweep and back in the
-            next: no sensor does that, a damaged frame does.
+        doubted: bool[k, 12], pads that are not valid, or None if all are.
+        spikes: int64[boards], how often a single pad of a triangle was off for one sweep and
+            back in the next: a damaged frame does that, a sensor does not.
     """
 
     def __init__(
         self,
         k: int,
         noise_units: Floats | None,
-        period_s: float,
+        period_s: float | Floats,
         repeats: Repeats | None = None,
+        boards: int = 1,
     ) -> None:
         shape = (k, PADS)
-        repeats = repeats or Repeats([NO_GAIN] * k, [0] * k, 0, truncates=False)
+        self._boards = boards
+        period_s = np.repeat(np.broadcast_to(np.float64(period_s), boards), k // boards)
+        conversion_s = np.maximum(period_s, CONVERSION_S)
+        repeats = repeats or Repeats([Encoding(NO_GAIN, 0, 0, truncates=False)] * k)
         calibrated = noise_units is not None
         if noise_units is None:
             noise_units = np.full(shape, USUAL_NOISE_UNITS)
-        self._share = min(1.0, period_s / CONVERSION_S)
-        self._weight = min(1.0, RATE_SAMPLES * period_s / RATE_MEMORY_S)
-        self._memory = RATE_MEMORY_S / max(period_s, CONVERSION_S)
-        self._seen = CALIBRATED_S / max(period_s, CONVERSION_S)
-        self._pads = StuckPads(noise_units, self._share, period_s, repeats)
+        self._share: Floats = np.minimum(1.0, period_s / CONVERSION_S)
+        self._weight: Floats = np.minimum(1.0, RATE_SAMPLES * period_s / RATE_MEMORY_S)
+        self._memory: Floats = RATE_MEMORY_S / conversion_s
+        self._seen: Floats = CALIBRATED_S / conversion_s
+        self._repeats = repeats
+        self._pads = StuckPads(noise_units, self._share, period_s, repeats, boards)
         self._rate: Floats = np.minimum(change_rate(noise_units), MOST_RATE)
         self._triangle_rate: Floats = 1.0 - np.prod(1.0 - self._rate, axis=1)
-        # What is too much noise nobody knows before the calibration.
+        # Before the calibration it is not known how much noise is too much.
         jump = np.maximum(NOISY_UNITS, NOISY_SIGMAS * noise_units)
         self._jump = jump if calibrated else np.full(shape, np.inf)
         self._spike = np.maximum(SPIKE_UNITS, SPIKE_SIGMAS * noise_units)
@@ -146,15 +156,18 @@ class Liveness:
         self.frozen: Mask = np.zeros(k, np.bool_)
         self.unproven: Mask = constant
         self._any_to_show = any_of(constant)
+        self.silenced: Mask = np.zeros(k, np.bool_)
         self.noisy: Mask = np.zeros(shape, np.bool_)
         self.doubted: Mask | None = None
-        self.spikes = 0
-        self._renew_limits()
+        self.spikes = np.zeros(boards, np.int64)
+        self._pad_expected = np.zeros(shape)
+        self._expected = np.zeros(k)
+        self._renew_limits(slice(None))
         self._doubt()
 
     @property
     def stuck(self) -> Mask:
-        """bool[k, 12], single pads that repeat themselves in a living triangle."""
+        """Return single pads that repeat their byte in a living triangle, bool[k, 12]."""
         return self._pads.stuck
 
     def step(
@@ -163,28 +176,65 @@ class Liveness:
         present: Mask,
         erring: Mask,
         touched: Mask | None = None,
+        came: Mask | None = None,
     ) -> None:
-        """Take one sweep.
+        """Take one sweep of some boards.
 
         Args:
             raw: uint8[k, 12], the bytes.
-            present: bool[k], triangles that came, and without an error in their status.
+            present: bool[k], triangles that were received, without an error in their status.
             erring: bool[k], triangles whose status word has an error.
-            touched: bool[k, 12], pads that were touched a moment ago, if any was.
+            touched: bool[k, 12], recently touched pads, if there are any.
+            came: bool[boards], boards whose sweep this is, all by default. Nothing of the others is
+                present.
         """
         compared = present & self._present
         changed = (raw != self._raw) & compared[:, None]
         self._note_jumps(raw, changed, compared)
         self._note_triangles(raw, changed, compared, erring, touched)
-        self._pads.step(raw, changed, compared, self.unproven, touched)
+        self._pads.step(raw, changed, compared, self.unproven, touched, came)
         np.copyto(self._raw, raw, where=present[:, None])
-        self._present = present.copy()
+        if came is None:
+            self._present = present.copy()
+        else:
+            np.copyto(self._present, present, where=np.repeat(came, len(present) // len(came)))
         if touched is None:
             self._samples += compared
             self._changes += changed
+        else:
+            calm = self._calm(touched)
+            self._samples += compared & calm
+            self._changes += changed & calm[:, None]
         if int(self._samples.max()) >= RATE_SAMPLES:
             self._learn()
         self._doubt()
+
+    def note_gap(self, board: int) -> None:
+        """Sweeps of a board (its row) were lost: the next step does not follow the last one."""
+        triangles = len(self._step) // self._boards
+        self._step[triangles * board : triangles * (board + 1)] = 0
+
+    def keep(self, before: "Liveness", boards: Mask) -> None:
+        """Take over the state of a predecessor for the same skin, for some boards
+        (bool[boards]).
+        """
+        self.spikes = before.spikes
+        rows = np.repeat(boards, len(self.frozen) // len(boards))
+        for mine, its in ((self, before), (self._pads, before._pads)):
+            for name, array in vars(mine).items():
+                if isinstance(array, np.ndarray) and name not in {"spikes", "doubted"}:
+                    chosen = boards if len(array) == len(boards) else rows
+                    array[chosen] = getattr(its, name)[chosen]
+        self._repeats.keep(before._repeats, rows)
+        self._any_jumping = any_of(self._jumping > 0.0)
+        self._any_to_show = any_of(self.unproven)
+        self._pads.any_stuck = any_of(self._pads.stuck)
+        self._doubt()
+
+    def _calm(self, touched: Mask) -> Mask:
+        """Return triangles bool[k] of boards on which nothing is touched."""
+        felt = touched.reshape(self._boards, -1).any(axis=1)
+        return np.repeat(~felt, len(touched) // self._boards)
 
     def _doubt(self) -> None:
         doubts = self._any_to_show or self._pads.any_stuck or any_of(self.noisy)
@@ -199,8 +249,7 @@ class Liveness:
         touched: Mask | None,
     ) -> None:
         alive = changed.any(axis=1)
-        if touched is None:
-            self._alive += alive
+        self._alive += alive if touched is None else alive & self._calm(touched)
         all_alive = alive.tobytes() == compared.tobytes()
         if all_alive and not self._any_to_show and not any_of(erring):
             self._surprise[compared] = 0.0
@@ -208,13 +257,13 @@ class Liveness:
         expected = self._expected
         movable = inside(raw)
         if not movable.all():
-            # What stands at an end of the scale cannot move, however well it is.
+            # A pad at an end of the scale cannot change, even if it works.
             most = (self._pad_expected * movable).sum(axis=1)
             expected = np.where(movable.any(axis=1), np.minimum(expected, most), 0.0)
         if touched is not None:
-            # A chip that died can look touched itself; only what others feel excuses it.
-            felt = np.count_nonzero(touched, axis=1)
-            elsewhere = felt.sum() > felt
+            # A chip that died can look touched itself; only a touch on other triangles counts.
+            felt = np.count_nonzero(touched, axis=1).reshape(self._boards, -1)
+            elsewhere = (felt.sum(axis=1, keepdims=True) > felt).ravel()
             expected = np.where(elsewhere, expected / TOUCHED_PACE, expected)
         self._surprise += np.where(compared, expected, 0.0)
         self._surprise[alive] = 0.0
@@ -225,9 +274,10 @@ class Liveness:
         self.unproven = self._to_show > 0
         self._any_to_show = any_of(self.unproven)
         self.frozen = (too_long | self.frozen) & self.unproven & ~erring
+        self.silenced = (self.silenced | erring) & self.unproven
 
     def _note_jumps(self, raw: NDArray[np.uint8], changed: Mask, compared: Mask) -> None:
-        """A step up followed by a step down is noise; a touch goes one way at a time."""
+        """A step up followed by a step down is noise; a touch goes in one direction at a time."""
         step = np.where(changed, np.subtract(raw, self._raw, dtype=np.int16), np.int16(0))
         far = np.abs(step) > self._jump
         if not self._any_jumping and not any_of(far):
@@ -236,8 +286,8 @@ class Liveness:
         jump = far & (np.abs(self._step) > self._jump) & ((step ^ self._step) < 0)
         size = np.minimum(np.abs(step), np.abs(self._step))
         spike = jump & (size > self._spike)
-        alone = np.count_nonzero(spike & (self._jumping < CALM_MEAN), axis=1) == 1
-        self.spikes += int(np.count_nonzero(alone))
+        alone = np.count_nonzero(spike & (self._jumping < LATELY_MEAN), axis=1) == 1
+        self.spikes += np.count_nonzero(alone.reshape(self._boards, -1), axis=1)
         np.copyto(self._step, step, where=compared[:, None])
         jumped = jump * np.minimum(size / self._jump, MOST_JUMP)
         self._jumping += compared[:, None] * (jumped - self._jumping) / NOISE_MEMORY_SAMPLES
@@ -246,21 +296,29 @@ class Liveness:
         self.noisy = self._jumping > np.where(self.noisy, CALM_MEAN, NOISY_MEAN)
 
     def _learn(self) -> None:
-        """Let the rates follow what was seen of those that live."""
-        seen = np.maximum(self._samples, 1)
-        weight = self._weight * (~self.unproven & (self._samples >= RATE_SAMPLES // 2))
-        self._triangle_rate += weight * (self._alive / seen - self._triangle_rate)
-        movable = ~self.stuck & inside(self._raw)
-        self._rate += (weight[:, None] * movable) * (self._changes / seen[:, None] - self._rate)
-        self._seen = min(self._seen + self._share * RATE_SAMPLES, self._memory)
-        self._samples[:] = 0
-        self._alive[:] = 0
-        self._changes[:] = 0
-        self._renew_limits()
+        """Update the rates of boards with enough samples, for triangles that live."""
+        enough = self._samples.reshape(self._boards, -1).max(axis=1) >= RATE_SAMPLES
+        rows: Rows = slice(None)
+        if not enough.all():
+            rows = np.flatnonzero(np.repeat(enough, len(self._samples) // self._boards))
+        samples, rate = self._samples[rows], self._rate[rows]
+        seen = np.maximum(samples, 1)
+        weight = self._weight[rows] * (~self.unproven[rows] & (samples >= RATE_SAMPLES // 2))
+        self._triangle_rate[rows] += weight * (self._alive[rows] / seen - self._triangle_rate[rows])
+        movable = ~self.stuck[rows] & inside(self._raw[rows])
+        rate = rate + weight[:, None] * movable * (self._changes[rows] / seen[:, None] - rate)
+        self._rate[rows] = rate
+        more = self._seen[rows] + self._share[rows] * RATE_SAMPLES
+        self._seen[rows] = np.minimum(more, self._memory[rows])
+        self._samples[rows] = 0
+        self._alive[rows] = 0
+        self._changes[rows] = 0
+        self._renew_limits(rows)
 
-    def _renew_limits(self) -> None:
-        """How long a pad may repeat itself, and how much each repeat of a triangle tells."""
-        self._pad_expected = -self._share * np.log1p(-np.minimum(self._rate, MOST_RATE))
-        together = np.clip(self._triangle_rate, LEAST_TRIANGLE_RATE, MOST_TRIANGLE_RATE)
-        run = longest_run(together, self._seen, TRIANGLE_ODDS)
-        self._expected = self._share * math.log(TRIANGLE_ODDS) / run
+    def _renew_limits(self, rows: Rows) -> None:
+        """Compute how long a pad may repeat, and how much each repeat of a triangle counts."""
+        share, rate = self._share[rows], np.minimum(self._rate[rows], MOST_RATE)
+        self._pad_expected[rows] = -share[:, None] * np.log1p(-rate)
+        together = np.clip(self._triangle_rate[rows], LEAST_TRIANGLE_RATE, MOST_TRIANGLE_RATE)
+        run = longest_run(together, self._seen[rows], TRIANGLE_ODDS)
+        self._expected[rows] = share * math.log(TRIANGLE_ODDS) / run

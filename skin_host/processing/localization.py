@@ -1,9 +1,9 @@
-"""Where in a contact: from the taxels it touches to one position with an uncertainty.
+"""Locates a contact: from the taxels it touches to one position with an uncertainty.
 
-Four methods behind one interface, chosen per part: the three of Son et al. and a template
-that knows the pads' geometry. They take the activation of a part's taxels in units
-(baseline minus reading, or `PressureCurve.units` of a pressure): it is in proportion to
-the covered share of a pad, which the pressure of a half covered pad is not.
+Four methods behind one interface, chosen per part: the three of Son et al. and a template that
+uses the pads' geometry. They take the activation of a part's taxels in units (baseline minus
+reading, or `PressureCurve.units` of a pressure), because it is proportional to the covered share
+of a pad; the pressure of a half covered pad is not.
 """
 
 from collections.abc import Sequence
@@ -22,10 +22,11 @@ __all__ = ["Localizer", "Location", "Method", "make_localizer", "separate"]
 
 Method = Literal["centroid", "half_maximum", "peak", "template"]
 
-#: Two maxima are two contacts if the way between them falls below this share of the lower.
+#: Two maxima are two contacts if the lowest taxel between them is below this share of the lower
+#: maximum.
 SADDLE = 0.6
-#: Sizes of what may touch, for the template, mm. One size is sharper if it is the right one
-#: and worse than the centroid if it is not.
+#: Assumed sizes of touching objects, for the template, mm. One size is more precise if it is the
+#: right one and worse than the centroid if it is not.
 PROBES_MM = (6.0, 8.0, 10.0, 12.0)
 
 
@@ -67,9 +68,11 @@ def separate(
 ) -> list[list[int]]:
     """Split a connected group of touched taxels where it has several clear maxima.
 
-    Each taxel goes with its strongest neighbour uphill to a maximum; two hills become one
-    again if the pass between them is higher than `SADDLE` of the lower. Groups come in
-    the order of their strength, strongest first; ties go to the lower number.
+    Each taxel goes with its strongest neighbour uphill to a maximum; two hills become one again if
+    the
+    pass between them is higher than `SADDLE` of the lower. Groups are ordered by strength,
+    strongest
+    first; ties go to the lower number.
 
     Args:
         taxels: a connected group, numbered within the part.

@@ -1,4 +1,4 @@
-"""The three ways of Son et al., section 2.2, to say where a contact is, for any lattice."""
+"""The three ways of Son et al., section 2.2, to locate a contact, for any lattice."""
 
 import math
 from dataclasses import dataclass
@@ -11,10 +11,10 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 
-#: Of one touched pad a contact may be this share of the pitch away (rms, radial), and less
-#: with more pads: measured on the 12-pad triangle with probes of 3, 6 and 10 mm.
+#: Rms radial distance of a contact from a single touched pad, in pitches; less with more pads.
+#: Measured on the 12-pad triangle with probes of 3, 6 and 10 mm.
 GEOMETRY_PITCHES = 0.36
-#: Pads so many pitches around the strongest take part in the quadratic fit.
+#: The quadratic fit uses pads up to this many pitches from the strongest.
 PEAK_PITCHES = 1.6
 
 
@@ -27,15 +27,15 @@ class Location:
 
 
 class Localizer(Protocol):
-    """Finds where in one contact."""
+    """Locates one contact."""
 
     def locate(self, taxels: Indices, units: Floats, usable: Mask) -> Location | None:
-        """Locate one contact, or None where its taxels carry no signal.
+        """Locate one contact, or return None where its taxels carry no signal.
 
         Args:
             taxels: intp[k], the contact's taxels, numbered within the part.
             units: float[n], activation of all taxels of the part.
-            usable: bool[n], whether a taxel may be believed and belongs to no other contact.
+            usable: bool[n], whether a taxel is valid and belongs to no other contact.
         """
         ...
 
@@ -54,7 +54,6 @@ class CentroidLocalizer:
         self._pitch_m = nearest_distance(position_m)
 
     def locate(self, taxels: Indices, units: Floats, usable: Mask) -> Location | None:
-        """See `Localizer.locate`."""
         taxels = taxels[usable[taxels]]
         if len(taxels) == 0:
             return None
@@ -80,7 +79,7 @@ class PeakLocalizer:
 
     On the irregular lattice of a triangle the paper's three points in a row become a
     least-squares paraboloid. Where a taxel around is missing, there are too few, or there
-    is no top within a pitch of the strongest, the threshold centroid answers.
+    is no top within a pitch of the strongest, the threshold centroid is used.
     """
 
     def __init__(self, position_m: Floats, normal: Floats, *, noise_units: float = 0.5) -> None:
@@ -92,7 +91,6 @@ class PeakLocalizer:
         self._fits: dict[int, tuple[Indices, Floats | None, Floats]] = {}
 
     def locate(self, taxels: Indices, units: Floats, usable: Mask) -> Location | None:
-        """See `Localizer.locate`."""
         mine = taxels[usable[taxels]]
         if len(mine) == 0:
             return None
@@ -105,7 +103,7 @@ class PeakLocalizer:
         return Location(position_m, math.hypot(noise_m, geometry_m))
 
     def _top(self, strongest: int, units: Floats, usable: Mask) -> tuple[Floats, float] | None:
-        """The paraboloid's top and its standard error from noise, or None."""
+        """Return the paraboloid's top and its standard error from noise, or None."""
         if strongest not in self._fits:
             self._fits[strongest] = self._prepare(strongest)
         index, inverse, basis = self._fits[strongest]
@@ -124,7 +122,7 @@ class PeakLocalizer:
         return self._position_m[strongest] + pitch_m * (offset @ basis), float(pitch_m * noise)
 
     def _prepare(self, centre: int) -> tuple[Indices, Floats | None, Floats]:
-        """Taxels around one, the fit of a paraboloid to them, and the plane's axes."""
+        """Return the taxels around one, the fit of a paraboloid to them, and the plane's axes."""
         pitch_m = self._pitch_m[centre]
         index, flat_m, basis = tangent_plane(
             self._position_m, self._normal, centre, PEAK_PITCHES * pitch_m
@@ -137,10 +135,11 @@ class PeakLocalizer:
 
 
 def quadratic_peak(before: Floats, middle: Floats, after: Floats, pitch: float) -> Floats:
-    """Offset of the top of a parabola through three readings in a row, from the middle one.
+    """Return the offset of the top of a parabola through three readings in a row from the middle
+    one.
 
     (p / 2)(a - c) / (a - 2 b + c). 0 where the three have no top, and never more than half
-    a pitch: beyond, another reading would have been the greatest.
+    a pitch: beyond that, another reading would have been the greatest.
     """
     bend = before - 2.0 * middle + after
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -151,7 +150,7 @@ def quadratic_peak(before: Floats, middle: Floats, after: Floats, pitch: float) 
 
 
 def nearest_distance(position_m: Floats) -> Floats:
-    """float64[n], distance from each taxel to the nearest other; 0 if there is no other."""
+    """Return the distance from each taxel to the nearest other, float64[n]; 0 without others."""
     n = len(position_m)
     nearest = np.zeros(n)
     for i in range(n if n > 1 else 0):
@@ -164,10 +163,10 @@ def nearest_distance(position_m: Floats) -> Floats:
 def tangent_plane(
     position_m: Floats, normal: Floats, centre: int, reach_m: float
 ) -> tuple[Indices, Floats, Floats]:
-    """Taxels near one of them, laid flat on the plane that touches the skin there.
+    """Project taxels near a centre onto the plane that touches the skin there.
 
-    Distances to the centre stay as they are, so that a curved patch is unrolled.
-    Taxels that face away (more than a right angle) are another side of the body.
+    Distances to the centre are preserved, so that a curved patch is unrolled.
+    Taxels that face away (more than a right angle) are on another side of the body.
 
     Returns:
         intp[k] taxels, the centre among them; float64[k, 2] their flat coordinates, m;

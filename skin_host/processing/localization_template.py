@@ -1,11 +1,11 @@
-"""The template localiser: which place of a round probe would have made these readings?
+"""The template localiser: finds the place of a round probe that explains the readings best.
 
-A pad answers in proportion to the area that is covered (foam as independent springs,
-paper Figs. 11-13), so a probe of known size at a known place makes a known pattern. The
-patterns of all places around a pad are laid down when it is first the strongest; each
-contact is then one product with that table. The mean of the places, weighted by how well
-they explain the readings, has the least expected square error, and their spread is the
-uncertainty: a small probe inside one pad is said to be anywhere in it.
+A pad responds in proportion to the covered area (foam as independent springs, paper Figs. 11-13),
+so a probe of known size at a known place gives a known pattern. The patterns of all places around
+a pad are computed when it is first the strongest; each contact is then one product with that
+table. The mean of the places, weighted by how well they explain the readings, has the least
+expected square error, and their spread is the uncertainty: for a small probe inside one pad, all
+places in that pad are equally probable.
 """
 
 import math
@@ -26,30 +26,31 @@ from skin_host.processing.localization_centroid import (
 
 Floats32 = NDArray[np.float32]
 
-#: Distance of the places on trial, mm. Between them the pattern is taken as linear.
+#: Distance of the candidate places, mm. Between them the pattern is treated as linear.
 STEP_MM = 0.3
-#: A place is on trial if the pad is covered there nearly as much as the most covered one.
-#: Strengths of pads differ, so the strongest reading need not be of the most covered pad.
+#: A place is a candidate if the pad is covered there nearly as much as the most covered one.
+#: Strengths of pads differ, so the strongest reading may not be that of the most covered pad.
 STRONGEST_WITHIN = 0.25
 #: Pads differ in strength by about this share even after calibration.
 GAIN_SPREAD = 0.03
-#: Error of a pattern half a step away from the nearest place on trial, in units per unit.
+#: Error of a pattern half a step away from the nearest candidate place, in units per unit.
 STEP_SHARE = 0.01
-#: Tables kept at a time, about 0.7 MB each with four sizes of probe.
+#: Number of tables kept at a time, about 0.7 MB each with four sizes of probe.
 MOST_TABLES = 128
-#: Where the places that explain the readings lie closer than this, the best is refined.
+#: If the places that explain the readings lie closer together than this, the best is refined.
 SHARP_MM = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class _Table:
-    """Patterns around one pad, of all places on trial and the pads that any of them covers.
+    """Patterns around one pad, of all candidate places and the pads that any of them covers.
 
     `pattern` and twice its square are [pads, places]: BLAS is faster over long rows.
-    `moments` [places, 4] are 1, x, y, x^2 + y^2 of the places, each times what a place is worth
-    before anything is read (see `TemplateLocalizer`); `shape` [places, 3, pads] are the pattern
-    and its slopes along x and y, per mm. `frame` [3, 3] holds, in mm, the pad's position and
-    what 1 mm along x and y adds to it.
+    `moments` [places, 4] are 1, x, y, x^2 + y^2 of the places, each times the prior weight of the
+    place (see `TemplateLocalizer`); `shape` [places, 3, pads] are the pattern and its slopes along
+    x
+    and y, per mm. `frame` [3, 3] holds, in mm, the pad's position and its change per mm along x and
+    y.
     """
 
     pads: Indices
@@ -64,19 +65,20 @@ class _Table:
 class TemplateLocalizer:
     """Matches the readings around the strongest pad with those of a round probe.
 
-    The strength of the push is not known, and two pads alone do not tell how far aside of
-    them the probe lies: farther away and stronger reads the same. Strong pushes are taken to
-    be rarer, with the square of the strength, which has no scale; so a place counts in
-    proportion to the size of its pattern.
+    The strength of the push is not known, and two pads alone do not determine how far to their side
+    the probe is: farther away and stronger gives the same readings. Strong pushes are assumed to be
+    rarer, with the square of the strength, which has no scale; so a place counts in proportion to
+    the
+    size of its pattern.
 
-    A contact wider than the largest probe can touch is like none of the patterns: of it the
-    centroid is told.
+    A contact wider than the largest probe matches none of the patterns: the centroid is used for
+    it.
 
     Args:
         position_m: float64[n, 3] of the part's taxels.
         normal: float64[n, 3].
         radius_mm: float64[n], of the pads.
-        probe_mm: diameter of what touches; several to leave the size open.
+        probe_mm: diameter of the touching object; several to leave the size open.
         noise_units: standard deviation of an untouched reading, rounding included.
     """
 
@@ -95,7 +97,7 @@ class TemplateLocalizer:
         self._probes_mm = np.atleast_1d(np.asarray(probe_mm, np.float64))
         self._noise_units = noise_units
         widest_m = 1e-3 * float(self._probes_mm.max() + 2.0 * radius_mm.max(initial=0.0))
-        #: For each taxel those that no probe reaches together with it, as bits of a number.
+        #: For each taxel those that no probe covers together with it, as bits of a number.
         self._far = [
             int.from_bytes(np.packbits(away, bitorder="little").tobytes(), "little")
             for away in (
@@ -106,7 +108,6 @@ class TemplateLocalizer:
         self._tables: dict[int, _Table] = {}
 
     def locate(self, taxels: Indices, units: Floats, usable: Mask) -> Location | None:
-        """See `Localizer.locate`."""
         mine = taxels[usable[taxels]]
         if len(mine) == 0:
             return None
@@ -121,8 +122,8 @@ class TemplateLocalizer:
             if len(self._tables) >= MOST_TABLES:
                 self._tables.pop(next(iter(self._tables)))
             table = self._tables[strongest] = self._lay_down(strongest)
-        # Each call of numpy costs as much as its work here, so there are few. float32
-        # throughout: one float64 among these would copy the tables at each touch.
+        # Each call of numpy costs as much as its work here, so there are few. All is float32: one
+        # float64 among these would copy the tables at each touch.
         trust = usable.take(table.pads)
         reading = np.multiply(units.take(table.pads), trust, dtype=np.float32)
         spread = reading * reading
@@ -130,13 +131,13 @@ class TemplateLocalizer:
         unsure = np.float32(self._noise_units**2 + (STEP_SHARE * peak) ** 2)
         coarse = np.divide(trust, spread + unsure, dtype=np.float32)
         weighted = coarse * reading
-        # The strength of the push is unknown: for each place take the one that fits best.
+        # The strength of the push is unknown: use the best one for each place.
         match = weighted @ table.pattern
         match *= match
         match /= coarse @ table.twice_squared
         place = int(match.argmax())
         best = match[place]
-        # What the best pattern leaves over, beyond noise: the contact is of another shape.
+        # The residual of the best pattern, beyond noise, shows that the contact has another shape.
         left = float(weighted @ reading) - 2.0 * float(best)
         excess = max(0.0, left - (np.count_nonzero(trust) - 3))
         misfit = 1.0 + excess / max(len(mine) - 3, 1)
@@ -148,21 +149,23 @@ class TemplateLocalizer:
             spread += np.float32(self._noise_units**2)
             fine = np.divide(trust, spread, dtype=np.float32)
             refined = _refine(table, place, reading, fine)
-            # A pattern that stands still under the probe refines nothing.
+            # A pattern that does not change with the place cannot be refined.
             if refined is not None and refined[2] < variance_mm2 + STEP_MM**2:
                 x, y, variance_mm2 = refined
         place_mm = np.array((1.0, x, y)) @ table.frame
         return Location(1e-3 * place_mm, 1e-3 * math.sqrt(variance_mm2 * misfit))
 
     def _is_wide(self, taxels: list[int]) -> bool:
-        """Whether two of the taxels are farther apart than any probe reaches."""
+        """Return whether two of the taxels are too far apart to be covered by one probe."""
         mask = 0
         for taxel in taxels:
             mask |= 1 << taxel
         return any(mask & self._far[taxel] for taxel in taxels)
 
     def _lay_down(self, centre: int) -> _Table:
-        """Patterns of all places at which this pad would read about the most."""
+        """Return the patterns of all places at which this pad would have about the highest
+        reading.
+        """
         radius = self._radius_mm
         reach_mm = self._probes_mm.max() + 2.0 * radius.max()
         pads, flat_m, basis = tangent_plane(self._position_m, self._normal, centre, 2e-3 * reach_mm)
@@ -212,17 +215,17 @@ class TemplateLocalizer:
 def _refine(
     table: _Table, place: int, reading: Floats32, weight: Floats32
 ) -> tuple[float, float, float] | None:
-    """One Gauss-Newton step in strength and place, from a place on trial.
+    """One Gauss-Newton step in strength and place, from a candidate place.
 
     Returns:
-        The place, mm, and the sum of its two variances, mm2. None where the step leads
-        away from the place, and from where its pattern is linear.
+        The place, mm, and the sum of its two variances, mm2. None where the step leaves the range
+        in which its pattern is linear.
     """
     shape = table.shape[place]
     weighted = shape * weight
     (tt, tx, ty), (_, xx, xy), (_, _, yy) = (weighted @ shape.T).tolist()
     t, x, y = (weighted @ reading).tolist()
-    # Solve by elimination of the strength; numpy's solver costs more than all the rest.
+    # Solved by elimination of the strength; numpy's solver costs more than all the rest.
     xx, xy, yy = xx - tx * tx / tt, xy - tx * ty / tt, yy - ty * ty / tt
     x, y = x - tx * t / tt, y - ty * t / tt
     determinant = xx * yy - xy * xy

@@ -1,4 +1,4 @@
-"""Masks over taxels, and the one question that is asked of them all the time."""
+"""Masks over taxels."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,5 +7,7 @@ Mask = NDArray[np.bool_]
 
 
 def any_of(flags: Mask) -> bool:
-    """Whether any is set; numpy's own takes several times as long for up to some thousand."""
+    """Return whether any is set; numpy's own takes several times as long up to some thousand
+    entries.
+    """
     return flags.tobytes().find(1) >= 0

@@ -1,10 +1,10 @@
-"""The state of the whole skin, and one step of it: bytes to pressure and touch.
+"""State of the whole skin, and the per-sweep processing step: bytes to pressure and touch.
 
-What is done at every sweep is little: a parabola per taxel turns its byte into pressure.
-All that is slow - relaxation, drift, with them the parabola, and the byte from which on a
-taxel may be touched - is brought up to date once a window (1 s by default) from the means
-of that time. A sweep in which no byte comes near its limit is known to be untouched by one
-comparison of bytes.
+The work per sweep is small: a parabola per taxel, or its own table, converts its byte into
+pressure. Everything slow - relaxation, drift, and with them the parabola and the byte from which
+on a taxel may be touched - is updated once a window (1 s by default) from the means of that time.
+A sweep in which no byte comes near its limit, and no taxel has evidence of an earlier one, is
+recognised as untouched by one comparison of bytes.
 """
 
 from dataclasses import dataclass
@@ -15,21 +15,38 @@ from numpy.typing import NDArray
 
 from skin_host.layout import Layout, PadKind, PartLayout
 from skin_host.processing.calibration import Calibration
+from skin_host.processing.course_fitting import limit_kpa, make_memory
+from skin_host.processing.curves import Curves, TableCurve, common_curve, with_own
 from skin_host.processing.drift import BaselineTracker
+from skin_host.processing.erratic import Erratic, step_kpa
 from skin_host.processing.masks import Mask, any_of
 from skin_host.processing.pressure import PressureCurve
+from skin_host.processing.readers import Parabolas, Reader, Tables
 from skin_host.processing.relaxation import OWN_MEANS, make_model, parameters_of
-from skin_host.processing.touch import Imprints, TouchDetector, sure_units, threshold_units
+from skin_host.processing.relaxation import Relaxation as Model
+from skin_host.processing.smoothing import StepFilter
+from skin_host.processing.touch import Levels, Residuals, TouchDetector, levels
+from skin_host.relaxation_settings import Relaxation
 from skin_host.settings import Processing
 
-#: A longer step is a gap or a jump of the clock: the pressure in it is not known.
+#: A longer step is a gap or a jump of the clock. The foam's model is advanced by it, under the
+#: readings after it; nothing else depends on its length.
 LONGEST_STEP_S = 1.0
-#: Baselines move this often where the relaxation model looks at every sample.
+#: Baselines move this often if the relaxation model needs every sample.
 WINDOW_S = 1.0
-#: Of an untouched part whose pressures nobody wants, one sweep in so much time is worked out.
-GLANCE_S = 0.2
-#: Samples are laid aside and summed so many at a time: fewer passes over the taxels.
+#: If the pressures of an untouched part are not subscribed, they are computed once in this time.
+IDLE_UPDATE_S = 0.2
+#: The curve of a taxel hardly bends below this.
+STRAIGHT_UNITS = 2.0
+#: Smaller relaxation does not affect the touch decision.
+RELAXED_KPA = 0.01
+#: Samples are stored and summed this many at a time, for fewer passes over the taxels.
 ROWS = 8
+#: Baselines of pads with own curves rise no faster above their calibrated zero (10 degrees in 10
+#: minutes are 0.008), and those of touched ones do not rise.
+RISE_UNITS_PER_S = 0.01
+#: A taxel that rests at this value or above sends 255 by noise alone.
+RESTING_NEAR_RAIL = 247.0
 
 Floats = NDArray[np.float32]
 _T = TypeVar("_T", bound=np.generic)
@@ -37,7 +54,7 @@ _T = TypeVar("_T", bound=np.generic)
 
 @dataclass(slots=True)
 class PressureFrame:
-    """One part at one instant. Arrays have one entry a taxel [m], in the layout's order.
+    """One part at one instant. Arrays have one entry per taxel [m], in the layout's order.
 
     Attributes:
         part: its name.
@@ -46,10 +63,10 @@ class PressureFrame:
         raw: uint8, bytes as received.
         pressure_kpa: float32, 0 where not valid.
         touched: whether something touches the taxel.
-        valid: received now, and fit to be believed.
-        beyond_range: the pressure is above the calibrated range: its order is right, its
-            size a guess.
-        computed: False if pressures were not asked for and nothing touches: they are 0.
+        valid: received now, and reliable.
+        beyond_range: the pressure is above the calibrated range, or the byte at an end of its
+            scale (0 or 255): its order is right, its value an estimate.
+        computed: False if pressures were not requested and nothing touches: they are 0.
     """
 
     part: str
@@ -64,46 +81,47 @@ class PressureFrame:
 
 
 class Pipeline:
-    """Everything that is remembered of the skin between sweeps, as flat arrays over it.
+    """The state of the skin between sweeps, as flat arrays over all taxels.
 
     Args:
         layout: the skin.
         settings: how to process it.
         calibration: of this layout.
-        after: the pipeline that this one replaces; its frames go on being counted.
 
     Attributes:
         baseline: float64[n], activation of the untouched taxels in units, drift included.
         relaxation_kpa: float32[n], pressure that the foam has lost by now.
     """
 
-    def __init__(
-        self,
-        layout: Layout,
-        settings: Processing,
-        calibration: Calibration,
-        after: "Pipeline | None" = None,
-    ) -> None:
+    def __init__(self, layout: Layout, settings: Processing, calibration: Calibration) -> None:
+        self._layout = layout
         self.baseline = calibration.baseline.copy()
         self.relaxation_kpa = np.zeros(layout.n_taxels, np.float32)
-        curve = PressureCurve(
-            layout.unit_ff / layout.sensitivity,
-            calibration.gain,
-            settings.pressure.a_kpa_per_ff2 * calibration.bend,
-            settings.pressure.b_kpa_per_ff,
-        )
-        on_units = threshold_units(
-            calibration.percentile, calibration.baseline, calibration.noise, settings.touch
-        )
-        believed = calibration.usable & (layout.pad_kind == PadKind.PRESSURE)
-        sure_at_units = sure_units(on_units, calibration.noise)
-        self._parts = [
-            _PartPipeline(self, layout, part, settings, believed, curve, on_units, sure_at_units)
-            for part in layout.parts
-        ]
-        if after is not None:
-            for part, before in zip(self._parts, after._parts, strict=True):
-                part.seq = before.seq
+        rules = _Rules.of(layout, settings, calibration)
+        self._parts = [_PartPipeline(self, layout, part, rules) for part in layout.parts]
+
+    def renew(
+        self,
+        settings: Processing,
+        calibration: Calibration,
+        zeroed: Mask,
+        layout: Layout | None = None,
+    ) -> None:
+        """Apply changed settings or a changed calibration; the state is kept.
+
+        Only another relaxation model starts without a state.
+
+        Args:
+            settings: how to process from now on.
+            calibration: the one in use from now on.
+            zeroed: bool[n], taxels that have been calibrated: they are untouched and relaxed.
+            layout: the skin from now on, if its foam or its scale has changed.
+        """
+        self._layout = layout or self._layout
+        np.copyto(self.baseline, calibration.baseline, where=zeroed)
+        rules = _Rules.of(self._layout, settings, calibration)
+        for part in self._parts:
+            part.renew(rules, zeroed)
 
     def step(
         self,
@@ -120,20 +138,20 @@ class Pipeline:
             raw: uint8[m], the bytes.
             present: bool[m], which of them were received.
             t_ns: time of the sweep.
-            pressures: False if nobody wants the pressures of this part: they are then only
-                worked out while something touches it.
+            pressures: False if the pressures of this part are not subscribed: they are then only
+                computed while something touches it.
         """
         return self._parts[part_index].step(raw, present, t_ns, pressures)
 
-    def take_zero(self, taxels: NDArray[np.int32], baseline: NDArray[np.float64]) -> None:
-        """Go on from new baselines: a board has taken its zero anew.
+    def set_zero(self, taxels: NDArray[np.int32], baseline: NDArray[np.float64]) -> None:
+        """Continue from new baselines, because a board was zeroed.
 
-        What was received of the taxels before is told against the old zero, so it is forgotten:
-        they are untouched until their next sample.
+        Earlier samples of the taxels refer to the old zero, so they are forgotten: the taxels are
+        untouched until their next sample.
 
         Args:
             taxels: int32[k], which ones.
-            baseline: float64[k], theirs from now on, in units.
+            baseline: float64[k], their new baselines, in units.
         """
         self.baseline[taxels] = baseline
         anew = np.zeros(len(self.baseline), np.bool_)
@@ -142,92 +160,95 @@ class Pipeline:
             part.begin_anew(anew)
 
     def seq(self, part_index: int) -> int:
-        """Number of the part's next frame."""
+        """Return the number of the part's next frame."""
         return self._parts[part_index].seq
 
+    def decides_kpa(self, part_index: int) -> float:
+        """Return the pressure that every usable taxel of a part detects within a second."""
+        return self._parts[part_index].decides_kpa
+
     def frozen(self, part_index: int) -> Mask:
-        """Taxels [m] of a part that have been touched for so long that it is told."""
+        """Return taxels [m] of a part that have been touched for so long that it is reported."""
         return self._parts[part_index].drift.frozen
 
     def at_limit(self, part_index: int) -> Mask:
-        """Taxels [m] of a part whose baseline has drifted as far as it may."""
+        """Return taxels [m] of a part whose baseline has drifted to its limit."""
         return self._parts[part_index].drift.at_limit
 
 
-class _PartPipeline:
-    """One part's share of the flat arrays, and scratch to work in without new memory."""
+@dataclass(frozen=True, slots=True)
+class _Rules:
+    """Values derived from settings and calibration, over the whole skin."""
 
-    def __init__(
-        self,
-        skin: Pipeline,
-        layout: Layout,
-        part: PartLayout,
-        settings: Processing,
-        believed: Mask,
-        curve: PressureCurve,
-        on_units: NDArray[np.float64],
-        sure_at_units: NDArray[np.float64],
-    ) -> None:
+    settings: Processing
+    usable: Mask
+    curve: PressureCurve | TableCurve
+    curves: Curves | None
+    levels: Levels
+
+    @classmethod
+    def of(cls, layout: Layout, settings: Processing, calibration: Calibration) -> "_Rules":
+        usable = calibration.usable & (layout.pad_kind == PadKind.PRESSURE)
+        common = common_curve(layout, settings.pressure, calibration.gain, calibration.bend)
+        curves = calibration.curves
+        curve = common if curves is None else with_own(common, curves)
+        above = calibration.percentile - calibration.baseline
+        found = levels(above, calibration.spread, settings.touch)
+        return cls(settings, usable, curve, curves, found)
+
+    def part(self, mine: slice) -> "_Rules":
+        """Return those of some of the taxels; unusable taxels are never touched."""
+        usable = self.usable[mine]
+        found = self.levels
+        return _Rules(
+            self.settings,
+            usable,
+            self.curve.part(mine),
+            self.curves,
+            Levels(
+                np.where(usable, found.enter[mine], np.inf),
+                np.where(usable, found.leave[mine], np.inf),
+                found.span[mine],
+                found.hold[mine],
+                found.fall[mine],
+                found.votes[mine],
+            ),
+        )
+
+
+class _PartPipeline:
+    """One part's share of the flat arrays, and work arrays that are reused."""
+
+    def __init__(self, skin: Pipeline, layout: Layout, part: PartLayout, rules: _Rules) -> None:
         self._mine = mine = slice(part.start, part.stop)
         m = part.n_taxels
         self._name = part.name
         self.seq = 0
         self._t_ns: int | None = None
-        self._believed = believed = believed[mine]
-        self._curve = curve = curve.part(mine)
         self._no_load = layout.no_load[mine].astype(np.float64)
         self._thermal = layout.pad_kind[mine] == PadKind.THERMAL
         self._has_thermal = bool(self._thermal.any())
-
-        # A model that may be stepped once a window is: the pipeline takes means anyway. Steps
-        # of a second are large enough for float32.
-        chosen = settings.relaxation
-        own_means = chosen.model in OWN_MEANS
-        windowed = chosen.update_s > 0.0 and not own_means
-        self._every_sample = not windowed
-        self._relaxation = make_model(
-            chosen.model,
-            m,
-            parameters_of(chosen),
-            update_s=chosen.update_s if own_means else 0.0,
-            dtype=np.float32 if windowed else np.float64,
-        )
-        self._window_s = chosen.update_s if windowed else WINDOW_S
         self._relaxation_kpa = skin.relaxation_kpa[mine]
-        self.drift = BaselineTracker(
-            skin.baseline[mine], believed, layout.triangle_of[mine], self._thermal, settings.drift
-        )
-
-        # A taxel that is not believed has a flat curve: it needs no masks later on.
-        self._square = np.where(believed, curve.square, 0.0).astype(np.float32)
-        self._linear = np.where(believed, curve.linear, 0.0).astype(np.float32)
-        self._beyond_units = np.where(believed, curve.beyond_units, np.inf).astype(np.float32)
-        self._units_per_kpa = np.where(believed, 1.0 / np.maximum(curve.linear, 1e-9), 0.0)
-        on_units = on_units[mine]
-        off_units = np.maximum(on_units - settings.touch.hysteresis_units, 0.0)
-        near_units = np.minimum(on_units, curve.beyond_units)
-        self._near_units = np.where(believed, near_units, np.inf).astype(np.float32)
-        on_kpa = np.where(believed, curve.kpa(on_units), np.inf).astype(np.float32)
-        self._imprints = Imprints(on_kpa)
-        self._detector = TouchDetector(
-            on_kpa,
-            np.where(believed, curve.kpa(off_units), np.inf).astype(np.float32),
-            settings.touch.votes_of_3,
-            np.where(believed, curve.kpa(sure_at_units[mine]), np.inf).astype(np.float32),
-        )
-
         self._zeros = _constant(np.zeros(m, np.float32))
-        self._offset = np.empty(m, np.float32)
-        self._slope = np.empty(m, np.float32)
-        self._level = np.empty(m, np.float32)
-        self._near_raw = np.empty(m, np.uint8)
-        self._beyond_raw = np.empty(m, np.uint8)
-        self._renew_limits()
-        self._last_raw = self._untouched_raw()
-        self._bytes = np.empty(m, np.float32)
-        self._near = np.empty(m, np.bool_)
         self._nowhere = _constant(np.zeros(m, np.bool_))
-        self._always_valid = _constant(believed.copy())
+        self._offset = np.empty(m, np.float32)
+        self._beyond_raw = np.empty(m, np.uint8)
+        self._shifted = np.empty(m, np.uint8)
+        self._near = np.empty(m, np.bool_)
+
+        rules = rules.part(mine)
+        self._set_model(rules)
+        self.drift = BaselineTracker(
+            skin.baseline[mine],
+            rules.usable,
+            layout.triangle_of[mine],
+            self._thermal,
+            rules.settings.drift,
+        )
+        self._detector = TouchDetector(rules.levels, rules.settings.touch.votes_of_3)
+        self._residuals = Residuals(m)
+        self._adopt(rules)
+        self._last_raw = self._untouched_raw()
 
         self._rows = np.zeros((ROWS, m), np.float32)
         self._row = list(self._rows)
@@ -242,25 +263,111 @@ class _PartPipeline:
         self._was_missing = np.zeros(m, np.bool_)
         self._since_glance_s = 0.0
 
+    def renew(self, rules: _Rules, zeroed: Mask) -> None:
+        before = self._rules
+        rules = rules.part(self._mine)
+        zeroed = zeroed[self._mine]
+        other_model = rules.settings.relaxation != before.settings.relaxation
+        other_foam = rules.curves is not before.curves
+        if other_foam or (other_model and rules.curves is None):
+            self._set_model(rules)
+        self._detector.configure(rules.levels, rules.settings.touch.votes_of_3)
+        self.drift.renew(rules.usable, zeroed, rules.settings.drift)
+        if any_of(zeroed):
+            for model in (self._relaxation, self._own):
+                if model is not None:
+                    model.reset(zeroed)
+            self._relaxation_kpa[zeroed] = 0.0
+            self._residuals.reset(zeroed)
+            self._rows[:, zeroed] = 0.0
+            self._sum_kpa[zeroed] = 0.0
+            self._was_touched[zeroed] = False
+            self._noted = self._nowhere
+        self._adopt(rules)
+        self._begin_anew(zeroed)
+
+    def _adopt(self, rules: _Rules) -> None:
+        """Compute what each sweep needs from the rules."""
+        self._rules = rules
+        self._curve = curve = rules.curve
+        self._usable = usable = rules.usable
+        self._reader: Reader
+        if isinstance(curve, TableCurve):
+            self._reader = Tables(curve, usable)
+        else:
+            self._reader = Parabolas(curve, usable)
+        self._beyond_units = np.where(usable, curve.beyond_units, np.inf).astype(np.float32)
+        self._units_per_kpa = np.where(usable, 1.0 / np.maximum(curve.linear, 1e-9), 0.0)
+        self._enter = np.where(usable, rules.levels.enter, 0.0)
+        self._enter_kpa = curve.kpa(self._enter)
+        # The reading of a single measurement that counts in full.
+        whole = self._enter + rules.settings.touch.hysteresis_units / 2
+        firm = curve.kpa(whole + rules.levels.fall)
+        on = np.where(usable, curve.kpa(whole), np.inf)
+        self._residuals.configure(on, firm, rules.levels.votes)
+        decides = curve.kpa(np.where(usable, rules.levels.decides, 0.0))
+        self.decides_kpa = float(decides.max(initial=0.0))
+        self._always_valid = _constant(usable.copy())
+        self._renew_limits()
+
+    def _set_model(self, rules: _Rules) -> None:
+        """Start a new relaxation model; a foam model that was fitted with curves replaces the
+        configured one.
+        """
+        self._relaxation_kpa.fill(0.0)
+        self._relaxation: Model | None = None
+        self._own: _OwnCurves | None = None
+        self._every_sample = False
+        self._window_s = WINDOW_S
+        if rules.curves is not None and isinstance(rules.curve, TableCurve):
+            smoothing_s = rules.settings.pressure.smoothing_s
+            self._own = _OwnCurves(rules.curve, rules.curves, self._mine, smoothing_s)
+            return
+        # A model that permits it is stepped once a window, because the pipeline takes means anyway.
+        # Steps of a second are large enough for float32.
+        chosen: Relaxation = rules.settings.relaxation
+        own_means = chosen.model in OWN_MEANS
+        windowed = chosen.update_s > 0.0 and not own_means
+        self._every_sample = not windowed
+        self._relaxation = make_model(
+            chosen.model,
+            len(self._relaxation_kpa),
+            parameters_of(chosen),
+            held=own_means and chosen.update_s > 0.0,
+            dtype=np.float32 if windowed else np.float64,
+        )
+        if windowed:
+            self._window_s = chosen.update_s
+
     def step(
         self, raw: NDArray[np.uint8], present: Mask, t_ns: int, pressures: bool
     ) -> PressureFrame:
-        dt_s = self._dt_s(t_ns)
+        dt_s, gap_s = self._dt_s(t_ns)
         raw = raw.copy()
+        own = self._own
+        if own is not None:
+            present = own.without_rails(raw, present, self._offset)
         valid = self._receive(raw, present)
-        quiet = not self._every_sample and self._is_quiet()
+        if gap_s > 0.0:
+            self._bridge(gap_s)
+        if own is not None and own.erratic.any:
+            valid = valid & ~own.erratic.pads
+        idle = self._detector.is_idle(self._last_raw)
+        touched = self._nowhere if idle else self._decide(valid, dt_s)
+        quiet = touched is self._nowhere and not self._residuals.any and not self._every_sample
         if quiet and not pressures and not self._due(dt_s):
             self._elapsed_s += dt_s
             self._skipped += 1
             return self._frame(t_ns, raw, valid, self._zeros, self._nowhere, self._nowhere, False)
         self._since_glance_s = 0.0
-        beyond = self._nowhere if quiet else self._beyond()
+        cut_off = b"\xff" in self._last_raw.tobytes()
+        beyond = self._beyond() if cut_off or not (idle and quiet) else self._nowhere
         corrected = self._corrected_kpa(beyond, dt_s)
-        touched = self._nowhere if quiet else self._detector.step(corrected)
         self._gather(touched, dt_s)
         if not quiet:
-            touched = self._imprints.step(touched, corrected)
-        pressure = np.fmax(corrected, self._zeros)
+            repeated = None if idle else self._detector.repeated
+            touched = self._residuals.step(touched, corrected, repeated)
+        pressure = np.fmax(corrected if own is None else own.reported_kpa, self._zeros)
         if valid is not self._always_valid:
             missing = ~valid
             pressure[missing] = 0.0
@@ -271,11 +378,14 @@ class _PartPipeline:
     def begin_anew(self, taxels: Mask) -> None:
         """Forget the last samples of some taxels, bool[n] over the skin: baselines are new."""
         anew = taxels[self._mine]
-        if not any_of(anew):
-            return
-        self._renew_limits()
-        self._last_raw = np.where(anew, self._untouched_raw(), self._last_raw)
-        self._detector.reset(anew)
+        if any_of(anew):
+            self.drift.forget(anew)
+            self._renew_limits()
+            self._begin_anew(anew)
+
+    def _begin_anew(self, taxels: Mask) -> None:
+        self._last_raw = np.where(taxels, self._untouched_raw(), self._last_raw)
+        self._detector.reset(taxels)
 
     def _frame(
         self,
@@ -290,24 +400,45 @@ class _PartPipeline:
         seq, self.seq = self.seq, self.seq + 1
         return PressureFrame(self._name, seq, t_ns, raw, pressure, touched, valid, beyond, computed)
 
-    def _dt_s(self, t_ns: int) -> float:
+    def _dt_s(self, t_ns: int) -> tuple[float, float]:
+        """Return the step to this sweep, and the time before it that is a gap."""
         last, self._t_ns = self._t_ns, t_ns
         if last is None:
-            return 0.0
-        return min(max((t_ns - last) * 1e-9, 0.0), LONGEST_STEP_S)
+            return 0.0, 0.0
+        dt_s = max((t_ns - last) * 1e-9, 0.0)
+        return min(dt_s, LONGEST_STEP_S), max(dt_s - LONGEST_STEP_S, 0.0)
+
+    def _bridge(self, gap_s: float) -> None:
+        """Advance the foam's model through a gap, under the readings after it."""
+        self._residuals.fade(gap_s)
+        self.drift.pass_gap(gap_s)
+        if self._relaxation is None:
+            return
+        if self._samples:
+            self._end_window()
+        momentary = self._part_kpa
+        self._reader.kpa(self._last_raw, momentary)
+        beyond = self._beyond()
+        if beyond is not self._nowhere:
+            momentary[beyond] = self._beyond_kpa(beyond)
+        if not self._every_sample:
+            np.add(momentary, self._relaxation_kpa, out=momentary)
+        np.fmax(momentary, self._zeros, out=momentary)
+        self._relaxation.step(momentary, gap_s, self._relaxation_kpa)
+        self._renew_limits()
 
     def _due(self, dt_s: float) -> bool:
-        """Whether a quiet sweep is worked out all the same: for the means, and at their end."""
+        """Whether a quiet sweep is computed anyway: for the means, and at their end."""
         self._since_glance_s += dt_s
-        return self._since_glance_s >= GLANCE_S or self._elapsed_s + dt_s >= self._window_s
+        return self._since_glance_s >= IDLE_UPDATE_S or self._elapsed_s + dt_s >= self._window_s
 
     def _receive(self, raw: NDArray[np.uint8], present: Mask) -> Mask:
         """Take in the bytes; return which are valid."""
         if b"\0" not in present.tobytes():
             self._last_raw = raw
             return self._always_valid
-        valid: Mask = present & self._believed
-        # What was not received is taken to be as it was: the foam does not forget.
+        valid: Mask = present & self._usable
+        # Values that were not received are taken as unchanged: the foam does not forget.
         self._last_raw = np.where(valid, raw, self._last_raw)
         if np.array_equal(valid, self._always_valid):
             return self._always_valid
@@ -317,42 +448,45 @@ class _PartPipeline:
     def _untouched_raw(self) -> NDArray[np.uint8]:
         return np.rint(np.clip(self._offset, 0.0, 255.0)).astype(np.uint8)
 
-    def _is_quiet(self) -> bool:
-        """Whether no taxel can be touched, nor was in the samples that still have a vote."""
-        if not self._detector.idle:
-            return False
-        np.less_equal(self._last_raw, self._near_raw, out=self._near)
-        return not any_of(self._near)
+    def _decide(self, valid: Mask, dt_s: float) -> Mask:
+        """Return which taxels are touched, `_nowhere` if none is."""
+        unheard = None if valid is self._always_valid else ~valid
+        touched = self._detector.step(self._last_raw, dt_s, unheard)
+        return touched if self._detector.any else self._nowhere
 
     def _beyond(self) -> Mask:
-        """Which taxels read more than their calibrated range."""
-        np.less(self._last_raw, self._beyond_raw, out=self._near)
+        """Return which taxels read more than their calibrated range, or an end of the scale."""
+        # After this 255 is 0, which is below every limit.
+        np.add(self._last_raw, np.uint8(1), out=self._shifted)
+        np.less_equal(self._shifted, self._beyond_raw, out=self._near)
+        np.logical_and(self._near, self._usable, out=self._near)
         return self._near.copy() if any_of(self._near) else self._nowhere
 
     def _corrected_kpa(self, beyond: Mask, dt_s: float) -> Floats:
-        """Equation (1) with the relaxation taken off, laid aside for the means.
-
-        With the byte r that is (square r + slope) r + level. Below zero activation the square
-        adds nothing that matters to any use of it.
-        """
+        """Return the momentary pressure minus the relaxation, and store it for the means."""
         row = self._row[self._laid]
-        self._bytes[...] = self._last_raw
-        np.multiply(self._bytes, self._square, out=row)
-        np.add(row, self._slope, out=row)
-        np.multiply(row, self._bytes, out=row)
-        np.add(row, self._level, out=row)
+        self._reader.kpa(self._last_raw, row)
+        if self._own is not None:
+            self._own.step(row, dt_s, self._relaxation_kpa)
+            np.subtract(row, self._relaxation_kpa, out=row)
+            return row
         if beyond is not self._nowhere:
-            units = self._offset[beyond] - self._last_raw[beyond]
-            row[beyond] = self._curve.part(beyond).kpa(units)
-            if not self._every_sample:
-                row[beyond] -= self._relaxation_kpa[beyond]
-        if self._every_sample:
-            self._relaxation.step(row, dt_s, self._relaxation_kpa)
+            row[beyond] = self._beyond_kpa(beyond)
+        if self._every_sample and self._relaxation is not None:
+            # Foam is not pulled: a taxel with too low a reading has nothing to relax from.
+            pressed = np.fmax(row, self._zeros, out=self._part_kpa)
+            self._relaxation.step(pressed, dt_s, self._relaxation_kpa)
             np.subtract(row, self._relaxation_kpa, out=row)
         return row
 
+    def _beyond_kpa(self, beyond: Mask) -> NDArray[np.float64]:
+        """Return the common curve beyond its calibrated range."""
+        units = self._offset[beyond] - self._last_raw[beyond]
+        kpa = self._curve.part(beyond).kpa(units)
+        return kpa if self._every_sample else kpa - self._relaxation_kpa[beyond]
+
     def _gather(self, touched: Mask, dt_s: float) -> None:
-        """Count the sample for the window's means; at its end bring up to date what is slow."""
+        """Add the sample to the window's means; at its end update the slow state."""
         self._laid += 1
         if self._laid == ROWS:
             self._fold()
@@ -361,22 +495,36 @@ class _PartPipeline:
         if touched is not self._noted:
             np.logical_or(self._was_touched, touched, out=self._was_touched)
             self._noted = touched
-        if self._elapsed_s < self._window_s:
-            return
+        if self._elapsed_s >= self._window_s:
+            self._end_window()
+
+    def _end_window(self) -> None:
+        """Update the slow state from the means of the window."""
         self._fold()
-        units: NDArray[np.float64] = self._sum_kpa / self._samples * self._units_per_kpa
+        units = self._units(np.divide(self._sum_kpa, self._samples, dtype=np.float64))
+        relaxed_units = np.multiply(self._relaxation_kpa, self._units_per_kpa, dtype=np.float64)
         if self._has_thermal:
             np.subtract(self._offset, self._last_raw, out=units, where=self._thermal)
-        if not self._every_sample:
-            # Within the window the relaxation was constant, and what was skipped was untouched.
+        if self._relaxation is not None and not self._every_sample:
+            # Within the window the relaxation was constant, and skipped sweeps were untouched.
             momentary = self._part_kpa
             np.multiply(self._sum_kpa, 1.0 / (self._samples + self._skipped), out=momentary)
             np.add(momentary, self._relaxation_kpa, out=momentary)
+            np.fmax(momentary, self._zeros, out=momentary)
             self._relaxation.step(momentary, self._elapsed_s, self._relaxation_kpa)
-        ghosts = self.drift.step(units, self._was_touched, self._was_missing, self._elapsed_s)
+        if self._own is not None:
+            self._own.erratic.pass_time(self._elapsed_s)
+        before = self.drift.baseline.copy()
+        ghosts = self.drift.step(
+            units, self._was_touched, self._was_missing, self._elapsed_s, relaxed_units
+        )
+        if self._own is not None:
+            slow = RISE_UNITS_PER_S * self._elapsed_s
+            rise = np.where(self._was_touched, 0.0, slow)
+            ghosts = self._own.hold_rises(self.drift, before, rise, slow, ghosts)
         if ghosts is not None:
             self._detector.reset(ghosts)
-        self._imprints.fade(self._elapsed_s)
+        self._residuals.fade(self._elapsed_s)
         self._renew_limits()
         self._sum_kpa.fill(0.0)
         self._samples = 0
@@ -386,30 +534,124 @@ class _PartPipeline:
         self._noted = self._nowhere
         self._was_missing.fill(False)
 
+    def _units(self, kpa: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return mean activations [m] in units; the bend of the curve matters only far from
+        zero.
+        """
+        if isinstance(self._curve, TableCurve):
+            return np.where(self._usable, self._curve.units(kpa), 0.0)
+        units = kpa * self._units_per_kpa
+        far = np.abs(units) > STRAIGHT_UNITS
+        if any_of(far):
+            curve, c = self._curve.part(far), kpa[far]
+            # Below zero the bytes are converted by the parabola, too.
+            below = np.minimum(c, 0.0)
+            root = np.sqrt(curve.linear**2 + 4.0 * curve.square * below)
+            units[far] = np.where(c < 0.0, 2.0 * below / (curve.linear + root), curve.units(c))
+        return units
+
     def _fold(self) -> None:
+        if self._own is not None:
+            self._own.erratic.look(self._rows[: self._laid])
         np.add.reduce(self._rows[: self._laid], axis=0, out=self._part_kpa)
         np.add(self._sum_kpa, self._part_kpa, out=self._sum_kpa)
         self._laid = 0
 
     def _renew_limits(self) -> None:
-        """The parabola of each taxel, and the bytes from which on it may be touched or beyond."""
-        offset, slope, level = self._offset, self._slope, self._level
+        """Compute the curve at each byte, and the bytes from which on it may be touched or beyond
+        range.
+        """
+        offset = self._offset
         np.subtract(self._no_load, self.drift.baseline, out=offset, casting="same_kind")
-        np.multiply(self._square, offset, out=slope)
-        np.add(slope, self._linear, out=level)
-        np.multiply(level, offset, out=level)
-        np.add(slope, slope, out=slope)
-        np.add(slope, self._linear, out=slope)
-        np.negative(slope, out=slope)
-        if not self._every_sample:
-            np.subtract(level, self._relaxation_kpa, out=level)
-        # The curve bends down, so this many units are at least needed to make up for the
-        # relaxation; the decision itself is made on the pressure.
-        needed = np.fmax(self._relaxation_kpa, self._zeros)
-        np.multiply(needed, self._units_per_kpa, out=needed, casting="same_kind")
-        np.add(needed, self._near_units, out=needed)
-        _as_bytes(offset - needed + 1e-3, self._near_raw)
-        _as_bytes(np.ceil(offset - self._beyond_units), self._beyond_raw)
+        self._reader.renew(offset)
+        if self._relaxation is not None and not self._every_sample:
+            self._reader.lower(self._relaxation_kpa)
+        # A press must exceed the relaxation of the foam.
+        zero = offset
+        relaxed = self._relaxation_kpa > RELAXED_KPA
+        if any_of(relaxed):
+            zero = offset.copy()
+            needed_kpa = self._enter_kpa[relaxed] + self._relaxation_kpa[relaxed]
+            needed = self._curve.part(relaxed).units(needed_kpa)
+            zero[relaxed] -= needed - self._enter[relaxed]
+        self._detector.renew(zero)
+        # At 0 the reading is cut off in any case.
+        _as_bytes(np.fmax(np.ceil(offset - self._beyond_units), 1.0), self._beyond_raw)
+
+
+class _OwnCurves:
+    """Extra state of taxels with own curves: smoothing, memory, and detection of jumps.
+
+    Attributes:
+        erratic: which of them jump.
+        reported_kpa: float32[m], the smoothed pressure minus the relaxation; of the last step.
+    """
+
+    def __init__(self, curve: TableCurve, curves: Curves, mine: slice, smoothing_s: float) -> None:
+        own, noise = curves.own[mine], curves.noise_units[mine]
+        m = len(own)
+        self._own = own
+        limit = np.where(own, limit_kpa(curve, noise), 0.0)
+        self._smoother = StepFilter(limit, smoothing_s, np.float32)
+        self._memory = make_memory(m, curves.memory, np.float32)
+        self.erratic = Erratic(np.where(own, step_kpa(curve, noise), np.inf))
+        self.reported_kpa = np.zeros(m, np.float32)
+
+    def step(self, momentary: Floats, dt_s: float, relaxation_kpa: Floats) -> None:
+        """Take the momentary pressures [m]; write the relaxation [m]."""
+        smooth = self._smoother.step(momentary, dt_s)
+        if self._memory is not None:
+            self._memory.step(smooth, dt_s, relaxation_kpa)
+        np.subtract(smooth, relaxation_kpa, out=self.reported_kpa)
+
+    def hold_rises(
+        self,
+        drift: BaselineTracker,
+        before: NDArray[np.float64],
+        rise: NDArray[np.float64],
+        slow: float,
+        drifted: NDArray[np.intp] | None,
+    ) -> NDArray[np.intp] | None:
+        """Limit baselines to a slow rise, in place.
+
+        A load that grows slowly, or has nearly gone, reads like drift; on a skin with known curves
+        it is
+        more probable than drift.
+
+        Args:
+            drift: with the baselines [m] that it would have.
+            before: float64[m], the baselines of the window before.
+            rise: float64[m], how much they may rise.
+            slow: how much those of `drifted` may rise.
+            drifted: touched taxels whose touch would be drift.
+
+        Returns:
+            Those of `drifted` that are: the others stay touched while their baselines rise.
+        """
+        highest = before + rise
+        if drifted is not None:
+            slowly = before[drifted] + slow
+            highest[drifted] = np.maximum(slowly, drift.calibrated[drifted])
+            reached = drift.baseline[drifted] <= highest[drifted]
+            drifted = drifted[reached | ~self._own[drifted]]
+        np.minimum(drift.baseline, highest, out=drift.baseline, where=self._own)
+        return drifted if drifted is not None and len(drifted) else None
+
+    def reset(self, taxels: Mask) -> None:
+        """Forget the readings of taxels [m]."""
+        self._smoother.reset(taxels)
+        self.erratic.reset(taxels)
+        if self._memory is not None:
+            self._memory.reset(taxels)
+
+    def without_rails(self, raw: NDArray[np.uint8], present: Mask, offset: Floats) -> Mask:
+        """Leave out bytes at the ends of the range: 0, and 255 far from rest, are not readings."""
+        data = raw.tobytes()
+        if b"\0" not in data and b"\xff" not in data:
+            return present
+        rail = (raw == 0) | ((raw == 255) & (offset < RESTING_NEAR_RAIL))
+        left: Mask = present & ~(rail & self._own)
+        return left
 
 
 def _as_bytes(levels: Floats, out: NDArray[np.uint8]) -> None:

@@ -10,8 +10,8 @@ Array = NDArray[np.float64]
 #: The paper's fit to taxel 2 with 5 and 6 mm probes.
 A_KPA_PER_FF2 = -0.001132
 B_KPA_PER_FF = 0.8141
-#: Equation (1) turns back at its vertex. From this share of the vertex's pressure on its
-#: tangent takes over, and the reading counts as beyond the calibrated range.
+#: Equation (1) turns back at its vertex. From this share of the vertex's pressure on, its tangent
+#: is used, and the reading counts as beyond the calibrated range.
 TANGENT_FROM = 0.9
 
 
@@ -28,8 +28,7 @@ class PressureCurve:
 
     Continued so that it never turns back: linear below zero activation, and by its tangent
     from 0.9 of the vertex's pressure (131.7 kPa, 246 fF at the paper's parameters). The
-    continuation keeps the order of pressures but is no calibration: `beyond_units` tells
-    where it begins.
+    continuation keeps the order of pressures but is not a calibration; it begins at `beyond_units`.
 
     Attributes:
         square, linear: coefficients [n] of the activation in units: C = square x^2 + linear x.
@@ -82,7 +81,7 @@ class PressureCurve:
         return result
 
     def units(self, kpa: ArrayLike) -> Array:
-        """Return the activation [..., n] in units that reads as these pressures; inverse of kpa."""
+        """Return the activation [..., n] in units for these pressures; inverse of kpa."""
         c = np.asarray(kpa, dtype=np.float64)
         safe_linear = np.where(self.linear > 0.0, self.linear, 1.0)
         finite_end = np.where(np.isfinite(self.beyond_units), self.beyond_units, 0.0)
@@ -92,7 +91,7 @@ class PressureCurve:
             np.inf,
         )
         inside = np.clip(c, 0.0, end_kpa)
-        # The form without cancellation, right for square = 0 too.
+        # The form without cancellation, also right for square = 0.
         root = np.sqrt(np.maximum(self.linear**2 + 4.0 * self.square * inside, 0.0))
         rising = 2.0 * inside / np.where(self.linear > 0.0, self.linear + root, 1.0)
         beyond = np.where(c > end_kpa, c - inside, 0.0)

@@ -1,66 +1,98 @@
-"""Does a pad repeat itself? Bytes that one and the same word of its chip explains say nothing new.
+"""Detects pads that repeat: a byte has no new information if the same word of its chip explains it.
 
-Without temperature compensation that is: the same byte as before. With it the board takes
-the noise of a thermal pad from every byte, so a pad that is stuck goes on moving. But the
-thermal pad's own byte tells what was taken, up to its rounding: each byte gives bounds of
-the chip's word, and a run of bytes is a repetition as long as one word lies in all of them.
-The thermal pad's noise even helps: words that shift against the bytes' edges leave a working
-pad less room than a byte does.
+Without temperature compensation that is the same byte as before. With it the board subtracts the
+noise of a temperature pad from every byte, so that the bytes of a stuck pad keep changing. But the
+temperature pad's own byte shows what was subtracted, up to its rounding: each byte gives bounds of
+the chip's word, and a run of bytes is a repetition as long as one word lies in all of them. The
+temperature pad's noise even helps: words that shift against the bytes' edges leave a working pad
+less room than a byte does.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.bus.protocol.compensation import THERMAL_TAXEL, drift_of
+from skin_host.bus.protocol.compensation import NO_GAIN, THERMAL_TAXEL, drift_of
 
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 
 
-#: So many bits may be left out for the words that a byte stands for to fit into 64 bits.
+#: At most this many bits may be left out, for the words that a byte stands for to fit into 64 bits.
 MOST_SHIFT = 4
 
 
-class Repeats:
-    """Watches the words behind the bytes of the k triangles of one board.
+class Encoding(NamedTuple):
+    """How a triangle's bytes are derived from its chip's words.
 
-    Args:
-        gains: of each triangle, x128 per taxel, `compensation.thermal_gains`.
-        shifts: of each triangle, bits that its bytes leave out.
+    Attributes:
+        gain: x128 per taxel, `compensation.thermal_gains`.
+        shift: bits that the bytes leave out.
         no_load: the byte of an untouched pad.
         truncates: how the board rounds, see `compensation.drift_of`.
     """
 
-    def __init__(
-        self, gains: list[tuple[int, ...]], shifts: list[int], no_load: int, *, truncates: bool
-    ) -> None:
-        self._gain = np.array(gains) / 128
-        # Coarser bytes hide what compensation does to them.
-        self._compensated = bool(self._gain.any()) and max(shifts) <= MOST_SHIFT
+    gain: tuple[int, ...]
+    shift: int
+    no_load: int
+    truncates: bool
+
+
+class Repeats:
+    """Watches the words behind the bytes of k triangles.
+
+    Args:
+        encodings: of each triangle.
+    """
+
+    def __init__(self, encodings: list[Encoding]) -> None:
+        self._gain = np.array([one.gain for one in encodings]) / 128
+        # Coarser bytes hide the effect of the compensation on them.
+        plain = [one.shift > MOST_SHIFT or not any(one.gain) for one in encodings]
+        self._plain = np.flatnonzero(plain)
+        self._compensated = not all(plain)
         if not self._compensated:
             return
-        kinds = sorted(set(zip(gains, shifts, strict=True)))
-        tables = [_words(gain, shift, no_load, truncates) for gain, shift in kinds]
+        encodings = [
+            Encoding(NO_GAIN, 0, 0, False) if of_bytes else one
+            for one, of_bytes in zip(encodings, plain, strict=True)
+        ]
+        kinds = sorted(set(encodings))
+        tables = [_words(*kind) for kind in kinds]
         self._lowest = np.concatenate([lowest for lowest, _ in tables])
         self._pattern = np.concatenate([pattern for _, pattern in tables])
-        # At an end of its scale the thermal pad does not tell what was taken.
+        # At an end of its scale the temperature pad does not show what was subtracted.
         scale = np.arange(256)
-        tells = [((scale > 0) & (scale < 255)) | (not any(gain)) for gain, _ in kinds]
-        self._tells = np.concatenate(tells)[:, None]
-        self._kind = np.array([256 * kinds.index(kind) for kind in zip(gains, shifts, strict=True)])
-        self._shift = np.array(shifts, np.int64)[:, None]
+        self._tells = np.tile((scale > 0) & (scale < 255), len(kinds))[:, None]
+        self._kind = np.array([256 * kinds.index(one) for one in encodings])
+        self._shift = np.array([one.shift for one in encodings], np.int64)[:, None]
         self._base = np.zeros(self._gain.shape, np.int64)
         self._possible = np.zeros(self._gain.shape, np.uint64)
 
     @property
     def shifted(self) -> Mask:
-        """bool[k, 12], pads whose words compensation moves against the edges of their bytes."""
-        return (self._gain > 0.0) & self._compensated
+        """Return pads whose words compensation moves against the edges of their bytes, bool[k,
+        12].
+        """
+        shifted = self._gain > 0.0
+        shifted[self._plain] = False
+        return shifted
+
+    def keep(self, before: "Repeats", rows: Mask) -> None:
+        """Take over the state of a predecessor for the same triangles, for some of them
+        (bool[k]).
+        """
+        if self._compensated:
+            self._base[rows] = before._base[rows]
+            self._possible[rows] = before._possible[rows]
 
     def own_noise(self, noise_units: Floats) -> Floats:
-        """Noise float64[k, 12] of the words, given that of the bytes (standard deviations)."""
+        """Return the noise float64[k, 12] of the words, given that of the bytes (standard
+        deviations).
+        """
         taken = self._gain * noise_units[:, THERMAL_TAXEL, None]
-        # The difference of two estimates may be anything where much was taken.
+        # The difference of two estimates may have any value where much was subtracted.
         own: Floats = np.sqrt(np.maximum(noise_units**2 - taken**2, noise_units**2 / 4))
         return own
 
@@ -70,11 +102,11 @@ class Repeats:
         Args:
             raw: uint8[k, 12].
             changed: bool[k, 12], bytes that differ from those before.
-            within: bool[k, 12], bytes that came, now and before, from within their scale.
+            within: bool[k, 12], bytes that were, now and before, within their scale.
 
         Returns:
             moved: bool[k, 12], no word explains this byte and all those since the last move.
-            told: bool[k, 12], whether there was anything to tell.
+            decidable: bool[k, 12], whether the byte could show a move.
         """
         if not self._compensated:
             return changed, within
@@ -89,13 +121,16 @@ class Repeats:
         moved: Mask = (self._possible == 0) & told
         np.copyto(self._base, base, where=moved)
         np.copyto(self._possible, words, where=moved)
+        if len(self._plain):
+            moved[self._plain] = changed[self._plain]
+            told[self._plain] = within[self._plain]
         return moved, told
 
 
 def _words(
     gain: tuple[int, ...], shift: int, no_load: int, truncates: bool
 ) -> tuple[NDArray[np.int64], NDArray[np.uint64]]:
-    """Which words a byte may stand for, given the byte of the thermal pad.
+    """Return which words a byte may stand for, given the byte of the temperature pad.
 
     Returns:
         lowest: int64[256, 12], the lowest word, less the byte's own share of it.

@@ -1,14 +1,14 @@
-"""Single pads that stand still in a triangle that is otherwise alive.
+"""Detects single stuck pads in a triangle that otherwise works.
 
-A pad is stuck when it repeats itself (`repeats`) for longer than chance allows. What chance
-allows is not told by how often the pad moves at all. Of a pad that reads 240 in 6 of 10
-samples, 239 and 241 in 2 each, 44 % of all samples repeat the one before. But a long run is
-spent at 240, where 60 % repeat. So moves are counted out of runs that have begun, and a run
-of k more repeats, after m moves in n such samples, has the probability
-B(m, n - m + k) / B(m, n - m) (Bayes' rule), which is (1 - m/n)^k where n is large.
+A pad is stuck when it repeats (`repeats`) for longer than chance allows. How often the pad moves
+in general does not show what chance allows. Of a pad that reads 240 in 6 of 10 samples, 239 and
+241 in 2 each, 44 % of all samples repeat the one before. But a long run is spent at 240, where
+60 % repeat. So moves are counted out of runs that have begun, and a run of k more repeats, after m
+moves in n such samples, has the probability B(m, n - m + k) / B(m, n - m) (Bayes' rule), which is
+(1 - m/n)^k where n is large.
 
-This is slow by nature. Per sample a repetition tells -ln(p) of the pad's commonest byte, 0.4
-to 0.9 at the noise of a hand's pads (0.4 to 0.8 units), and `ODDS` ask for 25.3.
+This is slow in principle. Per sample a repetition gives the information -ln(p) of the pad's
+commonest byte, 0.4 to 0.9 at the noise of a hand's pads (0.4 to 0.8 units), and `ODDS` need 25.3.
 """
 
 import math
@@ -20,39 +20,42 @@ from skin_host.processing.masks import Mask, any_of
 from skin_host.processing.repeats import Repeats
 
 Floats = NDArray[np.float64]
+#: Triangles: all, or their numbers.
+Rows = slice | NDArray[np.intp]
 
-#: A run with a probability below 1/odds is not chance. 2000 taxels at 20 Hz begin some 10^11
-#: runs a year.
+#: A run with a probability below 1/odds is not chance. 2000 taxels at 20 Hz begin some 10^11 runs a
+#: year.
 ODDS = 1e11
-#: A run has begun after so many repeats.
+#: A run has begun after this many repeats.
 BEGUN = 2
 #: Moves are counted over about this time, in steps of about this many samples.
 MEMORY_S = 300.0
 STEP_SAMPLES = 20
-#: A calibration is worth so many samples of runs that have begun.
+#: A calibration counts as this many samples of runs that have begun.
 CALIBRATED_SAMPLES = 100
-#: No pad is taken to move more often than in so many of its samples, nor to have less noise.
+#: The assumed share of samples in which a pad moves is at most this, and its noise at least this.
 MOST_RATE = 0.8
 LEAST_NOISE_UNITS = 0.1
 #: A quiet pad at the edge between two bytes moves often until it drifts away from there. Its rate
-#: is taken for no more than so many times that of one that rests in the middle.
+#: is assumed to be at most this multiple of that of a pad in the middle of a byte.
 RESTING_MARGIN = 1.25
-#: A repeat while something else is touched weighs one in so much.
+#: While something else is touched, this many repeats count as one.
 TOUCHED_PACE = 6
-#: So many moves make a stuck pad believable again.
+#: After this many moves a stuck pad is valid again.
 PROBATION_MOVES = 3
 LONGEST_RUN = 1e6
 NEWTON_STEPS = 8
 
 
 class StuckPads:
-    """Watches the pads of the k triangles of one board.
+    """Watches the pads of the k triangles of some boards, equally many of each.
 
     Args:
         noise_units: float64[k, 12], calibrated noise of the bytes.
-        share: how many of its samples are new conversions, 0 to 1.
-        period_s: how often the board sends.
-        repeats: tells which pads say something new.
+        share: float64[k], how many of the samples are new conversions, 0 to 1.
+        period_s: float64[k], how often the board of each triangle sends.
+        repeats: finds which pads send something new.
+        boards: how many boards.
 
     Attributes:
         stuck: bool[k, 12].
@@ -61,12 +64,14 @@ class StuckPads:
     """
 
     def __init__(
-        self, noise_units: Floats, share: float, period_s: float, repeats: Repeats
+        self, noise_units: Floats, share: Floats, period_s: Floats, repeats: Repeats, boards: int
     ) -> None:
         shape = noise_units.shape
+        share, period_s = share[:, None], period_s[:, None]
         self._repeats = repeats
-        self._begun = math.ceil(BEGUN / share)
-        self._forget = min(1.0, STEP_SAMPLES * period_s / MEMORY_S)
+        self._boards = boards
+        self._begun = np.ceil(BEGUN / share)
+        self._forget = np.minimum(1.0, STEP_SAMPLES * period_s / MEMORY_S)
         resting = share * rate_in_run(repeats.own_noise(noise_units))
         most = np.where(repeats.shifted, MOST_RATE, RESTING_MARGIN * resting)
         self._most = np.minimum(most, MOST_RATE)
@@ -76,10 +81,11 @@ class StuckPads:
         self._to_show = np.zeros(shape, np.int64)
         self._new_seen = np.zeros(shape)
         self._new_moved = np.zeros(shape, np.int64)
-        self._samples = 0
+        self._samples = np.zeros(boards, np.int64)
         self.stuck: Mask = np.zeros(shape, np.bool_)
         self.any_stuck = False
-        self._renew_limits()
+        self.longest = np.zeros(shape)
+        self._renew_limits(slice(None))
 
     def step(
         self,
@@ -88,31 +94,37 @@ class StuckPads:
         compared: Mask,
         unproven: Mask,
         touched: Mask | None,
+        came: Mask | None = None,
     ) -> None:
-        """Take one sweep.
+        """Take one sweep of some boards.
 
         Args:
             raw: uint8[k, 12].
             changed: bool[k, 12], bytes that differ from those before.
-            compared: bool[k], triangles that came now and before.
-            unproven: bool[k], triangles that are not believed at all.
-            touched: bool[k, 12], pads that were touched a moment ago, if any was.
+            compared: bool[k], triangles that were received now and before.
+            unproven: bool[k], triangles that are not valid as a whole.
+            touched: bool[k, 12], recently touched pads, if there are any.
+            came: bool[boards], boards whose sweep this is, all by default.
         """
         within = inside(raw) & compared[:, None]
         moved, told = self._repeats.step(raw, changed, within)
         run = self._run
-        if touched is None:
-            # A run counts when it ends: one that does not may be no chance.
-            ended = moved & (run >= self._begun)
+        # A run counts when it ends: a run without an end may not be chance.
+        ended = moved & (run >= self._begun)
+        more: Floats | Mask = told
+        if touched is not None:
+            # A touch that only the pad itself feels does not count: the pad may be stuck there.
+            felt = touched.reshape(self._boards, -1).sum(axis=1)
+            of_triangles = np.repeat(felt, len(touched) // self._boards)[:, None]
+            ended &= of_triangles == 0
+            more = told / np.where(of_triangles > touched, TOUCHED_PACE, 1)
+        if any_of(ended):
             np.add(self._new_seen, run - (self._begun - 1), out=self._new_seen, where=ended)
             self._new_moved += ended
-            run += told
-        else:
-            # What a pad feels all by itself is no excuse: it may be stuck there.
-            run += told / np.where(np.count_nonzero(touched) > touched, TOUCHED_PACE, 1)
+        run += more
         np.copyto(run, 0.0, where=moved)
-        self._samples += 1
-        if self._samples >= STEP_SAMPLES:
+        self._samples += 1 if came is None else came
+        if int(self._samples.max()) >= STEP_SAMPLES:
             self._learn(unproven)
         too_long = run > self.longest
         if not self.any_stuck and not any_of(too_long):
@@ -125,25 +137,31 @@ class StuckPads:
         self.any_stuck = any_of(self.stuck)
 
     def _learn(self, unproven: Mask) -> None:
-        """Let the rates follow what was seen of pads that live."""
-        lives = ~self.stuck & ~unproven[:, None]
-        keep = np.where(lives, 1.0 - self._forget, 1.0)
-        self._seen = self._seen * keep + np.where(lives, self._new_seen, 0.0)
-        self._moved = self._moved * keep + np.where(lives, self._new_moved, 0)
-        self._new_seen[:] = 0.0
-        self._new_moved[:] = 0
-        self._samples = 0
-        self._renew_limits()
+        """Update the rates of boards with enough samples, for pads that work."""
+        enough = self._samples >= STEP_SAMPLES
+        rows: Rows = slice(None)
+        if not enough.all():
+            rows = np.flatnonzero(np.repeat(enough, len(unproven) // self._boards))
+        lives = ~self.stuck[rows] & ~unproven[rows, None]
+        keep = np.where(lives, 1.0 - self._forget[rows], 1.0)
+        self._seen[rows] = self._seen[rows] * keep + np.where(lives, self._new_seen[rows], 0.0)
+        self._moved[rows] = self._moved[rows] * keep + np.where(lives, self._new_moved[rows], 0)
+        self._new_seen[rows] = 0.0
+        self._new_moved[rows] = 0
+        self._samples[enough] = 0
+        self._renew_limits(rows)
 
-    def _renew_limits(self) -> None:
-        rate = np.minimum(self._moved / np.maximum(self._seen, 1.0), self._most)
-        self.longest = self._begun + longest_run(rate, self._seen, ODDS)
+    def _renew_limits(self, rows: Rows) -> None:
+        seen = self._seen[rows]
+        rate = np.minimum(self._moved[rows] / np.maximum(seen, 1.0), self._most[rows])
+        self.longest[rows] = self._begun[rows] + longest_run(rate, seen, ODDS)
 
 
 def rate_in_run(noise_units: Floats) -> Floats:
-    """How often a pad leaves the byte in which it rests, given the noise of its bytes (units).
+    """Return how often a pad leaves the byte in which it rests, given the noise of its bytes
+    (units).
 
-    Of a normal distribution in the middle of a byte, 1 - erf(1 / (2 sqrt(2) sigma)): no place
+    For a normal distribution in the middle of a byte, 1 - erf(1 / (2 sqrt(2) sigma)): no place
     between two bytes keeps a pad for longer. Rounding has added 1/12 to the variance.
     """
     sigma = np.sqrt(np.maximum(noise_units**2 - 1.0 / 12.0, LEAST_NOISE_UNITS**2))
@@ -152,16 +170,18 @@ def rate_in_run(noise_units: Floats) -> Floats:
 
 
 def longest_run(rate: Floats, samples: Floats | float, odds: float) -> Floats:
-    """How many samples without a change are less probable than 1/odds.
+    """Return how many samples without a change are less probable than 1/odds.
 
     Args:
         rate: share of samples with a change.
-        samples: of how many it was seen.
+        samples: number of samples in which it was seen.
         odds: of the run.
 
-    The sum of ln((n + i) / (n - c + i)) over a run is taken as its integral, which is concave
-    in the run: Newton's method from 0 comes up to the root and never beyond it, exact for
-    runs below 1000 and to 1 % for the longest. A rate of 0 allows a run without end.
+    The sum of ln((n + i) / (n - c + i)) over a run is taken as its integral, which is concave in
+    the
+    run: Newton's method from 0 approaches the root and never exceeds it, exact for runs below 1000
+    and
+    to 1 % for the longest. A rate of 0 allows a run without end.
     """
     still = np.maximum((1.0 - rate) * samples, 0.5)
     n = np.maximum(samples, still)
@@ -176,6 +196,6 @@ def longest_run(rate: Floats, samples: Floats | float, odds: float) -> Floats:
 
 
 def inside(raw: NDArray[np.uint8]) -> Mask:
-    """Bytes that are not at an end of the scale: those cannot tell whether their pad moves."""
+    """Return bytes that are not at an end of the scale: at an end, a pad's moves do not show."""
     mask: Mask = raw - np.uint8(1) < np.uint8(254)  # 0 wraps to 255
     return mask

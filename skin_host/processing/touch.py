@@ -1,188 +1,356 @@
-"""The touch decision (paper, section V-B), with a vote and hysteresis."""
+"""The touch decision: evidence of each taxel, accumulated measurement by measurement.
+
+The paper (section V-B) compares each sample with a threshold two units above the 95th percentile
+of the untouched readings. On real skin noise reaches that all the time: its standard deviation is
+0.7 to 1.5 units on most pads and 4 to 6 on one in twenty, while 40 kPa are 3.5 units. So the
+threshold here is one for lasting changes: two units above the untouched mean. What a measurement
+reads above it, minus what later ones read below it, is evidence (Page's cumulative sum), and a
+taxel is touched when its evidence reaches its span. The span of each taxel is chosen so that its
+noise alone gets there once in `ODDS` measurements. A quiet taxel needs two measurements for that,
+a noisy one an average over as many as its noise requires, and a firm press always two.
+"""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.processing.masks import Mask
+from skin_host.processing.conversions import CONVERSION_S, Conversions
+from skin_host.processing.masks import Mask, any_of
 from skin_host.settings import Touch
 
 Array = NDArray[np.floating]
 Floats = NDArray[np.float64]
-#: Samples that have a vote.
-VOTERS = 3
 HALF_UNIT = 0.5
-#: Three samples in a row above the first, or two of three above the second, happen by chance once
-#: in some 10^5 hours of a taxel at 20 Hz. Of the first alone two of three come every 20 hours.
-NOISE_DEVIATIONS = 3.6
-SURE_DEVIATIONS = 5.0
-#: What a press leaves in the foam that no model takes off: a share of it, and the time in which
-#: that falls to 1/e. On the emulated foam, after 30 to 200 kPa of 0.5 to 8 s, about 3 % at
-#: first, 2 % after a second and 1 % after five.
-IMPRINT_SHARE = 0.03
-IMPRINT_S = 5.0
+#: Noise alone causes a touch once in this many measurements of a taxel: 10^4 hours at 27 a second.
+ODDS = 1e9
+#: A random walk passes a level by this many standard deviations of its step, in the mean
+#: (Siegmund, Sequential Analysis, 1985, chapter X).
+OVERSHOOT_DEVIATIONS = 1.166
+#: A noisy taxel is given the threshold at which it decides on the smallest press in this time.
+DECIDE_S = 1.0
+#: A touch accumulates at most this many spans of evidence. Fewer make noisy taxels flicker, more
+#: make them release late.
+HOLD_SPANS = 1.5
+#: A firm press ends after at most this many measurements.
+RELEASE_MEASUREMENTS = 14
+#: No threshold and no span is less, whatever the settings: rounding is not evidence.
+LEAST_UNITS = 0.1
+#: Residual that a press leaves in the foam and that no model removes: its share of the press, and
+#: the time in which it falls to 1/e. On the emulated foam, after 30 to 200 kPa of 0.5 to 8 s, about
+#: 3 % at first, 2 % after a second and 1 % after five.
+RESIDUAL_SHARE = 0.03
+RESIDUAL_S = 5.0
+#: A residual of less than this share of the threshold causes no touch.
+LEAST_RESIDUAL = 0.05
+#: Weight of a new sample in the mean that is compared with the residual.
+MEAN_SHARE = 0.25
+#: A repeated fall by this many standard deviations of a measurement is not noise.
+FALL_DEVIATIONS = 4.0
 
 
-def threshold_units(
-    percentile_units: Floats, baseline_units: Floats, noise_units: Floats, settings: Touch
-) -> Floats:
-    """Return the activation [n] above the baseline from which on a taxel counts as touched.
+@dataclass(frozen=True, slots=True)
+class Levels:
+    """Where n taxels begin and end to be touched, float64[n] in units above the baseline.
 
-    The paper: at least the 95th percentile of the calibration plus a margin of two units.
-    Readings are whole units, so half a unit less is the same rule; and it stays the same
-    when the baseline has followed drift by a fraction of a unit.
-
-    With more than about one unit of noise that margin is too small for a skin of thousands
-    of taxels: a noisy taxel keeps so many standard deviations of its noise instead.
+    Attributes:
+        enter: a lasting reading above this becomes a touch.
+        leave: a lasting reading below this ends it.
+        span: evidence that makes a touch.
+        hold: the most evidence of a touch, which must be gone at its end.
+        fall: readings that are this much lower, `votes` times in a row, are not noise.
+        votes: int64[n], measurements that a press of twice the threshold takes.
     """
-    above = percentile_units - baseline_units + settings.margin_units - HALF_UNIT
-    at_least = np.maximum(NOISE_DEVIATIONS * noise_units, settings.minimum_threshold_units)
-    return np.maximum(above, at_least)
+
+    enter: Floats
+    leave: Floats
+    span: Floats
+    hold: Floats
+    fall: Floats
+    votes: NDArray[np.int64]
+
+    @property
+    def decides(self) -> Floats:
+        """Return the activation [n] that becomes a touch within `DECIDE_S`."""
+        return self.enter + self.span * CONVERSION_S / DECIDE_S
 
 
-def sure_units(threshold: Floats, noise_units: Floats) -> Floats:
-    """The activation [n] from which on two of three samples are enough: noise does not get there.
+def levels(above: Floats, spread: Floats, settings: Touch) -> Levels:
+    """Return the levels of n taxels.
 
-    Below it, at the threshold, a press must last for a third sample.
+    Args:
+        above: float64[n], 95th percentile of the untouched readings above their mean, in units.
+        spread: float64[n], standard deviation of a measurement derived from sums of measurements:
+            more than that of single ones where noise lasts.
+        settings: margin and hysteresis.
+
+    The margin covers lasting changes that are not noise: drift, rounding, the effect of a press
+    next
+    to the taxel. Readings are whole units, so half a unit less is the same rule; and it stays the
+    same
+    when the baseline has followed drift by a fraction of a unit. The percentile counts at most as
+    that
+    of a byte: the span covers larger noise.
     """
-    return np.maximum(threshold, SURE_DEVIATIONS * noise_units)
+    margin = settings.margin_units - HALF_UNIT + np.minimum(above, HALF_UNIT)
+    margin = np.maximum(margin, max(settings.minimum_threshold_units, LEAST_UNITS))
+    band = np.minimum(settings.hysteresis_units, margin)
+    # With n measurements a press of `enter` + span / n is detected; the least of that:
+    best = spread * math.sqrt(math.log(ODDS) / 2 * CONVERSION_S / DECIDE_S)
+    enter = np.maximum(margin - band / 2, best)
+    span = np.maximum(_span(enter, spread), np.maximum(band, LEAST_UNITS))
+    # A reading near its threshold must not flicker, and the sum of noise goes far.
+    leave = enter - enter / 2 * (1.0 - band / span)
+    hold = np.maximum(span, np.minimum(2 * (span - band), HOLD_SPANS * span))
+    votes = np.clip(np.ceil(span / enter), 2, RELEASE_MEASUREMENTS)
+    fall = FALL_DEVIATIONS * spread * np.sqrt(2 / votes)
+    return Levels(enter, leave, span, hold, fall, votes.astype(np.int64))
+
+
+def _span(enter: Floats, spread: Floats) -> Floats:
+    """Evidence [n] that noise of so many units reaches once in `ODDS` measurements.
+
+    The mean time to a false alarm of a cumulative sum is exp(2 k b) / (2 k^2) steps, with the
+    drift k of its steps and the bound b, overshoot included, in standard deviations (Siegmund).
+    """
+    deviation = np.maximum(spread, 1e-6)
+    drift = enter / deviation
+    bound = np.log(ODDS * np.maximum(2 * drift**2, 1.0)) / (2 * drift)
+    return deviation * (bound - OVERSHOOT_DEVIATIONS)
 
 
 class TouchDetector:
-    """Which of n taxels are touched: enough of the last three samples at the threshold.
+    """Decides which of the n taxels of a part are touched.
 
-    With two votes these must be sure, or else three at the threshold. A touched taxel needs only
-    the lower release threshold to stay so. The signal and the thresholds may be in any unit, as
-    long as it is the same.
+    Each new measurement adds its excess above `enter` to the evidence of its taxel, or subtracts
+    what
+    it is below. No measurement counts for more than one vote: a touch begins and ends with at least
+    that many.
 
     Args:
-        on, off: [n], thresholds of touch and of release.
-        votes: of the last three samples, how many are needed.
-        sure: [n], from which on two votes are enough; `on` if not given.
+        found: levels [n] of the taxels; infinite where a taxel must never be touched.
+        votes: least number of measurements for a touch.
+
+    Attributes:
+        touched: bool[n]; see `step`.
+        any: whether any is.
+        repeated: bool[n], which taxels only repeated a measurement in the last step.
     """
 
-    def __init__(self, on: Array, off: Array, votes: int = 2, sure: Array | None = None) -> None:
-        if np.any(off > on):
-            raise ValueError("a release threshold lies above the threshold of touch")
-        self._on = np.array(on)
-        self._off = np.array(off)
-        self._sure = self._on if sure is None else np.array(sure)
-        self._threshold = self._on.copy()
-        self._votes = votes
-        n = self._on.shape[0]
-        self.touched: Mask = np.zeros(n, dtype=np.bool_)
-        #: Of this sample, the last and the one before: at the threshold; sure.
-        self._over = [np.zeros(n, dtype=np.bool_) for _ in range(VOTERS)]
-        self._certain = [np.zeros(n, dtype=np.bool_) for _ in range(VOTERS)]
-        self._next: Mask = np.zeros(n, dtype=np.bool_)
-        self._scratch: Mask = np.zeros(n, dtype=np.bool_)
+    def __init__(self, found: Levels, votes: int = 2) -> None:
+        n = len(found.enter)
+        self._none = np.zeros(n, np.float32)
+        self._zero = np.zeros(n, np.float32)
+        self._conversions = Conversions(n)
+        self._evidence = np.zeros(n, np.float32)
+        self._gain = np.empty(n, np.float32)
+        self._over: Mask = np.empty(n, np.bool_)
+        self._limit = np.empty(n, np.float32)
+        self._near = np.zeros(n, np.uint8)
+        self.touched: Mask = np.zeros(n, np.bool_)
         self._bits = self.touched.tobytes()
-        self._alike = VOTERS
-        self._none = True
+        self._reads: Mask = np.empty(n, np.bool_)
+        self.repeated: Mask = np.zeros(n, np.bool_)
+        self.any = False
+        self._clear = True
+        self._skipped = True
+        self.configure(found, votes)
 
-    def step(self, signal: Array) -> Mask:
-        """Take one sample [n]; return which taxels are touched [n].
+    def configure(self, found: Levels, votes: int) -> None:
+        """Use other levels from now on; touched taxels stay touched."""
+        self._enter = found.enter.astype(np.float32)
+        self._leave = found.leave.astype(np.float32)
+        self._span = found.span.astype(np.float32)
+        # A little more than its share, because rounding would otherwise require one vote more.
+        self._vote = self._span * np.float32((1 + 1e-5) / votes)
+        self._hold = found.hold.astype(np.float32)
+        self._veto = -self._hold * np.float32((1 + 1e-5) / votes)
+        # What was gathered against other levels is no evidence against these.
+        np.copyto(self._evidence, np.where(self.touched, self._hold, self._none))
+        self._set_limits()
 
-        A sample that is not a number counts as below any threshold. The answer is the same
-        array as before as long as nothing has changed, and is never written to again.
+    def renew(self, zero: Array) -> None:
+        """Set the readings [n] that are no activation, the foam's relaxation included."""
+        np.copyto(self._zero, zero, casting="same_kind")
+        self._set_limits()
+
+    def is_idle(self, raw: NDArray[np.uint8]) -> bool:
+        """Return whether a sweep of bytes [n] changes nothing and can be skipped.
+
+        That is so when nothing is touched, no taxel has evidence and none reads any.
         """
-        over = self._over[0]
-        np.greater_equal(signal, self._threshold, out=over)
-        bits = over.tobytes()
+        if self.any:
+            return False
+        np.less(raw, self._near, out=self._reads)
+        if any_of(self._reads):
+            return False
+        if not self._clear:
+            self._clear = not np.count_nonzero(self._evidence)
+            if not self._clear:
+                return False
+        self._skipped = True
+        return True
+
+    def step(self, raw: NDArray[np.uint8], dt_s: float, unheard: Mask | None = None) -> Mask:
+        """Take one sweep; return which taxels are touched [n].
+
+        The result is the same array as before as long as nothing has changed, and is never
+        written to again.
+
+        Args:
+            raw: uint8[n]; must not be written to afterwards.
+            dt_s: time since the sweep before.
+            unheard: bool[n], taxels that were not received: their evidence does not change.
+        """
+        if self._skipped:
+            self._skipped = False
+            self._conversions.forget()
+        self.repeated = repeated = self._conversions.step(raw, dt_s)
+        gain, evidence = self._gain, self._evidence
+        np.subtract(self._limit, raw, out=gain)
+        np.minimum(gain, self._vote, out=gain)
+        np.maximum(gain, self._veto, out=gain)
+        np.copyto(gain, self._none, where=repeated)
+        if unheard is not None:
+            gain[unheard] = 0.0
+        np.add(evidence, gain, out=evidence)
+        np.maximum(evidence, self._none, out=evidence)
+        np.minimum(evidence, self._hold, out=evidence)
+        np.greater_equal(evidence, self._bar, out=self._over)
+        bits = self._over.tobytes()
         if bits != self._bits:
-            self._bits, self._alike, self._none = bits, 0, bits.find(1) < 0
-        elif self._alike >= VOTERS:
-            return self.touched
-        self._alike += 1
-        np.greater_equal(signal, self._sure, out=self._certain[0])
-        self._vote()
+            self._bits = bits
+            self.any = bits.find(1) >= 0
+            self.touched = self._over.copy()
+            self._set_limits()
+        self._clear = False
         return self.touched
-
-    @property
-    def idle(self) -> bool:
-        """Whether nothing is touched or has a vote, so that a sample below all thresholds
-        changes nothing and need not be taken.
-        """
-        return self._none and self._alike >= VOTERS
 
     def reset(self, taxels: NDArray[np.intp] | Mask) -> None:
         """Forget that some taxels, by number or mask [n], were touched."""
         self.touched = self.touched.copy()
-        for state in (self.touched, *self._over[1:], *self._certain[1:]):
-            state[taxels] = False
-        self._threshold[taxels] = self._on[taxels]
-        self._alike = 0
+        self.touched[taxels] = False
+        self._evidence[taxels] = 0.0
+        self._bits = self.touched.tobytes()
+        self.any = self._bits.find(1) >= 0
+        self._set_limits()
 
-    def _vote(self) -> None:
-        touched, scratch = self._next, self._scratch
-        over, last, before = self._over
-        if self._votes == 1:
-            np.copyto(touched, over)
-        else:
-            # Three in a row begin a touch, or two of three that are sure.
-            np.logical_and(over, last, out=touched)
-            np.logical_and(touched, before, out=touched)
-            if self._votes == 2:
-                _two_of_three(self._certain, scratch)
-                np.logical_or(touched, scratch, out=touched)
-                _two_of_three(self._over, scratch)
-            else:
-                # Letting go needs as many votes as touching.
-                np.logical_or(last, before, out=scratch)
-                np.logical_or(scratch, over, out=scratch)
-            np.logical_and(scratch, self.touched, out=scratch)
-            np.logical_or(touched, scratch, out=touched)
-        for samples in (self._over, self._certain):
-            samples.insert(0, samples.pop())
-        np.not_equal(touched, self.touched, out=scratch)
-        if np.count_nonzero(scratch):
-            self.touched = touched.copy()
-            np.copyto(self._threshold, np.where(touched, self._off, self._on))
+    def _set_limits(self) -> None:
+        """Set the reading of each taxel below which its evidence grows, for touched and untouched
+        ones.
+        """
+        touched = self.touched
+        np.subtract(self._zero, np.where(touched, self._leave, self._enter), out=self._limit)
+        # A touched taxel stays touched as long as there is any evidence.
+        self._bar = np.where(touched, self._hold * np.float32(1e-4), self._span)
+        np.copyto(self._near, np.clip(np.ceil(self._limit - 1e-3), 0.0, 255.0), casting="unsafe")
 
 
-def _two_of_three(samples: list[Mask], out: Mask) -> None:
-    now, last, before = samples
-    np.logical_or(last, before, out=out)
-    np.logical_and(out, now, out=out)
-    # The third pair; the array is free until the next sample is taken.
-    np.logical_and(last, before, out=before)
-    np.logical_or(out, before, out=out)
+class Residuals:
+    """Selects which of n touched taxels to report: not those that feel only a residual.
 
+    A taxel that was released is reported as touched again when its reading exceeds the threshold by
+    the residual. A firm press ends when it has fallen to its residual: by evidence alone that takes
+    long, because the residual is nearly enough to keep a touch. The baselines still follow the
+    decision before: what is left may be drift, and then it lasts.
 
-class Imprints:
-    """Which of n touched taxels to tell of: not those that feel but what a press has left.
-
-    A taxel that was let go of is told as touched again when it feels that much more than the
-    threshold. The decision before stays as it is for whoever follows baselines: what is left
-    may be drift, and then it lasts.
+    Attributes:
+        any: whether any is reported.
     """
 
-    def __init__(self, on: Array) -> None:
-        self._on = np.array(on)
+    def __init__(self, n: int) -> None:
+        self._on = np.zeros(n, np.float32)
+        self._firmer = np.zeros(n, np.float32)
+        self._votes = np.full(n, 2, np.int64)
         #: The hardest press of each taxel, fading.
-        self._pressed = np.zeros_like(self._on)
-        self._told: Mask = np.zeros(len(self._on), dtype=np.bool_)
-        self._seen = self._told
-        self._any = False
+        self._pressed = np.zeros(n, np.float32)
+        self._felt = np.zeros(n, np.float32)
+        self._fallen = np.zeros(n, np.int64)
+        self._reported: Mask = np.zeros(n, dtype=np.bool_)
+        self._seen = self._reported
+        self._which: NDArray[np.intp] = np.zeros(0, np.intp)
+        self.any = False
         self._undecided = False
 
-    def step(self, touched: Mask, signal: Array) -> Mask:
-        """Take one decision [n] and the signal [n] that it was made on.
+    def configure(self, on: Array, firm: Array, votes: NDArray[np.int64]) -> None:
+        """Use other rules from now on.
 
-        As with the decision, the answer is the same array as long as nothing has changed.
+        Args:
+            on: float[n], activations that count in full, in kPa.
+            firm: float[n], activations that noise does not take below `on`.
+            votes: int[n], measurements in a row that end a firm press.
+        """
+        np.copyto(self._on, on, casting="same_kind")
+        firmer = np.where(np.isfinite(on), firm, 0.0) - np.where(np.isfinite(on), on, 0.0)
+        np.copyto(self._firmer, np.fmax(firmer, on), casting="same_kind")
+        self._votes = votes
+
+    def step(self, touched: Mask, signal: Array, repeated: Mask | None = None) -> Mask:
+        """Take one decision [n] and the signal [n] that it was based on, in kPa.
+
+        As with the decision, the result is the same array as long as nothing has changed.
+
+        Args:
+            touched: bool[n].
+            signal: float[n].
+            repeated: bool[n], which of them only repeat a measurement.
         """
         if self._undecided or touched is not self._seen:
-            self._seen = touched
-            told = touched & (self._told | (signal >= self._on + IMPRINT_SHARE * self._pressed))
-            self._any = bool(np.count_nonzero(told))
-            self._undecided = not np.array_equal(told, touched)
-            if not np.array_equal(told, self._told):
-                self._told = told
-        if self._any:
-            np.fmax(self._pressed, signal, out=self._pressed, where=self._told)
-        return self._told
+            self._begin_and_end(touched, signal)
+        if self.any:
+            self._end_fallen(signal, repeated)
+        return self._reported
+
+    def _begin_and_end(self, touched: Mask, signal: Array) -> None:
+        # A sample is noisy: a taxel's signal is its fading mean since it was touched.
+        known = touched & self._seen
+        felt = self._felt + np.where(known, MEAN_SHARE, 1.0) * (signal - self._felt)
+        np.copyto(self._felt, felt, where=~self._reported, casting="same_kind")
+        self._seen = touched
+        left = RESIDUAL_SHARE * self._pressed
+        enough = (left < LEAST_RESIDUAL * self._on) | (self._felt >= self._on + left)
+        self._report(touched & (self._reported | enough))
+        self._undecided = not np.array_equal(self._reported, touched)
+
+    def _end_fallen(self, signal: Array, repeated: Mask | None) -> None:
+        """End touches that have fallen from a firm press to its residual."""
+        which = self._which
+        now, felt = signal[which], self._felt[which]
+        pressed = np.fmax(self._pressed[which], now)
+        self._pressed[which] = pressed
+        bar = self._on[which] + RESIDUAL_SHARE * pressed
+        fallen = (now < bar) & (felt >= bar + self._firmer[which])
+        counts = np.where(fallen, self._fallen[which] + 1, 0)
+        # The earlier mean is kept while the fall is observed.
+        felt = np.where(fallen, felt, felt + MEAN_SHARE * (now - felt))
+        if repeated is not None:
+            again = repeated[which]
+            counts = np.where(again, self._fallen[which], counts)
+            felt = np.where(again, self._felt[which], felt)
+        self._fallen[which] = counts
+        self._felt[which] = felt
+        ended = which[counts >= self._votes[which]]
+        if len(ended):
+            self._felt[ended] = signal[ended]
+            reported = self._reported.copy()
+            reported[ended] = False
+            self._report(reported)
+            self._undecided = True
+
+    def _report(self, reported: Mask) -> None:
+        if not np.array_equal(reported, self._reported):
+            self._fallen[reported & ~self._reported] = 0
+            self._reported = reported
+            self._which = np.flatnonzero(reported)
+            self.any = bool(len(self._which))
 
     def fade(self, dt_s: float) -> None:
-        """Let what earlier presses left fade for so long."""
-        self._pressed *= math.exp(-dt_s / IMPRINT_S)
+        """Let the residuals of earlier presses fade for this time."""
+        self._pressed *= math.exp(-dt_s / RESIDUAL_S)
+
+    def reset(self, taxels: Mask) -> None:
+        """Forget the presses on some taxels [n]."""
+        self._pressed[taxels] = 0.0
+        self._report(self._reported & ~taxels)
+        self._undecided = True

@@ -1,1 +1,1 @@
-"""What is said to the world and how: messages, MQTT, recordings."""
+"""Output: messages, MQTT, recordings."""

@@ -1,17 +1,24 @@
-"""How to reach a broker, from settings or a URL: its address, our name to it, and TLS.
+"""Address of a broker, from settings or a URL, with our name at it, and TLS.
 
 The password comes from a file or from systemd's credentials and is never shown.
 """
 
 import os
 import ssl
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from hashlib import sha256
 from pathlib import Path
-from typing import Literal
-from urllib.parse import unquote, urlsplit
+from typing import TYPE_CHECKING, Literal
+from urllib.parse import SplitResult, unquote, urlsplit
 
 from skin_host.errors import ConfigurationError, RequestError
-from skin_host.settings import Mqtt
+
+if TYPE_CHECKING:
+    from skin_host.settings import Mqtt
+
+
+class CredentialError(ConfigurationError):
+    """The file with the password cannot be read, which may change."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +42,11 @@ class Broker:
         return self.protocol == "5"
 
     @classmethod
-    def from_settings(cls, settings: Mqtt, folder: Path = Path()) -> "Broker":
+    def from_settings(cls, settings: "Mqtt", folder: Path = Path()) -> "Broker":
         """Read the files that `settings` name; relative names start in `folder`.
 
         Raises:
+            CredentialError: the password cannot be read.
             ConfigurationError: one of them cannot be used.
         """
         return cls(
@@ -50,6 +58,40 @@ class Broker:
             _tls(settings, folder),
             settings.keepalive_s,
         )
+
+    @classmethod
+    def all_from_settings(
+        cls, settings: "Mqtt", folder: Path = Path(), name: str = ""
+    ) -> list["Broker"]:
+        """Return the brokers of `settings`, in the order in which a node of this name tries them.
+
+        Each name has a different order, so that nodes spread over the brokers, and those of a lost
+        broker
+        over all others.
+
+        Raises:
+            see `from_settings`.
+        """
+        first = cls.from_settings(settings, folder)
+        if not settings.brokers:
+            return [first]
+        brokers = [first._at(address) for address in settings.brokers]
+        if len({str(broker) for broker in brokers}) < len(brokers):
+            raise ConfigurationError("mqtt.brokers: one of them is named twice")
+        if len(brokers) > 1 and not first.v5:
+            raise ConfigurationError(
+                f'mqtt.brokers: {len(brokers)} brokers need mqtt.protocol = "5", by which '
+                "subscribers distinguish new messages from old ones"
+            )
+        return sorted(brokers, key=lambda one: sha256(f"{name}|{one}".encode()).digest())
+
+    def _at(self, address: str) -> "Broker":
+        try:
+            parts = urlsplit(f"//{address}")
+            port = parts.port or self.port
+        except ValueError as error:
+            raise ConfigurationError(f'mqtt.brokers: "{address}": {error}') from None
+        return replace(self, host=parts.hostname or self.host, port=port)
 
     @classmethod
     def from_url(cls, url: str, protocol: Literal["5", "3.1.1"] = "5") -> tuple["Broker", str]:
@@ -89,13 +131,31 @@ class Broker:
             port or (8883 if secure else 1883),
             protocol,
             username=unquote(parts.username) if parts.username else None,
-            password=unquote(parts.password) if parts.password else None,
+            password=unquote(parts.password) if parts.password else _from_environment(parts),
             tls=_default_context() if secure else None,
         )
         return broker, unquote(parts.path).strip("/")
 
 
-def _password(settings: Mqtt, folder: Path) -> str | None:
+def _from_environment(parts: SplitResult) -> str | None:
+    """Return the password of a URL with a user but without one, because process lists show URLs.
+
+    Raises:
+        RequestError: the file that the environment names cannot be read.
+    """
+    file = os.environ.get("SKIN_MQTT_PASSWORD_FILE")
+    if not parts.username:
+        return None
+    if file is None:
+        return os.environ.get("SKIN_MQTT_PASSWORD")
+    try:
+        return Path(file).read_text(encoding="utf-8").rstrip("\r\n")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8"
+        raise RequestError(f"SKIN_MQTT_PASSWORD_FILE: {file}: {reason}") from None
+
+
+def _password(settings: "Mqtt", folder: Path) -> str | None:
     if settings.password_file is not None:
         if settings.username is None:
             raise ConfigurationError("mqtt.password_file: needs mqtt.username too")
@@ -111,12 +171,12 @@ def _password(settings: Mqtt, folder: Path) -> str | None:
         password = path.read_text(encoding="utf-8").rstrip("\r\n")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8"
-        raise ConfigurationError(f"mqtt.password_file: {path}: {reason}") from None
+        raise CredentialError(f"mqtt.password_file: {path}: {reason}") from None
     return password or None
 
 
 class _TlsSocket(ssl.SSLSocket):
-    """A socket that paho leaves open when the handshake fails, so it closes itself."""
+    """A socket that closes itself, because paho leaves it open when the handshake fails."""
 
     def do_handshake(self, block: bool = False) -> None:
         try:
@@ -132,7 +192,7 @@ def _default_context(ca_file: Path | None = None) -> ssl.SSLContext:
     return context
 
 
-def _tls(settings: Mqtt, folder: Path) -> ssl.SSLContext | None:
+def _tls(settings: "Mqtt", folder: Path) -> ssl.SSLContext | None:
     files = {
         "ca_file": settings.ca_file,
         "certificate_file": settings.certificate_file,
@@ -154,7 +214,7 @@ def _tls(settings: Mqtt, folder: Path) -> ssl.SSLContext | None:
         if settings.certificate_file is not None:
             where = "certificate_file"
             key_file = None if settings.key_file is None else folder / settings.key_file
-            # Without a password of our own OpenSSL would ask for one on the terminal.
+            # If no password is given, OpenSSL would ask for one on the terminal.
             context.load_cert_chain(folder / settings.certificate_file, key_file, password="")
     except (OSError, ValueError) as error:
         raise ConfigurationError(f"mqtt.{where}: not usable for TLS: {error}") from None

@@ -1,6 +1,6 @@
-"""A broker of one's own for the demo: mosquitto if it is there, else one within Python.
+"""A local broker for the demo: mosquitto if it is installed, otherwise one within Python.
 
-Both listen on this machine only, on a free port, take everybody and remember nothing.
+Both listen on this machine only, on a free port, accept every client and store nothing.
 """
 
 import asyncio
@@ -20,12 +20,12 @@ from skin_host.errors import BrokerError
 
 HOST = "127.0.0.1"
 START_S = 10.0
-#: Where Debian and others put mosquitto, which is not on everybody's PATH.
+#: Where Debian and others install mosquitto, which may not be on the PATH.
 _MORE_PLACES = ("/usr/sbin", "/usr/local/sbin")
 
 
 class LocalBroker(NamedTuple):
-    """A broker that runs: where, and which."""
+    """A running broker: its address and kind."""
 
     host: str
     port: int
@@ -38,8 +38,13 @@ class LocalBroker(NamedTuple):
 
     @property
     def url(self) -> str:
-        """What `Broker.from_url` takes."""
+        """Return the URL for `Broker.from_url`."""
         return f"mqtt://{self.host}:{self.port}" + "?protocol=3.1.1" * (self.protocol != "5")
+
+    @property
+    def settings(self) -> dict[str, str | int]:
+        """Return the values for `settings.changed`."""
+        return {"mqtt.host": self.host, "mqtt.port": self.port, "mqtt.protocol": self.protocol}
 
 
 @asynccontextmanager
@@ -100,11 +105,13 @@ async def embedded_broker() -> AsyncIterator[LocalBroker]:
     except ImportError:
         raise BrokerError(
             "no MQTT broker: neither mosquitto nor the package amqtt is installed; mend it with: "
-            "apt install mosquitto, or pip install 'skin-host[demo]'"
+            "apt install mosquitto, or pip install amqtt"
         ) from None
 
     class TidyBroker(Broker):  # type: ignore[misc]
-        """Ends a connection without a word where amqtt lets asyncio cancel it as a failure."""
+        """Ends a connection silently where amqtt lets asyncio report a cancelled task as a
+        failure.
+        """
 
         async def stream_connected(
             self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, listener_name: str
@@ -135,7 +142,7 @@ def _start_mosquitto(program: str, port: int, folder: Path) -> "subprocess.Popen
         "log_dest stderr\nlog_type error\nlog_type warning\n"
     )
     with (folder / "log").open("wb") as log:
-        # In a session of its own Ctrl-C does not end it before its clients say goodbye.
+        # In a separate session Ctrl-C does not end it before its clients disconnect.
         return subprocess.Popen(
             [program, "-c", configuration],
             stdin=subprocess.DEVNULL,

@@ -1,9 +1,9 @@
-"""Requests to a node and their answers. Requests come from strangers and are bounded.
+"""Requests to a node and their answers. Requests are not trusted and are bounded.
 
-A request is a JSON object of at most `MAX_REQUEST_BYTES` (nothing counts as `{}`). Its
+A request is a JSON object of at most `MAX_REQUEST_BYTES` (an empty payload counts as `{}`). Its
 key `id`, if it has one, comes back in the answer. The answer is a JSON object:
 `{"schema":"skin.result/1","command":..,"id":..,"ok":true,"result":{..}}`, or with
-`"ok":false` and `"error"`, one line that says why.
+`"ok":false` and `"error"`, one line with the reason.
 """
 
 import asyncio
@@ -16,20 +16,20 @@ import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from skin_host.errors import SkinError
-from skin_host.publish.payload import MessageError, decode
+from skin_host.publish.payload import MessageError, decode, one_line
 
 RESULT_SCHEMA = "skin.result/1"
 MAX_REQUEST_BYTES = 64 * 1024
-#: So many commands may run at a time.
+#: At most this many commands run at a time.
 MAX_RUNNING = 8
-#: So many requests are taken at once, and so many a second in the long run.
+#: This many requests are taken at once, and this many a second in the long run.
 BURST = 20
 PER_SECOND = 10.0
 
-#: Answers a command: its name and its request, a JSON object as bytes. What it returns
+#: Answers a command: takes its name and its request, a JSON object as bytes. The return value
 #: becomes `result`; a `SkinError` becomes `error`.
 Handler = Callable[[str, bytes], Awaitable[Mapping[str, Any]]]
-#: Takes the payload of an answer to where it belongs.
+#: Sends the payload of an answer.
 Answer = Callable[[bytes], None]
 
 _log = logging.getLogger(__name__)
@@ -71,12 +71,12 @@ def decode_result(payload: bytes) -> Result:
     return result
 
 
-class CommandDesk:
-    """Takes requests, runs the handler beside everything else, and gives its answers.
+class CommandHandler:
+    """Takes requests, runs the handler in separate tasks, and sends its answers.
 
     Attributes:
         taken: requests that were given to the handler.
-        refused: requests that were not: too large, too many, or not JSON.
+        refused: requests that were not: too large, too many, retained, or not JSON.
     """
 
     def __init__(self, handler: Handler) -> None:
@@ -85,11 +85,12 @@ class CommandDesk:
         self._tokens = float(BURST)
         self._filled_s: float | None = None
         self._flooded = False
+        self._met_retained = False
         self.taken = 0
         self.refused = 0
 
     def take(self, name: str, payload: bytes, answer: Answer) -> None:
-        """Start what is asked for. Above the rate a request is counted and not answered.
+        """Start a request. Above the rate a request is counted and not answered.
 
         An answer to each of a flood of requests would make the flood twice as large.
         """
@@ -100,22 +101,31 @@ class CommandDesk:
             self.refused += 1
             return
         refusal = self._refusal(name, payload)
-        payload = payload or b"{}"
         identity: str | int | UnsetType = UNSET
         if refusal is None:
             try:
-                identity = msgspec.json.decode(payload, type=_Identified).id
+                identity = msgspec.json.decode(payload or b"{}", type=_Identified).id
             except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
                 refusal = f"the request is not a JSON object as it should be: {error}"
         if refusal is not None:
             self.refused += 1
-            _log.info("command %s refused: %s", _printable(name), refusal)
+            _log.info("command %s refused: %s", _printable(name), one_line(refusal))
             answer(_failure(name, identity, refusal))
             return
         self.taken += 1
         task = asyncio.get_running_loop().create_task(self._run(name, payload, identity, answer))
         self._running.add(task)
         task.add_done_callback(self._running.discard)
+
+    def ignore_retained(self, topic: str) -> None:
+        """Count a request that was published as retained: it may be from any time."""
+        if not self._met_retained:
+            self._met_retained = True
+            _log.warning(
+                "a retained request on %s is ignored; clear it with: mosquitto_pub -r -n -t %s",
+                *[one_line(topic)] * 2,
+            )
+        self.refused += 1
 
     async def close(self) -> None:
         """Cancel what is still running."""
@@ -132,10 +142,10 @@ class CommandDesk:
             reply = Result(RESULT_SCHEMA, name, ok=True, id=identity, result=result)
             encoded = msgspec.json.encode(reply)
         except SkinError as error:
-            _log.info("command %s refused: %s", name, error)
+            _log.info("command %s refused: %s", name, one_line(str(error)))
             answer(_failure(name, identity, str(error)))
         except Exception as error:
-            # A fault in one command must neither stop the service nor go unanswered.
+            # An error in one command must neither stop the service nor remain without an answer.
             _log.exception("command %s failed", name)
             answer(_failure(name, identity, f"failed: {type(error).__name__}; see the log"))
         else:
@@ -162,6 +172,12 @@ class CommandDesk:
             return False
         self._tokens -= 1.0
         return True
+
+
+def answer_too_large(answer: bytes) -> bytes:
+    """Return the replacement for an answer that is too large for the broker."""
+    result = msgspec.json.decode(answer, type=Result)
+    return _failure(result.command, result.id, "the answer is larger than the broker takes")
 
 
 def _failure(name: str, identity: str | int | UnsetType, why: str) -> bytes:

@@ -1,13 +1,13 @@
-"""What a part feels: the payload of `<part>/frame`, JSON or CBOR. Pure: arrays to bytes and back.
+"""Pressure of a part: the payload of `<part>/frame`, JSON or CBOR. Pure: arrays to bytes and back.
 
 A mask of taxels is a hexadecimal number in which bit i is taxel i of the part (bit 0 the
 lowest); it is written with its most significant digit first, in lower case, padded with
-zeros to one digit for every four taxels. Three taxels of which the first alone is valid
+zeros to one digit for every four taxels. Three taxels of which only the first is valid
 are "1"; twelve of which all but the last are valid are "7ff".
 """
 
 import re
-from typing import Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import msgspec
 import numpy as np
@@ -15,8 +15,11 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from skin_host.errors import SkinError
-from skin_host.processing.pipeline import PressureFrame
+from skin_host.publish.cbor import check_cbor
 from skin_host.publish.payload import MAX_TAXELS, Count, Int64, MessageError, check_size, decode
+
+if TYPE_CHECKING:
+    from skin_host.processing.pipeline import PressureFrame
 
 FRAME_SCHEMA: Final = "skin.frame/1"
 #: One unit of the values of a frame.
@@ -31,14 +34,14 @@ HexMask = Annotated[str, Meta(max_length=MAX_TAXELS // 4)]
 
 
 class Frame(Struct, frozen=True, eq=False):
-    """A frame as it was received. Arrays have one entry a taxel [m], in the part's order.
+    """A received frame. Arrays have one entry per taxel [m], in the part's order.
 
     Attributes:
         pressure_kpa: float64; 0 where not valid.
-        valid: the taxel was received and is fit to be believed.
+        valid: the taxel was received and is reliable.
         beyond_range: the pressure is above the calibrated range: its order is right, its
-            size a guess.
-        raw: uint8, the bytes as the boards sent them; None unless somebody asked for them
+            value an estimate.
+        raw: uint8, the bytes as the boards sent them; None unless they were requested
             (command `raw`).
         missed: how many sweeps of the part lie between this frame and the one received
             before it. They were lost, or left out on purpose (`mqtt.frame_hz`).
@@ -55,7 +58,7 @@ class Frame(Struct, frozen=True, eq=False):
 
 
 class _FrameFields(Struct, omit_defaults=True):
-    """The keys of a frame but for its values, which JSON and CBOR hold differently."""
+    """The keys of a frame without its values, which JSON and CBOR store differently."""
 
     schema: Annotated[str, Meta(max_length=32)]
     seq: Count
@@ -65,7 +68,7 @@ class _FrameFields(Struct, omit_defaults=True):
     values: Any
     valid: HexMask
     beyond_range: HexMask = ""
-    #: One byte a taxel; base64 in JSON. Empty where they were not asked for.
+    #: One byte per taxel; base64 in JSON. Empty if they were not requested.
     raw: Annotated[bytes, Meta(max_length=MAX_TAXELS)] = b""
 
 
@@ -105,7 +108,7 @@ def decode_mask(text: str, n: int) -> Mask:
 
 
 def encode_frame(
-    frame: PressureFrame, encoding: Literal["json", "cbor"] = "json", *, raw: bool = False
+    frame: "PressureFrame", encoding: Literal["json", "cbor"] = "json", *, raw: bool = False
 ) -> bytes:
     """Write the payload of `<part>/frame`, with the boards' own bytes if `raw`.
 
@@ -188,6 +191,7 @@ def load_cbor2() -> Any:
 def _decode_cbor_frame(payload: bytes) -> tuple[_FrameFields, NDArray[np.int32]]:
     check_size(payload, "frame")
     cbor2 = load_cbor2()
+    check_cbor(payload, "frame")
     try:
         keys = cbor2.loads(payload)
         fields = msgspec.convert(keys, _FrameFields)

@@ -1,4 +1,4 @@
-"""What is said of slips and of pressing too hard: `<part>/slip`, `<part>/over`. Pure."""
+"""Messages of slips and of pressing too hard: `<part>/slip`, `<part>/over`. Pure."""
 
 from typing import Annotated, Final, Literal
 
@@ -15,12 +15,13 @@ Part = Annotated[str, Meta(max_length=64)]
 
 
 class SlipMessage(Struct, frozen=True, kw_only=True):
-    """A fingertip begins or ends to slip: the payload of `<part>/slip`.
+    """A fingertip begins or stops to slip: the payload of `<part>/slip`.
 
     Attributes:
         id: of the contact, as in the touches of the part.
-        count: how many slip events of the part this node has had to say so far.
-        cause: what told it first: the rate of the tangential force, its share of the known limit
+        count: number of slip events of the part from this node so far.
+        cause: what indicated it first: the rate of the tangential force, its share of the known
+            limit
             of friction, or its abrupt fall.
         force_n, shear_n, shear_rate_n_s: normal force, tangential force and the latter's rate.
     """
@@ -38,11 +39,11 @@ class SlipMessage(Struct, frozen=True, kw_only=True):
 
 
 class OverMessage(Struct, frozen=True, kw_only=True):
-    """A fingertip begins or ends to press harder than configured: the payload of `<part>/over`.
+    """A fingertip begins or stops to press harder than configured: the payload of `<part>/over`.
 
     Attributes:
         id: of the contact, as in the touches of the part.
-        count: how many such events of the part this node has had to say so far.
+        count: number of such events of the part from this node so far.
         force_n: normal force.
     """
 
@@ -56,13 +57,13 @@ class OverMessage(Struct, frozen=True, kw_only=True):
 
 
 class Slip(SlipMessage, frozen=True, kw_only=True):
-    """A slip as it was received; `missed` slip events of its part were lost just before it."""
+    """A received slip; `missed` slip events of its part were lost just before it."""
 
     missed: int = 0
 
 
 class Over(OverMessage, frozen=True, kw_only=True):
-    """The same of pressing too hard."""
+    """A received excess; `missed` as in `Slip`."""
 
     missed: int = 0
 
@@ -72,7 +73,7 @@ _over_decoder = msgspec.json.Decoder(Over)
 
 
 def grasp_message(event: SlipEvent | OverEvent, count: int) -> SlipMessage | OverMessage:
-    """What is said of an event; `count` as in the messages."""
+    """Return the message of an event; `count` as in the messages."""
     if isinstance(event, OverEvent):
         return OverMessage(
             event=event.event,

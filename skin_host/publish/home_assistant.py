@@ -1,8 +1,8 @@
-"""How Home Assistant finds the skin by itself: its MQTT discovery messages.
+"""MQTT discovery messages, by which Home Assistant finds the skin automatically.
 
-Two entities a part, grouped by node: whether anything touches it, and whether it is well.
+Two entities per part, grouped by node: whether anything touches it, and whether it has a problem.
 Source: Home Assistant's documentation of the MQTT integration ("MQTT discovery") and of its
-binary sensor. Nothing of the configuration but names goes in.
+binary sensor. Only names of the configuration are included.
 """
 
 import re
@@ -13,22 +13,27 @@ import msgspec
 from skin_host.publish.info import NodeInfo
 from skin_host.publish.topics import Topics
 
-#: As on the page and in `skin status`: anything but `ok` is a problem, and says why.
+#: As on the page and in `skin status`: anything but `ok` is a problem, with its sentences.
 PROBLEM: Final = "{{ 'OFF' if value_json.state == 'ok' else 'ON' }}"
 WHY: Final = "{{ {'state': value_json.state, 'sentences': value_json.sentences} | tojson }}"
-#: What cannot be felt is not "not touched": then the contact is unavailable.
+#: A part that cannot feel is not "not touched": its contact is unavailable.
 FEELS: Final = (
-    "{{ 'online' if value_json.state in ('ok', 'degraded', 'saturated') else 'offline' }}"
+    "{{ 'online' if value_json.state in ('ok', 'warning', 'degraded', 'saturated') "
+    "else 'offline' }}"
 )
 
 
+#: For Home Assistant the text None is an unknown state.
+STATE: Final = "{{ 'None' if value == 'UNKNOWN' else value }}"
+
+
 def discovery(prefix: str, topics: Topics, info: NodeInfo) -> dict[str, bytes]:
-    """Topics and payloads, to be retained, that announce the parts and fingertips of a node.
+    """Return topics and payloads, to be retained, that announce the parts and fingertips of a node.
 
     Args:
-        prefix: where Home Assistant looks, `homeassistant` unless it was told otherwise.
+        prefix: of Home Assistant's discovery, `homeassistant` by default.
         topics: of the robot.
-        info: what the node is.
+        info: of the node.
     """
     skin = _identifier(topics.base)
     alive = {"topic": topics.node("status", info.node)}
@@ -39,6 +44,7 @@ def discovery(prefix: str, topics: Topics, info: NodeInfo) -> dict[str, bytes]:
             "name": f"{part} contact",
             "icon": "mdi:gesture-tap",
             "state_topic": topics.part("contact", part),
+            "value_template": STATE,
             "availability": [alive, {"topic": health, "value_template": FEELS}],
             "availability_mode": "all",
         }
@@ -70,5 +76,7 @@ def discovery(prefix: str, topics: Topics, info: NodeInfo) -> dict[str, bytes]:
 
 
 def _identifier(base: str) -> str:
-    """Letters, digits, `_` and `-`, which is all that a discovery topic takes."""
+    """Return a name of letters, digits, `_` and `-`, which are all that a discovery topic may
+    have.
+    """
     return re.sub(r"[^a-zA-Z0-9_-]", "_", base)

@@ -1,25 +1,29 @@
-"""What a node is: its parts, the order and places of their taxels, units and rates.
+"""Description of a node: its parts, the order and places of their taxels, units and rates.
 
-The payload of `nodes/<node>/info`, retained. With it a subscriber can draw the skin and
-give each entry of a frame its place without any file of the robot's.
+The payload of `nodes/<node>/info`, retained. With it a subscriber can draw the skin and locate each
+entry of a frame without any file of the robot's.
 """
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import msgspec
 import numpy as np
 from msgspec import Meta, Struct
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from skin_host.fingertip.settings import Fingertip
-from skin_host.layout import Layout, PadKind, PartLayout
 from skin_host.publish.frames import SCALE_KPA
 from skin_host.publish.payload import MessageError, Vector, decode
+
+if TYPE_CHECKING:
+    from skin_host.fingertip.settings import Fingertip
+    from skin_host.layout import Layout, PartLayout
 
 INFO_SCHEMA: Final = "skin.info/1"
 #: 100 000 taxels and their triangles fit.
 MAX_BYTES = 32 * 1024 * 1024
+MAX_PIECES = 10_000
 #: Positions to 0.001 mm, areas and radii to 0.01, normals to 0.0001.
 _M, _MM, _NORMAL = 6, 2, 4
 
@@ -32,13 +36,17 @@ class CalibrationInfo(Struct, frozen=True):
 
 
 class TriangleInfo(Struct, frozen=True):
-    """A triangle: who it is on the bus, its first taxel in the part, its outline [k, 3] (m)."""
+    """A triangle: its board and number, its first taxel in the part, its outline [k, 3] (m).
+
+    `no_load` is the byte of an untouched taxel, as configured; None from older nodes.
+    """
 
     board: str
     number: int
     kind: str
     first: int
     outline_m: list[Vector]
+    no_load: int | None = None
 
 
 class PartInfo(Struct, frozen=True):
@@ -87,10 +95,12 @@ class NodeInfo(Struct, frozen=True, kw_only=True):
     Attributes:
         version: of skin-host.
         configuration: hash of what a calibration belongs to (`settings.skin_hash`).
-        scale: what one unit of the values of a frame is, in `unit`.
-        frame_hz: frames are thinned to this rate; 0 says that every one is sent.
+        scale: one unit of the values of a frame, in `unit`.
+        frame_hz: frames are thinned to this rate; 0 means that every one is sent.
         calibration: None before the first.
         commands: whether the node takes commands (`mqtt.commands`).
+        pieces: number of documents, if one would be too large for the broker. The others are at
+            `nodes/<node>/2/info` and so on, equal except for `parts` and `fingertips`.
     """
 
     schema: Literal["skin.info/1"] = INFO_SCHEMA
@@ -104,6 +114,7 @@ class NodeInfo(Struct, frozen=True, kw_only=True):
     frame_hz: float = 0.0
     calibration: CalibrationInfo | None = None
     commands: bool = True
+    pieces: Annotated[int, Meta(ge=1, le=MAX_PIECES)] = 1
     parts: Annotated[dict[str, PartInfo], Meta(max_length=10_000)]
     fingertips: Annotated[dict[str, FingertipInfo], Meta(max_length=10_000)] = {}
 
@@ -112,7 +123,7 @@ _decoder = msgspec.json.Decoder(NodeInfo)
 
 
 def node_info(
-    layout: Layout,
+    layout: "Layout",
     node: str,
     *,
     version: str,
@@ -121,7 +132,7 @@ def node_info(
     frame_hz: float = 0.0,
     calibration: CalibrationInfo | None = None,
     commands: bool = True,
-    fingertips: Mapping[str, Fingertip] | None = None,
+    fingertips: Mapping[str, "Fingertip"] | None = None,
 ) -> NodeInfo:
     """Describe the parts of `layout`, and of `fingertips` those, that belong to `node`."""
     parts = {
@@ -152,6 +163,50 @@ def encode_info(info: NodeInfo) -> bytes:
     return msgspec.json.encode(info)
 
 
+def encode_pieces(info: NodeInfo, limit: int | None) -> list[bytes]:
+    """Write an info as one payload, or as several of at most `limit` bytes.
+
+    A part that is longer by itself follows as a piece that is not counted in `pieces`.
+    """
+    whole = encode_info(info)
+    if limit is None or len(whole) <= limit:
+        return [whole]
+    bare = replace(info, parts={}, fingertips={}, pieces=MAX_PIECES)
+    room = limit - len(encode_info(bare))
+    pieces: list[NodeInfo] = []
+    large: list[NodeInfo] = []
+    free = 0
+    for key in ("parts", "fingertips"):
+        for name, value in getattr(info, key).items():
+            size = len(msgspec.json.encode({name: value}))
+            if size > room:
+                large.append(replace(bare, **{key: {name: value}}))
+                continue
+            if size > free:
+                pieces.append(bare)
+                free = room
+            free -= size
+            pieces[-1] = replace(pieces[-1], **{key: getattr(pieces[-1], key) | {name: value}})
+    pieces = pieces or [bare]
+    return [encode_info(replace(one, pieces=len(pieces))) for one in [*pieces, *large]]
+
+
+def join_pieces(found: Mapping[int, NodeInfo]) -> NodeInfo | None:
+    """Put pieces together by their numbers; None while some are missing or of another skin."""
+    first = found.get(1)
+    if first is None or first.pieces == 1:
+        return first
+    pieces = [found.get(number) for number in range(1, first.pieces + 1)]
+    parts: dict[str, PartInfo] = {}
+    fingertips: dict[str, FingertipInfo] = {}
+    for one in pieces:
+        if one is None or (one.configuration, one.pieces) != (first.configuration, first.pieces):
+            return None
+        parts |= one.parts
+        fingertips |= one.fingertips
+    return replace(first, pieces=1, parts=parts, fingertips=fingertips)
+
+
 def decode_info(payload: bytes) -> NodeInfo:
     """Read the payload of `nodes/<node>/info`.
 
@@ -167,7 +222,9 @@ def decode_info(payload: bytes) -> NodeInfo:
     return info
 
 
-def _part_info(layout: Layout, number: int, part: PartLayout) -> PartInfo:
+def _part_info(layout: "Layout", number: int, part: "PartLayout") -> PartInfo:
+    from skin_host.layout import PadKind
+
     mine = slice(part.start, part.stop)
     return PartInfo(
         period_ms=max(layout.boards[board].settings.period_ms for board in part.boards),
@@ -185,6 +242,7 @@ def _part_info(layout: Layout, number: int, part: PartLayout) -> PartInfo:
                 triangle.kind,
                 triangle.first - part.start,
                 _vectors(triangle.outline_m, _M),
+                layout.boards[triangle.board].settings.no_load,
             )
             for triangle in layout.triangles
             if triangle.part == number
@@ -192,7 +250,7 @@ def _part_info(layout: Layout, number: int, part: PartLayout) -> PartInfo:
     )
 
 
-def _fingertip_info(tip: Fingertip) -> FingertipInfo:
+def _fingertip_info(tip: "Fingertip") -> FingertipInfo:
     size = tip.semi_axes_mm or (() if tip.radius_mm is None else (tip.radius_mm,))
     return FingertipInfo(
         tip.period_ms,

@@ -1,4 +1,4 @@
-"""Lines of `skin replay`: what is published, one JSON object a line with its type. Pure."""
+"""Lines of `skin replay`: published messages, one JSON object per line with its type. Pure."""
 
 from collections import Counter
 from typing import Any
@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 
 from skin_host.fingertip.events import FingertipEvent, SlipEvent
-from skin_host.processing.contacts import TouchEvent
+from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.publish.grasping import grasp_message
 from skin_host.publish.messages import KPA_DECIMALS, health_keys, touch_message

@@ -1,15 +1,15 @@
-"""What is said of touches, contact and health. Pure: data in, payload bytes out, and back.
+"""Messages of touches, contact and health. Pure: converts data to payload bytes and back.
 
 `docs/mqtt.md` is the contract.
 """
 
 import math
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, get_args
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import UNSET, Meta, Struct, UnsetType
 
-from skin_host.processing.contacts import Load, TouchEvent
+from skin_host.processing.events import Load, Reason, TouchEvent
 from skin_host.publish.payload import (
     MAX_TAXELS,
     Count,
@@ -21,6 +21,8 @@ from skin_host.publish.payload import (
 )
 
 TOUCH_SCHEMA: Final = "skin.touch/1"
+#: ON: touched; OFF: not touched; UNKNOWN: some of the part cannot feel.
+ContactState = Literal["ON", "OFF", "UNKNOWN"]
 HEALTH_SCHEMA: Final = "skin.health/1"
 #: Decimals of kPa, of mm2, of m (0.001 mm), of N, of N m and of the parts of a unit vector.
 KPA_DECIMALS = 3
@@ -32,11 +34,11 @@ NORMAL_DECIMALS = 4
 
 
 class LoadMessage(Struct, frozen=True, kw_only=True):
-    """What a force/torque board says of the contact on its fingertip.
+    """Force/torque data of the contact on a fingertip.
 
     Attributes:
         verdict: whether one push on the surface gives this force and torque.
-        force_n, torque_nm: of what touches on the fingertip, about the origin of its frame.
+        force_n, torque_nm: of the touching object on the fingertip, about the origin of its frame.
         shear_n: the share of the force along the surface; None without a place.
         flags: of the finger: search, move, touch, slip, over.
     """
@@ -54,11 +56,12 @@ class TouchMessage(Struct, frozen=True, kw_only=True):
     Attributes:
         id: of the contact, among those of its part.
         seq, t_ns: of the frame in which it happened.
-        count: how many events of the part this node has had to say so far, this one
-            included. A gap is a loss; it starts again at 1 with the node.
+        count: number of events of the part from this node so far, this one included. A gap is a
+            loss; it starts again at 1 with the node.
         taxels: numbers within the part.
         area_mm2, peak_kpa, mean_kpa: None on a fingertip without skin.
         sigma_m: radial standard error of `centroid_m`; None where it is not known.
+        reason: why it ended, only with an end.
     """
 
     schema: Literal["skin.touch/1"] = TOUCH_SCHEMA
@@ -76,31 +79,38 @@ class TouchMessage(Struct, frozen=True, kw_only=True):
     mean_kpa: float | None
     force_n: float
     sigma_m: Annotated[float, Meta(ge=0)] | None = None
+    reason: Reason | UnsetType | None = UNSET
 
 
 class FingertipTouchMessage(TouchMessage, frozen=True, kw_only=True):
-    """The same of a fingertip on a force/torque board, and what that says."""
+    """As `TouchMessage`, for a fingertip on a force/torque board, with the board's data."""
 
     load: LoadMessage
 
 
 class Touch(TouchMessage, frozen=True, kw_only=True):
-    """An event as it was received; `missed` events of its part were lost just before it.
+    """A received event; `missed` events of its part were lost just before it.
 
-    Only fingertips on force/torque boards have a `load`.
+    Only fingertips on force/torque boards have a `load`, only an end has a `reason`.
     """
 
+    reason: Reason | None = None
     load: LoadMessage | None = None
     missed: int = 0
 
 
 _encoder = msgspec.json.Encoder()
+_CONTACT_STATES: dict[bytes, ContactState] = {
+    state.encode(): state for state in get_args(ContactState)
+}
 _touch_decoder = msgspec.json.Decoder(Touch)
 _health_decoder = msgspec.json.Decoder(dict[str, Any])
 
 
 def touch_message(event: TouchEvent, count: int) -> TouchMessage:
-    """What is said of an event; `count` as in `TouchMessage`. Numbers are rounded as above."""
+    """Return the message of an event; `count` as in `TouchMessage`. Numbers are rounded as
+    above.
+    """
     said: dict[str, Any] = {
         "event": event.event,
         "id": event.id,
@@ -116,6 +126,7 @@ def touch_message(event: TouchEvent, count: int) -> TouchMessage:
         "mean_kpa": _known(event.mean_kpa, KPA_DECIMALS),
         "force_n": round(event.force_n, N_DECIMALS),
         "sigma_m": None if event.sigma_m is None else round(event.sigma_m, M_DECIMALS),
+        "reason": UNSET if event.reason is None else event.reason,
     }
     if event.load is None:
         return TouchMessage(**said)
@@ -136,24 +147,25 @@ def decode_touch(payload: bytes) -> Touch:
     return decode_event(_touch_decoder, payload, "touch")
 
 
-def encode_contact(touched: bool) -> bytes:
+def encode_contact(state: ContactState) -> bytes:
     """Write the payload of `<part>/contact`."""
-    return b"ON" if touched else b"OFF"
+    return state.encode()
 
 
-def decode_contact(payload: bytes) -> bool:
+def decode_contact(payload: bytes) -> ContactState:
     """Read the payload of `<part>/contact`.
 
     Raises:
-        MessageError: it is neither ON nor OFF.
+        MessageError: it is not a contact state.
     """
-    if payload not in (b"ON", b"OFF"):
-        raise MessageError(f"contact: {payload[:16]!r}; wanted ON or OFF")
-    return payload == b"ON"
+    state = _CONTACT_STATES.get(payload)
+    if state is None:
+        raise MessageError(f"contact: {payload[:16]!r}; wanted ON, OFF or UNKNOWN")
+    return state
 
 
 def health_keys(record: Any) -> dict[str, Any]:
-    """What is said of health: a record with keys, and our schema first."""
+    """Return the keys of a health message: the record, after our schema."""
     keys: dict[str, Any] = msgspec.to_builtins(record)
     return {"schema": HEALTH_SCHEMA} | keys
 

@@ -1,7 +1,7 @@
-"""Payloads of every topic: how they are typed, and how those of strangers are read. Pure.
+"""Payloads of every topic: types, and decoding of untrusted input. Pure.
 
-Sizes and types are checked, and whatever is wrong is a `MessageError`. Keys that are not
-known are passed over, so that a later daemon may say more.
+Sizes and types are checked, and every error is a `MessageError`. Unknown keys are ignored, so that
+a later daemon may add some.
 """
 
 from typing import Annotated, TypeVar
@@ -12,8 +12,10 @@ from msgspec.structs import replace
 
 from skin_host.errors import SkinError
 
-#: No honest message is longer, but for those that say so; no part has more taxels.
+#: No valid message is longer, with stated exceptions; no part has more taxels.
 MAX_BYTES = 4 * 1024 * 1024
+#: The largest valid payload with its topic and properties.
+MAX_PACKET_BYTES = MAX_BYTES + 80_000
 MAX_TAXELS = 100_000
 
 JSON_TYPE = "application/json"
@@ -27,11 +29,17 @@ S = TypeVar("S", bound=Struct)
 
 
 class MessageError(SkinError):
-    """A payload is not what its topic promises."""
+    """A payload does not fit its topic."""
+
+
+def one_line(text: str, most: int = 200) -> str:
+    """Make outside text safe for a line of the log: escaped, and cut to `most`."""
+    cut = text if len(text) <= most else text[:most] + "..."
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in cut)
 
 
 def check_size(payload: bytes, what: str, max_bytes: int = MAX_BYTES) -> None:
-    """Refuse what no honest program sends in a payload of the topic `what`.
+    """Refuse a payload of the topic `what` that is longer than any valid one.
 
     Raises:
         MessageError: it is too long.
@@ -56,7 +64,7 @@ def decode(
 
 
 def decode_event(decoder: "msgspec.json.Decoder[S]", payload: bytes, what: str) -> S:
-    """Read a numbered event of the topic `what`; how many were missed is not the sender's to say.
+    """Read a numbered event of the topic `what`; `missed` is never taken from the sender.
 
     Raises:
         MessageError: it is not such a payload.

@@ -1,9 +1,9 @@
-"""Recordings in MCAP: what is said on MQTT, and CAN frames, with their schemas inside.
+"""Recordings in MCAP: MQTT messages and CAN frames, with their schemas.
 
-Foxglove and every MCAP reader open them. Messages keep their topic and their very bytes (but
-for frames in CBOR, which are written as the JSON that says the same). CAN frames lie in
-channels `can/<channel>`, some milliseconds a message. A recording grows under a name of its
-own, and takes its place when it is closed; one that broke off is mended by `mcap recover`.
+Foxglove and every MCAP reader open them. Messages keep their topic and, in JSON, their bytes;
+frames in CBOR are stored as equivalent JSON. CAN frames are in channels `can/<channel>`, with some
+milliseconds per message. A recording is written under a temporary name and renamed when it is
+closed; an interrupted one can be repaired with `mcap recover`.
 """
 
 import logging
@@ -19,6 +19,7 @@ from msgspec import Struct
 
 from skin_host.bus.protocol import FrameBatch
 from skin_host.errors import LogError, SkinError
+from skin_host.extras import required
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.publish.frames import Frame, decode_frame, encode_frame
 from skin_host.publish.grasping import decode_over, decode_slip
@@ -31,12 +32,14 @@ CAN = "can/"
 #: Nothing that is worth recording is longer.
 MAX_PAYLOAD = 32 * 1024 * 1024
 MAX_BATCH = 100_000
+#: A chunk of a recording is no larger when decompressed; writers make chunks of some MB.
+MAX_CHUNK_BYTES = 64_000_000
 
 _log = logging.getLogger(__name__)
 
 
-class Said(NamedTuple):
-    """One message of a recording: where and when it was heard, and its very bytes."""
+class RecordedMessage(NamedTuple):
+    """One message of a recording: topic, time of reception, and its bytes."""
 
     topic: str
     t_ns: int
@@ -55,11 +58,11 @@ class _CanFrames(Struct):
 
 
 class Recorder:
-    """A recording that is being made.
+    """A recording in progress.
 
     Attributes:
         messages: recorded so far, by kind.
-        unreadable: messages that were not what their topic promises; they are left out.
+        unreadable: messages whose payload did not fit their topic; they are left out.
         gaps: times that the broker was lost.
 
     Raises:
@@ -95,7 +98,7 @@ class Recorder:
             self.close()
 
     def say(self, topic: str, t_ns: int, payload: bytes) -> None:
-        """Record a message as it was heard at `t_ns`; what cannot be read is counted.
+        """Record a message received at `t_ns`; an unreadable one is counted.
 
         Raises:
             SkinError: the disk is full or gone.
@@ -175,8 +178,8 @@ class Recorder:
             raise SkinError(f"{self._path}: cannot be recorded to: {error.strerror}") from None
 
 
-def read_said(path: Path) -> Iterator[Said]:
-    """The messages of a recording in the order in which they were heard.
+def read_messages_of(path: Path) -> Iterator[RecordedMessage]:
+    """Yield the messages of a recording in the order of reception.
 
     Raises:
         LogError: it cannot be read, or breaks off.
@@ -184,9 +187,9 @@ def read_said(path: Path) -> Iterator[Said]:
     for topic, t_ns, data in _messages(path):
         kind = _kind(topic)
         if kind in ("contact", "status"):
-            yield Said(topic, t_ns, _decode(path, topic, data, _Text).text.encode())
+            yield RecordedMessage(topic, t_ns, _decode(path, topic, data, _Text).text.encode())
         elif kind is not None:
-            yield Said(topic, t_ns, data)
+            yield RecordedMessage(topic, t_ns, data)
 
 
 def read_can(path: Path) -> Iterator[tuple[str, FrameBatch]]:
@@ -230,17 +233,48 @@ def _messages(path: Path) -> Iterator[tuple[str, int, bytes]]:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from None
     with file:
         try:
+            _check_chunks(path, file)
             for _, channel, message in reader.make_reader(file).iter_messages():
                 yield channel.topic, message.log_time, message.data
+        except LogError:
+            raise
         except Exception as error:  # whatever a damaged file makes of its readers
             what = (str(error) or type(error).__name__).splitlines()[0]
             raise LogError(
-                f"{path}: no whole MCAP file: {what}; `mcap recover` may mend it"
+                f"{path}: no whole MCAP file: {what}; `mcap recover` may repair it"
             ) from None
 
 
+def _check_chunks(path: Path, file: IO[bytes]) -> None:
+    """Refuse a recording with a chunk that decompresses to an unreasonable size.
+
+    The reader decompresses whole chunks.
+
+    Raises:
+        LogError: there is such a chunk.
+    """
+    chunk = _mcap("mcap.records").Chunk
+    for record in _mcap("mcap.stream_reader").StreamReader(file, emit_chunks=True).records:
+        if not isinstance(record, chunk):
+            continue
+        size = record.uncompressed_size
+        if record.compression == "zstd":
+            zstandard = _mcap("zstandard")
+            declared = zstandard.get_frame_parameters(record.data).content_size
+            size = max(size, 0 if declared == zstandard.CONTENTSIZE_UNKNOWN else declared)
+        elif record.compression == "lz4":
+            decompressor = _mcap("lz4.frame").LZ4FrameDecompressor()
+            size = max(size, len(decompressor.decompress(record.data, MAX_CHUNK_BYTES + 1)))
+        if size > MAX_CHUNK_BYTES:
+            raise LogError(
+                f"{path}: a chunk of {len(record.data)} bytes decompresses to more than "
+                f"{MAX_CHUNK_BYTES} bytes"
+            )
+    file.seek(0)
+
+
 def _kind(topic: str) -> str | None:
-    """frame, touch, ... by the end of a topic; None for what is not recorded."""
+    """Return frame, touch, ... by the end of a topic; None for topics that are not recorded."""
     head, _, last = topic.rpartition("/")
     if last in ("frame", "touch", "slip", "over", "contact", "health"):
         return last
@@ -292,26 +326,15 @@ def _decode(path: Path, topic: str, data: bytes, kind: type[Any]) -> Any:
 
 
 def recorded_topics(base: str, robot: str) -> list[str]:
-    """What to subscribe to for a whole recording of a robot."""
+    """Return the topics to subscribe to for a whole recording of a robot."""
     topics = Topics(base, robot)
     return [
         *(topics.part(kind, "+") for kind in get_args(PartTopic)),
-        *(topics.node(kind, "+") for kind in ("status", "info")),
+        topics.node("status", "+"),
+        topics.info("+"),
+        topics.info("+", "+"),
     ]
 
 
 def _mcap(name: str) -> Any:
-    """A module of mcap, which is an extra.
-
-    Raises:
-        SkinError: it is not installed.
-    """
-    import importlib
-
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise SkinError(
-            "MCAP recordings need the package mcap, which is not installed; "
-            "mend it with: pip install 'skin-host[record]'"
-        ) from None
+    return required(name, "MCAP recordings", "record")

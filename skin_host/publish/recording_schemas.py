@@ -1,4 +1,4 @@
-"""JSON schemas of what recordings hold, in the plain form that Foxglove's plots understand."""
+"""JSON schemas of recorded messages, in the plain form that Foxglove's plots understand."""
 
 from typing import Any
 
@@ -35,7 +35,7 @@ SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
             seq=_INTEGER,
             t_ns=_about(_INTEGER, "time of the sweep's last CAN frame, ns since 1970"),
             unit=_STRING,
-            scale=_about(_NUMBER, "what one unit of the values is, in `unit`"),
+            scale=_about(_NUMBER, "one unit of the values, in `unit`"),
             values=_INTEGERS,
             valid=_about(_STRING, "hexadecimal mask, bit i is taxel i"),
             beyond_range=_about(_STRING, "hexadecimal mask, bit i is taxel i"),
@@ -63,6 +63,7 @@ SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
             force_n=_NUMBER,
             sigma_m=_NUMBER,
             load={"type": "object"},
+            reason=_about(_STRING, "of an end: released, lost or stopped"),
         ),
     ),
     "slip": (
@@ -100,7 +101,7 @@ SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
         "skin.health/1",
         _object(
             "skin.health/1",
-            "How a part is",
+            "Health of a part",
             schema=_STRING,
             part=_STRING,
             state=_STRING,
@@ -114,7 +115,7 @@ SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
         "skin.info/1",
         _object(
             "skin.info/1",
-            "What a node is: its parts, the order and places of their taxels",
+            "Description of a node: its parts, the order and places of their taxels",
             schema=_STRING,
             robot=_STRING,
             node=_STRING,
@@ -124,11 +125,13 @@ SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
     ),
     "contact": (
         "skin.contact",
-        _object("skin.contact", "Whether anything touches a part: ON or OFF", text=_STRING),
+        _object(
+            "skin.contact", "Whether anything touches a part: ON, OFF or UNKNOWN", text=_STRING
+        ),
     ),
     "status": (
         "skin.status",
-        _object("skin.status", "Whether a node is there: online or offline", text=_STRING),
+        _object("skin.status", "Whether a node is connected: online or offline", text=_STRING),
     ),
     "can": (
         "skin.can/1",

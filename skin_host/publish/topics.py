@@ -1,15 +1,21 @@
-"""Where things are said: the topics of one robot below its base, `skin/<robot>`.
+"""Topics of one robot below its base, `skin/<robot>`.
 
-The topics of a part do not show which node (daemon) the part belongs to; what is said
-by and to a node lies below `nodes/<node>`. `docs/mqtt.md` is the contract.
+The topics of a part do not show which node (daemon) the part belongs to; the topics of a node are
+below `nodes/<node>`. `docs/mqtt.md` is the contract.
 """
 
+import re
 from typing import Literal, NamedTuple
 
 from skin_host.errors import ConfigurationError
 
 PartTopic = Literal["frame", "touch", "slip", "over", "contact", "health"]
 NodeTopic = Literal["status", "info"]
+
+#: What may follow `nodes/<node>/replies/`: one to four levels of up to 64 characters.
+_REPLY = re.compile(r"[A-Za-z0-9_.:@-]{1,64}(/[A-Za-z0-9_.:@-]{1,64}){0,3}")
+
+_PIECE = re.compile(r"[1-9][0-9]{0,4}")
 
 ONLINE = b"online"
 OFFLINE = b"offline"
@@ -19,8 +25,10 @@ class Place(NamedTuple):
     """What a topic is about: a part's frames, a node's status, ..."""
 
     kind: PartTopic | NodeTopic | Literal["answer"]
-    #: The part; for `status`, `info` and the answer to a command the node.
+    #: The part; for `status`, `info` and the answer to a command it is the node.
     name: str
+    #: Of an `info` in several pieces.
+    piece: int = 1
 
 
 class Topics:
@@ -52,30 +60,34 @@ class Topics:
         """Topic of a node; `+` for all nodes."""
         return f"{self.base}/nodes/{node}/{kind}"
 
+    def info(self, node: str, piece: int | Literal["+"] = 1) -> str:
+        """Topic of a piece of a node's info; `+` for all nodes, all pieces but the first."""
+        name = f"nodes/{node}/info" if piece == 1 else f"nodes/{node}/{piece}/info"
+        return f"{self.base}/{name}"
+
     def command(self, node: str, name: str) -> str:
-        """Where a node takes the command `name`; `+` for all commands."""
+        """Topic at which a node takes the command `name`; `+` for all commands."""
         return f"{self.base}/nodes/{node}/cmd/{name}"
 
     def result(self, node: str, name: str) -> str:
-        """Where a command is answered if the request named no other topic."""
+        """Topic of the answer to a command if the request named no other topic."""
         return f"{self.base}/nodes/{node}/cmd/{name}/result"
 
     def reply(self, node: str, client: str) -> str:
-        """Where `client` may ask to be answered: `nodes/<node>/replies/<client>`."""
+        """Topic at which `client` may receive its answers: `nodes/<node>/replies/<client>`."""
         return f"{self.base}/nodes/{node}/replies/{client}"
 
     def may_reply_to(self, node: str, topic: str) -> bool:
-        """Whether an answer may go to `topic`, which a stranger chose.
+        """Return whether an answer may go to `topic`, which comes with a request.
 
-        Below our own base only `nodes/<node>/replies/` is free, else a request could make
-        the daemon write into its own touches. Elsewhere the broker's access rules decide.
+        Only topics that `docs/mqtt.md` names: a request must not make the daemon publish to its own
+        touches, to another robot's, or to a topic over which a broker ends the connection.
         """
-        if not topic or len(topic) > 256 or set(topic) & set("+#\0") or topic[0] == "$":
-            return False
-        return not topic.startswith(f"{self.base}/") or topic.startswith(self.reply(node, ""))
+        prefix = self.reply(node, "")
+        return topic.startswith(prefix) and _REPLY.fullmatch(topic, len(prefix)) is not None
 
     def parse(self, topic: str) -> Place | None:
-        """Say what a received topic is about; None if it is none of ours."""
+        """Return what a received topic is about; None if it is not one of ours."""
         if not topic.startswith(f"{self.base}/"):
             return None
         match topic[len(self.base) + 1 :].split("/"):
@@ -86,6 +98,8 @@ class Topics:
                 return Place(part_kind, part)
             case ["nodes", node, ("status" | "info") as node_kind]:
                 return Place(node_kind, node)
+            case ["nodes", node, piece, "info"] if _PIECE.fullmatch(piece):
+                return Place("info", node, int(piece))
             case ["nodes", node, "cmd", _, "result"] | ["nodes", node, "replies", _]:
                 return Place("answer", node)
         return None

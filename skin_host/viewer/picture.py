@@ -1,7 +1,7 @@
-"""What is known of a robot's skin at this moment, in the form that pages are told it. Pure.
+"""Present state of a robot's skin, and the messages that bring each page up to date. Pure.
 
-Pages come and go and may be slow. Each holds a `Cursor`, and what it has not been told yet
-is worked out for it; frames that it was too slow for are passed over.
+Pages come and go and may be slow. Each has a `Cursor`, and gets the messages that it has not had
+yet; frames that it was too slow for are skipped.
 
 A frame goes to a page as bytes, little endian: kind 1 (u8), flags (u8, bit 0: raw values
 follow), number of the part (u16), number of taxels n (u32), version of the layout (u32),
@@ -27,7 +27,7 @@ _HEAD = struct.Struct("<BBHIIIdII")
 _U32 = 2**32
 
 
-#: A fingertip on a force/torque board has contacts and health; its health is what is timed.
+#: A fingertip on a force/torque board has contacts and health; its age is that of its health.
 _NO_TAXELS: dict[str, Any] = {
     "period_ms": 1000,
     "pads": [],
@@ -41,7 +41,7 @@ _NO_TAXELS: dict[str, Any] = {
 
 @dataclass(slots=True)
 class PartView:
-    """One part or fingertip: what was heard last; counters tell pages what is new by changing."""
+    """One part or fingertip: its last messages; the counters change with each new one."""
 
     number: int
     node: str
@@ -57,7 +57,7 @@ class PartView:
 
 @dataclass(slots=True)
 class Cursor:
-    """What one page has been told, as the counters stood then."""
+    """State of one page: the counters at the time of its last messages."""
 
     layout: int = -1
     status: int = -1
@@ -67,11 +67,11 @@ class Cursor:
 
 
 class Picture:
-    """All of it.
+    """State of the robot's skin.
 
     Attributes:
         parts: by name, in the order in which they are drawn.
-        version: of the layout; it changes with the parts and what they are.
+        version: of the layout; it changes with the parts and their descriptions.
     """
 
     def __init__(self) -> None:
@@ -83,7 +83,7 @@ class Picture:
         self._layout = b""
 
     def take_nodes(self, robot: str, nodes: dict[str, tuple[bool | None, NodeInfo | None]]) -> None:
-        """Say which nodes there are: whether each is online, and what it is."""
+        """Take the present nodes: whether each is online, and its description."""
         if self._nodes == nodes:
             return
         gone = [name for name, (online, _) in nodes.items() if not online]
@@ -97,14 +97,14 @@ class Picture:
         self._nodes = dict(nodes)
 
     def take_status(self, status: dict[str, Any]) -> None:
-        """Say how the connection to the broker is; the nodes are added."""
+        """Take the state of the connection to the broker; the nodes are added."""
         status = status | {"nodes": {name: online for name, (online, _) in self._nodes.items()}}
         if status != self._status:
             self._status = status
             self._status_changed += 1
 
     def take_frame(self, frame: Frame) -> None:
-        """A frame came."""
+        """Take a frame."""
         part = self.parts.get(frame.part)
         if part is not None and len(frame.pressure_kpa) == part.n_taxels:
             part.frame = frame
@@ -112,12 +112,12 @@ class Picture:
             part.missed += frame.missed
 
     def take_touch(self, touch: Touch) -> None:
-        """A contact began, moved or ended."""
+        """Take the event of a contact."""
         part = self.parts.get(touch.part)
         if part is None:
             return
         if touch.missed:
-            part.contacts.clear()  # an end may be among what was missed
+            part.contacts.clear()  # the missed events may include an end
         if touch.event == "end":
             part.contacts.pop(touch.id, None)
         else:
@@ -125,28 +125,28 @@ class Picture:
         part.contacts_changed += 1
 
     def take_contact(self, contact: Contact) -> None:
-        """A part is touched or not; where nothing touches, no contact is left."""
+        """Take the contact state of a part; without a touch it has no contacts."""
         part = self.parts.get(contact.part)
         if part is not None and not contact.touched and part.contacts:
             part.contacts.clear()
             part.contacts_changed += 1
 
     def take_health(self, health: Health) -> None:
-        """A part's health."""
+        """Take a part's health."""
         part = self.parts.get(health.part)
         if part is not None:
-            part.health = health.record
+            part.health = dict(health.record)
             part.health_changed += 1
 
     def forget_contacts(self) -> None:
-        """After a broken connection no contact is certain."""
+        """Forget all contacts, which are uncertain after a broken connection."""
         for part in self.parts.values():
             if part.contacts:
                 part.contacts.clear()
                 part.contacts_changed += 1
 
     def news(self, cursor: Cursor) -> list[bytes | str]:
-        """What a page has not been told; text is JSON. The cursor moves on."""
+        """Return the messages that a page has not had (text is JSON), and advance its cursor."""
         news: list[bytes | str] = []
         if cursor.layout != self.version and self._layout:
             news.append(self._layout.decode())
@@ -181,7 +181,7 @@ class Picture:
                 view.number, view.node = len(self.parts), node
                 self.parts[name] = view
                 parts.append({"name": name, "node": node} | msgspec.to_builtins(part))
-        # After them, as parts without taxels: pages number frames by the parts alone.
+        # Added last, as parts without taxels, because pages number frames by the parts alone.
         for node, info in nodes.items():
             for name in info.fingertips:
                 view = old.get(name)
@@ -242,11 +242,11 @@ def _contacts_text(name: str, part: PartView) -> str:
     return _json({"type": "contacts", "part": name, "contacts": contacts})
 
 
-#: What to say of a part's state where that is not a fault of its own.
+#: Text for states that are not faults themselves.
 STATES = {
     "not calibrated": "Not calibrated: leave the skin untouched and calibrate.",
     "no data": "No data have come yet.",
-    "silent": "Silent: no taxel can be believed.",
+    "silent": "Silent: no taxel is valid.",
     "disabled": "Disabled.",
 }
 
@@ -257,7 +257,7 @@ class _Triangle(Struct):
 
 
 class _Record(Struct):
-    """What pages draw of a health record; a stranger may have sent it."""
+    """The keys of a health record that pages draw; the sender is not trusted."""
 
     state: str = ""
     sentences: list[str] = []

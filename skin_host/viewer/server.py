@@ -1,8 +1,7 @@
-"""The web server of the live page: it hears the broker and tells the pages.
+"""The web server of the live page: it receives from the broker and sends to the pages.
 
-One port serves the page's few files and a WebSocket. Pages are strangers: the server
-listens on this machine only unless told otherwise, and takes requests from its own page
-alone.
+One port serves the page's few files and a WebSocket. Pages are not trusted: by default the server
+listens on this machine only, and it takes requests from its own page only.
 """
 
 import asyncio
@@ -26,16 +25,16 @@ from skin_host.errors import BrokerError, RequestError, SkinError
 from skin_host.publish.address import Broker
 from skin_host.viewer.picture import Cursor, Picture
 
-#: Pages are told what is new so often; screens show no more.
+#: Pages get new messages this often; screens show no more.
 TICK_S = 0.04
 NODES_S = 0.25
-#: A broker that is not there is tried again after this time.
+#: A broker that cannot be reached is tried again after this time.
 RETRY_S = 2.0
 MAX_PAGES = 32
 MAX_REQUEST_BYTES = 4096
-#: The longest calibration that a page waits for, and the time without one.
+#: The longest calibration that a page waits for, and the timeout of other commands.
 COMMAND_S = 120.0
-#: Raw values are asked for again before the lease ends.
+#: Raw values are requested again before this time ends.
 RAW_LEASE_S = 30.0
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
@@ -52,7 +51,7 @@ _log = logging.getLogger(__name__)
 
 
 class _Wish(Struct, forbid_unknown_fields=True):
-    """What a page asks for."""
+    """A request of a page."""
 
     do: Literal["calibrate", "raw"]
     node: str
@@ -85,13 +84,13 @@ class Viewer:
 
     @contextlib.asynccontextmanager
     async def serving(self, host: str = "127.0.0.1", port: int = 8080) -> AsyncIterator[str]:
-        """Serve for as long as the block lasts; gives the URL. Port 0 is any free one.
+        """Serve for as long as the block lasts; yields the URL. Port 0 is any free one.
 
         Raises:
-            SkinError: the port cannot be had.
+            SkinError: the port is not available.
         """
         local = host in LOOPBACK
-        # It calls every file that it serves a rejected connection ...
+        # It logs every file that it serves as a rejected connection ...
         logger = logging.getLogger("websockets.server")
         logger.setLevel(logging.WARNING)
         logger.addFilter(_is_no_idle_visit)
@@ -105,8 +104,9 @@ class Viewer:
                 compression=None,
                 server_header=None,
             )
-        except OSError as error:
-            why = os.strerror(error.errno) if error.errno else str(error)
+        except (OSError, OverflowError) as error:
+            number = error.errno if isinstance(error, OSError) else None
+            why = os.strerror(number) if number else str(error)
             raise SkinError(
                 f"the page cannot be served on {host}:{port}: {why}; choose another port"
             ) from None
@@ -119,23 +119,23 @@ class Viewer:
                 await asyncio.gather(listening, return_exceptions=True)
 
     async def run(
-        self, stop: asyncio.Event, host: str, port: int, told: Callable[[str], None]
+        self, stop: asyncio.Event, host: str, port: int, ready: Callable[[str], None]
     ) -> None:
-        """Serve until `stop` is set; `told` is called with the URL.
+        """Serve until `stop` is set; `ready` is called with the URL.
 
         Raises:
-            SkinError: the port cannot be had.
+            SkinError: the port is not available.
             RequestError: it is not clear which robot is meant.
         """
         async with self.serving(host, port) as url:
-            told(url)
+            ready(url)
             await stop.wait()
 
     def _answer(self, request: Request, *, local: bool) -> Response | None:
         """Answer a request for a file; None lets a page's WebSocket through."""
         host = request.headers.get("Host", "")
         if local and host.rpartition(":")[0].strip("[]") not in LOOPBACK:
-            # A page from elsewhere whose name was made to point at this machine.
+            # A page from another host whose name was made to point at this machine.
             return _response(HTTPStatus.FORBIDDEN, "text/plain", b"not served under this name\n")
         path = request.path.partition("?")[0]
         if path == "/live":
@@ -150,7 +150,7 @@ class Viewer:
         return _response(HTTPStatus.OK, *file)
 
     async def _talk(self, page: ServerConnection) -> None:
-        """Tell one page what is new until it goes, and take its wishes."""
+        """Send one page its new messages until it closes, and take its requests."""
         self._pages += 1
         telling = asyncio.create_task(self._tell(page))
         try:
@@ -168,7 +168,7 @@ class Viewer:
         now_s = asyncio.get_running_loop().time
         due_s = now_s()
         while True:
-            # Sending waits for a slow page; what comes meanwhile is passed over.
+            # Sending waits for a slow page; frames that arrive meanwhile are skipped.
             for message in self._picture.news(cursor):
                 await page.send(message)
             due_s = max(due_s + TICK_S, now_s())
@@ -185,14 +185,14 @@ class Viewer:
             result = await self._client.command(
                 wish.do, node=wish.node, timeout_s=COMMAND_S, **arguments
             )
-        except (SkinError, msgspec.DecodeError) as error:
+        except (SkinError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             answer: dict[str, Any] = {"ok": False, "error": str(error)}
         else:
             answer = {"ok": True, "do": wish.do, "result": result}
         await page.send(msgspec.json.encode({"type": "answer"} | answer).decode())
 
     async def _listen(self) -> None:
-        """Hear the robot; look for the broker again whenever it cannot be found."""
+        """Receive from the robot; look for the broker again whenever it cannot be found."""
         while True:
             try:
                 async with self._new_client() as client, asyncio.TaskGroup() as group:
@@ -213,7 +213,7 @@ class Viewer:
             await asyncio.sleep(RETRY_S)
 
     async def _watch(self, client: SkinClient) -> None:
-        """Look at the nodes and at the connection again and again."""
+        """Watch the nodes and the connection."""
         connections = client.connections
         while True:
             if client.connections != connections:
@@ -241,7 +241,7 @@ async def _pass_on(stream: Stream[T], take: Callable[[T], None]) -> None:
 
 
 def _is_no_idle_visit(record: logging.LogRecord) -> bool:
-    """... and a failure every connection that a browser opens beforehand and does not use."""
+    """... and each connection that a browser opens in advance and does not use as a failure."""
     return record.getMessage() != "opening handshake failed"
 
 
@@ -264,7 +264,7 @@ def _response(status: HTTPStatus, kind: str, body: bytes) -> Response:
 
 
 def _shown(host: str) -> str:
-    """How a browser on this machine writes the host that we listen on."""
+    """Return the address of our host as a browser on this machine writes it."""
     if host in ("", "0.0.0.0", "::"):  # noqa: S104  # shown, not bound
         return "localhost"
     return f"[{host}]" if ":" in host else host

@@ -47,7 +47,7 @@ def frames(
 
 
 def feed(assembler: Assembler, sent: list[tuple[int, bytes, int]]) -> list[Sweep]:
-    return assembler.feed(FrameBatch.of(sent))
+    return assembler.feed(FrameBatch.of(sent)).sweeps
 
 
 def test_a_whole_sweep_is_handed_on_with_its_last_frame():
@@ -101,6 +101,18 @@ def test_a_slot_that_comes_twice_starts_a_new_sweep():
     second = frames(values(4, 2), PERIOD + 100, spacing_ns=10)
     sweeps = feed(make(), first + second)
     assert [sweep.present for sweep in sweeps] == [0b0111, 0b1111]
+
+
+@pytest.mark.parametrize("place", [0, 3, 7])
+def test_a_frame_that_comes_twice_in_a_row_changes_nothing_and_is_counted(place: int) -> None:
+    raw = values(4)
+    sent = frames(raw, PERIOD)
+    assembler = make()
+    sweeps = feed(assembler, [*sent[: place + 1], *sent[place:], *frames(raw, 2 * PERIOD)])
+    assert [sweep.present for sweep in sweeps] == [0b1111, 0b1111]
+    np.testing.assert_array_equal(sweeps[0].raw[:4], raw)
+    counters = assembler.counters
+    assert (counters.doubled, counters.incomplete, counters.halves) == (1, 0, 0)
 
 
 def test_an_absent_triangle_soon_costs_no_delay_and_is_awaited_when_it_returns():

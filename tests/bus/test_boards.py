@@ -33,15 +33,18 @@ class Heard:
     def __init__(self) -> None:
         settings = load(CONFIG)
         layout = build_layout(settings, CONFIG.parent)
-        engine = Engine(settings, layout, [0, 1])
-        boards = [(i, layout.boards[i]) for i in engine.boards]
-        self.boards = Boards("can0", Nowhere(), boards, layout.triangles, 4.0)
-        self.health = Health(engine)
+        self.engine = Engine(settings, layout, [0, 1])
+        boards = [(i, layout.boards[i]) for i in self.engine.boards]
+        self.boards = Boards("can0", Nowhere(), boards, layout.triangles, self.engine.ledger)
+        self.health = Health(self.engine)
         self.now_ns = 1_700_000_000 * S
         self.look()
 
     def say(self, *frames: tuple[int, bytes]) -> None:
-        self.boards.feed(FrameBatch.of([(i, data, self.now_ns) for i, data in frames]))
+        output = self.engine.feed(
+            "can0", FrameBatch.of([(i, data, self.now_ns) for i, data in frames])
+        )
+        self.boards.note_answers(output.answers)
         self.look()
 
     def answer(self, message: Message, address: int) -> None:
@@ -85,7 +88,7 @@ def test_a_board_that_nobody_configured_is_told(heard: Heard) -> None:
 def test_a_board_that_could_not_send_is_told(heard: Heard) -> None:
     heard.say((identifier(MessageClass.MANAGEMENT, HAND, TX_OVERFLOW), b""))
     assert ("board_overflows", "hand") in heard.told()
-    assert heard.boards.records[HAND].tx_overflows == 1
+    assert heard.engine.ledger.tx_overflows.sum() == 1
 
 
 def test_a_board_tells_its_firmware(heard: Heard) -> None:

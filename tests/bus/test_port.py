@@ -12,10 +12,12 @@ import pytest
 from can.interfaces.socketcan.socketcan import build_can_frame
 
 from skin_host.bus.adapters import AdapterPort
-from skin_host.bus.port import LinkState, Port, open_port
+from skin_host.bus.opening import open_port
+from skin_host.bus.port import LinkState, Port
 from skin_host.bus.protocol import FrameBatch
 from skin_host.bus.socketcan import BatchReceiver, SocketCanPort
-from skin_host.errors import BusError
+from skin_host.clock import SYSTEM, Clock, SteppedClock
+from skin_host.errors import BusError, ConfigurationError
 from skin_host.evaluation.stand_in import StandInBus, pair, register
 from skin_host.settings import Bus, Receive
 
@@ -26,8 +28,10 @@ def can_frame(identifier: int, data: bytes) -> bytes:
     return struct.pack("=IB3x8s", identifier, len(data), data)
 
 
-def port_on(bus: can.BusABC, receive: Receive | None = None) -> SocketCanPort:
-    return SocketCanPort("left", Bus(), receive or Receive(), bus, lambda: bus)
+def port_on(
+    bus: can.BusABC, receive: Receive | None = None, clock: Clock = SYSTEM
+) -> SocketCanPort:
+    return SocketCanPort("left", Bus(), receive or Receive(), bus, lambda: bus, clock)
 
 
 def read_all(port: Port, expected: int) -> tuple[int, int]:
@@ -153,26 +157,25 @@ def test_one_line_is_logged_for_a_change_not_for_a_frame(ends, caplog):
     ]
 
 
-def test_a_loose_plug_is_logged_ever_more_rarely(ends, caplog, monkeypatch):
+def test_a_loose_plug_is_logged_ever_more_rarely(ends, caplog):
     ours, _ = ends
-    port = port_on(ours)
-    now_s = 1000.0
-    monkeypatch.setattr("skin_host.bus.port.time.monotonic", lambda: now_s)
+    clock = SteppedClock()
+    port = port_on(ours, clock=clock)
     with caplog.at_level(logging.INFO):
         for number in range(7200):
-            now_s += 0.5
+            clock.advance(0.5)
             port._enter(LinkState.DOWN if number % 3 else LinkState.UP)
-            port._tell()
+            port._log_state()
         assert 60 < len(caplog.records) < 70
         # A calm link is told of at once again.
-        now_s += 121.0
-        port._tell()
+        clock.advance(121.0)
+        port._log_state()
         lines = len(caplog.records)
-        now_s += 121.0
+        clock.advance(121.0)
         for _ in range(2):
-            now_s += 2.5
+            clock.advance(2.5)
             port._enter(LinkState.DOWN if port.state is LinkState.UP else LinkState.UP)
-            port._tell()
+            port._log_state()
     assert len(caplog.records) == lines + 2
 
 
@@ -274,7 +277,6 @@ def test_python_cans_socketcan_under_another_name_is_read_in_batches():
     [
         (Bus(channel="nowhere7"), "no such network interface .*ip link add dev nowhere7 type vcan"),
         (Bus(channel="lo"), "not a CAN interface"),
-        (Bus(interface="psychic"), "python-can has no such interface; it has .*socketcan"),
         (Bus(interface="slcan", channel="/dev/none"), "slcan /dev/none: cannot be opened"),
     ],
 )
@@ -286,3 +288,40 @@ def test_what_cannot_be_opened_is_one_line_with_its_name(bus, says, monkeypatch)
     with pytest.raises(BusError, match=f'bus "left": .*{says}') as caught:
         open_port("left", bus, Receive())
     assert "\n" not in str(caught.value)
+
+
+async def test_an_interface_that_is_absent_at_the_start_is_one_that_is_gone(caplog):
+    port = open_port("left", Bus(channel="nowhere7"), Receive(), wait=True)
+    assert port.state is LinkState.GONE
+    assert len(port.read()) == 0
+    assert port.fileno() is None
+    with pytest.raises(BusError, match="cannot send, gone"):
+        await port.send([(0x20E, b"")])
+    (line,) = caplog.messages
+    assert "no such network interface" in line
+    assert line.endswith("waiting for it")
+    port.close()
+
+
+def test_an_adapter_that_is_absent_at_the_start_is_used_once_it_is_there():
+    register()
+    taken, theirs = StandInBus(), StandInBus()
+    theirs.connect(taken.port)
+    port = open_port("left", Bus(interface="stand-in", channel=f"{taken.port}-0"), SMALL, wait=True)
+    assert len(port.read()) == 0
+    assert port.state is LinkState.GONE
+    taken.shutdown()
+    deadline = time.monotonic() + 10.0
+    while port.state is not LinkState.UP and time.monotonic() < deadline:
+        port.read()
+    theirs.socket.send(can_frame(0x410, b"\x40"))
+    assert read_all(port, 1) == (1, 0)
+    assert (port.counters.removals, port.counters.reopened) == (0, 1)
+    port.close()
+    theirs.shutdown()
+
+
+@pytest.mark.parametrize("wait", [True, False])
+def test_a_kind_of_interface_that_python_can_does_not_know_is_never_waited_for(wait):
+    with pytest.raises(ConfigurationError, match=r"python-can has no such interface; .*socketcan"):
+        open_port("left", Bus(interface="psychic"), Receive(), wait=wait)

@@ -7,7 +7,8 @@ import can
 import pytest
 
 from skin_host.bus.adapters import CAPACITY, AdapterPort, nanoseconds
-from skin_host.bus.port import LinkState, Port, open_port
+from skin_host.bus.opening import open_bus, open_port
+from skin_host.bus.port import LinkState, Port
 from skin_host.settings import Bus, Receive
 
 _numbers = itertools.count()
@@ -133,3 +134,17 @@ def test_an_unplugged_adapter_is_opened_again(caplog):
         assert len(port.read()) == 1
     assert port.counters.removals == port.counters.reopened == 1
     port.close()
+
+
+def test_buses_by_multicast_do_not_hear_each_other():
+    pytest.importorskip("msgpack")
+    here, there = (Bus(interface="udp_multicast", channel=f"239.74.163.{n}") for n in (201, 202))
+    with open_bus("a", here) as sender, open_bus("b", here) as near, open_bus("c", there) as far:
+        try:
+            sender.send(message(0x410, b"\x01"))
+        except can.CanError:
+            pytest.skip("this machine has no network for multicast")
+        received = near.recv(5)
+        assert received is not None
+        assert received.arbitration_id == 0x410
+        assert far.recv(0) is None

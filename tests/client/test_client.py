@@ -12,11 +12,13 @@ import aiomqtt
 import numpy as np
 import pytest
 from msgspec import json
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
 
 from skin_host.client import CommandError, Contact, SkinCallbacks, SkinClient
 from skin_host.errors import BrokerError, RequestError
 from skin_host.layout import build_layout
-from skin_host.processing.contacts import TouchEvent
+from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.publish.info import node_info
 from skin_host.publish.mqtt import Publisher
@@ -95,16 +97,16 @@ async def test_touches_of_one_part_are_heard_alone(mosquitto: Mosquitto) -> None
 
 async def test_state_is_known_at_once_also_to_who_asks_later(mosquitto: Mosquitto) -> None:
     async with publishing(mosquitto) as publisher:
-        publisher.put_contact("palm", True)
+        publisher.put_contact("palm", "ON")
         publisher.put_health("palm", {"rate_hz": 20.0})
         await until(lambda: publisher.counters.retained_sent >= 3)
         async with hearing(mosquitto) as skin:
             first, health = skin.contacts(), skin.health()
-            assert await take(first, 1) == [Contact("palm", True)]
+            assert await take(first, 1) == [Contact("palm", "ON")]
             (seen,) = await take(health, 1)
             assert (seen.part, seen.record["rate_hz"]) == ("palm", 20.0)
             second = skin.contacts("palm")
-            assert await take(second, 1) == [Contact("palm", True)]
+            assert await take(second, 1) == [Contact("palm", "ON")]
 
 
 async def test_a_client_hears_what_was_said_while_its_link_was_cut(
@@ -116,7 +118,7 @@ async def test_a_client_hears_what_was_said_while_its_link_was_cut(
         async with publishing(mosquitto) as publisher:
             publisher.put_touch(touch(1))
             assert (await take(touches, 1))[0].count == 1
-            skin._connection.cut()  # type: ignore[union-attr]  # its link alone breaks
+            skin._links[0].connection.cut()  # type: ignore[union-attr]  # its link alone breaks
             await until(lambda: not skin.connected)
             for number in (2, 3, 4):
                 publisher.put_touch(touch(number))
@@ -148,11 +150,11 @@ async def test_a_stream_that_ended_while_the_link_was_cut_is_given_up(
     async with publishing(mosquitto) as publisher, hearing(mosquitto) as skin:
         frames, touches = skin.frames(), skin.touches()
         await skin.ready()
-        skin._connection.cut()  # type: ignore[union-attr]
+        skin._links[0].connection.cut()  # type: ignore[union-attr]
         del frames
         await until(lambda: skin.connections == 2)
         received: list[Any] = []
-        skin._take_part = lambda kind, *_: received.append(kind)  # type: ignore[method-assign]
+        skin._take_part = lambda kind, *_, **__: received.append(kind)  # type: ignore[method-assign]
         publisher.put_frame(frame(1))
         await until(lambda: publisher.counters.frames_sent)
         publisher.put_touch(touch(1))
@@ -165,10 +167,10 @@ async def test_topics_that_nobody_reads_any_more_are_given_up(mosquitto: Mosquit
     async with publishing(mosquitto) as publisher, hearing(mosquitto) as skin:
         frames = skin.frames()
         await skin.ready()
-        assert "skin/robot/+/frame" in skin._subscribed
+        assert "skin/robot/+/frame" in skin._links[0]._subscribed
         del frames
         publisher.put_frame(frame(1))
-        await until(lambda: "skin/robot/+/frame" not in skin._subscribed)
+        await until(lambda: "skin/robot/+/frame" not in skin._links[0]._subscribed)
 
 
 async def test_streams_end_with_the_client(mosquitto: Mosquitto) -> None:
@@ -251,6 +253,23 @@ async def test_nonsense_on_a_topic_is_counted_and_passed_over(mosquitto: Mosquit
         assert skin.unreadable == 2  # the third was for somebody else
 
 
+async def test_a_bomb_of_properties_stops_no_client(mosquitto: Mosquitto) -> None:
+    bomb = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+    for _ in range(5000):
+        bomb.UserProperty = ("", "")
+    async with publishing(mosquitto) as publisher, hearing(mosquitto) as skin:
+        touches = skin.touches()
+        await skin.ready()
+        async with aiomqtt.Client(
+            mosquitto.host, mosquitto.port, protocol=aiomqtt.ProtocolVersion.V5
+        ) as stranger:
+            await stranger.publish("skin/robot/palm/touch", b"{}", qos=1, properties=bomb)
+        publisher.put_touch(touch(1))
+        assert (await take(touches, 1))[0].count == 1
+        assert skin.unreadable == 0  # it was not even decoded
+        assert skin.connections == 1
+
+
 async def test_without_a_broker_the_error_says_so() -> None:
     with pytest.raises(BrokerError, match="no broker listens there"):
         async with SkinClient(f"mqtt://127.0.0.1:{free_port()}", robot="r", patience_s=0.3):
@@ -284,19 +303,19 @@ async def test_callbacks_hear_the_same_from_a_thread_of_their_own(mosquitto: Mos
             return result
 
     async with publishing(mosquitto) as publisher:
-        publisher.put_contact("palm", True)
+        publisher.put_contact("palm", "ON")
         sent, ready = threading.Event(), threading.Event()
         user = asyncio.create_task(asyncio.to_thread(use, sent, ready))
         await asyncio.to_thread(ready.wait, PATIENCE_S)
         publisher.put_touch(touch(1))
         publisher.put_frame(frame(1))
-        publisher.put_contact("palm", False)
+        publisher.put_contact("palm", "OFF")
         await until(lambda: len(heard) == 4)
         sent.set()
         assert (await user) == {"arguments": {"seconds": 1}}
     assert [item for item in heard if isinstance(item, Contact)] == [
-        Contact("palm", True),
-        Contact("palm", False),
+        Contact("palm", "ON"),
+        Contact("palm", "OFF"),
     ]
 
 

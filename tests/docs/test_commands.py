@@ -2,12 +2,15 @@
 
 import argparse
 import re
+import tomllib
+from pathlib import Path
 
 import pytest
 
 from skin_host.cli import build_parser
 from tests.support.pages import PAGES, ROOT, blocks, commands, mentioned
 
+CONFIGURATION = PAGES["docs/configuration.md"].read_text()
 SHOWN = [
     pytest.param(command.words, id=f"{page}:{command.line}")
     for page in PAGES
@@ -41,6 +44,9 @@ def test_a_mentioned_command_and_its_options_exist(words: list[str]) -> None:
     parser = parsers()[words[1]]
     known = {option for action in parser._actions for option in action.option_strings}
     assert {word for word in words[2:] if word.startswith("-")} <= known
+    # One with a file can be typed as it stands; placeholders are in capitals.
+    if any(re.search(r"[a-z]\.[a-z]+$", word) for word in words[2:]):
+        build_parser().parse_args(words[1:])
 
 
 @pytest.mark.parametrize("command", parsers())
@@ -61,6 +67,17 @@ def test_every_command_is_explained_somewhere() -> None:
     named = {case.values[0][1] for case in [*OURS, *MENTIONED]}
     # `make demo` is how the demo is started.
     assert set(parsers()) - named <= {"demo"}
+
+
+def test_the_kinds_of_the_configuration_page_are_those_that_are_built_in() -> None:
+    (row,) = re.findall(r"^\| `kind` .*built in are ([^|]*)\|", CONFIGURATION, re.MULTILINE)
+    kinds = tomllib.loads((ROOT / "skin_host/kinds.toml").read_text())
+    assert row.strip().split(", ") == list(kinds)
+
+
+def test_every_page_has_its_place_on_the_site() -> None:
+    placed = set(re.findall(r": (\w+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE))
+    assert {Path(page).name for page in PAGES if page.startswith("docs/")} <= placed
 
 
 @pytest.mark.parametrize("page", PAGES)

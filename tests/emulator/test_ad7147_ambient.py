@@ -225,3 +225,46 @@ class TestLowPower:
             chip.advance(0.01)
             complete += get(chip, COMPLETE) >> 11 & 1
         assert complete == pytest.approx(10 / 0.209216, abs=1)
+
+
+class TestOpen:
+    """What the model does where no source at hand decides, see docs/scenes.md."""
+
+    def joystick(self):
+        """Stages 8 to 10 of the board data in Linux: two differences, and the sum."""
+        chip = AD7147()
+        chip.set_capacitances_ff(np.full(13, 3000.0))
+        for stage, words in (
+            (8, (0xFF7B, 0x3FFF, 0x0506, 0x2626, 1100, 1100, 1150, 1150)),
+            (9, (0xFDFE, 0x3FFF, 0x0606, 0x2626, 1100, 1100, 1150, 1150)),
+            (10, (0xFEBA, 0x1FFF, 0x1400, 0x2626, 1200, 1200, 1300, 1300)),
+        ):
+            put(chip, 0x080 + 8 * stage, *words)
+        put(chip, 0x000, 0x02B0, 0, 0x3233, 0x0819, 0x0832, 0x0700, 0x0700, 0)
+        put(chip, 0x001, 0x0700)
+        chip.advance(1.0)
+        return chip
+
+    def test_opposite_keys_of_one_stage_release_each_other(self):
+        chip = self.joystick()
+        chip.set_capacitance_ff(0, 3500.0)
+        chip.advance(2 * SEQUENCE_S)
+        assert get(chip, 0x041) & 0x700 == 0x600
+        chip.set_capacitance_ff(4, 3500.0)
+        chip.advance(2 * SEQUENCE_S)
+        assert get(chip, 0x041) & 0x700 == 0x400
+
+    def test_opposite_keys_within_one_sequence_are_the_sum_alone(self):
+        chip = self.joystick()
+        chip.set_capacitance_ff(0, 3500.0)
+        chip.set_capacitance_ff(4, 3500.0)
+        chip.advance(2 * SEQUENCE_S)
+        assert get(chip, 0x041) & 0x700 == 0x400
+
+    def test_a_key_that_is_held_becomes_the_ambient_value(self):
+        chip = self.joystick()
+        chip.set_capacitance_ff(0, 3500.0)
+        chip.advance(49 * SEQUENCE_S)
+        assert get(chip, 0x041) & 0x700 == 0x600
+        chip.advance(4 * SEQUENCE_S)
+        assert get(chip, 0x041) & 0x700 == 0

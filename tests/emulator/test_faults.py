@@ -1,5 +1,6 @@
 """Every fault by name, on a robot of the demo configuration, seen in the frames it sends."""
 
+import errno
 from collections.abc import Callable
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 from emulator.faults import KINDS, parse
+from emulator.i2c_dev import Caller, I2cDevice, Ioctl
 from emulator.robot import Robot
 from emulator.scene import Fault, Scene
 from skin_host import settings as configurations
@@ -18,7 +20,7 @@ from skin_host.layout import build_layout
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
 
 
-def make(scene: Scene | None = None, fidelity: str = "signal") -> Robot:
+def make(scene: Scene | None = None, fidelity: str = "signal", *, by_bus: bool = False) -> Robot:
     settings = configurations.load(CONFIG)
     robot = Robot(
         settings,
@@ -26,6 +28,7 @@ def make(scene: Scene | None = None, fidelity: str = "signal") -> Robot:
         scene or Scene(noise=False),
         fidelity=fidelity,
     )
+    robot.converters.by_bus = by_bus
     robot.bring_up()
     robot.step(0.21)
     return robot
@@ -102,7 +105,7 @@ def test_a_stuck_taxel_stays_where_it_is_told(robot: Robot) -> None:
 
 @pytest.mark.parametrize("fidelity", ["signal", "chip"])
 def test_several_stuck_taxels_of_a_chip_stay_and_are_mended_one_by_one(fidelity: str) -> None:
-    robot = make(Scene(), fidelity)
+    robot = make(Scene(quiet=True), fidelity)
     robot.inject(Fault(name="stuck_taxel", board="hand", triangle=9, taxel=4))
     mend = robot.inject(Fault(name="stuck_taxel", board="hand", triangle=9, taxel=5))
 
@@ -117,7 +120,7 @@ def test_several_stuck_taxels_of_a_chip_stay_and_are_mended_one_by_one(fidelity:
 
 @pytest.mark.parametrize("fidelity", ["signal", "chip"])
 def test_a_noisy_taxel_moves_more_than_its_neighbours(fidelity: str) -> None:
-    robot = make(Scene(), fidelity)
+    robot = make(Scene(quiet=True), fidelity)
     robot.inject(Fault(name="noisy_taxel", board="hand", triangle=9, taxel=5))
     rows = np.array([triangle(frames(robot, 0.05), 14, 9)[0] for _ in range(80)])
     assert rows[:, 5].std() == pytest.approx(6.0, rel=0.4)
@@ -230,10 +233,95 @@ def test_the_same_faults_give_the_same_bytes_at_both_fidelities() -> None:
             Fault(name="jittered_period", board="forearm_outer", at_s=1.4),
         ]
     )
-    runs = [frames(make(scene, fidelity), 2.0) for fidelity in ("signal", "chip")]
+    runs = [frames(make(scene, kind, by_bus=True), 2.0) for kind in ("signal", "chip")]
     assert (runs[0].id == runs[1].id).all()
     assert (runs[0].data == runs[1].data).all()
     assert (runs[0].t_ns == runs[1].t_ns).all()
+
+
+WIRES = ("shared_address", "no_acknowledge", "data_held_low", "clock_stretched", "brown_out")
+
+
+@pytest.mark.parametrize("name", WIRES)
+def test_faults_of_the_wire_give_the_same_bytes_at_both_fidelities(name: str) -> None:
+    fault = Fault(name=name, board="hand", triangle=2, at_s=1.3, until_s=1.6)
+    scene = Scene(fault=[fault])
+    runs = [frames(make(scene, kind, by_bus=True), 1.5) for kind in ("signal", "chip")]
+    assert (runs[0].data == runs[1].data).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("shared_address", 1),
+        ("no_acknowledge", 0),
+        ("no_acknowledge", 1),
+        ("data_held_low", 0),
+        ("clock_stretched", 20),
+        ("brown_out", None),
+        ("bit_flipped", 0.02),
+        ("slow_rise", 20),
+    ],
+)
+def test_faults_of_the_wire_are_seen_in_the_frames_of_boards(
+    robot: Robot, name: str, value: float | None
+) -> None:
+    mend = robot.inject(Fault(name=name, board="hand", triangle=2, value=value))
+    sent = frames(robot, 0.5)
+    words = sent.data[(sent.id == 0x4E2) & (sent.data[:, 0] == 0xC0)][:, 6:].tolist()
+    assert any(word != [0, 0] for word in words)
+    # Another data line; but all share one clock.
+    assert triangle(sent, 14, 4)[1] == 0 or name == "clock_stretched"
+    mend()
+    if name != "brown_out":
+        # The board may have taken another zero meanwhile; a new set-up mends that, too.
+        robot.inject(Fault(name="board_reset", board="hand"))
+        robot.bring_up()
+        assert triangle(frames(robot), 14, 2) == UNTOUCHED
+
+
+def test_a_chip_that_browned_out_measures_again_once_its_board_sets_it_up(robot: Robot) -> None:
+    robot.inject(Fault(name="brown_out", board="hand", triangle=2))
+    robot.step(1.0)
+    robot.bring_up()
+    values, _ = triangle(frames(robot), 14, 2)
+    assert values == [240] * 12
+    assert robot.boards["hand"].chips.read()[2][1:].tolist() == [0] * 11
+    robot.inject(Fault(name="board_reset", board="hand"))
+    robot.bring_up()
+    assert robot.boards["hand"].chips.read()[2].all()
+
+
+def test_a_data_line_that_is_held_costs_one_reading(robot: Robot) -> None:
+    robot.inject(Fault(name="data_held_low", board="hand", triangle=2))
+    sent = frames(robot, 0.1)
+    statuses = sent.data[(sent.id == 0x4E0) & (sent.data[:, 0] == 0xC0)][:, 6:].tolist()
+    assert [0, 0] != statuses[0] == [0xFF, 0xF1]
+    assert statuses[-1] == [0, 0]
+
+
+@pytest.mark.parametrize(
+    ("line", "error"),
+    [
+        ("no_acknowledge board=hand triangle=2 value=0", errno.ENXIO),
+        ("no_acknowledge board=hand triangle=2", errno.EREMOTEIO),
+        ("data_held_low board=hand triangle=2 value=0", errno.ETIMEDOUT),
+        ("clock_stretched board=hand triangle=2 value=200000", errno.ETIMEDOUT),
+        ("chip_gone board=hand triangle=2", errno.ENXIO),
+    ],
+)
+def test_i2c_clients_on_a_line_of_the_robot_meet_its_faults(line: str, error: int) -> None:
+    robot = make(fidelity="chip")
+    bus = I2cDevice(robot.converters.lines[0][0])
+    client = bus.open()
+    bus.ioctl(client, Ioctl.SLAVE, 0x2E, Caller(b"", 0))
+    mend = robot.inject(parse(line))
+    with pytest.raises(OSError) as raised:
+        bus.write(client, bytes([0x00, 0x17]))
+    assert raised.value.errno == error
+    mend()
+    bus.write(client, bytes([0x00, 0x17]))
+    assert bus.read(client, 2) == b"\x14\x71"
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -259,6 +347,10 @@ def test_every_fault_can_be_named_in_a_scene(name: str) -> None:
             r'fault\[0\].triangle: 6 is not fitted on "hand"',
         ),
         (Fault(name="bus_off", bus="can7"), r'fault\[0\].bus: no bus "can7"; there are: can0'),
+        (
+            Fault(name="bit_flipped", board="hand", triangle=0, value=2),
+            r"fault\[0\].value: 2; wanted 0 to 1",
+        ),
         (Fault(name="bus_off", bus="can0", at_s=2, until_s=1), r"fault\[0\].until_s: wanted"),
     ],
 )
@@ -293,3 +385,14 @@ def test_every_fault_is_explained_in_the_documentation() -> None:
     page = (CONFIG.parents[1] / "docs" / "scenes.md").read_text()
     for name in KINDS:
         assert f"| `{name}` |" in page
+
+
+def test_the_page_of_faults_has_a_result_in_time_for_each_on_every_firmware() -> None:
+    page = (CONFIG.parents[1] / "docs" / "faults.md").read_text()
+    rows = [line.strip("|").split("|") for line in page.splitlines() if line.startswith("| `")]
+    cells = [[cell.strip() for cell in row] for row in rows]
+
+    assert sorted(row[0].strip("`") for row in cells) == sorted([*KINDS, *KINDS])
+    assert all(len(row) == 9 for row in cells)
+    for _, _, within, *measured in cells:
+        assert all(float(one.split(" s")[0]) <= float(within.split(" s")[0]) for one in measured)

@@ -16,7 +16,7 @@ from skin_host.errors import ConfigurationError
 from skin_host.fingertip.events import SlipEvent
 from skin_host.fingertip.strain_protocol import start_frames
 from skin_host.layout import build_layout
-from skin_host.processing.contacts import TouchEvent
+from skin_host.processing.events import TouchEvent
 from skin_host.settings import load
 
 CONFIG = Path(__file__).parents[2] / "config"
@@ -29,7 +29,9 @@ class World:
     def __init__(self, *probes: dict[str, Any]) -> None:
         self.settings = load(PATH)
         layout = build_layout(self.settings, CONFIG)
-        scene = Scene(probe=[msgspec.convert(probe, Probe) for probe in probes], spread=False)
+        scene = Scene(
+            probe=[msgspec.convert(probe, Probe) for probe in probes], spread=False, quiet=True
+        )
         self.robot = Robot(self.settings, layout, scene)
         self.robot.bring_up()
         for tip in self.settings.fingertips.values():
@@ -43,10 +45,8 @@ class World:
 
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds / 0.02)):
-            self.engine.feed("can0", self.step())
-            self.engine.expire(self.robot.t_ns)
-            assert self.engine.fingertips is not None
-            self.events += self.engine.fingertips.take()
+            self.events += self.engine.feed("can0", self.step()).grasps
+            self.events += self.engine.expire(self.robot.t_ns).grasps
 
     def step(self) -> FrameBatch:
         return self.robot.step(0.02)["can0"]

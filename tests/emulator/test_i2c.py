@@ -6,6 +6,7 @@ from smbus2 import SMBus, i2c_msg
 
 from emulator.ad7147 import AD7147
 from emulator.i2c import EmulatedSMBus, build_lines, line_and_address
+from emulator.i2c_wire import FOR_EVER
 
 
 def bus_of_four(**arguments):
@@ -105,11 +106,11 @@ class TestFaults:
 
     def test_a_chip_can_go_and_come_back_with_its_registers(self):
         bus = bus_of_four()
-        bus.silent.add(0x2D)
+        bus.line.refuse(0x2D, 0)
         with pytest.raises(OSError):
             read(bus, 0x2D, 0x080)
         assert read(bus, 0x2C, 0x080) == b"\x00\x2c"
-        bus.silent.clear()
+        bus.line.refuse(0x2D, None)
         assert read(bus, 0x2D, 0x080) == b"\x00\x2d"
 
     def test_messages_before_the_missing_acknowledge_had_their_effect(self):
@@ -120,17 +121,17 @@ class TestFaults:
 
     def test_a_stuck_bus_times_out_for_everybody(self):
         bus = bus_of_four()
-        bus.stuck = True
+        bus.line.hold(FOR_EVER)
         for address in (0x2C, 0x2F):
             with pytest.raises(OSError) as raised:
                 read(bus, address, 0x017)
             assert raised.value.errno == errno.ETIMEDOUT
-        bus.stuck = False
+        bus.line.hold(0)
         assert read(bus, 0x2C, 0x017) == b"\x14\x71"
 
     def test_a_glitch_shifts_one_read_by_a_bit(self):
         bus = bus_of_four()
-        bus.glitch()
+        bus.line.slip()
         assert read(bus, 0x2C, 0x017) == b"\x8a\x38"
         assert read(bus, 0x2C, 0x017) == b"\x14\x71"
 

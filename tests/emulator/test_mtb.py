@@ -106,7 +106,7 @@ def test_a_chip_absent_since_calibration_sends_constant_no_load_and_not_connecte
 def test_a_chip_lost_later_reads_as_full_pressure_and_not_connected() -> None:
     """theSkin: raw 0xFFFF against a real baseline; reference vector of the wire."""
     bench = started()
-    bench.lines[0].silent.add(0x2C)
+    bench.lines[0].line.refuse(0x2C, 0)
     bench.run(0.01)
     assert bench.triangle(bench.run(0.05), 0) == ([0] * 12, 0xFFF2)
 

@@ -188,7 +188,7 @@ def test_reset_is_acknowledged_and_executed_only_if_addressed() -> None:
 def test_not_connected_replaces_no_acknowledge() -> None:
     """main FillCanMessages8bit(): `error = error_notconnected` overwrites."""
     bench = started(triangles=2)
-    bench.lines[0].silent.add(0x2C)
+    bench.lines[0].line.refuse(0x2C, 0)
     bench.run(0.05)
     frames = bench.run(0.06)
     # The baseline is below 0x8000, so the 16-bit difference wraps and clips at the wrong end.

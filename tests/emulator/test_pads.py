@@ -120,11 +120,10 @@ def test_capacitance_follows_pad_area_and_thickness():
     np.testing.assert_allclose(pads.c0_ff, [100, 25, 200 / 3])
 
 
-def test_most_pads_are_quiet_and_a_few_are_not():
-    rng = np.random.default_rng(3)
-    noise_units = draw_noise_ff(5000, rng) / 2.88
-    assert 0.19 < np.median(noise_units) < 0.41
-    assert 0.005 < np.mean(noise_units > 0.9) < 0.03
+def test_pads_of_the_best_skin_are_all_quiet():
+    noise_units = draw_noise_ff(5000, np.random.default_rng(3)) / 2.88
+    assert noise_units.min() >= 0.2
+    assert noise_units.max() <= 0.4
 
 
 def test_resting_pads_lie_thousands_of_codes_apart():

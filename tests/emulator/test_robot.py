@@ -7,15 +7,23 @@ import pytest
 from smbus2 import i2c_msg
 
 from emulator import scene as scenes
+from emulator.bring_up import triangle_set_ups
+from emulator.clock import SteppedClock
 from emulator.robot import Robot
 from emulator.scene import Place, Probe, Scene
 from skin_host import settings as configurations
 from skin_host.bus.protocol import FrameBatch, find_skin_frames
 from skin_host.bus.protocol.answers import Discovered, parse_answer
-from skin_host.bus.protocol.commands import Discover, command_frame
+from skin_host.bus.protocol.commands import (
+    Discover,
+    SetBoardConfig,
+    SetTxMode,
+    TxMode,
+    command_frame,
+)
 from skin_host.errors import ConfigurationError, LogError
 from skin_host.layout import Layout, build_layout
-from skin_host.settings import Settings
+from skin_host.settings import Settings, changed
 
 CONFIG = Path(__file__).parents[2] / "config"
 
@@ -119,6 +127,7 @@ def test_signal_and_chip_fidelity_send_the_same_bytes() -> None:
     runs = []
     for fidelity in ("signal", "chip", {"hand": "chip", "forearm_outer": "signal"}):
         robot = Robot(*load(), scene, fidelity=fidelity)
+        robot.converters.by_bus = True
         robot.bring_up()
         runs.append(bytes_of(robot, 9.0))
     assert runs[0] == runs[1] == runs[2]
@@ -189,6 +198,31 @@ async def test_a_robot_answers_and_streams_on_a_python_can_bus() -> None:
     assert answers == {12, 13, 14}
 
 
+async def test_boards_whose_computer_was_busy_get_their_commands_one_after_the_other() -> None:
+    settings, layout = load()
+    robot = Robot(settings, layout, Scene(noise=False))
+    clock = SteppedClock()
+    with (
+        can.Bus(interface="virtual", channel="test-busy") as inside,
+        can.Bus(interface="virtual", channel="test-busy") as outside,
+    ):
+        life = asyncio.create_task(robot.run({"can0": inside}, clock))
+        await clock.advance(0.01)
+        # The first command 50 takes its zero before the chips have converted, the second after.
+        board = layout.boards[0]
+        set_ups = triangle_set_ups(layout, 0)
+        start = [SetTxMode(TxMode.START)]
+        for message in [SetBoardConfig(0, 50, 240), *set_ups, *set_ups, *start]:
+            can_id, data = command_frame(message, board.settings.address)
+            outside.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+        for _ in range(3):
+            await clock.advance(0.2)
+        life.cancel()
+        frames = iter(lambda: outside.recv(0), None)
+        status = {bytes(frame.data[6:8]) for frame in frames if frame.data[0] == 0xC0}
+    assert status == {b"\0\0"}
+
+
 def test_a_program_can_press_with_a_probe_of_its_own() -> None:
     settings, layout = load()
     robot = Robot(settings, layout, Scene(noise=False))
@@ -254,11 +288,12 @@ def test_all_models_of_boards_live_in_a_robot_at_both_fidelities(model: str) -> 
     runs = []
     for fidelity in ("signal", "chip"):
         settings, layout = load()
-        for board in settings.boards.values():
-            board.model = model  # type: ignore[assignment]
+        for name in settings.boards:
+            settings = changed(settings, {f"boards.{name}.model": model})
         robot = Robot(
             settings, layout, scenes.load(CONFIG / "scenes" / "demo.toml"), fidelity=fidelity
         )
+        robot.converters.by_bus = True
         robot.bring_up()
         robot.step(5.0)
         sent = robot.step(2.0)["can0"]
@@ -266,6 +301,36 @@ def test_all_models_of_boards_live_in_a_robot_at_both_fidelities(model: str) -> 
         assert np.median(np.abs(values(sent, layout) - 240)) <= 1
         runs.append(sent.data.tobytes() + sent.id.tobytes() + sent.t_ns.tobytes())
     assert runs[0] == runs[1]
+
+
+def test_registers_are_the_same_whether_results_came_over_the_bus_or_not() -> None:
+    seen = []
+    for by_bus in (True, False):
+        scene = scenes.load(CONFIG / "scenes" / "demo.toml")
+        robot = Robot(*load(), scene, fidelity="chip")
+        robot.converters.by_bus = by_bus
+        robot.bring_up()
+        sent = robot.step(8.0)["can0"].data.tobytes()
+        registers = [i2c_msg.read(0x2C, 2 * 0x20) for _ in robot.converters.lines]
+        for lines, answer in zip(robot.converters.lines.values(), registers, strict=True):
+            # From where the board's own reading left the pointer.
+            lines[0].i2c_rdwr(answer)
+        whole = [robot.converters.synced(chip) for chip in robot.converters.registers]
+        words = [chip.write(b"\0\0") and chip.read(2 * 0x290) for chip in whole]
+        seen.append((sent, [bytes(answer) for answer in registers], words))
+    assert seen[0] == seen[1]
+
+
+def test_a_board_whose_chips_somebody_else_set_up_sends_what_they_read() -> None:
+    robot = Robot(*load(), Scene(noise=False), fidelity="chip")
+    robot.bring_up()
+    robot.step(0.2)
+    for lines in robot.converters.lines.values():
+        # Excitation off: all results are in the middle of the scale.
+        lines[0].i2c_rdwr(i2c_msg.write(0x2C, [0x00, 0x00, 0x10, 0xB0]))
+    robot.step(0.2)
+    assert robot.boards["hand"].chips.read()[0].tolist() == [32768] * 12
+    assert robot.boards["hand"].chips.read()[1].tolist() != [32768] * 12
 
 
 def test_others_on_an_i2c_line_of_the_robot_find_its_chips_at_work() -> None:

@@ -1,9 +1,17 @@
 import numpy as np
 import pytest
 
-from emulator.viscoelastic import BETA, TAU_S, FoamTruth
+from emulator.viscoelastic import (
+    BETA,
+    COLE_EXPONENT,
+    COLE_TAU_S,
+    HEALING_S,
+    SOFTENING,
+    TAU_S,
+    FoamTruth,
+)
 
-KINDS = ["S", "A", "L", "H"]
+KINDS = ["S", "A", "L", "H", "F", "M"]
 
 
 def run(truth, elastic, seconds, dt_s):
@@ -110,3 +118,45 @@ def test_drawn_truths_differ_from_taxel_to_taxel():
     truth.step(np.full(100, 50.0), 100.0)
     spread = truth.relaxation_kpa.std() / truth.relaxation_kpa.mean()
     assert 0.05 < spread < 0.15
+
+
+def test_the_fractional_truth_relaxes_by_powers_of_time():
+    truth = FoamTruth("F", 1)
+    level = 1e-3  # so small that losses do not grow with it
+    truth.step([level], 0.0)
+    lost = {}
+    at_s = 0.0
+    for wanted_s in (0.1, 1.0, 1e4, 1e5):
+        steps = 400
+        for _ in range(steps):
+            truth.step([level], (wanted_s - at_s) / steps)
+        at_s = wanted_s
+        lost[wanted_s] = truth.relaxation_kpa[0] / level / BETA.sum()
+    # The Mittag-Leffler function's two ends: Gamma(1.5) = sqrt(pi) / 2, Gamma(0.5) = sqrt(pi).
+    for t_s in (0.1, 1.0):
+        power = (t_s / COLE_TAU_S) ** COLE_EXPONENT
+        assert lost[t_s] == pytest.approx(power * 2.0 / np.sqrt(np.pi), rel=0.12)
+    for t_s in (1e4, 1e5):
+        power = (t_s / COLE_TAU_S) ** -COLE_EXPONENT
+        assert 1.0 - lost[t_s] == pytest.approx(power / np.sqrt(np.pi), rel=0.12)
+
+
+def test_foam_that_was_pressed_harder_is_softer_until_it_has_healed():
+    def borne_at_30_kpa(before, rest_s):
+        truth = FoamTruth("M", 1, loss=0.0)
+        truth.step([before], 0.0)
+        truth.step([0.0], 0.0)
+        truth.step([0.0], rest_s)
+        return truth.step([30.0], 0.0)[0]
+
+    assert borne_at_30_kpa(30.0, 0.0) == pytest.approx(30.0)
+    assert borne_at_30_kpa(300.0, 0.0) == pytest.approx(30.0 * (1.0 - SOFTENING), rel=1e-3)
+    assert borne_at_30_kpa(300.0, 10.0 * HEALING_S) == pytest.approx(30.0)
+
+
+def test_warm_foam_does_the_same_sooner_and_lossy_foam_more_of_it():
+    cold, warm, lossy = FoamTruth("S", 1), FoamTruth("S", 1, speed=2.8), FoamTruth("S", 1, loss=0.5)
+    for truth, dt_s in ((cold, 2.8), (warm, 1.0), (lossy, 2.8)):
+        run(truth, 50.0, 100.0 * dt_s, dt_s)
+    assert warm.relaxation_kpa == pytest.approx(cold.relaxation_kpa)
+    assert lossy.relaxation_kpa == pytest.approx(0.5 * cold.relaxation_kpa)

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from skin_host.layout import build_layout
-from skin_host.processing.contacts import TouchEvent
+from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.publish.info import node_info
 from skin_host.publish.mqtt import Publisher
@@ -115,3 +115,36 @@ async def test_a_contact_pushes_against_the_normal_and_turns_the_part_about_its_
     assert vars(said.wrench.force) == {"x": 0, "y": 0, "z": -2.0}
     # 2 N down at x = 0.1 m: the x side goes down, which is a positive turn about y.
     assert vars(said.wrench.torque) == {"x": 0, "y": pytest.approx(0.2), "z": 0}
+
+
+async def test_the_motor_stops_for_what_is_touched_and_for_what_is_not_known(
+    mosquitto: Mosquitto,
+) -> None:
+    program = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-u", EXAMPLES / "stop_on_touch.py", "left_hand"),
+        *(f"mqtt://{mosquitto.host}:{mosquitto.port}",),
+        cwd=ROOT,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    assert program.stdout is not None and program.stdin is not None
+    said = []
+    async with asyncio.timeout(PATIENCE_S):
+        async with node(mosquitto) as publisher:
+            for state in ("OFF", "ON", "OFF", "UNKNOWN", "OFF"):
+                publisher.put_contact("left_hand", state)
+                if not said:
+                    said.append(await program.stdout.readline())
+                said.append(await program.stdout.readline())
+        said.append(await program.stdout.readline())
+        program.stdin.close()
+        await program.wait()
+    assert [line.decode().strip() for line in said] == [
+        "stop until something is known",
+        "move",
+        "stop touched",
+        "move",
+        "stop not_felt",
+        "move",
+        "stop offline",
+    ]

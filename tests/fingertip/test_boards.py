@@ -20,12 +20,13 @@ from skin_host.bus.protocol import FrameBatch
 from skin_host.engine import Engine
 from skin_host.fingertip.boards import StrainBoards
 from skin_host.fingertip.engine import FingertipEngine
+from skin_host.fingertip.events import FingertipEvent
 from skin_host.fingertip.health import FingertipHealth, FingertipRecord
 from skin_host.layout import build_layout
 from skin_host.processing.calibration import Zero
-from skin_host.processing.contacts import TouchEvent
+from skin_host.processing.events import TouchEvent
 from skin_host.publish import messages
-from skin_host.settings import load
+from skin_host.settings import changed, load
 
 CONFIG = Path(__file__).parents[2] / "config"
 
@@ -36,7 +37,7 @@ class Bench:
     def __init__(self, *probes: dict[str, Any], noise: bool = True, **table: Any) -> None:
         settings = load(CONFIG / "fingertips.toml")
         index = msgspec.structs.replace(settings.fingertips["index"], **table)
-        settings.fingertips["index"] = index
+        settings = changed(settings, {"fingertips.index": index})
         layout = build_layout(settings, CONFIG)
         scene = Scene(probe=[msgspec.convert(probe, Probe) for probe in probes], noise=noise)
         self.robot = Robot(settings, layout, scene)
@@ -46,6 +47,7 @@ class Bench:
         self.tips: FingertipEngine = self.engine.fingertips
         self.health = FingertipHealth(self.tips)
         self.sent: list[tuple[int, bytes]] = []
+        self.felt: list[FingertipEvent] = []
         clock = lambda: self.robot.t_ns  # noqa: E731
         self.boards = StrainBoards("can0", self, self.tips.on_bus("can0"), clock)
 
@@ -57,8 +59,8 @@ class Bench:
 
     async def run(self, seconds: float) -> None:
         for _ in range(round(seconds / 0.02)):
-            self.engine.feed("can0", self.robot.step(0.02)["can0"])
-            self.engine.expire(self.robot.t_ns)
+            self.felt += self.engine.feed("can0", self.robot.step(0.02)["can0"]).grasps
+            self.felt += self.engine.expire(self.robot.t_ns).grasps
             self.boards.supervise()
             self.health.tick(self.robot.t_ns)
             await asyncio.sleep(0)
@@ -124,7 +126,7 @@ async def test_full_scales_that_are_given_are_used_and_compared() -> None:
     await bench.boards.bring_up()
     await bench.calibrate()
     assert bench.codes() == []
-    bench.tips.tips["index"].told_scale[2] = 2000.0
+    bench.tips.tips["index"].reported_scale[2] = 2000.0
     assert bench.codes() == ["scale"]
 
 
@@ -134,7 +136,7 @@ async def test_a_board_that_does_not_tell_its_full_scales_is_not_configured() ->
     await bench.run(0.1)
     state = bench.tips.tips["index"]
     state.assembler = None
-    state.told_scale[:] = 0.0
+    state.reported_scale[:] = 0.0
     assert (bench.record()["state"], bench.codes()) == ("not configured", ["not_configured"])
 
 
@@ -144,7 +146,7 @@ async def test_load_beyond_the_range_is_told_and_has_no_place() -> None:
     await bench.calibrate()
     await bench.run(2.5)
     assert (bench.record()["state"], bench.codes()) == ("saturated", ["saturated"])
-    told = [event for event in bench.tips.take() if event.part == "index"]
+    told = [event for event in bench.felt if event.part == "index"]
     loads = [getattr(event, "load", None) for event in told]
     assert "saturated" in {load.verdict for load in loads if load is not None}
     await bench.run(6.0)
@@ -182,17 +184,17 @@ def test_no_traffic_on_the_bus_breaks_the_engine_or_gives_numbers_that_are_none(
 ) -> None:
     bench = Bench(full_scale=(50.0, 50.0, 50.0, 1.0, 1.0, 1.0))
     noise = np.array([2e-3] * 3 + [5e-5] * 3)
-    bench.tips.use(dict.fromkeys(bench.tips.tips, Zero(np.zeros(6), noise)))
+    felt = bench.tips.use(dict.fromkeys(bench.tips.tips, Zero(np.zeros(6), noise)))
     t_ns = 1_000_000_000
     for can_id, data, pause_ns in traffic:
         t_ns = max(0, t_ns + pause_ns)
-        bench.engine.feed("can0", FrameBatch.of([(can_id, data, t_ns)]))
-        bench.engine.expire(t_ns)
+        felt += bench.engine.feed("can0", FrameBatch.of([(can_id, data, t_ns)])).grasps
+        felt += bench.engine.expire(t_ns).grasps
         bench.health.tick(t_ns)
         bench.health.records(t_ns)
-    bench.tips.end_all(t_ns)
+    felt += bench.tips.end_all(t_ns)
     open_now: dict[str, set[tuple[str, int]]] = {"touch": set(), "slip": set(), "over": set()}
-    for event in bench.tips.take():
+    for event in felt:
         kind = "touch" if isinstance(event, TouchEvent) else type(event).__name__[:-5].lower()
         assert math.isfinite(event.force_n)
         if isinstance(event, TouchEvent):

@@ -11,7 +11,7 @@ from skin_host.fingertip.settings import Fingertip
 from skin_host.fingertip.strain_protocol import Wrench
 from skin_host.fingertip.tip import Tip
 from skin_host.processing.calibration import Zero
-from skin_host.processing.contacts import TouchEvent
+from skin_host.processing.events import TouchEvent
 
 MS = 1_000_000
 RADIUS_MM = 13.0

@@ -12,14 +12,15 @@ import numpy as np
 
 from skin_host.bus.boards import Boards
 from skin_host.bus.protocol import FrameBatch
+from skin_host.clock import SYSTEM
 from skin_host.control import Control
 from skin_host.engine import Engine
-from skin_host.errors import RequestError, SkinError
+from skin_host.errors import NewerFileError, RequestError, SkinError
 from skin_host.health import Health
 from skin_host.layout import Layout, build_layout
 from skin_host.processing import calibration as calibrations
-from skin_host.publish.commands import CommandDesk, decode_result
-from skin_host.settings import Settings, load, skin_hash
+from skin_host.publish.commands import CommandHandler, decode_result
+from skin_host.settings import Settings, changed, load, skin_hash
 from skin_host.state import load_state
 
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
@@ -67,7 +68,7 @@ class Buses:
         self.engine.begin_calibration(0.5)
         self.health = Health(self.engine)
         boards = [(i, layout.boards[i]) for i in self.engine.boards]
-        self.boards = Boards("can0", _Port(), boards, layout.triangles, 4.0)
+        self.boards = Boards("can0", _Port(), boards, layout.triangles, self.engine.ledger)
         self.t_ns = 1_700_000_000_000_000_000
         self.frames = 0
 
@@ -81,16 +82,12 @@ class Buses:
         batch = FrameBatch(
             rows[:, :4].copy().view("<u4").ravel(), rows[:, 4], rows[:, 5:13].copy(), t_ns
         )
-        self.boards.feed(batch)
-        steps = self.engine.feed("can0", batch)
-        for sweep in self.engine.sweeps:
-            self.boards.note_sweep(sweep.board, sweep.present, sweep.t_ns)
-        steps += self.engine.expire(self.t_ns)
-        self.health.note_sweeps(self.engine.sweeps)
-        for step in steps:
-            self.health.note_step(step)
-            assert np.isfinite(step.frame.pressure_kpa).all()
-            assert not step.frame.touched[~step.frame.valid].any()
+        for output in (self.engine.feed("can0", batch), self.engine.expire(self.t_ns)):
+            self.boards.note_answers(output.answers)
+            self.health.note(output)
+            for frame in output.frames:
+                assert np.isfinite(frame.pressure_kpa).all()
+                assert not frame.touched[~frame.valid].any()
         if self.engine.calibrating and self.engine.calibration_progress() >= 1.0:
             self.engine.use(self.engine.end_calibration("2026-01-01T00:00:00+00:00"))
         self.frames += n
@@ -120,15 +117,16 @@ def calibration_file(data: bytes) -> None:
 def state_file(data: bytes) -> None:
     path = folder() / "state.json"
     path.write_bytes(data)
-    load_state(path)
+    with contextlib.suppress(NewerFileError):
+        load_state(path)
 
 
 class Commands:
-    """The desk and the control of a daemon that does nothing."""
+    """The handler and the control of a daemon that does nothing."""
 
     def __init__(self) -> None:
         settings, layout = skin()
-        settings.service.state_directory = str(folder())
+        settings = changed(settings, {"service.state_directory": str(folder())})
         engine = Engine(settings, layout, list(range(len(layout.parts))))
 
         async def calibrate(*_: Any) -> Any:
@@ -138,6 +136,7 @@ class Commands:
             return []
 
         daemon: Any = SimpleNamespace(
+            clock=SYSTEM,
             settings=settings,
             layout=layout,
             engine=engine,
@@ -155,11 +154,11 @@ class Commands:
         self.answered = 0
 
     async def take(self, name: str, payload: bytes) -> None:
-        """Give one request to a desk that has time for it; it must be answered."""
+        """Give one request to a handler that has time for it; it must be answered."""
         answers: list[bytes] = []
-        desk = CommandDesk(self.control.handle)
-        desk.take(name, payload, answers.append)
-        running = list(desk._running)
+        handler = CommandHandler(self.control.handle)
+        handler.take(name, payload, answers.append)
+        running = list(handler._running)
         if running:
             await asyncio.wait(running)
         (answer,) = answers
@@ -167,6 +166,6 @@ class Commands:
         assert result.ok or (result.error and "see the log" not in result.error), result
         self.answered += 1
         if self.control.recorder is not None:
-            self.control.recorder.stop()
+            await self.control.close()
             self.control.recorder.path.unlink(missing_ok=True)
             self.control.recorder = None

@@ -77,7 +77,7 @@ def test_an_unused_bus_and_a_board_of_two_daemons_are_warned_of() -> None:
             "arm": {"patches": [{"board": "mtb", "triangles": "0"}]},
             "hand": {"node": "second", "patches": [{"board": "mtb", "triangles": "1"}]},
         },
-        {"can0": {}, "can1": {}},
+        {"can0": {}, "can1": {"channel": "can1"}},
     )
     assert [warning.split(";")[0] for warning in description["warnings"]] == [
         "buses.can1: no board is on this bus",
@@ -112,7 +112,7 @@ def test_a_fingertip_is_listed_and_its_samples_load_the_bus() -> None:
     settings = msgspec.convert(
         {
             "robot": "test",
-            "buses": {"can0": {}, "can1": {}},
+            "buses": {"can0": {}, "can1": {"channel": "can1"}},
             "boards": {"hand": {"bus": "can0", "address": 1, "skin_type": 2}},
             "parts": {"palm": {"patches": [{"board": "hand", "triangles": "0-3"}]}},
             "fingertips": {
@@ -126,3 +126,18 @@ def test_a_fingertip_is_listed_and_its_samples_load_the_bus() -> None:
     assert description["buses"][1]["load"] == pytest.approx((0.038, 0.046))
     assert description["warnings"] == []
     assert "index      main  can1        3    5 ms  sphere  -" in check.table(description)
+
+
+def test_two_buses_on_one_channel_are_a_warning():
+    buses = {"a": {"channel": "can0"}, "b": {"channel": "can0"}}
+    boards = {name: {"bus": name, "address": 1, "skin_type": 2} for name in buses}
+    parts = {name: {"patches": [{"board": name, "triangles": "0"}]} for name in buses}
+    (warning,) = described(boards, parts, buses)["warnings"]
+    assert warning.startswith("buses.b.channel: can0 is that of buses.a too")
+
+
+def test_foam_in_metres_is_a_warning():
+    boards = {"mtb": {"bus": "can0", "address": 1, "skin_type": 2}}
+    parts = {"arm": {"foam_mm": 0.002, "patches": [{"board": "mtb", "triangles": "0-1"}]}}
+    (warning,) = described(boards, parts)["warnings"]
+    assert warning.startswith("parts.arm.foam_mm: 0.002")

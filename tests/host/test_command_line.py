@@ -6,9 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from skin_host.cli import main
+from skin_host.cli import main, watch
+from skin_host.processing.calibration import Calibrator
+from skin_host.settings import skin_hash
+from tests.support.broker import free_port
 
 ROOT = Path(__file__).parents[2]
 DEMO = ROOT / "config/demo.toml"
@@ -46,9 +50,9 @@ def changed(tmp_path: Path, old: str, new: str) -> str:
 @pytest.mark.parametrize(
     ("old", "new", "path", "seen"),
     [
-        ("address = 14", "address = 15", "boards.hand.address", "<= 14"),
+        ("address = 14", "address = 15", "boards.hand.address", "seen 15, wanted `int` <= 14"),
         ("address = 14", "adress = 14", "boards.hand", "adress"),
-        ("address = 14", 'address = "x"', "boards.hand.address", "str"),
+        ("address = 14", 'address = "x"', "boards.hand.address", "seen 'x', wanted `int`"),
         ('triangles = "0-4"', 'triangles = "0-40"', "parts.left_hand.patches[0].triangles", "40"),
         ('kind = "fingertip"', 'kind = "finger"', "parts.left_hand.patches[0].kind", "finger"),
         ('bus = "can0"', 'bus = "can9"', "boards.hand.bus", "can9"),
@@ -65,19 +69,17 @@ def test_every_configuration_of_the_project_is_right(config, capsys):
     assert main(["check", str(config)]) == 0, capsys.readouterr().err
 
 
-def test_a_missing_interface_is_named_with_what_mends_it(tmp_path):
+def test_a_missing_interface_is_waited_for_and_named_with_what_mends_it(tmp_path):
     config = changed(tmp_path, 'interface = "virtual"', 'interface = "socketcan"')
-    result = skin("run", config, "--calibrate", XDG_STATE_HOME=str(tmp_path))
-    lines = result.stderr.strip().splitlines()
-    assert result.returncode == 1
+    result = skin("run", config, "--calibrate", "--duration", "3", XDG_STATE_HOME=str(tmp_path))
     assert "Traceback" not in result.stderr
-    assert "skin-demo" in lines[-1]
-    assert not list(tmp_path.rglob("*.json"))
+    assert "skin-demo" in result.stderr
+    assert not list(tmp_path.rglob("*.calibration.json"))
 
 
 def test_an_unknown_interface_kind_is_refused(tmp_path):
     config = changed(tmp_path, 'interface = "virtual"', 'interface = "pigeon"')
-    refused(skin("run", config, "--calibrate", XDG_STATE_HOME=str(tmp_path)), 1, "pigeon")
+    refused(skin("run", config, "--calibrate", XDG_STATE_HOME=str(tmp_path)), 2, "pigeon")
 
 
 @pytest.mark.parametrize(
@@ -108,6 +110,49 @@ def test_a_calibration_of_another_configuration_is_refused(tmp_path):
     calibration.write_text("{}")
     result = skin("replay", str(log), "--config", str(DEMO), "--calibration", str(calibration))
     refused(result, 2, str(calibration), "skin calibrate")
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        (["calibrat"], "meant calibrate?"),
+        (["bench", "recieve"], "meant receive?"),
+        (["run", str(DEMO), "--duraton", "3"], "meant --duration?"),
+        (["run", str(DEMO), "--duration", "-3"], "seen -3, wanted a number above 0"),
+        (["calibrate", str(DEMO), "--seconds", "0"], "seen 0, wanted a number above 0"),
+        (["emulate", str(DEMO), "--speed", "fast"], "seen fast, wanted a number above 0"),
+    ],
+)
+def test_a_mistyped_word_comes_with_what_was_meant(typed, meant, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(typed)
+    assert ended.value.code == 2
+    assert meant in capsys.readouterr().err
+
+
+def test_a_status_without_broker_waits_for_none(capsys):
+    assert main(["status", "--broker", f"mqtt://127.0.0.1:{free_port()}"]) == 1
+    assert "no broker listens there" in capsys.readouterr().err
+    assert watch.PATIENCE_S < 2
+
+
+@pytest.mark.parametrize(("options", "status"), [([], 0), (["--strict"], 1)])
+def test_a_calibration_of_touched_skin_is_a_warning(options, status, tmp_path, monkeypatch, capsys):
+    async def touched(settings, layout, *_):
+        calibrator = Calibrator(layout)
+        raw = np.full(layout.parts[0].n_taxels, 240, np.uint8)
+        for sweep in range(100):
+            raw[3] = 240 if sweep < 70 else 150  # a finger comes and stays
+            calibrator.add(0, raw, np.full(len(raw), fill_value=True))
+        return calibrator.finish(skin_hash(settings), "2026-01-01T00:00:00+00:00")
+
+    monkeypatch.setattr("skin_host.calibrate.take_calibration", touched)
+    kept = tmp_path / "kept.json"
+    assert main(["calibrate", str(DEMO), "--output", str(kept), *options]) == status
+    assert kept.exists()
+    (warning,) = (line for line in capsys.readouterr().err.splitlines() if "warning" in line)
+    assert "taxel 3 of left_hand" in warning
+    assert "repeat" in warning
 
 
 @pytest.mark.parametrize("arguments", [[], ["fly"], ["replay"], ["run"], ["emulate", "nope.toml"]])

@@ -25,8 +25,14 @@ def changed(tmp_path: Path, old: str, new: str) -> Path:
 def counted(live: Live) -> dict[str, tuple[int, int, int]]:
     """Of each board: how often it was set up, fell silent, and lost its set-up."""
     records = live.daemon.link.boards["can0"].records.values()
+    ledger = live.daemon.engine.ledger
     return {
-        one.layout.name: (one.configurations, one.silences, one.lost_set_ups) for one in records
+        one.layout.name: (
+            one.configurations,
+            int(ledger.silences[one.row]),
+            int(ledger.lost_set_ups[one.row]),
+        )
+        for one in records
     }
 
 

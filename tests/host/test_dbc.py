@@ -32,7 +32,7 @@ from skin_host.fingertip.strain_protocol import (
     start_frames,
 )
 from skin_host.layout import build_layout
-from skin_host.settings import load
+from skin_host.settings import changed, load
 
 CONFIG = Path(__file__).parents[2] / "config"
 
@@ -154,7 +154,8 @@ def test_force_and_torque_are_decoded_alike(
 @cache
 def fingers() -> Any:
     settings = load(CONFIG / "fingertips.toml")
-    settings.fingertips["thumb"].full_scale = (33.3, 40.0, 50.0, 0.5, 0.75, 1.0)
+    scale = (33.3, 40.0, 50.0, 0.5, 0.75, 1.0)
+    settings = changed(settings, {"fingertips.thumb.full_scale": scale})
     text = dbc_text(build_layout(settings, CONFIG), fingertips=settings.fingertips)
     return cantools.database.load_string(text, "dbc", strict=True)
 
@@ -198,7 +199,7 @@ def test_commands_to_a_force_torque_board_are_decoded_alike(database: Any) -> No
 
 def test_a_sensor_with_the_name_of_a_board_gets_one_of_its_own() -> None:
     settings = load(CONFIG / "fingertips.toml")
-    settings.fingertips = {"hand": settings.fingertips["thumb"]}
+    settings = changed(settings, {"fingertips": {"hand": settings.fingertips["thumb"]}})
     text = dbc_text(build_layout(settings, CONFIG), fingertips=settings.fingertips)
     database = cantools.database.load_string(text, "dbc", strict=True)
     assert {node.name for node in database.nodes} == {"host", "hand", "hand_ft"}
@@ -206,7 +207,7 @@ def test_a_sensor_with_the_name_of_a_board_gets_one_of_its_own() -> None:
 
 def test_of_several_buses_one_must_be_named() -> None:
     icub = layout("icub")
-    with pytest.raises(RequestError, match="several buses; say which: left_arm, right_arm"):
+    with pytest.raises(RequestError, match="several buses; choose one: left_arm, right_arm"):
         dbc_text(icub)
     with pytest.raises(RequestError, match='no bus "can9"'):
         dbc_text(icub, "can9")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from emulator.robot import Robot
 from skin_host import demo
 from skin_host.errors import SkinError
 from skin_host.viewer.server import Viewer
@@ -55,8 +56,10 @@ def test_the_demo_tells_touches_and_ends_with_a_summary_of_them(tmp_path):
     assert summary["bus"] in {"virtual", "socketcan"}
 
 
-def test_the_demo_ends_by_itself(tmp_path):
-    out, err = start(tmp_path, "--duration", "1").communicate(timeout=60)
+def test_the_demo_of_any_configuration_ends_by_itself(tmp_path):
+    hand = str(ROOT / "config/icub_hand.toml")
+    out, err = start(tmp_path, hand, "--duration", "1").communicate(timeout=60)
+    assert "skin/icub/+/touch" in out
     assert json.loads(out.splitlines()[-1])["touches_begun"] == 0
     assert "Traceback" not in err
 
@@ -71,3 +74,15 @@ async def test_where_the_usual_port_is_taken_the_page_is_at_another(monkeypatch)
         with pytest.raises(SkinError, match="Address already in use; choose another port"):
             async with demo.served(viewer, port):
                 pass
+
+
+@pytest.mark.parametrize("name", ["icub", "fingertips", "kaspar"])
+def test_the_scene_for_any_robot_presses_each_of_its_parts(name):
+    settings, layout, scene = demo._prepared(demo.configuration(f"{name}.toml"), None)
+    bare = {name for name, tip in settings.fingertips.items() if tip.array is None}
+    assert {probe.part for probe in scene.probe} == {*settings.parts, *bare}
+    # The robot is built with it: every place is one of the skin.
+    Robot(settings, layout, scene)
+    channels = {(bus.interface, bus.channel) for bus in settings.buses.values()}
+    assert len(channels) == len(settings.buses)
+    assert {interface for interface, _ in channels} == {"virtual"}

@@ -9,7 +9,7 @@ from emulator.foam import Foam
 from emulator.viscoelastic import FoamTruth
 from skin_host.bus.protocol import encode_sweep
 from skin_host.cli import main
-from skin_host.errors import RequestError
+from skin_host.errors import ConfigurationError, RequestError
 from skin_host.evaluation.histories import record
 from skin_host.fit_recording import plateaus
 from skin_host.layout import build_layout
@@ -87,21 +87,30 @@ def test_a_hold_and_release_becomes_a_file_that_the_configuration_takes(bench, h
     # Six taxels at 1.7 kPa a unit.
     assert told["unit_rms_kpa"] == pytest.approx(1.7 / np.sqrt(12 * 6), abs=0.03)
     by_model = {found["model"]: found for found in told["fits"]}
-    assert by_model["asymmetric_clock"]["rms_hold_kpa"] < 1.0
-    assert by_model["asymmetric_clock"]["rms_rest_kpa"] < 1.0
+    assert by_model["asymmetric"]["rms_hold_kpa"] < 1.0
+    assert by_model["asymmetric"]["rms_rest_kpa"] < 1.0
     assert any("one level" in remark for remark in told["remarks"])
 
     bench.write_text(CONFIG + '[processing.relaxation]\nfile = "bench.relaxation.json"\n')
     relaxation = load(bench).processing.relaxation
-    assert relaxation.model == "asymmetric_clock"
+    assert relaxation.model == "asymmetric"
     assert 0.1 < sum(relaxation.beta) < 0.4
+
+
+def test_a_file_of_a_model_that_is_gone_says_which_to_fit(bench):
+    fitted = {"schema": "skin.relaxation/1", "model": "asymmetric_clock", "clock_kpa": 90.0}
+    fitted |= {name: [0.1] for name in ("beta", "tau_s", "beta_unload", "tau_unload_s")}
+    bench.with_name("old.json").write_text(json.dumps(fitted))
+    bench.write_text(CONFIG + '[processing.relaxation]\nfile = "old.json"\n')
+    with pytest.raises(ConfigurationError, match=r"asymmetric_clock.*no longer.*use `asymmetric`"):
+        load(bench)
 
 
 def test_people_are_told_what_the_record_cannot_tell(bench, hold, capsys):
     log, _ = hold
     status, said = run(capsys, "calibrate", bench, "--relaxation", log, "--weight-kpa", 50)
     assert status == 0
-    assert "> asymmetric_clock" in said.out
+    assert "> asymmetric" in said.out
     assert "readings in whole units leave up to 0.2" in said.out
     assert "not known from this record" in said.out
     assert "bench.relaxation.json" in said.out
@@ -275,3 +284,142 @@ def test_a_sample_taken_while_the_probe_moved_does_not_count(bench, tmp_path, ca
     status, said = run(capsys, *arguments)
     assert status == 0
     assert max(found["rms_hold_kpa"] for found in json.loads(said.out)["fits"]) < 0.7
+
+
+@pytest.fixture
+def chamber(tmp_path):
+    """A skin of another shape of curve under a staircase of air pressure, and its table."""
+    levels = np.concatenate([[0.0], np.linspace(0.0, 240.0, 9), np.linspace(210.0, 0.0, 8)])
+    kpa = np.repeat(levels, round(8 * HZ))
+    kpa = np.convolve(np.pad(kpa, 5, mode="edge"), np.ones(10) / 10, "same")[5:-5]
+    units = kpa / 8.0 + 1.5 * (1.0 - np.exp(-kpa / 30.0))
+    log, table = tmp_path / "air.log", tmp_path / "air.csv"
+    write_log(log, np.outer(units, np.linspace(0.8, 1.2, N)))
+    time_s = np.arange(len(kpa)) / HZ + 1.2
+    np.savetxt(table, np.column_stack([time_s, kpa]), delimiter=",", header="time_s,pressure_kpa")
+    return log, table
+
+
+def test_any_course_of_pressure_becomes_curves_that_a_replay_uses(bench, chamber, tmp_path, capsys):
+    log, table = chamber
+    output = tmp_path / "palm.json"
+    status, said = run(
+        capsys,
+        *("calibrate", bench, "--pressure", log, "--load", table, "--output", output, "--json"),
+    )
+    assert (status, said.err) == (0, "")
+    told = json.loads(said.out)
+    assert told["counts"]["good"] == N
+    assert told["lag_s"] == pytest.approx(1.2, abs=0.3)
+    assert told["median_error_kpa"] < 5.0
+    assert len(told["parts"]["palm"]["verdict"]) == N
+
+    status, said = run(
+        capsys,
+        *("replay", log, "--config", bench, "--calibration", output, "--calibrate-seconds", 5),
+    )
+    assert status == 0
+    lines = [json.loads(line) for line in said.out.splitlines()]
+    frames = [line for line in lines if line["type"] == "frame"]
+    highest = max(np.mean(frame["pressure_kpa"]) for frame in frames)
+    assert highest == pytest.approx(240.0, abs=12.0)
+    assert np.mean(frames[10]["pressure_kpa"]) < 10.0
+
+
+def test_people_read_what_a_course_of_pressure_showed(bench, chamber, tmp_path, capsys):
+    log, table = chamber
+    status, said = run(
+        capsys,
+        *("calibrate", bench, "--pressure", log, "--load", table),
+        *("--output", tmp_path / "palm.json"),
+    )
+    assert status == 0
+    assert "24 good" in said.out
+    assert "expected error" in said.out
+
+
+def of_another_time(time_s, kpa):
+    return time_s + 1.5e9, kpa
+
+
+def with_a_gap(time_s, kpa):
+    kept = (time_s < 40.0) | (time_s > 55.0)
+    return time_s[kept], kpa[kept]
+
+
+def falling(time_s, kpa):
+    return time_s[::-1], kpa
+
+
+def in_bar(time_s, kpa):
+    return time_s, kpa / 100.0
+
+
+def too_short(time_s, kpa):
+    return time_s[:300], kpa[:300]
+
+
+def of_something_else(time_s, kpa):
+    return time_s, 50.0 + 40.0 * np.sin(time_s * 3.0)
+
+
+def not_finite(time_s, kpa):
+    return time_s, np.where(time_s > 30.0, np.nan, kpa)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (of_another_time, "pressure of the same time"),
+        (with_a_gap, "a gap of 15"),
+        (falling, "follows"),
+        (in_bar, "bar"),
+        (too_short, "recording's"),
+        (of_something_else, "do not follow"),
+        (not_finite, "not finite"),
+    ],
+)
+def test_a_wrong_table_is_one_line_and_nothing_is_kept(bench, chamber, capsys, change, message):
+    log, table = chamber
+    time_s, kpa = change(*np.loadtxt(table, delimiter=",").T)
+    np.savetxt(table, np.column_stack([time_s, kpa]), delimiter=",")
+    output = bench.with_name("palm.json")
+    status, said = run(
+        capsys, "calibrate", bench, "--pressure", log, "--load", table, "--output", output
+    )
+    assert status == 2
+    assert message in said.err
+    assert str(table) in said.err
+    assert said.err.strip().count("\n") == 0
+    assert not output.exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"time_s,pressure_kpa\n", b"1,2,3\n", b"\xff\xfe\x00"])
+def test_what_is_no_table_of_pressure_is_refused(bench, chamber, capsys, content):
+    log, table = chamber
+    table.write_bytes(content)
+    status, said = run(capsys, "calibrate", bench, "--pressure", log, "--load", table)
+    assert status == 2
+    assert f"{table}" in said.err
+    assert "wanted rising times" in said.err
+
+
+def test_a_recording_in_which_nothing_is_pressed_is_refused(bench, chamber, tmp_path, capsys):
+    _, table = chamber
+    log = tmp_path / "quiet.log"
+    write_log(log, np.zeros((len(np.loadtxt(table, delimiter=",")), N)))
+    output = tmp_path / "palm.json"
+    status, said = run(
+        capsys, "calibrate", bench, "--pressure", log, "--load", table, "--output", output
+    )
+    assert status == 2
+    assert "nothing is pressed" in said.err
+    assert not output.exists()
+
+
+def test_levels_and_a_table_exclude_each_other(bench, chamber, capsys):
+    log, table = chamber
+    for more in ((), ("--load", table, "--levels", 10)):
+        status, said = run(capsys, "calibrate", bench, "--pressure", log, *more)
+        assert status == 2
+        assert "one of the two" in said.err

@@ -11,9 +11,10 @@ def test_a_look_after_a_pause_accuses_nobody_before_anything_is_read(
 ) -> None:
     bench.t_s += pause_s
     bench._look()
-    assert bench.told == {}
+    # The computer's own stall is reported; nobody is accused of it.
+    assert set(bench.told) <= {("host_stalls", "host")}
     bench.run(0.5)
-    assert bench.told == {}
+    assert set(bench.told) <= {("host_stalls", "host")}
 
 
 @pytest.mark.parametrize("jump_s", [-86_400.0, 0.0, 86_400.0])

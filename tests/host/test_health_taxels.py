@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from emulator.scene import load
+from emulator.scene import Air, Fault, Scene, load
+from skin_host.health.diagnosis import diagnose
 from tests.support.fault_bench import FaultBench
 
 HELD_SCENE = """
@@ -28,10 +29,7 @@ def codes(bench: FaultBench, part: str) -> set[str]:
 def close_limit() -> FaultBench:
     """A robot whose baselines may move by two units only."""
     bench = FaultBench()
-    bench.engine.settings.processing.drift.limit_units = 2.0
-    calibration = bench.engine.calibration
-    assert calibration is not None
-    bench.engine.use(calibration)
+    bench.reload({"processing.drift.limit_units": 2.0})
     bench.run(2.0)
     return bench
 
@@ -41,7 +39,10 @@ def test_a_zero_that_drifts_is_told_and_told_again_when_it_can_follow_no_farther
 ) -> None:
     bench = close_limit
     assert not codes(bench, "left_hand") & {"taxel_drifting", "taxel_at_limit"}
-    bench.inject("temperature_step", value=3.0)
+    # In steps: what a large one touches is followed slowly.
+    for more_c in (1.0, 2.0, 3.0):
+        bench.robot.inject(Fault(name="temperature_step", value=more_c))
+        bench.run(8.0)
     for _ in range(60):
         bench.run(1.0)
         if "taxel_at_limit" in codes(bench, "left_hand"):
@@ -58,7 +59,7 @@ def test_a_touch_that_never_ends_hides_a_zero_and_that_is_told(tmp_path: Path) -
     scene = tmp_path / "held.toml"
     scene.write_text(HELD_SCENE)
     bench = FaultBench(scene=load(scene))
-    bench.engine.settings.processing.drift.frozen_report_s = 4.0
+    bench.reload({"processing.drift.frozen_report_s": 4.0})
     while bench.t_s < 14.0:
         bench.run(0.5)
     assert "taxel_held" not in codes(bench, "left_forearm")
@@ -68,3 +69,27 @@ def test_a_touch_that_never_ends_hides_a_zero_and_that_is_told(tmp_path: Path) -
     # It is touched all the same, and believed.
     assert bench.touched["left_forearm"][27]
     assert bench.valid["left_forearm"][27]
+
+
+def test_a_part_that_is_degraded_always_says_why() -> None:
+    bench = FaultBench()
+    bench.run(1.0)
+    record = bench.records["left_hand"]
+    # A pad that failed under pressure: no board, triangle or taxel fault tells of it.
+    without = diagnose({**record, "state": "degraded", "invalid": [7], "faults": []})
+    (fault,) = (fault for fault in without if fault.code == "taxel_unproven")
+    assert fault.sentence.startswith("taxel 7 of left_hand: not valid")
+    bench.inject("chip_gone", board="hand", triangle=2)
+    bench.run(2.0)
+    codes_now = codes(bench, "left_hand")
+    assert bench.records["left_hand"]["state"] == "degraded"
+    assert "taxel_unproven" not in codes_now
+    assert codes_now
+
+
+def test_a_press_on_the_whole_part_is_no_change_of_its_temperature() -> None:
+    air = Air(part="left_hand", pressure_kpa=[(0, 0), (9, 0), (10, 40), (60, 40)])
+    bench = FaultBench(2.0, Scene(quiet=True, air=[air]), settle_s=3.0)
+    bench.run(9.0)
+    assert bench.touched["left_hand"].sum() > 60
+    assert "part_temperature" not in codes(bench, "left_hand")

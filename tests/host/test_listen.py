@@ -8,7 +8,7 @@ from pathlib import Path
 from skin_host.cli.lines import missed_line
 from skin_host.fingertip.events import OverEvent, SlipEvent
 from skin_host.layout import build_layout
-from skin_host.processing.contacts import TouchEvent
+from skin_host.processing.events import TouchEvent
 from skin_host.publish.grasping import Slip
 from skin_host.publish.info import node_info
 from skin_host.publish.mqtt import Publisher

@@ -38,6 +38,9 @@ async def test_a_running_daemon_answers_and_refuses_in_one_line(
         assert parts == {"left_hand", "left_forearm"}
     assert await skin("command", "thresholds", "--set", "margin_units=3", "--broker", url) == 0
     assert '"margin_units": 3' in capsys.readouterr().out
+    words = ["command", "thresholds", "--set", "margin_unit=3"]
+    assert await skin(*words, "--broker", url) == 1
+    assert "set: unknown key `margin_unit`; meant `margin_units`?" in capsys.readouterr().err
     assert await skin("command", "thresholds", "--reset", "--json", "--broker", url) == 0
     assert json.loads(capsys.readouterr().out)
     assert await skin("command", "disable", "--part", "tail", "--broker", url) == 1

@@ -31,8 +31,8 @@ TIP = 'fingertips.tip]\nbus = "can0"\naddress = 3\nshape = '
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("address = 14", 'address = "14"', "boards.hand.address: wanted `int`, seen `str`"),
-        ("address = 14", "address = 15", "boards.hand.address: wanted `int` <= 14"),
+        ("address = 14", 'address = "14"', "boards.hand.address: seen '14', wanted `int`"),
+        ("address = 14", "address = 15", "boards.hand.address: seen 15, wanted `int` <= 14"),
         ("skin_type", "skin_typ", "boards.hand: unknown key `skin_typ`; meant `skin_type`?"),
         (
             "skin_type = 1",
@@ -49,7 +49,7 @@ TIP = 'fingertips.tip]\nbus = "can0"\naddress = 3\nshape = '
         (
             "x_mm = -25",
             "normal = [0, 1]",
-            f"{PATCH}.places[0].normal: wanted `array` of length 3, seen 2",
+            f"{PATCH}.places[0].normal: seen 2, wanted `array` of length 3",
         ),
         ("x_mm = -25", "x_mm = nan", f"{PATCH}.places[0].x_mm: seen nan, wanted a finite number"),
         (
@@ -82,7 +82,7 @@ TIP = 'fingertips.tip]\nbus = "can0"\naddress = 3\nshape = '
         (
             TOP,
             f"{TOP}\n[processing.calibration]\nseconds = -1",
-            "processing.calibration.seconds: wanted `float` > 0.0",
+            "processing.calibration.seconds: seen -1, wanted `float` > 0.0",
         ),
         (
             TOP,
@@ -93,6 +93,30 @@ TIP = 'fingertips.tip]\nbus = "can0"\naddress = 3\nshape = '
             TOP,
             f"{TOP}\n[processing.relaxation]\nbeta = [0.1]",
             "processing.relaxation: `beta` and `tau_s` go together",
+        ),
+        (
+            TOP,
+            f"{TOP}\n[processing.relaxation]\nmodel = 'asymmetric_clock'",
+            (
+                "processing.relaxation.model: `asymmetric_clock` is no longer there: "
+                "use `asymmetric`, and fit it again if `beta` and `tau_s` were given"
+            ),
+        ),
+        (
+            TOP,
+            f"{TOP}\n[processing.relaxation]\nmodel = 'prony'",
+            (
+                "processing.relaxation.model: `prony` is no longer there: "
+                "use `asymmetric` with `tau_unload_s` equal to `tau_s`"
+            ),
+        ),
+        (
+            TOP,
+            f"{TOP}\n[processing.relaxation]\nclock_kpa = 60.0",
+            (
+                "processing.relaxation: `clock_kpa` is no longer there: "
+                "it was of the model `asymmetric_clock`: use `asymmetric`"
+            ),
         ),
         (
             TOP,
@@ -107,12 +131,12 @@ TIP = 'fingertips.tip]\nbus = "can0"\naddress = 3\nshape = '
         (
             TOP,
             f'{TOP}\n[{TIP}"plane"\nradius_mm = 3',
-            "fingertips.tip.radius_mm: a plane has none",
+            "fingertips.tip.radius_mm: a plane does not have it",
         ),
         (
             TOP,
             f'{TOP}\n[{TIP}"plane"\nmatrix = [[1, 0, 0, 0, 0, 0]]',
-            "fingertips.tip.matrix: wanted `array` of length 6, seen 1",
+            "fingertips.tip.matrix: seen 1, wanted `array` of length 6",
         ),
         (
             TOP,

@@ -52,7 +52,7 @@ def played(settings, layout, touch_only):
         frames = [
             (int(i), bytes(d), t_ns + k) for k, (i, d) in enumerate(zip(ids, data, strict=True))
         ]
-        steps += engine.feed("can0", FrameBatch.of(frames))
+        steps += engine.feed("can0", FrameBatch.of(frames)).steps
     return steps
 
 

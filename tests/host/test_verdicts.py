@@ -20,7 +20,7 @@ def calibration(**bad: list[int]) -> Calibration:
     for name, taxels in bad.items():
         verdict[taxels] = Verdict[name.upper()]
     zeros = np.zeros(LAYOUT.n_taxels)
-    return Calibration("x", "y", "z", zeros, zeros, zeros, zeros, zeros, verdict)
+    return Calibration("x", "y", "z", *[zeros] * 6, verdict)
 
 
 def test_triangles_that_are_well_are_one_line_a_board() -> None:

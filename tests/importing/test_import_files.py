@@ -17,7 +17,7 @@ from skin_host.importing.report import Findings
 from skin_host.importing.run import import_files
 from skin_host.importing.writing import configuration_text
 from skin_host.layout import Layout, build_layout, builtin_kinds
-from skin_host.settings import Place, Settings, load, parse_triangles
+from skin_host.settings import Place, Settings, changed, load, parse_triangles
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT.parent / "shared" / "data"
@@ -74,7 +74,7 @@ def test_the_samples_become_an_arm_with_placed_and_located_forearm(tmp_path: Pat
         x_mm=100, y_mm=-20, turn_deg=30, mirror=True
     )
     settings, layout = built(located)
-    robot = Robot(settings, layout, Scene())
+    robot = Robot(settings, layout, Scene(quiet=True))
     robot.bring_up()
     robot.step(0.1)
     assert robot.true_pressure_kpa("left_forearm").shape == (288,)
@@ -130,7 +130,7 @@ def test_placed_triangles_move_to_the_part_that_the_display_names(
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("wobble 3 0 0 0 1 0 0", '"wobble" is no kind of unit known here; not read'),
+        ("wobble 3 0 0 0 1 0 0", '"wobble" is not a known kind of unit; not read'),
         ("triangle 3 0 0", 'seen "triangle 3 0 0", wanted a type and 4 to 7 numbers; not read'),
         ("triangle 200 0 0 0 1", "id 200; wanted 0 to 127; not read"),
         ("triangle 0 5 5 0 1", "id 0 is placed in line 7; not read"),
@@ -304,7 +304,7 @@ def test_the_managers_thresholds_and_gains_are_taken(tmp_path: Path, arm: Path) 
         "1: inputPorts: of its ports",
         "8: zeroUpRawData true: here values always fall with pressure",
         '9: "wobble 3" is not understood; not read',
-        "11: positions/gone.txt: not there",
+        "11: positions/gone.txt: not found",
         "11: here.txt: `skin import positions",
         "12: the line before lacks its backslash",
     ):
@@ -322,7 +322,7 @@ def test_nothing_is_written_when_something_is_wrong(tmp_path: Path, arm: Path) -
     file = tmp_path / "hand.ini"
     file.write_text("robotPart Hand!\ncardid 14\n[SENSORS]\nfingertip 0 0 0 0 1\n")
     before = sorted(path.name for path in tmp_path.iterdir())
-    with pytest.raises(ConfigurationError, match="makes no configuration"):
+    with pytest.raises(ConfigurationError, match="do not give a valid configuration"):
         run("skingui", file, arm)
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
@@ -355,12 +355,17 @@ def test_settings_survive_writing(tmp_path: Path, path: Path) -> None:
 def test_any_values_survive_writing(
     tmp_path_factory: pytest.TempPathFactory, channel: str, turn: float, option: object
 ) -> None:
-    settings = load(ROOT / "config" / "demo.toml")
-    settings.buses["can0"].channel = channel
-    settings.buses["can0"].options = {"odd key": option}  # type: ignore[dict-item]
-    settings.parts["left_hand"].patches[0].places[0].turn_deg = turn
-    settings.processing.relaxation.beta = [0.1, 0.2]
-    settings.processing.relaxation.tau_s = [1.0, 2e-7]
+    settings = changed(
+        load(ROOT / "config" / "demo.toml"),
+        {
+            "buses.can0.channel": channel,
+            "buses.can0.options": {"odd key": option},
+            "processing.relaxation.beta": [0.1, 0.2],
+            "processing.relaxation.tau_s": [1.0, 2e-7],
+        },
+    )
+    places = settings.parts["left_hand"].patches[0].places
+    places[0] = changed(places[0], {"turn_deg": turn})
     path = tmp_path_factory.mktemp("any") / "robot.toml"
     path.write_text(configuration_text(settings), encoding="utf-8", newline="")
     assert msgspec.to_builtins(load(path)) == msgspec.to_builtins(settings)

@@ -133,7 +133,7 @@ def test_the_set_up_of_single_boards_replaces_the_default(tmp_path: Path) -> Non
         (
             "</params>",
             "",
-            "FILE:19: no XML any more from here: no element found; the rest is not read",
+            "FILE:19: not valid XML from here: no element found; the rest is not read",
         ),
     ],
 )
@@ -178,7 +178,7 @@ def test_a_set_that_is_off_takes_triangles_away(tmp_path: Path) -> None:
 def test_a_name_that_is_there_twice_is_named_and_both_sets_are_taken(tmp_path: Path) -> None:
     body = sets("1 13 0 0 1 2 0x2200", "1 13 1 1 1 2 0x2200").replace("Cfg2", "Cfg1")
     device, said = read(tmp_path, HEAD + DEFAULTS + body + "</params>")
-    assert "FILE:17: triangleSetCfg1 is there already, line 16; both are taken" in said
+    assert "FILE:17: triangleSetCfg1 exists already, line 16; both are taken" in said
     assert triangles(device.patches[1]) == {13: [0, 1]}
 
 
@@ -245,7 +245,7 @@ def test_an_included_file_that_is_missing_is_named(tmp_path: Path) -> None:
         '<xi:include xmlns:xi="x" href="../general.xml" /></device>',
     )
     assert device.patches == {}
-    assert 'FILE:2: includes "./gone-skinSpec.xml", which is not there' in said
+    assert 'FILE:2: includes "./gone-skinSpec.xml", which was not found' in said
     assert 'FILE:3: includes "../general.xml"; only skinSpec files are read' in said
 
 

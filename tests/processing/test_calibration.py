@@ -7,6 +7,9 @@ from skin_host.errors import CalibrationError
 from skin_host.evaluation.rig import flat_skin
 from skin_host.processing import calibration
 from skin_host.processing.calibration import Calibrator, Verdict
+from skin_host.processing.curves import KNOTS_UNITS, Curves, CurveVerdict, Memory, rising
+from skin_host.processing.pipeline import Pipeline
+from skin_host.settings import Processing
 
 _, LAYOUT = flat_skin(1)
 N = LAYOUT.n_taxels
@@ -82,6 +85,122 @@ def test_a_touch_during_calibration_is_named_and_left_out_of_the_baseline(first,
     assert np.count_nonzero(found.verdict) == 1
     assert found.baseline[7] == pytest.approx(untouched, abs=0.6)
     assert found.percentile[7] < untouched + 3.0
+
+
+def as_sent(conversions, period_s):
+    """Sweeps of conversions [c, N] of 36.9 ms, and their times: each is sent until the next."""
+    times_s = np.arange(0.0, len(conversions) * 0.0369, period_s)
+    return conversions[(times_s / 0.0369).astype(int)], np.rint(times_s * 1e9).astype(np.int64)
+
+
+def calibrated_as_sent(conversions, period_s):
+    calibrator = Calibrator(LAYOUT)
+    sweeps, times_ns = as_sent(conversions, period_s)
+    for raw, t_ns in zip(sweeps, times_ns.tolist(), strict=True):
+        calibrator.add(0, np.rint(raw).astype(np.uint8), PRESENT, t_ns)
+    return calibrator.finish("abc", TIME)
+
+
+@pytest.mark.parametrize("period_s", [0.01, 0.02, 0.0204, 0.04, 0.2])
+def test_noise_is_that_of_measurements_at_any_period(period_s):
+    conversions = 220.0 + np.random.default_rng(12).normal(0.0, 1.0, (140, N))
+    found = calibrated_as_sent(conversions, period_s)
+    assert np.median(found.noise) == pytest.approx(1.04, rel=0.05)
+    # What is seen for a short time may be more; that it was sent again makes it no more.
+    assert np.median(found.spread / found.noise) == pytest.approx(1.2, abs=0.3)
+
+
+#: Of a calibration of five seconds.
+CONVERSIONS = 136
+
+
+def telegraph(rng, count, share, dwell, height=12.0):
+    """Conversions [count, N] that jump between two levels, after so many of them in the mean."""
+    up = np.zeros((count, N), bool)
+    up[0] = rng.uniform(size=N) < share
+    for now, before in zip(up[1:], up[:-1], strict=True):
+        leaves = rng.uniform(size=N) < 1.0 / dwell
+        now[:] = np.where(leaves, rng.uniform(size=N) < share, before)
+    return 225.0 - height * up + rng.normal(0.0, 0.8, up.shape)
+
+
+@pytest.mark.parametrize("period_s", [0.02, 0.04])
+@pytest.mark.parametrize("dwell", [1, 3])
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.8])
+def test_a_pad_that_jumps_between_levels_is_noisy_and_not_touched(share, dwell, period_s):
+    conversions = telegraph(np.random.default_rng(13), 10 * CONVERSIONS, share, dwell)
+    found = calibrated_as_sent(conversions[:CONVERSIONS], period_s)
+    assert np.mean(np.isin(found.verdict, [Verdict.NOISY, Verdict.TOO_NOISY])) > 0.97
+    pipeline = Pipeline(LAYOUT, Processing(), found)
+    touched = np.zeros(N, bool)
+    for raw, t_ns in zip(*as_sent(conversions[CONVERSIONS:], period_s), strict=True):
+        frame = pipeline.step(0, np.rint(raw).astype(np.uint8), PRESENT, int(t_ns))
+        touched |= frame.touched
+    assert np.mean(touched) < 0.03
+
+
+def test_noise_that_lasts_has_a_larger_spread():
+    short, long = (
+        calibrated_as_sent(telegraph(np.random.default_rng(14), CONVERSIONS, 0.5, dwell), 0.04)
+        for dwell in (1, 8)
+    )
+    assert np.median(long.noise) == pytest.approx(np.median(short.noise), rel=0.2)
+    assert np.median(long.spread) > 1.5 * np.median(short.spread)
+
+
+def test_jumps_towards_pressure_count_for_more_than_jumps_away_from_it():
+    rng = np.random.default_rng(15)
+    rare = np.where(rng.uniform(size=(140, N)) < 0.1, 6.0, 0.0) + rng.normal(0, 0.3, (140, N))
+    towards = calibrated_as_sent(225.0 - rare, 0.04)
+    away = calibrated_as_sent(225.0 + rare, 0.04)
+    assert np.median(towards.noise) == pytest.approx(np.median(away.noise), rel=0.01)
+    assert np.median(towards.spread) > 1.5 * np.median(away.spread)
+
+
+def test_taps_that_two_pads_share_are_a_touch_and_those_of_one_pad_are_noise():
+    sweeps = noisy(np.random.default_rng(16), sweeps=250)
+    taps = np.arange(250) % 60 < 30
+    sweeps[np.ix_(taps, [7, 8, 100])] -= 20
+    found = calibrated(sweeps)
+    assert np.flatnonzero(found.verdict == Verdict.TOUCHED).tolist() == [7, 8]
+    assert found.verdict[100] in (Verdict.NOISY, Verdict.TOO_NOISY)
+
+
+def test_a_calibration_of_any_length_remembers_its_course():
+    sweeps = noisy(np.random.default_rng(17), sweeps=3000)
+    sweeps[2000:, 7] -= 30
+    found = calibrated(sweeps)
+    assert np.flatnonzero(found.verdict == Verdict.TOUCHED).tolist() == [7]
+
+
+def test_a_pad_that_rests_far_from_all_others_was_pressed_all_the_time():
+    sweeps = noisy(np.random.default_rng(18))
+    sweeps[:, 7] -= 12
+    sweeps[:, 8] -= 6
+    found = calibrated(sweeps)
+    assert np.flatnonzero(found.verdict).tolist() == [7]
+    assert found.verdict[7] == Verdict.TOUCHED
+    assert found.usable[7]
+
+
+def test_noise_beyond_use_has_no_vote():
+    sweeps = noisy(np.random.default_rng(19), level=150.0)
+    sweeps[:, 7] += np.rint(np.random.default_rng(20).normal(0.0, 25.0, 125))
+    found = calibrated(sweeps)
+    assert found.verdict[7] == Verdict.TOO_NOISY
+    assert not found.usable[7]
+
+
+def test_a_rest_so_near_an_end_of_the_scale_that_a_press_is_cut_off_is_named():
+    sweeps = noisy(np.random.default_rng(21))
+    sweeps[:, 48:60] -= 180.0
+    calibrator = Calibrator(LAYOUT, range_units=np.full(N, 85.0))
+    for raw in sweeps:
+        calibrator.add(0, raw.astype(np.uint8), PRESENT)
+    found = calibrator.finish("abc", TIME)
+    assert np.all(found.verdict[48:60] == Verdict.SATURATES)
+    assert found.usable.all()
+    assert np.all(np.delete(found.verdict, np.r_[48:60]) == Verdict.OK)
 
 
 @pytest.mark.parametrize("code", [0, 255])
@@ -184,6 +303,16 @@ def test_a_file_without_bends_is_understood(untouched, tmp_path):
     assert calibration.load(path, LAYOUT, "abc").bend == pytest.approx(np.ones(N))
 
 
+def test_a_file_without_spreads_is_understood(untouched, tmp_path):
+    path = tmp_path / "calibration.json"
+    calibration.save(path, untouched, LAYOUT)
+    document = json.loads(path.read_text())
+    del document["parts"]["skin"]["spread"]
+    path.write_text(json.dumps(document))
+    found = calibration.load(path, LAYOUT, "abc")
+    assert found.spread == pytest.approx(untouched.noise, abs=1e-6)
+
+
 def damaged(document, path):
     path.write_text(json.dumps(document))
     return path
@@ -192,7 +321,7 @@ def damaged(document, path):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda d: d.update(schema="skin.calibration/9"), "schema"),
+        (lambda d: d.update(schema="skin.relaxation/1"), "schema"),
         (lambda d: d.update(configuration="xyz"), "belongs to configuration xyz"),
         (lambda d: d["parts"].clear(), 'no part "skin"'),
         (lambda d: d["parts"]["skin"]["baseline"].pop(), "parts.skin.baseline: wanted 192"),
@@ -229,3 +358,65 @@ def test_what_is_no_calibration_is_refused(tmp_path, content):
 def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(CalibrationError, match="cannot be read"):
         calibration.load(tmp_path / "none.json", LAYOUT, "abc")
+
+
+def own_curves(good=slice(None), noise=0.8):
+    kpa = np.tile(8.0 * KNOTS_UNITS, (N, 1)) + np.arange(N)[:, np.newaxis] * KNOTS_UNITS * 0.1
+    verdict = np.full(N, CurveVerdict.JUMPS, np.uint8)
+    verdict[good] = CurveVerdict.GOOD
+    return Curves(
+        rising(kpa),
+        np.full(N, 42.0),
+        np.full(N, noise),
+        np.where(verdict == CurveVerdict.GOOD, 4.2, np.nan),
+        verdict,
+        340.0,
+        -0.3,
+        Memory((20.0,), (0.25,)),
+    )
+
+
+def test_curves_are_kept_with_it_and_outlive_new_zeros(untouched, tmp_path):
+    fitted = calibration.with_curves(untouched, own_curves(slice(0, 7)))
+    assert fitted.id != untouched.id
+    assert np.array_equal(np.flatnonzero(fitted.usable), range(7))
+    path = tmp_path / "calibration.json"
+    calibration.save(path, fitted, LAYOUT)
+    renewed = calibration.with_gains_of(calibrated(noisy(np.random.default_rng(77))), path, LAYOUT)
+    every = np.ones(N, bool)
+    for found in (calibration.load(path, LAYOUT, "abc"), renewed):
+        assert found.curves.kpa[:7] == pytest.approx(fitted.curves.kpa[:7], abs=1e-5)
+        assert np.array_equal(found.curves.verdict, fitted.curves.verdict)
+        assert found.curves.memory == fitted.curves.memory
+        assert found.curves.lag_s == -0.3
+    assert calibration.merge(fitted, untouched, every).curves is fitted.curves
+    assert calibration.load(path, LAYOUT, "abc").id == fitted.id
+
+
+def test_a_lively_pad_that_sends_one_byte_all_the_time_is_stuck():
+    constant = calibrated(np.full((125, N), 240))
+    found = calibration.with_curves(constant, own_curves(noise=1.0))
+    assert (found.verdict == Verdict.STUCK).all()
+    quiet = calibration.with_curves(constant, own_curves(noise=0.3))
+    assert (quiet.verdict == Verdict.OK).all()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"jumps"', '"leaps"', "verdict"),
+        ('"weight": [', '"weight": [1.0,', "radii"),
+        ('"highest_kpa": 340.0', '"highest_kpa": -1.0', "curves"),
+        ('"kpa": [\n', '"kpa": [[1.0],\n', "entries"),
+        ('"noise_units": [\n', '"noise_units": [1e999,\n', "calibration"),
+    ],
+)
+def test_damaged_curves_are_refused(untouched, tmp_path, old, new, message):
+    path = tmp_path / "calibration.json"
+    calibration.save(path, calibration.with_curves(untouched, own_curves(slice(0, 7))), LAYOUT)
+    text = path.read_text()
+    at = text.index('"curves"')
+    assert old in text[at:]
+    path.write_text(text[:at] + text[at:].replace(old, new, 1))
+    with pytest.raises(CalibrationError, match=message):
+        calibration.load(path, LAYOUT, "abc")

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skin_host.evaluation.rig import flat_skin
-from skin_host.processing.contacts import LOST_NS, PARTED_NS, ContactTracker
+from skin_host.processing.contacts import LOST_NS, MERGED_NS, PARTED_NS, ContactTracker
 from skin_host.processing.pipeline import PressureFrame
 
 SETTINGS, LAYOUT = flat_skin(1)
@@ -85,12 +85,42 @@ def test_a_contact_that_grows_and_slides_keeps_its_name():
         assert {event.id for event in skin.show(reached)} <= {1}
 
 
-def test_where_two_contacts_merge_the_larger_one_goes_on():
+def test_where_two_contacts_merge_for_good_the_larger_one_goes_on():
     skin = Skin()
     small, large = {0}, {4, 5, 6}
-    between = set(range(12)) - small - large
+    whole = set(range(12))
     assert kinds(skin.show(small, large)) == [("begin", 1), ("begin", 2)]
-    assert kinds(skin.show(small, large, between)) == [("end", 1), ("move", 2)]
+    (moved,) = skin.show(whole)
+    assert (moved.id, set(moved.taxels)) == (2, whole - small)
+    for _ in range(MERGED_NS // SWEEP_NS - 1):
+        assert {event.event for event in skin.show(whole)} <= {"move"}
+    ended, moved = skin.show(whole)
+    assert kinds([ended, moved]) == [("end", 1), ("move", 2)]
+    assert set(moved.taxels) == whole
+
+
+@pytest.mark.parametrize("sweeps", [1, 5, 12, 25, 40])
+def test_a_taxel_that_flickers_between_two_contacts_makes_no_other(sweeps):
+    skin = Skin()
+    # The first two have a common neighbour but are none of each other.
+    one, between, other = _chain()
+    assert kinds(skin.show({one}, {other})) == [("begin", 1), ("begin", 2)]
+    for number in range(1000):
+        flicker = {between} if number // sweeps % 2 else set()
+        assert {event.event for event in skin.show({one}, {other}, flicker)} <= {"move"}
+
+
+def _chain():
+    """Three taxels of which the second is the neighbour of both others, which are not."""
+    near = [
+        set(LAYOUT.neighbour[LAYOUT.neighbour_start[taxel] : LAYOUT.neighbour_start[taxel + 1]])
+        for taxel in range(N)
+    ]
+    for between in range(N):
+        for one in near[between]:
+            for other in near[between] - near[one] - {one}:
+                return int(one), between, int(other)
+    raise AssertionError("no three taxels in a row")
 
 
 def test_a_hand_that_lands_taxel_by_taxel_is_one_contact_from_the_first():
@@ -193,6 +223,19 @@ def test_stopping_ends_every_contact():
     skin.show(HERE, THERE)
     assert kinds(skin.tracker.end_all(7, 7)) == [("end", 1), ("end", 2)]
     assert skin.tracker.end_all(8, 8) == []
+
+
+def test_many_contacts_keep_their_names_whatever_the_others_do():
+    skin = Skin()
+    apart = [{taxel} for taxel in range(0, N, 12)]
+    begun = skin.show(*apart)
+    assert [event.id for event in begun] == list(range(1, len(apart) + 1))
+    for number, taxel in enumerate(apart):
+        others = [other for other in apart if other != taxel]
+        assert kinds(skin.show(*others)) == [("end", number + 1)]
+        assert kinds(skin.show(*apart)) == [("begin", len(apart) + number + 1)]
+    names = {event.taxels[0]: event.id for event in skin.show(*apart, kpa=60.0)}
+    assert sorted(names.values()) == list(range(len(apart) + 1, 2 * len(apart) + 1))
 
 
 @given(st.lists(st.sets(st.integers(0, 47), max_size=20), max_size=30))

@@ -11,7 +11,8 @@ from emulator.pads import UNIT_FF, Disc, Pads
 from emulator.viscoelastic import FoamTruth
 from skin_host.errors import ConfigurationError
 from skin_host.layout import Layout, build_layout
-from skin_host.processing.contacts import ContactTracker, TouchEvent
+from skin_host.processing.contacts import ContactTracker
+from skin_host.processing.events import TouchEvent
 from skin_host.processing.localization import Method
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.processing.pressure import PressureCurve

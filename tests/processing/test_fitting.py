@@ -7,6 +7,8 @@ from skin_host.evaluation.accuracy import fitted_hold
 from skin_host.evaluation.histories import grasps, record
 from skin_host.processing.fitting import HoldRecord, fit, merge
 from skin_host.processing.relaxation import STAND_INS, ParameterSet, make_model
+from skin_host.processing.relaxation.sets import log_spaced
+from skin_host.relaxation_settings import FITTED
 
 SHARED_RATIO = ParameterSet(
     (0.09, 0.12, 0.15), (7.0, 130.0, 1500.0), (0.09, 0.12, 0.15), (14.0, 260.0, 3000.0)
@@ -28,9 +30,10 @@ def hold_of(model, parameters, noise=0.0):
     return merge(dt_s, momentary, momentary - relaxation, 0, 3600)
 
 
-@pytest.mark.parametrize("model", ["prony", "asymmetric", "published"])
-def test_the_parameters_that_made_a_record_are_found_again(model):
-    true = SHARED_RATIO
+@pytest.mark.parametrize(
+    ("model", "true"), [("asymmetric", log_spaced(0.3)), ("published", SHARED_RATIO)]
+)
+def test_the_parameters_that_made_a_record_are_found_again(model, true):
     found = fit(model, hold_of(model, true)).parameters
     assert found.beta == pytest.approx(true.beta, rel=0.05)
     assert found.tau_s == pytest.approx(true.tau_s, rel=0.05)
@@ -44,27 +47,27 @@ def test_the_unloading_branch_of_the_published_model_is_found_again():
 
 
 def test_noise_hardly_moves_the_fit():
-    true = STAND_INS["mid"]
+    true = log_spaced(0.25)
     found = fit("asymmetric", hold_of("asymmetric", true, noise=1.0)).parameters
-    assert found.beta == pytest.approx(true.beta, rel=0.1)
-    assert found.tau_s == pytest.approx(true.tau_s, rel=0.2)
+    assert sum(found.beta) == pytest.approx(sum(true.beta), rel=0.05)
+    assert found.tau_unload_s == pytest.approx(true.tau_unload_s, rel=0.2)
 
 
 @pytest.mark.parametrize("kind", ["A", "S"])
 def test_what_was_fitted_to_a_hold_corrects_grasps(kind):
     played = record(kind, grasps(0.1), sample_hz=10.0)
-    fitted = fit("asymmetric_clock", hold_on(kind)).parameters
+    fitted = fit("asymmetric", hold_on(kind)).parameters
     rms = {}
-    for name, parameters in (("none", STAND_INS["mid"]), ("asymmetric_clock", fitted)):
-        model = make_model(name, 1, parameters, update_s=1.0)
+    for name, parameters in (("none", STAND_INS["mid"]), ("asymmetric", fitted)):
+        model = make_model(name, 1, parameters)
         corrected = [c - model.step(np.array([c]), played.dt_s)[0] for c in played.momentary_kpa]
         error = np.maximum(corrected, 0.0) - played.pressure_kpa
         rms[name] = np.sqrt(np.mean(error**2))
-    assert rms["asymmetric_clock"] < 0.6
-    assert rms["asymmetric_clock"] < 0.15 * rms["none"]
+    assert rms["asymmetric"] < 0.6
+    assert rms["asymmetric"] < 0.15 * rms["none"]
 
 
-@pytest.mark.parametrize("model", ["published", "asymmetric", "asymmetric_log"])
+@pytest.mark.parametrize("model", FITTED)
 def test_a_fit_tells_its_error_and_what_one_level_cannot_show(model):
     found = fit(model, hold_on("S"))
     assert 0.0 < found.rms_hold_kpa < 1.0
@@ -90,7 +93,7 @@ def test_a_short_record_says_that_long_times_are_not_known():
     short = merge(0.1, np.r_[np.full(600, 50.0), np.full(600, 3.0)], np.zeros(1200), 0, 600)
     found = fit("asymmetric", short)
     assert any("constant" in remark for remark in found.remarks)
-    assert "tau_3" in found.uncertain or "beta_3" in found.uncertain
+    assert "beta_6" in found.uncertain
 
 
 def test_merging_keeps_time_and_means():
@@ -107,11 +110,3 @@ def test_merging_keeps_time_and_means():
 def test_what_has_no_parameters_is_not_fitted(model):
     with pytest.raises(ValueError, match="no parameters"):
         fit(model, hold_on("L"))
-
-
-def test_unloading_ratio_and_clock_share_what_is_slow():
-    found = fit("asymmetric_clock", hold_on("A")).parameters
-    assert isinstance(found, ParameterSet)
-    ratio = np.array(found.tau_unload_s) / np.array(found.tau_s)
-    assert np.all(ratio > 1.2)
-    assert 50.0 < float(found.clock_kpa) < 500.0

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from skin_host.bus.assembler import Sweep
 from skin_host.cli.common import load_skin
 from skin_host.engine import Engine
-from skin_host.processing.intake import PartSample, _unpressable
+from skin_host.processing.intake import PartSample
+from skin_host.processing.validity import unpressable
 
 MS = 1_000_000
 PERIOD = 50 * MS
@@ -24,12 +25,26 @@ def skin():
     return load_skin(DEMO)
 
 
+class Joined:
+    """Ledger, validity and intake of an engine, as its sweeps pass through them."""
+
+    def __init__(self) -> None:
+        configuration, layout = skin()
+        self.engine = Engine(configuration, layout, [1])
+
+    def feed(self, sweeps: list[Sweep]) -> list[PartSample]:
+        return self.engine._take(sweeps)
+
+    def expire(self, now_ns: int) -> list[PartSample]:
+        self.engine.ledger.look(now_ns)
+        return self.engine._intake.expire(now_ns)
+
+
 def intake():
     """Of the forearm, both of whose boards have been heard of."""
-    configuration, layout = skin()
-    parts = Engine(configuration, layout, [1])._intake
+    parts = Joined()
     parts.feed([sweep(OUTER, 1), sweep(INNER, 2), sweep(OUTER, 3)])
-    parts.flush()
+    parts.engine._intake.flush()
     return parts
 
 
@@ -104,10 +119,10 @@ def test_what_sweeps_say_of_a_chips_life_holds_from_the_next_one_on():
         one.raw[:] = rng.normal(240.0, 1.0, one.raw.shape).round()
         one.raw[3] = 200  # a triangle that repeats itself for ever
         samples = [parts.feed([one]) + parts.expire((turn + 1) * PERIOD) for parts in (lazy, eager)]
-        eager.judge()
+        eager.engine.validity.judge()
         for mine, its in zip(*samples, strict=True):
             assert (mine.present == its.present).all()
-        dead = eager.liveness[OUTER].frozen[3]
+        dead = eager.engine.validity.liveness.frozen[3]
         believed = [sample.present[3 * 12 : 4 * 12].any() for sample in samples[1]]
         if frozen_at is None and dead:
             frozen_at = turn
@@ -141,8 +156,8 @@ def test_fine_scales_can_be_pressed_far_out() -> None:
     """Shift 0, as on some fingertips: far is 173 fF, and what is left of the triangle counts."""
     _, layout = skin()
     fine = dataclasses.replace(layout, unit_ff=np.full(layout.n_taxels, 0.36))
-    assert not _unpressable(fine, OUTER, 360.0).any()
-    assert _unpressable(layout, OUTER, 360.0).all()
+    assert not unpressable(fine, OUTER, 360.0).any()
+    assert unpressable(layout, OUTER, 360.0).all()
 
 
 def test_a_torn_pad_does_not_silence_the_pressed_ones_beside_it():

@@ -149,3 +149,29 @@ def test_any_bytes_at_all_are_survived(seed: int) -> None:
         assert liveness.doubted is None or liveness.doubted.shape == (K, 12)
     assert np.isfinite(liveness._rate).all()
     assert np.isfinite(liveness._pads.longest).all()
+
+
+@pytest.mark.parametrize("every", [8, 10, 15])
+def test_one_pad_that_jumps_now_and_then_is_not_taken_for_errors_of_the_bus(every: int) -> None:
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+    liveness = calibrated(rng, 0.4, centre)
+    for number in range(200):
+        raw = noisy_bytes(rng, 0.4, centre)
+        raw[1, 4] -= 40 * (number % every == 0)
+        liveness.step(raw, HERE, NO)
+    assert liveness.spikes.sum() <= 1 + 200 * PERIOD_S / 1.0 / 2
+
+
+@pytest.mark.parametrize("gap", [False, True])
+def test_a_press_before_a_gap_and_its_end_after_it_are_no_spike(gap: bool) -> None:
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+    liveness = calibrated(rng, 0.4, centre)
+    pressed = noisy_bytes(rng, 0.4, centre)
+    pressed[1, 4] -= 40
+    for raw in (noisy_bytes(rng, 0.4, centre), pressed, noisy_bytes(rng, 0.4, centre)):
+        if gap and raw is not pressed:
+            liveness.note_gap(0)
+        liveness.step(raw, HERE, NO)
+    assert liveness.spikes.sum() == (0 if gap else 1)

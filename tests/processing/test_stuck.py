@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from emulator.firmware.arithmetic import transmit_16, transmit_32
 from skin_host.bus.protocol.compensation import GAIN, GAIN_V2, NO_GAIN, THERMAL_TAXEL
 from skin_host.processing import stuck
-from skin_host.processing.repeats import Repeats
+from skin_host.processing.repeats import Encoding, Repeats
 from skin_host.processing.stuck import StuckPads
 
 K = 8
@@ -25,8 +25,9 @@ class Watched:
     """Pads of a board that are shown to a watcher sweep by sweep."""
 
     def __init__(self, seen: np.ndarray, repeats: Repeats | None = None, share: float = 1.0):
-        plain = Repeats([NO_GAIN] * K, [2] * K, NO_LOAD, truncates=False)
-        self.pads = StuckPads(seen.std(axis=0), share, PERIOD_S, repeats or plain)
+        plain = Repeats([Encoding(NO_GAIN, 2, NO_LOAD, False)] * K)
+        shares, periods_s = np.full(K, share), np.full(K, PERIOD_S)
+        self.pads = StuckPads(seen.std(axis=0), shares, periods_s, repeats or plain, 1)
         self.raw = seen[-1]
         self.accusations = 0
 
@@ -155,7 +156,7 @@ def test_a_word_that_stays_is_a_repetition_whatever_is_taken_from_it(
     gain: tuple[int, ...], shift: int, truncates: bool, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    repeats = Repeats([gain] * K, [shift] * K, NO_LOAD, truncates=truncates)
+    repeats = Repeats([Encoding(gain, shift, NO_LOAD, truncates)] * K)
     held = 20000 + rng.integers(-10, 60, SHAPE)
     raw, seen = np.zeros(SHAPE, np.uint8), np.zeros(SHAPE, bool)
     for _ in range(40):
@@ -170,7 +171,7 @@ def test_a_word_that_stays_is_a_repetition_whatever_is_taken_from_it(
 
 def test_a_stuck_pad_is_found_though_the_noise_of_the_thermal_pad_moves_its_byte() -> None:
     rng = np.random.default_rng(3)
-    repeats = Repeats([GAIN] * K, [2] * K, NO_LOAD, truncates=False)
+    repeats = Repeats([Encoding(GAIN, 2, NO_LOAD, False)] * K)
 
     def sweep() -> np.ndarray:
         return np.rint(20000 + 3.0 * rng.standard_normal(SHAPE))

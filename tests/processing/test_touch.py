@@ -1,155 +1,266 @@
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skin_host.processing.touch import Imprints, TouchDetector, sure_units, threshold_units
+from skin_host.processing.touch import Levels, Residuals, TouchDetector, levels
 from skin_host.settings import Touch
 
-ON, OFF = np.array([2.0]), np.array([1.5])
+REST = 200
 
 
-def told(signal, votes):
-    detector = TouchDetector(ON, OFF, votes)
-    return [bool(detector.step(np.array([value]))[0]) for value in signal]
+def levels_of(enter, leave, span, hold):
+    """Levels of taxels without noise."""
+    enter, leave, span, hold = (np.atleast_1d(value) for value in (enter, leave, span, hold))
+    nothing = np.zeros(len(enter))
+    return Levels(enter, leave, span, hold, nothing, nothing.astype(np.int64) + 2)
 
 
-def test_one_sample_over_the_threshold_is_no_touch():
-    assert not any(told([0, 0, 5, 0, 0, 0], votes=2))
+#: Two measurements of 2 units begin a touch, two of 1.5 end it.
+BAND = levels_of(1.75, 1.75, 0.5, 0.5)
+ON = np.array([2.0])
+#: What noise does not take below that.
+FIRM = np.array([6.0])
+#: Slower than a conversion: each sweep is a new measurement.
+SWEEP_S = 0.04
 
 
-def test_two_of_three_samples_are_a_touch_and_two_of_three_end_it():
-    assert told([0, 5, 0, 5, 5, 0, 5, 0, 0, 0], votes=2) == [
-        bool(x) for x in (0, 0, 0, 1, 1, 1, 1, 0, 0, 0)
-    ]
+def detector_of(found=BAND, votes=2):
+    detector = TouchDetector(found, votes)
+    detector.renew(np.full(len(found.enter), float(REST)))
+    return detector
 
 
-def test_one_vote_tells_at_once_and_three_wait_for_three():
-    assert told([0, 5, 5, 5, 0, 0, 0], votes=1) == [bool(x) for x in (0, 1, 1, 1, 0, 0, 0)]
-    assert told([0, 5, 5, 5, 0, 0, 0, 0], votes=3) == [bool(x) for x in (0, 0, 0, 1, 1, 1, 0, 0)]
+def pressed(detector, units, dt_s=SWEEP_S):
+    raw = np.full(len(detector.touched), REST, np.uint8) - np.asarray(units, np.uint8)
+    return detector.step(raw, dt_s)
 
 
-def test_what_is_barely_above_the_threshold_must_last_for_three_samples():
-    detector = TouchDetector(ON, OFF, 2, sure=np.array([4.0]))
-    signal = [0, 3, 3, 0, 0, 3, 3, 3, 1.6, 1.6, 0, 0, 0, 3, 4, 4, 0, 0]
-    told = [bool(detector.step(np.array([value]))[0]) for value in signal]
-    assert told == [bool(x) for x in (0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 0, 0, 0, 0, 1, 1, 0)]
+def residuals_of(votes=2):
+    residuals = Residuals(1)
+    residuals.configure(ON, FIRM, np.array([votes]))
+    return residuals
 
 
-def test_a_noisy_taxel_is_sure_further_above_its_threshold():
-    noise = np.array([0.3, 0.8])
-    threshold = threshold_units(np.array([1.0, 1.4]), np.zeros(2), noise, Touch())
-    quiet, noisy = sure_units(threshold, noise) - threshold
-    assert quiet == 0.0
-    assert noisy > 1.0
+def touched_over(signal, votes=2, found=BAND):
+    detector = detector_of(found, votes)
+    return [bool(pressed(detector, value)[0]) for value in signal]
 
 
-def test_exactly_the_threshold_is_a_touch():
-    assert told([2, 2, 2], votes=2)[-1]
+def flags(*numbers):
+    return [bool(number) for number in numbers]
 
 
-def test_a_touch_lasts_down_to_the_lower_threshold():
-    assert told([2, 2, 1.6, 1.6, 1.6, 1.4, 1.4], votes=2) == [
-        bool(x) for x in (0, 1, 1, 1, 1, 1, 0)
-    ]
-    assert not any(told([1.6] * 5, votes=2))
+def test_one_measurement_over_the_threshold_is_no_touch():
+    assert not any(touched_over([0, 0, 50, 0, 0, 0]))
 
 
-def test_what_is_no_number_touches_nothing():
-    assert not any(told([np.nan] * 5, votes=2))
+def test_two_measurements_are_a_touch_and_two_end_it():
+    assert touched_over([0, 5, 5, 5, 0, 5, 0, 0, 0]) == flags(0, 0, 1, 1, 1, 1, 1, 0, 0)
 
 
-@given(st.lists(st.floats(0.0, 4.0), max_size=60), st.sampled_from([1, 2, 3]))
-def test_after_three_quiet_samples_nothing_is_touched_and_none_need_be_taken(signal, votes):
-    detector = TouchDetector(ON, OFF, votes)
-    for value in [*signal, 0.0, 0.0, 0.0]:
-        touched = detector.step(np.array([value]))
-    assert not touched.any()
-    assert detector.idle
+def test_one_vote_decides_at_once_and_three_wait_for_three():
+    assert touched_over([0, 5, 5, 0, 0], votes=1) == flags(0, 1, 1, 0, 0)
+    assert touched_over([0, 5, 5, 5, 0, 0, 0], votes=3) == flags(0, 0, 0, 1, 1, 1, 0)
+
+
+def test_a_conversion_that_is_sent_again_has_no_second_vote():
+    detector = detector_of()
+    pressed(detector, 0)
+    for dt_s in (0.02, 0.01, 0.005):
+        assert not pressed(detector, 30, dt_s)[0]
+    # The chip has converted again since: the same byte is another measurement.
+    assert pressed(detector, 30, 0.03)[0]
+
+
+@pytest.mark.parametrize("period_ms", [5, 10, 18, 20, 25, 36])
+def test_no_period_gives_a_single_conversion_two_votes(period_ms):
+    detector = detector_of()
+    for t_ms in range(0, 37 - period_ms, period_ms):
+        assert not pressed(detector, 30, period_ms * 1e-3)[0], t_ms
+
+
+def test_what_was_not_received_has_no_vote():
+    detector = detector_of()
+    raw = np.full(1, REST - 30, np.uint8)
+    assert not detector.step(raw, SWEEP_S)[0]
+    for _ in range(5):
+        assert not detector.step(raw, SWEEP_S, np.ones(1, bool))[0]
+    assert detector.step(raw, SWEEP_S)[0]
+
+
+def test_a_touch_lasts_while_it_stands_between_the_thresholds():
+    found = levels_of(2.5, 1.5, 1.0, 1.0)
+    assert touched_over([3, 3, 2, 2, 2, 2, 1, 1], found=found) == flags(0, 1, 1, 1, 1, 1, 1, 0)
+    assert not any(touched_over([2] * 20, found=found))
+
+
+def test_a_weak_press_needs_as_many_measurements_as_its_noise_demands():
+    found = levels_of(1.75, 1.75, 6.0, 6.0)
+    assert touched_over([3] * 5, found=found).index(True) == 4
+    assert touched_over([6] * 5, found=found).index(True) == 1
+
+
+def test_a_taxel_without_a_vote_is_never_touched():
+    found = levels_of(np.inf, np.inf, 1.0, 1.0)
+    assert not any(touched_over([200] * 20, found=found))
 
 
 def test_answers_are_not_changed_afterwards():
-    detector = TouchDetector(ON, OFF, 1)
-    first = detector.step(np.array([5.0]))
-    detector.step(np.array([0.0]))
+    detector = detector_of(votes=1)
+    first = pressed(detector, 5)
+    pressed(detector, 0)
     detector.reset(np.array([0]))
     assert first[0]
 
 
-def test_the_threshold_is_the_papers_for_quiet_taxels():
-    # 95th percentile 1 unit above the mean, margin of 2: readings of 3 and more are a touch.
-    (threshold,) = threshold_units(np.array([1.0]), np.zeros(1), np.array([0.4]), Touch())
-    assert 2.0 < threshold <= 3.0
+def test_other_levels_leave_what_is_touched_touched():
+    detector = detector_of()
+    for _ in range(2):
+        pressed(detector, 10)
+    noisier = levels_of(3.0, 2.0, 8.0, 8.0)
+    detector.configure(noisier, 2)
+    assert pressed(detector, 10)[0]
+    assert not [pressed(detector, 0)[0] for _ in range(5)][-1]
 
 
-def test_noisy_taxels_keep_a_distance_in_proportion_to_their_noise():
-    noise = np.array([1.0, 2.0, 3.0])
-    thresholds = threshold_units(1.645 * noise, np.zeros(3), noise, Touch())
-    assert np.all(thresholds >= 3.6 * noise)
-
-
-def test_a_release_threshold_above_the_threshold_is_refused():
-    with pytest.raises(ValueError, match="release"):
-        TouchDetector(OFF, ON)
+def test_evidence_against_other_levels_makes_no_touch():
+    detector = detector_of(levels_of(1.75, 1.75, 3.0, 3.0))
+    pressed(detector, 3)
+    detector.configure(levels_of(6.75, 6.75, 0.5, 0.5), 2)
+    assert not pressed(detector, 0)[0]
 
 
 @given(
-    st.lists(st.lists(st.integers(0, 4), min_size=4, max_size=4), min_size=1, max_size=40),
+    st.lists(st.lists(st.integers(0, 6), min_size=4, max_size=4), min_size=1, max_size=60),
     st.sampled_from([1, 2, 3]),
     st.lists(st.integers(0, 39), max_size=3),
 )
-def test_the_decision_is_the_vote_counted_out_at_every_sample(rows, votes, resets):
-    detector = TouchDetector(np.full(4, 3.0), np.full(4, 2.0), votes, sure=np.full(4, 4.0))
-    nothing = np.zeros(4, bool)
-    touched, over, sure = nothing, [nothing] * 3, [nothing] * 3
+@settings(deadline=None)
+def test_the_decision_is_the_evidence_added_up_and_idle_sweeps_may_be_left_out(rows, votes, resets):
+    span = np.array([0.5, 1.0, 3.0, 6.0])
+    found = levels_of(np.full(4, 2.5), np.full(4, 1.5), span, np.array([0.5, 1.5, 3.0, 8.0]))
+    detector, evidence, touched = detector_of(found, votes), np.zeros(4), np.zeros(4, bool)
     for number, row in enumerate(rows):
         if number in resets:
             detector.reset(np.array([1]))
-            others = np.arange(4) != 1
-            touched = touched & others
-            over, sure = [one & others for one in over], [one & others for one in sure]
-        signal = np.array(row, float)
-        over = [*over[1:], signal >= np.where(touched, 2.0, 3.0)]
-        sure = [*sure[1:], signal >= 4.0]
-        count = np.sum(over, axis=0)
-        if votes == 1:
-            touched = over[-1]
-        elif votes == 2:
-            touched = (count == 3) | (np.sum(sure, axis=0) >= 2) | (touched & (count >= 2))
+            evidence[1], touched[1] = 0.0, False
+        vote, veto = (limit * (1 + 1e-5) / votes for limit in (span, found.hold))
+        gain = np.array(row) - np.where(touched, found.leave, found.enter)
+        evidence = np.clip(evidence + np.clip(gain, -veto, vote), 0.0, found.hold)
+        touched = np.where(touched, evidence > 1e-4 * found.hold, evidence >= span - 1e-5)
+        raw = REST - np.array(row, np.uint8)
+        if detector.is_idle(raw):
+            assert not touched.any()
         else:
-            touched = (count == 3) | (touched & (count > 0))
-        assert np.array_equal(detector.step(signal), touched)
+            assert np.array_equal(detector.step(raw, SWEEP_S), touched)
 
 
-def told_after_a_press(press, rest, *, rest_s=0.0):
-    """Whether a rest is told as a new touch, after a press and so long of nothing."""
-    detector, imprints = TouchDetector(ON, OFF), Imprints(ON)
-    told = []
-    for value in [press] * 5 + [0.0] * 3:
-        signal = np.array([value])
-        told.append(bool(imprints.step(detector.step(signal), signal)[0]))
-    assert any(told)
-    imprints.fade(rest_s)
+def test_the_threshold_is_the_papers_for_quiet_taxels():
+    # Two units above a mean of 0 and of 0.4: readings of 2, and of 3.
+    for rest in (0.0, 0.4):
+        found = levels(np.array([np.ceil(rest) - rest]), np.array([0.1]), Touch())
+        first = np.ceil(found.enter + found.span / 2 - 1e-9 + rest)
+        assert first == np.ceil(rest) + 2
+
+
+def test_noise_needs_measurements_and_not_pressure():
+    quiet, usual, noisy = levels(np.full(3, 0.6), np.array([0.3, 1.0, 1.5]), Touch()).decides
+    assert usual < quiet + 0.5
+    assert noisy < quiet + 1.0
+
+
+def test_settings_of_nothing_make_no_decision_of_noise():
+    still = Touch(margin_units=0.0, minimum_threshold_units=0.0, hysteresis_units=0.0)
+    found = levels(np.zeros(2), np.array([0.0, 1.0]), still)
+    assert np.all(found.leave >= 0.0)
+    assert np.all(found.enter > 0.0)
+    assert np.all(found.span > 0.0)
+
+
+@pytest.mark.parametrize("spread", [0.4, 0.8, 1.2, 2.0, 5.0])
+def test_noise_reaches_its_span_as_rarely_as_it_was_made_for(spread):
+    """At odds of 10^4 instead of 10^9, which can be counted."""
+    rng = np.random.default_rng(3)
+    n, steps = 400, 5000
+    found = levels(np.full(n, 0.5), np.full(n, spread), Touch())
+    less = np.log(1e4) / np.log(1e9)
+    fewer = replace(found, span=found.span * less)
+    detector = detector_of(fewer)
+    begun, before = 0, detector.touched
+    for _ in range(steps):
+        raw = np.rint(REST + spread * rng.standard_normal(n)).astype(np.uint8)
+        touched = detector.step(raw, SWEEP_S)
+        begun += int(np.count_nonzero(touched & ~before))
+        before = touched
+    assert begun < n * steps / 1e4
+
+
+def reported_after_a_press(press, rest, *, rest_s=0.0):
+    """Whether a rest is reported as a new touch, after a press and so long of nothing."""
+    detector, residuals = detector_of(), residuals_of()
+    reported = []
+    for value in [press] * 5 + [0] * 3:
+        touched = pressed(detector, value)
+        reported.append(bool(residuals.step(touched, np.array([float(value)]))[0]))
+    assert any(reported)
+    residuals.fade(rest_s)
     for _ in range(5):
-        signal = np.array([rest])
-        told.append(bool(imprints.step(detector.step(signal), signal)[0]))
-    return told[-1]
+        touched = pressed(detector, rest)
+        reported.append(bool(residuals.step(touched, np.array([float(rest)]))[0]))
+    return reported[-1]
 
 
 def test_what_a_hard_press_leaves_in_the_foam_is_no_new_touch():
-    assert not told_after_a_press(100.0, 4.5)
-    assert told_after_a_press(20.0, 4.5)  # a softer one leaves less
-    assert told_after_a_press(100.0, 6.0)  # and this is more than it left
+    assert not reported_after_a_press(100, 4)
+    assert reported_after_a_press(20, 4)  # a softer one leaves less
+    assert reported_after_a_press(100, 6)  # and this is more than it left
 
 
 def test_what_a_press_has_left_is_forgotten():
-    assert told_after_a_press(100.0, 3.0, rest_s=10.0)
+    assert reported_after_a_press(100, 3, rest_s=10.0)
 
 
-def test_a_press_that_goes_down_without_end_is_one_touch():
-    detector, imprints = TouchDetector(ON, OFF), Imprints(ON)
-    told = [
-        bool(imprints.step(detector.step(np.array([value])), np.array([value]))[0])
-        for value in [100.0] * 5 + [3.0] * 50
-    ]
-    assert told == [False] + [True] * 54
+def reported_over(values, residuals, dt_s=SWEEP_S):
+    """What is reported of a taxel that reads so many units, which are kPa here."""
+    detector = detector_of()
+    reported = []
+    for value in values:
+        touched = pressed(detector, value, dt_s)
+        signal = np.array([float(value)])
+        reported.append(bool(residuals.step(touched, signal, detector.repeated)[0]))
+    return reported
+
+
+def test_a_press_that_goes_down_to_more_than_it_leaves_is_one_touch():
+    assert reported_over([100] * 5 + [6] * 50, residuals_of()) == [False] + [True] * 54
+
+
+def test_a_press_that_has_fallen_to_what_it_leaves_has_ended():
+    # The detector alone would hold on to it: 3 units are more than its threshold.
+    assert (
+        reported_over([100] * 5 + [3] * 50, residuals_of())
+        == flags(0, 1, 1, 1, 1, 1) + [False] * 49
+    )
+
+
+def test_taps_stay_apart_though_the_foam_has_not_come_back_between_them():
+    taps = ([60] * 5 + [3] * 8) * 3
+    reported = reported_over(taps, residuals_of())
+    begins = [not before and now for before, now in pairwise([False, *reported])]
+    assert sum(begins) == 3
+
+
+def test_a_noisy_taxel_that_falls_needs_as_many_measurements_as_for_a_touch():
+    fall = [100] * 5 + [3] * 10
+    assert reported_over(fall, residuals_of(votes=5)) == [False] + [True] * 8 + [False] * 6
+    # One that is no lower than its noise goes ends nothing.
+    assert all(reported_over([100] * 5 + [3, 3, 50] * 10, residuals_of(votes=3))[1:])
+
+
+def test_a_measurement_that_is_sent_again_ends_no_press():
+    reported = reported_over([100] * 8 + [3] * 3, residuals_of(), dt_s=0.01)
+    assert reported[-3:] == flags(1, 1, 1)

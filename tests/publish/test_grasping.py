@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skin_host.fingertip.events import OverEvent, SlipEvent
-from skin_host.processing.contacts import Load, TouchEvent
+from skin_host.processing.events import Load, TouchEvent
 from skin_host.publish import grasping, messages
 from skin_host.publish.outbox import Outbox
 from skin_host.publish.payload import MessageError

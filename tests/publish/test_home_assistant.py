@@ -61,13 +61,14 @@ def test_a_contact_is_announced_as_documented(told: dict[str, Any]) -> None:
         "name": "left_hand contact",
         "icon": "mdi:gesture-tap",
         "state_topic": "skin/demo/left_hand/contact",
+        "value_template": "{{ 'None' if value == 'UNKNOWN' else value }}",
         "qos": 1,
         "availability": [
             {"topic": "skin/demo/nodes/main/status"},
             {
                 "topic": "skin/demo/left_hand/health",
                 "value_template": "{{ 'online' if value_json.state in "
-                "('ok', 'degraded', 'saturated') else 'offline' }}",
+                "('ok', 'warning', 'degraded', 'saturated') else 'offline' }}",
             },
         ],
         "availability_mode": "all",
@@ -125,6 +126,7 @@ def test_a_base_of_several_words_makes_a_topic_of_one(info: NodeInfo) -> None:
     ("state", "feels", "problem"),
     [
         ("ok", "online", "OFF"),
+        ("warning", "online", "ON"),
         ("degraded", "online", "ON"),
         ("saturated", "online", "ON"),
         ("silent", "offline", "ON"),
@@ -147,6 +149,15 @@ def test_a_part_that_feels_nothing_is_unavailable_and_never_untouched(
     assert said(contact["availability"][1]["value_template"]) == feels
     assert said(health["value_template"]) == problem
     assert json.loads(said(health["json_attributes_template"])) == record
+
+
+@pytest.mark.parametrize(("value", "state"), [("ON", "ON"), ("OFF", "OFF"), ("UNKNOWN", "None")])
+def test_a_contact_that_is_unknown_is_none_to_home_assistant(
+    told: dict[str, Any], value: str, state: str
+) -> None:
+    contact = told["homeassistant/binary_sensor/skin_demo_left_hand_contact/config"]
+    template = jinja2.Environment().from_string(contact["value_template"])
+    assert template.render(value=value) == state
 
 
 def test_a_fingertip_is_announced_like_a_part(info: NodeInfo) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from skin_host.errors import BrokerError
-from skin_host.processing.contacts import TouchEvent
+from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.publish import broker as local
 from skin_host.publish.mqtt import Publisher
@@ -39,7 +39,7 @@ async def publish_and_listen(host: str, port: int, protocol: str) -> list[str]:
             await until(lambda: publisher.counters.connected)
             publisher.put_frame(frame)
             publisher.put_touch(touch)
-            publisher.put_contact("palm", True)
+            publisher.put_contact("palm", "ON")
             await until(lambda: len(seen) == 4)
         await until(lambda: len(seen) == 5)
         task.cancel()

@@ -60,9 +60,12 @@ def test_a_touch_without_a_centroid_says_null() -> None:
 
 
 def test_a_touch_reads_back() -> None:
-    sent = messages.touch_message(make_event(), 12)
-    seen = messages.decode_touch(messages.encode_touch(make_event(), 12))
-    assert all(getattr(seen, key) == getattr(sent, key) for key in sent.__struct_fields__)
+    for event in (make_event(reason="lost"), make_event()):
+        sent = messages.touch_message(event, 12)
+        seen = messages.decode_touch(messages.encode_touch(event, 12))
+        fields = {*sent.__struct_fields__} - {"reason"}
+        assert all(getattr(seen, key) == getattr(sent, key) for key in fields)
+        assert seen.reason == event.reason
 
 
 def test_only_the_receiver_says_what_was_missed() -> None:
@@ -89,8 +92,8 @@ def test_a_touch_that_breaks_the_contract_is_refused(old: bytes, new: bytes) -> 
 
 
 def test_contact_is_on_or_off() -> None:
-    assert messages.encode_contact(True) == b"ON"
-    assert messages.decode_contact(messages.encode_contact(False)) is False
+    for state in ("ON", "OFF", "UNKNOWN"):
+        assert messages.decode_contact(messages.encode_contact(state)) == state
 
 
 def test_health_carries_its_schema_first() -> None:

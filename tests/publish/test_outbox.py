@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import json
 
-from skin_host.processing.contacts import TouchEvent
+from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.publish.outbox import Outbox
 

@@ -15,9 +15,10 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
 from skin_host.errors import ConfigurationError, RequestError
-from skin_host.processing.contacts import TouchEvent
+from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.publish.mqtt import Publisher
+from skin_host.publish.order import Stamp
 from skin_host.settings import Mqtt
 from tests.support.broker import Mosquitto, free_port
 from tests.support.waiting import PATIENCE_S, until
@@ -93,7 +94,7 @@ async def test_everything_put_arrives_as_the_contract_says(
             await until(lambda: publisher.counters.connected)
             publisher.put_frame(frame(1))
             publisher.put_touch(touch(1))
-            publisher.put_contact("palm", True)
+            publisher.put_contact("palm", "ON")
             publisher.put_health("palm", {"rate_hz": 20.0})
             await until(lambda: len(seen.messages) == 5)
         await until(lambda: seen.payloads("status") == [b"online", b"offline"])
@@ -109,12 +110,28 @@ async def test_everything_put_arrives_as_the_contract_says(
         assert properties.MessageExpiryInterval == 1
 
 
+async def test_frames_tell_their_run_also_when_it_changes_within_a_connection(
+    mosquitto: Mosquitto,
+) -> None:
+    async with listening(mosquitto, "skin/+/palm/frame") as seen:
+        async with Publisher(settings(mosquitto), "robot") as publisher:
+            await until(lambda: publisher.counters.connected)
+            publisher.put_frame(frame(1))
+            await until(lambda: len(seen.messages) == 1)
+            assert publisher._numbers.overtake(Stamp(2_000_000_000_000_000_000, 0))
+            publisher._number_messages()
+            publisher.put_frame(frame(2))
+            await until(lambda: len(seen.messages) == 2)
+    runs = [int(dict(message.properties.UserProperty)["run"]) for message in seen.messages]
+    assert runs[0] < 2_000_000_000_000_000_000 < runs[1]
+
+
 async def test_frames_and_touches_are_not_retained_the_rest_is(mosquitto: Mosquitto) -> None:
     async with Publisher(settings(mosquitto), "robot") as publisher:
         await until(lambda: publisher.counters.connected)
         publisher.put_frame(frame(1))
         publisher.put_touch(touch(1))
-        publisher.put_contact("palm", False)
+        publisher.put_contact("palm", "OFF")
         publisher.put_health("palm", {})
         await until(lambda: publisher.counters.retained_sent >= 3)
         await until(lambda: publisher.counters.frames_sent and publisher.counters.touches_sent)
@@ -176,12 +193,12 @@ async def test_a_contact_that_did_not_change_is_not_said_again(mosquitto: Mosqui
     async with listening(mosquitto, "skin/+/+/contact") as seen:
         async with Publisher(settings(mosquitto), "robot") as publisher:
             await until(lambda: publisher.counters.connected)
-            for touched in (True, True, False, False, True):
-                publisher.put_contact("palm", touched)
+            for state in ("ON", "ON", "OFF", "OFF", "UNKNOWN", "ON"):
+                publisher.put_contact("palm", state)
                 sent = publisher.counters.retained_sent
                 await asyncio.sleep(0.05)
             await until(lambda: publisher.counters.retained_sent >= sent)
-    assert [message.payload for message in seen.messages] == [b"ON", b"OFF", b"ON"]
+    assert [message.payload for message in seen.messages] == [b"ON", b"OFF", b"UNKNOWN", b"ON"]
 
 
 async def test_a_broker_that_comes_late_gets_what_still_matters(
@@ -192,8 +209,8 @@ async def test_a_broker_that_comes_late_gets_what_still_matters(
         publisher.put_frame(frame(1))
         publisher.put_touch(touch(1))
         publisher.put_touch(touch(1, "end"))
-        publisher.put_contact("palm", True)
-        publisher.put_contact("palm", False)
+        publisher.put_contact("palm", "ON")
+        publisher.put_contact("palm", "OFF")
         await until(lambda: publisher.counters.last_error)
         mosquitto.start()
         await until(lambda: publisher.counters.touches_sent == 2)
@@ -212,7 +229,7 @@ async def test_a_killed_broker_gets_every_touch_and_all_that_is_retained_again(
 ) -> None:
     async with Publisher(settings(mosquitto), "robot") as publisher:
         async with listening(mosquitto) as seen:
-            publisher.put_contact("palm", True)
+            publisher.put_contact("palm", "ON")
             publisher.put_health("palm", {"rate_hz": 1.0})
             number = 0
             for _ in range(3):
@@ -329,7 +346,7 @@ async def answer(name: str, payload: bytes) -> dict[str, Any]:
         raise ZeroDivisionError("secret detail")
     if name == "refuse":
         raise RequestError("not now: a calibration is running")
-    return {"name": name, "seen": json.decode(payload)}
+    return {"name": name, "seen": json.decode(payload or b"{}")}
 
 
 async def request(
@@ -371,7 +388,16 @@ async def test_a_command_is_answered_where_the_request_says(mosquitto: Mosquitto
     }
 
 
-@pytest.mark.parametrize("reply", [None, "skin/robot/palm/touch", "skin/robot/nodes/main/info"])
+@pytest.mark.parametrize(
+    "reply",
+    [
+        None,
+        "skin/robot/palm/touch",
+        "skin/robot/nodes/main/info",
+        "elsewhere",
+        "/" * 201,  # a broker ends the connection of whoever answers there
+    ],
+)
 async def test_a_command_without_a_fit_reply_topic_is_answered_beside_it(
     mosquitto: Mosquitto, reply: str | None
 ) -> None:
@@ -380,6 +406,7 @@ async def test_a_command_without_a_fit_reply_topic_is_answered_beside_it(
         await until(lambda: seen.payloads("cmd/scan/result"))
     assert json.decode(seen.payloads("cmd/scan/result")[0])["result"]["seen"] == {}
     assert not seen.payloads("/touch") + seen.payloads("/info")
+    assert seen.payloads("/status").count(b"online") == 1
 
 
 @pytest.mark.parametrize(
@@ -429,6 +456,50 @@ async def test_a_retained_command_is_not_obeyed(mosquitto: Mosquitto) -> None:
             await until(lambda nth=nth: mosquitto.subscriptions(COMMANDS) == nth)
             await asyncio.sleep(0.2)
             assert publisher.counters.commands_taken == 0
+
+
+async def test_a_retained_command_that_comes_while_the_node_is_online_is_counted_not_obeyed(
+    mosquitto: Mosquitto, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Publisher(settings(mosquitto), "robot", handler=answer) as publisher:
+        await until(lambda: mosquitto.subscriptions(COMMANDS))
+        async with aiomqtt.Client(mosquitto.host, mosquitto.port) as client:
+            for payload in ("{}", "{}", ""):  # the last one clears it
+                await client.publish("skin/robot/nodes/main/cmd/scan", payload, qos=1, retain=True)
+        await until(lambda: publisher.counters.commands_refused == 3)
+        assert publisher.counters.commands_taken == 0
+    said = [r.getMessage() for r in caplog.records if "is ignored" in r.getMessage()]
+    assert len(said) == 1
+    assert "mosquitto_pub -r -n -t skin/robot/nodes/main/cmd/scan" in said[0]
+
+
+async def test_a_bomb_of_properties_is_counted_and_stops_nobody(mosquitto: Mosquitto) -> None:
+    bomb = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+    for _ in range(2000):
+        bomb.UserProperty = ("", "")
+    async with asking(mosquitto) as (client, seen):
+        commands = "skin/robot/nodes/main/cmd/scan"
+        await client.publish(commands, "{}", qos=1, properties=bomb)
+        await request(client, "scan", b"{}")
+        await until(lambda: seen.payloads("cmd/scan/result"))
+    assert seen.payloads("/status").count(b"online") == 1
+    assert len(seen.payloads("cmd/scan/result")) == 1
+
+
+@pytest.mark.parametrize("protocol", ["5", "3.1.1"])
+async def test_a_request_larger_than_any_is_passed_over(
+    mosquitto: Mosquitto, protocol: str
+) -> None:
+    keys = settings(mosquitto, protocol=protocol)
+    async with Publisher(keys, "robot", handler=answer) as publisher:
+        await until(lambda: mosquitto.subscriptions(COMMANDS))
+        async with aiomqtt.Client(mosquitto.host, mosquitto.port) as client:
+            topic = "skin/robot/nodes/main/cmd/scan"
+            for _ in range(3):
+                await client.publish(topic, b" " * 5_000_000, qos=1)
+            await client.publish(topic, b"{}", qos=1)
+        await until(lambda: publisher.counters.commands_taken == 1)
+        assert publisher.counters.connections == 1
 
 
 async def test_with_commands_off_none_is_taken(mosquitto: Mosquitto) -> None:

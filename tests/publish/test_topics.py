@@ -40,9 +40,9 @@ def test_a_base_that_cannot_start_a_topic_is_refused(base: str) -> None:
         Topics(base, "icub")
 
 
-def test_an_answer_goes_to_the_replies_of_its_node_or_outside_the_skin() -> None:
-    assert TOPICS.may_reply_to("main", TOPICS.reply("main", "panel-1"))
-    assert TOPICS.may_reply_to("main", "operators/7/answers")
+@pytest.mark.parametrize("name", ["panel-1", "a/b/c/d", "mosquitto_rr.7:x@host", "a" * 64])
+def test_an_answer_goes_to_the_replies_of_its_node(name: str) -> None:
+    assert TOPICS.may_reply_to("main", TOPICS.reply("main", name))
 
 
 @pytest.mark.parametrize(
@@ -52,11 +52,14 @@ def test_an_answer_goes_to_the_replies_of_its_node_or_outside_the_skin() -> None
         "lab/skin/icub/palm/touch",
         "lab/skin/icub/nodes/main/status",
         "lab/skin/icub/nodes/other/replies/x",
+        "lab/skin/nao/palm/contact",
+        "operators/7/answers",
         "$SYS/broker",
-        "a/+",
-        "a/#",
-        "a" * 257,
+        *(
+            f"lab/skin/icub/nodes/main/replies/{name}"
+            for name in ("", "+", "#", "a//b", "/a", "a/", "a\n", "a" * 65, "a/b/c/d/e", "/" * 201)
+        ),
     ],
 )
-def test_an_answer_cannot_be_passed_off_as_something_else(topic: str) -> None:
+def test_an_answer_cannot_go_anywhere_else(topic: str) -> None:
     assert not TOPICS.may_reply_to("main", topic)

@@ -11,6 +11,8 @@ from skin_host import plots
 from skin_host.errors import LogError, RequestError
 from skin_host.export import Series, export, read_frames, read_messages
 from skin_host.layout import build_layout
+from skin_host.processing.calibration import with_curves
+from skin_host.processing.curves import KNOTS_UNITS, Curves, Memory, rising
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.publish.frames import encode_frame
 from skin_host.publish.recording import Recorder
@@ -38,7 +40,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def series(hand: Any, log: Path) -> Series:
-    return read_frames(log, *hand)
+    return read_frames(log, *hand, calibrate_from_log(log, *hand, 5.0))
 
 
 def test_every_sweep_of_a_recording_is_there(series: Series, hand: Any) -> None:
@@ -120,7 +122,7 @@ def test_a_recording_without_frames_is_refused(tmp_path: Path) -> None:
 
 
 def test_another_form_is_refused(series: Series, tmp_path: Path) -> None:
-    with pytest.raises(RequestError, match=r"ends in \.npz, or a folder"):
+    with pytest.raises(RequestError, match=r"ends in one of \.npz, .* or a folder"):
         export(series, tmp_path / "a.xlsx")
 
 
@@ -139,7 +141,20 @@ def test_pictures_are_drawn(series: Series, hand: Any, log: Path, tmp_path: Path
     plots.plot_map(series, tmp_path / "then.png", "left_hand", at_s=0.0)
     found = calibrate_from_log(log, settings, layout, 5.0)
     plots.plot_calibration(found, layout, tmp_path / "calibration.png")
-    for name in ("pressure", "map", "then", "calibration"):
+    n = layout.n_taxels
+    curves = Curves(
+        rising(np.tile(8.0 * KNOTS_UNITS, (n, 1))),
+        np.full(n, 40.0),
+        np.full(n, 0.8),
+        np.full(n, 4.0),
+        np.zeros(n, np.uint8),
+        340.0,
+        0.0,
+        Memory((20.0,), (0.3,)),
+    )
+    own = with_curves(found, curves)
+    plots.plot_calibration(own, layout, tmp_path / "curves.png")
+    for name in ("pressure", "map", "then", "calibration", "curves"):
         width, height = size(tmp_path / f"{name}.png")
         assert width > 600
         assert height > 200

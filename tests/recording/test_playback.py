@@ -18,12 +18,12 @@ from skin_host.client import SkinClient
 from skin_host.engine import Engine
 from skin_host.errors import RequestError
 from skin_host.layout import Layout, build_layout
-from skin_host.playback import paced, play_on_buses, play_processed, play_said
+from skin_host.playback import paced, play_messages, play_on_buses, play_processed
 from skin_host.publish.address import Broker
 from skin_host.publish.info import encode_info, node_info
-from skin_host.publish.recording import Recorder, read_can, read_said, recorded_topics
-from skin_host.replay import calibrate_from_log, replay
-from skin_host.settings import Bus, Mqtt, Settings, load
+from skin_host.publish.recording import Recorder, read_can, read_messages_of, recorded_topics
+from skin_host.replay import calibrate_from_log, steps
+from skin_host.settings import Bus, Mqtt, Settings, changed, load
 from tests.support.broker import Mosquitto
 from tests.support.waiting import PATIENCE_S, until
 
@@ -58,7 +58,7 @@ def steps_of(log: Path) -> list[Any]:
     engine = Engine(settings, layout, [0], calibrate_from_log(log, settings, layout, 5.0))
     return [
         (step.frame.t_ns, step.frame.raw.tobytes(), step.frame.pressure_kpa.tobytes(), step.events)
-        for step in replay(log, engine)
+        for step in steps(log, engine)
     ]
 
 
@@ -92,7 +92,8 @@ def test_a_format_that_nobody_knows_is_refused(tmp_path: Path) -> None:
 async def test_a_recording_played_on_a_bus_is_captured_as_it_was(tmp_path: Path) -> None:
     grasp = beginning(tmp_path, 400)
     settings, _ = hand()
-    settings.buses["can0"] = bus = Bus(interface="virtual", channel=f"play-{tmp_path.name}")
+    bus = Bus(interface="virtual", channel=f"play-{tmp_path.name}")
+    settings = changed(settings, {"buses.can0": bus})
     path = tmp_path / "again.mcap"
     stop = asyncio.Event()
     with (
@@ -136,7 +137,7 @@ async def test_what_a_broker_said_is_recorded_and_said_again_byte_for_byte(
     tmp_path: Path, mosquitto: Mosquitto
 ) -> None:
     settings, layout = hand()
-    settings.mqtt = Mqtt(host=mosquitto.host, port=mosquitto.port)
+    settings = changed(settings, {"mqtt": Mqtt(host=mosquitto.host, port=mosquitto.port)})
     grasp = beginning(tmp_path)
     first, second = tmp_path / "first.mcap", tmp_path / "second.mcap"
     calibration = calibrate_from_log(grasp, settings, layout, 5.0)
@@ -149,12 +150,12 @@ async def test_what_a_broker_said_is_recorded_and_said_again_byte_for_byte(
     assert recorder.messages["frame"] > 50
     async with recording(mosquitto, second) as again:
         broker, _ = Broker.from_url(f"mqtt://{mosquitto.host}:{mosquitto.port}", "5")
-        assert await play_said(first, broker, speed=5) == sum(recorder.messages.values())
+        assert await play_messages(first, broker, speed=5) == sum(recorder.messages.values())
         # Those recorded, the one that the broker had kept, and a last one at the end of the play.
         await until(lambda: again.messages.get("status") == recorder.messages["status"] + 2)
 
     def said(path: Path, kind: str) -> list[bytes]:
-        return [one.payload for one in read_said(path) if one.topic.endswith(f"/{kind}")]
+        return [one.payload for one in read_messages_of(path) if one.topic.endswith(f"/{kind}")]
 
     assert said(second, "frame") == said(first, "frame")
     assert said(second, "touch") == said(first, "touch")
@@ -178,21 +179,21 @@ async def test_a_recording_can_be_played_as_another_robot(
     async with SkinClient(url, robot="ghost") as skin:
         contacts = skin.contacts()
         await asyncio.sleep(0.2)
-        await play_said(path, broker, robot="ghost")
+        await play_messages(path, broker, robot="ghost")
         async with asyncio.timeout(PATIENCE_S):
             contact = await anext(contacts)
-            assert (contact.part, contact.touched) == ("left_hand", True)
+            assert (contact.part, contact.state) == ("left_hand", "ON")
             assert (await skin.info())["main"].parts.keys() == {"left_hand"}
 
 
 async def test_an_emulated_robot_can_be_recorded(tmp_path: Path) -> None:
     settings = load(ROOT / "config" / "demo.toml")
+    settings = changed(settings, {"buses.can0.channel": tmp_path.name})
     layout = build_layout(settings, CONFIG.parent)
     bus = settings.buses["can0"]
-    bus.channel = tmp_path.name
     path = tmp_path / "robot.blf"
     stop = asyncio.Event()
-    robot = Robot(settings, layout, Scene())
+    robot = Robot(settings, layout, Scene(quiet=True))
     robot.bring_up()
     with CanLog(path) as log, can.Bus(interface=bus.interface, channel=bus.channel) as opened:
         capturing = asyncio.create_task(capture_buses(settings, log.put, stop))

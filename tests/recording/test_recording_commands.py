@@ -16,7 +16,7 @@ from skin_host.cli import main
 from skin_host.layout import build_layout
 from skin_host.publish.info import node_info
 from skin_host.publish.mqtt import Publisher
-from skin_host.publish.recording import read_said
+from skin_host.publish.recording import read_messages_of
 from skin_host.settings import Mqtt, load
 from tests.support.broker import Mosquitto
 from tests.support.world import World
@@ -132,7 +132,7 @@ async def test_a_robot_is_recorded_until_ctrl_c_and_played_again(
     settings = Mqtt(host=mosquitto.host, port=mosquitto.port)
     async with Publisher(settings, "icub", "main") as publisher:
         publisher.put_info(node_info(layout, "main", version="1", configuration="x"))
-        publisher.put_contact("left_hand", touched=True)
+        publisher.put_contact("left_hand", "ON")
         command = [
             sys.executable,
             "-m",
@@ -154,7 +154,7 @@ async def test_a_robot_is_recorded_until_ctrl_c_and_played_again(
     assert recording.returncode == 0, err
     told = json.loads(out)
     assert told["messages"] == {"contact": 1, "info": 1, "status": 1}
-    assert {said.topic for said in read_said(file)} >= {"skin/icub/left_hand/contact"}
+    assert {said.topic for said in read_messages_of(file)} >= {"skin/icub/left_hand/contact"}
     played = await asyncio.to_thread(
         main, ["replay", str(file), "--onto", "broker", "--broker", url, "--robot", "ghost"]
     )

@@ -12,11 +12,11 @@ from mcap.reader import make_reader
 
 from skin_host.bus.protocol import FrameBatch
 from skin_host.errors import LogError
-from skin_host.processing.contacts import TouchEvent
+from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.publish.frames import encode_frame
 from skin_host.publish.messages import encode_touch
-from skin_host.publish.recording import Recorder, read_can, read_said
+from skin_host.publish.recording import Recorder, read_can, read_messages_of
 
 TOPIC = "skin/demo/palm"
 
@@ -54,15 +54,15 @@ def test_messages_come_back_byte_for_byte_in_their_order(tmp_path: Path) -> None
     with Recorder(path) as recorder:
         for at_ns, (topic, payload) in enumerate(everything()):
             recorder.say(topic, at_ns, payload)
-    assert [(said.topic, said.payload) for said in read_said(path)] == everything()
-    assert [said.t_ns for said in read_said(path)] == list(range(7))
+    assert [(said.topic, said.payload) for said in read_messages_of(path)] == everything()
+    assert [said.t_ns for said in read_messages_of(path)] == list(range(7))
 
 
 def test_frames_in_cbor_become_the_json_that_says_the_same(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with Recorder(path) as recorder:
         recorder.say(f"{TOPIC}/frame", 1, frame(3, "cbor", raw=True))
-    (said,) = read_said(path)
+    (said,) = read_messages_of(path)
     assert said.payload == frame(3, "json", raw=True)
 
 
@@ -110,7 +110,7 @@ def test_what_is_not_what_its_topic_promises_is_counted_and_left_out(tmp_path: P
             recorder.say(topic, 1, payload)
         recorder.say("skin/demo/nodes/main/cmd/calibrate", 1, b"{}")
         assert recorder.unreadable == 5
-    assert list(read_said(path)) == []
+    assert list(read_messages_of(path)) == []
 
 
 frames = st.lists(
@@ -154,7 +154,7 @@ def test_a_recording_that_is_being_made_has_not_its_name_yet(tmp_path: Path) -> 
     recorder.say(f"{TOPIC}/contact", 1, b"ON")
     assert path.read_bytes() == b"an older one"
     recorder.close()
-    assert [said.payload for said in read_said(path)] == [b"ON"]
+    assert [said.payload for said in read_messages_of(path)] == [b"ON"]
     assert [file.name for file in tmp_path.iterdir()] == ["a.mcap"]
 
 
@@ -174,7 +174,7 @@ def test_a_broken_recording_is_an_error_of_one_line(tmp_path: Path, cut: int) ->
             recorder.say(topic, 1, payload)
     path.write_bytes(path.read_bytes()[:cut])
     with pytest.raises(LogError, match=r"a\.mcap: no whole MCAP file") as caught:
-        list(read_said(path))
+        list(read_messages_of(path))
     assert "\n" not in str(caught.value)
 
 
@@ -183,12 +183,12 @@ def test_any_bytes_are_survived(tmp_path_factory: pytest.TempPathFactory, data: 
     path = tmp_path_factory.mktemp("any") / "a.mcap"
     path.write_bytes(b"\x89MCAP0\r\n" + data)
     with pytest.raises(LogError):
-        list(read_said(path))
+        list(read_messages_of(path))
 
 
 def test_a_missing_recording_is_named(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="cannot be read: No such file"):
-        list(read_said(tmp_path / "gone.mcap"))
+        list(read_messages_of(tmp_path / "gone.mcap"))
 
 
 def test_a_recording_that_failed_before_it_began_leaves_no_file(tmp_path: Path) -> None:
@@ -198,4 +198,4 @@ def test_a_recording_that_failed_before_it_began_leaves_no_file(tmp_path: Path) 
     with pytest.raises(LogError), Recorder(tmp_path / "a.mcap") as recorder:
         recorder.say(f"{TOPIC}/contact", 1, b"ON")
         raise LogError("the broker went away")
-    assert [said.payload for said in read_said(tmp_path / "a.mcap")] == [b"ON"]
+    assert [said.payload for said in read_messages_of(tmp_path / "a.mcap")] == [b"ON"]

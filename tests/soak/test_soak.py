@@ -93,13 +93,9 @@ def test_an_accelerated_month(tmp_path: Path) -> None:
         ids, data = encode_sweep(1, triangle, values[None].astype(np.uint8), status)
         times = np.array([t_ns, t_ns + 120_000])
         batch = FrameBatch(ids, np.full(2, 8, np.uint8), data, times)
-        steps = engine.feed("can0", batch)
-        health.note_sweeps(engine.sweeps)
-        steps += engine.expire(t_ns + 150_000)
-        health.note_sweeps(engine.sweeps)
-        for step in steps:
-            health.note_step(step)
-            events.update(event.event for event in step.events)
+        for output in (engine.feed("can0", batch), engine.expire(t_ns + 150_000)):
+            health.note(output)
+            events.update(event.event for event in output.events)
         if number % 5 == 0:
             health.tick(t_ns, {}, {})
         if number % 25 == 0:

@@ -34,7 +34,8 @@ def test_each_press_begins_moves_and_ends_where_it_is_with_its_pressure(
             # A machine that is held up may break one press into several touches.
             for events in sorted(whole_touches(), key=len, reverse=True):
                 held = {event["event"] for event in events} == {"begin", "move", "end"}
-                if held and events[0]["part"] == part and taxel in events[-1]["taxels"]:
+                felt = {taxel for event in events for taxel in event["taxels"]}
+                if held and events[0]["part"] == part and taxel in felt:
                     found.append(events)
                     break
         return found if len(found) == len(PRESSES) else []
@@ -51,6 +52,7 @@ def test_each_press_begins_moves_and_ends_where_it_is_with_its_pressure(
     assert daemon.poll() is None
     statuses = stack.stop()
     assert set(statuses) <= {0}
+    subscriber.catch_up()
 
     for (part, taxel, pressure_kpa, covered), events in zip(PRESSES, touches, strict=True):
         kinds = [event["event"] for event in events]
@@ -63,8 +65,8 @@ def test_each_press_begins_moves_and_ends_where_it_is_with_its_pressure(
             assert error_kpa < tolerance_kpa(stack, part, taxel, pressure_kpa)
     for part in ("left_forearm", "left_hand"):
         contacts = subscriber.payloads(f"{part}/contact")
-        assert contacts[0] == contacts[-1] == b"OFF"
-        assert b"ON" in contacts
+        assert contacts[0] == contacts[-1] == b"UNKNOWN"
+        assert {*contacts} == {b"UNKNOWN", b"OFF", b"ON"}
     assert subscriber.payloads("main/status") == [b"online", b"offline"]
 
 

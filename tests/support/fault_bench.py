@@ -1,5 +1,6 @@
 """A robot, an engine and its health in simulated time: faults happen, and what is told of them."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +9,10 @@ import numpy as np
 from emulator.robot import Robot
 from emulator.scene import Fault, Scene
 from skin_host.bus.assembler import Sweep
-from skin_host.engine import Engine, Step
+from skin_host.engine import Engine, Output
 from skin_host.health import Health, Record
 from skin_host.layout import build_layout
-from skin_host.settings import load
+from skin_host.settings import changed, load
 
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
 TICK_S = 0.05
@@ -23,10 +24,19 @@ EPOCH_NS = 1_700_000_000_000_000_000
 class FaultBench:
     """A calibrated robot; `run` lets time pass and remembers what is told and when."""
 
-    def __init__(self, calibrate_s: float = 5.0, scene: Scene | None = None) -> None:
-        settings = load(CONFIG)
-        self.layout = build_layout(settings, CONFIG.parent)
-        self.robot = Robot(settings, self.layout, scene)
+    def __init__(
+        self,
+        calibrate_s: float = 5.0,
+        scene: Scene | None = None,
+        *,
+        config: Path = CONFIG,
+        fidelity: str = "signal",
+        settle_s: float = 6.0,
+    ) -> None:
+        settings = load(config)
+        self.layout = build_layout(settings, config.parent)
+        self.robot = Robot(settings, self.layout, scene or Scene(quiet=True), fidelity=fidelity)
+        self.robot.converters.by_bus = True
         self.robot.bring_up()
         self.engine = Engine(settings, self.layout, list(range(len(self.layout.parts))))
         self.health = Health(self.engine)
@@ -38,7 +48,7 @@ class FaultBench:
         self.sweeps: dict[str, Sweep] = {}
         self.records: dict[str, Record] = {}
         self.calibrate(calibrate_s)
-        self.run(6.0)
+        self.run(settle_s)
         self.first_told.clear()
 
     @property
@@ -50,11 +60,19 @@ class FaultBench:
         self.run(seconds + 0.3)
         self.engine.use(self.engine.end_calibration("2026-01-01T00:00:00+00:00"))
 
-    def inject(self, name: str, **arguments: Any) -> None:
-        """Make a fault happen now; what was told before is forgotten."""
-        self.robot.inject(Fault(name=name, **arguments))
+    def reload(self, values: dict[str, Any]) -> None:
+        """Go on with other settings, as a daemon does that reads its configuration again."""
+        settings = changed(self.engine.settings, values)
+        self.layout = build_layout(settings, CONFIG.parent)
+        self.engine = Engine(settings, self.layout, self.engine.parts, after=self.engine)
+        self.health.use(self.engine)
+
+    def inject(self, name: str, **arguments: Any) -> Callable[[], None]:
+        """Make a fault happen now; what was told before is forgotten. The answer mends it."""
+        mend = self.robot.inject(Fault(name=name, **arguments))
         self.first_told.clear()
         self.since_s = self.t_s
+        return mend
 
     def status(self, board: str) -> np.ndarray:
         """Status words of a board's last sweep."""
@@ -71,14 +89,13 @@ class FaultBench:
             if round(self.t_s / TICK_S) % LOOK_EVERY == 0:
                 self._look()
 
-    def _note(self, steps: list[Step]) -> None:
-        self.health.note_sweeps(self.engine.sweeps)
-        for sweep in self.engine.sweeps:
+    def _note(self, output: Output) -> None:
+        self.health.note(output)
+        for sweep in output.sweeps:
             self.sweeps[self.layout.boards[sweep.board].name] = sweep
-        for step in steps:
-            self.health.note_step(step)
-            self.valid[step.frame.part] = step.frame.valid
-            self.touched[step.frame.part] = step.frame.touched
+        for frame in output.frames:
+            self.valid[frame.part] = frame.valid
+            self.touched[frame.part] = frame.touched
 
     def _look(self) -> None:
         self.health.tick(self.now_ns, {}, {})

@@ -14,6 +14,7 @@ from pathlib import Path
 import can
 
 from emulator.robot import Robot
+from emulator.scene import Scene
 from emulator.scene import load as load_scene
 from skin_host.cli import main as skin
 from skin_host.cli.common import load_skin
@@ -21,7 +22,7 @@ from skin_host.cli.common import load_skin
 
 def emulate(arguments: list[str], stop: threading.Event) -> None:
     settings, layout = load_skin(Path(arguments[0]))
-    scene = load_scene(Path(arguments[1])) if len(arguments) > 1 else None
+    scene = load_scene(Path(arguments[1])) if len(arguments) > 1 else Scene(quiet=True)
     robot = Robot(settings, layout, scene)
 
     async def work() -> None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from skin_host.processing.contacts import TouchEvent
+from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
 
 

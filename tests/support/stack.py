@@ -58,27 +58,30 @@ class Stack:
 
     def start(self, *command: str, scene: Path | None = None) -> "subprocess.Popen[str]":
         """Start `skin COMMAND...` with a robot on its bus."""
-        robot = [str(self.config)] + ([str(scene)] if scene else [])
+        robot = [str(self.config), str(self._scene(scene))]
         if self.kind == "virtual":
             program = [sys.executable, "-m", "tests.support.one_process", *robot, "--"]
         else:
-            emulate = [sys.executable, "-m", "skin_host", "emulate", *robot[:1]]
-            emulate += ["--scene", str(self._later(scene))] if scene else []
+            emulate = [sys.executable, "-m", "skin_host", "emulate", robot[0], "--scene", robot[1]]
             self._await_robot(self._spawn(emulate))
             program = [sys.executable, "-m", "skin_host"]
         return self._spawn([*program, *command])
 
-    def _later(self, scene: Path) -> Path:
-        """The same scene, but nothing is touched until the slow daemon has set the boards up."""
-        later = self.directory / scene.name
-        later.write_text(
-            re.sub(
-                r"(?m)^start_s = (\S+)",
-                lambda found: f"start_s = {float(found[1]) + START_S}",
-                scene.read_text(),
-            )
+    def _scene(self, scene: Path | None) -> Path:
+        """The same scene with quiet pads: the robot that was calibrated is the one that runs.
+
+        Nothing is touched until a slow daemon has set the boards up.
+        """
+        text = scene.read_text() if scene else ""
+        later_s = START_S if self.kind == "vcan" else 0.0
+        text = re.sub(
+            r"(?m)^start_s = (\S+)", lambda found: f"start_s = {float(found[1]) + later_s}", text
         )
-        return later
+        # Offsets of boards are drawn: another seed would be another robot.
+        text = re.sub(r"(?m)^seed = .*\n", "", text)
+        path = self.directory / (scene.name if scene else "untouched.toml")
+        path.write_text(f"quiet = true\n{text}")
+        return path
 
     def _spawn(self, command: list[str]) -> "subprocess.Popen[str]":
         said = self.directory / f"{len(self._said)}.log"

@@ -9,7 +9,7 @@ from emulator.scene import Place, Probe, Scene
 from skin_host.daemon import Daemon
 from skin_host.health import Record
 from skin_host.layout import build_layout
-from skin_host.settings import Bus, load
+from skin_host.settings import Bus, changed, load
 from tests.support import scheduled_bus
 
 PATIENCE_S = 120.0
@@ -62,7 +62,7 @@ def pressed(part: str, taxels: int) -> Scene:
         )
         for number in range(PROBES)
     ]
-    return Scene(spread=False, probe=probes)
+    return Scene(spread=False, quiet=True, probe=probes)
 
 
 @contextlib.asynccontextmanager
@@ -77,13 +77,19 @@ async def daemon_of(
         settings, layout, scene, UNTOUCHED_S + LOOP_S, LOOP_S, config.parent
     )
     for bus, file in files.items():
-        settings.buses[bus] = Bus(interface=scheduled_bus.INTERFACE, channel=str(file))
-    settings.mqtt.port = port
-    settings.service.state_directory = str(state or config.parent)
-    settings.processing.calibration.seconds = 3.0
-    settings.processing.touch.move_hz = 5.0
-    # At this rate, chance touches one of so many noisy taxels all the time.
-    settings.processing.touch.margin_units = 8.0
+        scheduled = Bus(interface=scheduled_bus.INTERFACE, channel=str(file))
+        settings = changed(settings, {f"buses.{bus}": scheduled})
+    settings = changed(
+        settings,
+        {
+            "mqtt.port": port,
+            "service.state_directory": str(state or config.parent),
+            "processing.calibration.seconds": 3.0,
+            "processing.touch.move_hz": 5.0,
+            # At this rate, chance touches one of so many noisy taxels all the time.
+            "processing.touch.margin_units": 8.0,
+        },
+    )
     daemon = Daemon(settings, layout)
     stop = asyncio.Event()
     running = asyncio.create_task(daemon.run(stop))

@@ -3,6 +3,7 @@
 import json
 import threading
 import time
+import uuid
 from typing import Any
 
 import paho.mqtt.client as mqtt
@@ -16,17 +17,33 @@ class Subscriber:
         self._messages: list[tuple[str, bytes]] = []
         self._read: dict[str, tuple[int, list[Any]]] = {}
         self._subscribed = threading.Event()
+        self._caught_up = threading.Event()
+        self._marker = f"caught-up/{uuid.uuid4().hex}"
         self._client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2, protocol=mqtt.MQTTv5)
         self._client.on_message = self._take
-        self._client.on_connect = lambda client, *_: client.subscribe(topic, qos=1)
+        self._client.on_connect = lambda client, *_: client.subscribe(
+            [(topic, 1), (self._marker, 1)]
+        )
         self._client.on_subscribe = lambda *_: self._subscribed.set()
         self._client.connect(host, port)
         self._client.loop_start()
         assert self._subscribed.wait(20)
 
     def _take(self, _client: Any, _data: Any, message: mqtt.MQTTMessage) -> None:
+        if message.topic == self._marker:
+            self._caught_up.set()
+            return
         with self._lock:
             self._messages.append((message.topic, message.payload))
+
+    def catch_up(self) -> None:
+        """Wait until everything has arrived that the broker has taken so far.
+
+        A program that has ended was answered by the broker, which says nothing about us.
+        """
+        self._caught_up.clear()
+        self._client.publish(self._marker, b"", qos=1)
+        assert self._caught_up.wait(20), "the broker did not send our own message back"
 
     def payloads(self, ending: str) -> list[bytes]:
         """Payloads so far of the topics that end so."""

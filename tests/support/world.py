@@ -46,7 +46,7 @@ def pressed_from(start_s: float) -> Scene:
         start_s=start_s,
         repeat_s=1,
     )
-    return Scene(probe=[press])
+    return Scene(quiet=True, probe=[press])
 
 
 class World:
@@ -105,7 +105,7 @@ class World:
             recorder.say("skin/demo/nodes/main/info", since_ns, encode_info(info))
             for bus, batch in read_buses(log, settings):
                 recorder.can(self.channel("robot"), batch)
-                for step in engine.feed(bus, batch):
+                for step in engine.feed(bus, batch).steps:
                     topic = f"skin/demo/{step.frame.part}"
                     payload = encode_frame(step.frame)
                     recorder.say(f"{topic}/frame", step.frame.t_ns, payload)
@@ -147,7 +147,7 @@ class World:
 
     async def _live(self, ready: threading.Event, end: asyncio.Event) -> None:
         settings = load(self.bare)
-        alone = Robot(settings, build_layout(settings, self.folder), Scene())
+        alone = Robot(settings, build_layout(settings, self.folder), Scene(quiet=True))
         with can.Bus(interface="virtual", channel=self.channel("bare")) as bus:
             body = asyncio.create_task(alone.run({"can0": bus}))
             async with living(

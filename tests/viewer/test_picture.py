@@ -159,7 +159,7 @@ def test_contacts_live_from_begin_to_end() -> None:
 def test_a_contact_whose_end_was_missed_does_not_stay() -> None:
     for lose in (
         lambda skin: skin.take_touch(touch("begin", 9, missed=2)),
-        lambda skin: skin.take_contact(Contact("palm", touched=False)),
+        lambda skin: skin.take_contact(Contact("palm", "OFF")),
         lambda skin: skin.forget_contacts(),
         lambda skin: skin.take_nodes("test", {"main": (False, info({"palm": 3}))}),
     ):

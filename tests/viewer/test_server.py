@@ -224,8 +224,42 @@ async def test_a_page_without_leave_may_not(mosquitto: Mosquitto) -> None:
         assert "switched off" in told["error"]
 
 
-@pytest.mark.parametrize("nonsense", ["", "{}", '{"do":"stop","node":"main"}', "[1]", "\x00"])
-async def test_nonsense_from_a_page_is_answered(nonsense: str) -> None:
+@pytest.mark.parametrize(
+    "wish",
+    ["+", "#", "a/b", "", "\\u0000", "x" * 65, "\\ud800"],
+)
+async def test_a_wish_for_no_node_costs_neither_page_nor_broker(
+    mosquitto: Mosquitto, wish: str
+) -> None:
+    broker = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    viewer = Viewer(broker, robot="demo")
+    async with (
+        node(mosquitto, skin()),
+        viewer.serving(port=0) as url,
+        page(url) as socket,
+    ):
+        await heard(socket, of_type("layout"))
+        client = viewer._client
+        assert client is not None
+        await socket.send('{"do":"raw","node":"' + wish + '"}')
+        assert not (await heard(socket, of_type("answer")))["ok"]
+        assert client.connections == 1
+        assert client.connected
+
+
+@pytest.mark.parametrize(
+    "nonsense",
+    [
+        "",
+        "{}",
+        '{"do":"stop","node":"main"}',
+        "[1]",
+        "\x00",
+        b'{"do":"raw","node":"\xff"}',
+        "[" * 4000,
+    ],
+)
+async def test_nonsense_from_a_page_is_answered(nonsense: str | bytes) -> None:
     async with Viewer(nowhere(), robot="demo").serving(port=0) as url, page(url) as socket:
         await socket.send(nonsense)
         assert not (await heard(socket, of_type("answer")))["ok"]

@@ -1,4 +1,4 @@
-"""The wire of the MTB family: identifiers, data frames, status words. Pure, both ways.
+"""Protocol of the MTB family: identifiers, data frames, status words. Pure, both directions.
 
 Classic CAN 2.0A at 1 Mbit/s, eleven-bit identifiers of three fields:
 
@@ -9,7 +9,7 @@ A triangle's twelve values travel as two frames of one identifier 0x400|board<<4
     A: 40 P0 P1 P2 P3 P4 P5 P6        B: C0 P7 P8 P9 P10 P11 S0 S1
 
 The status word S0<<8|S1 is a mask of taxels far out of range (bits 15..4) and an error
-nibble. Nothing numbers the frames and their order is free: pair them by header byte.
+nibble. The frames have no sequence number and no fixed order: pair them by header byte.
 Sources: icub-firmware's embot_prot_can_skin_periodic.cpp and mtb3/main_V3.c. Commands
 and their answers are in `commands`.
 """
@@ -54,7 +54,7 @@ class StatusError(IntFlag):
     NONE = 0
     #: A taxel reads 0 although its baseline is not: the chip did not acknowledge.
     NO_ACK = 1
-    #: All twelve values read 0xFFFF: nothing is on the line.
+    #: All twelve values read 0xFFFF: no chip on the line answers.
     NOT_CONNECTED = 2
 
 
@@ -87,10 +87,10 @@ class FrameBatch:
         return len(self.id)
 
     def frames(self) -> Iterator[tuple[int, int, int, int, int, bytes]]:
-        """Each frame as (seconds, nanoseconds, id, DLC, first byte, the other seven).
+        """Yield each frame as (seconds, nanoseconds, id, DLC, first byte, the other seven).
 
-        A read of a live bus brings some dozen frames. Walking through them costs less than
-        even a few operations on arrays; see docs/receive.md.
+        A read of a live bus returns some dozen frames. Looping over them costs less than even a few
+        operations on arrays; see docs/receive.md.
         """
         records = np.empty(len(self), _RECORD_ARRAY)
         records["seconds"], records["nanoseconds"] = np.divmod(self.t_ns, NS_PER_S)
@@ -115,13 +115,53 @@ class FrameBatch:
         return batch
 
 
+class RecordBatch(FrameBatch):
+    """A batch that is cut into others: its frames are laid out for walking through once."""
+
+    __slots__ = ("_records",)
+
+    def __init__(
+        self,
+        identifier: NDArray[np.uint32],
+        dlc: Bytes,
+        data: Bytes,
+        t_ns: NDArray[np.int64],
+        records: "NDArray[np.void] | None" = None,
+    ) -> None:
+        super().__init__(identifier, dlc, data, t_ns)
+        if records is None:
+            records = np.empty(len(identifier), _RECORD_ARRAY)
+            records["seconds"], records["nanoseconds"] = np.divmod(t_ns, NS_PER_S)
+            records["id"], records["dlc"], records["data"] = identifier, dlc, data
+        self._records = records
+
+    def __getitem__(self, rows: "slice | NDArray[np.intp]") -> "RecordBatch":
+        """Some of the frames."""
+        return RecordBatch(
+            self.id[rows], self.dlc[rows], self.data[rows], self.t_ns[rows], self._records[rows]
+        )
+
+    def joined(self, other: "RecordBatch") -> "RecordBatch":
+        """These frames and then the other ones."""
+        return RecordBatch(
+            np.concatenate((self.id, other.id)),
+            np.concatenate((self.dlc, other.dlc)),
+            np.concatenate((self.data, other.data)),
+            np.concatenate((self.t_ns, other.t_ns)),
+            np.concatenate((self._records, other._records)),
+        )
+
+    def frames(self) -> Iterator[tuple[int, int, int, int, int, bytes]]:
+        return _RECORD.iter_unpack(self._records.data)
+
+
 def skin_id(board: int, triangle: int) -> int:
     """Identifier of the two frames of a triangle, e.g. 0x4EF for board 14, triangle 15."""
     return MessageClass.SKIN_STREAM << 8 | board << 4 | triangle
 
 
 def identifier(message_class: MessageClass, sender: int, low_nibble: int) -> int:
-    """Put an eleven-bit identifier together."""
+    """Return an eleven-bit identifier from its fields."""
     return message_class << 8 | sender << 4 | low_nibble
 
 
@@ -135,7 +175,7 @@ class SkinFrames:
         half: intp[m], 0 for an A frame (P0..P6), 1 for a B frame (P7..P11 and status).
         wrong_header: frames of a skin identifier whose first byte is neither 40 nor C0.
         short: skin frames with too few bytes for their values.
-        other: frames that are not of the skin stream at all.
+        other: frames outside the skin stream.
     """
 
     row: NDArray[np.intp]
@@ -154,10 +194,10 @@ _SMALLEST_DLC = np.array([8, 6], np.uint8)
 
 
 def find_skin_frames(batch: FrameBatch) -> SkinFrames:
-    """Pick the frames that carry a triangle's values out of a batch.
+    """Return the frames of a batch that carry a triangle's values.
 
     Class 4, and the legacy class 3 in its two-frame form. An analog stream of class 3
-    (force/torque: DLC 6 or 7; temperature: DLC 5) never has DLC 8, so it is not taken
+    (force/torque: DLC 6 or 7; temperature: DLC 5) never has DLC 8, so it is not mistaken
     for skin. A B frame of old firmware may lack its status bytes (DLC 6 or 7, class 4).
     """
     n = len(batch)
@@ -220,7 +260,7 @@ def status_word(out_of_range: NDArray[np.bool_], error: NDArray[np.uint8]) -> ND
 
 
 def out_of_range(status: NDArray[np.uint16]) -> NDArray[np.bool_]:
-    """Masks bool[..., 12] of the taxels that a status word calls far out of range."""
+    """Return masks bool[..., 12] of the taxels that a status word marks as far out of range."""
     return (status[..., None] >> np.arange(4, 4 + TAXELS, dtype=np.uint16) & 1).astype(np.bool_)
 
 
@@ -230,9 +270,9 @@ def status_error(status: NDArray[np.uint16]) -> NDArray[np.uint8]:
 
 
 def legacy_values(dlc: int, data: bytes) -> tuple[int, ...] | None:
-    """Values of the reduced legacy formats (class 3, MTB3): the whole triangle or thirds.
+    """Return the values of the reduced legacy formats (class 3, MTB3), or None for other frames.
 
-    DLC 2 is one average of all twelve pads, DLC 4 three values. None for anything else.
+    DLC 2 is one average of all twelve pads, DLC 4 three values.
     Source: mtb3/main_V3.c, CONFIG_ALL and CONFIG_THREE.
     """
     if data[:1] == bytes([HEADER_A]) and dlc in {2, 4}:

@@ -1,4 +1,4 @@
-"""What boards answer to commands of class 2 and class 7; sources as in `commands`."""
+"""Answers of boards to commands of class 2 and class 7; sources as in `commands`."""
 
 import struct
 from dataclasses import dataclass
@@ -95,7 +95,9 @@ class DiscoveredBootloader(Management):
 
 @dataclass(frozen=True, slots=True)
 class TxOverflow:
-    """Notice of an MTB3 that its transmit buffer overflowed: class 7, low nibble 5, DLC 0."""
+    """Notification from an MTB3 that its transmit buffer overflowed: class 7, low nibble 5, DLC
+    0.
+    """
 
 
 #: Longest first where two answers share a code, so that the longer one is tried first.
@@ -117,7 +119,7 @@ def answer_frame(answer: Message, address: int) -> tuple[int, bytes]:
 
 
 def parse_answer(can_id: int, payload: bytes) -> tuple[int, Message | TxOverflow] | None:
-    """Sender (1..14) and answer of a frame from a board, or None if it is none."""
+    """Return sender (1..14) and answer of a frame from a board, or None for any other frame."""
     sender = can_id >> 4 & 0xF
     if can_id > MAX_STANDARD_ID or sender in {HOST_ADDRESS, BROADCAST_ADDRESS}:
         return None

@@ -1,9 +1,9 @@
-"""Commands to the boards: class 2 (analog) and class 7 (management). `answers` has the other half.
+"""Commands to the boards: class 2 (analog) and class 7 (management); see `answers` for the answers.
 
-Every message is a small record that knows its code and the shape of its payload, so one
-encoder and one parser serve all. Multi-byte numbers are little endian. None of the skin
-configuration commands is answered. Sources: the boards' protocol document TSD-ICUBUNIT
-(section 3), mtb3/can_interface.c and embot_prot_can_analog_polling.cpp.
+Every message is a small record that knows its code and the layout of its payload, so one encoder
+and one parser serve all. Multi-byte numbers are little endian. Boards do not answer the skin
+configuration commands. Sources: the boards' protocol document TSD-ICUBUNIT (section 3),
+mtb3/can_interface.c and embot_prot_can_analog_polling.cpp.
 """
 
 import struct
@@ -20,7 +20,7 @@ from skin_host.bus.protocol import (
 
 
 class BoardType(IntEnum):
-    """What a board calls itself. Source: iCubCanProto_types.h."""
+    """Type that a board reports. Source: iCubCanProto_types.h."""
 
     SKIN = 5
     MTB4 = 11
@@ -46,7 +46,7 @@ class Message:
     LAYOUT: ClassVar[struct.Struct] = struct.Struct("")
 
     def encode(self) -> bytes:
-        """Payload, the code byte first.
+        """Return the payload, the code byte first.
 
         Raises:
             ValueError: a field does not fit its bytes.
@@ -58,7 +58,7 @@ class Message:
 
     @classmethod
     def decode(cls, payload: bytes) -> Self | None:
-        """The record in `payload`, or None if it is too short or of another code.
+        """Return the record in `payload`, or None if it is too short or has another code.
 
         Bytes past the fields are ignored, as the boards ignore them.
         """
@@ -82,7 +82,7 @@ class Management(Message):
 
 
 class TxMode(IntEnum):
-    """Argument of command 07; the inverse of intuition."""
+    """Argument of command 07; note that 0 means start."""
 
     START = 0
     STOP = 1
@@ -108,7 +108,7 @@ class SetTransmissionPeriod(Analog):
 
 @dataclass(frozen=True, slots=True)
 class GetFirmwareVersion(Analog):
-    """1C: ask for the firmware, naming the CAN protocol the host speaks."""
+    """1C: query the firmware version, with the CAN protocol version of the host."""
 
     CODE = 0x1C
     LAYOUT = struct.Struct("2B")
@@ -127,7 +127,7 @@ class SetBoardAddress(Analog):
 
 @dataclass(frozen=True, slots=True)
 class ImuGet(Analog):
-    """33: ask for the inertial set-up (MTB4 family)."""
+    """33: query the inertial set-up (MTB4 family)."""
 
     CODE = 0x33
 
@@ -154,14 +154,14 @@ class ImuTransmit(Analog):
 
 @dataclass(frozen=True, slots=True)
 class ThermometerGet(Analog):
-    """38: ask for the thermometer set-up."""
+    """38: query the set-up of the temperature sensors."""
 
     CODE = 0x38
 
 
 @dataclass(frozen=True, slots=True)
 class ThermometerSet(Analog):
-    """39: which thermometers stream."""
+    """39: which temperature sensors stream."""
 
     CODE = 0x39
     LAYOUT = struct.Struct("B")
@@ -170,7 +170,7 @@ class ThermometerSet(Analog):
 
 @dataclass(frozen=True, slots=True)
 class ThermometerTransmit(Analog):
-    """3A: thermometer period in seconds, 0 stops."""
+    """3A: period of the temperature sensors in seconds, 0 stops."""
 
     CODE = 0x3A
     LAYOUT = struct.Struct("B")
@@ -258,14 +258,14 @@ class EnterBootloader(Management):
 
 @dataclass(frozen=True, slots=True)
 class Ping(Management):
-    """04: are you there (MTB3 application); ends the bootloader."""
+    """04: check that a board is present (MTB3 application); ends the bootloader."""
 
     CODE = 0x04
 
 
 @dataclass(frozen=True, slots=True)
 class GetAdditionalInfo(Management):
-    """0C: ask for the board's text of 32 characters."""
+    """0C: query the board's text of 32 characters."""
 
     CODE = 0x0C
 
@@ -282,7 +282,7 @@ class SetAdditionalInfo(Management):
 
 @dataclass(frozen=True, slots=True)
 class GetTimeOfLife(Management):
-    """0E: ask how long the board has been up."""
+    """0E: query how long the board has been up."""
 
     CODE = 0x0E
 
@@ -299,7 +299,7 @@ class SetCanAddress(Management):
 
 @dataclass(frozen=True, slots=True)
 class Discover(Management):
-    """FF: who is there. An MTB3 falls silent after any frame of this class."""
+    """FF: query all boards. An MTB3 stops sending after any frame of this class."""
 
     CODE = 0xFF
 
@@ -336,7 +336,7 @@ def command_frame(command: Message, address: int) -> tuple[int, bytes]:
 
 
 def parse_command(can_id: int, payload: bytes) -> tuple[int, Message] | None:
-    """Receiver (1..15) and command of a frame from the host, or None if it is none."""
+    """Return receiver (1..15) and command of a frame from the host, or None for any other frame."""
     if can_id > MAX_STANDARD_ID or can_id >> 4 & 0xF != HOST_ADDRESS:
         return None
     address = can_id & 0xF

@@ -2,18 +2,17 @@
 
 from skin_host.processing.relaxation.asymmetric import AsymmetricRelaxation
 from skin_host.processing.relaxation.base import Relaxation
-from skin_host.processing.relaxation.prony import NoRelaxation, PronyRelaxation
+from skin_host.processing.relaxation.none import NoRelaxation
+from skin_host.processing.relaxation.plays import PlayRelaxation
 from skin_host.processing.relaxation.published import PublishedRelaxation
 from skin_host.processing.relaxation.sets import (
     OWN_MEANS,
     STAND_INS,
     ParameterSet,
     make_model,
-    make_relaxation,
     parameters_of,
     stand_in,
 )
-from skin_host.processing.relaxation.windowed import WindowedRelaxation
 
 __all__ = [
     "OWN_MEANS",
@@ -21,12 +20,10 @@ __all__ = [
     "AsymmetricRelaxation",
     "NoRelaxation",
     "ParameterSet",
-    "PronyRelaxation",
+    "PlayRelaxation",
     "PublishedRelaxation",
     "Relaxation",
-    "WindowedRelaxation",
     "make_model",
-    "make_relaxation",
     "parameters_of",
     "stand_in",
 ]

@@ -1,7 +1,7 @@
 """The default model: one state per exponential, slower on unloading."""
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from skin_host.processing.relaxation.base import (
     Array,
@@ -25,17 +25,11 @@ class AsymmetricRelaxation:
     for ever, and zero input brings it back to zero. With equal time constants it is the
     linear Prony model. The published model (PublishedRelaxation) has neither property.
 
-    With a clock, compressed foam also lives faster: all time constants are those of
-    uncompressed foam and shrink by exp(-C / clock_kpa). That is the material clock of
-    viscoelastic solids, and another cause of what is seen as slower unloading; a hold at
-    one level cannot tell the two apart.
-
     Args:
         n: number of taxels.
         beta: what each mode takes of the pressure in the end, [modes] or [modes, n].
         tau_s: time constants of loading, alike.
         tau_unload_s: time constants of unloading, alike.
-        clock_kpa: pressure that makes the foam e times faster, shared or [n]; inf is no clock.
         dtype: of states and answers, float64 or float32.
     """
 
@@ -46,7 +40,6 @@ class AsymmetricRelaxation:
         beta: Parameters,
         tau_s: Parameters,
         tau_unload_s: Parameters,
-        clock_kpa: ArrayLike = np.inf,
         dtype: DTypeLike = np.float64,
     ) -> None:
         self.n = n
@@ -55,20 +48,12 @@ class AsymmetricRelaxation:
         tau = as_modes("tau_s", tau_s, n, np.float64)
         tau_unload = as_modes("tau_unload_s", tau_unload_s, n, np.float64)
         check_modes(beta=self._beta, tau_s=tau, tau_unload_s=tau_unload)
-        per_kpa = 1.0 / np.broadcast_to(np.asarray(clock_kpa, dtype=np.float64), n)
-        if not np.all(per_kpa >= 0.0):
-            raise ValueError("clock_kpa: every number must be positive")
-        self._per_kpa = per_kpa.astype(dtype) if np.any(per_kpa) else None
         self._tau_s, self._tau_unload_s = tau, tau_unload
-        self._rate_unload = (-1.0 / tau_unload).astype(dtype)
-        self._extra_rate = (1.0 / tau_unload - 1.0 / tau).astype(dtype)
         modes = self._beta.shape[0]
         self._states: Array = np.zeros((modes, n), dtype=dtype)
         self._over: Array = np.empty_like(self._states)
         self._share: Array = np.empty_like(self._states)
-        self._rises = np.empty(self._states.shape, dtype=np.bool_)
         self._zeros: Array = np.zeros_like(self._states)
-        self._age: Array = np.empty(n, dtype=dtype)
         self._input = FiniteInput(n, dtype)
         self._rates_dt_s = -1.0
         self._fall: Array = np.zeros(1, dtype=dtype)
@@ -81,10 +66,7 @@ class AsymmetricRelaxation:
         pressure_kpa = self._input.take(np.asarray(pressure_kpa, dtype=self._dtype))
         dt_s = clean_dt(dt_s)
         np.subtract(pressure_kpa, self._states, out=self._over)
-        if self._per_kpa is None:
-            self._approach(dt_s)
-        else:
-            self._approach_by_clock(pressure_kpa, self._per_kpa, dt_s)
+        self._approach(dt_s)
         self._flush.step(self._states, self._over, dt_s)
         return mix(self._beta, self._states, out)
 
@@ -106,17 +88,3 @@ class AsymmetricRelaxation:
         np.multiply(self._share, self._extra_rise, out=self._share)
         np.add(self._states, self._over, out=self._states)
         np.add(self._states, self._share, out=self._states)
-
-    def _approach_by_clock(self, pressure_kpa: Array, per_kpa: Array, dt_s: float) -> None:
-        """q += (1 - exp(-age / tau)) d, where the foam ages by dt exp(C / clock)."""
-        np.multiply(pressure_kpa, per_kpa, out=self._age)
-        np.exp(self._age, out=self._age)
-        np.multiply(self._age, dt_s, out=self._age)
-        # The rate of each state's direction, without a branch; expm1 gives minus the share.
-        np.greater(self._over, 0.0, out=self._rises)
-        np.multiply(self._rises, self._extra_rate, out=self._share)
-        np.add(self._share, self._rate_unload, out=self._share)
-        np.multiply(self._share, self._age, out=self._share)
-        np.expm1(self._share, out=self._share)
-        np.multiply(self._share, self._over, out=self._share)
-        np.subtract(self._states, self._share, out=self._states)

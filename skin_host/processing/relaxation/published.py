@@ -1,7 +1,5 @@
 """The published model (Schmitz et al. 2011, equation 5), exactly and at constant cost."""
 
-import math
-
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
@@ -16,9 +14,6 @@ from skin_host.processing.relaxation.base import (
     mix,
 )
 
-#: An imprint is smaller than this, a touch that matters larger.
-UNTOUCHED_KPA = 10.0
-
 
 class PublishedRelaxation:
     """Boltzmann superposition with one kernel for loading and one for unloading steps.
@@ -31,9 +26,7 @@ class PublishedRelaxation:
     same factor.
 
     The model is not one of fading memory: when the sums of beta differ between the
-    branches, every press leaves a residue for ever. Hence `bleed_s`, which is not published:
-    a taxel that reads so little that it must be untouched bears no pressure, and an offset is
-    moved until that is what comes out.
+    branches, every press leaves a residue for ever.
 
     Args:
         n: number of taxels.
@@ -43,7 +36,6 @@ class PublishedRelaxation:
         tau_unload_s: its time constant.
         mean_s: length of the average.
         threshold_kpa: difference above which a step is made.
-        bleed_s: time constant of the offset while untouched; without an offset if None.
         held: whether the answer stays the same between the ends of averages, for speed.
         dtype: of states and answers. The sums of steps grow without bound; in float32 they
             are off by a tenth of a kPa after some days of work.
@@ -59,7 +51,6 @@ class PublishedRelaxation:
         tau_unload_s: Parameters,
         mean_s: float = 1.0,
         threshold_kpa: float = 1.5,
-        bleed_s: float | None = None,
         held: bool = False,
         dtype: DTypeLike = np.float64,
     ) -> None:
@@ -77,22 +68,20 @@ class PublishedRelaxation:
         self._tau_s = np.concatenate([np.broadcast_to(a, (len(a), width)) for a in tau])
         self._split = len(beta[0])
         modes = len(self._beta)
-        # One array, so that the answer is one product: responses of both branches, the two
-        # sums of steps, the offset.
-        self._states: Array = np.zeros((modes + 3, n), dtype=dtype)
+        # One array, so that the answer is one product: responses of both branches, and the two
+        # sums of steps.
+        self._states: Array = np.zeros((modes + 2, n), dtype=dtype)
         self._responses = self._states[:modes]
         self._sum_load = self._states[modes]
         self._sum_unload = self._states[modes + 1]
-        self._offset = self._states[modes + 2]
         self._staircase: Array = np.zeros(n, dtype=dtype)
         self._relaxation: Array = np.zeros(n, dtype=dtype)
         self._gap: Array = np.empty(n, dtype=dtype)
         self._scratch: Array = np.empty_like(self._responses)
         self._threshold_kpa = threshold_kpa
-        self._bleed_s = bleed_s
         self._held = held
         self._mean = TumblingMean(n, mean_s, dtype)
-        self.bytes_per_taxel = (modes + 5) * self._dtype.itemsize + self._mean.bytes_per_taxel
+        self.bytes_per_taxel = (modes + 4) * self._dtype.itemsize + self._mean.bytes_per_taxel
 
     def step(self, pressure_kpa: Array, dt_s: float, out: Array | None = None) -> Array:
         """Return the relaxation [n] in kPa at the end of the step; see `Relaxation`."""
@@ -117,22 +106,19 @@ class PublishedRelaxation:
         modes, split = len(self._beta), self._split
         done = approach(age_s, self._tau_s)
         done *= self._beta
-        weights = np.empty((modes + 3, self._beta.shape[1]), dtype=self._dtype)
+        weights = np.empty((modes + 2, self._beta.shape[1]), dtype=self._dtype)
         np.subtract(self._beta, done, out=weights[:modes], casting="same_kind")
         weights[modes] = done[:split].sum(axis=0)
         weights[modes + 1] = done[split:].sum(axis=0)
-        weights[modes + 2] = 1.0
         return weights
 
     def _complete(self, mean_kpa: Array, seconds: int) -> None:
         """A second has ended; with the same mean, `seconds` of them."""
         self._advance(self._mean.length_s)
         self._add_steps(mean_kpa)
-        self._bleed(mean_kpa, 1)
         if seconds > 1:
             # The first has made the step, if there was one: the others bring no more.
             self._advance((seconds - 1) * self._mean.length_s)
-            self._bleed(mean_kpa, seconds - 1)
         if self._held:
             mix(self._weights(0.0), self._states, self._relaxation)
 
@@ -150,10 +136,3 @@ class PublishedRelaxation:
         np.add(self._staircase, self._gap, out=self._staircase)
         np.add(self._sum_load, np.maximum(self._gap, 0.0), out=self._sum_load)
         np.add(self._sum_unload, np.minimum(self._gap, 0.0), out=self._sum_unload)
-
-    def _bleed(self, mean_kpa: Array, seconds: int) -> None:
-        if self._bleed_s is None:
-            return
-        moved = -math.expm1(-seconds * self._mean.length_s / self._bleed_s)
-        left = mean_kpa - mix(self._weights(0.0), self._states)
-        self._offset += np.where(mean_kpa < UNTOUCHED_KPA, moved * left, 0.0)

@@ -34,6 +34,9 @@ function mixed(stops, share) {
   return `rgb(${parts.join(",")})`;
 }
 
+/** Where on a scale a value lies, 0 to 1: as its square root, so that 5 kPa shows beside 100. */
+export function shareOf(value, top) { return Math.sqrt(Math.min(1, Math.max(0, value / top))); }
+
 const papers = {};
 
 /** The page's own colours for drawings. */
@@ -42,7 +45,7 @@ export function paper() {
   if (!papers[name]) {
     const style = getComputedStyle(document.documentElement);
     const colour = (key) => style.getPropertyValue(key).trim();
-    papers[name] = { back: colour("--panel"), line: colour("--line"), text: colour("--text"), dim: colour("--dim"), alarm: colour("--alarm"), warn: colour("--warn") };
+    papers[name] = { back: colour("--panel"), line: colour("--line"), rim: colour("--rim"), text: colour("--text"), dim: colour("--dim"), alarm: colour("--alarm"), warn: colour("--warn") };
   }
   return papers[name];
 }

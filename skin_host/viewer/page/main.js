@@ -1,9 +1,9 @@
 // Wiring: the WebSocket, the tools, the keys, and when to draw.
-import { ramp, theme } from "./colours.js";
+import { DASHES, paper, ramp, shareOf, theme } from "./colours.js";
 import { SkinMap } from "./map.js";
 import { showContacts, showHealth, showParts } from "./panels.js";
 import { Store } from "./store.js";
-import { drawStrip, lineColour, nice } from "./strip.js";
+import { drawPlot, drawStrip, lineColour, roundTicks } from "./strip.js";
 
 const $ = (id) => document.getElementById(id);
 const MOST_CHOSEN = 6;
@@ -19,6 +19,7 @@ let dirty = true;
 let busy = false;
 let notice = null;
 let peaks = [];
+let restored = false;
 
 // --- the server -------------------------------------------------------------------------------
 
@@ -42,15 +43,20 @@ function take(data) {
   if (message.type === "layout") {
     store.takeLayout(message);
     if (map.shown && !store.part(map.shown)) map.shown = null;
+    if (!restored) {
+      restored = true;
+      map.chosen = recalled(`chosen-${message.robot}`);
+    }
     map.chosen = map.chosen.filter(({ part, taxel }) => taxel < (store.part(part)?.n ?? 0));
     map.relayout();
     showChosen();
+    document.body.dataset.many = String(store.parts.length > 6);
     document.title = `${message.robot} skin`;
     $("robot").textContent = message.robot;
   } else if (message.type === "status") store.status = message;
   else if (message.type === "contacts") {
     const part = store.part(message.part);
-    if (part) part.contacts = message.contacts;
+    if (part) part.takeContacts(message.contacts, performance.now());
   } else if (message.type === "health") store.takeHealth(message, performance.now());
   else if (message.type === "answer") answered(message);
 }
@@ -68,11 +74,16 @@ function answered(message) {
     return;
   }
   const counts = Object.entries(message.result.verdicts ?? {}).map(([part, verdicts]) => `${part}: ${Object.entries(verdicts).map(([verdict, n]) => `${n} ${verdict.replaceAll("_", " ")}`).join(", ")}`);
-  say(`Calibrated. ${counts.join("; ")}`, 6000, true);
+  const touched = Object.entries(message.result.verdicts ?? {}).filter(([, verdicts]) => verdicts.touched);
+  if (touched.length) {
+    const which = touched.map(([part, verdicts]) => `${verdicts.touched} taxels of ${part}`).join(", ");
+    return say(`Touched while it was calibrated: ${which}. Take away what touches the skin and calibrate again.`, 15000, "warn");
+  }
+  say(`Calibrated. ${counts.length > 3 ? `${counts.length} parts` : counts.join("; ")}`, 6000, "ok");
 }
 
-function say(text, ms, good = false) {
-  notice = { text, until: performance.now() + ms, good };
+function say(text, ms, level = "alarm") {
+  notice = { text, until: performance.now() + ms, level };
   dirty = true;
 }
 
@@ -94,6 +105,7 @@ function mayCommand() {
 function setRaw(on) {
   if (on && !mayCommand()) return say("Raw values are sent on request, and commands are not allowed here.", 4000);
   map.raw = on;
+  peaks = [];
   $("show-raw").setAttribute("aria-pressed", String(on));
   $("show-pressure").setAttribute("aria-pressed", String(!on));
   if (on) askRaw();
@@ -114,7 +126,7 @@ async function calibrate() {
   await new Promise((done) => dialog.addEventListener("close", done, { once: true }));
   if (dialog.returnValue !== "yes") return;
   busy = true;
-  say("Calibrating: leave the skin untouched.", 120000, true);
+  say("Calibrating: leave the skin untouched.", 120000, "ok");
   for (const node of nodesShown()) send({ do: "calibrate", node });
 }
 
@@ -128,15 +140,23 @@ function choose(found) {
   showChosen();
 }
 
+/** A piece of a line as it is drawn over time: by its dashes lines can be told without hues. */
+function sample(colour, dash) {
+  const picture = $("line").content.firstElementChild.cloneNode(true);
+  picture.firstElementChild.setAttribute("stroke", colour);
+  picture.firstElementChild.setAttribute("stroke-dasharray", dash.join(" "));
+  return picture;
+}
+
 function showChosen() {
+  if (restored) remember(`chosen-${store.robot}`, JSON.stringify(map.chosen.map(({ part, taxel }) => ({ part, taxel }))));
   map.chosen.forEach((one, i) => { one.colour = lineColour(i); });
   const list = $("chosen");
   list.replaceChildren(...map.chosen.map(({ part, taxel, colour }, i) => {
     const item = document.createElement("li");
     const button = document.createElement("button");
     button.title = "Forget this taxel";
-    const line = document.createElement("i");
-    line.style.background = colour;
+    const line = sample(colour, DASHES[i % DASHES.length]);
     const text = document.createElement("span");
     button.append(line, text);
     button.addEventListener("click", () => choose(map.chosen[i]));
@@ -152,9 +172,11 @@ function showChosen() {
   dirty = true;
 }
 
+function signed(number) { return number < 0 ? `−${-number}` : `+${number}`; }
+
 function value(part, taxel) {
   if (part.stale(performance.now())) return "stale";
-  if (map.raw) return part.raw ? `raw ${part.raw[taxel]}` : "no raw value";
+  if (map.raw) return part.raw ? `raw ${part.raw[taxel]} (${signed(part.raw[taxel] - part.noLoad[taxel])})` : "no raw value";
   if (part.thermal[taxel]) return "feels temperature";
   if (!part.valid(taxel)) return "not valid";
   return `${part.pressure[taxel].toFixed(1)} kPa${part.beyond(taxel) ? ", beyond range" : ""}`;
@@ -173,6 +195,19 @@ function showTip() {
   tip.style.top = `${at[1] + 16 + tip.offsetHeight > $("map").clientHeight ? at[1] - tip.offsetHeight - 12 : at[1] + 14}px`;
 }
 
+/** Names of some parts, or how many there are where they are many. */
+function named(parts) {
+  if (parts.length === store.parts.length && parts.length > 2) return `all ${parts.length} parts`;
+  return parts.length > 3 ? `${parts.length} parts` : parts.map((part) => part.name).join(", ");
+}
+
+function isUncalibrated(part) { return part.heardMs === null && part.health?.state === "not calibrated"; }
+
+function staleText(stale) {
+  const uncalibrated = stale.filter(isUncalibrated);
+  return uncalibrated.length === stale.length ? `${named(stale)}: not calibrated` : `no data from ${named(stale)}`;
+}
+
 function showStatus(nowMs) {
   const status = $("status");
   const offline = Object.entries(store.status.nodes ?? {}).filter(([, online]) => !online).map(([node]) => node);
@@ -182,46 +217,91 @@ function showStatus(nowMs) {
   else if (!store.status.connected) [text, level] = [store.status.error || "connecting", "alarm"];
   else if (!store.parts.length) [text, level] = ["waiting for a node to say what it is", "wait"];
   else if (offline.length) [text, level] = [`node ${offline.join(", ")} is offline`, "alarm"];
-  else if (stale.length) [text, level] = [`no data from ${stale.map((part) => part.name).join(", ")}`, "alarm"];
+  else if (stale.length) [text, level] = [staleText(stale), "alarm"];
   else text = `live, ${store.parts.reduce((sum, part) => sum + part.n, 0)} taxels`;
   status.dataset.level = level;
   if (status.textContent !== text) status.textContent = text;
   const banner = $("banner");
   const shown = map.parts;
+  const uncalibrated = stale.length > 0 && stale.every(isUncalibrated) && store.status.connected && link !== "lost";
   const allStale = shown.length > 0 && shown.every((part) => part.stale(nowMs));
   if (notice && nowMs > notice.until) notice = null;
-  const words = notice?.text ?? (link === "lost" || (store.parts.length && (!store.status.connected || allStale)) ? `Stale: ${text}` : map.raw && shown.some((part) => !part.raw && !part.stale(nowMs)) ? "Waiting for raw values" : "");
+  const words = notice?.text ?? (link === "lost" || (store.parts.length && (!store.status.connected || allStale)) ? (uncalibrated ? text : `Stale: ${text}`) : map.raw && shown.some((part) => !part.raw && !part.stale(nowMs)) ? "Waiting for raw values" : "");
   banner.hidden = !words;
-  banner.style.background = notice?.good ? "var(--ok)" : "";
+  banner.style.background = notice ? `var(--${notice.level})` : "";
   if (banner.textContent !== words) banner.textContent = words;
   document.body.dataset.stale = String(allStale || link !== "open" || !store.status.connected);
 }
 
+/** The next number of 1, 2, 5, 10, 20, ... */
+function nextRound(value) {
+  const power = 10 ** Math.floor(Math.log10(value));
+  return [1, 2, 5, 10].map((step) => step * power).find((step) => step >= value * 0.999);
+}
+
 function showScale(nowMs) {
   const wanted = $("scale").value;
-  if (map.raw) map.top = 255;
-  else if (wanted !== "auto") map.top = Number(wanted);
+  if (wanted !== "auto" && !map.raw) map.top = Number(wanted);
   else {
     let peak = 0;
     for (const part of map.parts) {
-      if (part.stale(nowMs)) continue;
-      for (let i = 0; i < part.n; i++) if (part.valid(i) && part.pressure[i] > peak) peak = part.pressure[i];
+      if (part.stale(nowMs) || (map.raw && !part.raw)) continue;
+      for (let i = 0; i < part.n; i++) {
+        if (!part.valid(i)) continue;
+        const value = map.raw ? part.noLoad[i] - part.raw[i] : part.pressure[i];
+        if (value > peak) peak = value;
+      }
     }
     peaks = [...peaks.filter(([t, p]) => nowMs - t < AUTO_MS && p > peak), [nowMs, peak]];
-    map.top = nice(Math.max(10, peaks[0][1]));
+    map.top = nextRound(Math.max(map.raw ? 20 : 10, peaks[0][1]));
   }
   $("scale").disabled = map.raw;
-  const labels = [0, 0.25, 0.5, 0.75, 1].map((share) => map.raw ? `${Math.round(255 * (1 - share))}` : `${+(map.top * share).toPrecision(4)}${share === 1 ? " kPa" : ""}`);
-  if (map.raw) labels[0] = "raw 255";
+  const share = (value) => shareOf(value, map.top);
+  // Room for a number, and for the unit with the last.
+  const apart = 46 / Math.max(200, $("ticks").clientWidth);
+  const values = roundTicks(map.top, share, apart).filter((value) => value === map.top || share(value) < 1 - 1.6 * apart);
+  const labels = values.map((value) => (map.raw && value ? `−${+value.toPrecision(4)}` : `${+value.toPrecision(4)}`));
+  if (map.raw) labels[0] = "raw = no-load";
+  else labels[labels.length - 1] += " kPa";
   const ticks = $("ticks");
-  if (ticks.textContent !== labels.join("")) {
+  if (ticks.dataset.shown !== labels.join()) {
+    ticks.dataset.shown = labels.join();
     ticks.replaceChildren(...labels.map((text, i) => {
       const tick = document.createElement("span");
       tick.textContent = text;
-      tick.style.left = `${25 * i}%`;
+      tick.style.left = `${100 * share(values[i])}%`;
       return tick;
     }));
   }
+}
+
+function showForce(nowMs) {
+  const parts = shownParts().filter((part) => part.contacts.length || part.forces.last > -Infinity);
+  // One course for all parts: each part's force counts until it says another.
+  const events = parts.flatMap((part, k) => [...part.forces].map(([t, value]) => [t, k, value])).sort((a, b) => a[0] - b[0]);
+  const now = new Array(parts.length).fill(0);
+  let sum = 0;
+  const course = events.map(([t, k, value]) => {
+    sum += value - now[k];
+    now[k] = value;
+    return [t, Math.max(0, sum)];
+  });
+  const look = paper();
+  const lines = [{ course, colour: look.text, dash: [] }];
+  const one = map.selected && store.part(map.selected.part)?.forceOf.get(map.selected.id);
+  if (one) lines.push({ course: [...one], colour: look.alarm, dash: [6, 3] });
+  drawPlot($("force"), lines, nowMs, { unit: "N", least: 1 });
+}
+
+/** The parts whose contacts and health are shown: the chosen one, or all. */
+function shownParts() { return store.parts.filter((part) => !map.shown || part.name === map.shown); }
+
+function pointAt(contact) { map.pointed = contact; dirty = true; }
+
+function select(contact) {
+  const same = map.selected?.part === contact?.part && map.selected?.id === contact?.id;
+  map.selected = same ? null : contact;
+  dirty = true;
 }
 
 function showRamp() {
@@ -246,8 +326,9 @@ function frame(nowMs) {
     showTip();
     showStatus(nowMs);
     showParts($("parts"), store, map.shown, nowMs, pick);
-    showContacts($("contacts"), $("no-contacts"), store, nowMs);
-    showHealth($("health"), store, map.shown, nowMs);
+    showContacts($("contacts"), $("no-contacts"), shownParts(), map, nowMs, pointAt, select);
+    showForce(nowMs);
+    showHealth($("health"), $("shared"), shownParts(), nowMs);
     drawStrip($("strip"), store, map.chosen, map.raw, nowMs);
     map.chosen.forEach(({ part, taxel }, i) => {
       const text = $("chosen").children[i]?.querySelector("span");
@@ -277,6 +358,7 @@ $("map").addEventListener("pointermove", (event) => {
   const here = [event.offsetX, event.offsetY];
   if (!before) {
     map.cursor = map.pick(...here);
+    map.pointed = map.contactAt(...here);
   } else if (pointers.size === 2) {
     const [other] = [...pointers].filter(([id]) => id !== event.pointerId).map(([, at]) => at);
     const apart = (at) => Math.hypot(at[0] - other[0], at[1] - other[1]) || 1;
@@ -293,10 +375,14 @@ $("map").addEventListener("pointermove", (event) => {
 });
 for (const kind of ["pointerup", "pointercancel"]) {
   $("map").addEventListener(kind, (event) => {
-    if (pointers.delete(event.pointerId) && kind === "pointerup" && moved <= 5) choose(map.pick(event.offsetX, event.offsetY));
+    if (pointers.delete(event.pointerId) && kind === "pointerup" && moved <= 5) {
+      const contact = map.contactAt(event.offsetX, event.offsetY);
+      if (contact) map.selected = contact;
+      choose(map.pick(event.offsetX, event.offsetY));
+    }
   });
 }
-$("map").addEventListener("pointerleave", () => { if (!pointers.size) map.cursor = null; dirty = true; });
+$("map").addEventListener("pointerleave", () => { if (!pointers.size) { map.cursor = null; map.pointed = null; } dirty = true; });
 $("map").addEventListener("wheel", (event) => {
   event.preventDefault();
   map.zoomAt(Math.exp(-event.deltaY * 0.0015), event.offsetX, event.offsetY);
@@ -319,9 +405,16 @@ function walk(by) {
 
 function setTheme(name) {
   document.documentElement.dataset.theme = name;
-  remember("theme", name);
   showRamp();
   showChosen();
+}
+
+/** What was chosen before the page was loaded again. */
+function recalled(key) {
+  try {
+    const found = JSON.parse(remembered(key) ?? "[]");
+    return found.filter(({ part, taxel }) => typeof part === "string" && Number.isInteger(taxel) && taxel >= 0).slice(0, MOST_CHOSEN);
+  } catch { return []; }
 }
 
 function remember(key, text) {
@@ -336,8 +429,8 @@ const keys = {
   ArrowLeft: () => step(-1), ArrowRight: () => step(1), 0: () => pick(null), a: () => pick(null),
   "+": () => zoom(1.25), "=": () => zoom(1.25), "-": () => zoom(0.8), f: () => { map.fit(); dirty = true; },
   ",": () => walk(-1), ".": () => walk(1), Enter: () => choose(map.cursor),
-  Escape: () => { map.chosen = []; map.cursor = null; showChosen(); },
-  r: () => setRaw(!map.raw), c: calibrate, t: () => setTheme(theme() === "dark" ? "light" : "dark"),
+  Escape: () => { map.chosen = []; map.cursor = null; map.selected = null; showChosen(); },
+  r: () => setRaw(!map.raw), c: calibrate, t: () => { setTheme(theme() === "dark" ? "light" : "dark"); remember("theme", theme()); },
   "?": () => $("keys").showModal(),
 };
 
@@ -360,7 +453,11 @@ $("help").addEventListener("click", keys["?"]);
 $("scale").addEventListener("change", () => { peaks = []; dirty = true; });
 window.addEventListener("resize", () => { map.arrange(); dirty = true; });
 
-setTheme(remembered("theme") ?? (matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark"));
+// The system's theme, also when it changes, until one is chosen here.
+const light = matchMedia("(prefers-color-scheme: light)");
+const ofSystem = () => { if (!remembered("theme")) setTheme(light.matches ? "light" : "dark"); };
+light.addEventListener("change", () => { ofSystem(); dirty = true; });
+setTheme(remembered("theme") ?? (light.matches ? "light" : "dark"));
 map.shown = remembered("part") || null;
 connect();
 requestAnimationFrame(frame);

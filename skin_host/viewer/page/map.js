@@ -1,7 +1,11 @@
 // The drawing of the skin: parts side by side, or one of them large.
-import { paper, ramp } from "./colours.js";
+import { paper, ramp, shareOf } from "./colours.js";
 
 const GAP_MM = 14;
+const LABEL_PX = 20;
+const FONT = "600 13px system-ui, sans-serif";
+/** Discs smaller than this (px) have no rim: it would hide them. */
+const RIM_PX = 1.2;
 const TAU = 2 * Math.PI;
 
 /** How one part is turned towards the eye; flat parts are not turned. */
@@ -90,6 +94,8 @@ export class SkinMap {
     this.chosen = [];
     this.raw = false;
     this.top = 50;
+    this.pointed = null; // [part, id] of the contact under the pointer
+    this.selected = null; // and of the one that was clicked
   }
 
   get parts() {
@@ -128,16 +134,47 @@ export class SkinMap {
 
   /** Put the parts on shelves so that all are as large as can be, at one scale. */
   arrange() {
+    const ctx = this.canvas.getContext("2d");
+    ctx.font = FONT;
     const boxes = this.parts.map((part) => {
       const [x0, y0, x1, y1] = this.poses.get(part.name)?.box ?? [0, 0, 1, 1];
-      return { part, w: x1 - x0 + GAP_MM, h: y1 - y0 + GAP_MM, x0, y0 };
+      const w = x1 - x0 + GAP_MM;
+      return { part, w, own: w, h: y1 - y0 + GAP_MM, x0, y0, label: ctx.measureText(part.name).width + 16 };
     });
     this.placed = [];
     if (!boxes.length) return;
+    // A label is as wide at any scale: parts that are narrower than theirs make room for it.
+    let best = this.shelved(boxes);
+    for (let turn = 0; turn < 4; turn++) {
+      for (const box of boxes) box.w = Math.max(box.own, box.label / best.scale);
+      best = this.shelved(boxes);
+    }
+    const labelMm = LABEL_PX / best.scale;
+    const highMm = best.high + labelMm * best.shelves.length;
+    let y = -highMm / 2;
+    for (const shelf of best.shelves) {
+      const wide = shelf.reduce((sum, b) => sum + b.w, 0);
+      const high = Math.max(...shelf.map((b) => b.h));
+      let x = -wide / 2;
+      for (const box of shelf) {
+        this.placed.push({
+          part: box.part,
+          dx: x + (box.w - box.own + GAP_MM) / 2 - box.x0,
+          dy: y + labelMm + GAP_MM / 2 - box.y0 + (high - box.h) / 2,
+          label: [x + box.w / 2, y + labelMm + (high - box.h) / 2],
+          room: box.w,
+        });
+        x += box.w;
+      }
+      y += high + labelMm;
+    }
+    this.base = best.scale;
+  }
+
+  /** The shelves that give the largest scale. */
+  shelved(boxes) {
     const w = this.canvas.clientWidth || 1;
     const h = this.canvas.clientHeight || 1;
-    // Labels take the same room on the screen whatever the scale.
-    const label = 20;
     let best = null;
     const total = boxes.reduce((sum, box) => sum + box.w, 0);
     const widest = Math.max(...boxes.map((box) => box.w));
@@ -152,28 +189,10 @@ export class SkinMap {
       }
       const wide = Math.max(...shelves.map((s) => s.reduce((sum, b) => sum + b.w, 0)));
       const high = shelves.reduce((sum, s) => sum + Math.max(...s.map((b) => b.h)), 0);
-      const scale = Math.min(w / wide, Math.max(20, h - label * shelves.length) / high);
+      const scale = Math.min(w / wide, Math.max(20, h - LABEL_PX * shelves.length) / high);
       if (!best || scale > best.scale) best = { scale, shelves, wide, high };
     }
-    const labelMm = label / best.scale;
-    const highMm = best.high + labelMm * best.shelves.length;
-    let y = -highMm / 2;
-    for (const shelf of best.shelves) {
-      const wide = shelf.reduce((sum, b) => sum + b.w, 0);
-      const high = Math.max(...shelf.map((b) => b.h));
-      let x = -wide / 2;
-      for (const box of shelf) {
-        this.placed.push({
-          part: box.part,
-          dx: x + GAP_MM / 2 - box.x0,
-          dy: y + labelMm + GAP_MM / 2 - box.y0 + (high - box.h) / 2,
-          label: [x + box.w / 2, y + labelMm + (high - box.h) / 2],
-        });
-        x += box.w;
-      }
-      y += high + labelMm;
-    }
-    this.base = best.scale;
+    return best;
   }
 
   get scale() { return this.base * this.zoom; }
@@ -222,6 +241,19 @@ export class SkinMap {
     return best;
   }
 
+  /** The contact whose outline holds a point of the canvas, or null. */
+  contactAt(sx, sy) {
+    for (const { part, dx, dy } of this.placed ?? []) {
+      const pose = this.poses.get(part.name);
+      for (const contact of part.contacts) {
+        const near = contact.taxels.some((i) => i < part.n
+          && Math.hypot(...this.toScreen([pose.points[i][0] + dx, pose.points[i][1] + dy]).map((v, k) => v - [sx, sy][k])) < part.radius[i] * this.scale + 4);
+        if (near) return { part: part.name, id: contact.id };
+      }
+    }
+    return null;
+  }
+
   /** Where a taxel is on the canvas, or null. */
   find(name, taxel) {
     const at = this.placed?.find(({ part }) => part.name === name);
@@ -242,7 +274,7 @@ export class SkinMap {
     this.drawMarks(ctx, look);
   }
 
-  drawPart(ctx, look, { part, dx, dy, label }, nowMs) {
+  drawPart(ctx, look, { part, dx, dy, label, room }, nowMs) {
     const pose = this.poses.get(part.name);
     const scale = this.scale;
     const stale = part.stale(nowMs);
@@ -264,8 +296,8 @@ export class SkinMap {
         ctx.lineWidth = 2;
         ctx.setLineDash([5, 4]);
       } else {
-        ctx.strokeStyle = look.line;
-        ctx.lineWidth = 1;
+        ctx.strokeStyle = look.rim;
+        ctx.lineWidth = 0.75;
         ctx.setLineDash([]);
       }
       ctx.stroke();
@@ -274,12 +306,14 @@ export class SkinMap {
     ctx.globalAlpha = 1;
     this.drawTaxels(ctx, look, part, pose, dx, dy, scale, stale);
     const [lx, ly] = this.toScreen(label);
-    ctx.font = "600 13px system-ui, sans-serif";
+    ctx.font = FONT;
     ctx.textAlign = "center";
     ctx.textBaseline = "bottom";
     ctx.fillStyle = stale ? look.alarm : look.dim;
     const age = part.heardMs === null ? "no data" : `stale, ${((nowMs - part.heardMs) / 1000).toFixed(0)} s`;
-    ctx.fillText(stale ? `${part.name}: ${age}` : part.name, lx, ly);
+    const words = stale ? `${part.name}: ${age}` : part.name;
+    // What does not fit without touching the next label is told by its colour, and beside Health.
+    ctx.fillText(ctx.measureText(words).width + 8 < room * scale ? words : part.name, lx, ly);
   }
 
   drawTaxels(ctx, look, part, pose, dx, dy, scale, stale) {
@@ -299,11 +333,11 @@ export class SkinMap {
       if (x < -r || y < -r || x > w + r || y > h + r) continue;
       const behind = pose.towards[i] < 0;
       if (part.thermal[i] && !this.raw) { if (!behind && r > 3) squares.push(x, y, r); }
-      else if (stale) { if (!behind) rings.push(x, y, r, look.line); }
+      else if (stale) { if (!behind) rings.push(x, y, r, look.rim); }
       else if (this.raw ? !part.raw : !part.valid(i)) { if (!behind) crosses.push(x, y, r); }
       else {
-        const share = this.raw ? (255 - part.raw[i]) / 255 : part.pressure[i] / this.top;
-        const level = Math.min(255, Math.max(0, Math.round(255 * share)));
+        const value = this.raw ? part.noLoad[i] - part.raw[i] : part.pressure[i];
+        const level = Math.round(255 * shareOf(value, this.top));
         const bucket = behind ? level + 256 : level;
         const list = buckets.get(bucket);
         if (list) list.push(x, y, r); else buckets.set(bucket, [x, y, r]);
@@ -321,6 +355,11 @@ export class SkinMap {
         ctx.arc(items[k], items[k + 1], items[k + 2], 0, TAU);
       }
       ctx.fill();
+      // The rim keeps an untouched disc visible on the page's own colour.
+      if (items[2] < RIM_PX) continue;
+      ctx.strokeStyle = look.rim;
+      ctx.lineWidth = Math.min(1, items[2] / 4);
+      ctx.stroke();
     }
     ctx.globalAlpha = 1;
     ctx.lineWidth = Math.max(1, Math.min(2, scale / 3));
@@ -337,7 +376,7 @@ export class SkinMap {
       ctx.rect(squares[k] - r / 2, squares[k + 1] - r / 2, r, r);
     }
     ctx.stroke();
-    ctx.lineWidth = 1.5;
+    ctx.lineWidth = Math.min(1.5, Math.max(0.75, scale / 2));
     for (let k = 0; k < rings.length; k += 4) {
       ctx.strokeStyle = rings[k + 3];
       ctx.beginPath();
@@ -357,7 +396,8 @@ export class SkinMap {
       ctx.beginPath();
       hull.forEach(([x, y], i) => { if (i) ctx.lineTo(x, y); else ctx.moveTo(x, y); });
       ctx.closePath();
-      halo(ctx, look, 2);
+      const marked = is(this.pointed, part, contact) || is(this.selected, part, contact);
+      halo(ctx, look, marked ? 4 : 2, marked);
       let [cx, cy] = [0, 1].map((k) => hull.reduce((sum, p) => sum + p[k], 0) / hull.length);
       if (contact.centroid_m) {
         const p = pose.place(contact.centroid_m.map((x) => x * 1e3));
@@ -373,7 +413,7 @@ export class SkinMap {
 
   /** Words beside an outline, on the side where there is room and no other words are. */
   drawLabel(ctx, look, hull, [cx, cy], text) {
-    ctx.font = "600 13px system-ui, sans-serif";
+    ctx.font = FONT;
     const wide = ctx.measureText(text).width;
     const [xs, ys] = [0, 1].map((k) => hull.map((p) => p[k]));
     const [left, right, top, bottom] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
@@ -422,13 +462,16 @@ function sharesOutline(part, k) {
   return k > 0 && sameOutline(part.triangles[k - 1], part.triangles[k]) && part.faults.has(`${part.triangles[k - 1].board}/${part.triangles[k - 1].number}`);
 }
 
-function halo(ctx, look, width) {
+/** Whether a contact is the one that was pointed at or selected. */
+function is(one, part, contact) { return one?.part === part.name && one.id === contact.id; }
+
+function halo(ctx, look, width, marked = false) {
   ctx.lineJoin = "round";
   ctx.lineWidth = width + 3;
   ctx.strokeStyle = look.back;
   ctx.stroke();
   ctx.lineWidth = width;
-  ctx.strokeStyle = look.text;
+  ctx.strokeStyle = marked ? look.alarm : look.text;
   ctx.stroke();
 }
 

@@ -1,5 +1,5 @@
 // Contacts, health, parts: what stands in words beside the map.
-const LEVELS = { ok: "ok", degraded: "warn", disabled: "warn" };
+const LEVELS = { ok: "ok", warning: "warn", degraded: "warn", disabled: "warn" };
 
 export function level(part, nowMs) {
   if (part.stale(nowMs)) return "alarm";
@@ -35,8 +35,9 @@ export function showParts(nav, store, shown, nowMs, pick) {
   });
 }
 
-export function showContacts(table, hint, store, nowMs) {
-  const live = store.parts.filter((part) => !part.stale(nowMs));
+/** Contacts of the parts that are shown, with their sum; the pointer and a click mark one. */
+export function showContacts(table, hint, parts, map, nowMs, point, select) {
+  const live = parts.filter((part) => !part.stale(nowMs));
   const rows = live.flatMap((part) => part.contacts.map((contact) => [part.name, contact]));
   const body = table.tBodies[0];
   table.hidden = !rows.length;
@@ -44,43 +45,133 @@ export function showContacts(table, hint, store, nowMs) {
   put(hint, live.length ? "Nothing touches the skin." : "Not known: no data.");
   keep(body, rows.length, () => {
     const row = document.createElement("tr");
+    row.tabIndex = 0;
     for (let i = 0; i < 5; i++) row.append(document.createElement("td"));
+    const mine = () => ({ part: row.dataset.part, id: Number(row.dataset.id) });
+    row.addEventListener("pointerenter", () => point(mine()));
+    row.addEventListener("pointerleave", () => point(null));
+    row.addEventListener("focus", () => point(mine()));
+    row.addEventListener("blur", () => point(null));
+    row.addEventListener("click", () => select(mine()));
+    row.addEventListener("keydown", (event) => {
+      if (event.key !== "Enter" && event.key !== " ") return;
+      event.preventDefault();
+      event.stopPropagation();
+      select(mine());
+    });
     return row;
   }).forEach((row, i) => {
     const [name, contact] = rows[i];
+    row.dataset.part = name;
+    row.dataset.id = contact.id;
+    row.setAttribute("aria-selected", String(map.selected?.part === name && map.selected.id === contact.id));
     const cells = [name, `#${contact.id}`, told(contact.force_n, 2, "N"), told(contact.peak_kpa, 1, "kPa"), told(contact.area_mm2, 0, "mm²")];
     cells.forEach((text, k) => put(row.children[k], text));
   });
+  const total = rows.reduce((sum, [, contact]) => sum + contact.force_n, 0);
+  put(table.tFoot.rows[0].cells[2], told(total, 2, "N"));
+  table.tFoot.hidden = rows.length < 2;
 }
 
-export function showHealth(box, store, shown, nowMs) {
-  const parts = store.parts.filter((part) => !shown || part.name === shown);
+/** More parts than this in one state are one line, which opens. */
+const MANY = 3;
+const ORDER = ["alarm", "warn", "ok"];
+
+function stateOf(part, nowMs) {
+  if (part.heardMs === null && part.health?.state === "not calibrated") return "not calibrated";
+  if (part.heardMs === null) return "no data";
+  return part.stale(nowMs) ? "stale" : part.health?.state ?? "ok";
+}
+
+/** Sentences that more than one part has, but for its own name: [sentence, how many]. */
+function sharedSentences(parts) {
+  const counts = new Map();
+  for (const part of parts) {
+    for (const says of new Set(part.health?.sentences ?? [])) counts.set(says, (counts.get(says) ?? 0) + 1);
+  }
+  return [...counts].filter(([, n]) => n > 1);
+}
+
+export function showHealth(box, list, parts, nowMs) {
   if (!parts.length) return;
   if (box.querySelector(".hint")) box.replaceChildren();
-  keep(box, parts.length, () => {
-    const article = document.createElement("article");
-    const head = document.createElement("h3");
-    head.append(document.createTextNode(""), document.createElement("span"));
-    const rates = document.createElement("p");
-    rates.className = "rates";
-    article.append(head, rates, document.createElement("ul"));
-    return article;
-  }).forEach((article, i) => {
-    const part = parts[i];
-    const stale = part.stale(nowMs);
-    const [head, rates, list] = article.children;
-    article.dataset.level = level(part, nowMs);
-    article.dataset.part = part.name;
-    put2(head.firstChild, part.name);
-    put(head.lastChild, part.heardMs === null ? "no data" : stale ? "stale" : part.health?.state ?? "");
-    const valid = part.health?.valid_taxels;
-    const taxels = valid === undefined ? `${part.n} taxels` : `${valid} of ${part.health.taxels} taxels valid`;
-    const frames = `${part.rate(nowMs).toFixed(1)} frames/s, ${part.missed} missed, ${taxels}`;
-    put(rates, part.fingertip ? `${told(part.health?.rate_hz, 0, "samples/s")} of force and torque` : frames);
-    const said = [...(stale && part.heardMs !== null ? [`${part.fingertip ? "Nothing" : "No frame"} for ${((nowMs - part.heardMs) / 1000).toFixed(0)} s.`] : []), ...(part.health?.sentences ?? [])];
-    keep(list, said.length, () => document.createElement("li")).forEach((item, k) => put(item, said[k]));
-    list.hidden = !said.length;
+  const shared = sharedSentences(parts);
+  keep(list, shared.length, () => document.createElement("li")).forEach((item, i) => put(item, `${shared[i][0]} (${shared[i][1]} parts)`));
+  list.hidden = !shared.length;
+  const once = new Set(shared.map(([says]) => says));
+  const groups = new Map();
+  for (const part of parts) {
+    const state = stateOf(part, nowMs);
+    if (!groups.has(state)) groups.set(state, { state, level: level(part, nowMs), parts: [] });
+    groups.get(state).parts.push(part);
+  }
+  const sorted = [...groups.values()].sort((a, b) => ORDER.indexOf(a.level) - ORDER.indexOf(b.level));
+  const entries = sorted.flatMap((group) => (group.parts.length > MANY ? [group] : group.parts.map((part) => ({ part }))));
+  const kinds = entries.map((entry) => (entry.part ? "article" : "details"));
+  // Nodes that stay keep what is open and what is focused.
+  while (box.children.length > entries.length) box.lastChild.remove();
+  entries.forEach((entry, i) => {
+    const key = entry.part ? "" : entry.state;
+    const there = box.children[i];
+    if (there?.localName !== kinds[i] || (there.dataset.state ?? "") !== key) {
+      const made = entry.part ? newArticle() : newGroup(key);
+      if (there) there.replaceWith(made); else box.append(made);
+    }
+    if (entry.part) return fill(box.children[i], entry.part, once, nowMs);
+    const details = box.children[i];
+    details.dataset.level = entry.level;
+    const [summary, ...articles] = details.children;
+    put(summary.firstChild, `${entry.parts.length} parts: ${entry.state}`);
+    put(summary.lastChild, ` ${rates(entry.parts, nowMs)}`);
+    while (articles.length > entry.parts.length) articles.pop().remove();
+    entry.parts.forEach((part, k) => {
+      if (!articles[k]) { articles[k] = newArticle(); details.append(articles[k]); }
+      fill(articles[k], part, once, nowMs);
+    });
   });
+}
+
+/** What a group of parts sends together. */
+function rates(parts, nowMs) {
+  const sum = (of) => parts.reduce((all, part) => all + of(part), 0);
+  const taxels = sum((part) => part.health?.taxels ?? part.n);
+  const valid = sum((part) => part.health?.valid_taxels ?? 0);
+  return `${sum((part) => part.rate(nowMs)).toFixed(0)} frames/s, ${valid} of ${taxels} taxels valid`;
+}
+
+function newGroup(state) {
+  const details = document.createElement("details");
+  details.dataset.state = state;
+  const summary = document.createElement("summary");
+  summary.append(document.createElement("b"), document.createElement("span"));
+  details.append(summary);
+  return details;
+}
+
+function newArticle() {
+  const article = document.createElement("article");
+  const head = document.createElement("h3");
+  head.append(document.createTextNode(""), document.createElement("span"));
+  const rates = document.createElement("p");
+  rates.className = "rates";
+  article.append(head, rates, document.createElement("ul"));
+  return article;
+}
+
+function fill(article, part, once, nowMs) {
+  const stale = part.stale(nowMs);
+  const [head, rates, list] = article.children;
+  article.dataset.level = level(part, nowMs);
+  article.dataset.part = part.name;
+  put2(head.firstChild, part.name);
+  put(head.lastChild, stateOf(part, nowMs));
+  const valid = part.health?.valid_taxels;
+  const taxels = valid === undefined ? `${part.n} taxels` : `${valid} of ${part.health.taxels} taxels valid`;
+  const frames = `${part.rate(nowMs).toFixed(1)} frames/s, ${part.missed} missed, ${taxels}`;
+  put(rates, part.fingertip ? `${told(part.health?.rate_hz, 0, "samples/s")} of force and torque` : frames);
+  const said = [...(stale && part.heardMs !== null ? [`${part.fingertip ? "Nothing" : "No frame"} for ${((nowMs - part.heardMs) / 1000).toFixed(0)} s.`] : []), ...(part.health?.sentences ?? []).filter((says) => !once.has(says))];
+  keep(list, said.length, () => document.createElement("li")).forEach((item, k) => put(item, said[k]));
+  list.hidden = !said.length;
 }
 
 /** A number with its unit; where there is no skin there is no pressure and no area. */

@@ -5,6 +5,23 @@ const HEAD = 32;
 const VALID = 1;
 const BEYOND = 2;
 
+/** Values over the last minute: [time, value], oldest first. */
+class Course {
+  constructor() { this.points = []; this.first = 0; }
+
+  get last() { return this.points.at(-1)?.[0] ?? -Infinity; }
+
+  add(nowMs, value) {
+    // Two pictures of one moment are one.
+    if (nowMs - this.last < 5) this.points.pop();
+    this.points.push([nowMs, value]);
+    while (this.points[this.first]?.[0] < nowMs - HISTORY_S * 1000) this.first++;
+    if (this.first > 1000) { this.points = this.points.slice(this.first); this.first = 0; }
+  }
+
+  *[Symbol.iterator]() { for (let k = this.first; k < this.points.length; k++) yield this.points[k]; }
+}
+
 export class Part {
   constructor(info) {
     this.name = info.name;
@@ -26,12 +43,29 @@ export class Part {
     this.missed = 0;
     this.arrivals = [];
     this.contacts = [];
+    this.forces = new Course(); // of all contacts together
+    this.forceOf = new Map(); // of each contact by its id
+    this.noLoad = this.triangles.length ? Float32Array.from({ length: this.n }, (_, i) => this.triangleOf(i)?.no_load ?? 240) : new Float32Array(this.n);
     this.health = null;
     this.times = new Float64Array(SLOTS);
     this.past = new Float32Array(SLOTS * this.n);
     this.pastRaw = null;
     this.at = 0;
     this.filled = 0;
+  }
+
+  takeContacts(contacts, nowMs) {
+    this.contacts = contacts;
+    this.rememberForces(nowMs);
+  }
+
+  rememberForces(nowMs) {
+    this.forces.add(nowMs, this.contacts.reduce((sum, contact) => sum + contact.force_n, 0));
+    for (const contact of this.contacts) {
+      if (!this.forceOf.has(contact.id)) this.forceOf.set(contact.id, new Course());
+      this.forceOf.get(contact.id).add(nowMs, contact.force_n);
+    }
+    for (const [id, course] of this.forceOf) if (course.last < nowMs - HISTORY_S * 1000) this.forceOf.delete(id);
   }
 
   valid(i) { return (this.bits[i] & VALID) !== 0; }
@@ -56,6 +90,7 @@ export class Part {
     this.arrivals.push([nowMs, this.received]);
     while (this.arrivals.length > 2 && nowMs - this.arrivals[0][0] > 2000) this.arrivals.shift();
     this.remember(nowMs);
+    this.rememberForces(nowMs);
   }
 
   remember(nowMs) {
@@ -109,7 +144,7 @@ export class Store {
       const before = old.get(part.name);
       // A new calibration gives a new layout of the same taxels: their past stays.
       if (before && before.n === part.n) {
-        for (const key of ["pressure", "bits", "raw", "heardMs", "received", "missed", "arrivals", "contacts", "health", "faults", "times", "past", "pastRaw", "at", "filled"]) part[key] = before[key];
+        for (const key of ["pressure", "bits", "raw", "heardMs", "received", "missed", "arrivals", "contacts", "forces", "forceOf", "health", "faults", "times", "past", "pastRaw", "at", "filled"]) part[key] = before[key];
       }
       return part;
     });
@@ -126,7 +161,7 @@ export class Store {
     const part = this.part(message.part);
     if (!part) return;
     part.health = message;
-    if (part.fingertip) part.heardMs = nowMs;
+    if (part.fingertip) { part.heardMs = nowMs; part.rememberForces(nowMs); }
     part.faults = new Set((message.triangles ?? []).map((t) => `${t.board}/${t.triangle}`));
   }
 }

@@ -1,4 +1,4 @@
-// The course of chosen taxels over the last minute.
+// Courses over the last minute: of chosen taxels, and of the contacts' force.
 import { DASHES, LINES, paper, theme } from "./colours.js";
 import { HISTORY_S } from "./store.js";
 
@@ -11,7 +11,18 @@ const GAP_MS = 700;
 
 export function lineColour(i) { return LINES[theme()][i % DASHES.length]; }
 
+/** The chosen taxels: kPa, or raw values less those of untouched skin. */
 export function drawStrip(canvas, store, chosen, raw, nowMs) {
+  const lines = chosen.map(({ part, taxel }, i) => {
+    const of = store.part(part);
+    const course = [...(of?.course(taxel, raw) ?? [])].map(([t, value]) => [t, raw ? of.noLoad[taxel] - value : value]);
+    return { course, colour: lineColour(i), dash: DASHES[i % DASHES.length] };
+  });
+  drawPlot(canvas, lines, nowMs, raw ? { unit: "units", least: 20 } : { unit: "kPa", least: 5 });
+}
+
+/** Courses over the last minute: what is below zero is noise. */
+export function drawPlot(canvas, lines, nowMs, { unit, least }) {
   const ratio = window.devicePixelRatio || 1;
   const { clientWidth: w, clientHeight: h } = canvas;
   canvas.width = Math.round(w * ratio);
@@ -19,9 +30,9 @@ export function drawStrip(canvas, store, chosen, raw, nowMs) {
   const ctx = canvas.getContext("2d");
   const look = paper();
   ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
-  const courses = chosen.map(({ part, taxel }) => [...(store.part(part)?.course(taxel, raw) ?? [])]);
-  const peak = courses.flat().reduce((top, [, value]) => (value > top ? value : top), 0);
-  const top = raw ? 255 : nice(Math.max(peak * 1.1, 5));
+  let peak = 0;
+  for (const { course } of lines) for (const [, value] of course) if (value > peak) peak = value;
+  const top = nice(Math.max(peak * 1.1, least));
   const x = (t) => LEFT + ((t - nowMs) / 1000 / HISTORY_S + 1) * (w - LEFT - 4);
   const y = (value) => Math.min(6 + (1 - value / top) * (h - BOTTOM - 6), h - BOTTOM + BELOW);
   ctx.font = "11px system-ui, sans-serif";
@@ -41,9 +52,9 @@ export function drawStrip(canvas, store, chosen, raw, nowMs) {
   ctx.textBaseline = "bottom";
   for (const s of [-60, -40, -20, 0]) {
     ctx.textAlign = s === 0 ? "right" : s === -60 ? "left" : "center";
-    ctx.fillText(s === 0 ? (raw ? "now" : "now, kPa") : `${s} s`, x(nowMs + s * 1000), h);
+    ctx.fillText(s === 0 ? `now, ${unit}` : `${s} s`, x(nowMs + s * 1000), h);
   }
-  courses.forEach((course, i) => {
+  for (const { course, colour, dash } of lines) {
     ctx.beginPath();
     let last = null;
     for (const [t, value] of course) {
@@ -53,16 +64,29 @@ export function drawStrip(canvas, store, chosen, raw, nowMs) {
       else ctx.lineTo(x(t), y(value));
       last = t;
     }
-    ctx.strokeStyle = lineColour(i);
-    ctx.setLineDash(DASHES[i % DASHES.length]);
+    ctx.strokeStyle = colour;
+    ctx.setLineDash(dash);
     ctx.lineWidth = 2;
     ctx.stroke();
-  });
+  }
   ctx.setLineDash([]);
 }
 
-/** The next round number. */
+/** The next round number, whose half is round too. */
 export function nice(value) {
   const power = 10 ** Math.floor(Math.log10(value));
-  return [1, 1.5, 2, 3, 4, 5, 6, 8, 10].map((step) => step * power).find((step) => step >= value * 0.999);
+  return [1, 2, 4, 6, 8, 10].map((step) => step * power).find((step) => step >= value * 0.999);
+}
+
+/** Round numbers of a scale from 0 to `top` that lie at least `apart` (a share of it) from each other. */
+export function roundTicks(top, share, apart) {
+  const ticks = [0, top];
+  const decade = 10 ** Math.floor(Math.log10(top));
+  for (const power of [decade, decade / 10, decade / 100]) {
+    for (const step of [5, 2, 1]) {
+      const value = step * power;
+      if (value < top && ticks.every((other) => Math.abs(share(other) - share(value)) >= apart)) ticks.push(value);
+    }
+  }
+  return ticks.sort((a, b) => a - b);
 }

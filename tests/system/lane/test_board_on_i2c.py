@@ -8,7 +8,10 @@ from pathlib import Path
 
 import can
 
+from skin_host.bus.protocol import BROADCAST_ADDRESS
+from skin_host.bus.protocol.answers import Discovered, parse_answer
 from skin_host.bus.protocol.commands import (
+    Discover,
     SetBoardConfig,
     SetTriangleConfig,
     SetTxMode,
@@ -28,12 +31,15 @@ def emulate(config: Path, channel: str, *options: str) -> "subprocess.Popen[byte
 
 
 def test_a_computer_with_chips_on_its_i2c_is_a_board_to_any_host(
-    new_can_bus: Callable[[], Bus],
+    new_can_bus: Callable[[], Bus], tmp_path: Path
 ):
     chips_bus, board_bus = new_can_bus(), new_can_bus()
     config = ROOT / "config/demo.toml"
     interface = ("--interface", "socketcan")
-    robot = emulate(config, chips_bus.channel, *interface, "--i2c-dev", str(FIRST))
+    quiet = tmp_path / "quiet.toml"
+    quiet.write_text("quiet = true\n")
+    chips = ("--scene", str(quiet), "--i2c-dev", str(FIRST))
+    robot = emulate(config, chips_bus.channel, *interface, *chips)
     devices = [Path(f"/dev/i2c-{FIRST + line}") for line in range(4)]
     board = None
     try:
@@ -61,7 +67,8 @@ def test_a_computer_with_chips_on_its_i2c_is_a_board_to_any_host(
 
 
 def stream(bus: can.BusABC) -> dict[int, tuple[list[int], int]]:
-    """Set the board up as a host does, and take one whole sweep of it, late enough."""
+    """Find the board and set it up as a host does, and take one whole sweep of it, late enough."""
+    find(bus)
     halves: dict[tuple[int, int], bytes] = {}
     started = configured = 0.0
     deadline = time.monotonic() + 90
@@ -91,6 +98,18 @@ def stream(bus: can.BusABC) -> dict[int, tuple[list[int], int]]:
         a, b = halves[triangle, 0x40], halves[triangle, 0xC0]
         result[triangle] = [*a[1:], *b[1:6]], b[6] << 8 | b[7]
     return result
+
+
+def find(bus: can.BusABC) -> None:
+    """Ask who is there until the board answers: its program needs some time to start."""
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        send(bus, command_frame(Discover(), BROADCAST_ADDRESS))
+        frame = bus.recv(1.0)
+        answer = None if frame is None else parse_answer(frame.arbitration_id, bytes(frame.data))
+        if answer is not None and answer[0] == ADDRESS and isinstance(answer[1], Discovered):
+            return
+    raise AssertionError("the board does not answer")
 
 
 def send(bus: can.BusABC, frame: tuple[int, bytes]) -> None:

@@ -128,7 +128,7 @@ def test_a_program_from_before_i2c_rdwr_reads_and_writes_the_file(i2c: EmulatedS
 def test_drivers_get_the_same_through_the_kernel(i2c: EmulatedSMBus, path: Path) -> None:
     script = conformance.load(path)
     chip = AD7147()
-    i2c.chips = {0x2D: chip}
+    i2c.line.chips = {0x2D: chip}
     with SMBus(NUMBER) as bus:
         done = conformance.run(script, bus, 0x2D, conformance.EmulatedBench(chip))
     assert done == len(script.steps)

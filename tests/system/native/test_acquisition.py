@@ -110,7 +110,7 @@ async def test_one_bus_of_four_that_is_unplugged_leaves_the_others_alone(
 ) -> None:
     config = four_parts(tmp_path)
     delays_ms: dict[str, list[float]] = defaultdict(list)
-    async with daemon_of(config, Scene(spread=False), mosquitto.port) as daemon:
+    async with daemon_of(config, Scene(spread=False, quiet=True), mosquitto.port) as daemon:
         put = daemon.publisher.put_frame
         valid: dict[str, list[float]] = defaultdict(list)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from skin_host.client import SkinClient, Stream, Touch
-from skin_host.processing.contacts import TouchEvent
+from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.publish.mqtt import Publisher
 from skin_host.settings import Mqtt

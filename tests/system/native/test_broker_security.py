@@ -12,7 +12,7 @@ import pytest
 
 from skin_host.client import Broker, SkinClient
 from skin_host.errors import BrokerError
-from skin_host.processing.contacts import TouchEvent
+from skin_host.processing.events import TouchEvent
 from skin_host.publish.mqtt import Publisher
 from skin_host.settings import Mqtt
 from tests.support import programs
@@ -193,7 +193,7 @@ async def test_publications_that_the_rules_forbid_are_counted_and_told(
     async with Publisher(keys, "robot", folder=tmp_path) as publisher:
         await until(lambda: publisher.counters.connected)
         for number in range(3):
-            publisher.put_contact("palm", bool(number % 2))
+            publisher.put_contact("palm", "ON" if number % 2 else "OFF")
             publisher.put_touch(touch(number))
             await asyncio.sleep(0.1)
         await until(lambda: publisher.counters.refused == 6)

@@ -9,7 +9,7 @@ import pytest
 from skin_host.importing.report import Findings
 from skin_host.importing.run import import_files
 from skin_host.importing.writing import configuration_text
-from skin_host.settings import Bus, load
+from skin_host.settings import Bus, changed, load
 from tests.support.broker import Mosquitto
 from tests.support.devtools import Page
 from tests.support.stack import ROOT, Stack
@@ -33,6 +33,59 @@ HEALTHY = """document.querySelector('#health [data-level="ok"]')
     && !document.querySelector('#health [data-level="alarm"], #health [data-level="warn"]')"""
 CONTACTS = """[...document.querySelectorAll("#contacts tbody tr")]
     .map(row => [...row.cells].map(cell => cell.textContent))"""
+
+
+TICKS = '[...document.querySelectorAll("#ticks span")].map(tick => tick.textContent)'
+CLICK_CONTACT = """(async () => {
+    for (let i = 0; i < 300; i++) {
+        const row = document.querySelector("#contacts tbody tr");
+        row?.click();
+        await new Promise(done => setTimeout(done, 100));
+        if (row?.ariaSelected === "true") return true; // it may have ended meanwhile
+    }
+})()"""
+#: Thirteen parts as the server tells of them, of which nothing has been heard but their health.
+MANY_PARTS = """(() => {
+    const square = [[0, 0, 0], [0.05, 0, 0], [0.05, 0.03, 0], [0, 0.03, 0]];
+    const parts = Array.from({ length: 13 }, (_, k) => ({
+        name: `right_upper_part_${k}`, node: "main", period_ms: 50,
+        pads: Array(12).fill("pressure"),
+        position_m: Array.from({ length: 12 }, (_, i) => [0.004 * i, 0.01, 0]),
+        normal: Array(12).fill([0, 0, 1]), radius_mm: Array(12).fill(2),
+        area_mm2: Array(12).fill(20),
+        triangles: [
+            { board: "b", number: 0, kind: "x", first: 0, outline_m: square, no_load: 240 },
+        ],
+    }));
+    const socket = window.sockets.at(-1);
+    const say = message => socket.onmessage({ data: JSON.stringify(message) });
+    say({ type: "layout", version: 9, robot: "many", parts, nodes: {} });
+    for (const part of parts) say({
+        type: "health", part: part.name, state: "not calibrated", taxels: 12, valid_taxels: 0,
+        sentences: ["Not calibrated: leave it untouched.", `${part.name} says so`], triangles: [],
+    });
+    const draws = () => Number(document.body.dataset.draws);
+    const before = draws();
+    return new Promise(done => setTimeout(() => done(draws() > before), 600));
+})()"""
+WATCH_SOCKETS = """
+    window.sockets = [];
+    window.WebSocket = class extends WebSocket {
+        constructor(...all) { super(...all); window.sockets.push(this); }
+    };
+    const words = CanvasRenderingContext2D.prototype.fillText;
+    window.labels = [];
+    CanvasRenderingContext2D.prototype.fillText = function (text, x, y) {
+        const wide = this.measureText(text).width;
+        if (this.canvas.id === "map") window.labels.push([text, x, y, wide]);
+        words.call(this, text, x, y);
+    };
+    const clear = CanvasRenderingContext2D.prototype.clearRect;
+    CanvasRenderingContext2D.prototype.clearRect = function (...all) {
+        if (this.canvas.id === "map") window.labels = [];
+        clear.apply(this, all);
+    };
+"""
 
 
 @pytest.fixture
@@ -67,11 +120,20 @@ async def test_a_press_is_seen_and_parts_and_values_can_be_chosen(
         )
         assert parts == ["all", "left_hand", "left_forearm"]
         assert await seen.run(DRAWN) > 20_000
-        assert "kPa" in await seen.run('document.getElementById("ticks").textContent')
+        ticks = await seen.run(TICKS)
+        assert ticks[-1].endswith(" kPa")
+        # Round, and as far apart as their square roots.
+        values = [float(tick.split()[0]) for tick in ticks]
+        assert values[0] == 0
+        assert {f"{value:e}"[0] for value in values[1:]} <= {"1", "2", "5"}
         name, number, force, peak, area = (await seen.until(f"({CONTACTS})[0]"))[:5]
         assert name in parts
         assert number.startswith("#")
         assert (force[-2:], peak[-4:], area[-4:]) == (" N", " kPa", " mm²")
+        # A contact in the table is marked on the map, and a click selects it.
+        assert await seen.run(CLICK_CONTACT)
+        await seen.press("Escape")
+        await seen.until("""!document.querySelector('#contacts tr[aria-selected="true"]')""")
         # A click chooses a taxel, whose course is drawn from before the click on.
         await seen.run('document.querySelectorAll("#parts button")[2].click()')
         await seen.press(".")
@@ -87,15 +149,24 @@ async def test_a_press_is_seen_and_parts_and_values_can_be_chosen(
             if await seen.run('document.querySelectorAll("#chosen button").length'):
                 break
         await seen.until('/left_forearm/.test(document.getElementById("chosen").textContent)')
+        # It survives a reload, with the dashes of its line in the legend.
+        await seen.call("Page.reload")
+        await seen.until('/left_forearm/.test(document.getElementById("chosen")?.textContent)')
+        assert await seen.run('document.querySelectorAll("#chosen svg line").length') == 1
         # Raw values come on request.
         await seen.press("r")
         await seen.until('/raw \\d+/.test(document.getElementById("chosen").textContent)')
-        assert "raw 255" in await seen.run('document.getElementById("ticks").textContent')
+        assert (await seen.run(TICKS))[0] == "raw = no-load"
         await seen.press("r")
         await seen.until('/kPa/.test(document.getElementById("chosen").textContent)')
         # Keys: all parts, dark and light.
         await seen.press("0")
         await seen.until('document.querySelector("#parts button").ariaCurrent === "true"')
+        # The theme is the system's, also when that changes, until one is chosen.
+        for name in ("light", "dark"):
+            feature = {"name": "prefers-color-scheme", "value": name}
+            await seen.call("Emulation.setEmulatedMedia", features=[feature])
+            await seen.until(f'document.documentElement.dataset.theme === "{name}"')
         before = await seen.run("document.documentElement.dataset.theme")
         await seen.press("t")
         await seen.until(f'document.documentElement.dataset.theme !== "{before}"')
@@ -126,11 +197,13 @@ async def test_the_skin_can_be_calibrated_from_the_page(robot: Stack, tmp_path: 
     async with page(robot, tmp_path / "profile") as seen:
         await seen.until(LIVE)
         # The daemon calibrates at its start, and takes one calibration at a time.
-        await seen.until(f"({HEALTHY}) && !document.getElementById('calibrate').disabled")
+        await seen.until("!document.getElementById('calibrate').disabled")
         await seen.run('document.getElementById("calibrate").click()')
         await seen.until('document.getElementById("confirm").open')
         await seen.run('document.querySelector("#confirm button.do").click()')
-        await seen.until('/^Calibrated/.test(document.getElementById("banner").textContent)')
+        # The scene presses on meanwhile, which is told.
+        done = "/^Calibrated|^Touched while it was calibrated/"
+        await seen.until(f'{done}.test(document.getElementById("banner").textContent)')
 
 
 async def test_a_phone_shows_everything_without_scrolling_sideways(
@@ -141,6 +214,29 @@ async def test_a_phone_shows_everything_without_scrolling_sideways(
         await seen.until(LIVE)
         assert await seen.run("document.documentElement.scrollWidth") == 400
         assert await seen.run(DRAWN) > 8_000
+
+
+@pytest.mark.parametrize("width", [1280, 400])
+async def test_a_whole_robot_is_one_line_that_opens_and_its_labels_keep_apart(
+    mosquitto: Mosquitto, tmp_path: Path, width: int
+) -> None:
+    async with viewing(mosquitto, "nobody", tmp_path / "p", width, watch=WATCH_SOCKETS) as seen:
+        await seen.until("window.sockets.length > 0")
+        assert await seen.run(MANY_PARTS)
+        text = await seen.run('document.getElementById("health").innerText')
+        assert text.startswith("13 parts: not calibrated")
+        assert "right_upper_part_3 says so" not in text
+        said = await seen.run('document.getElementById("shared").innerText')
+        assert said == "Not calibrated: leave it untouched. (13 parts)"
+        await seen.run('document.querySelector("#health summary").click()')
+        await seen.until('document.getElementById("health").innerText.includes("part_3 says so")')
+        labels = await seen.run("window.labels")
+        assert len(labels) == 13
+        for i, (_, x, y, wide) in enumerate(labels):
+            for _, other_x, other_y, other_wide in labels[:i]:
+                apart = abs(x - other_x) >= (wide + other_wide) / 2 or abs(y - other_y) >= 15
+                assert apart
+        assert await seen.run("document.documentElement.scrollWidth") == width
 
 
 @pytest.mark.skipif(not SAMPLES.exists(), reason=f"{SAMPLES} is not here")
@@ -155,9 +251,15 @@ async def test_the_imported_arm_of_an_icub_is_drawn(robot: Stack, tmp_path: Path
         known = None if source == "skinspec" else arm
         import_files(source, [SAMPLES / sample], arm, findings, config=known)  # type: ignore[arg-type]
     settings = load(arm)
-    settings.robot = demo.robot
-    settings.buses = dict.fromkeys(settings.buses, robot.bus)
-    settings.mqtt, settings.service = demo.mqtt, demo.service
+    settings = changed(
+        settings,
+        {
+            "robot": demo.robot,
+            "buses": dict.fromkeys(settings.buses, robot.bus),
+            "mqtt": demo.mqtt,
+            "service": demo.service,
+        },
+    )
     arm.write_text(configuration_text(settings))
     robot.start("run", str(arm), "--calibrate")
     async with page(robot, tmp_path / "profile") as seen:

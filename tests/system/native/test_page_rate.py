@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from skin_host.layout import Layout, build_layout
-from skin_host.processing.contacts import TouchEvent
+from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.publish.info import node_info
 from skin_host.publish.mqtt import Publisher

@@ -1,15 +1,18 @@
 """The service files: systemd finds nothing wrong with them, and little that is exposed."""
 
+import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
 
 from tests.support import programs
+from tests.support.broker import free_port
+from tests.support.certificates import authority, certificate
 
 ROOT = Path(__file__).parents[3]
 UNIT = ROOT / "systemd" / "skin-host@.service"
-MOST_EXPOSED = 15
+MOST_EXPOSED = 13
 
 
 def analyze(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":
@@ -61,40 +64,52 @@ def test_installing_and_removing_leaves_the_configuration(tmp_path: Path) -> Non
     enabled = root / "etc/systemd/system/multi-user.target.wants/skin-host@main.service"
     enabled.parent.mkdir()
     enabled.symlink_to("/etc/systemd/system/skin-host@.service")
+    for added in ("system/skin-host@.service.d", "network/80-skin-can.network.d"):
+        (root / "etc/systemd" / added).mkdir()
+        (root / "etc/systemd" / added / "own.conf").write_text("")
     subprocess.run([*run, "uninstall", *extra], cwd=ROOT, check=True, capture_output=True)
     left = [path.relative_to(root) for path in root.rglob("*") if not path.is_dir()]
     assert left == [Path("etc/skin-host/main.toml")]
 
 
-def test_the_link_and_network_files_name_keys_that_systemd_knows() -> None:
-    text = (ROOT / "systemd/80-skin-can.network").read_text()
-    assert "BitRate=1000000" in text
-    assert "RestartSec=" in text
+def test_the_interfaces_are_set_up_with_what_every_controller_takes() -> None:
+    """A driver that does not know a setting refuses the bit rate with it."""
+    lines = (ROOT / "systemd/80-skin-can.network").read_text().splitlines()
+    assert lines[lines.index("[CAN]") + 1 :] == ["BitRate=1000000"]
+    offered = {path.name for path in (ROOT / "systemd/80-skin-can.network.d").iterdir()}
+    assert offered == {"restart.conf", "errors.conf"}
 
 
-def test_mosquitto_takes_the_example_configuration(tmp_path: Path) -> None:
-    """Syntax and rules: the daemon writes, a subscriber reads and does not command."""
-    acl = (ROOT / "systemd/mosquitto/skin.acl").read_text()
-    assert "user operator" in acl
+def test_mosquitto_takes_the_example_configuration_beside_its_own(tmp_path: Path) -> None:
+    """Debian's main file, as it is but for its places, includes ours."""
     program = programs.require("mosquitto")
-    text = (ROOT / "systemd/mosquitto/skin.conf").read_text()
-    kept = [
-        line for line in text.splitlines() if not line.startswith(("cafile", "certfile", "keyfile"))
-    ]
-    text = "\n".join(kept).replace("/etc/mosquitto/skin", str(tmp_path / "skin"))
-    text = text.replace("/var/lib/mosquitto/", f"{tmp_path}/").replace("listener 8883", "")
-    text = "user root\n" + text.replace("listener 1883 127.0.0.1", f"listener 0 {tmp_path}/socket")
+    folder = tmp_path / "conf.d"
+    folder.mkdir()
+    shutil.copy(ROOT / "systemd/mosquitto/skin.acl", tmp_path)
     (tmp_path / "skin.passwords").write_text("")
-    (tmp_path / "skin.acl").write_text(acl)
-    (tmp_path / "mosquitto.conf").write_text(text)
+    authority(tmp_path, "ca")
+    certificate(tmp_path, "server", "IP:127.0.0.1")
+    text = (ROOT / "systemd/mosquitto/skin.conf").read_text()
+    text = text.replace("/etc/mosquitto/certs/", f"{tmp_path}/")
+    text = text.replace("/etc/mosquitto/", f"{tmp_path}/")
+    text = text.replace("listener 1883 127.0.0.1", f"listener 0 {tmp_path}/socket")
+    text = text.replace("listener 8883", f"listener {free_port()} 127.0.0.1")
+    (folder / "skin.conf").write_text(text)
+    main = Path("/etc/mosquitto/mosquitto.conf").read_text()
+    for place in ("/run/mosquitto/", "/var/lib/mosquitto/", "/var/log/mosquitto/"):
+        assert place in main
+        main = main.replace(place, f"{tmp_path}/")
+    main = main.replace("/etc/mosquitto/conf.d", str(folder))
+    (tmp_path / "mosquitto.conf").write_text(f"user root\n{main}")
     try:
         done = subprocess.run(
             [program, "-c", tmp_path / "mosquitto.conf"],
             check=False,
             capture_output=True,
             text=True,
-            timeout=1.0,
+            timeout=2.0,
         )
     except subprocess.TimeoutExpired:
+        assert (tmp_path / "socket").exists()
         return  # it runs
-    pytest.fail(done.stderr)
+    pytest.fail(done.stderr + (tmp_path / "mosquitto.log").read_text())

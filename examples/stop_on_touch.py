@@ -1,0 +1,20 @@
+"""Stop when a part is touched, or may be. `python examples/stop_on_touch.py PART [URL]`."""
+
+import sys
+
+from skin_host.client import Contact, SkinCallbacks
+
+
+def on_contact(contact: Contact) -> None:
+    """Let the motor move only while it is known that nothing touches."""
+    if contact.touched:  # ON, and UNKNOWN for whatever reason
+        print("stop", contact.why or "touched", flush=True)
+    else:
+        print("move", flush=True)
+
+
+print("stop", "until something is known", flush=True)
+with SkinCallbacks(*sys.argv[2:]) as skin:
+    skin.on_contact(on_contact, part=sys.argv[1])
+    sys.stdin.read()
+print("stop", "the program ends", flush=True)

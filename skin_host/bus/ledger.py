@@ -1,0 +1,203 @@
+"""State of each board of a node: when it sent last, how regularly, what is missing.
+
+There is one ledger for all boards, updated once per sweep. Supervision, validity and health read
+it, so that there is one answer to each question: whether a board has timed out, what its status
+words report, how often it was reset.
+
+Silence is measured on a clock that only runs while the buses are read up to the present: it
+advances with the reader's calls of `look` (in a replay with the sweeps' time stamps), a pause
+counts for no more than a limit, and a clock that is set back or forward changes nothing. While
+nothing is read, or old frames are read, no board times out.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.bus.assembler import Sweep
+from skin_host.bus.protocol import TAXELS, TRIANGLES, out_of_range, status_error
+from skin_host.layout import BoardLayout
+
+Mask = NDArray[np.bool_]
+
+#: A pause between two calls of `look` counts for no more than this: after a longer one it is not
+#: yet known which boards sent. Planned pauses are shorter.
+LONGEST_PAUSE_NS = 100_000_000
+#: A time stamp that is older than the newest by more than this comes from a clock that was set.
+LONGEST_DISORDER_NS = 1_000_000_000
+#: Intervals between sweeps that are kept.
+INTERVALS = 16
+#: After this long without a sweep, the intervals before it are not used for the period.
+STALE_INTERVALS_NS = 1_000_000_000
+#: Triangles are missing after this many sweeps in a row: single frames get lost and sweeps get cut.
+MISSING_SWEEPS = 5
+#: For a regular board all intervals, except the longest and shortest fifth, lie within this share.
+UNEVEN = 0.1
+_BITS = np.arange(TRIANGLES)
+_NO_STATUS = bytes(2 * TRIANGLES)
+
+
+class BoardLedger:
+    """Arrays over the boards of a node; a board's place in them is its row.
+
+    Args:
+        boards: (index in `Layout.boards`, board) of each.
+        silent_periods: a board has timed out after this many of its periods without a sweep.
+        poll_ms: longest planned pause between two reads of the buses.
+
+    Attributes:
+        row: of each board, by its index.
+        now_ns: the ledger's own clock; starts at 0.
+        received_ns: int64[b], when the last sweep was received, on that clock.
+        last: the last sweep of each board.
+        sweeps: int64[b], how many were received.
+        present: bool[b, 16], triangles of the last sweep.
+        error: uint8[b, 16], error nibbles of the last sweep's status words, see `StatusError`.
+        far: bool[b, 16, 12], pads that the last sweep's status words mark as far out of range.
+        flagged: whether a board's last sweep had any status word that is not 0.
+        absent: int64[b, 16], in how many sweeps in a row each enabled triangle has been missing.
+        silences, resets, lost_set_ups, tx_overflows, rezeros: int64[b], how often it timed out,
+            restarted by itself, sent something that it was not set up to send, reported that it had
+            to drop frames, and was zeroed.
+    """
+
+    def __init__(
+        self,
+        boards: Sequence[tuple[int, BoardLayout]],
+        silent_periods: float,
+        poll_ms: float = 0.0,
+    ) -> None:
+        n = len(boards)
+        self.row = {index: row for row, (index, _) in enumerate(boards)}
+        self.now_ns = 0
+        self._newest_ns: int | None = None
+        self._looked = False
+        self._longest_ns = LONGEST_PAUSE_NS + int(poll_ms * 1e6)
+        self._period_ns = np.array([board.settings.period_ms for _, board in boards]) * 1_000_000
+        self._silent_after_ns = (silent_periods * self._period_ns).astype(np.int64)
+        self._enabled = [board.enabled for _, board in boards]
+
+        self.received_ns = np.zeros(n, np.int64)
+        self.last: list[Sweep | None] = [None] * n
+        self.sweeps = np.zeros(n, np.int64)
+        self.present = np.zeros((n, TRIANGLES), np.bool_)
+        self._present = [0] * n
+        self.error = np.zeros((n, TRIANGLES), np.uint8)
+        self.far = np.zeros((n, TRIANGLES, TAXELS), np.bool_)
+        self.flagged = [False] * n
+        self.absent = np.zeros((n, TRIANGLES), np.int64)
+        self._complete = [True] * n
+        self._intervals_ns = np.zeros((n, INTERVALS), np.int64)
+        self._n_intervals = [0] * n
+        self._since_set_up = [0] * n
+        self.silences = np.zeros(n, np.int64)
+        self.resets = np.zeros(n, np.int64)
+        self.lost_set_ups = np.zeros(n, np.int64)
+        self.tx_overflows = np.zeros(n, np.int64)
+        self.rezeros = np.zeros(n, np.int64)
+
+    def look(self, now_ns: int) -> None:
+        """Everything received up to `now_ns` has been read (clock of the time stamps)."""
+        self._looked = True
+        self._advance(now_ns)
+
+    def note(self, sweep: Sweep) -> int:
+        """Take in a sweep; return the row of its board."""
+        row = self.row[sweep.board]
+        if not self._looked:
+            self._advance(sweep.t_ns)
+        before = self.last[row]
+        self.last[row] = sweep
+        self.received_ns[row] = self.now_ns
+        self.sweeps[row] += 1
+        if before is not None and self._since_set_up[row]:
+            self._note_interval(row, sweep.t_ns - before.t_ns)
+        self._since_set_up[row] += 1
+        if sweep.present != self._present[row]:
+            self._present[row] = sweep.present
+            self.present[row] = sweep.present >> _BITS & 1
+        complete = not self._enabled[row] & ~sweep.present
+        if not (complete and self._complete[row]):
+            self._complete[row] = complete
+            enabled = self._enabled[row] >> _BITS & 1
+            self.absent[row] = (self.absent[row] + enabled) * ~self.present[row]
+        # Comparing bytes costs a tenth of numpy's `any`.
+        flagged = sweep.status.tobytes() != _NO_STATUS
+        if flagged or self.flagged[row]:
+            self.flagged[row] = flagged
+            self.error[row] = status_error(sweep.status)
+            self.far[row] = out_of_range(sweep.status)
+        return row
+
+    def set_up(self, row: int) -> None:
+        """Note that a board has been set up: its earlier sweeps are no longer compared with the
+        set-up.
+        """
+        self._since_set_up[row] = 0
+        self._n_intervals[row] = 0
+
+    def since_set_up(self, row: int) -> int:
+        """Return how many sweeps came since a board was set up."""
+        return self._since_set_up[row]
+
+    def complete(self, row: int) -> bool:
+        """Whether the last sweep had every enabled triangle."""
+        return self._complete[row]
+
+    @property
+    def silent(self) -> Mask:
+        """Return the boards that have timed out, bool[b]."""
+        return self.now_ns - self.received_ns > self._silent_after_ns
+
+    def is_silent(self, row: int) -> bool:
+        """Return whether a board has timed out."""
+        return self.overdue(row, 0)
+
+    def overdue(self, row: int, since_ns: int) -> bool:
+        """As `is_silent`, for a board that could not send before `since_ns` (ledger's clock)."""
+        quiet_ns = self.now_ns - max(int(self.received_ns[row]), since_ns)
+        return quiet_ns > int(self._silent_after_ns[row])
+
+    def missing(self, row: int) -> int:
+        """Return a mask of the enabled triangles that a board has not sent since it was set up, or
+        has stopped sending.
+        """
+        if self._complete[row] or self._since_set_up[row] < MISSING_SWEEPS:
+            return 0
+        return int((self.absent[row] >= MISSING_SWEEPS) @ (1 << _BITS))
+
+    def intervals_ns(self, row: int) -> NDArray[np.int64]:
+        """Return the last intervals int64[up to 16] between a board's sweeps, unordered."""
+        return self._intervals_ns[row, : min(self._n_intervals[row], INTERVALS)]
+
+    def regular_period_ns(self, row: int) -> float | None:
+        """Return the median of a board's last intervals, or None if they are few or irregular.
+
+        A board's timer is regular, whatever period is set. Irregular intervals are delays
+        elsewhere.
+        """
+        intervals = np.sort(self.intervals_ns(row))
+        if len(intervals) < INTERVALS // 2 - 1:
+            return None
+        places = np.array((0.2, 0.5, 0.8)) * (len(intervals) - 1)
+        low_ns, usual_ns, high_ns = np.interp(places, np.arange(len(intervals)), intervals).tolist()
+        return usual_ns if high_ns - low_ns < UNEVEN * usual_ns else None
+
+    def _note_interval(self, row: int, interval_ns: int) -> None:
+        if not 0 < interval_ns < STALE_INTERVALS_NS:
+            self._n_intervals[row] = 0
+            return
+        n = self._n_intervals[row]
+        self._intervals_ns[row, n % INTERVALS] = interval_ns
+        self._n_intervals[row] = n + 1
+
+    def _advance(self, now_ns: int) -> None:
+        newest_ns, self._newest_ns = self._newest_ns, now_ns
+        if newest_ns is None:
+            return
+        passed_ns = now_ns - newest_ns
+        if passed_ns > 0:
+            self.now_ns += min(passed_ns, self._longest_ns)
+        elif passed_ns > -LONGEST_DISORDER_NS:
+            self._newest_ns = newest_ns

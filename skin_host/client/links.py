@@ -1,0 +1,152 @@
+"""Connection of a client to one broker: kept up, and subscribed to the wanted topics."""
+
+import asyncio
+import logging
+from collections.abc import Iterable
+from typing import Protocol
+
+from skin_host.errors import BrokerError, SkinError
+from skin_host.publish.address import Broker
+from skin_host.publish.connection import (
+    Connection,
+    Message,
+    MqttError,
+    Retry,
+    connect,
+    explain,
+    first_error,
+    is_refusal,
+)
+from skin_host.publish.payload import MAX_PACKET_BYTES
+
+MAX_INCOMING = 10_000
+#: The broker keeps touch events for this long while we are disconnected (MQTT 5).
+SESSION_S = 60
+
+_log = logging.getLogger(__name__)
+
+
+class Hearer(Protocol):
+    """The user of a link, which receives its messages."""
+
+    async def prepare(self, connection: Connection, broker: Broker) -> None:
+        """Find out what must be known before the first subscription."""
+
+    def wanted(self) -> Iterable[str]:
+        """Return the topics to subscribe to."""
+
+    def take(self, link: "Link", message: Message) -> None:
+        """Take a message."""
+
+    def unfollow(self, topic: str) -> None:
+        """A topic is no longer subscribed."""
+
+    def note(self, link: "Link") -> None:
+        """The link was made, or lost, or could not be made."""
+
+
+class Link:
+    """A connection that is kept up.
+
+    Args:
+        number: of the broker among those of the client.
+        broker: where.
+        identifier: our name at the broker.
+        hearer: receives the messages.
+
+    Attributes:
+        connection: None before all wanted topics have been subscribed to once.
+        connections: how often it was made.
+        since_s: when it was made last, by the event loop's clock.
+        last_error: why it was lost, or not made.
+        failure: why it will not be made, as far as is known, before it was made once.
+        again: to be set when the wanted topics change.
+    """
+
+    def __init__(self, number: int, broker: Broker, identifier: str, hearer: Hearer) -> None:
+        self.number = number
+        self.broker = broker
+        self.connection: Connection | None = None
+        self.connections = 0
+        self.since_s = 0.0
+        self.last_error = ""
+        self.failure: SkinError | None = None
+        self.again = asyncio.Event()
+        self._identifier = identifier
+        self._hearer = hearer
+        self._subscribed: set[str] = set()
+        self._kept: set[str] = set()  # subscriptions that the broker may still have
+
+    @property
+    def tried(self) -> bool:
+        """Return whether the broker has been found, or found absent."""
+        return bool(self.connections or self.last_error)
+
+    def has(self, topics: set[str]) -> bool:
+        """Return whether all of these are subscribed."""
+        return self._subscribed >= topics
+
+    async def run(self) -> None:
+        """Keep the connection up until cancelled."""
+        retry = Retry()
+        loop = asyncio.get_running_loop()
+        while True:
+            since_s: float | None = None
+            try:
+                async with connect(
+                    self.broker,
+                    identifier=self._identifier,
+                    max_incoming=MAX_INCOMING,
+                    max_packet=MAX_PACKET_BYTES,
+                    session_s=SESSION_S,
+                    resume=self.connections > 0,
+                ) as connection:
+                    since_s = loop.time()
+                    await self._talk(connection)
+            except* Exception as group:
+                self._note_loss(first_error(group))
+            finally:
+                self.connection = None
+                self._kept |= self._subscribed
+                self._subscribed = set()
+                self._hearer.note(self)
+            await asyncio.sleep(retry.delay_s(0.0 if since_s is None else loop.time() - since_s))
+
+    def _note_loss(self, error: BaseException) -> None:
+        why = explain(error)
+        if self.connections and why != self.last_error:
+            unknown = None if isinstance(error, MqttError) else error
+            _log.warning("broker %s: %s; trying again", self.broker, why, exc_info=unknown)
+        self.last_error = why
+        if not self.connections:
+            if isinstance(error, SkinError):
+                self.failure = error
+            elif is_refusal(error):
+                self.failure = BrokerError(f"broker {self.broker}: refuses us: {why}")
+
+    async def _talk(self, connection: Connection) -> None:
+        await self._hearer.prepare(connection, self.broker)
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._keep_subscribed(connection))
+            async for message in connection.messages:
+                self._hearer.take(self, message)
+
+    async def _keep_subscribed(self, connection: Connection) -> None:
+        while True:
+            self.again.clear()
+            want = set(self._hearer.wanted())
+            # Nodes first: what is retained of a part whose node has stopped is out of date.
+            for topic in sorted(want - self._subscribed, key=lambda one: "/nodes/" not in one):
+                await connection.subscribe(topic, qos=0 if topic.endswith("/frame") else 1)
+            for topic in (self._subscribed | self._kept) - want:
+                await connection.unsubscribe(topic)
+                self._hearer.unfollow(topic)
+            self._subscribed, self._kept = want, set()
+            if self.connection is None:
+                self.connection = connection
+                self.connections += 1
+                self.failure = None
+                self.since_s = asyncio.get_running_loop().time()
+                _log.info("broker %s: connected", self.broker)
+            self._hearer.note(self)
+            await self.again.wait()

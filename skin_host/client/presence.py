@@ -1,0 +1,167 @@
+"""Contact state of the parts, and whether it is still known. Pure: takes times.
+
+Fails safe: a part whose node is offline or silent, or whose broker is lost, is UNKNOWN, whatever
+was received from it last.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+from skin_host.publish.messages import ContactState, Touch
+
+#: Why a contact state is unknown: the node cannot feel all of the part; the node, or only this
+#: part, has not been received for too long; the node has stopped; the broker is lost.
+Why = Literal["not_felt", "stale", "offline", "disconnected"]
+
+
+class Contact(NamedTuple):
+    """Whether anything touches a part; `why` is given only with UNKNOWN."""
+
+    part: str
+    state: ContactState
+    why: Why | None = None
+
+    @property
+    def known(self) -> bool:
+        """Return whether the state is known."""
+        return self.state != "UNKNOWN"
+
+    @property
+    def touched(self) -> bool:
+        """Return whether the part may be touched: true also for UNKNOWN, so that it fails safe."""
+        return self.state != "OFF"
+
+
+@dataclass(slots=True)
+class _Part:
+    #: None: not yet received over this connection.
+    received: ContactState | None
+    alive_s: float
+    #: Brokers from which the state came; without any it is out of date.
+    over: set[int] = field(default_factory=set)
+    reported: Contact | None = None
+    touches: dict[int, tuple[Touch, float]] = field(default_factory=dict)
+
+
+class Presence:
+    """Follows contact states, touches and signs of life.
+
+    Args:
+        stale_s: a part not received for this long is UNKNOWN. Its health is sent once a second.
+    """
+
+    def __init__(self, stale_s: float) -> None:
+        self._stale_s = stale_s
+        self._parts: dict[str, _Part] = {}
+        self._node_of: dict[str, str] = {}
+        self._offline: set[str] = set()
+
+    def take_state(
+        self,
+        part: str,
+        state: ContactState | None,
+        now_s: float,
+        broker: int = 0,
+        *,
+        again: bool = False,
+    ) -> None:
+        """Take the newest contact state; None: it was deleted.
+
+        Args:
+            part: whose.
+            state: what was received.
+            now_s: the time.
+            broker: from which it came.
+            again: it came from another broker before.
+        """
+        if state is None:
+            self._parts.pop(part, None)
+            return
+        known = self._parts.setdefault(part, _Part(state, now_s))
+        known.received, known.alive_s = state, now_s
+        known.over = known.over | {broker} if again else {broker}
+        if state == "OFF":
+            known.touches.clear()
+
+    def take_sign(self, part: str, now_s: float) -> None:
+        """Take any other message of a part that was not a retained one."""
+        if part in self._parts:
+            self._parts[part].alive_s = now_s
+
+    def take_touch(self, touch: Touch, now_s: float) -> None:
+        """Take a touch event."""
+        part = self._parts.setdefault(touch.part, _Part(None, now_s))
+        part.alive_s = now_s
+        if touch.event == "end":
+            part.touches.pop(touch.id, None)
+        else:
+            part.touches[touch.id] = touch, now_s
+
+    def take_node(self, node: str, online: bool | None) -> None:
+        """Take the status of a node."""
+        if online is False:
+            self._offline.add(node)
+        else:
+            self._offline.discard(node)
+
+    def take_info(self, node: str, parts: Iterable[str]) -> None:
+        """Take which parts a node has."""
+        self._node_of |= dict.fromkeys(parts, node)
+
+    def take_loss(self, broker: int = 0) -> None:
+        """Note the loss of a broker. Its retained messages come again with the next connection."""
+        for part in self._parts.values():
+            part.over.discard(broker)
+            if not part.over:
+                part.received = None
+
+    def forget(self) -> None:
+        """Forget all parts."""
+        self._parts.clear()
+
+    def contact(self, part: str, now_s: float) -> Contact | None:
+        """Return the present state of a part; None if nothing was received of it."""
+        known = self._parts.get(part)
+        if known is None or (known.received is None and known.reported is None):
+            return None
+        why: Why | None = None
+        if known.received is None:
+            why = "disconnected"
+        elif self._node_of.get(part) in self._offline:
+            why = "offline"
+        elif now_s - known.alive_s > self._stale_s:
+            why = "stale"
+        elif known.received == "UNKNOWN":
+            why = "not_felt"
+        received = "UNKNOWN" if why is not None else known.received
+        return Contact(part, received or "UNKNOWN", why)
+
+    def touches(self, part: str | None, now_s: float) -> list[Touch]:
+        """What touches a part, or all, as far as it is known.
+
+        A touch whose end was lost goes when it has not moved for `stale_s` while its part was
+        received: a touch that lasts moves once a second.
+        """
+        found = []
+        for name, known in self._parts.items():
+            for number, (touch, at_s) in list(known.touches.items()):
+                if min(known.alive_s, now_s) - at_s > self._stale_s:
+                    del known.touches[number]
+                elif part in (None, name):
+                    found.append(touch)
+        return found
+
+    def reported(self) -> list[Contact]:
+        """The contact states as they were reported last."""
+        return [one.reported for one in self._parts.values() if one.reported is not None]
+
+    def changes(self, now_s: float) -> list[Contact]:
+        """Contact states that have changed since they were asked for last."""
+        changed = []
+        for name, known in self._parts.items():
+            now = self.contact(name, now_s)
+            if now is not None and now != known.reported:
+                known.reported = now
+                changed.append(now)
+        return changed

@@ -1,0 +1,308 @@
+"""Time and random numbers: the machine's, or stepped time and a seed.
+
+The daemon gets the time, waits, starts threads and draws random numbers only through a `Clock`;
+nothing else in its path uses the system's. With a `SteppedClock` the whole daemon, emulated robots
+and their bus run in one event loop, without a thread, as fast as the machine can:
+
+    clock = SteppedClock()
+    with clock.runner() as runner:
+        runner.run(main(clock))
+
+Its loop never waits. When nothing is ready to run, time jumps to the next timer, so `asyncio.sleep`
+and `asyncio.timeout` of libraries are stepped too. The same run gives the same results, as long as
+nothing outside the process takes part.
+"""
+
+import asyncio
+import ctypes
+import os
+import random
+import selectors
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from datetime import UTC, datetime
+from typing import Any, Protocol, TypeVar, TypeVarTuple, Unpack
+
+T = TypeVar("T")
+Ts = TypeVarTuple("Ts")
+
+NS_PER_S = 1_000_000_000
+#: Stepped time begins at a plausible time of day.
+EPOCH_NS = 1_700_000_000 * NS_PER_S
+#: A stepped loop without any timer waits this long at a time for a thread or for outside input.
+OUTSIDE_S = 0.01
+
+
+class Alarm(Protocol):
+    """A timer that calls a function."""
+
+    def set(self, delay_ns: int) -> None:
+        """Ring once after `delay_ns` > 0, and not before; this replaces an earlier setting."""
+
+    def close(self) -> None:
+        """Never ring again."""
+
+
+class Clock:
+    """The machine's time, timers, threads and random numbers."""
+
+    def __init__(self) -> None:
+        self._random = random.Random()
+
+    def now_ns(self) -> int:
+        """Time of day since 1970: that of the frames' time stamps. It may be set."""
+        return time.time_ns()
+
+    def monotonic_ns(self) -> int:
+        """Return a time that is never set."""
+        return time.monotonic_ns()
+
+    def monotonic_s(self) -> float:
+        """The same in seconds."""
+        return self.monotonic_ns() / NS_PER_S
+
+    def today(self) -> datetime:
+        """Date and time of day in UTC."""
+        return datetime.fromtimestamp(self.now_ns() / NS_PER_S, UTC)
+
+    def uniform(self, low: float, high: float) -> float:
+        """Return a random number between the two; each process draws different ones."""
+        return self._random.uniform(low, high)
+
+    async def sleep(self, seconds: float) -> None:
+        """Wait; other tasks run meanwhile, at least once."""
+        await asyncio.sleep(seconds)
+
+    def call_later(self, seconds: float, call: Callable[[Unpack[Ts]], object], *args: *Ts) -> None:
+        """Call a function of the running loop once."""
+        asyncio.get_running_loop().call_later(seconds, call, *args)
+
+    def timeout(self, seconds: float) -> asyncio.Timeout:
+        """Raise TimeoutError in a block of code that takes longer."""
+        return asyncio.timeout(seconds)
+
+    def timeout_at(self, when_s: float | None) -> asyncio.Timeout:
+        """The same at a time of `monotonic_s`; never, if it is None."""
+        return asyncio.timeout_at(when_s)
+
+    def alarm(self, ring: Callable[[], object]) -> Alarm:
+        """A timer of the running loop that is late by microseconds only."""
+        return _TimerFd(ring)
+
+    async def in_thread(self, function: Callable[[Unpack[Ts]], T], *args: *Ts) -> T:
+        """Run a blocking function, for a disk or a resolver, beside the event loop.
+
+        Unlike with `asyncio.to_thread`, the end of the program does not wait for it: a cancelled
+        caller
+        leaves the thread running.
+
+        Raises:
+            Exception: what the function raises.
+        """
+        loop = asyncio.get_running_loop()
+        done: asyncio.Future[T] = loop.create_future()
+
+        def settle(result: T | None, error: BaseException | None) -> None:
+            if done.done():
+                return
+            if error is not None:
+                done.set_exception(error)
+            else:
+                done.set_result(result)  # type: ignore[arg-type]
+
+        def run() -> None:
+            result, error = None, None
+            try:
+                result = function(*args)
+            except BaseException as raised:
+                error = raised
+            try:
+                loop.call_soon_threadsafe(settle, result, error)
+            except RuntimeError:
+                return  # the loop has ended meanwhile
+
+        name = getattr(function, "__name__", "work")
+        threading.Thread(target=run, name=name, daemon=True).start()
+        return await done
+
+    def executor(self, name: str) -> "Executor":
+        """Return a thread that runs one function after the other."""
+        return _Thread(name)
+
+    def thread(self, function: Callable[[], object], name: str) -> threading.Thread:
+        """Start a thread that nothing waits for, also beside stepped time: it may only write."""
+        thread = threading.Thread(target=function, name=name, daemon=True)
+        thread.start()
+        return thread
+
+
+class Executor(ABC):
+    """Runs one function after the other beside the event loop, in order."""
+
+    @abstractmethod
+    def submit(self, function: Callable[[Unpack[Ts]], T], *args: *Ts) -> "Future[T]":
+        """Run a function; see `concurrent.futures`."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Start no further functions; a running one is not waited for."""
+
+
+class SteppedClock(Clock):
+    """Time that moves when nothing is left to do at the present, or by `advance`.
+
+    Args:
+        epoch_ns: the time of day at which it begins.
+        seed: of the random numbers: the same seed gives the same ones.
+    """
+
+    def __init__(self, epoch_ns: int = EPOCH_NS, seed: int = 0) -> None:
+        self._random = random.Random(seed)
+        self._epoch_ns = epoch_ns
+        self._t_ns = 0
+
+    def now_ns(self) -> int:
+        return self._epoch_ns + self._t_ns
+
+    def monotonic_ns(self) -> int:
+        return self._t_ns
+
+    def advance(self, seconds: float) -> None:
+        """Move time on, as if the process had been stopped."""
+        self._t_ns += round(seconds * NS_PER_S)
+
+    def set(self, jump_s: float) -> None:
+        """Set the time of day forward or back."""
+        self._epoch_ns += round(jump_s * NS_PER_S)
+
+    def alarm(self, ring: Callable[[], object]) -> Alarm:
+        return _LoopAlarm(ring)
+
+    async def in_thread(self, function: Callable[[Unpack[Ts]], T], *args: *Ts) -> T:
+        """Run the function directly, without a thread."""
+        await asyncio.sleep(0)
+        return function(*args)
+
+    def executor(self, name: str) -> Executor:
+        """Return an executor without a thread."""
+        return _Inline()
+
+    def runner(self) -> asyncio.Runner:
+        """Runs coroutines by this clock; see `asyncio.Runner`."""
+        return asyncio.Runner(loop_factory=lambda: _SteppedLoop(self))
+
+
+class _SteppedLoop(asyncio.SelectorEventLoop):
+    """An event loop whose time is a stepped clock's."""
+
+    def __init__(self, clock: SteppedClock) -> None:
+        super().__init__(_Jumping(clock))
+        self._clock = clock
+
+    def time(self) -> float:
+        return self._clock.monotonic_s()
+
+    def run_in_executor(  # type: ignore[override]
+        self, executor: Any, func: Any, *args: Any
+    ) -> "asyncio.Future[Any]":
+        """Run the function directly, without a thread."""
+        done = self.create_future()
+        try:
+            done.set_result(func(*args))
+        except Exception as error:
+            done.set_exception(error)
+        return done
+
+
+class _Jumping(selectors.DefaultSelector):
+    """Makes time jump where a loop would wait for its next timer."""
+
+    def __init__(self, clock: SteppedClock) -> None:
+        super().__init__()
+        self._clock = clock
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        ready = super().select(0)
+        if ready or timeout == 0:
+            return ready
+        if timeout is None:
+            return super().select(OUTSIDE_S)
+        self._clock._t_ns += int(timeout * NS_PER_S) + 1
+        return ready
+
+
+class _TimerFd:
+    """timerfd_create(2), because the event loop's own timers are late by up to a millisecond."""
+
+    _CLOCK_MONOTONIC = 1
+
+    def __init__(self, ring: Callable[[], object]) -> None:
+        libc = ctypes.CDLL(None, use_errno=True)
+        self._fd: int = libc.timerfd_create(self._CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
+        if self._fd < 0:
+            code = ctypes.get_errno()
+            raise OSError(code, os.strerror(code))
+        self._settime = libc.timerfd_settime
+        # struct itimerspec: an interval (none) and a first time, each in s and ns.
+        self._time = (ctypes.c_long * 4)()
+        self._time_at = ctypes.byref(self._time)
+        self._loop = asyncio.get_running_loop()
+        # Expirations are not read: setting the next time makes the descriptor unreadable.
+        self._loop.add_reader(self._fd, ring)
+
+    def set(self, delay_ns: int) -> None:
+        self._time[2], self._time[3] = divmod(delay_ns, NS_PER_S)
+        self._settime(self._fd, 0, self._time_at, None)
+
+    def close(self) -> None:
+        if self._fd >= 0:
+            self._loop.remove_reader(self._fd)
+            os.close(self._fd)
+            self._fd = -1
+
+
+class _LoopAlarm:
+    """A timer of the loop itself: exact where the loop's time is stepped."""
+
+    def __init__(self, ring: Callable[[], object]) -> None:
+        self._ring = ring
+        self._handle: asyncio.TimerHandle | None = None
+
+    def set(self, delay_ns: int) -> None:
+        self.close()
+        loop = asyncio.get_running_loop()
+        self._handle = loop.call_later(delay_ns / NS_PER_S, self._ring)
+
+    def close(self) -> None:
+        if self._handle is not None:
+            self._handle.cancel()
+
+
+class _Thread(Executor):
+    def __init__(self, name: str) -> None:
+        self._pool = ThreadPoolExecutor(1, name)
+
+    def submit(self, function: Callable[[Unpack[Ts]], T], *args: *Ts) -> "Future[T]":
+        return self._pool.submit(function, *args)
+
+    def close(self) -> None:
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+class _Inline(Executor):
+    def submit(self, function: Callable[[Unpack[Ts]], T], *args: *Ts) -> "Future[T]":
+        done: Future[T] = Future()
+        try:
+            done.set_result(function(*args))
+        except Exception as error:
+            done.set_exception(error)
+        return done
+
+    def close(self) -> None:
+        pass
+
+
+SYSTEM = Clock()

@@ -1,0 +1,573 @@
+"""A fleet: many robots over three brokers, of which one is killed and brought back, one frozen.
+
+`skin bench fleet` needs mosquitto on the PATH; its three know nothing of each other. The robots are
+publishers as the daemon has them, with touches, contacts and health recorded from the demo's left
+hand. At each broker a subscriber receives all robots, and orders their messages by number as
+`SkinClient` does. What is counted: events that a broker acknowledged and that were not passed
+on, or twice, or out of order; and states that differ from all that the robot has sent within 5 s.
+"""
+
+import asyncio
+import json
+import logging
+import multiprocessing
+import os
+import random
+import resource
+import shutil
+import signal
+import socket
+import subprocess
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from multiprocessing.connection import Connection as Pipe
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import msgspec
+import numpy as np
+
+from skin_host.client.links import Link
+from skin_host.client.order import EventOrder, Newest
+from skin_host.client.presence import Presence
+from skin_host.client.session import HOLD_S
+from skin_host.errors import RequestError
+from skin_host.evaluation.machine import machine
+from skin_host.processing.events import TouchEvent
+from skin_host.publish.address import Broker
+from skin_host.publish.connection import Connection, Message
+from skin_host.publish.messages import Touch, decode_contact, decode_touch
+from skin_host.publish.mqtt import Publisher
+from skin_host.publish.order import run_of, stamp_of
+from skin_host.publish.topics import ONLINE
+from skin_host.settings import Mqtt
+
+TRAFFIC = Path(__file__).parent / "fleet_traffic.jsonl"
+BASE = "skin"
+PART = "left_hand"
+STALE_S = 3.0
+#: A client's state may lag by this much.
+ALLOWED_S = 5.0
+DRAIN_S = 30.0
+WORKERS = 2
+
+
+class Brokers(Protocol):
+    """Three brokers that can be stopped and frozen."""
+
+    name: str
+    addresses: list[str]
+    username: str | None
+    password: str | None
+
+    def kill(self, number: int) -> None:
+        """End a broker at once."""
+
+    def start(self, number: int) -> None:
+        """Start it again."""
+
+    def freeze(self, number: int) -> None:
+        """Freeze it."""
+
+    def resume(self, number: int) -> None:
+        """Let it continue."""
+
+    def cpu_s(self) -> float:
+        """Return the CPU time of the running brokers."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How long and how much.
+
+    Attributes:
+        robots: how many.
+        pace: of the recording; 1 is as fast as it was.
+        health_s: between two records of a robot's health.
+        phase_s: of each of: quiet, one killed, it is back, another frozen, it is back.
+    """
+
+    robots: int = 1000
+    pace: float = 0.15
+    health_s: float = 2.0
+    phase_s: float = 12.0
+
+
+PHASES = ("quiet", "one killed", "it is back", "another frozen", "it goes on")
+
+
+class Sent(NamedTuple):
+    """What a robot has sent: number of events, number of dropped ones, and its contact states."""
+
+    events: int
+    dropped: int
+    waiting: int
+    connections: int
+    contacts: list[tuple[float, str]]
+
+
+def run(*, quick: bool = False, robots: int | None = None) -> dict[str, Any]:
+    """Measure with mosquittos and return the document."""
+    plan = Plan(robots=60, pace=1.0, health_s=1.0, phase_s=6.0) if quick else Plan()
+    if robots is not None:
+        plan = replace(plan, robots=robots)
+    with mosquittos() as brokers:
+        return measure(brokers, plan)
+
+
+def measure(brokers: Brokers, plan: Plan) -> dict[str, Any]:
+    """Let the fleet run through all phases."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, max(soft, 65536)), hard))
+    context = multiprocessing.get_context("spawn")
+    pipes: list[Pipe] = []
+    workers = []
+    for number in range(WORKERS):
+        mine, theirs = context.Pipe()
+        names = [f"robot{i}" for i in range(number, plan.robots, WORKERS)]
+        keys = {"username": brokers.username, "brokers": brokers.addresses}
+        worker = context.Process(
+            target=_work, args=(theirs, names, keys, brokers.password, plan), daemon=True
+        )
+        worker.start()
+        pipes.append(mine)
+        workers.append(worker)
+    try:
+        return asyncio.run(_conduct(brokers, plan, pipes))
+    finally:
+        for worker in workers:
+            worker.kill()
+            worker.join()
+
+
+async def _conduct(brokers: Brokers, plan: Plan, pipes: list[Pipe]) -> dict[str, Any]:
+    logging.getLogger("skin_host.client").setLevel(logging.ERROR)
+    ear = _Receiver(plan)
+    links = [
+        Link(i, _broker(address, brokers), f"ear-{os.getpid()}-{i}", ear)
+        for i, address in enumerate(brokers.addresses)
+    ]
+    tasks = [asyncio.create_task(link.run()) for link in links]
+    tasks.append(asyncio.create_task(ear.watch()))
+    while not all(link.connection for link in links):  # noqa: ASYNC110
+        await asyncio.sleep(0.05)
+    for pipe in pipes:
+        pipe.send("start")
+    for pipe in pipes:
+        assert await asyncio.to_thread(pipe.recv) == "connected"
+    rows = []
+    deeds = [
+        lambda: None,
+        lambda: brokers.kill(0),
+        lambda: brokers.start(0),
+        lambda: brokers.freeze(1),
+        lambda: brokers.resume(1),
+    ]
+    for phase, deed in zip(PHASES, deeds, strict=True):
+        await asyncio.to_thread(deed)
+        ear.begin_phase()
+        began_s, cpu_s = time.monotonic(), brokers.cpu_s()
+        await asyncio.sleep(plan.phase_s)
+        took_s = time.monotonic() - began_s
+        rows.append(
+            ear.end_phase(phase, took_s)
+            | {"brokers_cpu": round(max(0.0, brokers.cpu_s() - cpu_s) / took_s, 3)}
+        )
+    for pipe in pipes:
+        pipe.send("end")
+    told: dict[str, Sent] = {}
+    for pipe in pipes:
+        told |= await asyncio.to_thread(pipe.recv)
+    await ear.settled({name: said.events for name, said in told.items()})
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+    verdict = ear.judge(told)
+    return {
+        "engine": brokers.name,
+        "machine": machine(),
+        "robots": plan.robots,
+        "pace": plan.pace,
+        "phases": rows,
+    } | verdict
+
+
+def _broker(address: str, brokers: Brokers) -> Broker:
+    host, _, port = address.rpartition(":")
+    return Broker(host, int(port), username=brokers.username, password=brokers.password)
+
+
+@dataclass
+class _Received:
+    """One robot, as assembled from its messages."""
+
+    order: EventOrder = field(default_factory=lambda: EventOrder(HOLD_S))
+    newest: Newest = field(default_factory=Newest)
+    presence: Presence = field(default_factory=lambda: Presence(STALE_S))
+    counts: list[int] = field(default_factory=list)
+    contacts: list[tuple[float, str]] = field(default_factory=list)
+    status: list[tuple[float, str]] = field(default_factory=list)
+
+    def note_contact(self) -> None:
+        """Store what a client would show."""
+        for contact in self.presence.changes(time.monotonic()):
+            self.contacts.append((time.time(), contact.state))
+
+
+class _Receiver:
+    """Receives all robots from all brokers; a `links.Hearer`."""
+
+    def __init__(self, plan: Plan) -> None:
+        self._robots = {f"robot{i}": _Received() for i in range(plan.robots)}
+        self._received = 0
+        self._delays_s: list[float] = []
+
+    async def prepare(self, connection: Connection, broker: Broker) -> None:
+        """Nothing must be known before subscribing."""
+
+    def wanted(self) -> Sequence[str]:
+        """Return all topics of all robots, except frames."""
+        kinds = [f"+/{kind}" for kind in ("touch", "contact", "health")]
+        return [f"{BASE}/+/{kind}" for kind in [*kinds, "nodes/+/status"]]
+
+    def unfollow(self, topic: str) -> None:
+        """Nothing is ever unfollowed."""
+
+    def note(self, link: Link) -> None:
+        """Links come and go."""
+        if link.connection is None:
+            for robot in self._robots.values():
+                robot.presence.take_loss(link.number)
+                robot.note_contact()
+
+    def take(self, link: Link, message: Message) -> None:
+        """Process a message."""
+        words = message.topic.value.split("/")
+        robot = self._robots.get(words[1])
+        if robot is None or not isinstance(message.payload, bytes):
+            return
+        self._received += 1
+        now_s = time.time()
+        kind = words[-1]
+        if kind == "touch":
+            touch = decode_touch(message.payload)
+            self._pass_on(
+                robot, robot.order.take(touch, run_of(message.properties), time.monotonic()), now_s
+            )
+            return
+        newness = robot.newest.take(kind, words[2], stamp_of(message.properties))
+        at_s = time.monotonic()
+        if kind == "contact" and newness is not False:
+            state = decode_contact(message.payload)
+            again = newness is None
+            robot.presence.take_state(PART, state, at_s, link.number, again=again)
+        elif kind == "health" and newness and not message.retain:
+            robot.presence.take_sign(PART, at_s)
+        elif kind == "status" and newness:
+            online = message.payload == ONLINE
+            robot.presence.take_node("main", online)
+            robot.status.append((now_s, message.payload.decode()))
+        robot.note_contact()
+
+    def _pass_on(self, robot: _Received, events: Sequence[Any], now_s: float) -> None:
+        for event in events:
+            assert isinstance(event, Touch)
+            robot.counts.append(event.count)
+            self._delays_s.append(now_s - event.t_ns * 1e-9)
+            robot.presence.take_touch(event, time.monotonic())
+        robot.note_contact()
+
+    async def watch(self) -> None:
+        """Release events whose predecessors never came."""
+        while True:
+            await asyncio.sleep(0.25)
+            now_s = time.monotonic()
+            for robot in self._robots.values():
+                self._pass_on(robot, robot.order.expire(now_s), time.time())
+
+    async def settled(self, events: dict[str, int]) -> None:
+        """Wait until as much was received as was sent, for a limited time."""
+        until_s = time.monotonic() + DRAIN_S
+        while time.monotonic() < until_s and any(  # noqa: ASYNC110
+            len(self._robots[name].counts) < n for name, n in events.items()
+        ):
+            await asyncio.sleep(0.1)
+        await asyncio.sleep(2 * HOLD_S)
+
+    def begin_phase(self) -> None:
+        """Start counting for a phase."""
+        self._received = 0
+        self._delays_s = []
+
+    def end_phase(self, name: str, seconds: float) -> dict[str, Any]:
+        """Return the results of the phase."""
+        delays_ms = np.array(self._delays_s or [np.nan]) * 1e3
+        return {
+            "phase": name,
+            "messages_s": round(self._received / seconds, 1),
+            "events_s": round(len(self._delays_s) / seconds, 1),
+            "p50_ms": round(float(np.percentile(delays_ms, 50)), 1),
+            "p99_ms": round(float(np.percentile(delays_ms, 99)), 1),
+            "worst_ms": round(float(np.max(delays_ms)), 1),
+        }
+
+    def judge(self, told: dict[str, Sent]) -> dict[str, Any]:
+        """Compare with what the robots sent."""
+        lost = twice = disordered = wrong = offline = events = 0
+        unknown_s = 0.0
+        for name, said in told.items():
+            heard = self._robots[name]
+            events += said.events
+            passed = Counter(heard.counts)
+            lost += sum(count not in passed for count in range(1, said.events + 1))
+            twice += sum(n - 1 for n in passed.values())
+            disordered += sum(b < a for a, b in zip(heard.counts, heard.counts[1:], strict=False))
+            wrong += _wrong(said.contacts, heard.contacts)
+            spans = zip(heard.contacts, heard.contacts[1:], strict=False)
+            unknown_s += sum(b[0] - a[0] for a, b in spans if a[1] == "UNKNOWN")
+            offline += _wrong([(0.0, "online")], heard.status)
+        return {
+            "events": events,
+            "dropped_by_robots": sum(one.dropped for one in told.values()),
+            "not_acknowledged": sum(one.waiting for one in told.values()),
+            "connections": sum(one.connections for one in told.values()),
+            "lost": lost,
+            "passed_on_twice": twice,
+            "out_of_order": disordered,
+            "unknown_s_a_robot": round(unknown_s / len(told), 2),
+            "robots_with_wrong_contact": wrong,
+            "robots_falsely_offline": offline,
+        }
+
+
+def _wrong(said: list[tuple[float, str]], heard: list[tuple[float, str]]) -> bool:
+    """Return whether a state was shown for longer than allowed after its end, or never came.
+
+    UNKNOWN is never wrong.
+    """
+    if not heard:
+        return bool(said)
+    end_s = max(said[-1][0], heard[-1][0])
+    for (from_s, shown), (to_s, _) in zip(heard, [*heard[1:], (end_s, "")], strict=True):
+        if shown == "UNKNOWN":
+            continue
+        # Shown until `to_s`: at that time it must have been true within the last seconds.
+        ends = [*(at_s for at_s, _ in said[1:]), float("inf")]
+        true_until_s = max(
+            (
+                end
+                for (at_s, state), end in zip(said, ends, strict=True)
+                if state == shown and at_s <= to_s
+            ),
+            default=0.0,
+        )
+        if to_s - max(true_until_s, from_s) > ALLOWED_S:
+            return True
+    known = [state for _, state in heard if state != "UNKNOWN"]
+    return known[-1:] != [said[-1][1]]
+
+
+def _work(
+    pipe: Pipe, names: list[str], keys: dict[str, Any], password: str | None, plan: Plan
+) -> None:
+    """Run some of the robots in a separate process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    logging.disable()  # each robot logs the loss of a broker
+    pipe.recv()
+    with tempfile.TemporaryDirectory() as folder:
+        if password is not None:
+            file = Path(folder) / "password"
+            file.write_text(password)
+            keys["password_file"] = str(file)
+        asyncio.run(_be(pipe, names, Mqtt(**keys), plan))
+
+
+async def _be(pipe: Pipe, names: list[str], settings: Mqtt, plan: Plan) -> None:
+    traffic = [json.loads(line) for line in TRAFFIC.read_text().splitlines()]
+    stop = asyncio.Event()
+    publishers = {name: Publisher(settings, name) for name in names}
+    contacts: dict[str, list[tuple[float, str]]] = {name: [] for name in names}
+    tasks = []
+    for name, publisher in publishers.items():
+        await publisher.__aenter__()
+        tasks.append(asyncio.create_task(_play(publisher, contacts[name], traffic, plan, stop)))
+        await asyncio.sleep(0.002)
+    while not all(one.counters.connected for one in publishers.values()):  # noqa: ASYNC110
+        await asyncio.sleep(0.05)
+    pipe.send("connected")
+    await asyncio.to_thread(pipe.recv)
+    stop.set()
+    await asyncio.gather(*tasks)
+    until_s = time.monotonic() + DRAIN_S
+    while time.monotonic() < until_s and any(  # noqa: ASYNC110
+        one.counters.touches_waiting or one._outbox.pending for one in publishers.values()
+    ):
+        await asyncio.sleep(0.1)
+    told = {}
+    for name, publisher in publishers.items():
+        known = publisher.counters
+        told[name] = Sent(
+            publisher._outbox.counted(publisher.topics.part("touch", PART)),
+            known.touches_dropped,
+            known.touches_waiting,
+            known.connections,
+            contacts[name],
+        )
+    pipe.send(told)
+    # The daemon's end would publish `offline`, which is not measured.
+    await asyncio.sleep(3600)
+
+
+async def _play(
+    publisher: Publisher,
+    contacts: list[tuple[float, str]],
+    traffic: list[dict[str, Any]],
+    plan: Plan,
+    stop: asyncio.Event,
+) -> None:
+    """Publish the recording in a loop, from a random place in it, until `stop` is set."""
+    health = traffic[0]["said"]
+    said = traffic[1:]
+    length_s = said[-1]["at_s"] + 1.0
+    now_s = random.uniform(0.0, length_s)
+    due = [one for one in said if one["at_s"] >= now_s] or list(said)
+    health_due_s = time.monotonic() + random.uniform(0.0, plan.health_s)
+    began_s = time.monotonic() - now_s / plan.pace
+    while not stop.is_set():
+        if not due:
+            due, began_s = list(said), began_s + length_s / plan.pace
+        at_s = began_s + due[0]["at_s"] / plan.pace
+        wait_s = min(at_s, health_due_s) - time.monotonic()
+        if wait_s > 0:
+            await asyncio.sleep(wait_s)
+            if stop.is_set():
+                return
+        if health_due_s <= at_s:
+            publisher.put_health(PART, health)
+            health_due_s += plan.health_s
+            continue
+        item = due.pop(0)
+        if item["kind"] == "touch":
+            publisher.put_touch(_event(item["said"]))
+        else:
+            publisher.put_contact(PART, item["said"])
+            if not contacts or contacts[-1][1] != item["said"]:
+                contacts.append((time.time(), item["said"]))
+
+
+def _event(said: dict[str, Any]) -> TouchEvent:
+    touch = decode_touch(msgspec.json.encode(said))
+    keys = {key: getattr(touch, key) for key in TouchEvent.__dataclass_fields__}
+    return replace(TouchEvent(**keys), t_ns=time.time_ns())
+
+
+def describe(document: dict[str, Any]) -> str:
+    """The document as a table and sentences."""
+    where = document["machine"]
+    lines = [
+        f"{document['robots']} robots, {document['engine']}",
+        f"{where['cores']} cores, load {where['load']:g}",
+        "phase            messages/s  events/s   p50 ms   p99 ms  worst ms  brokers, of a core",
+    ]
+    lines += [
+        f"{row['phase']:<16}{row['messages_s']:>11.0f}{row['events_s']:>10.0f}"
+        f"{row['p50_ms']:>9.1f}{row['p99_ms']:>9.1f}{row['worst_ms']:>10.0f}"
+        f"{row['brokers_cpu']:>20.2f}"
+        for row in document["phases"]
+    ]
+    lines.append(
+        f"{document['events']} events, {document['dropped_by_robots']} dropped by robots, "
+        f"{document['not_acknowledged']} not acknowledged; lost {document['lost']}, "
+        f"passed on twice {document['passed_on_twice']}, out of order {document['out_of_order']}"
+    )
+    lines.append(
+        f"robots of which a state was wrong for more than {ALLOWED_S:g} s: contact "
+        f"{document['robots_with_wrong_contact']} (UNKNOWN for "
+        f"{document['unknown_s_a_robot']:g} s a robot), status {document['robots_falsely_offline']}"
+    )
+    return "\n".join(lines)
+
+
+class _Mosquittos:
+    """Three independent ones."""
+
+    name = "three independent mosquittos"
+    username: str | None = None
+    password: str | None = None
+
+    def __init__(self, program: str, folder: Path) -> None:
+        self._program = program
+        self._files = []
+        self._processes: list[subprocess.Popen[bytes]] = []
+        self.addresses: list[str] = []
+        for number in range(3):
+            with socket.socket() as probe:
+                probe.bind(("127.0.0.1", 0))
+                port = probe.getsockname()[1]
+            file = folder / f"{number}.conf"
+            file.write_text(
+                f"listener {port} 127.0.0.1\nallow_anonymous true\nlog_dest none\n"
+                "max_queued_messages 100000\n"
+            )
+            self._files.append(file)
+            self.addresses.append(f"127.0.0.1:{port}")
+        for number in range(3):
+            self._processes.append(self._run(number))
+
+    def _run(self, number: int) -> "subprocess.Popen[bytes]":
+        return subprocess.Popen(
+            [self._program, "-c", self._files[number]],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+
+    def kill(self, number: int) -> None:
+        self._processes[number].kill()
+        self._processes[number].wait()
+
+    def start(self, number: int) -> None:
+        self._processes[number] = self._run(number)
+
+    def freeze(self, number: int) -> None:
+        self._processes[number].send_signal(signal.SIGSTOP)
+
+    def resume(self, number: int) -> None:
+        self._processes[number].send_signal(signal.SIGCONT)
+
+    def cpu_s(self) -> float:
+        running = [one.pid for one in self._processes if one.poll() is None]
+        return sum(cpu_of_s(pid) for pid in running)
+
+    def end(self) -> None:
+        """End all of them."""
+        for process in self._processes:
+            process.kill()
+            process.wait()
+
+
+def cpu_of_s(pid: int) -> float:
+    """CPU time of another process with all its threads."""
+    threads = Path(f"/proc/{pid}/task").glob("*/schedstat")
+    return sum(int(one.read_text().split()[0]) for one in threads) * 1e-9
+
+
+@contextmanager
+def mosquittos() -> Iterator[Brokers]:
+    """Run three mosquittos.
+
+    Raises:
+        RequestError: it is not installed.
+    """
+    program = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin")
+    if program is None:
+        raise RequestError("bench fleet: no mosquitto on the PATH; install it")
+    with tempfile.TemporaryDirectory() as folder:
+        brokers = _Mosquittos(program, Path(folder))
+        try:
+            yield brokers
+        finally:
+            brokers.end()

@@ -1,0 +1,152 @@
+"""Recordings of real skin: an insole under known air pressure, as CAN frames and as truth.
+
+280 pads of the skin's own technology in a chamber of compressed air: I. Belli et al.,
+"Modeling and Calibration of Pressure-Sensing Insoles via a New Plenum-Based Chamber", Sensors
+2023, 23(9), 4501 (data: ami-iit/paper_belli_2023_sensors_insole-calibration). The readings of a
+sweep become 28 triangles of ten pads on two boards, so that they pass through the whole program.
+"""
+
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.bus.protocol import FrameBatch, encode_sweep
+from skin_host.errors import LogError
+from skin_host.layout import Layout, PadKind, build_layout
+from skin_host.settings import Settings
+
+Floats = NDArray[np.float64]
+
+BUS = "can0"
+PADS = 280
+#: Triangles of board 1 and of board 2.
+TRIANGLES_OF = {1: 16, 2: 12}
+#: Pads that feel pressure; 6 and 10 feel temperature, are not recorded, and read `NO_LOAD`.
+PRESSURE_PADS = (0, 1, 2, 3, 4, 5, 7, 8, 9, 11)
+NO_LOAD = 240
+PERIOD_MS = 20
+#: A recording counts from 0; frames carry the time of day.
+START_NS = 1_600_000_000_000_000_000
+#: One frame takes this long on a bus of 1 Mbit/s.
+FRAME_NS = 125_000
+#: Bounds of what is read: an hour of sweeps, no pressure beyond 10 MPa.
+LONGEST_SWEEPS = 200_000
+HIGHEST_KPA = 10_000.0
+#: One batch of frames holds this many sweeps.
+SWEEPS_PER_BATCH = 8
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One recording.
+
+    Attributes:
+        name: of its file, without the ending.
+        t_ns: int64[t], time of each sweep since 1970, whole microseconds as in a log.
+        counts: uint8[t, 280].
+        pressure_kpa: float64[p], true pressure over the atmosphere's; sampled at the sweeps' rate
+            without times of its own, so paired with them by index.
+    """
+
+    name: str
+    t_ns: NDArray[np.int64]
+    counts: NDArray[np.uint8]
+    pressure_kpa: Floats
+
+    def batches(self) -> Iterator[FrameBatch]:
+        """The frames that the two boards would have sent."""
+        t = len(self.counts)
+        values = np.full((t, 28, 12), NO_LOAD, np.uint8)
+        values[:, :, PRESSURE_PADS] = self.counts.reshape(t, 28, 10)
+        per_sweep = 2 * 28
+        ids = np.empty(per_sweep, np.uint32)
+        data = np.empty((t, per_sweep, 8), np.uint8)
+        first = 0
+        for board, triangles in TRIANGLES_OF.items():
+            numbers = np.arange(triangles)
+            mine = slice(2 * first, 2 * (first + triangles))
+            status = np.zeros(triangles, np.uint16)
+            for sweep, its in enumerate(values[:, first : first + triangles]):
+                ids[mine], data[sweep, mine] = encode_sweep(board, numbers, its, status)
+            first += triangles
+        t_ns = self.t_ns[:, np.newaxis] + np.arange(per_sweep) * FRAME_NS
+        for begin in range(0, t, SWEEPS_PER_BATCH):
+            part = slice(begin, min(begin + SWEEPS_PER_BATCH, t))
+            k = (part.stop - part.start) * per_sweep
+            yield FrameBatch(
+                np.tile(ids, part.stop - part.start),
+                np.full(k, 8, np.uint8),
+                data[part].reshape(k, 8),
+                t_ns[part].ravel(),
+            )
+
+
+def read(path: Path) -> Recording:
+    """Read a recording: arrays `t_s`, `counts` and `pressure_kpa` of an .npz file.
+
+    Raises:
+        LogError: unreadable, or not such a recording.
+    """
+    wanted = "wanted arrays t_s [t], counts uint8 [t, 280] and pressure_kpa [p] in one .npz"
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            t_s, counts, pressure = (arrays[n] for n in ("t_s", "counts", "pressure_kpa"))
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise LogError(f"{path}: {str(error).splitlines()[0]}; {wanted}") from None
+    seen = f"t_s {t_s.shape}, counts {counts.dtype} {counts.shape}, pressure_kpa {pressure.shape}"
+    fits = counts.dtype == np.uint8 and counts.shape == (*t_s.shape, PADS) and pressure.ndim == 1
+    if not fits or not 0 < len(t_s) <= LONGEST_SWEEPS or not 0 < len(pressure) <= LONGEST_SWEEPS:
+        raise LogError(f"{path}: {seen}; {wanted}, at most {LONGEST_SWEEPS} sweeps")
+    t_s, pressure = t_s.astype(np.float64), pressure.astype(np.float64)
+    if not (np.isfinite(t_s).all() and (np.diff(t_s) > 0.0).all() and abs(t_s).max() < 1e6):
+        raise LogError(f"{path}: t_s does not rise; wanted seconds from 0")
+    if not (np.isfinite(pressure).all() and abs(pressure).max() < HIGHEST_KPA):
+        raise LogError(f"{path}: pressure_kpa is not finite or above {HIGHEST_KPA:g} kPa")
+    t_ns = START_NS + np.rint(t_s * 1e6).astype(np.int64) * 1000
+    return Recording(path.stem, t_ns, counts, pressure)
+
+
+def skin() -> tuple[Settings, Layout]:
+    """Settings and layout of the insole: its triangles in rows of seven, 32 mm apart."""
+    patches, first = [], 0
+    for board, triangles in TRIANGLES_OF.items():
+        places = [
+            {"x_mm": number % 7 * 32, "y_mm": number // 7 * 32}
+            for number in range(first, first + triangles)
+        ]
+        patches.append(
+            {
+                "board": f"board_{board}",
+                "triangles": f"0-{triangles - 1}",
+                "kind": "triangle_10pad",
+                "places": places,
+            }
+        )
+        first += triangles
+    document = {
+        "robot": "insole",
+        "buses": {BUS: {"channel": BUS}},
+        "boards": {
+            f"board_{board}": {
+                "bus": BUS,
+                "address": board,
+                "skin_type": 0,
+                "no_load": NO_LOAD,
+                "period_ms": PERIOD_MS,
+            }
+            for board in TRIANGLES_OF
+        },
+        "parts": {"insole": {"patches": patches}},
+    }
+    settings = msgspec.convert(document, Settings)
+    return settings, build_layout(settings, Path())
+
+
+def pads(layout: Layout) -> NDArray[np.intp]:
+    """Flat taxels [280] of the recorded pads, in the recording's order."""
+    return np.flatnonzero(layout.pad_kind == PadKind.PRESSURE)

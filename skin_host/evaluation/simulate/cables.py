@@ -1,0 +1,270 @@
+"""Buses in memory: the emulated robot at one end, the daemon's port at the other.
+
+A cable is asked, not waited for: the robot moves on when the port is read or sends, so nothing
+polls. What happens to frames between the two ends is drawn frame by frame.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import can
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.firmware.board import join
+from skin_host.bus.port import ERROR_FLAG, LinkState, Port
+from skin_host.bus.protocol import FrameBatch
+from skin_host.clock import Clock
+from skin_host.errors import BusError
+from skin_host.evaluation.simulate.trace import Trace
+from skin_host.settings import Bus
+
+#: Frames that wait to be read; more are dropped and counted, as a socket does.
+BUFFER_FRAMES = 4000
+#: Most frames of one read.
+CAPACITY = 1024
+_NOTHING = FrameBatch.of([])
+
+
+@dataclass(slots=True)
+class Mischief:
+    """Shares of the frames that something happens to between the boards and this computer."""
+
+    lost: float = 0.0
+    late: float = 0.0
+    doubled: float = 0.0
+    swapped: float = 0.0
+    damaged: float = 0.0
+    #: How late the late ones come.
+    late_ns: int = 3_000_000
+
+    def any(self) -> bool:
+        """Whether anything happens to any frame."""
+        return bool(self.lost or self.late or self.doubled or self.swapped or self.damaged)
+
+
+@dataclass(slots=True)
+class Fate:
+    """What became of the frames that the robot put on a bus.
+
+    Attributes:
+        sent: by the boards.
+        unheard: while no port was open, or the adapter was unplugged or down.
+        lost, damaged, doubled: by mischief.
+        dropped: because the buffer was full.
+        read: by the daemon.
+    """
+
+    sent: int = 0
+    unheard: int = 0
+    lost: int = 0
+    damaged: int = 0
+    doubled: int = 0
+    dropped: int = 0
+    read: int = 0
+
+
+class Cable:
+    """One bus.
+
+    Args:
+        name: of the bus.
+        clock: time.
+        move: brings the robot to the present, which calls `arrive` of each cable.
+        command: gives a frame of the host to the robot.
+        passes: whether the bus itself passes frames now.
+        rng: draws what happens to frames.
+
+    Attributes:
+        mischief: what happens to frames.
+        state: of the interface, as the port is to find it.
+        fate: what became of the frames since the port was opened.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        clock: Clock,
+        move: Callable[[], None],
+        command: Callable[[str, int, bytes], None],
+        passes: Callable[[], bool],
+        rng: np.random.Generator,
+        trace: Trace,
+    ) -> None:
+        self.name = name
+        self.mischief = Mischief()
+        self.state = LinkState.UP
+        self.fate = Fate()
+        self.move = move
+        self._clock = clock
+        self._command = command
+        self._passes = passes
+        self._rng = rng
+        self._trace = trace
+        self._port: SimulatedPort | None = None
+        self._waiting: list[FrameBatch] = []
+        self._n_waiting = 0
+        self._late: list[tuple[int, FrameBatch]] = []
+        #: When a frame of each standard identifier was last read (ns, stepped time).
+        self.read_ns = np.full(0x800, -(1 << 62), np.int64)
+
+    def open(self, port: "SimulatedPort") -> None:
+        """What waits for nobody is forgotten; from now on frames are kept for this port."""
+        self.move()
+        self._port = port
+        self._forget()
+        self.fate = Fate()
+
+    def close(self, port: "SimulatedPort") -> None:
+        """Frames are not kept any more, if they were kept for this port."""
+        if self._port is port:
+            self._port = None
+            self._forget()
+
+    def _forget(self) -> None:
+        self.fate.unheard += self._n_waiting
+        self._waiting.clear()
+        self._n_waiting = 0
+        self._late.clear()
+
+    def set_state(self, state: LinkState) -> None:
+        """The interface goes down, comes up, is unplugged or plugged in."""
+        self.move()
+        self.state = state
+        if state in (LinkState.GONE, LinkState.DOWN):
+            self._forget()
+
+    def arrive(self, batch: FrameBatch) -> None:
+        """Frames that passed over the bus, stamped with the robot's time."""
+        n = len(batch)
+        fate = self.fate
+        fate.sent += n
+        if self._port is None or self.state in (LinkState.GONE, LinkState.DOWN):
+            fate.unheard += n
+            return
+        if self._late:
+            due = [one for at_ns, one in self._late if at_ns <= self._clock.monotonic_ns()]
+            if due:
+                now_ns = self._clock.monotonic_ns()
+                self._late = [one for one in self._late if one[0] > now_ns]
+                for one in due:
+                    one.t_ns = np.full(len(one), now_ns, np.int64)
+                batch = join([*due, batch])
+        if n and self.mischief.any():
+            batch = self._spoil(batch)
+        if not len(batch):
+            return
+        batch.t_ns = batch.t_ns + (self._clock.now_ns() - self._clock.monotonic_ns())
+        room = BUFFER_FRAMES - self._n_waiting
+        if len(batch) > room:
+            fate.dropped += len(batch) - room
+            self._port.counters.dropped += len(batch) - room
+            batch = _rows(batch, slice(0, room))
+        self._n_waiting += len(batch)
+        self._waiting.append(batch)
+
+    def _spoil(self, batch: FrameBatch) -> FrameBatch:
+        what, rng, fate = self.mischief, self._rng, self.fate
+        n = len(batch)
+        if what.damaged:
+            wrong = np.flatnonzero(rng.random(n) < what.damaged)
+            bits = rng.integers(0, 64, len(wrong))
+            batch.data[wrong, bits // 8] ^= (1 << bits % 8).astype(np.uint8)
+            fate.damaged += len(wrong)
+        if what.swapped:
+            order = np.arange(n)
+            for row in np.flatnonzero(rng.random(max(n - 1, 0)) < what.swapped).tolist():
+                order[[row, row + 1]] = order[[row + 1, row]]
+            t_ns = batch.t_ns
+            batch = _rows(batch, order)
+            batch.t_ns = t_ns
+        if what.doubled:
+            times = 1 + (rng.random(n) < what.doubled)
+            fate.doubled += int(times.sum()) - n
+            batch = _rows(batch, np.repeat(np.arange(n), times))
+            n = len(batch)
+        if what.late:
+            late = rng.random(n) < what.late
+            if late.any():
+                at_ns = self._clock.monotonic_ns() + what.late_ns
+                self._late.append((at_ns, _rows(batch, late)))
+                batch = _rows(batch, ~late)
+                n = len(batch)
+        if what.lost:
+            kept = rng.random(n) >= what.lost
+            fate.lost += n - int(np.count_nonzero(kept))
+            batch = _rows(batch, kept)
+        return batch
+
+    def take(self) -> FrameBatch:
+        """What waits, at most `CAPACITY` frames."""
+        if not self._waiting:
+            return _NOTHING
+        batch = self._waiting[0] if len(self._waiting) == 1 else join(self._waiting)
+        if len(batch) > CAPACITY:
+            self._waiting = [_rows(batch, slice(CAPACITY, None))]
+            batch = _rows(batch, slice(0, CAPACITY))
+        else:
+            self._waiting = []
+        self._n_waiting -= len(batch)
+        self.fate.read += len(batch)
+        self.read_ns[batch.id & 0x7FF] = self._clock.monotonic_ns()
+        self._trace.data(
+            self._clock.monotonic_ns(), self.name, batch.id.tobytes(), batch.data.tobytes()
+        )
+        return batch
+
+    def send(self, can_id: int, data: bytes) -> bool:
+        """A frame of the host; False if nobody acknowledges it."""
+        self.move()
+        if not self._passes():
+            return False
+        self._trace.data(self._clock.monotonic_ns(), f"{self.name}<{can_id:03x}", data)
+        self._command(self.name, can_id, data)
+        return True
+
+
+class SimulatedPort(Port):
+    """The daemon's end of a cable."""
+
+    capacity = CAPACITY
+
+    def __init__(self, cable: Cable, settings: Bus, clock: Clock) -> None:
+        super().__init__(cable.name, settings, None, clock)
+        self._cable = cable
+        self.dead = False
+        self.state = self._logged_state = cable.state
+        cable.open(self)
+
+    def read(self) -> FrameBatch:
+        if self.dead:
+            return _NOTHING
+        cable = self._cable
+        cable.move()
+        if cable.state is not self.state:
+            if self.state is LinkState.GONE:
+                if not self._time_to_check():
+                    return _NOTHING
+                self.counters.reopened += 1
+            self._enter(cable.state)
+        if self.state is not self._logged_state:
+            self._log_state()
+        batch = cable.take()
+        self.counters.frames += len(batch)
+        if len(batch) and int(batch.id.max()) & ERROR_FLAG:
+            self._note_errors(batch)
+        return batch
+
+    def close(self) -> None:
+        self._cable.close(self)
+
+    def _try_send(self, message: can.Message) -> bool:
+        if self.dead:
+            return True
+        if self.state in (LinkState.GONE, LinkState.DOWN):
+            raise BusError(f'bus "{self.name}": {self.channel}: cannot send, {self.state}')
+        return self._cable.send(message.arbitration_id, bytes(message.data))
+
+
+def _rows(batch: FrameBatch, rows: NDArray[np.bool_] | NDArray[np.intp] | slice) -> FrameBatch:
+    return FrameBatch(batch.id[rows], batch.dlc[rows], batch.data[rows], batch.t_ns[rows])

@@ -1,0 +1,403 @@
+"""One run: storms of troubles and touches, each followed by a calm in which all must be well."""
+
+import asyncio
+import os
+import random
+import tempfile
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from emulator.scene import Scene
+from skin_host.errors import ConfigurationError
+from skin_host.evaluation.simulate.disk import PowerCut
+from skin_host.evaluation.simulate.promises import SAMPLE_S, Promises
+from skin_host.evaluation.simulate.troubles import ACTS, KINDS, WIRING, Trouble, act
+from skin_host.evaluation.simulate.world import Life, World
+from skin_host.layout import Layout
+from skin_host.settings import Settings
+
+#: How long a storm lasts, and how long the calm after it may take to be well.
+STORM_S = 40.0
+CALM_S = 45.0
+#: Mean times between troubles, presses, requests and ends of the daemon in a storm.
+TROUBLE_S = 3.0
+PRESS_S = 2.5
+REQUEST_S = 6.0
+DEATH_S = 60.0
+#: Troubles at one time.
+MOST_TROUBLES = 3
+#: Faults that a calm may keep: they report what happened within the last minute, or real pads.
+LATE_FAULTS = {
+    "board_lost_set_up",
+    "board_reset",
+    "board_rezeroed",
+    "board_overflows",
+    "touches_dropped",
+    "broker_refuses",
+    "taxel_decides_late",
+    "taxel_held",
+    "part_temperature",
+    "taxel_drifting",
+}
+
+
+@dataclass
+class Result:
+    """What came of a run.
+
+    Attributes:
+        seed: of it.
+        simulated_s, cpu_s: how long it lasted, simulated and in CPU time.
+        events, digest: how many events there were, and the hash of them all.
+        broken: the promise that was broken, or None; `last` are the events before.
+        troubles: how many of each kind were injected; `named` are those that health had to name.
+        touches, deaths: events of touch, and ends of the daemon.
+    """
+
+    seed: int
+    simulated_s: float = 0.0
+    cpu_s: float = 0.0
+    events: int = 0
+    digest: str = ""
+    broken: str | None = None
+    last: list[str] = field(default_factory=list)
+    troubles: dict[str, int] = field(default_factory=dict)
+    named: list[str] = field(default_factory=list)
+    touches: int = 0
+    deaths: int = 0
+
+
+def simulate(
+    settings: Settings,
+    layout: Layout,
+    config: Path,
+    seed: int,
+    seconds: float,
+    *,
+    until_s: float | None = None,
+) -> Result:
+    """Let a robot and its daemon live for some time; the same arguments give the same events.
+
+    Args:
+        settings, layout, config: of the robot, and the file that they were read from.
+        seed: of everything that happens.
+        seconds: simulated time, rounded up to a whole storm and its calm.
+        until_s: end the same run at this time.
+    """
+    began_s = time.process_time()
+    with tempfile.TemporaryDirectory(prefix="skin-simulate-") as state:
+        before = os.environ.get("STATE_DIRECTORY")
+        os.environ["STATE_DIRECTORY"] = state
+        try:
+            scene = Scene(quiet=True)
+            world = World(settings, layout, config, seed, scene)
+            with world.clock.runner() as runner:
+                run = _Run(world, Path(state), seed, seconds, until_s)
+                runner.run(run.live())
+        finally:
+            if before is None:
+                del os.environ["STATE_DIRECTORY"]
+            else:
+                os.environ["STATE_DIRECTORY"] = before
+    result = run.result
+    result.cpu_s = time.process_time() - began_s
+    return result
+
+
+class _Run:
+    def __init__(
+        self, world: World, state: Path, seed: int, seconds: float, until_s: float | None
+    ) -> None:
+        self.world = world
+        self.result = Result(seed)
+        self._state = state
+        self._seconds = seconds
+        self._until_s = until_s
+        self._chance = random.Random(f"{seed} run")
+        self._troubles: list[Trouble] = []
+        self._injected: Counter[str] = Counter()
+        self._requests = 0
+
+    async def live(self) -> None:
+        """Storm and calm, until the time is over or a promise is broken."""
+        world = self.world
+        self._promises = Promises(world)
+        asyncio.get_running_loop().set_exception_handler(self._unexpected)
+        looking = asyncio.create_task(self._look(), name="look")
+        living = asyncio.create_task(self._weather(), name="weather")
+        stopped = asyncio.create_task(self._promises.stopped.wait(), name="stopped")
+        await asyncio.wait(
+            [living, stopped], timeout=self._until_s, return_when=asyncio.FIRST_COMPLETED
+        )
+        for task in (living, looking, stopped):
+            task.cancel()
+        outcome, *_ = await asyncio.gather(living, looking, stopped, return_exceptions=True)
+        if isinstance(outcome, Exception) and self._promises.broken is None:
+            raise outcome
+        if world.life is not None:
+            world.life.kill()
+        result = self.result
+        result.simulated_s = world.clock.monotonic_s()
+        result.events, result.digest = world.trace.count, world.trace.digest()
+        result.broken = self._promises.broken
+        result.last = list(world.trace.last)
+        result.troubles = dict(sorted(self._injected.items()))
+        result.named = sorted(self._promises.named)
+        result.touches = self._promises.touches
+
+    def _unexpected(self, _: object, context: dict[str, Any]) -> None:
+        error = context.get("exception")
+        if isinstance(error, PowerCut):
+            return
+        self._promises.break_(f"unexpected: {context['message']}: {error!r}")
+
+    async def _look(self) -> None:
+        while True:
+            await self.world.clock.sleep(SAMPLE_S)
+            self._promises.sample()
+            self._promises.contacts()
+            life = self.world.life
+            if life is not None and not life.dead and life.task.done() and not life.stop.is_set():
+                self._promises.break_(f"the daemon ended by itself: {life.task.exception()!r}")
+
+    async def _weather(self) -> None:
+        world = self.world
+        self._start()
+        await self._calm()
+        while world.clock.monotonic_s() < self._seconds:
+            await self._storm()
+            await self._calm()
+        await self._stop()
+
+    # ------------------------------------------------------------------ the daemon's lives
+
+    def _start(self) -> None:
+        for path in sorted(self._state.rglob("*")):
+            if ".damaged-" in path.name:
+                self._promises.break_(f"a file was damaged: {path.name}")
+        world = self.world
+        world.note("the daemon starts")
+        self._promises.begin(act("start"))
+        world.life = Life(world)
+        world.life.start(self._promises.watch)
+        self._promises.started(world.life)
+
+    async def _stop(self) -> None:
+        life = self.world.life
+        if life is None:
+            return
+        self.world.note("the daemon is asked to end")
+        try:
+            await self.world.end()
+        except TimeoutError:
+            self._promises.break_("the daemon did not end")
+        except Exception as error:
+            self._promises.break_(f"the daemon ended with {error!r}")
+        self._promises.over(life, whole=True)
+
+    def _kill(self, *, power: bool) -> None:
+        world = self.world
+        life = world.life
+        if life is None:
+            return
+        world.note("the power fails" if power else "the daemon is killed")
+        if power:
+            life.disk.cut()
+        life.kill()
+        world.life = None
+
+    # ------------------------------------------------------------------ storm
+
+    async def _storm(self) -> None:
+        world = self.world
+        world.note("storm")
+        end_s = world.clock.monotonic_s() + STORM_S
+        async with asyncio.TaskGroup() as group:
+            for work, mean_s in (
+                (self._trouble, TROUBLE_S),
+                (self._press, PRESS_S),
+                (self._request, REQUEST_S),
+                (self._die, DEATH_S),
+            ):
+                group.create_task(self._now_and_then(work, mean_s, end_s, group))
+
+    async def _now_and_then(
+        self, work: Any, mean_s: float, end_s: float, group: asyncio.TaskGroup
+    ) -> None:
+        clock = self.world.clock
+        while True:
+            wait_s = self._chance.expovariate(1 / mean_s)
+            left_s = end_s - clock.monotonic_s() - wait_s
+            if left_s <= 0:
+                return
+            await clock.sleep(wait_s)
+            group.create_task(work(left_s))
+
+    async def _trouble(self, left_s: float) -> None:
+        world, chance = self.world, self._chance
+        if len(self._troubles) >= MOST_TROUBLES:
+            return
+        name = chance.choice(list(KINDS))
+        if any(trouble.name == name for trouble in self._troubles):
+            return
+        if name in WIRING and any(trouble.name in WIRING for trouble in self._troubles):
+            return
+        try:
+            trouble = KINDS[name](world, chance)
+        except ConfigurationError:
+            return  # another trouble has unplugged the chip that was drawn
+        world.note(f"trouble: {trouble.about}")
+        self._injected[name] += 1
+        self._promises.begin(trouble)
+        least_s, most_s = trouble.lasts_s
+        if not most_s:
+            return
+        self._troubles.append(trouble)
+        try:
+            await world.clock.sleep(min(left_s, chance.uniform(least_s, most_s)))
+        finally:
+            trouble.end()
+            self._troubles.remove(trouble)
+            world.note(f"ended: {trouble.about}")
+            self._promises.end(trouble)
+
+    async def _press(self, left_s: float) -> None:
+        spots = [spot for spot in self.world.spots if not spot.pressed]
+        if spots:
+            spot = self._chance.choice(spots)
+            # A tap of one sweep cannot be distinguished from a byte that was off for one sweep.
+            await spot.press(max(0.2, min(left_s, self._chance.uniform(0.2, 5.0))))
+
+    async def _request(self, _: float) -> None:
+        """An operator does something, at a moment that may be a bad one."""
+        parts = [part.name for part in self.world.layout.parts]
+        boards = [board.name for board in self.world.layout.boards]
+        part, board = self._chance.choice(parts), self._chance.choice(boards)
+        margin = round(self._chance.uniform(1.0, 4.0), 1)
+        name, payload = self._chance.choice(
+            [
+                ("calibrate", "{}"),
+                ("calibrate", f'{{"seconds": 1, "board": "{board}"}}'),
+                ("configure", f'{{"board": "{board}"}}'),
+                ("disable", f'{{"part": "{part}"}}'),
+                ("enable", f'{{"part": "{part}"}}'),
+                ("thresholds", f'{{"set": {{"margin_units": {margin}}}}}'),
+                ("thresholds", '{"reset": true}'),
+                ("raw", '{"seconds": 5}'),
+                ("reload", "{}"),
+                ("status", ""),
+                ("nonsense", "{}"),
+                ("calibrate", "no request"),
+            ]
+        )
+        self._ask(name, payload)
+
+    def _ask(self, name: str, payload: str) -> int:
+        world = self.world
+        self._requests += 1
+        if name in ACTS:
+            self._promises.begin(act(name))
+        topics = world.life.daemon.publisher.topics if world.life is not None else None
+        if topics is None:
+            return self._requests
+        world.note(f"request {self._requests}: {name} {payload}")
+        reply_to = topics.reply("main", "operator")
+        world.broker.request(
+            topics.command("main", name), payload.encode(), reply_to, b"%d" % self._requests
+        )
+        return self._requests
+
+    async def _die(self, left_s: float) -> None:
+        world, chance = self.world, self._chance
+        life = world.life
+        if life is None:
+            return
+        self.result.deaths += 1
+        kind = chance.choice(("killed", "power", "writing", "asked"))
+        if kind == "asked":
+            await self._stop()
+        elif kind == "writing":
+            life.disk.steps_left = chance.randrange(8)
+            self._ask("calibrate", '{"seconds": 0.5}')
+            self._ask("thresholds", '{"set": {"margin_units": 3}}')
+            world.power_failed.clear()
+            await asyncio.wait(
+                [asyncio.create_task(world.power_failed.wait())], timeout=min(3.0, left_s)
+            )
+            self._kill(power=True)
+        else:
+            self._kill(power=kind == "power")
+        await world.clock.sleep(min(left_s, chance.uniform(0.1, 5.0)))
+        self._start()
+
+    # ------------------------------------------------------------------ calm
+
+    async def _calm(self) -> None:
+        """Nothing happens any more. The operator does what a careful one does; then all is well."""
+        world = self.world
+        world.note("calm")
+        began_s = world.clock.monotonic_s()
+        await world.clock.sleep(8.0)
+        repaired = False
+        while not self._is_well():
+            if world.clock.monotonic_s() - began_s > CALM_S:
+                self._promises.break_(
+                    f"not well after {CALM_S:g} s of calm: {self._state_of_all()}"
+                )
+                return
+            if not repaired and self._is_reachable():
+                repaired = True
+                world.note("the operator sets everything up and calibrates")
+                for part in world.layout.parts:
+                    self._ask("enable", f'{{"part": "{part.name}"}}')
+                self._ask("thresholds", '{"reset": true}')
+                self._ask("configure", "{}")
+                await world.clock.sleep(6.0)
+                self._ask("calibrate", "{}")
+                await world.clock.sleep(7.0)
+                self._promises.calibrated_at_rest()
+            await world.clock.sleep(0.5)
+        world.note("well")
+        if world.life is not None:
+            self._promises.account(world.life)
+
+    def _is_reachable(self) -> bool:
+        life = self.world.life
+        return life is not None and life.daemon.publisher.counters.connected
+
+    def _is_well(self) -> bool:
+        return not self._state_of_all()
+
+    def _state_of_all(self) -> list[str]:
+        """What is not as it should be after quiet, as the broker keeps it."""
+        world = self.world
+        life = world.life
+        if life is None:
+            return ["no daemon"]
+        topics, retained = life.daemon.publisher.topics, world.broker.retained
+        found = []
+        if retained.get(topics.node("status", "main")) != b"online":
+            found.append("status is not online")
+        for part in world.layout.parts:
+            if retained.get(topics.part("contact", part.name)) != b"OFF":
+                state = retained.get(topics.part("contact", part.name))
+                found.append(f"{part.name}: contact {state!r}")
+            for fault, where in self._faults(retained.get(topics.part("health", part.name))):
+                if fault not in LATE_FAULTS:
+                    found.append(f"{part.name}: {fault} {where}")
+        return found
+
+    @staticmethod
+    def _faults(payload: bytes | None) -> list[tuple[str, str]]:
+        if payload is None:
+            return [("no health", "")]
+        record = msgspec.json.decode(payload)
+        found = [(fault["code"], fault["where"]) for fault in record["faults"]]
+        if record["state"] not in ("ok", "warning"):
+            found.append((record["state"], f"{record['valid_taxels']} of {record['taxels']}"))
+        return found

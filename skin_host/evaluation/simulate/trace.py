@@ -1,0 +1,37 @@
+"""Every event of a run: hashed, and the last ones kept to be shown."""
+
+from collections import deque
+from hashlib import blake2b
+
+#: So many events are shown when a promise is broken.
+KEPT = 40
+
+
+class Trace:
+    """Takes the events of a run in order.
+
+    Attributes:
+        count: events so far.
+        last: the last ones that are worth showing, as lines.
+    """
+
+    def __init__(self) -> None:
+        self._hash = blake2b(digest_size=16)
+        self.count = 0
+        self.last: deque[str] = deque(maxlen=KEPT)
+
+    def data(self, t_ns: int, kind: str, *values: bytes) -> None:
+        """An event that is only hashed: frames on a bus, publications."""
+        self.count += 1
+        self._hash.update(b"%d %s" % (t_ns, kind.encode()))
+        for value in values:
+            self._hash.update(value)
+
+    def note(self, t_ns: int, text: str) -> None:
+        """An event that is hashed and shown."""
+        self.data(t_ns, text)
+        self.last.append(f"{t_ns / 1e9:11.6f}  {text}")
+
+    def digest(self) -> str:
+        """Of all events so far, 32 hexadecimal digits."""
+        return self._hash.hexdigest()

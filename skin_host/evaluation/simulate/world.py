@@ -1,0 +1,208 @@
+"""The whole system in one event loop: robot, buses, daemon, broker, disk, and who touches it.
+
+Everything is drawn from one seed and lives by one stepped clock. The daemon is the real one.
+"""
+
+import asyncio
+import contextlib
+import random
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from emulator.robot import NS, LiveProbe, Robot
+from emulator.scene import Place, Probe, Scene
+from skin_host.bus.port import Port
+from skin_host.calibrate import stored_calibration
+from skin_host.clock import SYSTEM, Clock, SteppedClock
+from skin_host.daemon import Daemon
+from skin_host.evaluation.simulate.broker import Broker, Living
+from skin_host.evaluation.simulate.cables import Cable, SimulatedPort
+from skin_host.evaluation.simulate.disk import SimulatedDisk
+from skin_host.evaluation.simulate.trace import Trace
+from skin_host.files import on_disk
+from skin_host.layout import Layout
+from skin_host.settings import Bus, Receive, Settings
+
+#: Places that are pressed.
+SPOTS = 6
+#: A daemon that has not ended so long after it was asked to hangs.
+LONGEST_END_S = 8.0
+
+
+class Life(Living):
+    """One start of the daemon, until it ends or is killed."""
+
+    def __init__(self, world: "World") -> None:
+        super().__init__()
+        self.world = world
+        self.ports: list[SimulatedPort] = []
+        self.began_ns = world.clock.monotonic_ns()
+        self.disk = SimulatedDisk(
+            world.chance, world.clock.monotonic_ns, world.trace, world.power_cut
+        )
+        self.disk.refuses = world.disk_refuses
+        self.stop = asyncio.Event()
+        self.daemon: Daemon
+        self.task: asyncio.Task[None]
+
+    def start(self, watch: Callable[["Life"], None]) -> None:
+        """Make the daemon as `skin run` does, and let it run.
+
+        Raises:
+            SkinError: it does not start.
+        """
+        world = self.world
+        calibration = stored_calibration(world.settings, world.layout, "main")
+        self.daemon = Daemon(
+            world.settings,
+            world.layout,
+            calibration=calibration,
+            folder=world.config.parent,
+            configuration=world.config,
+            clock=world.clock,
+            open_port=self._open_port,
+            connect=world.broker.connector(self),
+        )
+        watch(self)
+        with on_disk(self.disk):
+            self.task = asyncio.create_task(self.daemon.run(self.stop), name="daemon")
+
+    def _open_port(
+        self, name: str, bus: Bus, receive: Receive, *, wait: bool = False, clock: Clock = SYSTEM
+    ) -> Port:
+        port = SimulatedPort(self.world.cables[name], bus, clock)
+        self.ports.append(port)
+        return port
+
+    def kill(self) -> None:
+        """It does nothing from now on that anybody could notice."""
+        if self.dead:
+            return
+        self.dead = True
+        self.disk.die()
+        for port in self.ports:
+            port.dead = True
+            port.close()
+        for line in self.lines:
+            line.vanish()
+        self.task.cancel()
+
+
+class World:
+    """See the module.
+
+    Args:
+        settings, layout: of the robot.
+        config: the file that they were read from.
+        seed: of everything.
+        scene: the robot's skin and temperature.
+    """
+
+    def __init__(
+        self, settings: Settings, layout: Layout, config: Path, seed: int, scene: Scene
+    ) -> None:
+        self.settings = settings
+        self.layout = layout
+        self.config = config
+        self.chance = random.Random(f"{seed} world")
+        self.clock = SteppedClock(seed=seed)
+        self.trace = Trace()
+        self.robot = Robot(settings, layout, scene, seed=seed)
+        self.broker = Broker(self.clock, self.trace)
+        self.cables = {
+            name: Cable(
+                name,
+                self.clock,
+                self.move,
+                self.robot.receive,
+                lambda wire=wire: not wire.off,  # type: ignore[misc]
+                np.random.default_rng([seed, 20, number]),
+                self.trace,
+            )
+            for number, (name, wire) in enumerate(self.robot.wires.items())
+        }
+        self.life: Life | None = None
+        self.spots = [Spot(self, self.chance) for _ in range(SPOTS)]
+        self.power_failed = asyncio.Event()
+        self._disk_refuses: int | None = None
+
+    def move(self) -> None:
+        """Bring the robot to the present; what its boards sent waits on the buses."""
+        passed_ns = self.clock.monotonic_ns() - self.robot.t_ns
+        if passed_ns <= 0:
+            return
+        for name, batch in self.robot.step(passed_ns / NS).items():
+            self.cables[name].arrive(batch)
+
+    @property
+    def disk_refuses(self) -> int | None:
+        """The error that writing to the disk gives, or None."""
+        return self._disk_refuses
+
+    @disk_refuses.setter
+    def disk_refuses(self, code: int | None) -> None:
+        self._disk_refuses = code
+        if self.life is not None:
+            self.life.disk.refuses = code
+
+    def power_cut(self) -> None:
+        """The computer lost its power in the middle of writing."""
+        self.power_failed.set()
+
+    async def end(self) -> None:
+        """Let the daemon end as it is asked to."""
+        life = self.life
+        if life is None:
+            return
+        life.stop.set()
+        async with self.clock.timeout(LONGEST_END_S):
+            await asyncio.wait([life.task])
+        self.life = None
+        with contextlib.suppress(asyncio.CancelledError):
+            life.task.result()
+
+    def note(self, text: str) -> None:
+        """Something happens that is worth showing."""
+        self.trace.note(self.clock.monotonic_ns(), text)
+
+
+class Spot:
+    """A place on the skin that is pressed now and then."""
+
+    def __init__(self, world: World, chance: random.Random) -> None:
+        part = chance.choice(world.layout.parts)
+        self.part = part.name
+        self.taxel = chance.randrange(part.n_taxels)
+        diameter_mm = chance.choice((4.0, 8.0, 12.0))
+        self._area_mm2 = np.pi / 4 * diameter_mm**2
+        self._world = world
+        self._chance = chance
+        self._probe: LiveProbe = world.robot.touch(
+            Probe(
+                part=part.name,
+                at=Place(taxel=self.taxel),
+                diameter_mm=diameter_mm,
+                force_n=[(0.0, 0.0)],
+            )
+        )
+        self.pressed = False
+
+    async def press(self, seconds: float) -> None:
+        """Press for a while, then lift."""
+        world = self._world
+        kpa = self._chance.uniform(20.0, 80.0)
+        world.note(f"press {self.part}/{self.taxel} {kpa:.0f} kPa for {seconds:.1f} s")
+        self.pressed = True
+        try:
+            for share in (0.25, 0.5, 0.75, 1.0):
+                world.move()
+                self._probe.press(share * kpa * self._area_mm2 * 1e-3)
+                await world.clock.sleep(0.03)
+            await world.clock.sleep(seconds)
+        finally:
+            world.move()
+            self._probe.lift()
+            world.note(f"lift {self.part}/{self.taxel}")
+            self.pressed = False

@@ -1,0 +1,467 @@
+"""Fits curves and the foam's memory to any course of known pressure that is equal on all pads.
+
+The pressure on a pad is P = f(x) - relaxation: f is the pad's own curve over its activation x, and
+the relaxation of all pads follows f(x) by one shared set of plays. The plays are fitted to the
+pads' median, the curves pad by pad.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.errors import RequestError
+from skin_host.processing.curves import (
+    KNOTS_UNITS,
+    Curves,
+    CurveVerdict,
+    Memory,
+    TableCurve,
+    rising,
+)
+from skin_host.processing.relaxation import PlayRelaxation
+from skin_host.processing.smoothing import LIMIT_DEVIATIONS, StepFilter
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]
+
+#: Means over this time are enough to find which pads follow the pressure.
+BLOCK_S = 0.25
+#: Noise is measured in pieces of this length without their linear trend; this share of them is
+#: below the noise.
+NOISE_BLOCK_S = 2.0
+NOISE_QUANTILE = 0.9
+#: Less than this is no response, and with less correlation a pad does not follow.
+LEAST_UNITS = 3.0
+LEAST_CORRELATION = 0.8
+#: If the pads' median correlates less than this with the table, the table does not belong to the
+#: recording.
+SAME_CORRELATION = 0.9
+#: The table's clock may be ahead or behind by this much.
+LONGEST_LAG_S = 60.0
+LAG_STEP_S = 0.05
+#: A course must span this pressure; otherwise it is in another unit or nothing is pressed.
+LEAST_KPA = 10.0
+#: Uncertainty of the pressure itself, and its possible time shift against the pads while it moves.
+UNCERTAINTY_KPA = 2.0
+DOUBT_S = 0.7
+#: A pad jumps if it changes by this much, and this multiple of its noise, within half a second
+#: beyond twice what the pressure explains.
+JUMP_UNITS = 8.0
+JUMP_DEVIATIONS = 3.0
+#: A pad that spends more than this share of its time at 0 saturates; or at 255, where none is
+#: pressed.
+PRESSED_RAIL_SHARE = 0.005
+RESTING_RAIL_SHARE = 0.05
+#: A pad is noisy if its error is above this share of the highest pressure, and above this pressure.
+NOISY_SHARE = 0.035
+NOISY_KPA = 4.0
+#: Radii of plays to try, as shares of the highest pressure, and how many at most. One more is used
+#: if it lowers the square error on data that was not fitted by this share. Together their weights
+#: stay below the last number.
+RADII = (0.015, 0.03, 0.06, 0.12, 0.24)
+MOST_PLAYS = 3
+WORTH_SHARE = 0.1
+MOST_WEIGHT = 0.5
+#: The recording is cut into this many pieces; each fit leaves one of them out.
+FOLDS = 8
+#: Samples at this distance are independent enough to be fitted.
+FIT_STEP_S = 0.1
+#: Weight of a curve's bends, relative to its mean slope.
+STIFFNESS = 1280.0
+#: Above this quantile the activations are too few to fit a knot to them.
+UPPERMOST = 0.995
+
+
+@dataclass(frozen=True)
+class Course:
+    """Pads under a known pressure, at equal distances in time.
+
+    Attributes:
+        dt_s: distance of the samples.
+        raw: uint8[t, n].
+        zero: float64[n], the untouched reading.
+        there: bool[n], pads that were received.
+        pressure_kpa: float64[t].
+        lag_s: by how much the table's clock was found to be ahead.
+    """
+
+    dt_s: float
+    raw: Bytes
+    zero: Floats
+    there: Mask
+    pressure_kpa: Floats
+    lag_s: float = 0.0
+
+
+def fit_course(course: Course, smoothing_s: float) -> Curves:
+    """Find the curve of each pad, the foam's memory, and a verdict on each pad.
+
+    Args:
+        course: a recording and its pressure.
+        smoothing_s: of the filter that will be applied to the pads.
+
+    Raises:
+        RequestError: no pad follows the pressure.
+    """
+    n = course.raw.shape[1]
+    units, saturates = activations(course)
+    noise = _noise(units, course.dt_s)
+    verdict = np.full(n, CurveVerdict.UNKNOWN, np.uint8)
+    pressure = course.pressure_kpa
+    follows = _follows(units, pressure, course.dt_s)
+    verdict[course.there] = CurveVerdict.DEAD
+    verdict[course.there & follows] = CurveVerdict.GOOD
+    jumps = _jumps(units, pressure, noise, course.dt_s)
+    verdict[course.there & jumps] = CurveVerdict.JUMPS
+    verdict[course.there & saturates] = CurveVerdict.SATURATES
+    good = np.flatnonzero(verdict == CurveVerdict.GOOD)
+    if not len(good):
+        raise RequestError("no pad follows the pressure without jumps; wanted all pads pressed")
+    highest_kpa = float(np.max(pressure))
+    smooth = _smoothed(units[:, good], noise[good], smoothing_s, course.dt_s)
+    thin = slice(None, None, max(round(FIT_STEP_S / course.dt_s), 1))
+    weight = _weight(pressure, course.dt_s)[thin]
+    memory = _fit_memory(np.median(smooth, axis=1)[thin], pressure[thin], weight, highest_kpa)
+    loading = _loading_kpa(pressure, memory)[thin]
+    kpa = np.zeros((n, len(KNOTS_UNITS)))
+    beyond = np.full(n, np.inf)
+    for column, pad in enumerate(good):
+        x = smooth[thin, column]
+        beyond[pad] = float(np.quantile(x, UPPERMOST))
+        kpa[pad] = _fit_curve(x, loading, weight, beyond[pad])
+    error = np.full(n, np.nan)
+    found = Curves(rising(kpa), beyond, noise, error, verdict, highest_kpa, course.lag_s, memory)
+    read = read_course(found, good, units[:, good], smoothing_s, course.dt_s)
+    error[good] = np.sqrt(np.mean((read - pressure[:, np.newaxis]) ** 2, axis=0))
+    noisy = error > max(NOISY_SHARE * highest_kpa, NOISY_KPA)
+    verdict[noisy] = CurveVerdict.NOISY
+    return replace(found, verdict=verdict)
+
+
+def activations(course: Course) -> tuple[Floats, Mask]:
+    """Return activations [t, n] in units, and which pads [n] are often at an end of the byte's
+    range.
+
+    Such a byte is not a reading; it is replaced by the last one before it.
+    """
+    pressed, resting = course.raw == 0, course.raw == 255
+    at_rail = pressed | resting
+    rows = np.where(at_rail, 0, np.arange(len(course.raw))[:, np.newaxis])
+    held = np.take_along_axis(course.raw, np.maximum.accumulate(rows, axis=0), axis=0)
+    saturates = (pressed.mean(axis=0) > PRESSED_RAIL_SHARE) | (
+        resting.mean(axis=0) > RESTING_RAIL_SHARE
+    )
+    return course.zero - held, saturates
+
+
+def read_course(
+    curves: Curves, pads: NDArray[np.intp], units: Floats, smoothing_s: float, dt_s: float
+) -> Floats:
+    """Pressures [t, k] that some pads would have reported for activations [t, k]."""
+    curve = TableCurve(curves.kpa[pads], curves.beyond_units[pads])
+    smoother = StepFilter(limit_kpa(curve, curves.noise_units[pads]), smoothing_s)
+    relaxation = make_memory(len(pads), curves.memory)
+    result = np.empty(units.shape)
+    for row, momentary in enumerate(curve.kpa(units)):
+        smooth = smoother.step(momentary, dt_s)
+        result[row] = smooth
+        if relaxation is not None:
+            result[row] -= relaxation.step(smooth, dt_s)
+    return np.maximum(result, 0.0, out=result)
+
+
+def limit_kpa(curve: TableCurve, noise_units: Floats) -> Floats:
+    """Return the effect of noise [n] in the middle of the measured range, for `StepFilter`."""
+    end = np.where(np.isfinite(curve.beyond_units), curve.beyond_units, 1.0)
+    end = np.maximum(end, 1.0)
+    slope = curve.kpa(end) / end
+    limit: Floats = LIMIT_DEVIATIONS * noise_units * slope
+    return limit
+
+
+def make_memory(n: int, memory: Memory, dtype: type = np.float64) -> PlayRelaxation | None:
+    """Return the relaxation of n pads of a foam; None if it has none."""
+    if not memory.radius_kpa:
+        return None
+    return PlayRelaxation(n, radius_kpa=memory.radius_kpa, weight=memory.weight, dtype=dtype)
+
+
+def find_lag(median_units: Floats, time_s: Floats, table: tuple[Floats, Floats]) -> float:
+    """Return by how many seconds a table's clock is ahead of a recording's, from the whole of both.
+
+    Args:
+        median_units: activation [t] of the pads that move.
+        time_s: float64[t], of the samples, on the table's clock as far as it is known.
+        table: times in s and pressures in kPa.
+
+    Raises:
+        RequestError: the pads do not follow the pressure, whatever the lag.
+    """
+    coarse = np.arange(time_s[0], time_s[-1], 1.0)
+    units = np.interp(coarse, time_s, median_units)
+    lags = np.arange(-LONGEST_LAG_S, LONGEST_LAG_S + 0.5)
+    likeness = np.array([_correlation(units, np.interp(coarse + lag, *table)) for lag in lags])
+    # A table that is at rest for long before and after correlates well even a second off.
+    near = float(lags[int(np.argmax(likeness))])
+    if likeness.max() < SAME_CORRELATION:
+        raise RequestError(
+            f"the pads do not follow these pressures: correlation {likeness.max():.2f} at the best "
+            f"lag of {near:+.0f} s, wanted {SAME_CORRELATION} or more; is it the table of this "
+            "recording?"
+        )
+    fine = np.arange(time_s[0], time_s[-1], FIT_STEP_S)
+    units = np.interp(fine, time_s, median_units)
+    basis = np.hstack([_hinges(units), _lagging(units)])
+    # One pseudo-inverse for all lags: only the right-hand side differs.
+    project = np.linalg.pinv(basis)
+    tried = near + np.arange(-2.0, 2.0 + 0.5 * LAG_STEP_S, LAG_STEP_S)
+    error = []
+    for lag in tried:
+        wanted = np.interp(fine + lag, *table)
+        error.append(float(np.mean((basis @ (project @ wanted) - wanted) ** 2)))
+    return round(float(tried[int(np.argmin(error))]), 3)
+
+
+def median_of_moving(units: Floats, dt_s: float) -> Floats:
+    """Activation [t] of the pads that move, each sample the median over them.
+
+    Raises:
+        RequestError: none does.
+    """
+    blocks = _block_means(units, max(round(BLOCK_S / dt_s), 1))
+    low, high = np.quantile(blocks, (0.05, 0.95), axis=0)
+    moving = high - low > LEAST_UNITS
+    if not moving.any():
+        raise RequestError(
+            "nothing is pressed in the recording: no pad's reading changes by "
+            f"{LEAST_UNITS:g} units or more"
+        )
+    median: Floats = np.median(units[:, moving], axis=1)
+    return median
+
+
+def _hinges(units: Floats) -> Floats:
+    """A piecewise linear basis [t, k] over an activation [t]."""
+    top = float(np.max(units))
+    knots = np.linspace(0.0, max(top, 1.0), 9)[:-1]
+    columns = [np.ones_like(units), units, *(np.maximum(units - knot, 0.0) for knot in knots[1:])]
+    return np.stack(columns, axis=1)
+
+
+def _lagging(units: Floats) -> Floats:
+    """Return the lag of plays of some radii [t, k]: hysteresis that could be mistaken for a time
+    lag.
+    """
+    radii = np.array([0.03, 0.1]) * max(float(np.max(units)), 1.0)
+    plays = np.zeros(2)
+    result = np.empty((len(units), 2))
+    for row, reading in enumerate(units):
+        plays = np.minimum(np.maximum(plays, reading - radii), reading + radii)
+        result[row] = reading - plays
+    return result
+
+
+def _noise(units: Floats, dt_s: float) -> Floats:
+    length = max(round(NOISE_BLOCK_S / dt_s), 4)
+    count = len(units) // length
+    blocks = units[: count * length].reshape(count, length, -1)
+    line = np.arange(length) - (length - 1) / 2
+    slope = np.einsum("j,ijk->ik", line, blocks) / np.sum(line**2)
+    # The variance about a straight line: that of the block minus what the line explains.
+    variance = np.var(blocks, axis=1) - slope**2 * np.mean(line**2)
+    noise: Floats = np.sqrt(np.maximum(np.quantile(variance, NOISE_QUANTILE, axis=0), 0.0))
+    return noise
+
+
+def _follows(units: Floats, pressure: Floats, dt_s: float) -> Mask:
+    length = max(round(BLOCK_S / dt_s), 1)
+    blocks, mean = _block_means(units, length), _block_means(pressure[:, np.newaxis], length)
+    low, high = np.quantile(blocks, (0.02, 0.98), axis=0)
+    centred, course = blocks - blocks.mean(axis=0), mean - mean.mean()
+    power = np.sqrt(np.sum(centred**2, axis=0) * np.sum(course**2))
+    correlation = np.sum(centred * course, axis=0) / np.where(power > 0.0, power, 1.0)
+    follows: Mask = (high - low > LEAST_UNITS) & (correlation > LEAST_CORRELATION)
+    return follows
+
+
+def _jumps(units: Floats, pressure: Floats, noise: Floats, dt_s: float) -> Mask:
+    length = max(round(BLOCK_S / dt_s), 1)
+    blocks, mean = _block_means(units, length), _block_means(pressure[:, np.newaxis], length)[:, 0]
+    change = np.abs(blocks[2:] - blocks[:-2])
+    # The pressure may be shifted by up to a second.
+    around = np.pad(mean, 4, mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(around, 11)[: len(change)]
+    moved = windows.max(axis=1) - windows.min(axis=1)
+    per_kpa = (np.quantile(blocks, 0.98, axis=0) - np.quantile(blocks, 0.02, axis=0)) / np.ptp(mean)
+    beyond = change - 2.0 * moved[:, np.newaxis] * per_kpa
+    jumps: Mask = np.any(beyond > np.maximum(JUMP_UNITS, JUMP_DEVIATIONS * noise), axis=0)
+    return jumps
+
+
+def _smoothed(units: Floats, noise: Floats, smoothing_s: float, dt_s: float) -> Floats:
+    smoother = StepFilter(LIMIT_DEVIATIONS * noise, smoothing_s)
+    return np.array([smoother.step(row, dt_s).copy() for row in units])
+
+
+def _weight(pressure: Floats, dt_s: float) -> Floats:
+    """Return the weight [t] of each sample: less while the pressure moves."""
+    length = max(round(0.5 / dt_s), 1)
+    smooth = np.convolve(np.pad(pressure, length, mode="edge"), np.ones(length) / length, "same")
+    rate = np.gradient(smooth)[length:-length] / dt_s
+    weight: Floats = 1.0 / (UNCERTAINTY_KPA**2 + (DOUBT_S * rate) ** 2)
+    return weight
+
+
+def _fit_memory(units: Floats, pressure: Floats, weight: Floats, highest_kpa: float) -> Memory:
+    """Return as many plays as lower the error on data that was not fitted.
+
+    As plays of the pressure they enter the reading linearly: f(x) = P + sum v (p - max(P - rho,
+    0)).
+    The compensator's plays, of the reading, are those of the inverse operator.
+    """
+    wanted = np.maximum(pressure, 0.0)
+    lags = {share: _play_lag(wanted, share * highest_kpa) for share in RADII}
+    hinges = _hinges(units)
+    root = np.sqrt(weight)[:, np.newaxis]
+    piece = np.arange(len(units)) * 4 * FOLDS // len(units) % FOLDS
+
+    def fitted(shares: list[float], kept: Mask) -> Floats | None:
+        """Return coefficients of hinges and plays; None if a play would have the wrong sign."""
+        basis = np.hstack([hinges, *(-lags[share][:, np.newaxis] for share in shares)])
+        found = np.linalg.lstsq((root * basis)[kept], (root[:, 0] * wanted)[kept], rcond=None)[0]
+        plays = found[hinges.shape[1] :]
+        return None if np.any(plays <= 0.0) or np.sum(plays) >= MOST_WEIGHT else found
+
+    def held_out(shares: list[float]) -> float:
+        basis = np.hstack([hinges, *(-lags[share][:, np.newaxis] for share in shares)])
+        total = 0.0
+        for fold in range(FOLDS):
+            found = fitted(shares, piece != fold)
+            if found is None:
+                return np.inf
+            error = (basis @ found - wanted)[piece == fold]
+            total += float(np.sum(weight[piece == fold] * error**2))
+        return total
+
+    chosen: list[float] = []
+    best = held_out(chosen)
+    while len(chosen) < MOST_PLAYS:
+        tried = [sorted([*chosen, share]) for share in RADII if share not in chosen]
+        scores = [held_out(shares) for shares in tried]
+        index = int(np.argmin(scores))
+        if scores[index] > (1.0 - WORTH_SHARE) * best:
+            break
+        best, chosen = scores[index], tried[index]
+    found = fitted(chosen, np.ones(len(units), np.bool_))
+    if found is None or not chosen:
+        return Memory()
+    return _inverse([share * highest_kpa for share in chosen], found[hinges.shape[1] :].tolist())
+
+
+def _play_lag(pressure: Floats, radius_kpa: float) -> Floats:
+    """Return how far a play of the pressure [t] lags behind its value while loading."""
+    play, result = 0.0, np.empty_like(pressure)
+    for row, kpa in enumerate(pressure.tolist()):
+        play = min(max(play, kpa - radius_kpa), kpa + radius_kpa)
+        result[row] = play - max(kpa - radius_kpa, 0.0)
+    return result
+
+
+def _inverse(radius_kpa: list[float], weight: list[float]) -> Memory:
+    """Plays of the reading that undo plays of the pressure.
+
+    After a turn the reading follows with the slope 1 - sum of the weights of the plays that
+    have not yet turned, until twice their radius; the inverse has the inverse slopes.
+    """
+    slope, rho, r = 1.0 - sum(weight), 0.0, 0.0
+    slopes, radii = [1.0 / slope], []
+    for next_rho, share in zip(radius_kpa, weight, strict=True):
+        r += slope * (next_rho - rho)
+        rho, slope = next_rho, slope + share
+        radii.append(r)
+        slopes.append(1.0 / slope)
+    weights = [before - after for before, after in pairwise(slopes)]
+    return Memory(tuple(round(r, 3) for r in radii), tuple(round(w, 4) for w in weights))
+
+
+def _loading_kpa(pressure: Floats, memory: Memory) -> Floats:
+    """Return what a pad of the foam reads [t] under pressures [t]: the inverse of C -
+    relaxation(C).
+
+    The solution is unique, because C - relaxation rises with C. For each sample the step of C is
+    found
+    by trying each possible state of the plays.
+    """
+    if not memory.radius_kpa:
+        return pressure
+    radius, weight = np.array(memory.radius_kpa), np.array(memory.weight)
+    plays = np.zeros(len(radius))
+    result = np.empty_like(pressure)
+    reading = 0.0
+    for row, wanted in enumerate(np.maximum(pressure, 0.0)):
+        # Newton's method on a piecewise linear function ends after at most as many steps as it has
+        # pieces.
+        for _ in range(4 * len(radius) + 2):
+            moved = np.minimum(np.maximum(plays, reading - radius), reading + radius)
+            over = reading - radius
+            value = reading - float(weight @ (moved - np.maximum(over, 0.0)))
+            slope = 1.0 - float(weight @ ((moved != plays) * 1.0 - (over > 0.0)))
+            step = (wanted - value) / slope
+            reading = max(reading + step, 0.0)
+            if abs(step) < 1e-6:
+                break
+        plays = np.minimum(np.maximum(plays, reading - radius), reading + radius)
+        result[row] = reading
+    return result
+
+
+def _fit_curve(units: Floats, kpa: Floats, weight: Floats, top: float) -> Floats:
+    """Fit the curve [k] at `KNOTS_UNITS` to samples [t]: least squares, smooth, rising."""
+    count = int(np.searchsorted(KNOTS_UNITS, max(top, 10.0))) + 1
+    knots = KNOTS_UNITS[:count]
+    inside = np.clip(units, 0.0, knots[-1])
+    knot = np.searchsorted(knots[1:-1], inside, side="right")
+    high = (inside - knots[knot]) / (knots[knot + 1] - knots[knot])
+    # Below zero the first straight line continues.
+    high = np.where(units < 0.0, units / knots[1], high)
+    low = 1.0 - high
+    normal = np.zeros((count, count))
+    for row, column, product in (
+        (knot, knot, low * low),
+        (knot, knot + 1, low * high),
+        (knot + 1, knot, low * high),
+        (knot + 1, knot + 1, high * high),
+    ):
+        flat = row * count + column
+        normal += np.bincount(flat, weight * product, count * count).reshape(count, count)
+    right = np.bincount(knot, weight * low * kpa, count)
+    right += np.bincount(knot + 1, weight * high * kpa, count)
+    widths = np.diff(knots)
+    slopes = np.diff(np.eye(count), axis=0) / widths[:, np.newaxis]
+    bends = np.diff(slopes, axis=0) * np.sqrt(0.5 * (widths[1:] + widths[:-1]))[:, np.newaxis]
+    mean_slope = max(float(np.sum(weight * units * kpa) / np.sum(weight * units**2)), 1e-3)
+    normal += STIFFNESS / mean_slope**2 * bends.T @ bends
+    # An untouched pad reads no pressure, so the first knot is fixed.
+    found = np.zeros(len(KNOTS_UNITS))
+    found[1:count] = np.linalg.solve(normal[1:, 1:], right[1:])
+    found[:count] = rising(np.pad(found[:count], (0, len(KNOTS_UNITS) - count), mode="edge"))[
+        :count
+    ]
+    last = max((found[count - 1] - found[count - 3]) / (knots[-1] - knots[-3]), 0.1 * mean_slope)
+    found[count:] = found[count - 1] + last * (KNOTS_UNITS[count:] - knots[-1])
+    return found
+
+
+def _block_means(values: Floats, length: int) -> Floats:
+    count = len(values) // length
+    means: Floats = values[: count * length].reshape(count, length, -1).mean(axis=1)
+    return means
+
+
+def _correlation(one: Floats, other: Floats) -> float:
+    one, other = one - one.mean(), other - other.mean()
+    power = float(np.sqrt(np.sum(one**2) * np.sum(other**2)))
+    return float(np.sum(one * other)) / power if power > 0.0 else 0.0

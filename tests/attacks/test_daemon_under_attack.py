@@ -1,0 +1,215 @@
+"""A running daemon, a real broker, and somebody on the network who means harm.
+
+After each attack: the same process, its watchdog fed all the time, memory as before, frames and
+answers as before, and few lines in the log, none of them a traceback or of somebody's making.
+"""
+
+import json
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import paho.mqtt.client as mqtt
+import pytest
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+
+from tests.support.broker import Mosquitto
+from tests.support.stack import Stack, wait_for
+from tests.support.subscriber import Subscriber
+
+NODE = "skin/demo/nodes/main"
+GROWTH_KB = 20_000
+GAP_S = 1.0
+LOG_BYTES = 20_000
+
+
+class Watchdog:
+    """What systemd would see: when the daemon says that it works."""
+
+    def __init__(self, path: Path) -> None:
+        self.fed_s: list[float] = []
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(str(path))
+        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._thread.start()
+
+    def _listen(self) -> None:
+        # `shutdown` ends the wait with an empty datagram.
+        while said := self._socket.recv(4096):
+            if b"WATCHDOG=1" in said:
+                self.fed_s.append(time.monotonic())
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._socket.shutdown(socket.SHUT_RDWR)
+        self._thread.join()
+        self._socket.close()
+
+    def longest_gap_s(self, since_s: float) -> float:
+        times_s = [since_s, *(at_s for at_s in self.fed_s if at_s >= since_s), time.monotonic()]
+        return max(b - a for a, b in pairwise(times_s))
+
+
+class Attacker:
+    """A client that may do whatever the broker allows."""
+
+    def __init__(self, broker: Mosquitto) -> None:
+        self.place = broker.host, broker.port
+        self.idle: list[socket.socket] = []
+        self.client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2, protocol=mqtt.MQTTv5)
+        self.client.connect(broker.host, broker.port)
+        self.client.loop_start()
+
+    def ask(self, name: str, payload: bytes = b"{}", n: int = 1, **keys: Any) -> None:
+        for _ in range(n):
+            sent = self.client.publish(f"{NODE}/cmd/{name}", payload, qos=1, **keys)
+            if not _ % 100:
+                sent.wait_for_publish(30)
+
+
+def properties(**keys: Any) -> Properties:
+    made = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+    for key, value in keys.items():
+        setattr(made, key, value)
+    return made
+
+
+def bomb(attacker: Attacker) -> None:
+    pairs = [("", "")] * 3000
+    for _ in range(20):
+        attacker.ask("status", properties=properties(UserProperty=pairs))
+
+
+def huge(attacker: Attacker) -> None:
+    attacker.ask("status", b" " * 5_000_000, n=5)
+    attacker.ask("status", b" " * 70_000, n=20)
+
+
+def replies(attacker: Attacker) -> None:
+    for topic in ("/" * 250, "a" * 60_000, f"{NODE}/replies/" + "x/" * 150, "skin/demo/x/contact"):
+        attacker.ask("status", properties=properties(ResponseTopic=topic))
+
+
+def flood(attacker: Attacker) -> None:
+    attacker.ask("status", n=3000)
+
+
+def nested(attacker: Attacker) -> None:
+    for payload in (b"[" * 60_000, b'{"a":' * 10_000, b'{"id":1e999999}', b'{"id":"\\ud800"}'):
+        attacker.ask("calibrate", payload)
+    attacker.ask("thresholds", b'{"set":{"margin_units":1e400}}')
+
+
+def forged(attacker: Attacker) -> None:
+    evil = {"id": "x\nERROR forged line", "x\nERROR forged line\u2028": 1}
+    for name in ("disable", "calibrate", "record", "nothing"):
+        attacker.ask(name, json.dumps(evil, ensure_ascii=False).encode(), n=5)
+    attacker.ask("record", json.dumps({"file": "../../\nERROR forged line"}).encode(), n=5)
+
+
+def poisoned(attacker: Attacker) -> None:
+    for name in ("calibrate", "disable", "record"):
+        attacker.ask(name, b'{"part":"left_hand"}', retain=True)
+        attacker.ask(name, b"", retain=True)
+    for topic in (f"{NODE}/status", f"{NODE}/info", "skin/demo/left_hand/health"):
+        attacker.client.publish(topic, b"\xff" * 1000, qos=1, retain=True)
+
+
+def deaf(attacker: Attacker) -> None:
+    """Subscribers of everything that read nothing, and whose windows stay shut."""
+    for number in range(30):
+        reader = socket.socket()
+        reader.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+        reader.connect(attacker.place)
+        attacker.idle.append(reader)
+        name = b"deaf%02d" % number
+        reader.sendall(b"\x10" + bytes([13 + len(name)]) + b"\0\4MQTT\5\2\0\0\0\0")
+        reader.sendall(bytes([len(name)]) + name + b"\x82\7\0\1\0\0\1#\1")
+    time.sleep(2.0)
+
+
+ATTACKS: list[Callable[[Attacker], None]] = [
+    bomb,
+    huge,
+    replies,
+    flood,
+    nested,
+    forged,
+    poisoned,
+    deaf,
+]
+
+
+@pytest.fixture
+def watchdog(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Watchdog]:
+    path = tmp_path / "notify"
+    made = Watchdog(path)
+    monkeypatch.setenv("NOTIFY_SOCKET", str(path))
+    monkeypatch.setenv("WATCHDOG_USEC", "400000")
+    yield made
+    made.close()
+
+
+def memory_kb(pid: int) -> int:
+    status = Path(f"/proc/{pid}/status").read_text()
+    (line,) = [line for line in status.splitlines() if line.startswith("VmRSS")]
+    return int(line.split()[1])
+
+
+def test_whoever_is_on_the_network_stops_nothing(
+    stack: Stack, mosquitto: Mosquitto, subscriber: Subscriber, watchdog: Watchdog
+) -> None:
+    stack.calibrate()
+    daemon = stack.start("run", str(stack.config))
+    log = stack._said[-1]
+    wait_for(lambda: len(subscriber.payloads("left_hand/frame")) > 20, "frames")
+    attacker = Attacker(mosquitto)
+
+    def answers() -> int:
+        return len(subscriber.payloads("cmd/status/result"))
+
+    def is_well() -> None:
+        """A request is answered, and frames come."""
+        frames, said = len(subscriber.payloads("left_hand/frame")), answers()
+        deadline_s = time.monotonic() + 30
+        while answers() == said and time.monotonic() < deadline_s:
+            attacker.ask("status")
+            time.sleep(0.5)
+        assert answers() > said, log.read_text()[-3000:]
+        wait_for(lambda: len(subscriber.payloads("left_hand/frame")) > frames, "more frames")
+
+    is_well()
+    calm_s = time.monotonic()
+    time.sleep(3.0)
+    # A machine with other work has gaps of its own.
+    allowed_s = max(GAP_S, 2.0 * watchdog.longest_gap_s(calm_s))
+    for attack in ATTACKS:
+        before_kb, log_bytes, since_s = memory_kb(daemon.pid), log.stat().st_size, time.monotonic()
+        attack(attacker)
+        is_well()
+        what = attack.__name__
+        assert daemon.poll() is None, what
+        assert watchdog.longest_gap_s(since_s) < allowed_s, what
+        assert memory_kb(daemon.pid) - before_kb < GROWTH_KB, what
+        assert log.stat().st_size - log_bytes < LOG_BYTES, what
+        sys.stdout.write(
+            f"{what}: longest gap {watchdog.longest_gap_s(since_s):.2f} s of {allowed_s:.2f}, "
+            f"{memory_kb(daemon.pid) - before_kb} kB more, {log.stat().st_size - log_bytes} "
+            "bytes of log\n"
+        )
+    said = log.read_text()
+    assert "Traceback" not in said
+    assert not [line for line in said.splitlines() if line.startswith("ERROR forged")]
+    assert len(subscriber.payloads("main/status")) < 20
+    assert b"OFF" not in subscriber.payloads("x/contact")
+    for reader in attacker.idle:
+        reader.close()
+    attacker.client.disconnect()
+    attacker.client.loop_stop()
+    assert set(stack.stop()) <= {0}

@@ -1,0 +1,77 @@
+"""A broker that sends what no broker should: packets of every type, malformed and endless."""
+
+import asyncio
+import logging
+import random
+
+import pytest
+
+from skin_host.publish.mqtt import Publisher
+from skin_host.settings import Mqtt
+from tests.support.waiting import until
+
+CONNACK_5 = bytes([0x20, 3, 0, 0, 0])
+CONNACK_311 = bytes([0x20, 2, 0, 0])
+
+
+def packets(chance: random.Random) -> list[bytes]:
+    """Every type with every flag: empty, random, of a length that never comes, and a bomb."""
+    found = []
+    for first in range(0x10, 0x100):
+        body = chance.randbytes(chance.randrange(60))
+        found.append(bytes([first, len(body)]) + body)
+        found.append(bytes([first, 0]))
+        found.append(bytes([first, 0xFF, 0xFF, 0xFF, 0x7F]) + chance.randbytes(1000))
+        found.append(bytes([first, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF]))
+    properties = b"\x26\0\0\0\0" * 100_000
+    body = b"\0\1a\0\1" + b"\xa0\xc2\x1e" + properties
+    found.append(b"\x32" + b"\xa8\xc2\x1e" + body)
+    chance.shuffle(found)
+    return found
+
+
+@pytest.mark.parametrize("protocol", ["5", "3.1.1"])
+async def test_a_hostile_broker_is_left_and_tried_again_with_few_words(
+    protocol: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    hostile = packets(random.Random(1))
+    served = 0
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        nonlocal served
+        try:
+            await reader.readuntil(b"MQTT")
+            writer.write(CONNACK_5 if protocol == "5" else CONNACK_311)
+            for packet in hostile[served : served + 60]:
+                writer.write(packet)
+            served += 60
+            await writer.drain()
+            await asyncio.sleep(0.05)
+        except (OSError, asyncio.IncompleteReadError):
+            pass
+        finally:
+            writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    port = server.sockets[0].getsockname()[1]
+    longest_s = 0.0
+
+    async def beat() -> None:
+        nonlocal longest_s
+        now_s = asyncio.get_running_loop().time
+        while True:
+            before_s = now_s()
+            await asyncio.sleep(0.01)
+            longest_s = max(longest_s, now_s() - before_s)
+
+    beating = asyncio.create_task(beat())
+    settings = Mqtt(host="127.0.0.1", port=port, protocol=protocol)
+    async with Publisher(settings, "robot", drain_s=0.0):
+        await until(lambda: served >= 300)
+    beating.cancel()
+    await asyncio.gather(beating, return_exceptions=True)
+    server.close()
+    assert longest_s < 5.0  # a bomb that is decoded takes most of a minute
+    errors = [r for r in caplog.records if r.exc_info is not None]
+    assert errors == []
+    assert len([r for r in caplog.records if r.levelno >= logging.WARNING]) < 40

@@ -1,0 +1,78 @@
+"""Hostile files and arguments end in one line and exit status 2 or 1, never in a traceback."""
+
+from pathlib import Path
+
+import pytest
+
+from skin_host import metrics
+from skin_host.cli import main
+from skin_host.errors import RequestError, SkinError
+from skin_host.publish.address import Broker
+from skin_host.recorder import MAX_RECORDINGS, Recorder
+
+CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "(99999999999999999999.000000) can0 4E0#00",
+        "(-5.000000) can0 4E0#00",
+        "(1.000000) can0 4E0#" + "AA" * 100_000,
+    ],
+)
+def test_a_recording_with_impossible_frames_is_refused_in_a_line(
+    tmp_path: Path, line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "x.log"
+    log.write_text(line + "\n")
+    assert main(["replay", str(log), "--config", str(CONFIG), "--output", "-"]) == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert str(log) in said
+    assert len(said) < 500
+
+
+@pytest.mark.parametrize("text", ["a=" + "[" * 100_000, "a=" + "{b=" * 50_000])
+def test_a_configuration_nested_without_end_is_refused_in_a_line(
+    tmp_path: Path, text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "x.toml"
+    path.write_text(text)
+    assert main(["check", str(path)]) == 2
+    said = capsys.readouterr()
+    assert "nested too deep" in said.err + said.out
+
+
+def test_an_impossible_port_is_refused_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["view", "--port", "99999"]) != 0
+    (said,) = capsys.readouterr().err.splitlines()
+    assert "99999" in said
+
+
+def test_a_folder_takes_so_many_recordings_and_no_more(tmp_path: Path) -> None:
+    for number in range(MAX_RECORDINGS):
+        (tmp_path / f"{number}.log").touch()
+    with pytest.raises(SkinError, match="holds 100 recordings already"):
+        Recorder(tmp_path / "one_more.log", 1.0, 1000)
+
+
+def test_a_password_need_not_stand_in_the_url(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SKIN_MQTT_PASSWORD", "sesame")
+    assert Broker.from_url("mqtt://anna@host")[0].password == "sesame"
+    assert Broker.from_url("mqtt://anna:own@host")[0].password == "own"
+    assert Broker.from_url("mqtt://host")[0].password is None
+    (tmp_path / "password").write_text("open\n")
+    monkeypatch.setenv("SKIN_MQTT_PASSWORD_FILE", str(tmp_path / "password"))
+    assert Broker.from_url("mqtt://anna@host")[0].password == "open"
+    monkeypatch.setenv("SKIN_MQTT_PASSWORD_FILE", str(tmp_path / "none"))
+    with pytest.raises(RequestError, match="none: No such file"):
+        Broker.from_url("mqtt://anna@host")
+
+
+def test_metrics_are_in_seconds_not_negative_and_name_faults() -> None:
+    record = {"age_ms": -3.0, "faults": [{"code": "board_silent", "where": "hand"}]}
+    text = metrics.exposition({"palm": record})  # type: ignore[dict-item]
+    assert 'skin_age_seconds{part="palm"} 0\n' in text
+    assert 'skin_fault{part="palm",code="board_silent",where="hand"} 1\n' in text

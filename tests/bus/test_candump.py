@@ -1,0 +1,109 @@
+"""Logs of candump are read in blocks: the same batches as line by line."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import can
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from skin_host.bus import candump
+from skin_host.bus.adapters import identifier, nanoseconds
+from skin_host.bus.logs import CAPACITY, WINDOW_NS, read_channels
+from skin_host.bus.protocol import FrameBatch
+from skin_host.errors import LogError
+
+Read = list[tuple[str, list[tuple[int, bytes, int]]]]
+
+
+def line_by_line(path: Path) -> Iterator[tuple[str, list[tuple[int, bytes, int]]]]:
+    """The oracle: each message of python-can put where it belongs."""
+    windows: dict[str, list[tuple[int, bytes, int]]] = {}
+    end_ns = 0
+    with can.LogReader(path) as reader:
+        for message in reader:
+            if message.is_fd:
+                continue
+            channel = "" if message.channel is None else str(message.channel)
+            t_ns = nanoseconds(message.timestamp)
+            if windows and (t_ns >= end_ns or len(windows.get(channel, ())) == CAPACITY):
+                yield from windows.items()
+                windows = {}
+            if not windows:
+                end_ns = t_ns + WINDOW_NS
+            frame = identifier(message), bytes(message.data), t_ns
+            windows.setdefault(channel, []).append(frame)
+    yield from windows.items()
+
+
+def frames_of(batch: FrameBatch) -> list[tuple[int, bytes, int]]:
+    walked = [
+        (number, (bytes((first,)) + others)[:dlc], seconds * 1_000_000_000 + ns)
+        for seconds, ns, number, dlc, first, others in batch.frames()
+    ]
+    columns = zip(batch.id.tolist(), batch.data, batch.dlc.tolist(), batch.t_ns, strict=True)
+    assert walked == [(number, bytes(data[:dlc]), int(t_ns)) for number, data, dlc, t_ns in columns]
+    return walked
+
+
+def in_blocks(path: Path) -> Read:
+    return [(channel, frames_of(batch)) for channel, batch in read_channels(path)]
+
+
+HEX = st.sampled_from(["", "40", "40F4F4F3F4F4F3F4", "c0f3f3f4f4f40000", "0102030405"])
+LINES = st.builds(
+    "({}.{}) {} {}{}".format,
+    st.sampled_from(["1700000000", "1700000001", "99", "0"]),
+    st.sampled_from(["000000", "000125", "003999", "004000", "999999", "5", "1234567"]),
+    st.sampled_from(["can0", "can1", "vcan0", "0", "007", "1"]),
+    st.sampled_from(["4E4", "4e5", "FFF", "00000123", "1F334455", "20000080"]),
+    st.one_of(
+        HEX.map("#{}".format),
+        HEX.map("#{} R".format),
+        st.sampled_from(["#R", "#R8", "##1" + "00" * 12, "##000", "#4", "#40F"]),
+    ),
+)
+
+
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    st.lists(st.one_of(LINES, LINES, LINES, st.sampled_from(["", "  "])), min_size=1, max_size=40),
+    st.sampled_from(["\n", "\r\n"]),
+    st.sampled_from([1, 100, 1 << 20]),
+    st.booleans(),
+)
+def test_any_lines_make_the_same_batches(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    lines: list[str],
+    newline: str,
+    block: int,
+    is_ended: bool,
+) -> None:
+    monkeypatch.setattr(candump, "BLOCK_BYTES", block)
+    path = tmp_path / "a.log"
+    path.write_text(newline.join(lines) + newline * is_ended, newline="")
+    expected: Read = []
+    try:
+        expected = list(line_by_line(path))
+    except (ValueError, IndexError):
+        with pytest.raises(LogError, match=r"damaged after frame|cannot be read"):
+            in_blocks(path)
+        return
+    if not any(line.strip() for line in lines):
+        with pytest.raises(LogError, match="no CAN frame"):
+            in_blocks(path)
+        return
+    assert in_blocks(path) == expected
+
+
+def test_what_is_alike_is_not_read_line_by_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.log"
+    lines = [f"({10 + i // 9}.{i:06d}) can{i % 3} {0x400 + i % 16:X}#" for i in range(3000)]
+    path.write_text("".join(f"{line}{'F4' * (i % 9)}\n" for i, line in enumerate(lines)))
+    expected = list(line_by_line(path))
+    monkeypatch.setattr(candump, "_decode_one", None)
+    assert in_blocks(path) == expected

@@ -1,0 +1,99 @@
+"""Whatever ways messages come, each is passed on once and in order, the newest state wins."""
+
+import random
+
+import pytest
+from msgspec.structs import replace
+
+from skin_host.client.order import MAX_HELD, EventOrder, Newest
+from skin_host.publish.messages import Touch
+from skin_host.publish.order import Numbers, Stamp
+from tests.client.test_presence import seen
+
+
+def event(count: int) -> Touch:
+    return replace(seen("move"), count=count)
+
+
+def counts(events: list[Touch]) -> list[int]:
+    return [one.count for one in events]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_of_several_ways_each_with_its_own_delay_comes_one_order(seed: int) -> None:
+    chance = random.Random(seed)
+    order = EventOrder(hold_s=1.0)
+    order.take(event(1), 7, 0.0)
+    # Each way brings all events in order, some twice, some late, within the holding time.
+    ways = [[*range(2, 40)] for _ in range(3)]
+    for way in ways:
+        at = chance.randrange(20)
+        way[at:at] = way[max(0, at - 5) : at]
+    passed: list[int] = []
+    while any(ways):
+        way = chance.choice([way for way in ways if way])
+        passed += counts(order.take(event(way.pop(0)), 7, 0.5))
+    assert passed == list(range(2, 40))
+
+
+def test_a_gap_is_waited_for_and_then_passed_over() -> None:
+    order = EventOrder(hold_s=1.0)
+    assert counts(order.take(event(1), 7, 0.0)) == [1]
+    assert counts(order.take(event(3), 7, 0.1)) == []
+    assert counts(order.expire(1.0)) == []
+    assert counts(order.take(event(5), 7, 1.0)) == []
+    assert counts(order.expire(1.2)) == [3]
+    assert counts(order.take(event(4), 7, 1.3)) == [4, 5]
+    assert counts(order.take(event(2), 7, 1.4)) == []
+
+
+def test_a_single_way_waits_for_nothing() -> None:
+    order = EventOrder(hold_s=0.0)
+    assert counts(order.take(event(1), 7, 0.0)) == [1]
+    assert counts(order.take(event(9), 7, 0.0)) == [9]
+
+
+def test_a_node_that_starts_anew_begins_at_1_and_its_last_run_is_over() -> None:
+    order = EventOrder(hold_s=1.0)
+    assert counts(order.take(event(50), 7, 0.0)) == [50]
+    assert counts(order.take(event(52), 7, 0.0)) == []
+    assert counts(order.take(event(1), 8, 0.1)) == [52, 1]
+    assert counts(order.take(event(51), 7, 0.2)) == []
+
+
+def test_what_waits_is_bounded() -> None:
+    order = EventOrder(hold_s=1e9)
+    order.take(event(1), 7, 0.0)
+    passed = [one for n in range(3, 3 + MAX_HELD + 1) for one in order.take(event(n), 7, 0.0)]
+    assert counts(passed) == [*range(3, 3 + MAX_HELD + 1)]
+
+
+def test_the_newest_state_wins_over_what_comes_late() -> None:
+    newest = Newest()
+    assert newest.take("contact", "palm", Stamp(5, 3))
+    assert newest.take("contact", "palm", Stamp(5, 3)) is None
+    assert newest.take("contact", "palm", Stamp(4, 9)) is False
+    assert newest.take("contact", "palm", None) is False
+    assert newest.take("contact", "arm", None)
+    newest.forget("contact")
+    assert newest.take("contact", "palm", Stamp(4, 9))
+
+
+def test_numbers_rise_while_the_clock_is_set_back() -> None:
+    times = iter([100, 50, 51, 200])
+    numbers = Numbers(lambda: next(times))
+    given = [numbers.run]
+    for _ in range(3):
+        numbers.connect()
+        given.append(numbers.connection)
+        assert numbers.online < numbers.offline < numbers.state() < numbers.state()
+    assert given == [100, 101, 102, 200]
+
+
+def test_a_run_overtakes_one_that_had_a_clock_ahead() -> None:
+    numbers = Numbers(lambda: 5)
+    assert not numbers.overtake(Stamp(5, 1))
+    assert numbers.overtake(Stamp(1000, 1))
+    assert numbers.run > 1000
+    numbers.connect()
+    assert numbers.online > Stamp(1000, 10**6)

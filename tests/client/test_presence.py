@@ -1,0 +1,177 @@
+"""What a client knows of contacts fails safe: whatever is not known now is UNKNOWN."""
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from skin_host.client import Contact, SkinCallbacks
+from skin_host.client.presence import Presence
+from skin_host.layout import build_layout
+from skin_host.publish.info import node_info
+from skin_host.publish.messages import Touch
+from skin_host.publish.mqtt import Publisher
+from skin_host.settings import load
+from tests.client.test_client import hearing, publishing, take, touch
+from tests.support.broker import Mosquitto
+from tests.support.waiting import until
+
+CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
+
+
+def seen(event: Any, number: int = 1) -> Touch:
+    return Touch(
+        event=event,
+        id=number,
+        seq=1,
+        t_ns=1,
+        part="palm",
+        taxels=[1],
+        centroid_m=None,
+        normal=None,
+        area_mm2=1.0,
+        peak_kpa=1.0,
+        mean_kpa=1.0,
+        force_n=1.0,
+    )
+
+
+def test_unknown_counts_as_touched() -> None:
+    assert [Contact("a", state).touched for state in ("ON", "OFF", "UNKNOWN")] == [
+        True,
+        False,
+        True,
+    ]
+    assert not Contact("a", "UNKNOWN", "stale").known
+
+
+def test_a_part_of_which_nothing_comes_is_stale() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_state("palm", "OFF", 0.0)
+    assert presence.changes(0.0) == [Contact("palm", "OFF")]
+    presence.take_sign("palm", 2.0)
+    assert presence.changes(4.9) == []
+    assert presence.changes(5.1) == [Contact("palm", "UNKNOWN", "stale")]
+    presence.take_sign("palm", 6.0)
+    assert presence.changes(6.0) == [Contact("palm", "OFF")]
+
+
+def test_a_node_that_stops_takes_its_parts_with_it() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_info("arm", ["palm"])
+    presence.take_node("arm", True)
+    presence.take_state("palm", "OFF", 0.0)
+    presence.take_state("foot", "OFF", 0.0)
+    presence.changes(0.0)
+    presence.take_node("arm", False)
+    assert presence.changes(0.1) == [Contact("palm", "UNKNOWN", "offline")]
+
+
+def test_after_a_lost_broker_the_state_before_is_history() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_state("palm", "OFF", 0.0)
+    presence.changes(0.0)
+    presence.take_loss()
+    assert presence.changes(1.0) == [Contact("palm", "UNKNOWN", "disconnected")]
+    assert presence.changes(2.0) == []
+    presence.take_state("palm", "ON", 2.1)
+    assert presence.changes(2.1) == [Contact("palm", "ON")]
+
+
+def test_contacts_are_present_from_begin_to_end() -> None:
+    presence = Presence(stale_s=3.0)
+    for event, number in (("begin", 1), ("begin", 2), ("move", 1), ("end", 2)):
+        presence.take_touch(seen(event, number), 0.0)
+    assert [(one.event, one.id) for one in presence.touches(None, 0.0)] == [("move", 1)]
+    assert presence.touches("foot", 0.0) == []
+
+
+def test_a_contact_whose_end_was_lost_goes_while_its_part_is_received() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_touch(seen("begin", 1), 0.0)
+    assert presence.touches("palm", 10.0)  # nothing came at all: nothing is known of its end
+    presence.take_sign("palm", 10.0)
+    assert presence.touches("palm", 10.0) == []
+    presence.take_touch(seen("begin", 2), 11.0)
+    presence.take_state("palm", "OFF", 11.0)
+    assert presence.touches("palm", 11.0) == []
+
+
+async def announced(publisher: Publisher) -> None:
+    """The node is the demo's, whose parts have a contact and send their health."""
+    layout = build_layout(load(CONFIG), CONFIG.parent)
+    publisher.put_info(node_info(layout, "main", version="1", configuration="x"))
+    publisher.put_contact("left_hand", "OFF")
+    publisher.put_health("left_hand", {})
+    await until(lambda: publisher.counters.retained_sent >= 4)
+
+
+async def test_a_node_that_falls_silent_is_stale_and_one_that_ends_is_offline(
+    mosquitto: Mosquitto,
+) -> None:
+    async with hearing(mosquitto, stale_s=0.5) as skin:
+        contacts = skin.contacts("left_hand")
+        await skin.ready()
+        async with publishing(mosquitto) as publisher:
+            await announced(publisher)
+            assert await take(contacts, 1) == [Contact("left_hand", "OFF")]
+            # It is online and says nothing more.
+            assert await take(contacts, 1) == [Contact("left_hand", "UNKNOWN", "stale")]
+            publisher.put_health("left_hand", {"rate_hz": 1.0})
+            assert await take(contacts, 1) == [Contact("left_hand", "OFF")]
+        assert await take(contacts, 1) == [Contact("left_hand", "UNKNOWN", "offline")]
+
+
+async def test_what_the_broker_kept_of_a_node_that_is_offline_is_never_off(
+    mosquitto: Mosquitto,
+) -> None:
+    async with publishing(mosquitto) as publisher:
+        await announced(publisher)
+    for _ in range(5):
+        async with hearing(mosquitto) as skin:
+            (first,) = await take(skin.contacts("left_hand"), 1)
+            assert first == Contact("left_hand", "UNKNOWN", "offline")
+
+
+@pytest.mark.parametrize("how", ["kill", "freeze"])
+async def test_a_lost_broker_makes_everything_unknown(mosquitto: Mosquitto, how: str) -> None:
+    async with publishing(mosquitto) as publisher, hearing(mosquitto, stale_s=1.0) as skin:
+        contacts = skin.contacts()
+        await announced(publisher)
+        assert await take(contacts, 1) == [Contact("left_hand", "OFF")]
+        mosquitto.kill() if how == "kill" else mosquitto.freeze()
+        (lost,) = await take(contacts, 1)
+        assert lost == Contact("left_hand", "UNKNOWN", "disconnected" if how == "kill" else "stale")
+        if how == "freeze":
+            mosquitto.resume()
+
+
+async def test_present_contacts_are_listed(mosquitto: Mosquitto) -> None:
+    async with publishing(mosquitto) as publisher, hearing(mosquitto) as skin:
+        contacts = skin.contacts()
+        await skin.ready()
+        publisher.put_touch(touch(1, event="begin"))
+        await until(lambda: [one.part for one in skin.present()] == ["palm"])
+        publisher.put_touch(touch(2, event="end"))
+        await until(lambda: not skin.present("palm"))
+        del contacts
+
+
+async def test_callbacks_for_what_is_unknown(mosquitto: Mosquitto) -> None:
+    unknown: list[Contact] = []
+
+    def use() -> SkinCallbacks:
+        skin = SkinCallbacks(f"mqtt://{mosquitto.host}:{mosquitto.port}", robot="robot")
+        skin.__enter__()
+        skin.on_unknown(unknown.append)
+        return skin
+
+    async with publishing(mosquitto) as publisher:
+        await announced(publisher)
+        skin = await asyncio.to_thread(use)
+        publisher.put_contact("left_hand", "ON")
+        publisher.put_contact("left_forearm", "UNKNOWN")
+        await until(lambda: unknown == [Contact("left_forearm", "UNKNOWN", "not_felt")])
+        assert await asyncio.to_thread(skin.present) == []
+        await asyncio.to_thread(skin.__exit__)

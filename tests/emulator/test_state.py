@@ -1,0 +1,109 @@
+"""A robot that is saved and restored goes on as if nothing had happened; other files do nothing."""
+
+import os
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from emulator import state
+from emulator.faults import parse
+from emulator.robot import Robot
+from emulator.scene import load as load_scene
+from emulator.state import StateError
+from skin_host.layout import Layout, build_layout
+from skin_host.settings import Settings, load
+
+CONFIG = Path(__file__).parents[2] / "config"
+FAULTS = (
+    "stuck_taxel board=hand triangle=2 taxel=3",
+    "noisy_taxel board=hand triangle=2 taxel=4",
+    "chip_gone board=forearm_outer triangle=3",
+    "frame_loss bus=can0 value=0.1",
+    "no_acknowledge board=hand triangle=0",
+    "bit_flipped board=forearm_inner triangle=0",
+    "shared_address board=forearm_outer triangle=6",
+)
+
+
+def skin(name: str = "demo") -> tuple[Settings, Layout]:
+    settings = load(CONFIG / f"{name}.toml")
+    return settings, build_layout(settings, CONFIG)
+
+
+def sent(robot: Robot, steps: int) -> bytes:
+    batches = [robot.step(0.05)["can0"] for _ in range(steps)]
+    return b"".join(
+        batch.id.tobytes() + batch.data.tobytes() + batch.t_ns.tobytes() for batch in batches
+    )
+
+
+@pytest.mark.parametrize("fidelity", ["signal", "chip"])
+@pytest.mark.parametrize("name", ["demo", "fingertips"])
+def test_branches_from_one_state_send_the_same_bytes(
+    name: str, fidelity: str, tmp_path: Path
+) -> None:
+    """In the middle of a press, with faults on that end later."""
+    configuration = skin(name)
+    scene = load_scene(CONFIG / "scenes" / f"{name}.toml")
+    robot = Robot(*configuration, scene, fidelity=fidelity)
+    robot.bring_up()
+    robot.step(7.0 - robot.t_ns * 1e-9)
+    for line in FAULTS if name == "demo" else ():
+        fault = parse(line)
+        fault.at_s, fault.until_s = 0.0, 0.8
+        robot.inject(fault)
+    robot.step(0.3)
+    robot.write(tmp_path / "state")
+    branches = [Robot.read(tmp_path / "state", *configuration) for _ in range(2)]
+
+    wanted = sent(robot, 25)
+    for branch in branches:
+        assert sent(branch, 25) == wanted
+        np.testing.assert_array_equal(branch.skin.capacitance_ff, robot.skin.capacitance_ff)
+
+
+def test_a_state_of_another_configuration_is_refused() -> None:
+    robot = Robot(*skin())
+    other = skin("fingertips")
+
+    with pytest.raises(StateError, match="of another configuration"):
+        Robot.restore(robot.save(), *other)
+
+
+def test_a_damaged_or_foreign_file_is_refused_in_one_line(tmp_path: Path) -> None:
+    configuration = skin()
+    data = Robot(*configuration).save()
+    for wrong in (b"", b"hello", data[: len(data) // 2], data[:60]):
+        (tmp_path / "state").write_bytes(wrong)
+        with pytest.raises(StateError) as refused:
+            Robot.read(tmp_path / "state", *configuration)
+        assert str(tmp_path / "state") in str(refused.value)
+        assert "\n" not in str(refused.value)
+
+
+class _Evil:
+    def __init__(self, *call: object) -> None:
+        self._call = call
+
+    def __reduce__(self) -> tuple[object, tuple[object, ...]]:
+        return self._call[0], self._call[1:]
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        (os.system, "true"),
+        (eval, "1"),
+        (getattr, "", "join"),
+        (getattr, Path("x"), "write_text"),
+        (load, Path("x")),
+    ],
+)
+def test_a_state_calls_nothing_but_the_emulators_own(call: tuple[object, ...]) -> None:
+    configuration = skin()
+    head = Robot(*configuration).save()[: len(state.MAGIC) + state.DIGEST_BYTES]
+
+    with pytest.raises(StateError, match="the state names"):
+        Robot.restore(head + pickle.dumps(_Evil(*call)), *configuration)

@@ -1,0 +1,56 @@
+"""Bugs that seeds of `skin simulate` found, each as a claim."""
+
+import asyncio
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from emulator.scene import Scene
+from skin_host.cli.common import load_skin
+from skin_host.demo import configuration
+from skin_host.evaluation.simulate.world import Life, World
+
+DEMO = configuration("demo.toml")
+
+
+@pytest.fixture
+def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
+    settings, layout = load_skin(DEMO)
+    yield World(settings, layout, DEMO, 1, Scene(quiet=True))
+
+
+def start(world: World) -> Life:
+    world.life = Life(world)
+    world.life.start(lambda _: None)
+    return world.life
+
+
+def test_a_daemon_that_died_in_a_touch_does_not_call_it_untouched_when_it_is_back(
+    world: World,
+) -> None:
+    """Its boards go on sending; the zero that they take at the next start takes in what presses."""
+
+    async def live() -> bytes:
+        life = start(world)
+        await world.clock.sleep(8.0)
+        spot = world.spots[0]
+        pressing = asyncio.create_task(spot.press(8.0))
+        await world.clock.sleep(2.0)
+        life.kill()
+        await world.clock.sleep(0.5)
+        life = start(world)
+        await world.clock.sleep(4.0)
+        assert not pressing.done()
+        topic = life.daemon.publisher.topics.part("contact", spot.part)
+        state = world.broker.retained[topic]
+        board_doubts = [
+            life.daemon.engine.in_doubt(board).sum() for board in life.daemon.engine.boards
+        ]
+        assert sum(board_doubts) > 0
+        life.kill()
+        return state
+
+    with world.clock.runner() as runner:
+        assert runner.run(live()) == b"UNKNOWN"

@@ -1,0 +1,238 @@
+"""Recordings of real skin: read as they are, measured as defined, said to be absent."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from skin_host.cli import main
+from skin_host.errors import LogError
+from skin_host.evaluation import insole, page, real
+from skin_host.evaluation.insole import PADS, Recording
+from skin_host.evaluation.real import Course
+
+ROOT = Path(__file__).parents[2]
+TOOL = ROOT.parent / "shared" / "tools" / "insole_log"
+PERIOD_NS = 20_400_000
+
+
+def recording(pressure_kpa: np.ndarray, kpa_per_unit: float = 8.0) -> Recording:
+    """Pads that read a unit for every so many kPa, with noise, under a course of pressure."""
+    rng = np.random.default_rng(1)
+    t = len(pressure_kpa)
+    rest = rng.uniform(180.0, 220.0, PADS)
+    activation = pressure_kpa[:, np.newaxis] / kpa_per_unit
+    counts = np.rint(rest - activation + rng.normal(0.0, 0.6, (t, PADS))).astype(np.uint8)
+    t_ns = insole.START_NS + np.arange(t, dtype=np.int64) * PERIOD_NS
+    return Recording("left_made_up", t_ns, counts, pressure_kpa)
+
+
+def ramp(seconds: float = 30.0, high_kpa: float = 300.0) -> np.ndarray:
+    """Ten seconds of rest, up to a pressure, and down again."""
+    t_s = np.arange(0.0, seconds, PERIOD_NS * 1e-9)
+    return np.interp(t_s, [0.0, 12.0, 20.0, 28.0], [5.0, 5.0, high_kpa, 5.0])
+
+
+def course(made: Recording, pressure_kpa: np.ndarray, touched: np.ndarray | None = None) -> Course:
+    t = len(made.t_ns)
+    return Course(
+        made.t_ns,
+        np.arange(t),
+        np.broadcast_to(pressure_kpa[:, np.newaxis], (t, PADS)).astype(np.float32),
+        np.zeros((t, PADS), np.bool_) if touched is None else touched,
+        np.ones((t, PADS), np.bool_),
+        np.zeros(0, np.int64),
+    )
+
+
+def write(folder: Path, made: Recording) -> Path:
+    path = folder / f"{made.name}.npz"
+    t_s = (made.t_ns - insole.START_NS) * 1e-9
+    np.savez(path, t_s=t_s, counts=made.counts, pressure_kpa=made.pressure_kpa)
+    return path
+
+
+@pytest.fixture(scope="module")
+def pressed() -> Recording:
+    return recording(ramp())
+
+
+@pytest.fixture(scope="module")
+def replayed(pressed: Recording) -> Course:
+    settings, layout = insole.skin()
+    calibration = real.calibrate(pressed, settings, layout)
+    return real.play(pressed, settings, layout, calibration)
+
+
+@pytest.mark.skipif(not TOOL.exists(), reason=f"{TOOL} is not here")
+def test_the_skin_and_its_frames_are_those_of_the_tool_that_writes_logs(
+    pressed: Recording, tmp_path: Path
+) -> None:
+    from importlib.machinery import SourceFileLoader
+    from importlib.util import module_from_spec, spec_from_loader
+
+    from skin_host.settings import load, skin_hash
+
+    spec = spec_from_loader("insole_log", SourceFileLoader("insole_log", str(TOOL)))
+    assert spec is not None
+    tool = module_from_spec(spec)
+    assert spec.loader is not None
+    spec.loader.exec_module(tool)
+    (tmp_path / "insole.toml").write_text(tool.configuration())
+    settings, layout = insole.skin()
+    assert skin_hash(load(tmp_path / "insole.toml")) == skin_hash(settings)
+    assert tuple(tool.PADS) == insole.PRESSURE_PADS
+    assert len(insole.pads(layout)) == PADS
+
+
+def test_every_recorded_byte_passes_through_the_engine(
+    pressed: Recording, replayed: Course
+) -> None:
+    assert sorted(set(replayed.sweep.tolist())) == list(range(len(pressed.counts)))
+    settings, layout = insole.skin()
+    engine = real.Engine(settings, layout, [0], real.calibrate(pressed, settings, layout))
+    first = {0: 0, 1: 16}
+    sweeps: dict[int, list[np.ndarray]] = {board: [] for board in first}
+    for batch in pressed.batches():
+        for sweep in engine.feed(insole.BUS, batch).sweeps:
+            sweeps[sweep.board].append(sweep.raw)
+    recorded = pressed.counts.reshape(-1, 28, 10)
+    for board, triangles in zip(first, insole.TRIANGLES_OF.values(), strict=True):
+        raw = np.array(sweeps[board])[:, :triangles][:, :, insole.PRESSURE_PADS]
+        wanted = recorded[:, first[board] : first[board] + triangles]
+        np.testing.assert_array_equal(raw, wanted)
+
+
+def test_quiet_pads_are_detected_and_touch_nothing_before(
+    pressed: Recording, replayed: Course
+) -> None:
+    live = real.live_pads(pressed)
+    assert live.all()
+    row = real.touches(pressed, replayed, live, live)
+    assert row["touches_begun_10s"] == row["false_begins_per_s"] == 0
+    assert row["detected_60kpa"] == row["detected_40kpa"] == 1.0
+    assert 1.0 <= row["begins_per_pad"] < 1.5
+
+
+def test_a_spike_of_the_pressures_own_record_is_no_press(pressed: Recording) -> None:
+    pressure = pressed.pressure_kpa.copy()
+    pressure[100::200] += 70.0
+    spiky = Recording(pressed.name, pressed.t_ns, pressed.counts, pressure)
+    late = pressed.t_ns - pressed.t_ns[0] > 15e9
+    touched = np.broadcast_to(late[:, np.newaxis], (len(late), PADS)).copy()
+    everyone = np.ones(PADS, np.bool_)
+    # 60 kPa over rest are passed at 13.6 s, 100 kPa at 14.7 s.
+    for level, found in ((60.0, 0.0), (100.0, 1.0)):
+        given = course(spiky, pressure, touched)
+        assert real._detected(spiky, given, everyone, level) == found
+
+
+def test_dead_and_still_pads_are_not_live() -> None:
+    made = recording(ramp())
+    made.counts[:, 0] = 240
+    made.counts[5, 1] = 3
+    assert np.flatnonzero(~real.live_pads(made)).tolist() == [0, 1]
+
+
+def test_right_pressures_have_no_error_and_late_ones_the_lag_that_was_put_in() -> None:
+    made = recording(ramp())
+    everyone = np.ones(PADS, np.bool_)
+    row = real.pressure_errors(made, course(made, made.pressure_kpa), everyone, None)
+    assert row["median_rmse_kpa"] < 1e-4
+    assert row["lag_s"] == 0.0
+    late = np.concatenate([np.full(25, 5.0), made.pressure_kpa[:-25]])
+    row = real.pressure_errors(made, course(made, late), everyone, None)
+    assert row["median_rmse_kpa"] == pytest.approx(
+        float(np.sqrt(np.mean((late - made.pressure_kpa) ** 2))), rel=1e-4
+    )
+    assert row["lag_s"] == pytest.approx(25 * PERIOD_NS * 1e-9)
+    assert row["lagged_median_rmse_kpa"] < 1e-4
+
+
+def test_a_pad_is_judged_by_the_frames_in_which_it_is_valid() -> None:
+    made = recording(ramp())
+    given = course(made, made.pressure_kpa)
+    given.pressure_kpa[:100, 7] = 0.0
+    given.valid[:100, 7] = False
+    row = real.pressure_errors(made, given, np.arange(PADS) == 7, None)
+    assert row["median_rmse_kpa"] < 1e-4
+    assert row["valid_share"] == pytest.approx(1.0 - 100 / len(made.t_ns))
+
+
+def test_one_json_document_has_a_row_for_each_recording(
+    pressed: Recording,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(real, "RECORDINGS", tmp_path / "nowhere")
+    write(tmp_path, pressed)
+    options = ["--real", "--recordings", str(tmp_path), "--json", "--output", str(tmp_path / "o")]
+    assert main(["report", *options]) == 0
+    (row,) = json.loads(capsys.readouterr().out)["real"]
+    assert row["recording"] == "left_made_up"
+    assert row["pads_live"] == row["pads_usable"] == PADS
+    assert row["touches_begun_10s"] == 0
+    assert row["median_rmse_kpa"] is None
+    assert row["why_no_pressure"] == "left_calibration.npz is missing"
+    assert "left_made_up" in (tmp_path / "o" / "real.md").read_text()
+    assert "left_made_up" in (tmp_path / "o" / "real.html").read_text()
+
+
+def test_a_recording_is_measured_with_the_curves_that_its_foams_calibration_gave(
+    tmp_path: Path,
+) -> None:
+    path = write(tmp_path, replace(recording(ramp()), name="left_calibration"))
+    row = real.measure(path, real.fit_pressures(path))
+    assert row["pads_usable"] > 0.9 * PADS
+    assert row["why_no_pressure"] is None
+    assert row["median_rmse_kpa"] < 12.0
+    assert row["valid_share"] > 0.9
+
+
+def test_recordings_that_are_not_there_are_said_to_be_absent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(real, "RECORDINGS", tmp_path / "nowhere")
+    assert main(["report", "--real"]) == 0
+    assert "no recordings of real skin here" in capsys.readouterr().out
+    document = real.run(quick=False, output=None)
+    assert document["real"] == []
+    assert "absent" in page.real_skin(document).text[0]
+    assert main(["report", "--real", "--recordings", str(tmp_path)]) == 2
+    assert "no recording in it" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "arrays",
+    [
+        {"counts": np.zeros((5, 280))},
+        {"counts": np.zeros((5, 279), np.uint8)},
+        {"counts": np.zeros((4, 280), np.uint8)},
+        {"t_s": np.array([0.0, 1.0, 1.0, 2.0, 3.0])},
+        {"t_s": np.array([0.0, 1.0, np.nan, 2.0, 3.0])},
+        {"pressure_kpa": np.array([])},
+        {"pressure_kpa": np.array([1.0, np.inf])},
+        {"pressure_kpa": np.array(["a"], dtype=object)},
+    ],
+)
+def test_what_is_no_recording_is_refused_in_one_line(
+    arrays: dict[str, np.ndarray], tmp_path: Path
+) -> None:
+    whole = {
+        "t_s": np.arange(5.0),
+        "counts": np.zeros((5, 280), np.uint8),
+        "pressure_kpa": np.zeros(5),
+    }
+    np.savez(tmp_path / "bad.npz", **(whole | arrays))
+    with pytest.raises(LogError, match=r"bad\.npz: ") as error:
+        insole.read(tmp_path / "bad.npz")
+    assert "\n" not in str(error.value)
+
+
+def test_bytes_that_are_no_archive_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "bad.npz").write_bytes(b"not an archive")
+    with pytest.raises(LogError, match="wanted arrays"):
+        insole.read(tmp_path / "bad.npz")

@@ -1,0 +1,206 @@
+"""Recordings as other tools open them: read back by those tools' own loaders."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rerun.chunk import McapReader, RrdReader
+
+from skin_host.cli import main
+from skin_host.errors import RequestError, SkinError
+from skin_host.export import HealthLine, PartSeries, Series, export
+from skin_host.export.scene import ARROW_M_PER_N, POINT, Scene
+from skin_host.extras import required
+from skin_host.publish.info import PartInfo, TriangleInfo
+from skin_host.publish.messages import TouchMessage
+
+N, TAXELS = 5, 12
+START_NS = 1_700_000_000_000_000_000
+PERIOD_NS = 50_000_000
+
+
+def part(name: str, *, start_ns: int = START_NS) -> PartSeries:
+    kpa = np.arange(N * TAXELS, dtype=np.float32).reshape(N, TAXELS)
+    kpa[2, 3] = np.nan
+    t_ns = start_ns + PERIOD_NS * np.arange(N, dtype=np.int64)
+    return PartSeries(name, np.arange(N), t_ns, kpa, kpa > 55, None)
+
+
+def shape() -> PartInfo:
+    return PartInfo(
+        period_ms=50,
+        pads=["pressure"] * 11 + ["thermal"],
+        position_m=[(0.004 * i, 0.01, 0.002) for i in range(TAXELS)],
+        normal=[(0.0, 0.0, 1.0)] * TAXELS,
+        radius_mm=[2.0] * TAXELS,
+        area_mm2=[25.0] * TAXELS,
+        triangles=[TriangleInfo("b", 0, "triangle", 0, [(0.0, 0.0, 0.0)] * 3, 240)],
+    )
+
+
+def touch(event: str, frame: int, force_n: float) -> TouchMessage:
+    return TouchMessage(
+        event=event,  # type: ignore[arg-type]
+        id=7,
+        seq=frame,
+        t_ns=START_NS + PERIOD_NS * frame,
+        part="arm",
+        taxels=[1, 2],
+        centroid_m=(0.004, 0.01, 0.002),
+        normal=(0.0, 0.0, 1.0),
+        area_mm2=50.0,
+        peak_kpa=40.0,
+        mean_kpa=30.0,
+        force_n=force_n,
+    )
+
+
+@pytest.fixture
+def series() -> Series:
+    touches = [touch("begin", 1, 1.5), touch("move", 2, 2.0), touch("end", 3, 0.0)]
+    health = [HealthLine("arm", START_NS, "warning", "arm: warning; taxel 3: stuck")]
+    later_ns = START_NS + PERIOD_NS
+    parts = {"arm": part("arm"), "hand": part("hand", start_ns=later_ns)}
+    return Series(parts, touches, {"arm": shape(), "hand": shape()}, health)
+
+
+def test_foxglove_reads_points_contacts_transforms_and_log(series: Series, tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+    from mcap_protobuf.decoder import DecoderFactory
+
+    output = tmp_path / "shown.mcap"
+    assert export(series, output) == [output]
+    seen: dict[str, list[Any]] = {}
+    with output.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for schema, channel, message, decoded in reader.iter_decoded_messages():
+            seen.setdefault(channel.topic, []).append((schema.name, message.log_time, decoded))
+    kinds = {topic: messages[0][0] for topic, messages in seen.items()}
+    assert kinds == {
+        "/tf": "foxglove.FrameTransforms",
+        "/arm/points": "foxglove.PointCloud",
+        "/hand/points": "foxglove.PointCloud",
+        "/arm/contacts": "foxglove.SceneUpdate",
+        "/health": "foxglove.Log",
+    }
+    (_, t_ns, cloud) = seen["/arm/points"][2]
+    assert t_ns == START_NS + 2 * PERIOD_NS == cloud.timestamp.ToNanoseconds()
+    assert cloud.frame_id == "arm"
+    points = np.frombuffer(cloud.data, POINT)
+    assert len(points) == 11  # the thermal pad is none
+    assert cloud.point_stride == POINT.itemsize
+    fields = {one.name: one.offset for one in cloud.fields}
+    assert fields == {name: POINT.fields[name][1] for name in POINT.names}
+    assert (points["valid"] == 0).nonzero()[0].tolist() == [3]
+    assert points["kpa"][4] == 28.0
+    assert points["x"][4] == pytest.approx(0.016)
+    begin, moved, ended = (decoded for _, _, decoded in seen["/arm/contacts"])
+    (arrow,) = moved.entities[0].arrows
+    assert arrow.shaft_length + arrow.head_length == pytest.approx(2.0 * ARROW_M_PER_N)
+    # It points into the skin, and ends at the contact.
+    assert arrow.pose.position.z == pytest.approx(0.002 + 2.0 * ARROW_M_PER_N)
+    assert begin.entities[0].texts[0].text == "#7 1.50 N"
+    assert not ended.entities[0].arrows
+    (tf,) = (decoded for _, _, decoded in seen["/tf"])
+    places = {one.child_frame_id: one.translation.x for one in tf.transforms}
+    assert places["hand"] - places["arm"] > 0.044  # side by side
+    assert seen["/health"][0][2].message.endswith("taxel 3: stuck")
+
+
+def test_an_arrow_turns_to_where_a_force_points() -> None:
+    from skin_host.export.scene import _turned_from_x
+
+    for wanted in ([0, 0, -2.0], [0, 1.0, 0], [-1.0, 0, 0], [0.6, 0, 0.8]):
+        x, y, z, w = _turned_from_x(np.array(wanted))
+        turned = [1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)]
+        np.testing.assert_allclose(turned, np.array(wanted) / np.linalg.norm(wanted), atol=1e-9)
+
+
+def chunks(reader: Any) -> dict[str, set[str]]:
+    """The columns of each entity that a reader of Rerun finds."""
+    found: dict[str, set[str]] = {}
+    for chunk in reader.stream():
+        names = chunk.to_record_batch().schema.names
+        found.setdefault(chunk.entity_path, set()).update(names)
+    return found
+
+
+def test_rerun_reads_what_was_exported(series: Series, tmp_path: Path) -> None:
+    output = tmp_path / "grasp.rrd"
+    assert export(series, output) == [output]
+    seen = chunks(RrdReader(output))
+    assert {"time", "Points3D:positions", "Points3D:colors"} <= seen["/robot/arm/taxels"]
+    assert {"Arrows3D:vectors", "Arrows3D:labels"} <= seen["/robot/arm/contacts"]
+    assert "Transform3D:translation" in seen["/robot/hand"]
+    assert {"Scalars:scalars"} <= seen["/force_n/arm"] & seen["/kpa/hand"]
+    assert "TextLog:text" in seen["/health"]
+
+
+def test_rerun_reads_the_file_for_foxglove_too(series: Series, tmp_path: Path) -> None:
+    export(series, tmp_path / "shown.mcap")
+    seen = chunks(McapReader(tmp_path / "shown.mcap"))
+    assert {"Points3D:positions", "CoordinateFrame:frame"} <= seen["/arm/points"]
+    assert "Transform3D:child_frame" in seen["/tf"]
+    assert "TextLog:text" in seen["/health"]
+
+
+def test_pandas_and_polars_read_parquet_with_units_and_layout(
+    series: Series, tmp_path: Path
+) -> None:
+    import pandas as pd
+    import polars as pl
+    from pyarrow import parquet
+
+    frames, touches = export(series, tmp_path / "grasp.parquet")
+    table = pd.read_parquet(frames, filters=[("part", "==", "arm")])
+    kpa = np.stack(table["pressure_kpa"])
+    np.testing.assert_array_equal(kpa, series.parts["arm"].pressure_kpa)
+    assert table["t"].iloc[0] == pd.Timestamp(START_NS, tz="UTC")
+    forces = pl.read_parquet(touches).filter(pl.col("event") == "move")["force_n"]
+    assert forces.to_list() == [2.0]
+    schema = parquet.read_schema(frames)
+    assert schema.field("pressure_kpa").metadata[b"unit"] == b"kPa"
+    layout = json.loads(schema.metadata[b"skin"])
+    assert layout["parts"]["arm"]["position_m"][1] == [0.004, 0.01, 0.002]
+
+
+def test_a_data_set_for_learning_has_an_array_a_step(series: Series, tmp_path: Path) -> None:
+    from pyarrow import parquet
+
+    export(series, tmp_path / "set", lerobot=True)
+    info = json.loads((tmp_path / "set/meta/info.json").read_text())
+    path = info["data_path"].format(episode_chunk=0, episode_index=0)
+    table = parquet.read_table(tmp_path / "set" / path)
+    assert info["fps"] == 20
+    assert info["total_frames"] == table.num_rows == N
+    assert set(info["features"]) == set(table.column_names)
+    arm = np.array(table["observation.skin.arm"].to_pylist())
+    valid = np.array(table["observation.skin.arm.valid"].to_pylist())
+    assert arm.shape == (N, TAXELS)
+    assert arm[2, 3] == 0
+    assert not valid[2, 3]
+    # The hand began a step later: until then nothing of it is valid.
+    hand_valid = np.array(table["observation.skin.hand.valid"].to_pylist())
+    assert not hand_valid[0].any()
+    assert hand_valid[1].all()
+    np.testing.assert_allclose(table["timestamp"].to_pylist(), 0.05 * np.arange(N), atol=1e-6)
+
+
+def test_what_is_missing_is_said(series: Series, tmp_path: Path) -> None:
+    with pytest.raises(RequestError, match="has no positions of the taxels of arm, hand"):
+        Scene(Series(series.parts, [], {}))
+    with pytest.raises(SkinError, match=r"need the package nowhere.*pip install 'skin-host\[x\]'"):
+        required("nowhere", "things", "x")
+    with pytest.raises(RequestError, match=r"ends in one of .npz, .parquet, .mcap, .rrd"):
+        export(series, tmp_path / "x.xls")
+
+
+def test_a_recording_is_not_written_over_itself(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = tmp_path / "grasp.mcap"
+    recording.write_bytes(b"")
+    assert main(["export", str(recording), str(recording)]) == 2
+    assert "is the recording itself" in capsys.readouterr().err
