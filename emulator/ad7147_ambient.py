@@ -6,9 +6,9 @@ near. The rules are [M] except where the register map names a source; a stage is
 its noise-free code, since the chip averages many samples and thresholds are hundreds of codes
 away.
 
-State changes at conversions only, one pass over the stages at a time, so that it never depends
-on when somebody reads the chip. After a pass that changes nothing but
-counters the next ones are counted, not computed: an hour costs as much as the minute until then.
+State changes at conversions only, one pass over the stages at a time, so that it never depends on
+when somebody reads the chip. After a pass that changes nothing but counters the next ones are
+counted, not computed: an hour costs as much as the minute until then.
 """
 
 import numpy as np

@@ -118,8 +118,7 @@ def stored_calibration(settings: Settings, layout: Layout, node: str) -> Calibra
     """Return the stored calibration, or None if there is none.
 
     An unreadable one counts as none, so that a service can continue without it. So does a damaged
-    one,
-    which is set aside.
+    one, which is set aside.
 
     Raises:
         OtherSkinError: it belongs to another configuration or robot.

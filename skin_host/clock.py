@@ -96,8 +96,7 @@ class Clock:
         """Run a blocking function, for a disk or a resolver, beside the event loop.
 
         Unlike with `asyncio.to_thread`, the end of the program does not wait for it: a cancelled
-        caller
-        leaves the thread running.
+        caller leaves the thread running.
 
         Raises:
             Exception: what the function raises.

@@ -311,14 +311,12 @@ class Engine:
         """Find the new untouched readings after a board was zeroed.
 
         For two seconds, longer for slow boards, none of its taxels is valid. Taxels that were
-        touched
-        just before stay invalid until they are calibrated.
+        touched just before stay invalid until they are calibrated.
 
         Args:
             board: its index.
             believed: whether touches just before are real. Touches of a board that was not set up,
-                by
-                this start of the daemon or an earlier one, are not.
+                by this start of the daemon or an earlier one, are not.
 
         Returns:
             How many taxels were touched.

@@ -22,8 +22,7 @@ def explain(document: Any, error: msgspec.ValidationError, root: Table, named: N
     """Return where in the file the error is, then what it is.
 
     msgspec's message is "Expected `int`, got `str` - at `$.boards[...].address`": it does not name
-    the
-    board, so each named table is checked once more separately.
+    the board, so each named table is checked once more separately.
 
     Args:
         document: the decoded file.

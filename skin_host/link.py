@@ -54,8 +54,8 @@ class Link:
 
     Raises:
         ConfigurationError: python-can has no such kind of interface.
-        BusError: a bus cannot be opened, and `wait` is not set.
-            Those already open are closed again.
+        BusError: a bus cannot be opened, and `wait` is not set. Those already open are closed
+            again.
     """
 
     def __init__(

@@ -297,8 +297,7 @@ class Assembler:
         """Handle a frame that is not the next one of a sweep in progress.
 
         It may begin a sweep, which ends the one before, or belong to a triangle that was not
-        awaited.
-        Returns False if it came too late for its sweep.
+        awaited. Returns False if it came too late for its sweep.
         """
         if state.missing and (
             state.awaited & ~state.missing & bit

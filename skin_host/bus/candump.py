@@ -3,8 +3,7 @@
 Lines of one form are decoded together: `(1700000000.000125) can0 4E4#40F4F4F3F4F4F3F4`, with six
 decimals, a standard identifier and whole bytes. All other lines (extended identifiers, remote and
 error frames, CAN FD, damage) go through python-can one by one, so that the result does not depend
-on
-how a line was read.
+on how a line was read.
 """
 
 import io

@@ -24,8 +24,7 @@ def open_port(
         bus: interface and channel.
         receive: size of the buffer.
         wait: treat an interface that cannot be opened now like one that was unplugged: return a
-            port
-            that waits for it.
+            port that waits for it.
         clock: for waiting.
 
     Raises:

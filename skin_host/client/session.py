@@ -170,8 +170,7 @@ class SkinClient:
         """Contact states of parts: the present one, and each change.
 
         UNKNOWN is an item of its own: when the node cannot feel all of the part, when the part was
-        not
-        received for `stale_s`, when its node stops or the broker is lost.
+        not received for `stale_s`, when its node stops or the broker is lost.
         """
         return self._stream(part, "contact")
 

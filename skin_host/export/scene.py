@@ -1,13 +1,11 @@
 """Recordings as three-dimensional scenes, for common robotics tools.
 
 An `.mcap` file for Foxglove holds, besides the recording's own messages, a point cloud of each
-part,
-its contacts as arrows, the parts' transforms and health, in Foxglove's own Protobuf schemas: no
-custom panel is needed. An `.rrd` file holds the same for Rerun.
+part, its contacts as arrows, the parts' transforms and health, in Foxglove's own Protobuf schemas:
+no custom panel is needed. An `.rrd` file holds the same for Rerun.
 
 A configuration does not contain where on the body a part is: the parts lie side by side, each in
-its
-frame.
+its frame.
 """
 
 import contextlib

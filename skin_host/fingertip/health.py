@@ -26,8 +26,7 @@ class FingertipRecord(TypedDict):
 
     `lone` are frames whose other half did not arrive, `silences` counts how often the board timed
     out, `full_scale` is N and N m of its channels, `threshold_n` the least force of a contact,
-    which
-    noise may raise.
+    which noise may raise.
     """
 
     part: str

@@ -40,8 +40,7 @@ class RatioDrop:
     For unknown friction (Bicchi and Dario, Fig. 6, second strategy). The ratio's mean over a short
     window is compared with that of the window before; the fall must exceed the effect of noise. If
     sliding friction is no lower than static friction, the ratio does not fall and this detector
-    finds
-    nothing.
+    finds nothing.
 
     Args:
         contacts: n.

@@ -174,8 +174,7 @@ class WrenchAssembler:
 
     Two frames belong together if they are of different types and arrived within three quarters of a
     period. A frame whose other half is late is counted and dropped, so that force is never joined
-    with
-    the torque of another sample.
+    with the torque of another sample.
 
     Args:
         board: its address.

@@ -46,8 +46,7 @@ class Describer:
     """Builds the health records of an engine's parts.
 
     All times are on the clock of the frames' time stamps. Without a time (a replay) the records
-    have
-    no ages.
+    have no ages.
     """
 
     def __init__(self, engine: Engine, watch: Watch) -> None:

@@ -182,8 +182,7 @@ def import_places(files: list[Path], base: Settings | None, findings: Findings) 
     """Place the triangles of `base` as the display does; each file gives a part.
 
     A triangle moves from its part to the part that the file names. Without `base` the boards are
-    made
-    from `cardid`, with default set-up.
+    made from `cardid`, with default set-up.
 
     Raises:
         ConfigurationError: a file cannot be read, or its boards are not known.
@@ -336,11 +335,9 @@ def _boards(settings: Settings, display: Display, findings: Findings) -> list[st
 
     The candidates are the boards of one bus that `cardid` names, in the order of the configuration
     (the order of the values on the robot's own ports), in the order of `cardid` or reversed; and
-    the
-    boards of the part of the same name. The choice is the bus whose name shares the longest
-    beginning
-    with the part's name, and on it the order that fits the triangles that are on and not yet
-    placed.
+    the boards of the part of the same name. The choice is the bus whose name shares the longest
+    beginning with the part's name, and on it the order that fits the triangles that are on and not
+    yet placed.
     """
     n = display.n_boards
     free: dict[str, set[int]] = {}

@@ -259,10 +259,8 @@ class Calibrator:
         last.
 
         The variance of block means is larger by this factor. How conversions fall into sweeps is
-        the same
-        for all taxels of a part, so their median counts; for a single taxel the difference must be
-        beyond
-        chance.
+        the same for all taxels of a part, so their median counts; for a single taxel the difference
+        must be beyond chance.
 
         Args:
             variance: float64[n], of a measurement.
@@ -287,8 +285,7 @@ class Calibrator:
         """Return the taxels [n] that were touched for a part of the time.
 
         Not those that jump between levels: such noise has no course, or one that goes up and down
-        more
-        often than a press does and that no other pad shares.
+        more often than a press does and that no other pad shares.
         """
         course = self._course
         moved = course.highest - course.lowest > STEADY_UNITS + STEADY_ERRORS * course.error

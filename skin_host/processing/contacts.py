@@ -62,10 +62,8 @@ class ContactTracker:
 
     With the part's `localization` left at `centroid`, a connected patch of touched taxels is one
     contact at its mean weighted by force. With any other, a patch with several clear maxima is
-    several
-    contacts, and each is located from activations. The template's table of a pad is computed when
-    the
-    pad is first the strongest, which takes some 30 ms once.
+    several contacts, and each is located from activations. The template's table of a pad is
+    computed when the pad is first the strongest, which takes some 30 ms once.
     """
 
     def __init__(self, layout: Layout, part_index: int, settings: Settings) -> None:
@@ -154,8 +152,7 @@ class ContactTracker:
         """Return the groups; a new group is joined with those that it will grow together with.
 
         When an object lands on the skin, the taxels pass their thresholds one by one. Those between
-        two
-        that have passed already feel some pressure.
+        two that have passed already feel some pressure.
         """
         if len(groups) < 2 or self._are_as_before(groups):
             return groups
@@ -226,8 +223,7 @@ class ContactTracker:
         """Return the groups, with the pieces of one contact joined that have only just come apart.
 
         While a contact begins or releases, its taxels pass their thresholds one by one, and for a
-        moment
-        it is in pieces. Pieces that feel very little never become contacts.
+        moment it is in pieces. Pieces that feel very little never become contacts.
         """
         if self._are_as_before(groups):
             for contact in self._contacts.values():
@@ -262,8 +258,7 @@ class ContactTracker:
         """Give each group the name of the contact that it continues, or a new one.
 
         The largest overlap decides; among equal ones the older contact. A group next to the place
-        of a
-        contact continues it too, if nothing overlaps that contact: it slid.
+        of a contact continues it too, if nothing overlaps that contact: it slid.
         """
         names: dict[int, int] = {}
         for slid in (False, True):
@@ -494,8 +489,7 @@ class _Places:
     """Separates and locates the contacts of one part with its configured method.
 
     Pressures are converted back into activations of one standard pad, the part's median: pads of
-    other
-    sizes, shifts and strengths then read alike where they are covered alike.
+    other sizes, shifts and strengths then read alike where they are covered alike.
     """
 
     def __init__(self, layout: Layout, part_index: int, settings: Settings) -> None:

@@ -392,8 +392,7 @@ def _loading_kpa(pressure: Floats, memory: Memory) -> Floats:
     relaxation(C).
 
     The solution is unique, because C - relaxation rises with C. For each sample the step of C is
-    found
-    by trying each possible state of the plays.
+    found by trying each possible state of the plays.
     """
     if not memory.radius_kpa:
         return pressure

@@ -116,8 +116,7 @@ class BaselineTracker:
     """The baselines of the n taxels of one part.
 
     The readings that it follows must be corrected for relaxation: the residual that a touch leaves
-    in
-    the foam is not drift.
+    in the foam is not drift.
 
     Args:
         baseline: float64[n] in units, as calibrated; moved in place.
@@ -182,8 +181,7 @@ class BaselineTracker:
 
         Returns:
             Numbers of taxels whose touch was recognised as drift, or None. Their baselines have
-            moved
-            up to their readings.
+            moved up to their readings.
         """
         if self._settings.rule == "none":
             return None

@@ -69,10 +69,8 @@ def separate(
     """Split a connected group of touched taxels where it has several clear maxima.
 
     Each taxel goes with its strongest neighbour uphill to a maximum; two hills become one again if
-    the
-    pass between them is higher than `SADDLE` of the lower. Groups are ordered by strength,
-    strongest
-    first; ties go to the lower number.
+    the pass between them is higher than `SADDLE` of the lower. Groups are ordered by strength,
+    strongest first; ties go to the lower number.
 
     Args:
         taxels: a connected group, numbered within the part.

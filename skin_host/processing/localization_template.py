@@ -45,12 +45,10 @@ SHARP_MM = 0.5
 class _Table:
     """Patterns around one pad, of all candidate places and the pads that any of them covers.
 
-    `pattern` and twice its square are [pads, places]: BLAS is faster over long rows.
-    `moments` [places, 4] are 1, x, y, x^2 + y^2 of the places, each times the prior weight of the
-    place (see `TemplateLocalizer`); `shape` [places, 3, pads] are the pattern and its slopes along
-    x
-    and y, per mm. `frame` [3, 3] holds, in mm, the pad's position and its change per mm along x and
-    y.
+    `pattern` and twice its square are [pads, places]: BLAS is faster over long rows. `moments`
+    [places, 4] are 1, x, y, x^2 + y^2 of the places, each times the prior weight of the place (see
+    `TemplateLocalizer`); `shape` [places, 3, pads] are the pattern and its slopes along x and y,
+    per mm. `frame` [3, 3] holds, in mm, the pad's position and its change per mm along x and y.
     """
 
     pads: Indices
@@ -68,8 +66,7 @@ class TemplateLocalizer:
     The strength of the push is not known, and two pads alone do not determine how far to their side
     the probe is: farther away and stronger gives the same readings. Strong pushes are assumed to be
     rarer, with the square of the strength, which has no scale; so a place counts in proportion to
-    the
-    size of its pattern.
+    the size of its pattern.
 
     A contact wider than the largest probe matches none of the patterns: the centroid is used for
     it.

@@ -615,8 +615,7 @@ class _OwnCurves:
         """Limit baselines to a slow rise, in place.
 
         A load that grows slowly, or has nearly gone, reads like drift; on a skin with known curves
-        it is
-        more probable than drift.
+        it is more probable than drift.
 
         Args:
             drift: with the baselines [m] that it would have.

@@ -180,8 +180,7 @@ def longest_run(rate: Floats, samples: Floats | float, odds: float) -> Floats:
     The sum of ln((n + i) / (n - c + i)) over a run is taken as its integral, which is concave in
     the
     run: Newton's method from 0 approaches the root and never exceeds it, exact for runs below 1000
-    and
-    to 1 % for the longest. A rate of 0 allows a run without end.
+    and to 1 % for the longest. A rate of 0 allows a run without end.
     """
     still = np.maximum((1.0 - rate) * samples, 0.5)
     n = np.maximum(samples, still)

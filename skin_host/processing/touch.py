@@ -86,12 +86,9 @@ def levels(above: Floats, spread: Floats, settings: Touch) -> Levels:
         settings: margin and hysteresis.
 
     The margin covers lasting changes that are not noise: drift, rounding, the effect of a press
-    next
-    to the taxel. Readings are whole units, so half a unit less is the same rule; and it stays the
-    same
-    when the baseline has followed drift by a fraction of a unit. The percentile counts at most as
-    that
-    of a byte: the span covers larger noise.
+    next to the taxel. Readings are whole units, so half a unit less is the same rule; and it stays
+    the same when the baseline has followed drift by a fraction of a unit. The percentile counts at
+    most as that of a byte: the span covers larger noise.
     """
     margin = settings.margin_units - HALF_UNIT + np.minimum(above, HALF_UNIT)
     margin = np.maximum(margin, max(settings.minimum_threshold_units, LEAST_UNITS))
@@ -124,9 +121,8 @@ class TouchDetector:
     """Decides which of the n taxels of a part are touched.
 
     Each new measurement adds its excess above `enter` to the evidence of its taxel, or subtracts
-    what
-    it is below. No measurement counts for more than one vote: a touch begins and ends with at least
-    that many.
+    what it is below. No measurement counts for more than one vote: a touch begins and ends with at
+    least that many.
 
     Args:
         found: levels [n] of the taxels; infinite where a taxel must never be touched.

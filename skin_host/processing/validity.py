@@ -91,8 +91,7 @@ class Validity:
         Returns:
             valid: bool[192].
             received: bool[192], the same without regard to `veto`: values that a new calibration
-                may
-                use.
+                may use.
         """
         if self._waiting[row]:
             self.judge()
@@ -203,8 +202,7 @@ def lifted(raw: NDArray[np.uint8], far: Mask) -> Mask:
     """Return triangles bool[k] whose pads read far below zero pressure: those of another chip.
 
     Pressing cannot do it. Plugs of data lines that were swapped, or a chip at another one's
-    address,
-    put the pads of one triangle on the baselines of another.
+    address, put the pads of one triangle on the baselines of another.
 
     Args:
         raw: uint8[k, 12].

@@ -66,8 +66,7 @@ class Broker:
         """Return the brokers of `settings`, in the order in which a node of this name tries them.
 
         Each name has a different order, so that nodes spread over the brokers, and those of a lost
-        broker
-        over all others.
+        broker over all others.
 
         Raises:
             see `from_settings`.

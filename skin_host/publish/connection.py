@@ -242,8 +242,7 @@ class Connection(aiomqtt.Client):
         """Wait as aiomqtt does, and never lose a cancellation.
 
         The `asyncio.wait_for` of Python 3.11 loses one that comes together with the result. The
-        task then
-        continues, and the canceller waits for ever.
+        task then continues, and the canceller waits for ever.
         """
         task = asyncio.current_task()
         before = task.cancelling() if task else 0

@@ -21,8 +21,7 @@ class SlipMessage(Struct, frozen=True, kw_only=True):
         id: of the contact, as in the touches of the part.
         count: number of slip events of the part from this node so far.
         cause: what indicated it first: the rate of the tangential force, its share of the known
-            limit
-            of friction, or its abrupt fall.
+            limit of friction, or its abrupt fall.
         force_n, shear_n, shear_rate_n_s: normal force, tangential force and the latter's rate.
     """
 

@@ -211,8 +211,7 @@ class Outbox:
         """Put recently acknowledged events before all waiting ones; return how many events.
 
         They may have been lost with their broker: an acknowledgement means that the broker has an
-        event,
-        not that subscribers have it.
+        event, not that subscribers have it.
         """
         since_s = self._clock.monotonic_s() - REPEAT_S
         again = [event for at_s, event in self.passed_on if at_s >= since_s]

@@ -187,8 +187,8 @@ class SkinFrames:
     other: int
 
 
-#: What an identifier's class may carry: bit 0 an A frame, bit 1 a B frame.
-#: Class 3 is the legacy stream. A special firmware sends B frames with class 6.
+#: What an identifier's class may carry: bit 0 an A frame, bit 1 a B frame. Class 3 is the legacy
+#: stream. A special firmware sends B frames with class 6.
 _HALVES_OF_CLASS = np.array([0, 0, 0, 3, 3, 0, 2, 0], np.uint8)
 _SMALLEST_DLC = np.array([8, 6], np.uint8)
 

@@ -21,9 +21,9 @@ FLUSH_EVERY_S = 10.0
 class Relaxation(Protocol):
     """A viscoelastic model of n taxels: how much pressure the foam has lost by now.
 
-    The pressure on a taxel is its momentary pressure minus its relaxation
-    (paper, equation 2). Samples hold over their step: `pressure_kpa` is what the
-    taxels read during the last `dt_s` seconds.
+    The pressure on a taxel is its momentary pressure minus its relaxation (paper, equation 2).
+    Samples hold over their step: `pressure_kpa` is what the taxels read during the last `dt_s`
+    seconds.
     """
 
     n: int
