@@ -12,14 +12,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.converters import Converters
-from emulator.fingertips import Fingertips
-from emulator.firmware.chips import ADDRESSES, CHIPS_PER_LINE
-from emulator.i2c_wire import FOR_EVER, DataLine
-from emulator.mtb import Mtb
-from emulator.pads import UNIT_FF
-from emulator.scene import Fault
-from emulator.skin import Skin
+from emulator.boards.chip_access import ADDRESSES, CHIPS_PER_LINE
+from emulator.boards.fingertips import Fingertips
+from emulator.boards.mtb import Mtb
+from emulator.chips.converters import Converters
+from emulator.chips.i2c_wire import FOR_EVER, DataLine
+from emulator.probes.pads import UNIT_FF
+from emulator.probes.scene import Fault
+from emulator.probes.skin import Skin
 from emulator.wire import Wire
 from skin_host.errors import ConfigurationError
 from skin_host.layout import TAXELS_PER_TRIANGLE

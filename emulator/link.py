@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import can
 from can.interfaces.socketcan import SocketcanBus
 
-from skin_host.bus.protocol import FrameBatch, MessageClass
+from skin_host.bus.wire import FrameBatch, MessageClass
 
 log = logging.getLogger(__name__)
 

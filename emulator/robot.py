@@ -15,25 +15,25 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from emulator import faults, state
-from emulator.bring_up import set_up
-from emulator.bursts import Bursts
+from emulator.boards.arithmetic import TAXELS
+from emulator.boards.bring_up import set_up
+from emulator.boards.bursts import Bursts
+from emulator.boards.fingertips import Fingertips
+from emulator.boards.mtb import Mtb, make_board
+from emulator.boards.recording import load_recordings
+from emulator.chips.converters import Converters, fidelities
 from emulator.clock import Clock, RealClock
-from emulator.converters import Converters, fidelities
-from emulator.fingertips import Fingertips
-from emulator.firmware.arithmetic import TAXELS
 from emulator.link import Link
-from emulator.mtb import Mtb, make_board
-from emulator.recording import load_recordings
-from emulator.scene import Fault, Probe, Scene, check
-from emulator.skin import NEVER_NS, Skin
+from emulator.probes.scene import Fault, Probe, Scene, check
+from emulator.probes.skin import NEVER_NS, Skin
 from emulator.state import StateError
 from emulator.wire import Wire
-from skin_host.bus.protocol import FrameBatch
-from skin_host.bus.protocol.commands import Message, SetTxMode, TxMode, command_frame
+from skin_host.bus.commands import Message, SetTxMode, TxMode, command_frame
+from skin_host.bus.wire import FrameBatch
+from skin_host.config.settings import Settings
 from skin_host.errors import ConfigurationError
 from skin_host.files import write_atomic
 from skin_host.layout import Layout
-from skin_host.settings import Settings
 
 NS = 1_000_000_000
 #: Boards that are due within the same millisecond are computed together.

@@ -48,16 +48,25 @@ _FUNCTIONS = {
     for name in ("_force", "_hold", "_set_noise", "_warm", "_hush", "_clear", "_separate")
 }
 _FUNCTIONS |= {("emulator.faults", "_nothing")}
-_FUNCTIONS |= {("emulator.firmware.arithmetic", f"transmit_{bits}") for bits in (16, 32)}
+_FUNCTIONS |= {("emulator.boards.arithmetic", f"transmit_{bits}") for bits in (16, 32)}
 #: Modules whose classes a state may hold, and those that open devices or buses.
 _PARTS = (
     "emulator.",
-    "skin_host.bus.protocol",
+    "skin_host.bus.answers",
+    "skin_host.bus.commands",
+    "skin_host.bus.compensation",
+    "skin_host.bus.strain",
+    "skin_host.bus.wire",
     "skin_host.fingertip.",
     "skin_host.layout",
-    "skin_host.settings",
+    "skin_host.config.",
 )
-_DOORS = ("emulator.cuse", "emulator.i2c_dev", "emulator.link", "emulator.single_board")
+_DOORS = (
+    "emulator.chips.cuse",
+    "emulator.chips.i2c_dev",
+    "emulator.link",
+    "emulator.boards.single_board",
+)
 _NAME = re.compile(r"_?[a-z][a-z0-9_]*")
 
 

@@ -9,9 +9,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.firmware.board import join
-from skin_host.bus.protocol import FrameBatch, MessageClass, identifier
-from skin_host.bus.protocol.answers import TX_OVERFLOW_TYPE
+from emulator.boards.board import join
+from skin_host.bus.answers import TX_OVERFLOW_TYPE
+from skin_host.bus.wire import FrameBatch, MessageClass, identifier
 
 #: A standard frame without its data, with interframe space; and the mean of stuffed bits,
 #: which are 0 to 24 in a frame of 8 bytes (recorded skin frames have 5).

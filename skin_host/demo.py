@@ -18,15 +18,15 @@ import numpy as np
 from skin_host.cli.common import load_skin
 from skin_host.cli.lines import event_line
 from skin_host.client import SkinClient
-from skin_host.daemon import Daemon
+from skin_host.config.settings import Bus, Mqtt, Settings, changed
+from skin_host.daemon.daemon import Daemon
 from skin_host.errors import ConfigurationError, SkinError
 from skin_host.layout import Layout, PadKind, build_layout
-from skin_host.publish.broker import LocalBroker, local_broker
-from skin_host.settings import Bus, Mqtt, Settings, changed
+from skin_host.mqtt.broker import LocalBroker, local_broker
 from skin_host.viewer.server import Viewer
 
 if TYPE_CHECKING:
-    from emulator.scene import Scene
+    from emulator.probes.scene import Scene
 
 log = logging.getLogger(__name__)
 
@@ -108,7 +108,7 @@ async def run(
 
 def _prepared(config: Path | None, scene: Path | None) -> "tuple[Settings, Layout, Scene]":
     """Return the robot of a configuration on buses of this process, as one node; and its scene."""
-    from emulator import scene as scenes
+    from emulator.probes import scene as scenes
 
     settings, _ = load_skin(config or configuration("demo.toml"))
     buses = {
@@ -135,7 +135,7 @@ def _prepared(config: Path | None, scene: Path | None) -> "tuple[Settings, Layou
 
 def presses(settings: Settings, layout: Layout) -> "Scene":
     """A scene for any robot: a press in the middle of each part, one part after the other."""
-    from emulator.scene import Place, Probe, Scene
+    from emulator.probes.scene import Place, Probe, Scene
 
     # A fingertip under an array of taxels is pressed through the array.
     bare = [name for name, tip in settings.fingertips.items() if tip.array is None]

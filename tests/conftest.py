@@ -8,7 +8,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-from skin_host.settings import Bus
+from skin_host.config.settings import Bus
 from tests.support import programs
 from tests.support.broker import Mosquitto
 from tests.support.stack import configuration, stack, subscriber  # noqa: F401  (fixtures for all)

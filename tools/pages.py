@@ -15,13 +15,13 @@ ROOT = Path(__file__).parents[1]
 MODULES = (
     "skin_host.client",
     "skin_host.errors",
-    "skin_host.replay",
-    "skin_host.export",
-    "skin_host.settings",
+    "skin_host.recording.replay",
+    "skin_host.recording.export",
+    "skin_host.config.settings",
     "skin_host.layout",
     "skin_host.processing.relaxation.base",
     "emulator.robot",
-    "emulator.scene",
+    "emulator.probes.scene",
     "emulator.faults",
 )
 _OUTWARD = re.compile(r"\[([^\]]+)\]\(\.\./[^)]*\)")

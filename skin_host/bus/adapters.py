@@ -12,10 +12,10 @@ import can
 import numpy as np
 
 from skin_host.bus.port import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, SKIN_CLASSES, LinkState, Port
-from skin_host.bus.protocol import FrameBatch
+from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SYSTEM, Clock, Executor
+from skin_host.config.settings import Bus
 from skin_host.errors import BusError, ConfigurationError
-from skin_host.settings import Bus
 
 #: One read takes at most this many frames, so that a flood cannot block the event loop.
 CAPACITY = 1024

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.bus.protocol import (
+from skin_host.bus.wire import (
     HEADER_A,
     HEADER_B,
     MAX_STANDARD_ID,

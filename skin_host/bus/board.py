@@ -3,7 +3,7 @@
 import asyncio
 from dataclasses import dataclass, field
 
-from skin_host.bus.protocol.commands import BoardType, Message, SetBoardConfig, SetTriangleConfig
+from skin_host.bus.commands import BoardType, Message, SetBoardConfig, SetTriangleConfig
 from skin_host.layout import BoardLayout, TriangleLayout
 
 MTB3_GAP_PERIODS = 2.5

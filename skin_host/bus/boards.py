@@ -22,17 +22,15 @@ import logging
 from collections.abc import Callable, Coroutine, Iterable
 from typing import Protocol
 
-from skin_host.bus.board import GAP_S, BoardRecord, configuration
-from skin_host.bus.ledger import BoardLedger
-from skin_host.bus.protocol import BROADCAST_ADDRESS
-from skin_host.bus.protocol.answers import (
+from skin_host.bus.answers import (
     Discovered,
     DiscoveredBootloader,
     TimeOfLife,
     TxOverflow,
     parse_answer,
 )
-from skin_host.bus.protocol.commands import (
+from skin_host.bus.board import GAP_S, BoardRecord, configuration
+from skin_host.bus.commands import (
     SKIN_BOARD_TYPES,
     Discover,
     GetTimeOfLife,
@@ -41,6 +39,8 @@ from skin_host.bus.protocol.commands import (
     TxMode,
     command_frame,
 )
+from skin_host.bus.ledger import BoardLedger
+from skin_host.bus.wire import BROADCAST_ADDRESS
 from skin_host.clock import SYSTEM, Clock
 from skin_host.errors import BusError
 from skin_host.layout import BoardLayout, TriangleLayout

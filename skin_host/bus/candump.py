@@ -16,7 +16,7 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.bus.protocol import FrameBatch, RecordBatch
+from skin_host.bus.wire import FrameBatch, RecordBatch
 
 #: Number of bytes that are read at a time.
 BLOCK_BYTES = 1 << 20

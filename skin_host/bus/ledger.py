@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.bus.assembler import Sweep
-from skin_host.bus.protocol import TAXELS, TRIANGLES, out_of_range, status_error
+from skin_host.bus.wire import TAXELS, TRIANGLES, out_of_range, status_error
 from skin_host.layout import BoardLayout
 
 Mask = NDArray[np.bool_]

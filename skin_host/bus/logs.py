@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from skin_host.bus.adapters import identifier, nanoseconds, one_line
 from skin_host.bus.candump import Block, Frame, block_of, read_blocks
-from skin_host.bus.protocol import FrameBatch, RecordBatch
+from skin_host.bus.wire import FrameBatch, RecordBatch
 from skin_host.errors import LogError
 
 #: One batch holds at most this many frames.

@@ -8,8 +8,8 @@ from can.interfaces.socketcan import SocketcanBus
 from skin_host.bus import adapters, socketcan
 from skin_host.bus.port import Port
 from skin_host.clock import SYSTEM, Clock
+from skin_host.config.settings import Bus, Receive
 from skin_host.errors import BusError
-from skin_host.settings import Bus, Receive
 
 log = logging.getLogger(__name__)
 

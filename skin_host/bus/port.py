@@ -17,10 +17,10 @@ from enum import StrEnum
 import can
 import numpy as np
 
-from skin_host.bus.protocol import FrameBatch, MessageClass
+from skin_host.bus.wire import FrameBatch, MessageClass
 from skin_host.clock import SYSTEM, Clock
+from skin_host.config.settings import Bus
 from skin_host.errors import BusError
-from skin_host.settings import Bus
 
 log = logging.getLogger(__name__)
 

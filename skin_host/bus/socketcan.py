@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 
 from skin_host.bus.interfaces import can_interfaces
 from skin_host.bus.port import SKIN_CLASSES, LinkState, Port
-from skin_host.bus.protocol import NS_PER_S, FrameBatch
+from skin_host.bus.wire import NS_PER_S, FrameBatch
 from skin_host.clock import SYSTEM, Clock
+from skin_host.config.settings import Bus, Receive
 from skin_host.errors import BusError
-from skin_host.settings import Bus, Receive
 
 log = logging.getLogger(__name__)
 

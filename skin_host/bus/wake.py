@@ -12,7 +12,7 @@ import contextlib
 from collections.abc import Callable, Iterable, Mapping
 
 from skin_host.clock import SYSTEM, Clock
-from skin_host.settings import Receive
+from skin_host.config.settings import Receive
 
 #: The ports are read this long after the last frame of a sweep is due.
 GUARD_NS = 200_000

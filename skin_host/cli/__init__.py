@@ -15,7 +15,7 @@ import sys
 from collections.abc import Sequence
 from typing import NoReturn
 
-from skin_host import __version__, emulator_path, service
+from skin_host import __version__, emulator_path
 from skin_host.cli import (
     completion,
     emulation,
@@ -26,6 +26,7 @@ from skin_host.cli import (
     simulation,
     watch,
 )
+from skin_host.daemon import service
 from skin_host.errors import SkinError
 
 

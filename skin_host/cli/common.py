@@ -10,11 +10,11 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from skin_host import service
+from skin_host.daemon import service
 
 if TYPE_CHECKING:
+    from skin_host.config.settings import Settings
     from skin_host.layout import Layout
-    from skin_host.settings import Settings
 
 Commands = Any  # argparse's own type of sub-parser collections is private
 
@@ -72,9 +72,9 @@ def load_skin(config: Path) -> "tuple[Settings, Layout]":
     Raises:
         ConfigurationError: see `settings.load` and `layout.build_layout`.
     """
+    from skin_host.config.settings import load
     from skin_host.errors import ConfigurationError
     from skin_host.layout import build_layout
-    from skin_host.settings import load
 
     settings = load(config)
     try:

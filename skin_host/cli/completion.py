@@ -15,7 +15,7 @@ from skin_host.bus.interfaces import can_interfaces
 from skin_host.cli.common import Commands, add_command
 
 if TYPE_CHECKING:
-    from skin_host.settings import Settings
+    from skin_host.config.settings import Settings
 
 Completer = Callable[..., Iterable[str]]
 
@@ -108,8 +108,8 @@ def _channels(**_: Any) -> list[str]:
 
 def _settings(parsed_args: argparse.Namespace) -> "Settings | None":
     """Return the settings of the configuration that is already on the command line."""
+    from skin_host.config.settings import load
     from skin_host.errors import ConfigurationError
-    from skin_host.settings import load
 
     config = getattr(parsed_args, "config", None)
     if config is None:

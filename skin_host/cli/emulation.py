@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     import can
 
     from emulator.robot import Robot
+    from skin_host.config.settings import Settings
     from skin_host.layout import Layout
-    from skin_host.settings import Settings
 
 log = logging.getLogger(__name__)
 
@@ -98,7 +98,7 @@ def add_commands(commands: Commands) -> None:
 
 def _emulate(arguments: argparse.Namespace) -> int:
     from skin_host.bus.opening import open_bus
-    from skin_host.settings import changed
+    from skin_host.config.settings import changed
 
     set_up_logging(arguments.verbose)
     settings, layout = load_skin(arguments.config)
@@ -143,7 +143,7 @@ def _on_real_chips(
 ) -> Work:
     from smbus2 import SMBus
 
-    from emulator import single_board
+    from emulator.boards import single_board
 
     board = settings.boards[arguments.board]
     lines = [opened.enter_context(SMBus(path.strip())) for path in arguments.i2c.split(",")]
@@ -156,10 +156,10 @@ def _on_emulated_chips(
     layout: "Layout",
     opened: contextlib.ExitStack,
 ) -> Work:
+    from emulator.chips.cuse import CuseBus
     from emulator.clock import RealClock
-    from emulator.cuse import CuseBus
+    from emulator.probes.scene import load as load_scene
     from emulator.robot import Robot
-    from emulator.scene import load as load_scene
 
     scene = None if arguments.scene is None else load_scene(arguments.scene)
     fidelity: str | dict[str, str] = arguments.fidelity

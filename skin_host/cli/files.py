@@ -81,8 +81,8 @@ def add_commands(commands: Commands) -> None:
 
 
 def _check(arguments: argparse.Namespace) -> int:
-    from skin_host import check
-    from skin_host.settings import load_running, needs_restart
+    from skin_host.config import check
+    from skin_host.config.settings import load_running, needs_restart
 
     settings, layout = load_skin(arguments.config)
     if arguments.running is not None:
@@ -108,9 +108,9 @@ def _replay(arguments: argparse.Namespace) -> int:
         raise RequestError("the following arguments are required: --config")
     if len(arguments.logs) > 1 or arguments.scheduler is not None:
         return _replay_all(arguments)
-    from skin_host.batch import Task, process, write_lines
-    from skin_host.engine import Engine
-    from skin_host.replay import calibration_for
+    from skin_host.processing.core import Engine
+    from skin_host.recording.batch import Task, process, write_lines
+    from skin_host.recording.replay import calibration_for
 
     (log,) = arguments.logs
     progress = Progress("replay")
@@ -133,7 +133,7 @@ def _replay(arguments: argparse.Namespace) -> int:
 
 def _replay_all(arguments: argparse.Namespace) -> int:
     """Process several recordings, each into its own file in the folder OUTPUT."""
-    from skin_host.batch import Task, process_all
+    from skin_host.recording.batch import Task, process_all
 
     if arguments.output == "-":
         raise RequestError("several LOGs go into a folder: wanted --output FOLDER")

@@ -6,15 +6,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from skin_host.cli.common import Progress, load_skin, print_json
+from skin_host.config.relaxation import FITTED
 from skin_host.errors import RequestError
-from skin_host.relaxation_settings import FITTED
 
 if TYPE_CHECKING:
-    from skin_host import fit_recording
+    from skin_host.config.settings import Settings
     from skin_host.layout import Layout
     from skin_host.processing.curves import Curves
-    from skin_host.processing.fitting import Fit, HoldRecord
-    from skin_host.settings import Settings
+    from skin_host.processing.fitting.hold import Fit, HoldRecord
+    from skin_host.recording import fitting
 
 
 def add_arguments(calibrate: argparse.ArgumentParser) -> None:
@@ -64,9 +64,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _relaxation(arguments: argparse.Namespace) -> int:
-    from skin_host import fit_recording
-    from skin_host.load_table import read_table
     from skin_host.processing.pressure import PressureCurve
+    from skin_host.recording import fitting
+    from skin_host.recording.load_table import read_table
 
     settings, layout = load_skin(arguments.config)
     load = None if arguments.load is None else read_table(arguments.load)
@@ -80,11 +80,11 @@ def _relaxation(arguments: argparse.Namespace) -> int:
     curve = PressureCurve(
         layout.unit_ff / layout.sensitivity, 1.0, pressure.a_kpa_per_ff2, pressure.b_kpa_per_ff
     )
-    record = fit_recording.hold_record(samples, curve, load, arguments.weight_kpa)
-    fits = fit_recording.fit_relaxation(record, FITTED)
+    record = fitting.hold_record(samples, curve, load, arguments.weight_kpa)
+    fits = fitting.fit_relaxation(record, FITTED)
     (chosen,) = [found for found in fits if found.model == model]
     path = arguments.output or arguments.config.with_suffix(".relaxation.json")
-    fit_recording.save_relaxation(path, chosen, settings, record)
+    fitting.save_relaxation(path, chosen, settings, record)
     if arguments.json:
         print_json(
             {
@@ -105,9 +105,9 @@ def _relaxation(arguments: argparse.Namespace) -> int:
 
 
 def _pressure(arguments: argparse.Namespace) -> int:
-    from skin_host import fit_recording
-    from skin_host.calibrate import calibration_path
+    from skin_host.daemon.calibrate import calibration_path
     from skin_host.processing import calibration as calibrations
+    from skin_host.recording import fitting
 
     if (arguments.load is None) == (not arguments.levels):
         raise RequestError(
@@ -120,7 +120,7 @@ def _pressure(arguments: argparse.Namespace) -> int:
         raise RequestError(f"--levels: {min(arguments.levels):g} kPa; wanted pressures above 0")
     settings, layout = load_skin(arguments.config)
     samples = _read_samples(arguments.pressure, settings, layout, arguments.seconds)
-    found, fit = fit_recording.fit_pressures(samples, settings, layout, arguments.levels)
+    found, fit = fitting.fit_pressures(samples, settings, layout, arguments.levels)
     path = arguments.output or calibration_path(settings, arguments.node)
     calibrations.save(path, found, layout)
     counts = {
@@ -156,17 +156,17 @@ def _pressure(arguments: argparse.Namespace) -> int:
 def _course(arguments: argparse.Namespace) -> int:
     import numpy as np
 
-    from skin_host import fit_recording
-    from skin_host.calibrate import calibration_path
-    from skin_host.load_table import check_course, read_table
+    from skin_host.daemon.calibrate import calibration_path
     from skin_host.processing import calibration as calibrations
     from skin_host.processing.curves import CurveVerdict
+    from skin_host.recording import fitting
+    from skin_host.recording.load_table import check_course, read_table
 
     settings, layout = load_skin(arguments.config)
     load = read_table(arguments.load)
     check_course(arguments.load, *load)
     samples = _read_samples(arguments.pressure, settings, layout, arguments.seconds)
-    found, curves = fit_recording.fit_curves(samples, settings, layout, load, arguments.load)
+    found, curves = fitting.fit_curves(samples, settings, layout, load, arguments.load)
     path = arguments.output or calibration_path(settings, arguments.node)
     calibrations.save(path, found, layout)
     verdicts = curve_verdicts(curves, layout)
@@ -255,8 +255,8 @@ def ranges(numbers: list[int]) -> str:
 
 def _read_samples(
     log: Path, settings: "Settings", layout: "Layout", seconds: float
-) -> "fit_recording.Samples":
-    from skin_host.fit_recording import read_samples
+) -> "fitting.Samples":
+    from skin_host.recording.fitting import read_samples
 
     progress = Progress(f"reading {log.name}")
     try:

@@ -2,8 +2,8 @@
 
 import json
 
-from skin_host.publish.grasping import Over, Slip
-from skin_host.publish.messages import Touch
+from skin_host.mqtt.grasping import Over, Slip
+from skin_host.mqtt.messages import Touch
 
 #: What first indicated a slip.
 _CAUSES = {

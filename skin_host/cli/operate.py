@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from skin_host import service
 from skin_host.cli import fit
 from skin_host.cli.common import (
     Commands,
@@ -26,11 +25,12 @@ from skin_host.cli.common import (
     stop_on_signals,
     warn,
 )
+from skin_host.daemon import service
 from skin_host.errors import OtherSkinError, RequestError, SkinError
 
 if TYPE_CHECKING:
-    from skin_host.daemon import Daemon
-    from skin_host.settings import Settings
+    from skin_host.config.settings import Settings
+    from skin_host.daemon.daemon import Daemon
 
 log = logging.getLogger(__name__)
 
@@ -150,11 +150,11 @@ def reload_on_hangup(daemon: "Daemon") -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from skin_host.calibrate import stored_calibration
-    from skin_host.daemon import Daemon
+    from skin_host.config.settings import Settings
+    from skin_host.daemon.calibrate import stored_calibration
+    from skin_host.daemon.daemon import Daemon
+    from skin_host.daemon.sharing import share_name, share_of
     from skin_host.layout import build_layout
-    from skin_host.settings import Settings
-    from skin_host.sharing import share_name, share_of
 
     set_up_logging(arguments.verbose)
     settings, layout = load_skin(arguments.config)
@@ -209,8 +209,8 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _run_workers(arguments: argparse.Namespace, settings: "Settings") -> int:
-    from skin_host import workers
-    from skin_host.sharing import share_name, share_out
+    from skin_host.daemon import workers
+    from skin_host.daemon.sharing import share_name, share_out
 
     node, n = arguments.node, arguments.workers
     if n < 1:
@@ -236,8 +236,8 @@ def _run_workers(arguments: argparse.Namespace, settings: "Settings") -> int:
 
 
 def _calibrate(arguments: argparse.Namespace) -> int:
-    from skin_host.calibrate import calibration_path, take_calibration
     from skin_host.cli import verdicts
+    from skin_host.daemon.calibrate import calibration_path, take_calibration
     from skin_host.files import refuse_newer
     from skin_host.layout import parts_of
     from skin_host.processing import calibration as calibrations
@@ -290,8 +290,8 @@ def _calibrate(arguments: argparse.Namespace) -> int:
 
 
 def _scan(arguments: argparse.Namespace) -> int:
-    from skin_host.scan import describe, scan
-    from skin_host.settings import Bus
+    from skin_host.bus.scan import describe, scan
+    from skin_host.config.settings import Bus
 
     bus = Bus(interface=arguments.interface, channel=arguments.channel)
     found = asyncio.run(scan(bus))

@@ -18,8 +18,8 @@ from skin_host.cli.common import (
 from skin_host.errors import BrokerError, RequestError
 
 if TYPE_CHECKING:
-    from skin_host.export import Series
-    from skin_host.publish.address import Broker
+    from skin_host.mqtt.address import Broker
+    from skin_host.recording.export import Series
 
 LOCAL = "mqtt://localhost"
 
@@ -102,7 +102,7 @@ def play(arguments: argparse.Namespace) -> int:
     Raises:
         RequestError: the options do not go together.
     """
-    from skin_host.publish.recording import SUFFIX
+    from skin_host.recording.mcap import SUFFIX
 
     if arguments.onto == "can":
         if arguments.config is None:
@@ -143,8 +143,8 @@ def _numbers(text: str) -> list[int]:
 
 
 def _record(arguments: argparse.Namespace) -> int:
-    from skin_host.capture import CanLog
-    from skin_host.publish.recording import SUFFIX, Recorder
+    from skin_host.recording.capture import CanLog
+    from skin_host.recording.mcap import SUFFIX, Recorder
 
     file: Path = arguments.file
     if file.exists():
@@ -180,7 +180,7 @@ def _plain(value: Any) -> str:
 
 async def _capture(arguments: argparse.Namespace, recorder: Any, log: Any = None) -> dict[str, Any]:
     """Record until a signal comes or the time is over; report what was lost."""
-    from skin_host.capture import capture_broker, capture_buses
+    from skin_host.recording.capture import capture_broker, capture_buses
 
     stop = asyncio.Event()
     stop_on_signals(stop)
@@ -212,7 +212,7 @@ async def _capture(arguments: argparse.Namespace, recorder: Any, log: Any = None
 async def _robot(url: str, robot: str | None) -> tuple["Broker", str, str]:
     """Return the broker behind a URL, the base of its topics, and the robot."""
     from skin_host.client import SkinClient
-    from skin_host.publish.address import Broker
+    from skin_host.mqtt.address import Broker
 
     broker, base = Broker.from_url(url)
     async with SkinClient(url, robot=robot) as skin:
@@ -220,9 +220,9 @@ async def _robot(url: str, robot: str | None) -> tuple["Broker", str, str]:
 
 
 def _series(arguments: argparse.Namespace) -> "Series":
-    from skin_host.export import read_frames, read_messages
-    from skin_host.publish.recording import SUFFIX
-    from skin_host.replay import calibration_for
+    from skin_host.recording.export import read_frames, read_messages
+    from skin_host.recording.mcap import SUFFIX
+    from skin_host.recording.replay import calibration_for
 
     if arguments.config is None:
         if arguments.recording.suffix != SUFFIX:
@@ -236,7 +236,7 @@ def _series(arguments: argparse.Namespace) -> "Series":
 
 
 def _export(arguments: argparse.Namespace) -> int:
-    from skin_host.export import export
+    from skin_host.recording.export import export
 
     if arguments.output.exists() and arguments.output.samefile(arguments.recording):
         raise RequestError(f"{arguments.output}: is the recording itself; choose another name")
@@ -249,9 +249,9 @@ def _export(arguments: argparse.Namespace) -> int:
 
 
 def _plot(arguments: argparse.Namespace) -> int:
-    from skin_host import plots
+    from skin_host.config.settings import skin_hash
     from skin_host.processing import calibration
-    from skin_host.settings import skin_hash
+    from skin_host.recording import plots
 
     if arguments.what == "calibration":
         if arguments.config is None:
@@ -273,7 +273,7 @@ def _plot(arguments: argparse.Namespace) -> int:
 
 
 def _dbc(arguments: argparse.Namespace) -> int:
-    from skin_host.dbc import dbc_text
+    from skin_host.bus.dbc import dbc_text
     from skin_host.files import write_atomic
 
     if arguments.config is None:
@@ -291,7 +291,7 @@ def _dbc(arguments: argparse.Namespace) -> int:
 
 async def _play_on_buses(arguments: argparse.Namespace) -> int:
     from skin_host.bus.opening import open_bus
-    from skin_host.playback import play_on_buses
+    from skin_host.recording.playback import play_on_buses
 
     settings, _ = load_skin(arguments.config)
     with contextlib.ExitStack() as stack:
@@ -304,11 +304,11 @@ async def _play_on_buses(arguments: argparse.Namespace) -> int:
 
 
 async def _play_processed(arguments: argparse.Namespace) -> int:
-    from skin_host.engine import Engine
-    from skin_host.playback import play_processed
-    from skin_host.publish.address import Broker
-    from skin_host.replay import calibration_for
-    from skin_host.settings import changed
+    from skin_host.config.settings import changed
+    from skin_host.mqtt.address import Broker
+    from skin_host.processing.core import Engine
+    from skin_host.recording.playback import play_processed
+    from skin_host.recording.replay import calibration_for
 
     settings, layout = load_skin(arguments.config)
     broker, base = Broker.from_url(arguments.broker)
@@ -332,9 +332,9 @@ async def _play_processed(arguments: argparse.Namespace) -> int:
 async def _play_said(arguments: argparse.Namespace) -> int:
     from aiomqtt import MqttError
 
-    from skin_host.playback import play_messages
-    from skin_host.publish.address import Broker
-    from skin_host.publish.connection import explain
+    from skin_host.mqtt.address import Broker
+    from skin_host.mqtt.connection import explain
+    from skin_host.recording.playback import play_messages
 
     broker, _ = Broker.from_url(arguments.broker)
     try:

@@ -3,7 +3,7 @@
 from itertools import groupby
 from typing import TypedDict
 
-from skin_host.check import columns, format_triangles
+from skin_host.config.check import columns, format_triangles
 from skin_host.health.diagnosis import named
 from skin_host.layout import TAXELS_PER_TRIANGLE, Layout, PadKind
 from skin_host.processing.calibration import Calibration, Verdict

@@ -13,11 +13,11 @@ from skin_host.client.heard import Health
 from skin_host.client.presence import Contact
 from skin_host.client.session import CommandError, Node, SkinClient
 from skin_host.client.streams import Stream
-from skin_host.publish.address import Broker
-from skin_host.publish.frames import Frame
-from skin_host.publish.grasping import Over, Slip
-from skin_host.publish.info import NodeInfo, PartInfo
-from skin_host.publish.messages import Touch
+from skin_host.mqtt.address import Broker
+from skin_host.mqtt.frames import Frame
+from skin_host.mqtt.grasping import Over, Slip
+from skin_host.mqtt.info import NodeInfo, PartInfo
+from skin_host.mqtt.messages import Touch
 
 __all__ = [
     "Broker",

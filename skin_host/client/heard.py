@@ -4,11 +4,11 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 from skin_host.client.presence import Contact
-from skin_host.publish.frames import Frame, decode_frame
-from skin_host.publish.grasping import Over, Slip, decode_over, decode_slip
-from skin_host.publish.messages import Touch, decode_contact, decode_health, decode_touch
-from skin_host.publish.payload import MessageError
-from skin_host.publish.topics import PartTopic
+from skin_host.mqtt.frames import Frame, decode_frame
+from skin_host.mqtt.grasping import Over, Slip, decode_over, decode_slip
+from skin_host.mqtt.messages import Touch, decode_contact, decode_health, decode_touch
+from skin_host.mqtt.payload import MessageError
+from skin_host.mqtt.topics import PartTopic
 
 if TYPE_CHECKING:
     from skin_host.health.record import Record

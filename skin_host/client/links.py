@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from typing import Protocol
 
 from skin_host.errors import BrokerError, SkinError
-from skin_host.publish.address import Broker
-from skin_host.publish.connection import (
+from skin_host.mqtt.address import Broker
+from skin_host.mqtt.connection import (
     Connection,
     Message,
     MqttError,
@@ -17,7 +17,7 @@ from skin_host.publish.connection import (
     first_error,
     is_refusal,
 )
-from skin_host.publish.payload import MAX_PACKET_BYTES
+from skin_host.mqtt.payload import MAX_PACKET_BYTES
 
 MAX_INCOMING = 10_000
 #: The broker keeps touch events for this long while we are disconnected (MQTT 5).

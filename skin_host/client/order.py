@@ -6,10 +6,10 @@ are passed on as they arrive.
 
 from dataclasses import dataclass, field
 
-from skin_host.publish.frames import Frame
-from skin_host.publish.grasping import Over, Slip
-from skin_host.publish.messages import Touch
-from skin_host.publish.order import Stamp
+from skin_host.mqtt.frames import Frame
+from skin_host.mqtt.grasping import Over, Slip
+from skin_host.mqtt.messages import Touch
+from skin_host.mqtt.order import Stamp
 
 Event = Touch | Slip | Over
 

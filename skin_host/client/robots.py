@@ -3,9 +3,9 @@
 import asyncio
 
 from skin_host.errors import RequestError
-from skin_host.publish.address import Broker
-from skin_host.publish.connection import Connection
-from skin_host.publish.topics import ONLINE
+from skin_host.mqtt.address import Broker
+from skin_host.mqtt.connection import Connection
+from skin_host.mqtt.topics import ONLINE
 
 #: Retained messages come within this time of a subscription.
 RETAINED_S = 0.5

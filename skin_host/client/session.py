@@ -17,22 +17,22 @@ from skin_host.client.presence import Contact, Presence
 from skin_host.client.robots import RETAINED_S, only_robot
 from skin_host.client.streams import Stream
 from skin_host.errors import BrokerError, RequestError, SkinError
-from skin_host.publish.address import Broker
-from skin_host.publish.commands import Result, decode_result, encode_request
-from skin_host.publish.connection import (
+from skin_host.mqtt.address import Broker
+from skin_host.mqtt.commands import Result, decode_result, encode_request
+from skin_host.mqtt.connection import (
     Connection,
     Message,
     MqttError,
     explain,
     message_properties,
 )
-from skin_host.publish.frames import Frame
-from skin_host.publish.grasping import Over, Slip
-from skin_host.publish.info import NodeInfo, decode_info, join_pieces
-from skin_host.publish.messages import Touch
-from skin_host.publish.order import run_of, stamp_of
-from skin_host.publish.payload import JSON_TYPE
-from skin_host.publish.topics import ONLINE, PartTopic, Topics
+from skin_host.mqtt.frames import Frame
+from skin_host.mqtt.grasping import Over, Slip
+from skin_host.mqtt.info import NodeInfo, decode_info, join_pieces
+from skin_host.mqtt.messages import Touch
+from skin_host.mqtt.order import run_of, stamp_of
+from skin_host.mqtt.payload import JSON_TYPE
+from skin_host.mqtt.topics import ONLINE, PartTopic, Topics
 
 #: An event waits this long for an earlier one, which may come from another broker.
 HOLD_S = 1.0

@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.foam import Foam
-from emulator.viscoelastic import FoamTruth, TruthKind
-from skin_host.bus.protocol import TAXELS
+from emulator.probes.foam import Foam
+from emulator.probes.viscoelastic import FoamTruth, TruthKind
+from skin_host.bus.wire import TAXELS
+from skin_host.config.relaxation import FITTED, MODELS, Relaxation
 from skin_host.evaluation.histories import HISTORIES, Record, calibration_hold, play, record
 from skin_host.evaluation.rig import Rig
-from skin_host.processing.fitting import Fit, HoldRecord, fit, merge
+from skin_host.processing.fitting.hold import Fit, HoldRecord, fit, merge
 from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.relaxation import OWN_MEANS, ParameterSet, make_model, stand_in
-from skin_host.relaxation_settings import FITTED, MODELS, Relaxation
 
 Floats = NDArray[np.float64]
 Row = dict[str, Any]

@@ -31,8 +31,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.bus.protocol import TAXELS, TRIANGLES
-from skin_host.daemon import Daemon
+from skin_host.bus.wire import TAXELS, TRIANGLES
+from skin_host.config.settings import changed
+from skin_host.daemon.daemon import Daemon
+from skin_host.daemon.sharing import share_name, share_of
 from skin_host.errors import BrokerError, SkinError
 from skin_host.evaluation.body_stream import Body, send_body
 from skin_host.evaluation.rooms import RoomClock
@@ -40,9 +42,7 @@ from skin_host.evaluation.stand_in import register
 from skin_host.evaluation.touch_listener import PLAIN_TOPIC, collected, listen, publish_plain
 from skin_host.evaluation.wakeups import Wakeups
 from skin_host.layout import build_layout
-from skin_host.publish.broker import find_mosquitto, mosquitto_broker
-from skin_host.settings import changed
-from skin_host.sharing import share_name, share_of
+from skin_host.mqtt.broker import find_mosquitto, mosquitto_broker
 
 SIZES = (192, 2000, 10_000)
 RATES_HZ = (20, 50)

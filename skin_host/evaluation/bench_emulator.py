@@ -13,12 +13,12 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from emulator.probes.scene import Place, Probe, Scene
+from emulator.probes.skin import MOVING_NS, Skin
 from emulator.robot import Robot
-from emulator.scene import Place, Probe, Scene
-from emulator.skin import MOVING_NS, Skin
+from skin_host.config.settings import Settings
 from skin_host.evaluation.rig import wired
 from skin_host.layout import Layout, build_layout
-from skin_host.settings import Settings
 
 Row = dict[str, Any]
 

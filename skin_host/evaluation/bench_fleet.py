@@ -35,16 +35,16 @@ from skin_host.client.links import Link
 from skin_host.client.order import EventOrder, Newest
 from skin_host.client.presence import Presence
 from skin_host.client.session import HOLD_S
+from skin_host.config.settings import Mqtt
 from skin_host.errors import RequestError
 from skin_host.evaluation.machine import machine
+from skin_host.mqtt.address import Broker
+from skin_host.mqtt.connection import Connection, Message
+from skin_host.mqtt.messages import Touch, decode_contact, decode_touch
+from skin_host.mqtt.order import run_of, stamp_of
+from skin_host.mqtt.publisher import Publisher
+from skin_host.mqtt.topics import ONLINE
 from skin_host.processing.events import TouchEvent
-from skin_host.publish.address import Broker
-from skin_host.publish.connection import Connection, Message
-from skin_host.publish.messages import Touch, decode_contact, decode_touch
-from skin_host.publish.mqtt import Publisher
-from skin_host.publish.order import run_of, stamp_of
-from skin_host.publish.topics import ONLINE
-from skin_host.settings import Mqtt
 
 TRAFFIC = Path(__file__).parent / "fleet_traffic.jsonl"
 BASE = "skin"

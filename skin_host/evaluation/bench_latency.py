@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.bus.protocol import TAXELS, TRIANGLES
-from skin_host.daemon import Daemon
+from skin_host.bus.wire import TAXELS, TRIANGLES
+from skin_host.config.settings import changed
+from skin_host.daemon.daemon import Daemon
 from skin_host.errors import BrokerError, SkinError
 from skin_host.evaluation.can_stream import FULL_BUS_FRAMES_PER_S, Stream, Wire, send
 from skin_host.evaluation.touch_listener import PLAIN_TOPIC, collected, listen, publish_plain
 from skin_host.layout import build_layout
-from skin_host.publish.broker import find_mosquitto, mosquitto_broker
-from skin_host.settings import changed
+from skin_host.mqtt.broker import find_mosquitto, mosquitto_broker
 
 #: The daemon must have set itself up and calibrated by then; the test machine's processor is slow.
 _READY_S = 150.0

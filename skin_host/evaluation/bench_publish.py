@@ -21,15 +21,15 @@ from typing import Any
 
 import numpy as np
 
+from skin_host.config.settings import Mqtt
 from skin_host.errors import RequestError
+from skin_host.mqtt.address import Broker
+from skin_host.mqtt.connection import Connection, PackedProperties, connect, message_properties
+from skin_host.mqtt.frames import encode_frame
+from skin_host.mqtt.packets import publish_head, publish_packet
+from skin_host.mqtt.payload import JSON_TYPE
+from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.pipeline import PressureFrame
-from skin_host.publish.address import Broker
-from skin_host.publish.connection import Connection, PackedProperties, connect, message_properties
-from skin_host.publish.frames import encode_frame
-from skin_host.publish.mqtt import Publisher
-from skin_host.publish.packets import publish_head, publish_packet
-from skin_host.publish.payload import JSON_TYPE
-from skin_host.settings import Mqtt
 
 TAXELS = (192, 816, 2000)
 RATE_HZ = 50.0

@@ -27,7 +27,8 @@ import numpy as np
 
 from skin_host.bus.assembler import Assembler, Sweep
 from skin_host.bus.opening import open_bus, open_port
-from skin_host.bus.protocol import (
+from skin_host.bus.wake import WakeUp
+from skin_host.bus.wire import (
     HEADER_A,
     HEADER_B,
     TAXELS,
@@ -36,11 +37,10 @@ from skin_host.bus.protocol import (
     FrameBatch,
     MessageClass,
 )
-from skin_host.bus.wake import WakeUp
-from skin_host.engine import Engine
+from skin_host.config.settings import Settings
 from skin_host.evaluation.can_stream import BUS, Stream, Wire, send
 from skin_host.layout import build_layout
-from skin_host.settings import Settings
+from skin_host.processing.core import Engine
 
 PATHS = ("notifier_async", "notifier_callback", "batch")
 #: Frames a second; 0 is as fast as the sender can.

@@ -12,6 +12,7 @@ import os
 from multiprocessing.connection import Connection
 from typing import Any
 
+from skin_host.daemon.sharing import share_out
 from skin_host.errors import BrokerError, SkinError
 from skin_host.evaluation.bench_daemon import (
     TOUCHED,
@@ -21,7 +22,6 @@ from skin_host.evaluation.bench_daemon import (
 )
 from skin_host.evaluation.body_stream import PAUSE, Body, send_body
 from skin_host.evaluation.touch_listener import listen
-from skin_host.sharing import share_out
 
 SIZES = (10_000, 30_000, 100_000)
 HZ = 20

@@ -15,10 +15,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.bus.protocol import TAXELS, TRIANGLES, encode_sweep
+from skin_host.bus.wire import TAXELS, TRIANGLES, encode_sweep
+from skin_host.config.settings import Settings
 from skin_host.evaluation.can_stream import CAN_FRAME, FRAMES_PER_SWEEP, FULL_BUS_FRAMES_PER_S
 from skin_host.evaluation.stand_in import HOST, INTERFACE, StandInBus
-from skin_host.settings import Settings
 
 #: So many boards make one part of the body.
 BOARDS_PER_PART = 4

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.bus.interfaces import NETWORKS, can_interfaces
-from skin_host.bus.protocol import TRIANGLES, encode_sweep
+from skin_host.bus.wire import TRIANGLES, encode_sweep
+from skin_host.config.settings import Bus, Settings
 from skin_host.evaluation.stand_in import HOST, INTERFACE, StandInBus, register
-from skin_host.settings import Bus, Settings
 
 BUS = "can0"
 FULL_BUS_FRAMES_PER_S = 8000

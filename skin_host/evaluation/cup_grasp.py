@@ -14,13 +14,13 @@ from dataclasses import dataclass, field
 import can
 import numpy as np
 
+from emulator.probes.scene import Place, Probe, Scene
 from emulator.robot import LiveProbe, Robot
-from emulator.scene import Place, Probe, Scene
 from skin_host.client import SkinClient
-from skin_host.daemon import Daemon
+from skin_host.config.settings import Settings, changed
+from skin_host.daemon.daemon import Daemon
 from skin_host.layout import TAXELS_PER_TRIANGLE, Layout
-from skin_host.publish.broker import local_broker
-from skin_host.settings import Settings, changed
+from skin_host.mqtt.broker import local_broker
 
 HAND = "left_hand"
 #: Triangles of the part: index, middle, thumb.

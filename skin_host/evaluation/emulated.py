@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.probes.scene import Air, Scene
 from emulator.robot import Robot
-from emulator.scene import Air, Scene
-from skin_host.bus.protocol import FrameBatch
+from skin_host.bus.wire import FrameBatch
 from skin_host.evaluation import insole
 
 Row = dict[str, Any]

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from emulator.viscoelastic import FoamTruth
+from emulator.probes.viscoelastic import FoamTruth
 from skin_host.evaluation.accuracy import DEFAULT, UNIT_FF, relaxation_table
 from skin_host.evaluation.goals import goal
 from skin_host.evaluation.histories import play

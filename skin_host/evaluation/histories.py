@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.viscoelastic import FoamTruth, TruthKind
+from emulator.probes.viscoelastic import FoamTruth, TruthKind
 
 Floats = NDArray[np.float64]
 #: A commanded change takes this long: the robot's fastest move over the foam.

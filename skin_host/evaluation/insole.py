@@ -15,10 +15,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.bus.protocol import FrameBatch, encode_sweep
+from skin_host.bus.wire import FrameBatch, encode_sweep
+from skin_host.config.settings import Settings
 from skin_host.errors import LogError
 from skin_host.layout import Layout, PadKind, build_layout
-from skin_host.settings import Settings
 
 Floats = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.foam import Drive, Foam, FoamLayer
-from emulator.pads import UNIT_FF, Disc, Pads
-from emulator.viscoelastic import FoamTruth
+from emulator.probes.foam import Drive, Foam, FoamLayer
+from emulator.probes.pads import UNIT_FF, Disc, Pads
+from emulator.probes.viscoelastic import FoamTruth
 from skin_host.layout import builtin_kinds
 from skin_host.processing.localization import Localizer, Method, make_localizer, separate
 

@@ -18,17 +18,17 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.engine import Engine
+from skin_host.config.settings import Settings
 from skin_host.errors import RequestError
 from skin_host.evaluation import emulated, insole, page, tables
 from skin_host.evaluation.goals import goal
 from skin_host.evaluation.insole import Recording
 from skin_host.evaluation.machine import cores, machine
-from skin_host.fit_recording import Samples, fit_curves
 from skin_host.layout import Layout, build_layout
 from skin_host.processing.calibration import Calibration, Verdict, with_pressures_of
-from skin_host.replay import calibrate_from_log, steps
-from skin_host.settings import Settings
+from skin_host.processing.core import Engine
+from skin_host.recording.fitting import Samples, fit_curves
+from skin_host.recording.replay import calibrate_from_log, steps
 
 Row = dict[str, Any]
 Floats = NDArray[np.float64]

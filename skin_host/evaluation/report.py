@@ -16,14 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from emulator.viscoelastic import TruthKind
+from emulator.probes.viscoelastic import TruthKind
+from skin_host.config.relaxation import MODELS
 from skin_host.evaluation import accuracy, hard_cases, page, real, speed, tables, touching
 from skin_host.evaluation.accuracy import DEFAULT, Plan, Variant
 from skin_host.evaluation.goals import goal
 from skin_host.evaluation.histories import TRUTHS
 from skin_host.evaluation.localization_trials import Case, errors, localizer_for
 from skin_host.evaluation.machine import cores, machine
-from skin_host.relaxation_settings import MODELS
 
 Row = dict[str, Any]
 Report = dict[str, Any]

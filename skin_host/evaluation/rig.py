@@ -11,11 +11,11 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from emulator.noise import SampledNoise
+from emulator.chips.noise import SampledNoise
+from skin_host.config.settings import Settings
 from skin_host.layout import Layout, build_layout
 from skin_host.processing.calibration import Calibrator
 from skin_host.processing.pipeline import Pipeline, PressureFrame
-from skin_host.settings import Settings
 
 BOARDS_PER_BUS = 14
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.bench import NAMED_PADS, PalmRig
-from emulator.experiments import Presses, Scan
+from emulator.probes.bench import NAMED_PADS, PalmRig
+from emulator.probes.experiments import Presses, Scan
 from skin_host.evaluation.cup_grasp import Grasp
 
 Floats = NDArray[np.float64]

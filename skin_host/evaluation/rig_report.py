@@ -14,18 +14,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.bench import NAMED_PADS, PalmRig
-from emulator.experiments import Hold, Presses, Scan, deepening_presses, hold, scan
-from emulator.pads import UNIT_FF
+from emulator.probes.bench import NAMED_PADS, PalmRig
+from emulator.probes.experiments import Hold, Presses, Scan, deepening_presses, hold, scan
+from emulator.probes.pads import UNIT_FF
 from skin_host.cli.common import load_skin
+from skin_host.config.relaxation import FITTED
 from skin_host.demo import configuration
 from skin_host.evaluation.cup_grasp import Grasp
 from skin_host.evaluation.cup_grasp import run as grasp_cups
 from skin_host.evaluation.rig_plots import Corrected, Results, plot
-from skin_host.processing.fitting import fit, merge
+from skin_host.processing.fitting.hold import fit, merge
 from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.relaxation import make_model
-from skin_host.relaxation_settings import FITTED
 
 Row = dict[str, Any]
 Floats = NDArray[np.float64]

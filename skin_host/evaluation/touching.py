@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.viscoelastic import TruthKind
+from emulator.probes.viscoelastic import TruthKind
 from skin_host.evaluation.accuracy import DEFAULT, relaxation_table
 from skin_host.evaluation.histories import Holds, record
 from skin_host.evaluation.rig import Rig

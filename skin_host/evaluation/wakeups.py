@@ -9,7 +9,7 @@ from typing import Any
 _CAUSES = {
     "skin_host.bus": "plan",
     "skin_host.clock": "plan",
-    "skin_host.publish": "mqtt",
+    "skin_host.mqtt": "mqtt",
     "aiomqtt": "mqtt",
     "asyncio": "thread",
 }

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 from skin_host.bus.board import GAP_S
 from skin_host.bus.boards import RETRY_S, Sender
-from skin_host.bus.protocol.commands import SetTxMode, command_frame
+from skin_host.bus.commands import SetTxMode, command_frame
+from skin_host.bus.strain import SILENT_NS, StrainMode, start_frames
 from skin_host.errors import BusError
 from skin_host.fingertip.engine import TipState
-from skin_host.fingertip.strain_protocol import SILENT_NS, StrainMode, start_frames
 
 log = logging.getLogger(__name__)
 

@@ -7,10 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.bus.protocol import FrameBatch, MessageClass
-from skin_host.fingertip.events import FingertipEvent
-from skin_host.fingertip.settings import Fingertip
-from skin_host.fingertip.strain_protocol import (
+from skin_host.bus.strain import (
     CHANNELS,
     SILENT_NS,
     StrainType,
@@ -19,11 +16,14 @@ from skin_host.fingertip.strain_protocol import (
     parse_full_scale,
     parse_strain,
 )
+from skin_host.bus.wire import FrameBatch, MessageClass
+from skin_host.config.fingertips import Fingertip
+from skin_host.config.settings import Settings
+from skin_host.fingertip.events import FingertipEvent
 from skin_host.fingertip.tip import Tip
 from skin_host.layout import Layout
 from skin_host.processing.calibration import Zero
 from skin_host.processing.events import TouchEvent
-from skin_host.settings import Settings
 
 Floats = NDArray[np.float64]
 

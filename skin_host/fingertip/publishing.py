@@ -5,9 +5,9 @@ from collections.abc import Iterable
 from skin_host.fingertip.engine import FingertipEngine
 from skin_host.fingertip.events import FingertipEvent
 from skin_host.fingertip.health import FingertipHealth, FingertipRecord
+from skin_host.mqtt.messages import ContactState
+from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.events import TouchEvent
-from skin_host.publish.messages import ContactState
-from skin_host.publish.mqtt import Publisher
 
 #: Health is published at once when something changes, otherwise this often.
 HEALTH_NS = 1_000_000_000

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.config.fingertips import Fingertip
 from skin_host.fingertip.events import Cause
-from skin_host.fingertip.settings import Fingertip
 from skin_host.fingertip.slip import RatioDrop, ShearRate, friction_used
 
 Floats = NDArray[np.float64]

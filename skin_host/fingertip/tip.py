@@ -13,13 +13,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.bus.strain import SILENT_NS, Wrench
+from skin_host.config.fingertips import Fingertip
 from skin_host.fingertip.events import Cause, FingertipEvent, OverEvent, SlipEvent
 from skin_host.fingertip.grasp import FingerFlags, Flags, Thresholds
 from skin_host.fingertip.intrinsic import IntrinsicContact, Verdict, locate
 from skin_host.fingertip.joining import locate_with_skin
-from skin_host.fingertip.settings import Fingertip
 from skin_host.fingertip.slip_watch import SlipWatch
-from skin_host.fingertip.strain_protocol import SILENT_NS, Wrench
 from skin_host.fingertip.wrench import Butterworth2
 from skin_host.processing.calibration import Zero
 from skin_host.processing.contacts import ALIVE_NS, LOST_NS, MOVED_M, PRESSED_SHARE

@@ -9,11 +9,11 @@ from typing import Any
 
 from skin_host.bus.boards import Boards
 from skin_host.bus.port import Port
-from skin_host.engine import Engine, Output
 from skin_host.health.describe import Describer
 from skin_host.health.diagnosis import Fault, diagnose
 from skin_host.health.record import Record
 from skin_host.health.watch import Watch
+from skin_host.processing.core import Engine, Output
 
 __all__ = ["Health", "Record"]
 

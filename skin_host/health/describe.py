@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.bus.boards import Boards
+from skin_host.bus.commands import SKIN_BOARD_TYPES
 from skin_host.bus.port import Port
-from skin_host.bus.protocol import TRIANGLES, StatusError
-from skin_host.bus.protocol.commands import SKIN_BOARD_TYPES
-from skin_host.engine import Engine
+from skin_host.bus.wire import TRIANGLES, StatusError
 from skin_host.health.record import (
     BoardHealth,
     BusHealth,
@@ -23,6 +22,7 @@ from skin_host.health.record import (
 from skin_host.health.watch import Watch
 from skin_host.layout import TAXELS_PER_TRIANGLE, PadKind
 from skin_host.processing.calibration import Verdict
+from skin_host.processing.core import Engine
 from skin_host.processing.masks import Mask
 from skin_host.processing.validity import FAR_PADS, lifted
 

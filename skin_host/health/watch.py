@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from skin_host.bus.boards import Boards
 from skin_host.bus.port import Port
-from skin_host.engine import Engine, Output, Step
+from skin_host.processing.core import Engine, Output, Step
 
 #: Rates are means over about this time.
 RATE_S = 2.0

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import msgspec
 
-from skin_host.check import format_triangles
+from skin_host.config.check import format_triangles
+from skin_host.config.settings import Board, Bus, Part, Patch, Settings
 from skin_host.errors import ConfigurationError
 from skin_host.importing.report import Findings
 from skin_host.importing.skinspec import BoardSpec, Device, read_device
-from skin_host.settings import Board, Bus, Part, Patch, Settings
 
 #: Boards of these types correct their values with a temperature pad: their triangles have ten pads.
 TEN_PAD_TYPES = (0, 3, 8)

@@ -15,12 +15,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.check import format_triangles
-from skin_host.errors import ConfigurationError
-from skin_host.geometry import fit_unit
-from skin_host.importing.report import Findings
-from skin_host.layout import TAXELS_PER_TRIANGLE, builtin_kinds
-from skin_host.settings import (
+from skin_host.config.check import format_triangles
+from skin_host.config.settings import (
     TRIANGLES_PER_BOARD,
     Board,
     Bus,
@@ -30,6 +26,10 @@ from skin_host.settings import (
     Settings,
     parse_triangles,
 )
+from skin_host.errors import ConfigurationError
+from skin_host.importing.report import Findings
+from skin_host.layout import TAXELS_PER_TRIANGLE, builtin_kinds
+from skin_host.layout.geometry import fit_unit
 
 LARGEST_FILE = 20_000_000
 TAXELS_PER_BOARD = TAXELS_PER_TRIANGLE * TRIANGLES_PER_BOARD

@@ -8,7 +8,8 @@ from typing import Literal, get_args
 
 import msgspec
 
-from skin_host import settings as configuration
+from skin_host.config import settings as configuration
+from skin_host.config.settings import Patch, Settings
 from skin_host.errors import ConfigurationError
 from skin_host.files import write_atomic
 from skin_host.importing.boards import import_boards
@@ -18,7 +19,6 @@ from skin_host.importing.skingui import import_places
 from skin_host.importing.skinmanager import import_manager
 from skin_host.importing.writing import configuration_text
 from skin_host.layout import build_layout
-from skin_host.settings import Patch, Settings
 
 Source = Literal["skinspec", "skingui", "positions", "skinmanager"]
 SOURCES: tuple[Source, ...] = get_args(Source)

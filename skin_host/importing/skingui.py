@@ -12,11 +12,8 @@ from pathlib import Path
 
 import msgspec
 
-from skin_host.check import format_triangles
-from skin_host.errors import ConfigurationError
-from skin_host.importing.report import Findings
-from skin_host.layout import TAXELS_PER_TRIANGLE, builtin_kinds
-from skin_host.settings import (
+from skin_host.config.check import format_triangles
+from skin_host.config.settings import (
     TRIANGLES_PER_BOARD,
     Board,
     Bus,
@@ -26,6 +23,9 @@ from skin_host.settings import (
     Settings,
     parse_triangles,
 )
+from skin_host.errors import ConfigurationError
+from skin_host.importing.report import Findings
+from skin_host.layout import TAXELS_PER_TRIANGLE, builtin_kinds
 
 LARGEST_FILE = 1_000_000
 #: The display accepts ids below this.

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import msgspec
 
+from skin_host.config.settings import Settings
 from skin_host.errors import ConfigurationError
 from skin_host.importing.report import Findings
-from skin_host.settings import Settings
 
 LARGEST_FILE = 1_000_000
 #: Keys without a counterpart here, and why.

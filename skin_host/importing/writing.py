@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 from msgspec import Struct
 
-from skin_host.settings import Patch, Settings
+from skin_host.config.settings import Patch, Settings
 
 
 def configuration_text(settings: Settings, comment: str = "") -> str:

@@ -18,6 +18,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.config.settings import Touch
 from skin_host.errors import CalibrationError, NewerFileError, OtherSkinError
 from skin_host.files import read_document, write_atomic
 from skin_host.layout import Layout, PadKind
@@ -25,7 +26,6 @@ from skin_host.processing.conversions import Conversions
 from skin_host.processing.curves import KNOTS_UNITS, Curves, CurveVerdict, Memory, rising
 from skin_host.processing.masks import Mask
 from skin_host.processing.touch import levels
-from skin_host.settings import Touch
 
 SCHEMA = "skin.calibration/1"
 #: A taxel is noisy if a decision within a second needs more than this multiple of the touch margin,

@@ -9,6 +9,7 @@ from itertools import accumulate, chain, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.config.settings import Settings
 from skin_host.layout import Layout, PadKind
 from skin_host.processing.events import Reason, TouchEvent
 from skin_host.processing.localization import Localizer, make_localizer, separate
@@ -16,7 +17,6 @@ from skin_host.processing.localization_centroid import GEOMETRY_PITCHES
 from skin_host.processing.patches import Patches
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.processing.pressure import PressureCurve
-from skin_host.settings import Settings
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -12,9 +12,9 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from skin_host.config.settings import Pressure
 from skin_host.layout import Layout
 from skin_host.processing.pressure import PressureCurve
-from skin_host.settings import Pressure
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -39,8 +39,8 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.config.settings import Drift
 from skin_host.processing.masks import Mask
-from skin_host.settings import Drift
 
 Array = NDArray[np.float64]
 

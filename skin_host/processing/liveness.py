@@ -28,7 +28,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.bus.protocol.compensation import NO_GAIN
+from skin_host.bus.compensation import NO_GAIN
 from skin_host.processing.masks import Mask, any_of
 from skin_host.processing.repeats import Encoding, Repeats
 from skin_host.processing.stuck import (

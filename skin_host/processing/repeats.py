@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.bus.protocol.compensation import NO_GAIN, THERMAL_TAXEL, drift_of
+from skin_host.bus.compensation import NO_GAIN, THERMAL_TAXEL, drift_of
 
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]

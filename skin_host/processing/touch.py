@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.config.settings import Touch
 from skin_host.processing.conversions import CONVERSION_S, Conversions
 from skin_host.processing.masks import Mask, any_of
-from skin_host.settings import Touch
 
 Array = NDArray[np.floating]
 Floats = NDArray[np.float64]

@@ -11,9 +11,9 @@ for all boards at once: when every board that sends has sent, or before one send
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.bus.compensation import thermal_gains
 from skin_host.bus.ledger import BoardLedger
-from skin_host.bus.protocol import TRIANGLES
-from skin_host.bus.protocol.compensation import thermal_gains
+from skin_host.bus.wire import TRIANGLES
 from skin_host.layout import Layout
 from skin_host.processing.liveness import PADS, Liveness
 from skin_host.processing.masks import Mask

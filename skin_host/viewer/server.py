@@ -22,7 +22,7 @@ from websockets.http11 import Request, Response
 
 from skin_host.client import SkinClient, Stream
 from skin_host.errors import BrokerError, RequestError, SkinError
-from skin_host.publish.address import Broker
+from skin_host.mqtt.address import Broker
 from skin_host.viewer.picture import Cursor, Picture
 
 #: Pages get new messages this often; screens show no more.

@@ -9,9 +9,9 @@ import pytest
 from mcap.writer import CompressionType, Writer
 
 from skin_host.errors import LogError
-from skin_host.publish.frames import decode_frame
-from skin_host.publish.payload import MessageError
-from skin_host.publish.recording import read_messages_of
+from skin_host.mqtt.frames import decode_frame
+from skin_host.mqtt.payload import MessageError
+from skin_host.recording.mcap import read_messages_of
 
 
 def shared_key(depth: int) -> bytes:

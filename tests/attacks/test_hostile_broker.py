@@ -6,8 +6,8 @@ import random
 
 import pytest
 
-from skin_host.publish.mqtt import Publisher
-from skin_host.settings import Mqtt
+from skin_host.config.settings import Mqtt
+from skin_host.mqtt.publisher import Publisher
 from tests.support.waiting import until
 
 CONNACK_5 = bytes([0x20, 3, 0, 0, 0])

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skin_host.bus import protocol
+from skin_host.bus import wire
 from skin_host.bus.assembler import PATIENCE_SWEEPS, Assembler, Sweep
-from skin_host.bus.protocol import FrameBatch
+from skin_host.bus.wire import FrameBatch
+from skin_host.config.settings import Board, Bus, Part, Patch, Settings
 from skin_host.layout import build_layout
-from skin_host.settings import Board, Bus, Part, Patch, Settings
 
 MS = 1_000_000
 PERIOD = 50 * MS
@@ -39,7 +39,7 @@ def frames(
     raw: np.ndarray, t_ns: int, board: int = 1, spacing_ns: int = 125_000
 ) -> list[tuple[int, bytes, int]]:
     n = len(raw)
-    ids, data = protocol.encode_sweep(board, np.arange(n), raw, np.zeros(n, np.uint16))
+    ids, data = wire.encode_sweep(board, np.arange(n), raw, np.zeros(n, np.uint16))
     return [
         (int(can_id), row.tobytes(), t_ns + i * spacing_ns)
         for i, (can_id, row) in enumerate(zip(ids, data, strict=True))
@@ -138,7 +138,7 @@ def test_missed_periods_are_counted():
 
 
 def test_status_words_are_kept_and_missing_ones_read_zero():
-    ids, data = protocol.encode_sweep(
+    ids, data = wire.encode_sweep(
         1, np.arange(4), values(4), np.array([0, 0x2000, 2, 0xFFF1], np.uint16)
     )
     sent = [

@@ -4,14 +4,14 @@ from collections.abc import Iterable
 
 import pytest
 
+from skin_host.bus.answers import Discovered, DiscoveredBootloader, answer_frame
 from skin_host.bus.boards import Boards
-from skin_host.bus.protocol import FrameBatch, MessageClass, identifier
-from skin_host.bus.protocol.answers import Discovered, DiscoveredBootloader, answer_frame
-from skin_host.bus.protocol.commands import BoardType, Message
-from skin_host.engine import Engine
+from skin_host.bus.commands import BoardType, Message
+from skin_host.bus.wire import FrameBatch, MessageClass, identifier
+from skin_host.config.settings import load
 from skin_host.health import Health, Record
 from skin_host.layout import build_layout
-from skin_host.settings import load
+from skin_host.processing.core import Engine
 from tests.support.stack import ROOT
 
 CONFIG = ROOT / "config" / "demo.toml"

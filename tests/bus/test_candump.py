@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from skin_host.bus import candump
 from skin_host.bus.adapters import identifier, nanoseconds
 from skin_host.bus.logs import CAPACITY, WINDOW_NS, read_channels
-from skin_host.bus.protocol import FrameBatch
+from skin_host.bus.wire import FrameBatch
 from skin_host.errors import LogError
 
 Read = list[tuple[str, list[tuple[int, bytes, int]]]]

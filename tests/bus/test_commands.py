@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skin_host.bus.protocol import answers, commands
-from skin_host.bus.protocol.answers import (
+from skin_host.bus import answers, commands
+from skin_host.bus.answers import (
     Discovered,
     DiscoveredBootloader,
     FirmwareVersion,
@@ -15,7 +15,7 @@ from skin_host.bus.protocol.answers import (
     TxOverflow,
     parse_answer,
 )
-from skin_host.bus.protocol.commands import (
+from skin_host.bus.commands import (
     AccGyroSetup,
     Discover,
     GetFirmwareVersion,

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from skin_host.bus.assembler import Sweep
 from skin_host.bus.ledger import LONGEST_PAUSE_NS, BoardLedger
+from skin_host.config.settings import load
 from skin_host.layout import build_layout
-from skin_host.settings import load
 from tests.support.stack import ROOT
 
 CONFIG = ROOT / "config" / "demo.toml"

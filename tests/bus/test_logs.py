@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from skin_host.bus.logs import WINDOW_NS, read_channels
-from skin_host.bus.protocol import FrameBatch
+from skin_host.bus.wire import FrameBatch
 from skin_host.errors import LogError
 
 GRASP = Path(__file__).parents[2].parent / "shared/data/icub_grasp.log"

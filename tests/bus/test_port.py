@@ -14,12 +14,12 @@ from can.interfaces.socketcan.socketcan import build_can_frame
 from skin_host.bus.adapters import AdapterPort
 from skin_host.bus.opening import open_port
 from skin_host.bus.port import LinkState, Port
-from skin_host.bus.protocol import FrameBatch
 from skin_host.bus.socketcan import BatchReceiver, SocketCanPort
+from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SYSTEM, Clock, SteppedClock
+from skin_host.config.settings import Bus, Receive
 from skin_host.errors import BusError, ConfigurationError
 from skin_host.evaluation.stand_in import StandInBus, pair, register
-from skin_host.settings import Bus, Receive
 
 SMALL = Receive(buffer_bytes=65536)
 

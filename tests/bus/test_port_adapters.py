@@ -9,7 +9,7 @@ import pytest
 from skin_host.bus.adapters import CAPACITY, AdapterPort, nanoseconds
 from skin_host.bus.opening import open_bus, open_port
 from skin_host.bus.port import LinkState, Port
-from skin_host.settings import Bus, Receive
+from skin_host.config.settings import Bus, Receive
 
 _numbers = itertools.count()
 

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from skin_host.bus.wake import GIVE_UP_NS, GUARD_NS, LONGEST_NS, RETRY_NS, SLIP_NS, Plan, WakeUp
-from skin_host.settings import Receive
+from skin_host.config.settings import Receive
 
 MS = 1_000_000
 PERIOD = 50 * MS

@@ -16,13 +16,13 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
 from skin_host.client import CommandError, Contact, SkinCallbacks, SkinClient
+from skin_host.config.settings import Mqtt, load
 from skin_host.errors import BrokerError, RequestError
 from skin_host.layout import build_layout
+from skin_host.mqtt.info import node_info
+from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
-from skin_host.publish.info import node_info
-from skin_host.publish.mqtt import Publisher
-from skin_host.settings import Mqtt, load
 from tests.support.broker import Mosquitto, free_port
 from tests.support.waiting import PATIENCE_S, until
 

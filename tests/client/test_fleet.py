@@ -10,13 +10,13 @@ import pytest
 from msgspec import json
 
 from skin_host.client import Contact, SkinClient
+from skin_host.config.settings import Mqtt
 from skin_host.errors import ConfigurationError, RequestError
-from skin_host.publish.address import Broker
-from skin_host.publish.mqtt import Publisher
-from skin_host.publish.order import Stamp, stamp_of
-from skin_host.settings import Mqtt
+from skin_host.mqtt.address import Broker
+from skin_host.mqtt.order import Stamp, stamp_of
+from skin_host.mqtt.publisher import Publisher
 from tests.client.test_client import answer, frame, take, touch
-from tests.publish.test_publisher import listening
+from tests.mqtt.test_publisher import listening
 from tests.support.broker import Mosquitto
 from tests.support.waiting import until
 

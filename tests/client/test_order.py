@@ -6,8 +6,8 @@ import pytest
 from msgspec.structs import replace
 
 from skin_host.client.order import MAX_HELD, EventOrder, Newest
-from skin_host.publish.messages import Touch
-from skin_host.publish.order import Numbers, Stamp
+from skin_host.mqtt.messages import Touch
+from skin_host.mqtt.order import Numbers, Stamp
 from tests.client.test_presence import seen
 
 

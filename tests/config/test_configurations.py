@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skin_host import check
+from skin_host.config import check
+from skin_host.config.settings import load
 from skin_host.layout import build_layout
-from skin_host.settings import load
 
 CONFIG = Path(__file__).parents[2] / "config"
 

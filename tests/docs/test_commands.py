@@ -71,7 +71,7 @@ def test_every_command_is_explained_somewhere() -> None:
 
 def test_the_kinds_of_the_configuration_page_are_those_that_are_built_in() -> None:
     (row,) = re.findall(r"^\| `kind` .*built in are ([^|]*)\|", CONFIGURATION, re.MULTILINE)
-    kinds = tomllib.loads((ROOT / "skin_host/kinds.toml").read_text())
+    kinds = tomllib.loads((ROOT / "skin_host/layout/kinds.toml").read_text())
     assert row.strip().split(", ") == list(kinds)
 
 

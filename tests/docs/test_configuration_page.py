@@ -9,7 +9,7 @@ import msgspec
 import pytest
 from msgspec import Struct
 
-from skin_host.settings import Settings
+from skin_host.config.settings import Settings
 from tests.support.pages import PAGES
 
 PAGE = PAGES["docs/configuration.md"].read_text()

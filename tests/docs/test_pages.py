@@ -20,8 +20,8 @@ import pytest
 
 from emulator import faults
 from skin_host.cli import build_parser
+from skin_host.mqtt.frames import encode_frame
 from skin_host.processing.pipeline import PressureFrame
-from skin_host.publish.frames import encode_frame
 from tests.support import programs
 from tests.support.broker import Mosquitto, free_port
 from tests.support.pages import PAGES, ROOT, Block, Command, blocks, commands

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from emulator.chips.i2c_dev import Caller, I2cDevice, Ioctl
 from emulator.faults import KINDS, parse
-from emulator.i2c_dev import Caller, I2cDevice, Ioctl
+from emulator.probes.scene import Fault, Scene
 from emulator.robot import Robot
-from emulator.scene import Fault, Scene
-from skin_host import settings as configurations
-from skin_host.bus.protocol import FrameBatch
-from skin_host.bus.protocol.commands import Discover, command_frame
+from skin_host.bus.commands import Discover, command_frame
+from skin_host.bus.wire import FrameBatch
+from skin_host.config import settings as configurations
 from skin_host.errors import ConfigurationError
 from skin_host.layout import build_layout
 

@@ -6,24 +6,24 @@ import numpy as np
 import pytest
 from smbus2 import i2c_msg
 
-from emulator import scene as scenes
-from emulator.bring_up import triangle_set_ups
+from emulator.boards.bring_up import triangle_set_ups
 from emulator.clock import SteppedClock
+from emulator.probes import scene as scenes
+from emulator.probes.scene import Place, Probe, Scene
 from emulator.robot import Robot
-from emulator.scene import Place, Probe, Scene
-from skin_host import settings as configurations
-from skin_host.bus.protocol import FrameBatch, find_skin_frames
-from skin_host.bus.protocol.answers import Discovered, parse_answer
-from skin_host.bus.protocol.commands import (
+from skin_host.bus.answers import Discovered, parse_answer
+from skin_host.bus.commands import (
     Discover,
     SetBoardConfig,
     SetTxMode,
     TxMode,
     command_frame,
 )
+from skin_host.bus.wire import FrameBatch, find_skin_frames
+from skin_host.config import settings as configurations
+from skin_host.config.settings import Settings, changed
 from skin_host.errors import ConfigurationError, LogError
 from skin_host.layout import Layout, build_layout
-from skin_host.settings import Settings, changed
 
 CONFIG = Path(__file__).parents[2] / "config"
 

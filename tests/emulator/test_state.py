@@ -9,11 +9,11 @@ import pytest
 
 from emulator import state
 from emulator.faults import parse
+from emulator.probes.scene import load as load_scene
 from emulator.robot import Robot
-from emulator.scene import load as load_scene
 from emulator.state import StateError
+from skin_host.config.settings import Settings, load
 from skin_host.layout import Layout, build_layout
-from skin_host.settings import Settings, load
 
 CONFIG = Path(__file__).parents[2] / "config"
 FAULTS = (

@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from skin_host.bus.protocol import TAXELS, TRIANGLES
+from skin_host.bus.wire import TAXELS, TRIANGLES
 from skin_host.evaluation.body_stream import Body
 from skin_host.evaluation.rooms import RoomClock, _room_of
 from skin_host.layout import build_layout

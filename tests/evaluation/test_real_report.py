@@ -73,7 +73,7 @@ def test_the_skin_and_its_frames_are_those_of_the_tool_that_writes_logs(
     from importlib.machinery import SourceFileLoader
     from importlib.util import module_from_spec, spec_from_loader
 
-    from skin_host.settings import load, skin_hash
+    from skin_host.config.settings import load, skin_hash
 
     spec = spec_from_loader("insole_log", SourceFileLoader("insole_log", str(TOOL)))
     assert spec is not None

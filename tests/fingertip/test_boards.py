@@ -13,20 +13,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emulator.faults import parse
+from emulator.probes.scene import Probe, Scene
 from emulator.robot import Robot
-from emulator.scene import Probe, Scene
-from skin_host import metrics
-from skin_host.bus.protocol import FrameBatch
-from skin_host.engine import Engine
+from skin_host.bus.wire import FrameBatch
+from skin_host.config.settings import changed, load
+from skin_host.daemon import metrics
 from skin_host.fingertip.boards import StrainBoards
 from skin_host.fingertip.engine import FingertipEngine
 from skin_host.fingertip.events import FingertipEvent
 from skin_host.fingertip.health import FingertipHealth, FingertipRecord
 from skin_host.layout import build_layout
+from skin_host.mqtt import messages
 from skin_host.processing.calibration import Zero
+from skin_host.processing.core import Engine
 from skin_host.processing.events import TouchEvent
-from skin_host.publish import messages
-from skin_host.settings import changed, load
 
 CONFIG = Path(__file__).parents[2] / "config"
 

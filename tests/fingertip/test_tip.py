@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from skin_host.bus.strain import Wrench
+from skin_host.config.fingertips import Fingertip
 from skin_host.fingertip.events import FingertipEvent, OverEvent, SlipEvent
-from skin_host.fingertip.settings import Fingertip
-from skin_host.fingertip.strain_protocol import Wrench
 from skin_host.fingertip.tip import Tip
 from skin_host.processing.calibration import Zero
 from skin_host.processing.events import TouchEvent

@@ -13,7 +13,7 @@ import time
 
 import numpy as np
 
-from skin_host.bus.protocol import encode_sweep
+from skin_host.bus.wire import encode_sweep
 from tests.fuzz import targets
 
 BATCH = 200

@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 
 from skin_host.bus.boards import Boards
-from skin_host.bus.protocol import FrameBatch
+from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SYSTEM
-from skin_host.control import Control
-from skin_host.engine import Engine
+from skin_host.config.settings import Settings, changed, load, skin_hash
+from skin_host.daemon.control import Control
+from skin_host.daemon.state import load_state
 from skin_host.errors import NewerFileError, RequestError, SkinError
 from skin_host.health import Health
 from skin_host.layout import Layout, build_layout
+from skin_host.mqtt.commands import CommandHandler, decode_result
 from skin_host.processing import calibration as calibrations
-from skin_host.publish.commands import CommandHandler, decode_result
-from skin_host.settings import Settings, changed, load, skin_hash
-from skin_host.state import load_state
+from skin_host.processing.core import Engine
 
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
 #: A frame of the fuzzer: identifier (4), dlc (1), data (8), pause before it (1).

@@ -8,16 +8,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from emulator.probes.scene import Scene
 from emulator.robot import Robot
-from emulator.scene import Scene
-from skin_host import check
+from skin_host.config import check
+from skin_host.config.settings import Place, Settings, changed, load, parse_triangles
 from skin_host.errors import ConfigurationError
-from skin_host.geometry import lay
 from skin_host.importing.report import Findings
 from skin_host.importing.run import import_files
 from skin_host.importing.writing import configuration_text
 from skin_host.layout import Layout, build_layout, builtin_kinds
-from skin_host.settings import Place, Settings, changed, load, parse_triangles
+from skin_host.layout.geometry import lay
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT.parent / "shared" / "data"

@@ -3,13 +3,13 @@ import json
 import numpy as np
 import pytest
 
+from skin_host.config.settings import Processing
 from skin_host.errors import CalibrationError
 from skin_host.evaluation.rig import flat_skin
 from skin_host.processing import calibration
 from skin_host.processing.calibration import Calibrator, Verdict
 from skin_host.processing.curves import KNOTS_UNITS, Curves, CurveVerdict, Memory, rising
 from skin_host.processing.pipeline import Pipeline
-from skin_host.settings import Processing
 
 _, LAYOUT = flat_skin(1)
 N = LAYOUT.n_taxels

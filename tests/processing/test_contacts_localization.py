@@ -6,9 +6,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from emulator.foam import Drive, Foam, FoamLayer
-from emulator.pads import UNIT_FF, Disc, Pads
-from emulator.viscoelastic import FoamTruth
+from emulator.probes.foam import Drive, Foam, FoamLayer
+from emulator.probes.pads import UNIT_FF, Disc, Pads
+from emulator.probes.viscoelastic import FoamTruth
+from skin_host.config.settings import Settings, load
 from skin_host.errors import ConfigurationError
 from skin_host.layout import Layout, build_layout
 from skin_host.processing.contacts import ContactTracker
@@ -16,7 +17,6 @@ from skin_host.processing.events import TouchEvent
 from skin_host.processing.localization import Method
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.processing.pressure import PressureCurve
-from skin_host.settings import Settings, load
 
 UNITS = 57.0
 NOISE_UNITS = 0.4

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from skin_host.config.settings import Drift
 from skin_host.processing.drift import BaselineTracker, paper_step, proportional_step
-from skin_host.settings import Drift
 
 N = 24
 NOBODY = np.zeros(N, bool)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from skin_host.bus.assembler import Sweep
 from skin_host.cli.common import load_skin
-from skin_host.engine import Engine
+from skin_host.processing.core import Engine
 from skin_host.processing.intake import PartSample
 from skin_host.processing.validity import unpressable
 

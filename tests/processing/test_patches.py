@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from skin_host.config.settings import load
 from skin_host.layout import build_layout
 from skin_host.processing.patches import MANY, Patches
-from skin_host.settings import load
 
 ICUB = Path(__file__).parents[2] / "config" / "icub.toml"
 

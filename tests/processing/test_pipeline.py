@@ -4,13 +4,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from skin_host.config.relaxation import MODELS
+from skin_host.config.settings import Processing
 from skin_host.evaluation.rig import Rig, flat_skin
 from skin_host.layout import PadKind
 from skin_host.processing.calibration import Calibrator, Verdict
 from skin_host.processing.pipeline import Pipeline
 from skin_host.processing.pressure import PressureCurve
-from skin_host.relaxation_settings import MODELS
-from skin_host.settings import Processing
 
 CURVE = PressureCurve(2.88)
 NO_RELAXATION = {"relaxation": {"model": "none"}}

@@ -3,6 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from skin_host.config.relaxation import FITTED, MODELS
 from skin_host.processing.relaxation import (
     STAND_INS,
     AsymmetricRelaxation,
@@ -11,7 +12,6 @@ from skin_host.processing.relaxation import (
     make_model,
     stand_in,
 )
-from skin_host.relaxation_settings import FITTED, MODELS
 
 MID = STAND_INS["mid"]
 LOADING = {"beta": MID.beta, "tau_s": MID.tau_s, "tau_unload_s": MID.tau_unload_s}

@@ -10,12 +10,12 @@ import os
 import numpy as np
 import pytest
 
+from skin_host.config.relaxation import FITTED
 from skin_host.processing.relaxation import (
     AsymmetricRelaxation,
     make_model,
     stand_in,
 )
-from skin_host.relaxation_settings import FITTED
 
 DAYS = float(os.environ.get("SOAK_DAYS", "0.5"))
 

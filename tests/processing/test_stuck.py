@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulator.firmware.arithmetic import transmit_16, transmit_32
-from skin_host.bus.protocol.compensation import GAIN, GAIN_V2, NO_GAIN, THERMAL_TAXEL
+from emulator.boards.arithmetic import transmit_16, transmit_32
+from skin_host.bus.compensation import GAIN, GAIN_V2, NO_GAIN, THERMAL_TAXEL
 from skin_host.processing import stuck
 from skin_host.processing.repeats import Encoding, Repeats
 from skin_host.processing.stuck import StuckPads

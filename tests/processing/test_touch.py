@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from skin_host.config.settings import Touch
 from skin_host.processing.touch import Levels, Residuals, TouchDetector, levels
-from skin_host.settings import Touch
 
 REST = 200
 

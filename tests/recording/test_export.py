@@ -7,17 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skin_host import plots
+from skin_host.config.settings import load
 from skin_host.errors import LogError, RequestError
-from skin_host.export import Series, export, read_frames, read_messages
 from skin_host.layout import build_layout
+from skin_host.mqtt.frames import encode_frame
 from skin_host.processing.calibration import with_curves
 from skin_host.processing.curves import KNOTS_UNITS, Curves, Memory, rising
 from skin_host.processing.pipeline import PressureFrame
-from skin_host.publish.frames import encode_frame
-from skin_host.publish.recording import Recorder
-from skin_host.replay import calibrate_from_log
-from skin_host.settings import load
+from skin_host.recording import plots
+from skin_host.recording.export import Series, export, read_frames, read_messages
+from skin_host.recording.mcap import Recorder
+from skin_host.recording.replay import calibrate_from_log
 
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / "config" / "icub_hand.toml"

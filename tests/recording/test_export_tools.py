@@ -10,11 +10,11 @@ from rerun.chunk import McapReader, RrdReader
 
 from skin_host.cli import main
 from skin_host.errors import RequestError, SkinError
-from skin_host.export import HealthLine, PartSeries, Series, export
-from skin_host.export.scene import ARROW_M_PER_N, POINT, Scene
 from skin_host.extras import required
-from skin_host.publish.info import PartInfo, TriangleInfo
-from skin_host.publish.messages import TouchMessage
+from skin_host.mqtt.info import PartInfo, TriangleInfo
+from skin_host.mqtt.messages import TouchMessage
+from skin_host.recording.export import HealthLine, PartSeries, Series, export
+from skin_host.recording.export.scene import ARROW_M_PER_N, POINT, Scene
 
 N, TAXELS = 5, 12
 START_NS = 1_700_000_000_000_000_000
@@ -110,7 +110,7 @@ def test_foxglove_reads_points_contacts_transforms_and_log(series: Series, tmp_p
 
 
 def test_an_arrow_turns_to_where_a_force_points() -> None:
-    from skin_host.export.scene import _turned_from_x
+    from skin_host.recording.export.scene import _turned_from_x
 
     for wanted in ([0, 0, -2.0], [0, 1.0, 0], [-1.0, 0, 0], [0.6, 0, 0.8]):
         x, y, z, w = _turned_from_x(np.array(wanted))

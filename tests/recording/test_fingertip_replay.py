@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
+from emulator.probes.scene import load as load_scene
 from emulator.robot import Robot
-from emulator.scene import load as load_scene
+from skin_host.bus.strain import start_frames
 from skin_host.cli import main
-from skin_host.fingertip.strain_protocol import start_frames
+from skin_host.config.settings import load
 from skin_host.layout import build_layout
-from skin_host.settings import load
 
 CONFIG = Path(__file__).parents[2] / "config"
 

@@ -10,20 +10,20 @@ import can
 import numpy as np
 import pytest
 
+from emulator.probes.scene import Scene
 from emulator.robot import Robot
-from emulator.scene import Scene
 from skin_host.bus.logs import read_channels
-from skin_host.capture import CanLog, capture_broker, capture_buses
 from skin_host.client import SkinClient
-from skin_host.engine import Engine
+from skin_host.config.settings import Bus, Mqtt, Settings, changed, load
 from skin_host.errors import RequestError
 from skin_host.layout import Layout, build_layout
-from skin_host.playback import paced, play_messages, play_on_buses, play_processed
-from skin_host.publish.address import Broker
-from skin_host.publish.info import encode_info, node_info
-from skin_host.publish.recording import Recorder, read_can, read_messages_of, recorded_topics
-from skin_host.replay import calibrate_from_log, steps
-from skin_host.settings import Bus, Mqtt, Settings, changed, load
+from skin_host.mqtt.address import Broker
+from skin_host.mqtt.info import encode_info, node_info
+from skin_host.processing.core import Engine
+from skin_host.recording.capture import CanLog, capture_broker, capture_buses
+from skin_host.recording.mcap import Recorder, read_can, read_messages_of, recorded_topics
+from skin_host.recording.playback import paced, play_messages, play_on_buses, play_processed
+from skin_host.recording.replay import calibrate_from_log, steps
 from tests.support.broker import Mosquitto
 from tests.support.waiting import PATIENCE_S, until
 

@@ -13,11 +13,11 @@ import pytest
 from mcap.reader import make_reader
 
 from skin_host.cli import main
+from skin_host.config.settings import Mqtt, load
 from skin_host.layout import build_layout
-from skin_host.publish.info import node_info
-from skin_host.publish.mqtt import Publisher
-from skin_host.publish.recording import read_messages_of
-from skin_host.settings import Mqtt, load
+from skin_host.mqtt.info import node_info
+from skin_host.mqtt.publisher import Publisher
+from skin_host.recording.mcap import read_messages_of
 from tests.support.broker import Mosquitto
 from tests.support.world import World
 

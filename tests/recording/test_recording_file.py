@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
-from skin_host.bus.protocol import FrameBatch
+from skin_host.bus.wire import FrameBatch
 from skin_host.errors import LogError
+from skin_host.mqtt.frames import encode_frame
+from skin_host.mqtt.messages import encode_touch
 from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
-from skin_host.publish.frames import encode_frame
-from skin_host.publish.messages import encode_touch
-from skin_host.publish.recording import Recorder, read_can, read_messages_of
+from skin_host.recording.mcap import Recorder, read_can, read_messages_of
 
 TOPIC = "skin/demo/palm"
 

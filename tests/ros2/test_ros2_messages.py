@@ -16,7 +16,7 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from skin_host.client import Contact, Frame, Health, PartInfo, Touch
-from skin_host.publish.info import TriangleInfo
+from skin_host.mqtt.info import TriangleInfo
 
 ROS2 = Path(__file__).parents[2] / "ros2"
 NODE = (ROS2 / "skin_host_ros/skin_host_ros/node.py").read_text()

@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-from emulator.scene import load as load_scene
-from skin_host.bus.protocol import FrameBatch, encode_sweep
-from skin_host.engine import Engine
+from emulator.probes.scene import load as load_scene
+from skin_host.bus.wire import FrameBatch, encode_sweep
+from skin_host.config.settings import Bus, load
 from skin_host.health import Health
 from skin_host.layout import build_layout
-from skin_host.settings import Bus, load
+from skin_host.processing.core import Engine
 from tests.support.broker import Mosquitto
 from tests.support.live import living
 from tests.support.programs import require

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import can
 
-from skin_host.settings import Bus
+from skin_host.config.settings import Bus
 
 _WAIT_S = 20.0
 

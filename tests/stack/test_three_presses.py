@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
+from skin_host.config.settings import load
 from skin_host.layout import build_layout
 from skin_host.processing.pressure import PressureCurve
-from skin_host.settings import load
 from tests.support.stack import Stack, wait_for
 from tests.support.subscriber import Subscriber
 

@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 
-from emulator.ad7147 import AD7147
-from emulator.firmware.chips import I2cChips
-from emulator.i2c import build_lines
-from emulator.mtb import make_board
-from skin_host.bus.protocol.answers import parse_answer
-from skin_host.bus.protocol.commands import Message, command_frame
+from emulator.boards.chip_access import I2cChips
+from emulator.boards.mtb import make_board
+from emulator.chips.ad7147 import AD7147
+from emulator.chips.i2c import build_lines
+from skin_host.bus.answers import parse_answer
+from skin_host.bus.commands import Message, command_frame
 
 RESTING_FF = 9000.0
 STEP_NS = 1_000_000

@@ -30,9 +30,9 @@ from typing import Protocol
 import msgspec
 from smbus2 import SMBus, i2c_msg
 
-from emulator.ad7147 import AD7147
+from emulator.chips.ad7147 import AD7147
 
-SCRIPTS = sorted(Path(__file__).parent.parent.glob("emulator/conformance/*.toml"))
+SCRIPTS = sorted(Path(__file__).parent.parent.glob("emulator/chips/conformance/*.toml"))
 
 
 class Ping(msgspec.Struct, tag_field="op", tag="ping", forbid_unknown_fields=True):

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from emulator.probes.scene import Fault, Scene
 from emulator.robot import Robot
-from emulator.scene import Fault, Scene
 from skin_host.bus.assembler import Sweep
-from skin_host.engine import Engine, Output
+from skin_host.config.settings import changed, load
 from skin_host.health import Health, Record
 from skin_host.layout import build_layout
-from skin_host.settings import changed, load
+from skin_host.processing.core import Engine, Output
 
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
 TICK_S = 0.05

@@ -13,7 +13,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from emulator.scene import Place, Probe, Scene
+from emulator.probes.scene import Place, Probe, Scene
 from skin_host.files import write_atomic
 from tests.support.fault_bench import FaultBench
 

@@ -9,12 +9,12 @@ from pathlib import Path
 import can
 
 from emulator.clock import RealClock
+from emulator.probes.scene import Fault, Scene
 from emulator.robot import Robot
-from emulator.scene import Fault, Scene
 from skin_host.clock import SYSTEM, Clock
-from skin_host.daemon import Daemon
+from skin_host.config.settings import Bus, changed, load
+from skin_host.daemon.daemon import Daemon
 from skin_host.layout import build_layout
-from skin_host.settings import Bus, changed, load
 
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
 PATIENCE_S = 30.0

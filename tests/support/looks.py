@@ -10,8 +10,8 @@ import sys
 
 import numpy as np
 
-from emulator import ad7147_map as reg
-from emulator.ad7147 import AD7147
+from emulator.chips import ad7147_map as reg
+from emulator.chips.ad7147 import AD7147
 
 #: Reading these clears them: that is no look.
 STATUS = range(reg.STAGE_LOW_INT_STATUS, reg.STAGE_COMPLETE_INT_STATUS + 1)

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import can
 
+from emulator.probes.scene import Scene
+from emulator.probes.scene import load as load_scene
 from emulator.robot import Robot
-from emulator.scene import Scene
-from emulator.scene import load as load_scene
 from skin_host.cli import main as skin
 from skin_host.cli.common import load_skin
 

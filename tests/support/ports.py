@@ -3,9 +3,9 @@
 from collections.abc import Iterable
 
 from skin_host.bus.port import Port
-from skin_host.bus.protocol import FrameBatch
+from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SYSTEM, Clock
-from skin_host.settings import Bus, Receive
+from skin_host.config.settings import Bus, Receive
 
 
 class StillPort(Port):

@@ -18,10 +18,10 @@ import can
 import numpy as np
 from can.interfaces import BACKENDS
 
+from emulator.probes.scene import Scene
 from emulator.robot import Robot
-from emulator.scene import Scene
+from skin_host.config.settings import Settings, load
 from skin_host.layout import Layout, build_layout
-from skin_host.settings import Settings, load
 
 INTERFACE = "scheduled"
 _TICK_S = 0.02

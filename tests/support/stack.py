@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from skin_host.settings import Bus
+from skin_host.config.settings import Bus
 from tests.support.broker import Mosquitto
 from tests.support.subscriber import Subscriber
 

@@ -5,11 +5,11 @@ import contextlib
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
-from emulator.scene import Place, Probe, Scene
-from skin_host.daemon import Daemon
+from emulator.probes.scene import Place, Probe, Scene
+from skin_host.config.settings import Bus, changed, load
+from skin_host.daemon.daemon import Daemon
 from skin_host.health import Record
 from skin_host.layout import build_layout
-from skin_host.settings import Bus, changed, load
 from tests.support import scheduled_bus
 
 PATIENCE_S = 120.0

@@ -13,19 +13,19 @@ from pathlib import Path
 
 import can
 
+from emulator.probes.scene import Place, Probe, Scene
 from emulator.robot import Robot
-from emulator.scene import Place, Probe, Scene
-from skin_host.bus.protocol import FrameBatch
-from skin_host.capture import CanLog
-from skin_host.engine import Engine
+from skin_host.bus.wire import FrameBatch
+from skin_host.config.settings import Bus, load
 from skin_host.layout import build_layout
+from skin_host.mqtt.frames import encode_frame
+from skin_host.mqtt.info import encode_info, node_info
+from skin_host.mqtt.messages import encode_touch
 from skin_host.processing import calibration
-from skin_host.publish.frames import encode_frame
-from skin_host.publish.info import encode_info, node_info
-from skin_host.publish.messages import encode_touch
-from skin_host.publish.recording import Recorder
-from skin_host.replay import calibrate_from_log, read_buses
-from skin_host.settings import Bus, load
+from skin_host.processing.core import Engine
+from skin_host.recording.capture import CanLog
+from skin_host.recording.mcap import Recorder
+from skin_host.recording.replay import calibrate_from_log, read_buses
 from tests.support.broker import Mosquitto
 from tests.support.live import living
 from tests.support.pages import ROOT

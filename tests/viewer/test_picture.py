@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 
 from skin_host.client import Contact, Frame, Health, NodeInfo, PartInfo, Touch
-from skin_host.publish.info import FingertipInfo, TriangleInfo
+from skin_host.mqtt.info import FingertipInfo, TriangleInfo
 from skin_host.viewer.picture import Cursor, Picture
 
 

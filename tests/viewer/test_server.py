@@ -15,12 +15,12 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import InvalidStatus
 
 from skin_host.client.robots import RETAINED_S
+from skin_host.config.settings import Mqtt, load
 from skin_host.errors import RequestError, SkinError
 from skin_host.layout import Layout, build_layout
+from skin_host.mqtt.info import node_info
+from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.pipeline import PressureFrame
-from skin_host.publish.info import node_info
-from skin_host.publish.mqtt import Publisher
-from skin_host.settings import Mqtt, load
 from skin_host.viewer import server
 from skin_host.viewer.server import Viewer
 from tests.support.broker import Mosquitto, free_port

@@ -1,6 +1,7 @@
 """A bottle's cap that two round fingertips close: the world of Ohka et al.'s second task.
 
-The contacts stick and slip as in `emulator.held_objects`. Lengths in mm, forces in N, time in s.
+The contacts stick and slip as in `emulator.probes.held_objects`. Lengths in mm, forces in N,
+time in s.
 """
 
 from dataclasses import dataclass, field
@@ -8,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.held_objects import Friction, StickSlip
+from emulator.probes.held_objects import Friction, StickSlip
 
 Floats = NDArray[np.float64]
 

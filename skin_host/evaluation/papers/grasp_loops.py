@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.held_objects import Friction, HeldObjects
+from emulator.probes.held_objects import Friction, HeldObjects
 from skin_host.evaluation.papers.cap import Cap, CapWorld
 from skin_host.evaluation.papers.three_axis import (
     ThreeAxisSensor,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.held_objects import Friction, HeldObjects
+from emulator.probes.held_objects import Friction, HeldObjects
 from skin_host.evaluation.papers.grasp_loops import FORCE_HZ, NOISE_N
 from skin_host.fingertip.slip import RatioDrop, ShearRate, friction_used
 

@@ -15,8 +15,8 @@ from paho.mqtt.properties import Properties
 
 from skin_host.clock import Clock
 from skin_host.evaluation.simulate.trace import Trace
-from skin_host.publish.address import Broker as Address
-from skin_host.publish.connection import TIMEOUT_S, Connection, Message, MqttError, Will
+from skin_host.mqtt.address import Broker as Address
+from skin_host.mqtt.connection import TIMEOUT_S, Connection, Message, MqttError, Will
 
 #: One way.
 LATENCY_S = 0.001

@@ -11,13 +11,13 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.firmware.board import join
+from emulator.boards.board import join
 from skin_host.bus.port import ERROR_FLAG, LinkState, Port
-from skin_host.bus.protocol import FrameBatch
+from skin_host.bus.wire import FrameBatch
 from skin_host.clock import Clock
+from skin_host.config.settings import Bus
 from skin_host.errors import BusError
 from skin_host.evaluation.simulate.trace import Trace
-from skin_host.settings import Bus
 
 #: Frames that wait to be read; more are dropped and counted, as a socket does.
 BUFFER_FRAMES = 4000

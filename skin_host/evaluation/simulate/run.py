@@ -12,14 +12,14 @@ from typing import Any
 
 import msgspec
 
-from emulator.scene import Scene
+from emulator.probes.scene import Scene
+from skin_host.config.settings import Settings
 from skin_host.errors import ConfigurationError
 from skin_host.evaluation.simulate.disk import PowerCut
 from skin_host.evaluation.simulate.promises import SAMPLE_S, Promises
 from skin_host.evaluation.simulate.troubles import ACTS, KINDS, WIRING, Trouble, act
 from skin_host.evaluation.simulate.world import Life, World
 from skin_host.layout import Layout
-from skin_host.settings import Settings
 
 #: How long a storm lasts, and how long the calm after it may take to be well.
 STORM_S = 40.0

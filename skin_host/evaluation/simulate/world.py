@@ -11,19 +11,19 @@ from pathlib import Path
 
 import numpy as np
 
+from emulator.probes.scene import Place, Probe, Scene
 from emulator.robot import NS, LiveProbe, Robot
-from emulator.scene import Place, Probe, Scene
 from skin_host.bus.port import Port
-from skin_host.calibrate import stored_calibration
 from skin_host.clock import SYSTEM, Clock, SteppedClock
-from skin_host.daemon import Daemon
+from skin_host.config.settings import Bus, Receive, Settings
+from skin_host.daemon.calibrate import stored_calibration
+from skin_host.daemon.daemon import Daemon
 from skin_host.evaluation.simulate.broker import Broker, Living
 from skin_host.evaluation.simulate.cables import Cable, SimulatedPort
 from skin_host.evaluation.simulate.disk import SimulatedDisk
 from skin_host.evaluation.simulate.trace import Trace
 from skin_host.files import on_disk
 from skin_host.layout import Layout
-from skin_host.settings import Bus, Receive, Settings
 
 #: Places that are pressed.
 SPOTS = 6

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import DTypeLike
 
+from skin_host.config.relaxation import MODELS
+from skin_host.config.relaxation import Relaxation as Settings
 from skin_host.processing.relaxation.asymmetric import AsymmetricRelaxation
 from skin_host.processing.relaxation.base import Parameters, Relaxation
 from skin_host.processing.relaxation.none import NoRelaxation
 from skin_host.processing.relaxation.published import PublishedRelaxation
-from skin_host.relaxation_settings import MODELS
-from skin_host.relaxation_settings import Relaxation as Settings
 
 #: Evenly spaced modes, from a second to the longest that an hour's record can distinguish from a
 #: constant.

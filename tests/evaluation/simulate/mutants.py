@@ -37,25 +37,25 @@ class Mutant(NamedTuple):
 MUTANTS = [
     Mutant(
         "a full queue's loss is not counted",
-        "publish/outbox.py",
+        "mqtt/outbox.py",
         "        self.counters.touches_dropped += 1\n        if not self._overflowing:",
         "        if not self._overflowing:",
     ),
     Mutant(
         "what is retained is not sent again to a broker that forgot",
-        "publish/outbox.py",
+        "mqtt/outbox.py",
         "self.pending = {topic: None for topic in self.retained if not self._is_given_up(topic)}",
         "self.pending = dict(self.pending)",
     ),
     Mutant(
         "events in flight are dropped with a connection",
-        "publish/outbox.py",
+        "mqtt/outbox.py",
         "kept = [event for event in self.events if event.is_touch]",
         "kept = list[Event]()",
     ),
     Mutant(
         "an event that arrived is sent once more",
-        "publish/outbox.py",
+        "mqtt/outbox.py",
         "event = self.events.popleft()\n        self.counters.touches_sent += event.is_touch",
         "event = self.events[0]\n        self.counters.touches_sent += event.is_touch\n"
         "        if event.payload[-2:] != b'  ': self.events[0] = "
@@ -63,19 +63,19 @@ MUTANTS = [
     ),
     Mutant(
         "every event has the same count",
-        "publish/outbox.py",
+        "mqtt/outbox.py",
         "count = self._counts[topic] = self._counts.get(topic, 0) + 1",
         "count = self._counts[topic] = 1",
     ),
     Mutant(
         "a part without a valid taxel is OFF",
-        "publish/contact.py",
+        "mqtt/contact.py",
         '        if not feels.any():\n            return "UNKNOWN"',
         '        if not feels.any():\n            return "OFF"',
     ),
     Mutant(
         "a change of contact is published once only",
-        "publish/mqtt.py",
+        "mqtt/publisher.py",
         "if self._outbox.retained.get(topic) != payload:",
         "if len(self._outbox.retained.get(topic, b'')) < 4:",
     ),

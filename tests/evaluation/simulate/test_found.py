@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from emulator.scene import Scene
+from emulator.probes.scene import Scene
 from skin_host.cli.common import load_skin
 from skin_host.demo import configuration
 from skin_host.evaluation.simulate.world import Life, World

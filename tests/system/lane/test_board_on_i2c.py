@@ -8,9 +8,8 @@ from pathlib import Path
 
 import can
 
-from skin_host.bus.protocol import BROADCAST_ADDRESS
-from skin_host.bus.protocol.answers import Discovered, parse_answer
-from skin_host.bus.protocol.commands import (
+from skin_host.bus.answers import Discovered, parse_answer
+from skin_host.bus.commands import (
     Discover,
     SetBoardConfig,
     SetTriangleConfig,
@@ -18,7 +17,8 @@ from skin_host.bus.protocol.commands import (
     TxMode,
     command_frame,
 )
-from skin_host.settings import Bus
+from skin_host.bus.wire import BROADCAST_ADDRESS
+from skin_host.config.settings import Bus
 
 ROOT = Path(__file__).parents[3]
 FIRST = 20

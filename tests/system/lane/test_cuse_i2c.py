@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from smbus2 import SMBus, i2c_msg
 
-from emulator.ad7147 import AD7147
-from emulator.cuse import CuseBus
-from emulator.i2c import EmulatedSMBus
+from emulator.chips.ad7147 import AD7147
+from emulator.chips.cuse import CuseBus
+from emulator.chips.i2c import EmulatedSMBus
 from skin_host.errors import BusError
 from tests.support import conformance, programs
 

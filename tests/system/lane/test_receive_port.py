@@ -14,15 +14,15 @@ from multiprocessing.connection import Connection
 
 import pytest
 
-from emulator.mtb import join
+from emulator.boards.mtb import join
 from skin_host.bus.opening import open_port
 from skin_host.bus.port import LinkState, Port
-from skin_host.bus.protocol import FrameBatch
 from skin_host.bus.wake import WakeUp
+from skin_host.bus.wire import FrameBatch
+from skin_host.config.settings import Bus, Receive
 from skin_host.errors import BusError
 from skin_host.evaluation.bench_receive import measure
 from skin_host.evaluation.can_stream import Wire
-from skin_host.settings import Bus, Receive
 from tests.support.vcan import Vcan
 
 WAIT_S = 60.0

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from emulator.scene import Scene
+from emulator.probes.scene import Scene
 from skin_host.health import Record
 from skin_host.processing.pipeline import PressureFrame
 from tests.support.broker import Mosquitto, break_at_random

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from skin_host.client import SkinClient, Stream, Touch
+from skin_host.config.settings import Mqtt
+from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
-from skin_host.publish.mqtt import Publisher
-from skin_host.settings import Mqtt
 from tests.support.broker import Mosquitto, break_at_random
 
 PARTS = [f"part_{i}" for i in range(10)]

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from skin_host.client import Broker, SkinClient
+from skin_host.config.settings import Mqtt
 from skin_host.errors import BrokerError
+from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.events import TouchEvent
-from skin_host.publish.mqtt import Publisher
-from skin_host.settings import Mqtt
 from tests.support import programs
 from tests.support.broker import Mosquitto
 from tests.support.certificates import authority, certificate

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from emulator.scene import Scene
+from emulator.probes.scene import Scene
 from skin_host.bus.logs import read_channels
-from skin_host.daemon import Daemon
+from skin_host.config.settings import skin_hash
+from skin_host.daemon.daemon import Daemon
+from skin_host.daemon.state import load_state
 from skin_host.errors import SkinError
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration
-from skin_host.settings import skin_hash
-from skin_host.state import load_state
 from tests.support import scheduled_bus
 from tests.support.broker import Mosquitto
 from tests.support.programs import require

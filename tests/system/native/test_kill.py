@@ -15,10 +15,10 @@ from pathlib import Path
 
 import pytest
 
+from skin_host.config.settings import load, skin_hash
+from skin_host.daemon.state import SCHEMA, State
 from skin_host.layout import build_layout
 from skin_host.processing import calibration as calibrations
-from skin_host.settings import load, skin_hash
-from skin_host.state import SCHEMA, State
 from tests.support.broker import Mosquitto
 from tests.support.programs import require
 

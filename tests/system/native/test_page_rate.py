@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from skin_host.config.settings import Mqtt, load
 from skin_host.layout import Layout, build_layout
+from skin_host.mqtt.info import node_info
+from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
-from skin_host.publish.info import node_info
-from skin_host.publish.mqtt import Publisher
-from skin_host.settings import Mqtt, load
 from tests.support.broker import Mosquitto
 from tests.support.devtools import Page
 from tests.support.steady import whole_skin

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from skin_host.settings import Bus
+from skin_host.config.settings import Bus
 from tests.support import programs
 from tests.support.broker import Mosquitto
 from tests.support.stack import ROOT, Stack, wait_for

@@ -1,0 +1,273 @@
+"""Fingertips on force/torque boards: the load of probes, as their boards measure it.
+
+A probe of the scene presses along the inward normal at its place; where it is also pulled along
+the surface, it carries an object that sticks and slips (`held_objects`). The board measures force
+and torque about its own origin, along its own axes, with an offset.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.boards.strain import StrainBoard
+from emulator.probes.held_objects import Friction, HeldObjects
+from emulator.probes.scene import Keyframes, Probe, Scene, resolve, tangents
+from skin_host.bus.commands import (
+    SetTransmissionPeriod,
+    SetTxMode,
+    TxMode,
+    command_frame,
+)
+from skin_host.bus.wire import FrameBatch
+from skin_host.config.settings import Fingertip, Settings
+from skin_host.errors import ConfigurationError
+from skin_host.layout import Layout
+
+Floats = NDArray[np.float64]
+Frame = tuple[int, bytes]
+
+NEVER_NS = 1 << 62
+#: N and N m of the channels of a board that the configuration leaves open.
+FULL_SCALE = (50.0, 50.0, 50.0, 1.0, 1.0, 1.0)
+#: Unloaded boards read up to this share of their full scale.
+OFFSET_SHARE = 0.01
+#: Mass of the object that the probe pulls.
+OBJECT_KG = 0.2
+SLIDING_SHARE = 0.85
+#: Inner step of its motion; the contact's spring swings at some 16 Hz.
+STEP_S = 1e-3
+
+
+class Fingertips:
+    """The force/torque boards of a robot and what lies on them.
+
+    Args:
+        settings, layout: of the robot.
+        scene: its probes on fingertips and on parts that cover one.
+        skin_force_n: force (N) of each probe on the skin now, by its number in the scene.
+
+    Attributes:
+        boards: by name of the fingertip.
+        hung: names of those whose boards neither receive nor send.
+
+    Raises:
+        ConfigurationError: a probe cannot be on its fingertip; the message names the key.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        layout: Layout,
+        scene: Scene,
+        skin_force_n: Callable[[], dict[int, float]],
+    ) -> None:
+        self.boards: dict[str, StrainBoard] = {}
+        self.hung: set[str] = set()
+        self._tips = settings.fingertips
+        self._skin_force_n = skin_force_n
+        self._presses: dict[str, list[_Press]] = {}
+        for number, (name, tip) in enumerate(settings.fingertips.items()):
+            presses = self._presses[name] = []
+            for i, probe in enumerate(scene.probe):
+                if probe.part not in (name, tip.array):
+                    continue
+                try:
+                    presses.append(self._press(i, name, tip, probe, layout))
+                except ConfigurationError as error:
+                    raise ConfigurationError(f"probe[{i}].{error}") from None
+            rng = np.random.default_rng([scene.seed, 6, number])
+            scale = np.array(tip.full_scale or FULL_SCALE)
+            self.boards[name] = StrainBoard(
+                tip.address,
+                _Load(tip, presses, OFFSET_SHARE * rng.uniform(-1, 1, 6) * scale),
+                rng,
+                full_scale=tuple(scale),
+                noise_share=5e-5 if scene.noise else 0.0,
+            )
+
+    @property
+    def due_ns(self) -> int:
+        """When the next board samples."""
+        return min(
+            (
+                board.next_ns
+                for name, board in self.boards.items()
+                if board.next_ns is not None and name not in self.hung
+            ),
+            default=NEVER_NS,
+        )
+
+    def start(self, t_ns: int) -> None:
+        """Let all boards send, at the periods of the configuration, for use without a host."""
+        for name, board in self.boards.items():
+            for message in (
+                SetTransmissionPeriod(self._tips[name].period_ms),
+                SetTxMode(TxMode.START),
+            ):
+                board.handle(*command_frame(message, board.address), t_ns)
+
+    def slipped_mm(self, name: str) -> float:
+        """How far what presses on a fingertip has slid over it since it was put there."""
+        return max((press.slipped_mm for press in self._presses[name]), default=0.0)
+
+    def step(self, t_ns: int) -> list[tuple[str, FrameBatch]]:
+        """Bring all boards to `t_ns`; the frames that they send, by bus."""
+        return [
+            (self._tips[name].bus, board.step(t_ns))
+            for name, board in self.boards.items()
+            if name not in self.hung
+        ]
+
+    def handle(self, bus: str, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
+        """A frame from the host; what the boards answer."""
+        return [
+            answer
+            for name, board in self.boards.items()
+            if self._tips[name].bus == bus and name not in self.hung
+            for answer in board.handle(can_id, data, t_ns)
+        ]
+
+    def _force_on_skin(self, number: int) -> float:
+        return self._skin_force_n().get(number, 0.0)
+
+    def _press(
+        self, number: int, name: str, tip: Fingertip, probe: Probe, layout: Layout
+    ) -> "_Press":
+        if probe.part == name:
+            if tip.array is not None:
+                raise ConfigurationError(f'part: "{name}" is covered by "{tip.array}"; name that')
+            if probe.by_depth:
+                raise ConfigurationError("depth_mm: a fingertip without skin is driven by a force")
+            point, normal = place_on(tip, probe)
+            return _Press(probe, point, normal, partial(self._force_on_skin, number))
+        point_m, normal = resolve(probe.at, probe.part, layout)
+        return _Press(
+            probe,
+            1e3 * point_m,
+            normal,
+            partial(self._force_on_skin, number),
+            on_skin=True,
+        )
+
+
+class _Press:
+    """One probe on a fingertip, and the object that its pull hangs on."""
+
+    def __init__(
+        self,
+        probe: Probe,
+        point_mm: Floats,
+        normal: Floats,
+        skin_force_n: Callable[[], float],
+        *,
+        on_skin: bool = False,
+    ) -> None:
+        self._probe = probe
+        self._point_mm = point_mm
+        self._normal = normal
+        self._along = tangents(normal)
+        self._skin_force_n = skin_force_n
+        self._on_skin = on_skin
+        turn = np.deg2rad(probe.tangential_deg)
+        self._pull = np.cos(turn) * self._along[0] + np.sin(turn) * self._along[1]
+        self._object: HeldObjects | None = None
+        self._last_ns = 0
+
+    @property
+    def slipped_mm(self) -> float:
+        """How far its object has slid."""
+        return 0.0 if self._object is None else float(self._object.slipped_mm[0])
+
+    def wrench(self, t_ns: int) -> Floats:
+        """Force (N) and torque (N m) on the fingertip about its origin, float64[6]."""
+        probe = self._probe
+        phase_s = 1e-9 * t_ns - probe.start_s
+        if probe.repeat_s and phase_s >= 0.0:
+            phase_s %= probe.repeat_s
+        normal_n = self._skin_force_n() if self._on_skin else _value(probe.drive, phase_s)
+        force = -normal_n * self._normal
+        if probe.tangential_n is not None:
+            force = force + self._held_n(normal_n, phase_s, t_ns) * self._pull
+        offset = np.zeros(2)
+        if probe.slide_mm:
+            times, x_mm, y_mm = np.array(probe.slide_mm).T
+            offset = np.array([np.interp(phase_s, times, x_mm), np.interp(phase_s, times, y_mm)])
+        point_mm = self._point_mm + offset @ self._along
+        return np.concatenate([force, 1e-3 * np.cross(point_mm, force)])
+
+    def _held_n(self, normal_n: float, phase_s: float, t_ns: int) -> float:
+        """Tangential force (N) by which the object drags at the fingertip."""
+        dt_s = 1e-9 * (t_ns - self._last_ns)
+        self._last_ns = t_ns
+        if normal_n <= 0.0:
+            self._object = None
+            return 0.0
+        if self._object is None:
+            static = self._probe.friction
+            law = Friction(static=static, sliding=SLIDING_SHARE * static)
+            self._object = HeldObjects(1, law, mass_kg=OBJECT_KG, dt_s=STEP_S)
+            dt_s = 0.0
+        pull_n = _value(self._probe.tangential_n or [], phase_s)
+        return float(self._object.advance([pull_n], [normal_n], dt_s)[0])
+
+
+class _Load:
+    """What a board measures: force (N) and torque (N m) of its channels, with its offset."""
+
+    def __init__(self, tip: Fingertip, presses: Sequence[_Press], offset: Floats) -> None:
+        self._presses = presses
+        self._offset = offset
+        self._sensor_m = 1e-3 * np.array(tip.sensor_mm)
+        self._to_board = np.eye(6) if tip.matrix is None else np.linalg.inv(tip.matrix)
+
+    def __call__(self, t_ns: int) -> Floats:
+        load = np.zeros(6)
+        for press in self._presses:
+            load += press.wrench(t_ns)
+        load[3:] -= np.cross(self._sensor_m, load[:3])
+        measured: Floats = self._to_board @ load + self._offset
+        return measured
+
+
+def place_on(tip: Fingertip, probe: Probe) -> tuple[Floats, Floats]:
+    """Where a probe presses on a bare fingertip: point (mm) and outward normal, float64[3].
+
+    The ray from the place's offset (x, y, z in the fingertip's frame) `towards` leaves the
+    body there.
+
+    Raises:
+        ConfigurationError: it does not, or the place names what a fingertip does not have.
+    """
+    at = probe.at
+    if at.taxel is not None or at.triangle is not None:
+        raise ConfigurationError("at: a fingertip without skin has no taxels and no triangles")
+    origin = np.array([at.x_mm, at.y_mm, at.z_mm])
+    size = float(np.linalg.norm(at.towards))
+    if size == 0.0:
+        raise ConfigurationError("at.towards: is no direction")
+    ray = np.array(at.towards) / size
+    if tip.shape == "plane":
+        return np.array([at.x_mm, at.y_mm, 0.0]), np.array([0.0, 0.0, 1.0])
+    if tip.semi_axes_mm is not None:
+        weight = np.array(tip.semi_axes_mm) ** -2.0
+    else:
+        weight = np.full(3, float(tip.radius_mm or 1.0) ** -2.0)
+        if tip.shape == "cylinder":
+            weight[2] = 0.0
+    a, b = float(weight @ ray**2), float(weight @ (origin * ray))
+    c = float(weight @ origin**2) - 1.0
+    if b * b - a * c < 0.0 or a <= 1e-12 * weight.max():
+        raise ConfigurationError("at: from there the fingertip is not reached")
+    point = origin + (-b + np.sqrt(b * b - a * c)) / a * ray
+    gradient = weight * point
+    return point, gradient / np.linalg.norm(gradient)
+
+
+def _value(keyframes: Keyframes, t_s: float) -> float:
+    """Straight lines between keyframes; 0 before the first and after the last."""
+    times = [at_s for at_s, _ in keyframes]
+    if not times or not times[0] <= t_s <= times[-1]:
+        return 0.0
+    return float(np.interp(t_s, times, [value for _, value in keyframes]))

@@ -1,0 +1,372 @@
+"""Chips without registers: capacitance straight to counts, for the whole skin at once.
+
+The same sequencer, law and noise as `emulator.chips.ad7147`, worked out over arrays: twelve stages
+follow each other, a result is taken when its conversion has ended, its noise is drawn when it
+is first read. Given the same capacitances at the same times and the same generators, both
+kinds of chip answer the same words.
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.boards.arithmetic import ABSENT, TAXELS
+from emulator.boards.chip_access import SLOTS, StageMap, Words, set_up_bursts
+from emulator.chips import ad7147_map as reg
+from emulator.chips.noise import ChipNoise
+
+_STAGES = np.arange(reg.N_STAGES)
+_NO_SET_UP = np.zeros((reg.N_STAGES, reg.STAGE_WORDS), np.uint16)
+#: So many changes of the inputs are remembered before they are worked out.
+_MOST_CHANGES = 64
+#: A sequence that never comes to its end.
+_STOPPED_NS = 1 << 58
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+
+
+class SignalSkin:
+    """The chips of a whole robot.
+
+    Args:
+        noise: of the n chips; None is no noise at all.
+        input_noise_ff: float64[n, 12], noise of each pad (fF rms).
+        q_ff: capacitance of one code.
+
+    Attributes:
+        t_ns: the present; `SignalChips` reads the chips at this time.
+        forced: int32[n], the word that a chip answers whatever it measures, or -1.
+    """
+
+    def __init__(
+        self,
+        noise: ChipNoise | None,
+        input_noise_ff: Floats,
+        q_ff: float = 0.36,
+    ) -> None:
+        n = len(input_noise_ff)
+        self.t_ns = 0
+        self.forced = np.full(n, -1, np.int32)
+        self._q_ff = q_ff
+        self._noise = noise
+        self._noise_ff = input_noise_ff
+        self._capacitance_ff = np.zeros((n, reg.N_CINS))
+        self._bank_2: list[NDArray[np.uint16]] = [np.zeros_like(_NO_SET_UP)] * n
+        self._weights: list[Floats | None] = [None] * n
+        #: Stage s measures only pad s, the usual case.
+        self._plain = np.ones(n, np.bool_)
+        self._offset_ff = np.zeros((n, reg.N_STAGES))
+        self._power: list[reg.PowerControl] = [reg.PowerControl.of(0)] * n
+        self._n_stages = np.ones(n, np.int64)
+        self._stage_ns = np.full(n, reg.STAGE_NS[0], np.int64)
+        self._start_ns = np.zeros(n, np.int64)
+        self._taken = np.zeros(n, np.int64)
+        self._ideal = np.zeros((n, reg.N_STAGES))
+        self._clean = np.zeros((n, reg.N_STAGES))
+        self._unseen = np.zeros((n, reg.N_STAGES), bool)
+        self._held = np.zeros((n, reg.N_STAGES), bool)
+        self._sigma = np.zeros((n, reg.N_STAGES))
+        self._results = np.zeros((n, reg.N_STAGES), np.uint16)
+        #: When the pass began that last converted each stage.
+        self._began_ns = np.zeros((n, reg.N_STAGES), np.int64)
+        #: Chips whose inputs have changed, when, and to what, since they were last worked out.
+        self._changed = np.zeros(0, np.intp)
+        self._changes: list[tuple[int, Floats]] = []
+
+    def set_capacitance_ff(self, chips: Ints, values: Floats) -> None:
+        """Change the inputs of some chips from now on: float64[k, 12] (fF).
+
+        Changes of the same chips (the same array) are worked out together, when it matters.
+        """
+        if chips is not self._changed or len(self._changes) == _MOST_CHANGES:
+            self._work_out()
+            if not self._plain[chips].all():
+                self._take(chips)
+                self._capacitance_ff[chips, :TAXELS] = values
+                self._update_ideal(chips)
+                return
+            self._changed = chips
+        self._changes.append((self.t_ns, values.copy()))
+
+    def _work_out(self) -> None:
+        """Take what was converted while the inputs changed."""
+        if self._changes:
+            chips = self._changed
+            times_ns, values = zip(*self._changes, strict=True)
+            ideals = self._ideal_of(chips, np.stack(values))
+            ideals = np.concatenate([self._ideal[chips][None], ideals])
+            self._take(chips, np.array(times_ns), ideals)
+            self._capacitance_ff[chips, :TAXELS] = values[-1]
+            self._ideal[chips] = ideals[-1]
+            self._changes = []
+        self._changed = np.zeros(0, np.intp)
+
+    def set_input_noise_ff(self, chips: Ints, values: Floats) -> None:
+        """Change the noise of the pads of some chips, float64[k, 12] (fF rms)."""
+        self._settle(chips)
+        self._noise_ff[chips] = values
+        for chip in chips:
+            self._update_sigma(int(chip))
+
+    def hold_results(self, chip: int, held: NDArray[np.bool_]) -> None:
+        """Results bool[12] of a chip that show no noise at all, not even the converter's own."""
+        self._settle(np.array([chip]))
+        self._held[chip] = held
+        self._update_sigma(chip)
+
+    def configure(
+        self, chips: Iterable[int], stages: StageMap, cdc_offset: int, power_control: int
+    ) -> None:
+        """What the set-up bursts of the firmware do to the chips."""
+        bank_2 = _NO_SET_UP.copy()
+        for first, words in set_up_bursts(stages, cdc_offset, power_control):
+            if first >= reg.BANK_2:
+                bank_2[(first - reg.BANK_2) // reg.STAGE_WORDS] = words
+        rows = np.fromiter(chips, np.intp)
+        self._settle(rows)
+        self._set_up(rows, bank_2, reg.PowerControl.of(power_control), plain=stages == 0)
+
+    def _set_up(
+        self,
+        rows: Ints,
+        bank_2: NDArray[np.uint16],
+        power: reg.PowerControl,
+        *,
+        plain: bool = False,
+    ) -> None:
+        """Let settled chips go on with a set-up that they all have."""
+        weights, offset_ff = reg.decode_stages(bank_2)
+        if not power.excited:
+            weights[:], offset_ff[:], plain = 0.0, 0.0, False
+        for chip in rows.tolist():
+            self._bank_2[chip] = bank_2
+            self._weights[chip] = weights
+            self._plain[chip] = plain
+            self._offset_ff[chip] = offset_ff
+            if self._power[chip] != power:
+                self._restart(chip, power)
+            self._update_sigma(chip)
+        self._update_ideal(rows)
+
+    def _restart(self, chip: int, power: reg.PowerControl) -> None:
+        self._power[chip] = power
+        self._n_stages[chip] = power.n_stages
+        self._stage_ns[chip] = _STOPPED_NS if power.mode == reg.SHUTDOWN else power.stage_ns
+        self._start_ns[chip] = self.t_ns
+        self._taken[chip] = 0
+
+    def brown_out(self, chip: int, ram: NDArray[np.uint16]) -> None:
+        """Let the supply of a chip fail for a moment, see `AD7147.brown_out`."""
+        self._reset(chip, ram[: _NO_SET_UP.size].reshape(_NO_SET_UP.shape))
+
+    def _reset(self, chip: int, bank_2: NDArray[np.uint16]) -> None:
+        """Defaults in Bank 1."""
+        row = np.array([chip])
+        self._settle(row)
+        self._results[chip] = self._clean[chip] = 0
+        self._unseen[chip] = False
+        power = reg.PowerControl.of(0)
+        self._set_up(row, bank_2, power)
+        self._restart(chip, power)
+
+    def write_register(self, chip: int, address: int, word: int) -> bool:
+        """Write a register as far as results depend on it; whether all was acknowledged."""
+        row = np.array([chip])
+        bank_2, power = self._bank_2[chip], self._power[chip]
+        if address == reg.PWR_CONTROL:
+            if word & reg.SW_RESET:
+                self._reset(chip, bank_2)
+                return False
+            power = reg.PowerControl.of(word)
+        elif address == reg.AMB_COMP_CTRL0:
+            if word & reg.CONV_RESET:
+                self._settle(row)
+                self._restart(chip, power)
+            return True
+        elif reg.BANK_2 <= address < reg.BANK_3:
+            bank_2 = bank_2.copy()
+            bank_2[divmod(address - reg.BANK_2, reg.STAGE_WORDS)] = word
+        else:
+            return True
+        self._settle(row)
+        self._set_up(row, bank_2, power)
+        return True
+
+    def read_register(self, chip: int, address: int) -> int:
+        """A register as far as results depend on it; all others read 0."""
+        if reg.CDC_RESULT <= address < reg.DEVICE_ID:
+            return int(self.read(np.array([chip]))[0, address - reg.CDC_RESULT])
+        if reg.BANK_2 <= address < reg.BANK_3:
+            return int(self._bank_2[chip][divmod(address - reg.BANK_2, reg.STAGE_WORDS)])
+        return reg.DEVICE_ID_VALUE if address == reg.DEVICE_ID else 0
+
+    def read(self, chips: Ints) -> Words:
+        """The twelve results of some chips, uint16[k, 12]."""
+        forced = self.forced[chips]
+        if (forced >= 0).any():
+            # A chip that is gone is not read: its sequencer and its noise go on later.
+            there = forced < 0
+            words = np.repeat(forced[:, None], TAXELS, axis=1).astype(np.uint16)
+            words[there] = self.read(chips[there])
+            return words
+        self._settle(chips)
+        results: Words = self._results[chips]
+        return results
+
+    def _settle(self, chips: Ints) -> None:
+        """Store the results of the conversions that have ended, with their noise."""
+        self._work_out()
+        self._take(chips)
+        fresh = self._unseen[chips].any(axis=1)
+        if not fresh.any():
+            return
+        rows = self._rows(chips if fresh.all() else chips[fresh])
+        codes = self._clean[rows]
+        if self._noise is not None:
+            noise = self._noise.at(rows, self._began_ns[rows])
+            noise *= self._sigma[rows]
+            codes = codes + noise
+        codes = np.minimum(np.maximum(np.rint(codes), 0), reg.FULL_SCALE)
+        unseen = self._unseen[rows]
+        self._results[rows] = (
+            codes if unseen.all() else np.where(unseen, codes, self._results[rows])
+        )
+        self._unseen[rows] = False
+
+    def _rows(self, chips: Ints) -> Ints | slice:
+        """The same chips; all of them in their order as a slice, which costs no copies."""
+        if len(chips) == len(self.forced) and (chips[1:] > chips[:-1]).all():
+            return slice(None)
+        return chips
+
+    def _take(
+        self,
+        chips: Ints,
+        changed_ns: NDArray[np.int64] | None = None,
+        ideals: Floats | None = None,
+    ) -> None:
+        """Hold the noise-free results of the conversions that have ended since the last look.
+
+        Args:
+            chips: which ones.
+            changed_ns: int64[m], when their inputs have changed since then.
+            ideals: float64[m + 1, k, 12], what conversions give until the first change, and
+                from each change on.
+        """
+        stages, stage_ns = self._n_stages[chips], self._stage_ns[chips]
+        sequences, rest_ns = np.divmod(self.t_ns - self._start_ns[chips], stages * stage_ns)
+        ended = sequences * stages + rest_ns // stage_ns
+        taken = self._taken[chips]
+        new = ended - taken
+        self._taken[chips] = ended
+        # Stages that this pass has not reached yet were converted in the one before.
+        last = sequences[:, None] - ((rest_ns // stage_ns)[:, None] <= _STAGES)
+        began_ns = self._start_ns[chips, None] + last * (stages * stage_ns)[:, None]
+        if changed_ns is None or ideals is None:
+            ideal = self._ideal[chips]
+        else:
+            ended_ns = began_ns + (_STAGES + 1) * stage_ns[:, None]
+            in_force = np.searchsorted(changed_ns, ended_ns)
+            ideal = np.take_along_axis(ideals, in_force[None], axis=0)[0]
+        if new.min(initial=reg.N_STAGES) >= reg.N_STAGES == stages.min(initial=reg.N_STAGES):
+            self._clean[chips] = ideal
+            self._began_ns[chips] = began_ns
+            self._unseen[chips] = True
+        elif new.any():
+            done = (_STAGES - taken[:, None]) % stages[:, None] < new[:, None]
+            done &= stages[:, None] > _STAGES
+            self._clean[chips] = np.where(done, ideal, self._clean[chips])
+            self._began_ns[chips] = np.where(done, began_ns, self._began_ns[chips])
+            self._unseen[chips] |= done
+
+    def _ideal_of(self, chips: Ints, values: Floats) -> Floats:
+        """What plain chips convert such inputs to."""
+        ideal: Floats = reg.MID_SCALE + (values - self._offset_ff[chips]) / self._q_ff
+        return ideal
+
+    def _update_ideal(self, chips: Ints) -> None:
+        difference_ff = self._capacitance_ff[chips, :TAXELS] - self._offset_ff[chips]
+        for row in np.flatnonzero(~self._plain[chips]).tolist():
+            chip = chips[row]
+            weights = self._weights[chip]
+            if weights is not None:
+                total_ff = weights @ self._capacitance_ff[chip]
+                difference_ff[row] = total_ff - self._offset_ff[chip]
+        self._ideal[chips] = reg.MID_SCALE + difference_ff / self._q_ff
+
+    def _update_sigma(self, chip: int) -> None:
+        weights = self._weights[chip]
+        if weights is None:
+            return
+        squares = np.zeros(reg.N_CINS)
+        squares[:TAXELS] = np.square(self._noise_ff[chip] / self._q_ff)
+        own = reg.NOISE_CODES_RMS[self._power[chip].decimation]
+        sigma = np.sqrt(own**2 + np.square(weights) @ squares)
+        self._sigma[chip] = sigma * ~self._held[chip]
+
+
+class SignalChips:
+    """The chips of one board in a `SignalSkin`, as its firmware sees them.
+
+    Args:
+        skin: the whole robot's chips.
+        chip_of_slot: intp[20], the chip at each slot of the board, -1 where there is none.
+    """
+
+    def __init__(self, skin: SignalSkin, chip_of_slot: Ints) -> None:
+        self._skin = skin
+        self.chip_of_slot = chip_of_slot
+
+    def configure(
+        self, slots: Iterable[int], stages: StageMap, cdc_offset: int, power_control: int
+    ) -> None:
+        """Set up the chips that are there."""
+        own = self.chip_of_slot[list(slots)]
+        own = own[own >= 0]
+        chips = own[self._skin.forced[own] < 0].tolist()
+        if chips:
+            self._skin.configure(chips, stages, cdc_offset, power_control)
+
+    def read(self, without: int = 0) -> Words:
+        """The twelve results of every slot, uint16[20, 12]; 0xFFFF where nothing is."""
+        del without  # that a chip is read changes nothing
+        words = np.full((SLOTS, TAXELS), ABSENT, np.uint16)
+        fitted = self.chip_of_slot >= 0
+        if fitted.any():
+            words[fitted] = self._skin.read(self.chip_of_slot[fitted])
+        return words
+
+
+class SignalPort:
+    """A chip of a `SignalSkin` as a bus sees it: connections, offsets, sequence and results.
+
+    Other registers of an AD7147 (status, ambient, low power) are missing: they read 0.
+    """
+
+    def __init__(self, skin: SignalSkin, chip: int) -> None:
+        self._skin = skin
+        self._chip = chip
+        #: The boards read their results up to here.
+        self.pointer = reg.DEVICE_ID
+
+    def write(self, data: bytes) -> int:
+        """Take one write message, as `AD7147.write` does."""
+        if len(data) >= 2:
+            self.pointer = (data[0] << 8 | data[1]) & 0x3FF
+        for at in range(2, len(data) - 1, 2):
+            word = data[at] << 8 | data[at + 1]
+            if not self._skin.write_register(self._chip, self.pointer, word):
+                self.pointer = 0
+                return at + 1
+            self.pointer = min(self.pointer + 1, max(self.pointer, reg.END_OF_MAP))
+        return len(data)
+
+    def read(self, length: int) -> bytes:
+        """Answer one read message, as `AD7147.read` does."""
+        words = [
+            self._skin.read_register(self._chip, self.pointer + at) for at in range(-(-length // 2))
+        ]
+        self.pointer = max(self.pointer, min(self.pointer + length // 2, reg.END_OF_MAP))
+        return b"".join(word.to_bytes(2) for word in words)[:length]

@@ -1,1 +1,0 @@
-"""The firmware of the MTB boards: arithmetic, access to the chips, personalities."""

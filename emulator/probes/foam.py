@@ -1,0 +1,338 @@
+"""Contact mechanics of the foam: the depth of a probe and the force on it.
+
+The foam is a Winkler layer: each point responds only to its own compression, which is what the
+paper's Figs. 11-16 show (no crosstalk, 5 and 6 mm probes alike). Its law is
+
+    sigma(x) = E0 x (1 + k x^2)      with a pole at x = 0.95 from x = 0.85 (about 200 kPa) on,
+
+fitted to the paper's eq. (1) below 130 kPa. With the viscoelastic truth of
+`emulator.probes.viscoelastic` a taxel under strain x carries P = sigma(x) - relaxation, and never
+less than zero: where the foam has not yet recovered, the probe does not touch it.
+
+Quantities: strain x = depth / thickness; pressures in kPa; "elastic pressure" is sigma(x).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from emulator.probes.viscoelastic import FoamTruth
+
+E0_KPA = 91.7
+STIFFENING = 2.07
+#: Spread from taxel to taxel: k explains that taxels agree at low pressure and differ by 1.44
+#: at 155 kPa (paper, Figs. 14-15), E0 hardly differs.
+STIFFENING_SD = 0.12
+E0_SD = 0.025
+
+#: Infinergy (expanded thermoplastic polyurethane) under air, 3 mm of it on pads of 2.2 mm radius:
+#: fitted to the median pad of the recorded insole `left_calibration`, with the Cole-Cole truth at
+#: `INFINERGY_LOSS` of its losses. It is over five times as stiff as the paper's foam.
+INFINERGY_E0_KPA = 521.0
+INFINERGY_STIFFENING = 3.06
+INFINERGY_LOSS = 0.464
+
+DENSE_STRAIN = 0.85
+POLE_STRAIN = 0.95
+_DENSE_KPA = 2000.0
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+
+
+@dataclass(frozen=True, slots=True)
+class Foam:
+    """The elastic law under each of n taxels: arrays [n] of E0 (kPa), k and thickness (mm)."""
+
+    e0_kpa: Floats
+    stiffening: Floats
+    thickness_mm: Floats
+
+    @classmethod
+    def uniform(cls, n: int, thickness_mm: ArrayLike = 2.0) -> "Foam":
+        """The same law everywhere. `thickness_mm`: one value or [n]; 2 on hands, else 3."""
+        return cls(
+            np.full(n, E0_KPA), np.full(n, STIFFENING), np.broadcast_to(thickness_mm, n) + 0.0
+        )
+
+    @classmethod
+    def drawn(cls, n: int, rng: np.random.Generator, thickness_mm: ArrayLike = 2.0) -> "Foam":
+        """A real layer: k log-normal with sd 12 %, E0 with sd 2.5 %."""
+        stiffening = STIFFENING * np.exp(STIFFENING_SD * rng.standard_normal(n))
+        e0_kpa = E0_KPA * np.exp(E0_SD * rng.standard_normal(n))
+        return cls(e0_kpa, stiffening, np.broadcast_to(thickness_mm, n) + 0.0)
+
+    def infinergy(self) -> "Foam":
+        """The same layer, with its spread, of Infinergy instead of the paper's foam."""
+        return Foam(
+            self.e0_kpa * INFINERGY_E0_KPA / E0_KPA,
+            self.stiffening * INFINERGY_STIFFENING / STIFFENING,
+            self.thickness_mm,
+        )
+
+    def __len__(self) -> int:
+        return len(self.e0_kpa)
+
+    def take(self, taxels: Ints) -> "Foam":
+        """The law under some taxels only."""
+        return Foam(self.e0_kpa[taxels], self.stiffening[taxels], self.thickness_mm[taxels])
+
+    def elastic_kpa(self, strain: Floats) -> Floats:
+        """sigma(x) for strains [n] below the pole."""
+        return self.elastic_kpa_and_slope(strain)[0]
+
+    def strain(self, elastic_kpa: Floats) -> Floats:
+        """The inverse of `elastic_kpa`, for pressures [n] >= 0."""
+        # Without densification the law is a cubic with one real root (hyperbolic form).
+        root = np.sqrt(3 * self.stiffening)
+        argument = 1.5 * root * elastic_kpa / self.e0_kpa
+        strain = 2 / root * np.sinh(np.arcsinh(argument) / 3)
+        if strain.max(initial=0.0) <= DENSE_STRAIN:
+            return strain
+        # The law is convex, so Newton's steps from above come down to the root.
+        strain = np.minimum(strain, 0.5 * (DENSE_STRAIN + POLE_STRAIN))
+        for _ in range(50):
+            value, slope = self.elastic_kpa_and_slope(strain)
+            step = (value - elastic_kpa) / slope
+            strain = np.minimum(strain - step, 0.5 * (strain + POLE_STRAIN))
+            if np.abs(step).max() < 1e-13:
+                break
+        return strain
+
+    def elastic_kpa_and_slope(self, strain: Floats) -> tuple[Floats, Floats]:
+        """sigma(x) and its derivative, for strains [n] below the pole."""
+        square = self.stiffening * strain * strain
+        value = self.e0_kpa * strain * (1 + square)
+        slope = self.e0_kpa * (1 + 3 * square)
+        if strain.max(initial=0.0) > DENSE_STRAIN:
+            over = np.maximum(strain - DENSE_STRAIN, 0.0)
+            room = POLE_STRAIN - strain
+            value = value + _DENSE_KPA * over**2 / room
+            slope = slope + _DENSE_KPA * over * (2 * room + over) / room**2
+        return value, slope
+
+
+@dataclass(frozen=True, slots=True)
+class Footprint:
+    """Which pads c contacts cover: m rows, one for each pad (or zone of a pad) of a contact.
+
+    Attributes:
+        taxel, contact: int[m], indices of the pad and of the contact.
+        covered: float64[m], fraction of the pad's area in this row.
+        share: float64[m], strain here as a fraction of the strain under the contact: 1 under
+            it, less in the zone around it that a membrane draws down.
+        bears_mm2: float64[m], covered area that bears the contact; 0 in the zone around.
+        area_mm2: float64[c], the contact's whole area.
+        edge: float64[c], force on the contact over force on its area alone; 1 without membrane.
+    """
+
+    taxel: Ints
+    contact: Ints
+    covered: Floats
+    share: Floats
+    bears_mm2: Floats
+    area_mm2: Floats
+    edge: Floats
+
+    @classmethod
+    def empty(cls) -> "Footprint":
+        """No contact at all."""
+        index, none = np.zeros(0, np.intp), np.zeros(0)
+        return cls(index, index, none, none, none, none, none)
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """How c rigid probes are driven: arrays [c].
+
+    A probe is driven by force where `force_n` is a number. Where it is NaN, `depth_mm` is
+    commanded (below the undeformed surface) and reached through a spring in series: load
+    cell, arm, or the object itself.
+    """
+
+    depth_mm: Floats
+    force_n: Floats
+    compliance_mm_per_n: Floats
+
+    @classmethod
+    def by_force(cls, force_n: ArrayLike) -> "Drive":
+        """Probes pushed with given forces [c] (N)."""
+        force = np.atleast_1d(np.asarray(force_n, np.float64))
+        return cls(np.zeros(len(force)), force, np.zeros(len(force)))
+
+    @classmethod
+    def by_depth(cls, depth_mm: ArrayLike, compliance_mm_per_n: ArrayLike = 0.0) -> "Drive":
+        """Probes moved to given depths [c] (mm) by robots of given compliance."""
+        depth = np.atleast_1d(np.asarray(depth_mm, np.float64))
+        compliance = np.broadcast_to(compliance_mm_per_n, depth.shape).astype(np.float64)
+        return cls(depth, np.full(len(depth), np.nan), compliance)
+
+
+@dataclass(frozen=True, slots=True)
+class Felt:
+    """Strained foam after a step: arrays [k], the footprint's rows first, then residuals."""
+
+    taxel: Ints
+    strain: Floats
+    covered: Floats
+
+
+class FoamLayer:
+    """The foam of n taxels over time, computed only where something presses or has pressed.
+
+    Args:
+        foam: elastic law, n taxels.
+        truth: viscoelastic truth, n taxels.
+
+    Attributes:
+        pressure_kpa: float64[n], true pressure on the covered part of each pad.
+        force_n, depth_mm: float64[c], of each contact in the last step.
+    """
+
+    #: Foam that nothing touches any more is followed in steps of this length.
+    RECOVERY_STEP_S = 0.25
+    #: A residual below this elastic pressure is over: a hundredth of one unit.
+    RESIDUAL_OVER_KPA = 0.02
+
+    def __init__(self, foam: Foam, truth: FoamTruth) -> None:
+        self.foam = foam
+        self.truth = truth
+        self.pressure_kpa = np.zeros(len(foam))
+        self.force_n = np.zeros(0)
+        self.depth_mm = np.zeros(0)
+        self._imprint_strain = np.zeros(len(foam))
+        self._covered = np.zeros(len(foam))
+        self._touched = self._recovering = np.zeros(0, np.intp)
+        self._waited_s = 0.0
+        self._strain = np.zeros(0)
+        #: Those of the two steps before the last one.
+        self._strains_before = self._strain, self._strain
+        self._mean_thickness_mm = float(foam.thickness_mm.mean()) if len(foam) else 1.0
+        self._place(Footprint.empty(), 0.0)
+
+    def step(self, footprint: Footprint, drive: Drive, dt_s: float) -> Felt:
+        """Let `dt_s` pass while `footprint`'s contacts go where `drive` takes them.
+
+        A footprint object that stays the same from step to step saves finding out what it
+        covers; make a new one only for contacts that moved, came or went.
+        """
+        if footprint is not self._footprint:
+            self._place(footprint, dt_s)
+        else:
+            self._waited_s += dt_s
+            if self._waited_s >= self.RECOVERY_STEP_S:
+                self._recovering = self._free(self._recovering, self._waited_s)
+                self._waited_s = 0.0
+        rows = footprint
+        strain = self._press(drive)[rows.contact] * rows.share
+        # Where the foam has not come back to the probe's depth, they do not touch.
+        imprint = self.truth.relaxation_kpa[rows.taxel]
+        elastic = np.maximum(self._law.elastic_kpa(strain), imprint)
+        loose = elastic <= imprint
+        if loose.any():
+            strain = np.where(loose, self._law.strain(elastic), strain)
+        if self._repeats:
+            deepest = np.zeros(len(self.foam))
+            np.maximum.at(deepest, rows.taxel, elastic)
+            elastic = deepest[self._touched]
+            pressure = self.truth.step(elastic, dt_s, self._touched)
+            self.pressure_kpa[self._touched] = np.maximum(pressure, 0.0)
+        else:
+            pressure = self.truth.step(elastic, dt_s, rows.taxel)
+            self.pressure_kpa[rows.taxel] = np.maximum(pressure, 0.0)
+        borne = self._weight * np.where(loose, 0.0, self.pressure_kpa[rows.taxel])
+        mean_kpa = np.bincount(rows.contact, borne, len(rows.area_mm2))
+        if len(self._between):
+            mean_kpa[~self._bears] = self._between.elastic_kpa(self._strain[~self._bears])
+        self.force_n = mean_kpa * self._bears_n_per_kpa
+        if not len(self._recovering):
+            return Felt(rows.taxel, strain, rows.covered)
+        left = self._recovering
+        return Felt(
+            np.concatenate([rows.taxel, left]),
+            np.concatenate([strain, self._imprint_strain[left]]),
+            np.concatenate([rows.covered, self._covered[left]]),
+        )
+
+    def _press(self, drive: Drive) -> Floats:
+        """The strain under each contact, [c]: a x + b p(x) = d by Newton's method.
+
+        p is the mean pressure under the contact. It is convex in x, so the steps overshoot at
+        most once and then come down to the root.
+        """
+        rows, n_contacts = self._footprint, len(self._footprint.area_mm2)
+        forced = ~np.isnan(drive.force_n) & self._bears
+        softness = drive.compliance_mm_per_n * self._bears_n_per_kpa / self._thickness_mm
+        a = np.where(forced, 0.0, 1.0)
+        b = np.where(forced, 1.0, softness)
+        depth = drive.depth_mm / self._thickness_mm
+        d = np.maximum(np.where(forced, drive.force_n / self._bears_n_per_kpa, depth), 0.0)
+        if len(self._between):
+            bare = np.flatnonzero(~self._bears)
+            by_force = bare[~np.isnan(drive.force_n[bare])]
+            pressed = np.maximum(drive.force_n / self._bears_n_per_kpa, 0.0)
+            d[by_force] = Foam.uniform(len(by_force)).strain(pressed[by_force])
+            b[bare] = 0.0
+        imprint = self.truth.relaxation_kpa[rows.taxel]
+        # Start value: the contact continues nearly as in the last three steps.
+        last, before, earlier = self._strain, *self._strains_before
+        strain = 3 * (last - before) + earlier
+        strain = np.minimum(np.maximum(strain, 0.0), 0.5 * (last + POLE_STRAIN))
+        for _ in range(60):
+            value, slope = self._law.elastic_kpa_and_slope(strain[rows.contact])
+            weight = np.where(value > imprint, self._weight, 0.0)
+            mean = np.bincount(rows.contact, weight * (value - imprint), n_contacts)
+            mean_slope = np.bincount(rows.contact, weight * slope, n_contacts)
+            newton = (a * strain + b * mean - d) / np.maximum(a + b * mean_slope, 1e-9)
+            # Half way to the pole at most, so that no step jumps over it.
+            nearest = 0.5 * (strain + POLE_STRAIN)
+            last, strain = strain, np.minimum(np.maximum(strain - newton, 0.0), nearest)
+            # Convergence is quadratic: what is left is far below the step just made.
+            if np.abs(strain - last).max(initial=0.0) < 1e-5:
+                break
+        self._strains_before = self._strain, self._strains_before[0]
+        self._strain = strain
+        self.depth_mm = strain * self._thickness_mm
+        return strain
+
+    def _place(self, footprint: Footprint, dt_s: float) -> None:
+        """Take over a footprint: gather its foam, release what it no longer covers."""
+        is_touched = np.zeros(len(self.foam), bool)
+        is_touched[footprint.taxel] = True
+        touched = np.flatnonzero(is_touched)
+        left = self._touched[~is_touched[self._touched]]
+        met = is_touched[self._recovering]
+        self._free(self._recovering[met], self._waited_s)
+        recovering = self._free(self._recovering[~met], self._waited_s + dt_s)
+        self._recovering = np.concatenate([recovering, self._free(left, dt_s)])
+        self._waited_s = 0.0
+
+        rows = self._footprint = footprint
+        n_contacts = len(rows.area_mm2)
+        self._touched = touched
+        self._repeats = len(touched) < len(rows.taxel)
+        self._covered[touched] = 0.0
+        np.add.at(self._covered, rows.taxel, rows.covered)
+        self._law = self.foam.take(rows.taxel)
+        bears_mm2 = np.bincount(rows.contact, rows.bears_mm2, n_contacts)
+        self._bears = bears_mm2 > 0
+        self._weight = rows.bears_mm2 / np.where(self._bears, bears_mm2, 1.0)[rows.contact]
+        thickness_mm = np.bincount(rows.contact, self._weight * self._law.thickness_mm, n_contacts)
+        self._thickness_mm = np.where(self._bears, thickness_mm, self._mean_thickness_mm)
+        # A probe between the pads has foam under it too: nominal, and purely elastic.
+        self._between = Foam.uniform(int(np.count_nonzero(~self._bears)))
+        self._bears_n_per_kpa = rows.area_mm2 * rows.edge * 1e-3
+        self._strain = np.full(n_contacts, 0.3)
+        self._strains_before = self._strain, self._strain
+
+    def _free(self, taxels: Ints, dt_s: float) -> Ints:
+        """Let untouched foam come back for `dt_s`; returns where a residual is left."""
+        if not len(taxels):
+            return taxels
+        elastic = self.truth.step_pressure(np.zeros(len(taxels)), dt_s, taxels)
+        self.pressure_kpa[taxels] = 0.0
+        self._imprint_strain[taxels] = self.foam.take(taxels).strain(elastic)
+        shows = elastic >= self.RESIDUAL_OVER_KPA
+        self.truth.reset(taxels[~shows])
+        return taxels[shows]

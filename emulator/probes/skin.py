@@ -1,0 +1,349 @@
+"""The skin of a robot: probes in, capacitance of every pad out, and the truth beside it.
+
+Mechanics runs for contacts and for foam that still recovers; a pad that nobody touches keeps
+its capacitance and costs nothing.
+"""
+
+from collections.abc import Collection
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from emulator.boards.arithmetic import TAXELS
+from emulator.chips.noise import SENT_UNIT_FF, PadNoise
+from emulator.probes.air import Course, read_course
+from emulator.probes.coverage import Coverage
+from emulator.probes.foam import INFINERGY_LOSS, Drive, Foam, FoamLayer, Footprint
+from emulator.probes.pads import (
+    Jumps,
+    Pads,
+    draw_dead,
+    draw_noise_ff,
+    draw_resting_ff,
+)
+from emulator.probes.scene import Air, Moment, Probe, Scene, Script
+from emulator.probes.viscoelastic import FoamTruth
+from skin_host.bus.compensation import GAIN, GAIN_V2
+from skin_host.errors import ConfigurationError
+from skin_host.layout import Layout, PadKind
+
+#: Change of a thermal pad with temperature (fF per degree): some ten codes.
+THERMAL_FF_PER_C = 3.6
+#: Change of the other pads relative to the thermal one, where the firmware compensates it.
+THERMAL_SPREAD = 0.05
+#: Without thermal pads beside them, pads drift about half as much.
+PLAIN_SHARE = 0.5
+REFERENCE_C = 25.0
+#: Temperature is passed on in steps of this size.
+STEP_C = 0.01
+#: While drives change, mechanics is worked out this often; all its times are multiples of it.
+MOVING_NS = 5_000_000
+#: While probes are held, foam recovers or the temperature moves, this is enough, after a time.
+HOLDING_NS = 50_000_000
+#: Air changes slowly enough for this.
+AIR_NS = 20_000_000
+SETTLING_SHARE = 10
+NEVER_NS = 1 << 62
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+
+
+class Skin:
+    """All pads of a robot under a scene.
+
+    Attributes:
+        capacitance_ff: float64[n], what each pad measures now.
+        resting_ff: float64[n], what it measures untouched at 25 degrees C.
+        held_ff: float64[n], what a stuck pad measures instead, else NaN.
+        noise: of the pads of each triangle; None is no noise at all.
+        noise_ff: float64[n], its rms.
+        probes: the scene's probes on skin, then the live ones.
+        numbers: of the former, in the scene.
+
+    Args:
+        layout: of the skin.
+        scene: what happens to it.
+        bare: names of fingertips without skin; the probes on them are none of ours.
+    """
+
+    def __init__(self, layout: Layout, scene: Scene, bare: Collection[str] = ()) -> None:
+        n = layout.n_taxels
+        self._t_ns = 0
+        rng = np.random.default_rng([scene.seed, 1])
+        self._layout = layout
+        thickness_mm = np.repeat(
+            [part.foam_mm for part in layout.parts], [part.n_taxels for part in layout.parts]
+        )
+        cover = np.repeat(
+            [part.covered for part in layout.parts], [part.n_taxels for part in layout.parts]
+        )
+        self._thickness_mm = thickness_mm
+        self._membrane_mm = scene.membrane_mm
+        self._pads = Pads(np.zeros((n, 2)), layout.radius_mm, thickness_mm, cover=cover)
+        self._pads.c0_ff[layout.pad_kind == PadKind.THERMAL] = 0.0
+        if scene.spread:
+            foam = Foam.drawn(n, rng, thickness_mm)
+            truth = _truth(scene, n, rng)
+            self.resting_ff = draw_resting_ff(n, rng)
+            spread = 1 + THERMAL_SPREAD * rng.standard_normal(n)
+        else:
+            foam = Foam.uniform(n, thickness_mm)
+            truth = _truth(scene, n, None)
+            self.resting_ff = np.full(n, 7800.0)
+            spread = np.ones(n)
+        self._ff_per_c = THERMAL_FF_PER_C * _thermal_gain(layout) * spread
+        self._ff_per_c[layout.pad_kind == PadKind.THERMAL] = THERMAL_FF_PER_C
+        if scene.foam == "infinergy":
+            foam = foam.infinergy()
+        self._foam = FoamLayer(foam, truth)
+        self._draw_flaws(scene, rng)
+        self._times_s = [t_s for t_s, _ in scene.temperature.keyframes_c]
+        self._degrees_c = [c for _, c in scene.temperature.keyframes_c]
+        self._shift_c = 0.0
+        self._none = self._touched = self._felt = np.zeros(0, np.intp)
+        self._all = np.arange(n)
+        self._covered = np.zeros(n)
+        self.capacitance_ff = self.resting_ff.copy()
+        self.held_ff = np.where(self._dead, self.resting_ff, np.nan)
+        self._set_probes(scene.probe, bare)
+        self._set_air(scene.air)
+        self.temperature_step_c = 0.0
+
+    def _draw_flaws(self, scene: Scene, rng: np.random.Generator) -> None:
+        """Noise, jumps and dead pads: those of the paper's good skin, or of real robots' skin."""
+        n = self._layout.n_taxels
+        triangles = n // TAXELS
+        self.noise = PadNoise.normal(triangles) if scene.noise else None
+        self.noise_ff = np.zeros(n)
+        self._jumps, self._dead = Jumps.none(n), np.zeros(n, bool)
+        if scene.noise and scene.quiet:
+            self.noise_ff = draw_noise_ff(n, rng)
+        elif scene.noise:
+            rng = np.random.default_rng([scene.seed, 7])
+            thermal = self._layout.pad_kind == PadKind.THERMAL
+            self.noise = PadNoise.drawn(thermal.reshape(-1, TAXELS), rng)
+            self.noise_ff = SENT_UNIT_FF * self.noise.rms_units.reshape(-1)
+            self._jumps = Jumps.drawn(n, TAXELS, rng)
+            self._dead = draw_dead(n, rng) & ~thermal
+
+    def _set_probes(self, probes: list[Probe], bare: Collection[str]) -> None:
+        self.probes: list[Probe] = []
+        self.numbers = [i for i, probe in enumerate(probes) if probe.part not in bare]
+        self._script = Script([probes[i] for i in self.numbers])
+        self._coverage = Coverage(self._layout, self._thickness_mm, self._membrane_mm)
+        for number in self.numbers:
+            probe = probes[number]
+            try:
+                self._place_probe(probe)
+            except ConfigurationError as error:
+                raise ConfigurationError(f"probe[{number}].{error}") from None
+        self._gather()
+        self._active = np.zeros(0, np.intp)
+        self._offset_mm = np.zeros((0, 2))
+        self._footprint = Footprint.empty()
+        self._by_depth_now = np.zeros(0, bool)
+        self._any_by_depth = False
+        self._no_drive = self._compliance_now = np.zeros(0)
+        self._idle = True
+        self._still_until_s = 0.0
+        self._changed_ns = self._t_ns
+
+    def _set_air(self, airs: list[Air]) -> None:
+        """Where air presses, and its courses."""
+        self._air_kpa = np.zeros(self._layout.n_taxels)
+        self._air: list[tuple[Course, Ints]] = []
+        for number, air in enumerate(airs):
+            try:
+                part = self._layout.part(air.part)
+                keyframes = read_course(Path(air.file)) if air.file else air.pressure_kpa
+            except KeyError:
+                raise ConfigurationError(f'air[{number}].part: no part "{air.part}"') from None
+            except ConfigurationError as error:
+                raise ConfigurationError(f"air[{number}].file: {error}") from None
+            course = Course.of(keyframes, air.start_s)
+            self._air.append((course, np.arange(part.start, part.stop)))
+        taxels = [taxels for _, taxels in self._air]
+        self._under_air = np.concatenate([np.zeros(0, np.intp), *taxels])
+        self._air_shows = False
+
+    def _place_probe(self, probe: Probe) -> None:
+        self._coverage.add(probe)
+        self.probes.append(probe)
+
+    def _gather(self) -> None:
+        self._by_depth = np.array([probe.by_depth for probe in self.probes], bool)
+        self._compliance = np.array([probe.compliance_mm_per_n for probe in self.probes])
+        self._grounded = np.array([probe.kind == "grounded" for probe in self.probes], bool)
+
+    def add_live(self, probe: Probe) -> int:
+        """Add a probe that `set_live` moves; its number. Its keyframes are not used.
+
+        Raises:
+            ConfigurationError: there is no such part, triangle or taxel.
+        """
+        self._place_probe(probe)
+        self._gather()
+        return self._script.add_live()
+
+    def set_live(self, number: int, drive: float, x_mm: float = 0.0, y_mm: float = 0.0) -> None:
+        """Press with a live probe: force (N), or depth (mm) if it has `depth_mm` keyframes."""
+        self._script.set_live(number, drive, x_mm, y_mm)
+        self._changed_ns = self._t_ns
+
+    @property
+    def due_ns(self) -> int:
+        """When the mechanics has to be worked out again: a time of its own grid."""
+        if self._changed_ns == self._t_ns:
+            return self._t_ns + MOVING_NS
+        quiet = not len(self._active) and self._idle and self._t_ns * 1e-9 >= self._times_s[-1]
+        due_ns = NEVER_NS if quiet else self._t_ns + self._holding_ns
+        if np.isfinite(self._still_until_s):
+            change_ns = round(self._still_until_s * 1e9)
+            due_ns = min(due_ns, max(change_ns, self._t_ns + 1))
+        due_ns = min(due_ns, self._air_due_ns)
+        return -(-max(due_ns, self._t_ns + 1) // MOVING_NS) * MOVING_NS
+
+    @property
+    def _air_due_ns(self) -> int:
+        """When air has to be worked out again."""
+        t_s = self._t_ns * 1e-9
+        if self._air_shows or any(course.start_s <= t_s < course.end_s for course, _ in self._air):
+            return self._t_ns + AIR_NS
+        starts_s = [course.start_s for course, _ in self._air if course.start_s > t_s]
+        return round(min(starts_s) * 1e9) if starts_s else NEVER_NS
+
+    @property
+    def _holding_ns(self) -> int:
+        """Foam relaxes fastest after a change, so the steps grow with the time since then."""
+        return min(HOLDING_NS, (self._t_ns - self._changed_ns) // SETTLING_SHARE)
+
+    def true_pressure_kpa(self) -> Floats:
+        """True pressure of each pad, float64[n]: mean over the pad's whole area (kPa)."""
+        return self._foam.pressure_kpa * self._covered + self._air_kpa
+
+    def contact_force_n(self) -> dict[int, float]:
+        """Force (N) of each probe that is in contact now, by its number in `probes`."""
+        return dict(zip(self._active.tolist(), self._foam.force_n.tolist(), strict=True))
+
+    def step(self, t_ns: int) -> Ints:
+        """Go on to `t_ns`.
+
+        Returns:
+            The taxels whose capacitance may have changed; the same array as at the last step
+            if they are the same.
+        """
+        dt_s = (t_ns - self._t_ns) * 1e-9
+        self._t_ns = t_ns
+        t_s = t_ns * 1e-9
+        warmed = self._warm(t_s)
+        touched = self._none
+        moment = self._script.at(t_s)
+        self._still_until_s = self._script.still_until_s(t_s)
+        if self._still_until_s <= t_s:
+            self._changed_ns = t_ns
+        if len(moment.number) or not self._idle:
+            touched = self._press(moment, dt_s)
+        if self._air and self._blow(t_s, dt_s):
+            touched = (
+                np.concatenate([touched, self._under_air]) if len(touched) else self._under_air
+            )
+        return self._all if warmed else touched
+
+    def _blow(self, t_s: float, dt_s: float) -> bool:
+        """Let air press; whether anything is, or was until now, squeezed by it."""
+        before, self._air_shows = self._air_shows, False
+        truth = self._foam.truth
+        for course, taxels in self._air:
+            kpa = course.kpa_at(t_s)
+            if not (kpa or before):
+                continue
+            elastic_kpa = truth.step_pressure(np.full(len(taxels), kpa), dt_s, taxels)
+            shows = kpa > 0 or bool((elastic_kpa >= self._foam.RESIDUAL_OVER_KPA).any())
+            if not shows:
+                truth.reset(taxels)
+                elastic_kpa = np.zeros(len(taxels))
+            self._air_shows |= shows
+            self._air_kpa[taxels] = kpa
+            strain = self._foam.foam.take(taxels).strain(elastic_kpa)
+            rise_ff = np.where(self._pads.cover[taxels], self._pads.c0_ff[taxels], 0.0)
+            rise_ff *= strain / (1 - strain)
+            rise_ff += self._jumps.step_ff(taxels, self._air_kpa[taxels])
+            drifted_ff = self._ff_per_c[taxels] * self._shift_c
+            self.capacitance_ff[taxels] = self.resting_ff[taxels] + rise_ff + drifted_ff
+        return before or self._air_shows
+
+    def _warm(self, t_s: float) -> bool:
+        # Beyond the last keyframe, as nearly always, there is nothing to look up.
+        now_c = self._degrees_c[-1]
+        if t_s < self._times_s[-1]:
+            now_c = float(np.interp(t_s, self._times_s, self._degrees_c))
+        shift_c = now_c + self.temperature_step_c - REFERENCE_C
+        if abs(shift_c - self._shift_c) < STEP_C:
+            return False
+        self.capacitance_ff += self._ff_per_c * (shift_c - self._shift_c)
+        self._shift_c = shift_c
+        return True
+
+    def _press(self, moment: Moment, dt_s: float) -> Ints:
+        number = moment.number
+        same = number is self._active or np.array_equal(number, self._active)
+        if not same or (moment.offset_mm != self._offset_mm).any():
+            self._place(moment)
+        depth_mm, force_n = self._no_drive, moment.drive
+        if self._any_by_depth:
+            depth_mm = np.where(self._by_depth_now, moment.drive, 0.0)
+            force_n = np.where(self._by_depth_now, np.nan, moment.drive)
+        drive = Drive(depth_mm, force_n, self._compliance_now)
+        felt = self._foam.step(self._footprint, drive, dt_s)
+        rise_ff = self._pads.rise_ff(felt, self._footprint, self._grounded[number])
+        if felt.taxel is not self._felt and not np.array_equal(felt.taxel, self._felt):
+            self._touched = np.union1d(felt.taxel, self._felt)
+            self._felt = felt.taxel
+        elif len(self._touched) > len(self._felt):
+            self._touched = np.unique(self._felt)
+        touched = self._touched
+        self._idle = len(felt.taxel) == 0
+        drifted_ff = self._ff_per_c[touched] * self._shift_c
+        rise_ff = rise_ff[touched]
+        if self._jumps.any:
+            pressure_kpa = self._foam.pressure_kpa[touched] * self._covered[touched]
+            rise_ff += self._jumps.step_ff(touched, pressure_kpa)
+        self.capacitance_ff[touched] = self.resting_ff[touched] + rise_ff + drifted_ff
+        return touched
+
+    def _place(self, moment: Moment) -> None:
+        """Find out what the probes cover, when some came, went or slid."""
+        self._active, self._offset_mm = moment.number, moment.offset_mm
+        self._by_depth_now = self._by_depth[moment.number]
+        self._any_by_depth = bool(self._by_depth_now.any())
+        self._no_drive = np.zeros(len(moment.number))
+        self._compliance_now = self._compliance[moment.number]
+        self._footprint = self._coverage.footprint(moment.number, moment.offset_mm)
+        under = self._footprint.bears_mm2 > 0
+        self._covered = np.bincount(
+            self._footprint.taxel[under], self._footprint.covered[under], self._layout.n_taxels
+        ).astype(np.float64)
+
+
+def _truth(scene: Scene, n: int, rng: np.random.Generator | None) -> FoamTruth:
+    """The foam's memory under n taxels, drawn if there is a generator."""
+    if scene.foam == "infinergy":
+        return FoamTruth("F", n, rng, loss=INFINERGY_LOSS)
+    return FoamTruth(scene.foam, n, rng)
+
+
+def _thermal_gain(layout: Layout) -> Floats:
+    """How much each pad drifts with temperature, relative to a thermal pad.
+
+    Pads beside thermal ones drift by the gains in the firmware, for which they were
+    measured; elsewhere nobody published a figure.
+    """
+    gain = np.full(layout.n_taxels, PLAIN_SHARE)
+    for triangle in layout.triangles:
+        taxels = slice(triangle.first, triangle.first + TAXELS)
+        if (layout.pad_kind[taxels] == PadKind.THERMAL).any():
+            skin_type = layout.boards[triangle.board].settings.skin_type
+            gain[taxels] = np.array(GAIN if skin_type == 0 else GAIN_V2) / 128
+    return gain

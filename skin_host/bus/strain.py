@@ -1,0 +1,222 @@
+"""Force/torque boards (STRAIN, STRAIN2) on the robot's CAN: streams, commands, pairing.
+
+Force and torque of one sample are two frames of class 3, ID 0x300 | board<<4 | type, each
+with three little-endian words around 0x8000. They have no sequence number and are paired by
+arrival. Source: icub-main's CanBusFtSensor.cpp and iCubCanProto_analogSensorMessages.h.
+"""
+
+import struct
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skin_host.bus.commands import Analog, SetTransmissionPeriod, SetTxMode, command_frame
+from skin_host.bus.wire import HOST_ADDRESS, FrameBatch, MessageClass, identifier
+
+Floats = NDArray[np.float64]
+
+ZERO_WORD = 0x8000
+CHANNELS = 6
+#: The sensor has timed out when nothing was received for this long.
+SILENT_NS = 100_000_000
+
+
+#: Time in which the two frames of a sample must arrive, per ms of period.
+PAIR_NS_PER_MS = 750_000
+
+
+class StrainType(IntEnum):
+    """Type of a stream: the low nibble of its identifier."""
+
+    RAW_FORCE = 0x8
+    RAW_TORQUE = 0x9
+    FORCE = 0xA
+    TORQUE = 0xB
+
+
+class StrainMode(IntEnum):
+    """Argument of command 07 (`SetTxMode`) to a force/torque board."""
+
+    CALIBRATED = 0
+    STOP = 1
+    UNCALIBRATED = 3
+    BOTH = 4
+
+
+@dataclass(frozen=True, slots=True)
+class GetFullScale(Analog):
+    """18: query the full scale of a channel: 0-2 force (N), 3-5 torque (N m)."""
+
+    CODE: ClassVar[int] = 0x18
+    LAYOUT: ClassVar[struct.Struct] = struct.Struct("<B")
+    channel: int
+
+
+@dataclass(frozen=True, slots=True)
+class FullScale(Analog):
+    """Answer to 18. The only number in this protocol with its high byte first."""
+
+    CODE: ClassVar[int] = 0x18
+    LAYOUT: ClassVar[struct.Struct] = struct.Struct(">BH")
+    channel: int
+    value: int
+
+
+def start_frames(board: int, period_ms: int) -> list[tuple[int, bytes]]:
+    """Return the frames that set a board up: query all full scales, set the period, start it."""
+    asked: list[Analog] = [GetFullScale(channel) for channel in range(CHANNELS)]
+    asked += [SetTransmissionPeriod(period_ms), SetTxMode(StrainMode.CALIBRATED)]
+    return [command_frame(command, board) for command in asked]
+
+
+def parse_full_scale(can_id: int, payload: bytes) -> tuple[int, FullScale] | None:
+    """Return board and full scale of an answer to `GetFullScale`; None for any other frame."""
+    board = can_id >> 4 & 0xF
+    if can_id != identifier(MessageClass.ANALOG_COMMAND, board, HOST_ADDRESS) or board == 0:
+        return None
+    answer = FullScale.decode(payload)
+    if answer is None or answer.channel >= CHANNELS:
+        return None
+    return board, answer
+
+
+@dataclass(slots=True)
+class StrainFrames:
+    """The frames of a batch that force/torque boards sent.
+
+    Attributes:
+        row: intp[m], their rows in the batch.
+        board, type: intp[m], see `StrainType`.
+        value: int32[m, 3], words minus 0x8000.
+        saturated: bool[m].
+        wrong_length: frames of such an identifier with neither 6 nor 7 bytes.
+    """
+
+    row: NDArray[np.intp]
+    board: NDArray[np.intp]
+    type: NDArray[np.intp]
+    value: NDArray[np.int32]
+    saturated: NDArray[np.bool_]
+    wrong_length: int
+
+
+def parse_strain(batch: FrameBatch) -> StrainFrames:
+    """Return the force/torque frames of a batch."""
+    kind = batch.id & 0xF
+    mine = (
+        (batch.id >> 8 == MessageClass.ANALOG_STREAM)
+        & (batch.id >> 4 & 0xF != HOST_ADDRESS)
+        & (kind >= StrainType.RAW_FORCE)
+        & (kind <= StrainType.TORQUE)
+    )
+    fits = (batch.dlc == 6) | (batch.dlc == 7)
+    row = np.flatnonzero(mine & fits)
+    data = batch.data[row]
+    words = data[:, 0:6:2].astype(np.int32) | data[:, 1:6:2].astype(np.int32) << 8
+    return StrainFrames(
+        row=row,
+        board=(batch.id[row] >> 4 & 0xF).astype(np.intp),
+        type=kind[row].astype(np.intp),
+        value=words - ZERO_WORD,
+        saturated=(batch.dlc[row] == 7) & (data[:, 6] != 0),
+        wrong_length=int(np.count_nonzero(mine & ~fits)),
+    )
+
+
+def encode_strain(
+    board: int, kind: StrainType, value: ArrayLike, *, overflow: int = 0
+) -> tuple[int, bytes]:
+    """Return one frame (identifier and payload) with three values in -32768..32767.
+
+    Raises:
+        ValueError: a value does not fit its word.
+    """
+    words = np.asarray(value, np.int64) + ZERO_WORD
+    if words.shape != (3,) or words.min() < 0 or words.max() > 0xFFFF:
+        raise ValueError(f"{value!r}: wanted three values in -32768..32767")
+    payload = words.astype("<u2").tobytes() + (bytes([overflow]) if overflow else b"")
+    return identifier(MessageClass.ANALOG_STREAM, board, kind), payload
+
+
+@dataclass(frozen=True, slots=True)
+class Wrench:
+    """Force and torque of one sample. `t_ns` is the arrival of its later frame."""
+
+    t_ns: int
+    force_n: Floats
+    torque_nm: Floats
+    saturated: bool
+
+
+@dataclass(slots=True)
+class StrainCounters:
+    """Counters of one board's stream.
+
+    Attributes:
+        samples: pairs found.
+        lone: frames whose other half did not arrive in time.
+        saturated: samples with a saturated channel.
+        wrong_length: frames that were neither force nor torque.
+    """
+
+    samples: int = 0
+    lone: int = 0
+    saturated: int = 0
+    wrong_length: int = 0
+
+
+@dataclass(slots=True)
+class WrenchAssembler:
+    """Pairs the force and torque frames of one board, in either order.
+
+    Two frames belong together if they are of different types and arrived within three quarters of a
+    period. A frame whose other half is late is counted and dropped, so that force is never joined
+    with the torque of another sample.
+
+    Args:
+        board: its address.
+        period_ms: between samples.
+        full_scale: float64[6], N and N m of a value of 0x8000.
+    """
+
+    board: int
+    period_ms: int
+    full_scale: Floats
+    counters: StrainCounters = field(default_factory=StrainCounters)
+    _half: tuple[int, int, NDArray[np.int32], bool] | None = None
+
+    def add(self, batch: FrameBatch) -> list[Wrench]:
+        """Take a batch of the bus; return the samples that it completes."""
+        return self.take(parse_strain(batch), batch.t_ns)
+
+    def take(self, frames: StrainFrames, t_ns_of: NDArray[np.int64]) -> list[Wrench]:
+        """As `add`, for frames that were picked out already and the batch's times [n]."""
+        self.counters.wrong_length += frames.wrong_length
+        mine = (frames.board == self.board) & (frames.type >= StrainType.FORCE)
+        samples = []
+        for i in np.flatnonzero(mine).tolist():
+            t_ns = int(t_ns_of[frames.row[i]])
+            sample = self._pair(
+                t_ns, int(frames.type[i]), frames.value[i], bool(frames.saturated[i])
+            )
+            if sample is not None:
+                samples.append(sample)
+        return samples
+
+    def _pair(
+        self, t_ns: int, kind: int, value: NDArray[np.int32], saturated: bool
+    ) -> Wrench | None:
+        half, self._half = self._half, None
+        if half is None or half[1] == kind or abs(t_ns - half[0]) > self.period_ms * PAIR_NS_PER_MS:
+            self.counters.lone += half is not None
+            self._half = (t_ns, kind, value, saturated)
+            return None
+        force, torque = (half[2], value) if kind == StrainType.TORQUE else (value, half[2])
+        scaled = np.concatenate([force, torque]) * (self.full_scale / ZERO_WORD)
+        saturated = saturated or half[3]
+        self.counters.samples += 1
+        self.counters.saturated += saturated
+        return Wrench(t_ns, scaled[:3], scaled[3:], saturated)

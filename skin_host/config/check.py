@@ -1,0 +1,408 @@
+"""Describes a configuration in numbers: `skin check`.
+
+`--json` prints the records; `table` formats them for people. Permitted values that are probably
+mistakes are listed as warnings, with their path in the file.
+"""
+
+import math
+from itertools import combinations, groupby
+from typing import TypedDict
+
+import numpy as np
+
+from skin_host.config.settings import Settings, skin_hash
+from skin_host.layout import TAXELS_PER_TRIANGLE, BoardLayout, Layout, PadKind
+
+#: Bits of a standard frame of eight bytes with its interframe space: without stuff bits, and with
+#: the most possible.
+FRAME_BITS = (111, 135)
+FRAMES_PER_TRIANGLE = 2
+#: The same for the two frames of six bytes that make one sample of force and torque.
+WRENCH_BITS = (2 * 95, 2 * 115)
+#: A bus with a higher load has no room for commands and retransmissions.
+WARN_LOAD = 0.8
+#: Twelve stages at decimation 256 take the chip this long (AD7147; MTB3's timer constants).
+CONVERSION_MS = 36.86
+#: Boards of these types use pad 6 as a temperature pad (type 3: only from triangle 5 on).
+THERMOMETER_PAD = 6
+COMPENSATED_TYPES = {0: 0, 3: 5, 8: 0}
+#: Taxels of a part that are closer than this are at the same place.
+SAME_PLACE_M = 1e-4
+#: Foam outside this range usually means a wrong unit.
+USUAL_FOAM_MM = (0.3, 30.0)
+
+
+class BusRecord(TypedDict):
+    """One bus. `load` is the share of its time for all configured boards, least and most."""
+
+    name: str
+    interface: str
+    channel: str
+    boards: int
+    triangles: int
+    frames_per_s: float
+    load: tuple[float, float]
+
+
+class BoardRecord(TypedDict):
+    """One board, and the parts it belongs to."""
+
+    name: str
+    bus: str
+    address: int
+    model: str
+    skin_type: int
+    period_ms: int
+    triangles: str
+    taxels: int
+    parts: list[str]
+
+
+class PartRecord(TypedDict):
+    """One part; `thermal` of its taxels measure temperature."""
+
+    name: str
+    node: str
+    boards: int
+    triangles: int
+    taxels: int
+    thermal: int
+    area_cm2: float
+
+
+class FingertipRecord(TypedDict):
+    """One fingertip on a force/torque board."""
+
+    name: str
+    node: str
+    bus: str
+    address: int
+    period_ms: int
+    shape: str
+    array: str | None
+
+
+class Totals(TypedDict):
+    """The whole robot."""
+
+    buses: int
+    boards: int
+    parts: int
+    triangles: int
+    taxels: int
+    thermal: int
+    area_cm2: float
+
+
+class Description(TypedDict):
+    """A whole configuration. `configuration` is the hash that calibrations carry."""
+
+    robot: str
+    configuration: str
+    buses: list[BusRecord]
+    boards: list[BoardRecord]
+    parts: list[PartRecord]
+    fingertips: list[FingertipRecord]
+    total: Totals
+    warnings: list[str]
+
+
+def describe(settings: Settings, layout: Layout) -> Description:
+    """Count what `settings` and their `layout` hold, and look for likely mistakes."""
+    buses = [_bus(name, settings, layout) for name in settings.buses]
+    parts = [_part(number, layout) for number in range(len(layout.parts))]
+    return {
+        "robot": settings.robot,
+        "configuration": skin_hash(settings),
+        "buses": buses,
+        "boards": [_board(board, layout) for board in layout.boards],
+        "parts": parts,
+        "fingertips": [
+            {
+                "name": name,
+                "node": tip.node,
+                "bus": tip.bus,
+                "address": tip.address,
+                "period_ms": tip.period_ms,
+                "shape": tip.shape,
+                "array": tip.array,
+            }
+            for name, tip in settings.fingertips.items()
+        ],
+        "total": {
+            "buses": len(buses),
+            "boards": len(layout.boards),
+            "parts": len(parts),
+            "triangles": len(layout.triangles),
+            "taxels": layout.n_taxels,
+            "thermal": sum(part["thermal"] for part in parts),
+            "area_cm2": round(sum(part["area_cm2"] for part in parts), 1),
+        },
+        "warnings": [
+            *_bus_warnings(buses, {tip.bus for tip in settings.fingertips.values()}),
+            *_board_warnings(layout),
+            *_part_warnings(layout),
+        ],
+    }
+
+
+def format_triangles(numbers: list[int]) -> str:
+    """Turn [0, 1, 2, 3, 4, 8] into "0-4,8", the form of a configuration file."""
+    runs = []
+    for _, run in groupby(enumerate(numbers), key=lambda item: item[1] - item[0]):
+        members = [number for _, number in run]
+        first, last = members[0], members[-1]
+        runs.append(f"{first}-{last}" if last > first else f"{first}")
+    return ",".join(runs)
+
+
+def _bus(name: str, settings: Settings, layout: Layout) -> BusRecord:
+    bus = settings.buses[name]
+    boards = [board for board in layout.boards if board.settings.bus == name]
+    frames_per_s = math.fsum(
+        FRAMES_PER_TRIANGLE * len(board.triangles) * 1000 / board.settings.period_ms
+        for board in boards
+    )
+    samples_per_s = math.fsum(
+        1000 / tip.period_ms for tip in settings.fingertips.values() if tip.bus == name
+    )
+    least, most = (
+        (bits * frames_per_s + wrench_bits * samples_per_s) / bus.bitrate
+        for bits, wrench_bits in zip(FRAME_BITS, WRENCH_BITS, strict=True)
+    )
+    return {
+        "name": name,
+        "interface": bus.interface,
+        "channel": bus.channel,
+        "boards": len(boards),
+        "triangles": sum(len(board.triangles) for board in boards),
+        "frames_per_s": round(frames_per_s + 2 * samples_per_s, 1),
+        "load": (round(least, 3), round(most, 3)),
+    }
+
+
+def _board(board: BoardLayout, layout: Layout) -> BoardRecord:
+    return {
+        "name": board.name,
+        "bus": board.settings.bus,
+        "address": board.settings.address,
+        "model": board.settings.model,
+        "skin_type": board.settings.skin_type,
+        "period_ms": board.settings.period_ms,
+        "triangles": format_triangles(list(board.triangles)),
+        "taxels": TAXELS_PER_TRIANGLE * len(board.triangles),
+        "parts": [layout.parts[part].name for part in board.parts],
+    }
+
+
+def _part(number: int, layout: Layout) -> PartRecord:
+    part = layout.parts[number]
+    taxels = slice(part.start, part.stop)
+    thermal = layout.pad_kind[taxels] == PadKind.THERMAL
+    return {
+        "name": part.name,
+        "node": part.node,
+        "boards": len(part.boards),
+        "triangles": part.n_taxels // TAXELS_PER_TRIANGLE,
+        "taxels": part.n_taxels,
+        "thermal": int(thermal.sum()),
+        "area_cm2": round(float(layout.area_mm2[taxels][~thermal].sum()) / 100, 1),
+    }
+
+
+def _bus_warnings(buses: list[BusRecord], used: set[str]) -> list[str]:
+    return (
+        [
+            f"buses.{bus['name']}: skin frames take {_load(bus)} of the bus; wanted at most "
+            f"{WARN_LOAD:.0%}: raise period_ms of its boards, or move boards to another bus"
+            for bus in buses
+            if bus["load"][1] > WARN_LOAD
+        ]
+        + [
+            f"buses.{bus['name']}: no board is on this bus; it will be opened for nothing"
+            for bus in buses
+            if not bus["boards"] and bus["name"] not in used
+        ]
+        + [
+            f"buses.{later['name']}.channel: {later['channel']} is that of buses.{bus['name']} "
+            "too; each receives the frames of both"
+            for bus, later in combinations(buses, 2)
+            if (bus["interface"], bus["channel"]) == (later["interface"], later["channel"])
+        ]
+    )
+
+
+def _board_warnings(layout: Layout) -> list[str]:
+    warnings = []
+    for number, board in enumerate(layout.boards):
+        where = f"boards.{board.name}"
+        if board.settings.period_ms < CONVERSION_MS:
+            warnings.append(
+                f"{where}.period_ms: {board.settings.period_ms}; the chips need "
+                f"{CONVERSION_MS} ms for twelve pads, shorter periods repeat old values"
+            )
+        nodes = {layout.parts[part].node for part in board.parts}
+        if len(nodes) > 1:
+            warnings.append(
+                f"{where}: feeds parts of the nodes {', '.join(sorted(nodes))}; one daemon "
+                "should set a board up: give these parts one node"
+            )
+        first = COMPENSATED_TYPES.get(board.settings.skin_type)
+        if first is None:
+            continue
+        wrong = [
+            triangle.number
+            for triangle in layout.triangles
+            if triangle.board == number
+            and triangle.number >= first
+            and layout.pad_kind[triangle.first + THERMOMETER_PAD] != PadKind.THERMAL
+        ]
+        if wrong:
+            warnings.append(
+                f"{where}.skin_type: {board.settings.skin_type} takes pad {THERMOMETER_PAD} as a "
+                f"thermometer, but that of triangles {format_triangles(wrong)} feels pressure; "
+                "wanted 1 or 2"
+            )
+    return warnings
+
+
+def _part_warnings(layout: Layout) -> list[str]:
+    warnings = []
+    n_neighbours = np.diff(layout.neighbour_start)
+    for part in layout.parts:
+        low, high = USUAL_FOAM_MM
+        if not low <= part.foam_mm <= high:
+            warnings.append(
+                f"parts.{part.name}.foam_mm: {part.foam_mm:g}; foam is {low:g} to {high:g} mm "
+                "thick as a rule, and pressures are scaled by it: is it in mm?"
+            )
+        taxels = slice(part.start, part.stop)
+        pressure = layout.pad_kind[taxels] == PadKind.PRESSURE
+        alone = int((n_neighbours[taxels][pressure] == 0).sum())
+        if alone:
+            warnings.append(
+                f"parts.{part.name}: {alone} taxel(s) have no neighbour; look at their places"
+            )
+        cells = np.round(layout.position_m[taxels][pressure] / SAME_PLACE_M).astype(np.int64)
+        shared = len(cells) - len(np.unique(cells, axis=0))
+        if shared:
+            warnings.append(
+                f"parts.{part.name}: {shared} taxel(s) lie where another one lies; "
+                "contacts there cannot be distinguished"
+            )
+    return warnings
+
+
+def table(description: Description) -> str:
+    """The description as text for a terminal, without a newline at its end."""
+    total = description["total"]
+    sections = [
+        f"robot {description['robot']}, configuration {description['configuration']}",
+        columns(
+            ["bus", "interface", "channel", ">boards", ">triangles", ">frames/s", ">load"],
+            [
+                [
+                    bus["name"],
+                    bus["interface"],
+                    bus["channel"],
+                    bus["boards"],
+                    bus["triangles"],
+                    f"{bus['frames_per_s']:.0f}",
+                    _load(bus),
+                ]
+                for bus in description["buses"]
+            ],
+        ),
+        columns(
+            [
+                "board",
+                "bus",
+                ">address",
+                "model",
+                ">type",
+                ">period",
+                "triangles",
+                ">taxels",
+                "parts",
+            ],
+            [
+                [
+                    board["name"],
+                    board["bus"],
+                    board["address"],
+                    board["model"],
+                    board["skin_type"],
+                    f"{board['period_ms']} ms",
+                    board["triangles"],
+                    board["taxels"],
+                    ", ".join(board["parts"]),
+                ]
+                for board in description["boards"]
+            ],
+        ),
+        columns(
+            ["part", "node", ">boards", ">triangles", ">taxels", ">thermal", ">area"],
+            [
+                [
+                    part["name"],
+                    part["node"],
+                    part["boards"],
+                    part["triangles"],
+                    part["taxels"],
+                    part["thermal"],
+                    f"{part['area_cm2']:.0f} cm²",
+                ]
+                for part in [
+                    *description["parts"],
+                    PartRecord(
+                        name="total",
+                        node="",
+                        boards=total["boards"],
+                        triangles=total["triangles"],
+                        taxels=total["taxels"],
+                        thermal=total["thermal"],
+                        area_cm2=total["area_cm2"],
+                    ),
+                ]
+            ],
+        ),
+    ]
+    if description["fingertips"]:
+        sections.append(
+            columns(
+                ["fingertip", "node", "bus", ">address", ">period", "shape", "array"],
+                [
+                    [
+                        tip["name"],
+                        tip["node"],
+                        tip["bus"],
+                        tip["address"],
+                        f"{tip['period_ms']} ms",
+                        tip["shape"],
+                        tip["array"] or "-",
+                    ]
+                    for tip in description["fingertips"]
+                ],
+            )
+        )
+    if description["warnings"]:
+        sections.append("\n".join(f"warning: {text}" for text in description["warnings"]))
+    return "\n\n".join(sections)
+
+
+def _load(bus: BusRecord) -> str:
+    least, most = bus["load"]
+    return f"{100 * least:.0f} .. {100 * most:.0f} %"
+
+
+def columns(heads: list[str], rows: list[list[str | int]]) -> str:
+    """Format columns as wide as their longest entry; a head that starts with > is right-aligned."""
+    cells = [[head.removeprefix(">") for head in heads], *([str(x) for x in row] for row in rows)]
+    widths = [max(len(row[column]) for row in cells) for column in range(len(heads))]
+    return "\n".join(
+        "  ".join(
+            cell.rjust(width) if head.startswith(">") else cell.ljust(width)
+            for cell, width, head in zip(row, widths, heads, strict=True)
+        ).rstrip()
+        for row in cells
+    )

@@ -1,0 +1,120 @@
+"""Explains an error in a configuration file: the place first, then the values seen and wanted."""
+
+import difflib
+import math
+import re
+from collections.abc import Iterator
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+import msgspec
+from msgspec import Struct
+
+from skin_host.config.fields import Name
+from skin_host.config.relaxation import RETIRED
+
+Table = type[Struct]
+Named = dict[str, Table]
+#: Longer values are shown by their beginning.
+LONGEST_VALUE = 40
+
+
+def explain(document: Any, error: msgspec.ValidationError, root: Table, named: Named) -> str:
+    """Return where in the file the error is, then what it is.
+
+    msgspec's message is "Expected `int`, got `str` - at `$.boards[...].address`": it does not name
+    the board, so each named table is checked once more separately.
+
+    Args:
+        document: the decoded file.
+        error: msgspec's error.
+        root: the type of the whole file.
+        named: the sections of the file that hold tables by name, and the type of these.
+    """
+    for section, table in named.items():
+        entries = document.get(section)
+        if not isinstance(entries, dict):
+            continue
+        for name, entry in entries.items():
+            try:
+                msgspec.convert(name, Name)
+            except msgspec.ValidationError:
+                return (
+                    f'{section}: the name "{name}"; wanted at most 64 of the characters '
+                    "a-z, 0-9, - and _"
+                )
+            try:
+                msgspec.convert(entry, table)
+            except msgspec.ValidationError as inner:
+                return _readable(str(inner), f"{section}.{name}", table, entry)
+    return _readable(str(error), "", root, document)
+
+
+def _readable(message: str, place: str, table: Table, document: Any) -> str:
+    """Put the place first, then the value seen; suggest the probable key for an unknown one.
+
+    Args:
+        message: msgspec's own.
+        place: where in the file `table` is.
+        table: what was checked.
+        document: the same, decoded without its types.
+    """
+    text, _, inner = message.partition(" - at ")
+    keys = inner.strip("`").removeprefix("$").removeprefix(".")
+    place = f"{place}.{keys}".strip(".") if keys else place
+    kind = table
+    for key in re.sub(r"\[[^]]*\]", "", keys).split(".") if keys else []:
+        kind = _innermost(get_type_hints(kind)[key]) if hasattr(kind, key) else kind
+    if text.startswith("Object contains unknown field"):
+        key = text.split("`")[1]
+        near = difflib.get_close_matches(key, kind.__struct_fields__, n=1)
+        text = f"unknown key `{key}`" + (f"; meant `{near[0]}`?" if near else "")
+        if key in RETIRED:
+            text = f"`{key}` is no longer there: {RETIRED[key]}"
+    elif text.startswith("Invalid enum value"):
+        known = ", ".join(str(value) for value in get_args(kind))
+        seen = text.removeprefix("Invalid enum value ")
+        text = f"seen {seen}, wanted one of: {known}"
+        name = seen.strip("'")
+        if name in RETIRED:
+            text = f"`{name}` is no longer there: {RETIRED[name]}"
+    else:
+        text = text.replace("Object missing required field", "missing key")
+        wanted, _, got = text.replace("Expected", "wanted").partition(", got ")
+        seen = got if " of length " in wanted and got else _value(document, keys)
+        text = f"seen {seen}, {wanted}" if wanted.startswith("wanted") and seen else wanted
+    return f"{place}: {text}" if place else text
+
+
+def _value(document: Any, keys: str) -> str:
+    """Return the value at a place such as `patches[0].shift`, shortened; empty if not known."""
+    value = document
+    for key in re.findall(r"[^.\[\]]+", keys):
+        if isinstance(value, list) and key.isdecimal() and int(key) < len(value):
+            value = value[int(key)]
+        elif isinstance(value, dict) and key in value:
+            value = value[key]
+        else:
+            return ""
+    text = repr(value)
+    return text if len(text) <= LONGEST_VALUE else text[: LONGEST_VALUE - 3] + "..."
+
+
+def _innermost(hint: Any) -> Any:
+    """Return the table or `Literal` within `list[Patch]`, `dict[Name, Bus]`, `X | None` and
+    such.
+    """
+    while get_origin(hint) not in (None, Literal):
+        hint = next(inner for inner in reversed(get_args(hint)) if inner is not type(None))
+    return hint
+
+
+def not_finite(value: Any, where: str = "") -> Iterator[tuple[str, float]]:
+    """Yield where in a decoded file `nan` and `inf` are."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from not_finite(inner, f"{where}.{key}" if where else key)
+    elif isinstance(value, list):
+        for number, inner in enumerate(value):
+            yield from not_finite(inner, f"{where}[{number}]")
+    elif isinstance(value, float) and not math.isfinite(value):
+        yield where, value

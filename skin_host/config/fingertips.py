@@ -1,0 +1,92 @@
+"""Table `[fingertips.NAME]` of a configuration: a fingertip on a force/torque board."""
+
+from collections.abc import Iterator
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+
+from skin_host.config.fields import Name, Positive
+from skin_host.fingertip.intrinsic import Plane, Quadric, Surface, cylinder, ellipsoid, sphere
+
+Vector = tuple[float, float, float]
+Six = tuple[float, float, float, float, float, float]
+
+#: Dimensions that a shape needs, and optional ones.
+_NEEDS = {"sphere": ["radius_mm"], "cylinder": ["radius_mm"], "ellipsoid": ["semi_axes_mm"]}
+_MAY = {"cylinder": ["half_length_mm"], "plane": ["reach_mm"]}
+_DIMENSIONS = ("radius_mm", "semi_axes_mm", "half_length_mm", "reach_mm")
+
+
+class Fingertip(Struct, forbid_unknown_fields=True, kw_only=True, frozen=True):
+    """A fingertip on a force/torque board (STRAIN, STRAIN2): contact from force and torque.
+
+    Its frame has its origin in the middle of a sphere, a cylinder (about z) or an ellipsoid
+    (axes along x, y, z), or on a plane that faces z. Its topics have its name.
+    """
+
+    bus: Name
+    address: Annotated[int, Meta(ge=1, le=14)]
+    shape: Literal["sphere", "cylinder", "ellipsoid", "plane"]
+    #: Of a sphere or cylinder.
+    radius_mm: Positive | None = None
+    #: Of an ellipsoid.
+    semi_axes_mm: tuple[Positive, Positive, Positive] | None = None
+    #: Distance from the middle to the ends of a cylinder; without it, the cylinder is infinite.
+    half_length_mm: Positive | None = None
+    #: Distance from the middle to the edge of a plane; without it, the plane is infinite.
+    reach_mm: Positive | None = None
+    #: A part whose skin covers the fingertip, in the same frame: both contribute to one estimate.
+    array: Name | None = None
+    node: Name = "main"
+    #: A sample is sent this often; at 10 ms slips are reported after a millimetre.
+    period_ms: Annotated[int, Meta(ge=1, le=255)] = 5
+    #: N and N m that the largest value of each channel stands for; without it, the board is
+    #: queried.
+    full_scale: tuple[Positive, Positive, Positive, Positive, Positive, Positive] | None = None
+    #: Calibration matrix from the values of the board (N, N m) to the force and torque that the
+    #: touching object exerts, along the axes of the fingertip's frame. Without it, the board's own
+    #: axes are used.
+    matrix: tuple[Six, Six, Six, Six, Six, Six] | None = None
+    #: Position of the force/torque sensor's origin in the fingertip's frame.
+    sensor_mm: Vector = (0.0, 0.0, 0.0)
+    #: Coefficient of static friction, better too low than too high; without it, an abrupt fall of
+    #: tangential over normal force is detected instead.
+    friction: Positive | None = None
+    #: A contact begins at this force, and ends at 0.7 of it (F1).
+    threshold_n: Positive = 0.2
+    #: Above this normal force the fingertip presses too hard (F2).
+    over_n: Positive = 10.0
+    #: A faster change of the tangential force is a slip.
+    slip_n_s: Positive = 6.0
+    #: Contacts are located on force and torque below this frequency.
+    filter_hz: Positive = 10.0
+
+    def wrong_values(self) -> Iterator[tuple[str, str]]:
+        """Values that are wrong beyond their types: the key, and the reason."""
+        if self.filter_hz >= 500.0 / self.period_ms:
+            limit = 500.0 / self.period_ms
+            what = f"{self.filter_hz:g}; wanted below {limit:g}, half of the samples' rate"
+            yield "filter_hz", what
+        if self.over_n <= self.threshold_n:
+            yield "over_n", f"{self.over_n:g}; wanted more than threshold_n"
+        needs = _NEEDS.get(self.shape, [])
+        for key in _DIMENSIONS:
+            given = getattr(self, key) is not None
+            if key in needs and not given:
+                yield f"{key}", f"missing key; a {self.shape} needs it"
+            if given and key not in [*needs, *_MAY.get(self.shape, [])]:
+                yield f"{key}", f"a {self.shape} does not have it"
+
+    @property
+    def surface(self) -> Surface:
+        """The surface, in its frame."""
+        inf = float("inf")
+        if self.shape == "plane":
+            return Plane(reach_mm=self.reach_mm or inf)
+        if self.semi_axes_mm is not None:
+            return ellipsoid(*self.semi_axes_mm)
+        assert self.radius_mm is not None
+        body: Quadric = sphere(self.radius_mm)
+        if self.shape == "cylinder":
+            body = cylinder(self.radius_mm, self.half_length_mm or inf)
+        return body

@@ -1,0 +1,486 @@
+"""A configuration file (TOML) as typed settings.
+
+One file describes one robot: its CAN buses, the boards on them, the parts of the
+body that their triangles cover, and how the signals are processed and published.
+Unknown keys, wrong types, wrong lengths and references to nothing are errors that
+name the file and the path inside it. `docs/configuration.md` explains every key.
+"""
+
+import hashlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
+from msgspec import Meta, Struct, field
+
+from skin_host.config.explain import Named, explain, not_finite
+from skin_host.config.fields import Name, NotNegative, Positive
+from skin_host.config.fingertips import Fingertip as Fingertip  # noqa: PLC0414 (for others too)
+from skin_host.config.relaxation import Relaxation, with_file, wrong_parameters
+from skin_host.errors import ConfigurationError, RequestError
+
+Byte = Annotated[int, Meta(ge=0, le=255)]
+T = TypeVar("T", bound=Struct)
+TRIANGLES_PER_BOARD = 16
+#: host, host:port or [IPv6]:port
+_ADDRESS = r"^([A-Za-z0-9_.-]+|\[[0-9A-Fa-f:.]+\])(:[0-9]{1,5})?$"
+
+
+class _Table(Struct, forbid_unknown_fields=True, kw_only=True, frozen=True):
+    """Settings never change; `changed` makes others."""
+
+
+class Bus(_Table, frozen=True):
+    """One CAN bus, opened by python-can."""
+
+    interface: str = "socketcan"
+    channel: str = "can0"
+    bitrate: int = 1_000_000
+    #: Further keyword arguments for `can.Bus`, as python-can's own documentation names them.
+    options: dict[str, str | int | float | bool] = {}
+    #: Ignore frames of other classes (motors, ...): they are neither read nor counted.
+    skin_only: bool = False
+
+
+class Board(_Table, frozen=True):
+    """One MTB. Sources: reference of the wire, commands 4D (SET_BRD_CFG)."""
+
+    bus: Name
+    address: Annotated[int, Meta(ge=1, le=14)]
+    #: Selects the board's known problems to work around on bring-up, and the emulated firmware.
+    model: Literal["mtb3", "mtb4", "mtb4c"] = "mtb4"
+    period_ms: Annotated[int, Meta(ge=10, le=209)] = 50
+    #: 0 with temperature compensation, 1 palm and fingertips, 2 without, 3 ergoHand, 7 raw, 8 V2.
+    skin_type: Literal[0, 1, 2, 3, 7, 8] = 0
+    no_load: Byte = 240
+
+
+class Place(_Table, frozen=True):
+    """Where one triangle lies: its origin, its rotation, and the normal of its plane.
+
+    The triangle's own frame is rotated about its z axis by `turn_deg`, then its z axis is
+    laid along `normal` by the shortest rotation, then moved to (x, y, z).
+    """
+
+    x_mm: float = 0.0
+    y_mm: float = 0.0
+    z_mm: float = 0.0
+    turn_deg: float = 0.0
+    normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    mirror: bool = False
+
+
+class Patch(_Table, frozen=True):
+    """Some triangles of one board, all of one kind and with the same set-up (command 50)."""
+
+    board: Name
+    #: Triangle numbers of the board, in the order of the part's taxels: "0-4,8".
+    triangles: str
+    kind: Name = "triangle"
+    shift: Annotated[int, Meta(ge=0, le=8)] = 2
+    cdc_offset: Annotated[int, Meta(ge=0, le=0xFFFF)] = 0x2200
+    #: One place per triangle. Without them the triangles are tiled side by side.
+    places: list[Place] = []
+    #: Or a file of taxel positions: one row x y z nx ny nz (m) per taxel of the patch.
+    positions: str | None = None
+
+
+class Kind(_Table, frozen=True):
+    """A kind of sensor unit: 12 pads, or 24, 36, 48 where triangles are cut as one."""
+
+    about: str
+    pads_mm: list[tuple[float, float]]
+    pitch_mm: Positive
+    radius_mm: Positive
+    area_mm2: Positive
+    outline_mm: list[tuple[float, float]]
+    thermal: list[int] = []
+
+
+class Part(_Table, frozen=True):
+    """A part of the body: one topic, one array of taxels."""
+
+    patches: Annotated[list[Patch], Meta(min_length=1)]
+    #: The daemon that reads this part, see `skin run --node`.
+    node: Name = "main"
+    #: Which objects the skin feels: any, or only grounded ones (no cover).
+    covered: bool = True
+    foam_mm: Positive = 3.0
+    #: Whether frames of pressure are published. Without them, touches are still reported, and a
+    #: part that nothing touches costs almost nothing.
+    frames: bool = True
+    #: How a contact is located, see `processing.localization`. All but `centroid` also separate
+    #: several contacts in one touched patch.
+    localization: Literal["centroid", "half_maximum", "peak", "template"] = "centroid"
+    #: For `template`: diameters of touching objects. A single one is more precise if it is the
+    #: right one.
+    probe_mm: Annotated[list[Positive], Meta(min_length=1)] = field(
+        default_factory=lambda: [6.0, 8.0, 10.0, 12.0]
+    )
+
+
+class Calibration(_Table, frozen=True):
+    """How a calibration is taken (paper, section V-A)."""
+
+    seconds: Positive = 5.0
+    percentile: Annotated[float, Meta(gt=0, le=1)] = 0.95
+
+
+class Pressure(_Table, frozen=True):
+    """Counts to kPa. The defaults are the paper's equation (1) and its 2.88 fF at shift 3.
+
+    Other pads and foams are scaled to the pad that the equation was measured on, as plate
+    capacitors are: with the area of the pad over the thickness of the foam.
+    """
+
+    code_ff: Positive = 0.36
+    a_kpa_per_ff2: float = -0.001132
+    b_kpa_per_ff: Positive = 0.8141
+    #: The palm of the paper: 2 mm of foam; the radius follows from its Figs. 11 to 13.
+    pad_radius_mm: Positive = 2.1
+    foam_mm: Positive = 2.0
+    #: Noise in pressures of pads with their own curve is smoothed over this time; larger steps pass
+    #: at once. Touches are decided before that. 0 smooths nothing.
+    smoothing_s: NotNegative = 0.5
+
+
+class Touch(_Table, frozen=True):
+    """The touch decision (paper, section V-B), in units of the 8-bit value."""
+
+    margin_units: NotNegative = 2.0
+    minimum_threshold_units: NotNegative = 1.0
+    hysteresis_units: NotNegative = 0.5
+    #: A touch begins and ends with at least this many measurements; noise or a weak press need
+    #: more.
+    votes_of_3: Literal[1, 2, 3] = 2
+    #: `move` events are sent at most this often for a contact.
+    move_hz: Positive = 50.0
+
+
+class Drift(_Table, frozen=True):
+    """Baseline tracking (paper, section V-C, and the proportional rule of deployed hosts)."""
+
+    rule: Literal["none", "paper", "proportional"] = "proportional"
+    rate_units_per_s: Positive = 0.1
+    dead_band_units: NotNegative = 0.5
+    gain_per_s: Positive = 0.2
+    #: A baseline is never moved farther than this from its calibrated value.
+    limit_units: Positive = 40.0
+    #: A baseline held still by a touch for longer than this is reported.
+    frozen_report_s: Positive = 600.0
+
+
+class Processing(_Table, frozen=True):
+    """Sweeps to pressure to contacts."""
+
+    calibration: Calibration = field(default_factory=Calibration)
+    pressure: Pressure = field(default_factory=Pressure)
+    relaxation: Relaxation = field(default_factory=Relaxation)
+    touch: Touch = field(default_factory=Touch)
+    drift: Drift = field(default_factory=Drift)
+
+
+class Mqtt(_Table, frozen=True):
+    """The broker. The password is never stored here: it is read from a file or credential."""
+
+    host: str = "localhost"
+    port: Annotated[int, Meta(ge=1, le=65535)] = 1883
+    #: Instead of `host`: nodes of a cluster or independent brokers, as "host" or "host:port".
+    brokers: Annotated[list[Annotated[str, Meta(pattern=_ADDRESS)]], Meta(max_length=16)] = []
+    protocol: Literal["5", "3.1.1"] = "5"
+    base: str = "skin"
+    username: str | None = None
+    #: A file with the password; otherwise systemd's credential `mqtt-password`.
+    password_file: str | None = None
+    tls: bool = False
+    ca_file: str | None = None
+    certificate_file: str | None = None
+    key_file: str | None = None
+    keepalive_s: Annotated[int, Meta(ge=5, le=3600)] = 10
+    encoding: Literal["json", "cbor"] = "json"
+    frame_hz: Annotated[float, Meta(ge=0)] = 0.0
+    event_queue: Annotated[int, Meta(ge=16, le=1_000_000)] = 10_000
+    commands: bool = True
+    #: Publish the parts to Home Assistant below this prefix, usually "homeassistant".
+    discovery_prefix: Annotated[str, Meta(pattern=r"^[a-zA-Z0-9_/-]+$")] | None = None
+
+
+class Receive(_Table, frozen=True):
+    """The receive path, see docs/receive.md."""
+
+    poll_ms: Annotated[float, Meta(gt=0, le=1000)] = 4.0
+    buffer_bytes: Annotated[int, Meta(ge=65536)] = 4_194_304
+    #: A sweep with missing triangles is closed after this many periods.
+    close_periods: Positive = 0.9
+    silent_periods: Positive = 4.0
+
+
+class Service(_Table, frozen=True):
+    """The daemon as a whole."""
+
+    #: Calibrations and recordings; default: systemd's $STATE_DIRECTORY, otherwise XDG state.
+    state_directory: str | None = None
+    #: Prometheus text on this port of localhost; 0 is off.
+    metrics_port: Annotated[int, Meta(ge=0, le=65535)] = 0
+
+
+class Settings(_Table, frozen=True):
+    """A whole configuration file."""
+
+    robot: Name
+    buses: Annotated[dict[Name, Bus], Meta(min_length=1)]
+    boards: Annotated[dict[Name, Board], Meta(min_length=1)]
+    parts: Annotated[dict[Name, Part], Meta(min_length=1)]
+    #: Kinds of sensor unit beyond the built-in ones.
+    kinds: dict[Name, Kind] = {}
+    #: Fingertips on force/torque boards.
+    fingertips: dict[Name, Fingertip] = {}
+    processing: Processing = field(default_factory=Processing)
+    mqtt: Mqtt = field(default_factory=Mqtt)
+    receive: Receive = field(default_factory=Receive)
+    service: Service = field(default_factory=Service)
+
+
+def parse_triangles(text: str) -> list[int]:
+    """Turn "0-4,8" into [0, 1, 2, 3, 4, 8].
+
+    Raises:
+        ValueError: not such a list, a number outside 0..15, or one named twice.
+    """
+    numbers: list[int] = []
+    for item in text.split(","):
+        first, dash, last = item.strip().partition("-")
+        if not first.isdecimal() or (dash and not last.isdecimal()):
+            raise ValueError(f'"{text}": seen "{item.strip()}", wanted a list such as "0-4,8"')
+        low, high = int(first), int(last if dash else first)
+        if max(low, high) >= TRIANGLES_PER_BOARD:
+            raise ValueError(f'"{text}": a board has triangles 0 to {TRIANGLES_PER_BOARD - 1}')
+        if high < low:
+            raise ValueError(f'"{text}": the range "{item.strip()}" is reversed')
+        numbers.extend(range(low, high + 1))
+    if len(set(numbers)) != len(numbers):
+        raise ValueError(f'"{text}": a triangle is named twice')
+    return numbers
+
+
+def read_toml(path: Path, table: type[T], named: Named) -> T:
+    """Read a file whose keys are those of a table.
+
+    Args:
+        path: of the file.
+        table: what it must be.
+        named: its sections that hold tables by name, and the type of these.
+
+    Raises:
+        ConfigurationError: unreadable, not TOML, or wrong; the message names file and key.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from None
+    try:
+        found = msgspec.toml.decode(data, type=table)
+    except msgspec.ValidationError as error:
+        what = explain(msgspec.toml.decode(data), error, table, named)
+        raise ConfigurationError(f"{path}: {what}") from None
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise ConfigurationError(f"{path}: not TOML: {error}") from None
+    except RecursionError:
+        raise ConfigurationError(f"{path}: not a configuration: nested too deep") from None
+    for where, number in not_finite(msgspec.toml.decode(data)):
+        raise ConfigurationError(f"{path}: {where}: seen {number}, wanted a finite number")
+    return found
+
+
+def load(path: Path) -> Settings:
+    """Read and check a configuration file.
+
+    Raises:
+        ConfigurationError: unreadable, not TOML, or wrong; the message names file and key.
+    """
+    named: Named = {
+        "buses": Bus,
+        "boards": Board,
+        "parts": Part,
+        "kinds": Kind,
+        "fingertips": Fingertip,
+    }
+    settings = read_toml(path, Settings, named)
+    _check_references(path, settings)
+    processing = settings.processing
+    relaxation = with_file(processing.relaxation, path)
+    processing = msgspec.structs.replace(processing, relaxation=relaxation)
+    return msgspec.structs.replace(settings, processing=processing)
+
+
+def _check_references(path: Path, settings: Settings) -> None:
+    def wrong(where: str, what: str) -> ConfigurationError:
+        return ConfigurationError(f"{path}: {where}: {what}")
+
+    addresses: dict[tuple[str, int], str] = {}
+    for name, board in settings.boards.items():
+        if board.bus not in settings.buses:
+            raise wrong(f"boards.{name}.bus", f'no bus "{board.bus}"; {_known(settings.buses)}')
+        twin = addresses.setdefault((board.bus, board.address), name)
+        if twin != name:
+            raise wrong(
+                f"boards.{name}.address",
+                f'{board.address} on bus "{board.bus}" is already that of board "{twin}"',
+            )
+    used: dict[tuple[str, int], str] = {}
+    if "nodes" in settings.parts:
+        raise wrong("parts.nodes", "the name is taken by the topics of the nodes; choose another")
+    for part_name, part in settings.parts.items():
+        for number, patch in enumerate(part.patches):
+            where = f"parts.{part_name}.patches[{number}]"
+            if patch.board not in settings.boards:
+                known = _known(settings.boards)
+                raise wrong(f"{where}.board", f'no board "{patch.board}"; {known}')
+            try:
+                triangles = parse_triangles(patch.triangles)
+            except ValueError as error:
+                raise wrong(f"{where}.triangles", str(error)) from None
+            for triangle in triangles:
+                other = used.setdefault((patch.board, triangle), where)
+                if other != where:
+                    raise wrong(
+                        f"{where}.triangles",
+                        f'triangle {triangle} of board "{patch.board}" is already in {other}',
+                    )
+            if patch.places and patch.positions is not None:
+                raise wrong(where, "has both `places` and `positions`; wanted one of them")
+    unused = set(settings.boards) - {board for board, _ in used}
+    if unused:
+        raise wrong(f"boards.{min(unused)}", "no part uses this board; remove it or add a patch")
+    _check_fingertips(settings, wrong)
+    misfit = wrong_parameters(settings.processing.relaxation)
+    if misfit is not None:
+        raise wrong("processing.relaxation", misfit)
+
+
+def _check_fingertips(settings: Settings, wrong: Callable[[str, str], ConfigurationError]) -> None:
+    addresses = {
+        (board.bus, board.address): f'board "{name}"' for name, board in settings.boards.items()
+    }
+    nodes = {part.node for part in settings.parts.values()}
+    for name, tip in settings.fingertips.items():
+        where = f"fingertips.{name}"
+        if name in settings.parts or name == "nodes":
+            raise wrong(where, "the name is taken by another's topics; choose another")
+        if tip.bus not in settings.buses:
+            raise wrong(f"{where}.bus", f'no bus "{tip.bus}"; {_known(settings.buses)}')
+        twin = addresses.setdefault((tip.bus, tip.address), where)
+        if twin != where:
+            what = f'{tip.address} on bus "{tip.bus}" is already that of {twin}'
+            raise wrong(f"{where}.address", what)
+        if tip.array is not None and tip.array not in settings.parts:
+            raise wrong(f"{where}.array", f'no part "{tip.array}"; {_known(settings.parts)}')
+        if tip.array is not None and settings.parts[tip.array].node != tip.node:
+            raise wrong(f"{where}.node", f'"{tip.node}", but its array belongs to another node')
+        if tip.node not in nodes:
+            raise wrong(f"{where}.node", f'no part belongs to node "{tip.node}"')
+        for key, what in tip.wrong_values():
+            raise wrong(f"{where}.{key}", what)
+
+
+def _known(table: dict[str, Any]) -> str:
+    return "there are: " + ", ".join(table)
+
+
+def changed(settings: T, values: Mapping[str, Any]) -> T:
+    """Return a copy of settings with other values, by their keys: {"mqtt.port": 1883}.
+
+    Raises:
+        KeyError: there is no such key.
+    """
+    for path, value in values.items():
+        settings = _changed(settings, path.split("."), value)
+    return settings
+
+
+def _changed(table: Any, keys: list[str], value: Any) -> Any:
+    key, *rest = keys
+    known = table if isinstance(table, dict) else msgspec.structs.asdict(table)
+    if key not in known:
+        raise KeyError(key)
+    inner = _changed(known[key], rest, value) if rest else value
+    if isinstance(table, dict):
+        return table | {key: inner}
+    return msgspec.structs.replace(table, **{key: inner})
+
+
+#: Settings of parts that a running node can change, besides `processing`.
+_OF_PARTS = ("covered", "foam_mm", "frames", "localization", "probe_mm")
+_OF_PATCHES = ("places", "positions")
+
+
+def load_running(path: Path) -> Settings:
+    """Return a daemon's configuration, from the JSON that it wrote at its start.
+
+    Raises:
+        RequestError: it is absent or damaged.
+    """
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=Settings)
+    except OSError as error:
+        raise RequestError(
+            f"{path}: {error.strerror}; a daemon that runs under systemd writes it"
+        ) from None
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise RequestError(f"{path}: damaged: {error}; restart the daemon") from None
+
+
+def needs_restart(old: Settings, new: Settings) -> str | None:
+    """Return the first key that differs and that a running node cannot change.
+
+    All keys that are not listed here as changeable must be equal, and in the same order.
+    """
+    same = changed(new, {"processing": old.processing})
+    for name, part in old.parts.items():
+        if name not in new.parts or len(new.parts[name].patches) != len(part.patches):
+            return f"parts.{name}"
+        taken = {key: getattr(part, key) for key in _OF_PARTS}
+        patches = [
+            msgspec.structs.replace(its, **{key: getattr(mine, key) for key in _OF_PATCHES})
+            for mine, its in zip(part.patches, new.parts[name].patches, strict=True)
+        ]
+        part = msgspec.structs.replace(new.parts[name], patches=patches, **taken)  # noqa: PLW2901
+        same = changed(same, {f"parts.{name}": part})
+    return _first_difference(msgspec.to_builtins(old), msgspec.to_builtins(same))
+
+
+def _first_difference(old: Any, new: Any, where: str = "") -> str | None:
+    if not isinstance(old, dict) or not isinstance(new, dict):
+        return where if old != new else None
+    if list(old) != list(new):
+        return where or "the tables"
+    for key in old:
+        found = _first_difference(old[key], new[key], f"{where}.{key}" if where else key)
+        if found is not None:
+            return found
+    return None
+
+
+def skin_hash(settings: Settings) -> str:
+    """Return a hash of what a calibration belongs to: boards, their set-up, parts and fingertips.
+
+    Twelve hexadecimal digits. Processing, publishing and channel names do not count, so
+    a calibration survives a change of the threshold or a move to another interface.
+    """
+    boards = {
+        name: [board.bus, board.address, board.skin_type, board.no_load]
+        for name, board in settings.boards.items()
+    }
+    parts = {
+        name: [
+            [patch.board, patch.triangles, patch.kind, patch.shift, patch.cdc_offset]
+            for patch in part.patches
+        ]
+        for name, part in settings.parts.items()
+    }
+    described: list[Any] = [boards, parts]
+    if settings.fingertips:
+        tips = settings.fingertips.items()
+        described.append({name: [tip.bus, tip.address, tip.full_scale] for name, tip in tips})
+    return hashlib.sha256(msgspec.json.encode(described)).hexdigest()[:12]

@@ -1,0 +1,1 @@
+"""The service: reads the buses, runs the processing, publishes, and obeys its operator."""

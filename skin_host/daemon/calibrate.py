@@ -1,0 +1,140 @@
+"""Takes a calibration without a daemon, and finds the stored one."""
+
+import asyncio
+import contextlib
+import logging
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from skin_host.clock import SYSTEM, Clock
+from skin_host.config.settings import Settings, skin_hash
+from skin_host.daemon import service
+from skin_host.daemon.link import Link
+from skin_host.errors import CalibrationError, OtherSkinError, SkinError
+from skin_host.files import set_aside
+from skin_host.layout import Layout
+from skin_host.processing import calibration as calibrations
+from skin_host.processing.calibration import Calibration
+from skin_host.processing.core import Engine
+
+log = logging.getLogger(__name__)
+
+#: If nothing was received for this long, a calibration ends with what it has.
+GRACE_S = 5.0
+
+
+async def take_calibration(
+    settings: Settings,
+    layout: Layout,
+    parts: list[int],
+    seconds: float,
+    progress: Callable[[float], None],
+    clock: Clock = SYSTEM,
+) -> Calibration:
+    """Bring up the boards of some parts and calibrate them.
+
+    Raises:
+        BusError: a bus cannot be opened.
+        SkinError: no board sent a sweep.
+    """
+    engine = Engine(settings, layout, parts)
+    link = Link(engine, clock=clock)
+    tasks = [
+        asyncio.create_task(link.read(lambda _: None)),
+        asyncio.create_task(_supervise(link, clock)),
+    ]
+    try:
+        # A bus without any other node never takes the set-up; the time limit reports that.
+        async with clock.timeout(GRACE_S):
+            await link.bring_up()
+        with contextlib.suppress(TimeoutError):
+            async with clock.timeout(GRACE_S):
+                while not link.all_alive():
+                    await clock.sleep(0.05)
+        return await collect(lambda: engine, seconds, progress, clock)
+    except TimeoutError:
+        raise SkinError(
+            "the boards could not be set up: no node acknowledges; check with `skin scan` "
+            "whether they are powered and answer"
+        ) from None
+    finally:
+        await link.stop()
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        link.close()
+
+
+async def _supervise(link: Link, clock: Clock) -> None:
+    """Set up boards again that are late, or missed their set-up."""
+    while True:
+        await clock.sleep(0.5)
+        link.supervise()
+
+
+async def collect(
+    engine: Callable[[], Engine],
+    seconds: float,
+    progress: Callable[[float], None] = lambda _: None,
+    clock: Clock = SYSTEM,
+) -> Calibration:
+    """Let a running engine collect a calibration.
+
+    Args:
+        engine: returns the engine in use, which may be replaced meanwhile.
+        seconds: how long.
+        progress: is called with the share that has been collected.
+        clock: for waiting.
+
+    Raises:
+        SkinError: no board sent a sweep.
+    """
+    engine().begin_calibration(seconds)
+    grown_s = clock.monotonic_s()
+    share = 0.0
+    while share < 1.0 and clock.monotonic_s() - grown_s < GRACE_S:
+        await clock.sleep(0.02)
+        before, share = share, engine().calibration_progress()
+        if share > before:
+            grown_s = clock.monotonic_s()
+        progress(share)
+    found = engine().end_calibration(clock.today().isoformat(timespec="seconds"))
+    if share == 0.0:
+        raise SkinError(
+            "no calibration: no board sent a sweep; check with `skin scan` whether the boards are "
+            "powered and answer"
+        )
+    return found
+
+
+def calibration_path(settings: Settings, node: str) -> Path:
+    """Where a node keeps its calibration."""
+    directory = service.state_directory(settings.service.state_directory)
+    return directory / f"{settings.robot}-{node}.calibration.json"
+
+
+def stored_calibration(settings: Settings, layout: Layout, node: str) -> Calibration | None:
+    """Return the stored calibration, or None if there is none.
+
+    An unreadable one counts as none, so that a service can continue without it. So does a damaged
+    one, which is set aside.
+
+    Raises:
+        OtherSkinError: it belongs to another configuration or robot.
+        NewerFileError: a newer version has written it.
+    """
+    path = calibration_path(settings, node)
+    if not os.access(path, os.F_OK):
+        return None
+    if not os.access(path, os.R_OK):
+        log.error("%s: cannot be read: no permission; a new one is taken", path)
+        return None
+    try:
+        return calibrations.load(path, layout, skin_hash(settings))
+    except OtherSkinError:
+        raise
+    except CalibrationError as error:
+        log.warning("%s", error)
+        set_aside(path)
+        return None

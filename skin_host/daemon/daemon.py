@@ -1,0 +1,417 @@
+"""The composition root: opens the buses, connects the components, and owns the loop."""
+
+import asyncio
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+
+from skin_host import __version__
+from skin_host.bus.opening import open_port
+from skin_host.bus.wire import FrameBatch
+from skin_host.clock import SYSTEM, Clock
+from skin_host.config.settings import Settings, load, needs_restart, skin_hash
+from skin_host.daemon import metrics, service
+from skin_host.daemon.calibrate import calibration_path, collect
+from skin_host.daemon.control import Control
+from skin_host.daemon.link import Link, OpenPort
+from skin_host.daemon.state import State, Thresholds, load_state, save_state
+from skin_host.errors import ConfigurationError, RequestError, SkinError
+from skin_host.fingertip.health import FingertipRecord
+from skin_host.fingertip.publishing import FingertipPublisher
+from skin_host.health import Health, Record
+from skin_host.health.fault_log import FaultLog
+from skin_host.layout import Layout, build_layout, parts_of
+from skin_host.mqtt.connection import connect
+from skin_host.mqtt.contact import PartContact
+from skin_host.mqtt.info import CalibrationInfo, NodeInfo, node_info
+from skin_host.mqtt.publisher import Connect, Publisher
+from skin_host.processing import calibration as calibrations
+from skin_host.processing.calibration import Calibration
+from skin_host.processing.core import Engine, Output
+
+log = logging.getLogger(__name__)
+
+#: Health is computed this often, and published at once when something changes ...
+LOOK_S = 0.1
+#: ... otherwise this often.
+HEALTH_S = 1.0
+#: Faults that are expected while a calibration is being taken.
+_UNTIL_CALIBRATED = {"part_not_calibrated", "fingertip_not_calibrated"}
+#: The time of day was set if it differs by more than this from the monotonic time.
+JUMP_NS = 50_000_000
+#: Readiness is reported after the first sweeps, or after this time without them.
+PATIENCE_S = 3.0
+
+
+class Daemon:
+    """One node of one robot: its share of the buses, boards and parts.
+
+    Args:
+        settings: the configuration.
+        layout: its skin.
+        node: which parts are ours.
+        calibration: to start with; None takes one as soon as the boards send.
+        folder: relative file names in the settings start from here.
+        configuration: the file that `reload` reads again.
+        clock: for time, waiting and threads.
+        open_port: opens buses, see `bus.opening.open_port`.
+        connect: connects to the broker, see `publish.connection.connect`.
+        share: makes of a configuration that was read again the one of this daemon, see `sharing`.
+
+    Attributes:
+        settings, layout: in use, with the changes that operators made.
+        thresholds: these changes.
+        unkept: what could not be written to the state directory (`calibration`, `state`), and why.
+
+    Raises:
+        ConfigurationError: no part belongs to this node, or python-can does not know the kind
+            of a bus.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        layout: Layout,
+        node: str = "main",
+        calibration: Calibration | None = None,
+        folder: Path = Path(),
+        configuration: Path | None = None,
+        clock: Clock = SYSTEM,
+        open_port: OpenPort = open_port,
+        connect: Connect = connect,
+        share: Callable[[Settings], Settings] = lambda settings: settings,
+    ) -> None:
+        self.clock = clock
+        self._share = share
+        self.settings = settings
+        self.layout = layout
+        self._node = node
+        self._configuration = configuration
+        state = load_state(self._state_path())
+        self._configured = settings
+        self.thresholds = state.thresholds
+        self.settings = settings = state.thresholds.over_settings(settings)
+        self.engine = Engine(settings, layout, parts_of(layout, node), calibration)
+        self.engine.disabled = {
+            i for i in self.engine.parts if layout.parts[i].name in state.disabled
+        }
+        self.engine.touch_only = _touch_only(settings, layout, self.engine.parts)
+        self.health = Health(self.engine)
+        self.control = Control(self)
+        self.publisher = Publisher(
+            settings.mqtt,
+            layout.robot,
+            node,
+            handler=self.control.handle,
+            folder=folder,
+            clock=clock,
+            connect=connect,
+        )
+        self.publisher.put_info(self._info())
+        self._contacts = {i: PartContact(layout, i) for i in self.engine.parts}
+        for i in self.engine.parts:
+            # The state that the broker retained from an earlier start is no longer known.
+            self.publisher.put_contact(layout.parts[i].name, "UNKNOWN")
+        self.fingertips = FingertipPublisher(self.engine.fingertips, self.publisher)
+        self.link = Link(self.engine, wait=True, open_port=open_port, clock=clock)
+        self.unkept: dict[str, str] = {}
+        self._calibration_lock = asyncio.Lock()
+        self._feed_s = service.watchdog_interval_s()
+        self._fed_s = 0.0
+        self._status_s = 0.0
+        self._fault_log = FaultLog()
+        self._clock_ahead_ns = self._clock_against_ns()
+
+    async def run(self, stop: asyncio.Event, *, calibrate: bool = False) -> None:
+        """Run until `stop` is set; then end every touch, stop the boards and disconnect.
+
+        Args:
+            stop: set it to end.
+            calibrate: take a calibration at the start even if there is one.
+        """
+        try:
+            async with self.publisher:
+                await self._work(stop, calibrate)
+        finally:
+            await self.control.close()
+            self.link.close()
+
+    async def _work(self, stop: asyncio.Event, calibrate: bool) -> None:
+        tasks = [
+            asyncio.create_task(self.link.read(self._deliver, self._record), name="read"),
+            asyncio.create_task(self._start(calibrate), name="start"),
+            asyncio.create_task(self._housekeep(), name="housekeeping"),
+        ]
+        if self.settings.service.metrics_port:
+            serving = metrics.serve(self.settings.service.metrics_port, self.status, self.clock)
+            tasks.append(asyncio.create_task(serving, name="metrics"))
+        stopping = asyncio.create_task(stop.wait(), name="stop")
+        try:
+            await _first_failure(tasks, stopping)
+        finally:
+            service.notify("STOPPING=1")
+            for task in [*tasks, stopping]:
+                task.cancel()
+            await asyncio.gather(*tasks, stopping, return_exceptions=True)
+            for part in self.engine.parts:
+                self._end_contacts(part)
+            self.fingertips.end(self.clock.now_ns())
+            await self.link.stop()
+
+    async def calibrate(self, seconds: float, boards: list[int] | None = None) -> Calibration:
+        """Take a calibration, use it from then on, and store it.
+
+        Args:
+            seconds: how long to observe the untouched skin.
+            boards: indices of those whose taxels are calibrated; all by default.
+
+        Raises:
+            SkinError: another one is being taken, or no data came.
+        """
+        if self._calibration_lock.locked():
+            raise SkinError("a calibration is being taken already; wait for it to end")
+        async with self._calibration_lock:
+            log.info("calibrating for %g s: keep the skin untouched", seconds)
+            found = await collect(lambda: self.engine, seconds, clock=self.clock)
+            known = self.engine.calibration
+            if known is not None:
+                chosen = self.engine.boards if boards is None else boards
+                found = calibrations.merge(
+                    known, found, self.engine.taxels_of(chosen), zeros=boards is None
+                )
+            path = calibration_path(self.settings, self._node)
+            if known is None:
+                found = await self.clock.in_thread(
+                    calibrations.with_gains_of, found, path, self.layout
+                )
+            self.engine.use(found, boards)
+            try:
+                await self.clock.in_thread(calibrations.save, path, found, self.layout)
+            except OSError as error:
+                # The calibration is in use anyway; a restart will need a new one.
+                self.unkept["calibration"] = f"{path}: {error.strerror}"
+                log.error("calibration not kept: %s", self.unkept["calibration"])
+            else:
+                self.unkept.pop("calibration", None)
+                log.info("calibration %s kept in %s", found.id, path)
+            self.publisher.put_info(self._info())
+            return found
+
+    def disable(self, part: int) -> None:
+        """Publish only the health of a part from now on."""
+        self.engine.disabled.add(part)
+        self._end_contacts(part)
+
+    def set_thresholds(self, thresholds: Thresholds) -> None:
+        """Apply these changes to the configured touch thresholds; baselines are kept."""
+        self.thresholds = thresholds
+        self._swap(self._configured, self.layout)
+
+    async def configure(self, boards: list[int] | None = None) -> list[str]:
+        """Send boards (indices; all by default) their set-up again; return their names.
+
+        Raises:
+            BusError: a bus does not take frames.
+        """
+        chosen = self.engine.boards if boards is None else boards
+        await self.link.set_up(chosen)
+        return [self.layout.boards[board].name for board in chosen]
+
+    async def reload(self) -> None:
+        """Read the configuration file again and send it to the boards.
+
+        Settings of processing and of the boards' set-up take effect; the calibration stays.
+
+        Raises:
+            RequestError: the file is wrong, or changes what only a restart can change; then nothing
+                changes.
+        """
+        if self._configuration is None:
+            raise RequestError("started without a configuration file: nothing to read again")
+        settings = self._share(await self.clock.in_thread(load, self._configuration))
+        try:
+            layout = await self.clock.in_thread(build_layout, settings, self._configuration.parent)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{self._configuration}: {error}") from None
+        what = needs_restart(self._configured, settings)
+        if what is not None:
+            raise RequestError(f"{self._configuration}: {what} changed; that needs a restart")
+        self._configured = settings
+        self._swap(settings, layout)
+        log.info("%s read again; the boards are set up again", self._configuration)
+        await self.configure()
+        self.publisher.put_info(self._info())
+
+    def keep(self, state: State) -> None:
+        """Write what operators changed to the state directory.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        path = self._state_path()
+        try:
+            save_state(path, state)
+        except OSError as error:
+            self.unkept["state"] = f"{path}: {error.strerror}"
+            raise
+        self.unkept.pop("state", None)
+
+    def records(self) -> dict[str, Record]:
+        """The health record of every part, as it is now."""
+        return {self.layout.parts[part].name: self._record_of(part) for part in self.engine.parts}
+
+    def status(self) -> dict[str, Record | FingertipRecord]:
+        """The same with the fingertips on force/torque boards."""
+        return {**self.records(), **self.fingertips.records(self.link.read_ns)}
+
+    def _swap(self, configured: Settings, layout: Layout) -> None:
+        """Replace the engine by one with other settings, which continues its state."""
+        settings = self.thresholds.over_settings(configured)
+        engine = Engine(settings, layout, self.engine.parts, after=self.engine)
+        engine.touch_only = _touch_only(settings, layout, engine.parts)
+        self.settings, self.layout, self.engine = settings, layout, engine
+        self.link.use(engine)
+        self.health.use(engine)
+
+    def _end_contacts(self, part: int) -> None:
+        events = self.engine.end_part(part, self.clock.now_ns())
+        for event in events:
+            self.publisher.put_touch(event)
+        self.publisher.put_contact(self.layout.parts[part].name, self._contacts[part].stop(events))
+
+    async def _start(self, calibrate: bool) -> None:
+        """Bring the boards up, then calibrate if necessary."""
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._report_ready())
+            await self.link.bring_up()
+        while calibrate or self.engine.calibration is None:
+            try:
+                await self.calibrate(self.settings.processing.calibration.seconds)
+                break
+            except SkinError as error:
+                log.warning("%s", error)
+        await asyncio.Event().wait()
+
+    async def _report_ready(self) -> None:
+        """Report readiness: buses open, and first sweeps or a timeout. Health reports a dead
+        bus.
+        """
+        deadline_s = self.clock.monotonic_s() + PATIENCE_S
+        while not self.link.all_alive():
+            if self.clock.monotonic_s() > deadline_s:
+                break
+            await self.clock.sleep(0.05)
+        service.notify("READY=1")
+
+    def _deliver(self, output: Output) -> None:
+        self.fingertips.deliver(output.grasps)
+        # Touches first, so that they leave before the frames are encoded.
+        for step in output.steps:
+            for event in step.events:
+                self.publisher.put_touch(event)
+        self.health.note(output)
+        self._follow_clock()
+        for step in output.steps:
+            state = self._contacts[step.part].step(step.frame, step.events)
+            self.publisher.put_contact(step.frame.part, state)
+            if step.part not in self.engine.touch_only:
+                self.publisher.put_frame(step.frame)
+        # Notify systemd's watchdog only here, after work that was done.
+        now_s = self.clock.monotonic_s()
+        if self._feed_s is not None and now_s - self._fed_s > 0.5 * self._feed_s:
+            self._fed_s = now_s
+            service.notify("WATCHDOG=1")
+
+    def _clock_against_ns(self) -> int:
+        return self.clock.now_ns() - self.clock.monotonic_ns()
+
+    def _follow_clock(self) -> None:
+        """Notice that the time of day was set, by which nothing has gone unfelt."""
+        ahead_ns = self._clock_against_ns()
+        jump_ns = ahead_ns - self._clock_ahead_ns
+        if abs(jump_ns) > JUMP_NS:
+            self._clock_ahead_ns = ahead_ns
+            for contact in self._contacts.values():
+                contact.follow_clock(jump_ns)
+
+    def _record(self, bus: str, batch: FrameBatch) -> None:
+        if self.control.recorder is not None:
+            self.control.recorder.put(self.settings.buses[bus].channel, batch)
+
+    async def _housekeep(self) -> None:
+        """Supervise the boards, publish health, log faults, set the status line."""
+        said: dict[int, tuple[object, ...]] = {}
+        said_s = dict.fromkeys(self.engine.parts, 0.0)
+        while True:
+            await self.clock.sleep(LOOK_S)
+            self.link.supervise()
+            now_s = self.clock.monotonic_s()
+            self.health.tick(self.link.read_ns, self.link.ports, self.link.boards)
+            told = self.fingertips.publish_health(self.link.read_ns)
+            for part in self.engine.parts:
+                await self.clock.sleep(0)  # the reader must not wait for all parts
+                record = self._record_of(part)
+                told |= {
+                    (fault["code"], fault["where"]): says
+                    for fault, says in zip(record["faults"], record["sentences"], strict=True)
+                }
+                # Without the sentences, because numbers in them change all the time.
+                state = (record["state"], {(one["code"], one["where"]) for one in record["faults"]})
+                if said.get(part) != state or now_s - said_s[part] >= HEALTH_S:
+                    said[part], said_s[part] = state, now_s
+                    self.publisher.put_health(self.layout.parts[part].name, record)
+            if self.engine.calibrating:
+                told = {key: says for key, says in told.items() if key[0] not in _UNTIL_CALIBRATED}
+            self._fault_log.note(told, now_s)
+            if now_s - self._status_s >= HEALTH_S:
+                self._status_s = now_s
+                service.notify("STATUS=" + self._status(len(told)))
+
+    def _record_of(self, part: int) -> Record:
+        link = self.link
+        output = msgspec.to_builtins(self.publisher.counters)
+        return self.health.record(part, link.read_ns, link.ports, link.boards, output, self.unkept)
+
+    def _status(self, faults: int) -> str:
+        rates = self.health.rates()
+        dropped = sum(port.counters.dropped for port in self.link.ports.values())
+        broker = "connected" if self.publisher.counters.connected else "away"
+        return (
+            f"{rates['frames_hz']:.0f} frames/s, {rates['sweeps_hz']:.1f} sweeps/s, "
+            f"{dropped} dropped, {faults} faults, broker {broker}"
+        )
+
+    def _info(self) -> NodeInfo:
+        found = self.engine.calibration
+        info = None if found is None else CalibrationInfo(found.id, found.time)
+        return node_info(
+            self.layout,
+            self._node,
+            version=__version__,
+            configuration=skin_hash(self.settings),
+            encoding=self.settings.mqtt.encoding,
+            frame_hz=self.settings.mqtt.frame_hz,
+            calibration=info,
+            commands=self.settings.mqtt.commands,
+            fingertips=self.settings.fingertips,
+        )
+
+    def _state_path(self) -> Path:
+        directory = service.state_directory(self.settings.service.state_directory)
+        return directory / f"{self.settings.robot}-{self._node}.state.json"
+
+
+def _touch_only(settings: Settings, layout: Layout, parts: list[int]) -> set[int]:
+    """Return those of some parts whose frames are not published."""
+    return {i for i in parts if not settings.parts[layout.parts[i].name].frames}
+
+
+async def _first_failure(tasks: list[asyncio.Task[None]], stopping: "asyncio.Task[bool]") -> None:
+    """Wait for the stop request. A task that fails before it ends the daemon."""
+    done, _ = await asyncio.wait([*tasks, stopping], return_when=asyncio.FIRST_COMPLETED)
+    for task in done:
+        if task is not stopping:
+            task.result()
+            raise SkinError(f"the task {task.get_name()} ended by itself")

@@ -1,0 +1,251 @@
+"""The buses of one node: their ports, their boards, and the loop that reads them."""
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable
+from itertools import chain
+from typing import Protocol
+
+from skin_host.bus.boards import Boards
+from skin_host.bus.opening import open_port
+from skin_host.bus.port import Port
+from skin_host.bus.wake import WakeUp
+from skin_host.bus.wire import FrameBatch
+from skin_host.clock import SYSTEM, Clock
+from skin_host.config.settings import Bus, Receive
+from skin_host.errors import BusError, SkinError
+from skin_host.fingertip.boards import StrainBoards
+from skin_host.processing.core import Engine, Output
+
+log = logging.getLogger(__name__)
+
+#: Waiting sweeps and samples are checked this often.
+EXPIRE_NS = 20_000_000
+#: A bus that does not take the set-up of its boards is tried again after this.
+RETRY_S = 2.0
+STOP_S = 1.0
+
+
+class OpenPort(Protocol):
+    """How buses are opened."""
+
+    def __call__(
+        self, name: str, bus: Bus, receive: Receive, *, wait: bool = False, clock: Clock = SYSTEM
+    ) -> Port:
+        """See `bus.opening.open_port`."""
+
+
+class Link:
+    """Connects an engine to the buses that it needs.
+
+    Args:
+        engine: processes the frames.
+        wait: wait for a bus that cannot be opened, as for one that was unplugged.
+        open_port: opens a bus, see `bus.opening.open_port`.
+        clock: for waiting.
+
+    Attributes:
+        ports, boards: by name of the bus.
+        force_torque: the boards of fingertips, by name of the bus.
+        read_ns: everything received up to then has been read, on the clock of the frames' time
+            stamps. Ages count from here, not from now: a board whose frames wait unread has not
+            timed out.
+
+    Raises:
+        ConfigurationError: python-can has no such kind of interface.
+        BusError: a bus cannot be opened, and `wait` is not set. Those already open are closed
+            again.
+    """
+
+    def __init__(
+        self,
+        engine: Engine,
+        *,
+        wait: bool = False,
+        open_port: OpenPort = open_port,
+        clock: Clock = SYSTEM,
+    ) -> None:
+        self._clock = clock
+        self._engine = engine
+        self.read_ns = clock.now_ns()
+        self.ports: dict[str, Port] = {}
+        self.boards: dict[str, Boards] = {}
+        self.force_torque: dict[str, StrainBoards] = {}
+        fingertips = engine.fingertips
+        settings, layout = engine.settings, engine.layout
+        periods_ns = {i: layout.boards[i].settings.period_ms * 1_000_000 for i in engine.boards}
+        if fingertips is not None:
+            # Negative keys never collide with board indices.
+            for tip in fingertips.tips.values():
+                periods_ns[~tip.number] = tip.settings.period_ms * 1_000_000
+        alone = [(key,) for key in periods_ns if key < 0]
+        fastest_ns = [
+            min(periods_ns[one] for one in layout.parts[part].boards) for part in engine.parts
+        ]
+        fastest_ns += [periods_ns[key] for (key,) in alone]
+        self._wake_up = WakeUp(
+            settings.receive,
+            periods_ns,
+            clock,
+            lambda: chain(self._engine.missing(), alone),
+            sum(1e9 / period_ns for period_ns in fastest_ns),
+        )
+        self._expired_ns = 0
+        try:
+            for bus in engine.assemblers:
+                port = open_port(bus, settings.buses[bus], settings.receive, wait=wait, clock=clock)
+                self.ports[bus] = port
+                mine = [
+                    (i, layout.boards[i])
+                    for i in engine.boards
+                    if layout.boards[i].settings.bus == bus
+                ]
+                self.boards[bus] = Boards(
+                    bus,
+                    port,
+                    mine,
+                    layout.triangles,
+                    engine.ledger,
+                    self._zeroed,
+                    clock,
+                )
+                if fingertips is not None and (tips := fingertips.on_bus(bus)):
+                    self.force_torque[bus] = StrainBoards(
+                        bus, port, tips, lambda: engine.ledger.now_ns
+                    )
+        except SkinError:
+            self.close()
+            raise
+
+    def use(self, engine: Engine) -> None:
+        """Continue with another engine, which has the ledger of the one before."""
+        self._engine = engine
+
+    def _zeroed(self, board: int, believed: bool) -> None:
+        self._engine.rezero(board, believed)
+
+    async def read(
+        self,
+        deliver: Callable[[Output], None],
+        record: Callable[[str, FrameBatch], None] = lambda *_: None,
+    ) -> None:
+        """Read all buses for ever; pass the results to `deliver`.
+
+        Args:
+            deliver: called after each batch, and several times a second.
+            record: called with each received batch.
+        """
+        loop = asyncio.get_running_loop()
+
+        def work() -> None:
+            self.turn(self._clock.now_ns(), deliver, record)
+            # After the delivered results have been sent.
+            loop.call_soon(self._engine.judge)
+
+        await self._wake_up.run(work)
+
+    def turn(
+        self,
+        now_ns: int,
+        deliver: Callable[[Output], None],
+        record: Callable[[str, FrameBatch], None] = lambda *_: None,
+    ) -> None:
+        """Read every bus once.
+
+        Args:
+            now_ns: the time, on the clock of the frames' time stamps.
+            deliver, record: see `read`.
+        """
+        drained = True
+        for bus, port in self.ports.items():
+            batch = port.read()
+            if not len(batch):
+                continue
+            drained &= len(batch) < port.capacity
+            record(bus, batch)
+            output = self._engine.feed(bus, batch)
+            if output.answers:
+                self._note_answers(bus, output.answers)
+            self._note(output)
+            deliver(output)
+        if not drained:
+            return
+        self.read_ns = now_ns
+        self._engine.ledger.look(now_ns)
+        if not 0 <= now_ns - self._expired_ns < EXPIRE_NS:
+            self._expired_ns = now_ns
+            output = self._engine.expire(now_ns)
+            self._note(output)
+            deliver(output)
+
+    def _note(self, output: Output) -> None:
+        """Note that the next sweep of a board is one period later."""
+        for sweep in output.sweeps:
+            self._wake_up.sweep_ended(sweep.board, sweep.t_ns)
+        for number, t_ns in output.samples:
+            self._wake_up.sweep_ended(~number, t_ns)
+
+    def _note_answers(self, bus: str, answers: list[tuple[int, bytes]]) -> None:
+        self.boards[bus].note_answers(answers)
+        if bus in self.force_torque:
+            self.force_torque[bus].claim(self.boards[bus].strangers)
+
+    async def bring_up(self) -> None:
+        """Set up and start the boards of every bus; a bus where that fails is tried again for
+        ever.
+        """
+        await asyncio.gather(*(self._bring_up(boards) for boards in self._all_boards()))
+
+    async def set_up(self, boards: list[int]) -> None:
+        """Send boards, by index, their set-up again and start them.
+
+        Raises:
+            BusError: a bus does not take frames.
+        """
+        layout = self._engine.layout
+        chosen = [layout.boards[board].settings for board in boards]
+        await asyncio.gather(*(self.boards[one.bus].set_up(one.address) for one in chosen))
+
+    def supervise(self) -> None:
+        """Supervise the boards: those that timed out, and those that lost their set-up."""
+        for boards in self._all_boards():
+            boards.supervise()
+
+    def all_alive(self) -> bool:
+        """Whether every board has sent at least one sweep, or sample of a fingertip."""
+        fingertips = self._engine.fingertips
+        if fingertips is not None and not all(tip.frames for tip in fingertips.tips.values()):
+            return False
+        return bool(self._engine.ledger.sweeps.all())
+
+    async def stop(self) -> None:
+        """Command the boards to stop, as far as their buses still work."""
+        for boards in self._all_boards():
+            with contextlib.suppress(BusError, TimeoutError):
+                async with self._clock.timeout(STOP_S):
+                    await boards.stop()
+
+    def close(self) -> None:
+        """Close the interfaces."""
+        for port in self.ports.values():
+            port.close()
+
+    def _all_boards(self) -> list[Boards | StrainBoards]:
+        return [*self.boards.values(), *self.force_torque.values()]
+
+    async def _bring_up(self, boards: Boards | StrainBoards) -> None:
+        told = ""
+        while True:
+            try:
+                if isinstance(boards, Boards):
+                    # Touches cannot be detected without a calibration.
+                    await boards.bring_up(listen=self._engine.calibration is not None)
+                else:
+                    await boards.bring_up()
+                return
+            except BusError as error:
+                if str(error) != told:
+                    log.warning("%s", error)
+                    told = str(error)
+                await self._clock.sleep(RETRY_S)

@@ -1,0 +1,79 @@
+"""State that a node keeps over a restart, besides its calibration: changes by operators.
+
+It is a file of the state directory, written completely or not at all. A damaged one is set aside
+and reported, so that the service can always start.
+"""
+
+import logging
+import os
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta, Struct, field
+
+from skin_host.config.fields import Name
+from skin_host.config.settings import Settings, Touch, changed
+from skin_host.files import read_document, set_aside, write_atomic
+
+log = logging.getLogger(__name__)
+
+SCHEMA = "skin.state/1"
+
+
+class Thresholds(Struct, forbid_unknown_fields=True, omit_defaults=True):
+    """Changes to the touch decision; None where the configuration's number applies."""
+
+    margin_units: Annotated[float, Meta(ge=0, le=255)] | None = None
+    minimum_threshold_units: Annotated[float, Meta(ge=0, le=255)] | None = None
+    hysteresis_units: Annotated[float, Meta(ge=0, le=255)] | None = None
+    votes_of_3: Literal[1, 2, 3] | None = None
+
+    def over(self, touch: Touch) -> Touch:
+        """Return the settings with these changes."""
+        changes = msgspec.structs.asdict(self)
+        known = {key: value for key, value in changes.items() if value is not None}
+        return msgspec.structs.replace(touch, **known)
+
+    def over_settings(self, settings: Settings) -> Settings:
+        """Return a whole configuration with these changes."""
+        touch = self.over(settings.processing.touch)
+        return changed(settings, {"processing.touch": touch})
+
+
+class State(Struct, forbid_unknown_fields=True):
+    """Changes by operators since the configuration was written."""
+
+    schema: str = SCHEMA
+    disabled: list[Name] = []
+    thresholds: Thresholds = field(default_factory=Thresholds)
+
+
+def load_state(path: Path) -> State:
+    """Read the state of a node.
+
+    A missing or unreadable file gives an unchanged one; so does a damaged one, which is set aside.
+
+    Raises:
+        NewerFileError: a newer version has written it.
+    """
+    if not os.access(path, os.F_OK):
+        return State()
+    if not os.access(path, os.R_OK):
+        log.error("%s: cannot be read: no permission; starting without it", path)
+        return State()
+    try:
+        return read_document(path, State, SCHEMA, "state", ValueError)
+    except ValueError as error:
+        log.error("%s: damaged (%s); starting without it", path, error)
+        set_aside(path)
+        return State()
+
+
+def save_state(path: Path, state: State) -> None:
+    """Store the state of a node.
+
+    Raises:
+        OSError: it cannot be written; the old one is unchanged.
+    """
+    write_atomic(path, msgspec.json.format(msgspec.json.encode(state), indent=1) + b"\n")

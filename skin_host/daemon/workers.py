@@ -1,0 +1,129 @@
+"""`skin run --workers N`: one daemon for each share of a node, started by this process.
+
+For systemd they are one service: it is ready when all are, its watchdog is notified when each
+daemon has notified, and it ends with the first that ends. Each daemon gets a separate notify socket
+here, instead of systemd's.
+"""
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from skin_host.daemon import service
+
+#: Daemons end touches, stop boards and disconnect within this time; systemd waits as long for all.
+STOP_S = 4.5
+_NOTIFICATION_BYTES = 4096
+
+
+class Merged:
+    """Merges the messages of several daemons to systemd. Pure.
+
+    Args:
+        names: of the daemons.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names = names
+        self._unready = set(names)
+        self._unfed = set(names)
+        self._status = dict.fromkeys(names, "starting")
+        self._is_stopping = False
+
+    def take(self, name: str, message: str) -> list[str]:
+        """Take a message of a daemon; return the messages to systemd."""
+        said = dict(line.partition("=")[::2] for line in message.splitlines())
+        told = []
+        if "RELOADING" in said:
+            if not self._unready:
+                told.append(message)
+            self._unready.add(name)
+        if said.get("READY") == "1" and name in self._unready:
+            self._unready.discard(name)
+            if not self._unready:
+                told.append("READY=1")
+        if said.get("WATCHDOG") == "1":
+            self._unfed.discard(name)
+            if not self._unfed:
+                self._unfed = set(self._names)
+                told.append("WATCHDOG=1")
+        if "STATUS" in said:
+            self._status[name] = said["STATUS"]
+            told.append("STATUS=" + "; ".join(f"{one}: {self._status[one]}" for one in self._names))
+        if said.get("STOPPING") == "1" and not self._is_stopping:
+            self._is_stopping = True
+            told.append("STOPPING=1")
+        return told
+
+
+async def run(commands: dict[str, list[str]]) -> int:
+    """Run daemons until a signal comes or one of them ends; return the worst exit status.
+
+    Args:
+        commands: arguments of `skin` by the name of the daemon.
+    """
+    loop = asyncio.get_running_loop()
+    merged = Merged(list(commands))
+    processes: dict[str, asyncio.subprocess.Process] = {}
+
+    is_ending = False
+
+    def forward(number: int) -> None:
+        nonlocal is_ending
+        is_ending |= number != signal.SIGHUP
+        for process in processes.values():
+            with contextlib.suppress(ProcessLookupError):
+                process.send_signal(number)
+
+    for caught in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        loop.add_signal_handler(caught, forward, caught)
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="skin-run-")))
+        for number, (name, arguments) in enumerate(commands.items()):
+            path = folder / str(number)
+            _listen(stack, path, name, merged)
+            processes[name] = await asyncio.create_subprocess_exec(
+                *(sys.executable, "-m", "skin_host", *arguments),
+                env=_environment(path),
+                # Ctrl-C of a terminal reaches only this process, which passes it on once.
+                start_new_session=True,
+            )
+        waiting = [asyncio.ensure_future(process.wait()) for process in processes.values()]
+        await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+        if not is_ending:  # a second signal would end them at once
+            forward(signal.SIGTERM)
+        _, left = await asyncio.wait(waiting, timeout=STOP_S)
+        if left:
+            forward(signal.SIGKILL)
+        statuses = await asyncio.gather(*waiting)
+    return max(status if status >= 0 else 1 for status in statuses)
+
+
+def _listen(stack: contextlib.ExitStack, path: Path, name: str, merged: Merged) -> None:
+    """Pass on a daemon's messages from the socket at `path`."""
+    sock = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
+    sock.setblocking(False)
+    sock.bind(str(path))
+
+    def pass_on() -> None:
+        message = sock.recv(_NOTIFICATION_BYTES).decode(errors="replace")
+        for told in merged.take(name, message):
+            service.notify(told)
+
+    loop = asyncio.get_running_loop()
+    loop.add_reader(sock.fileno(), pass_on)
+    stack.callback(loop.remove_reader, sock.fileno())
+
+
+def _environment(notify_socket: Path) -> dict[str, str]:
+    """Of a daemon; systemd's watchdog time holds for it, whatever its process identifier."""
+    return {
+        **{key: value for key, value in os.environ.items() if key != "WATCHDOG_PID"},
+        "NOTIFY_SOCKET": str(notify_socket),
+    }

@@ -1,0 +1,359 @@
+"""The skin as arrays: parts, boards, triangles, taxels, and their positions.
+
+A part's taxels lie side by side in the flat arrays, in the order of its patches and
+their triangles, twelve a triangle. All other packages index by this order.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cache
+from importlib import resources
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.config.settings import (
+    TRIANGLES_PER_BOARD,
+    Board,
+    Kind,
+    Patch,
+    Settings,
+    parse_triangles,
+)
+from skin_host.errors import ConfigurationError
+from skin_host.layout.geometry import (
+    NEIGHBOUR_PITCHES,
+    Floats,
+    fitted_outline,
+    lay,
+    read_positions,
+    tile,
+)
+
+TAXELS_PER_TRIANGLE = 12
+
+
+class PadKind(IntEnum):
+    """Quantity that a pad measures."""
+
+    PRESSURE = 0
+    THERMAL = 1
+
+
+@dataclass(frozen=True, slots=True)
+class TriangleLayout:
+    """One triangle: `number` on its board (index into `Layout.boards`), first flat taxel."""
+
+    part: int
+    board: int
+    number: int
+    kind: str
+    first: int
+    shift: int
+    cdc_offset: int
+    outline_m: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class BoardLayout:
+    """One board. `taxel_index` int32[16, 12] is the flat index of each value, -1 where unused."""
+
+    name: str
+    settings: Board
+    triangles: tuple[int, ...]
+    enabled: int
+    taxel_index: NDArray[np.int32]
+    parts: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class PartLayout:
+    """One part: flat taxels `start:stop`, and its boards."""
+
+    name: str
+    node: str
+    start: int
+    stop: int
+    boards: tuple[int, ...]
+    covered: bool
+    foam_mm: float
+
+    @property
+    def n_taxels(self) -> int:
+        """How many taxels the part has, thermal pads included."""
+        return self.stop - self.start
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """The whole skin. Arrays have one row a taxel; positions in m in the part's frame.
+
+    Attributes:
+        position_m, normal: float64[n, 3].
+        area_mm2, radius_mm: float64[n]; the skin a pad answers for, and the pad's radius.
+        pad_kind: uint8[n], see `PadKind`.
+        unit_ff: float64[n], capacitance of one unit of the transmitted byte.
+        sensitivity: float64[n], capacitance of the pad over that of the pad that equation (1)
+            was measured on, both unloaded: it grows with the area, falls with the foam.
+        no_load: uint8[n], the byte sent when untouched.
+        triangle_of: int32[n], index into `triangles`.
+        neighbour_start, neighbour: int32[n + 1], int32[m]; the neighbours of taxel i are
+            neighbour[neighbour_start[i]:neighbour_start[i + 1]], all in the same part.
+    """
+
+    robot: str
+    parts: tuple[PartLayout, ...]
+    boards: tuple[BoardLayout, ...]
+    triangles: tuple[TriangleLayout, ...]
+    position_m: Floats
+    normal: Floats
+    area_mm2: Floats
+    radius_mm: Floats
+    pad_kind: NDArray[np.uint8]
+    unit_ff: Floats
+    sensitivity: Floats
+    no_load: NDArray[np.uint8]
+    triangle_of: NDArray[np.int32]
+    neighbour_start: NDArray[np.int32]
+    neighbour: NDArray[np.int32]
+
+    @property
+    def n_taxels(self) -> int:
+        """How many taxels the skin has, thermal pads included."""
+        return len(self.triangle_of)
+
+    def part(self, name: str) -> PartLayout:
+        """The part called `name`.
+
+        Raises:
+            KeyError: there is none.
+        """
+        for part in self.parts:
+            if part.name == name:
+                return part
+        raise KeyError(name)
+
+
+@cache
+def builtin_kinds() -> dict[str, Kind]:
+    """The kinds of sensor unit that come with the project (`kinds.toml`)."""
+    text = resources.files("skin_host.layout").joinpath("kinds.toml").read_bytes()
+    return msgspec.toml.decode(text, type=dict[str, Kind])
+
+
+def build_layout(settings: Settings, folder: Path) -> Layout:
+    """Lay out the skin that `settings` describe.
+
+    Args:
+        settings: checked settings.
+        folder: where relative file names in them start, the configuration's own folder.
+
+    Raises:
+        ConfigurationError: an unknown kind, wrong numbers of places, a bad positions file.
+    """
+    kinds = builtin_kinds() | settings.kinds
+    board_names = list(settings.boards)
+    board_index = {
+        name: np.full((TRIANGLES_PER_BOARD, TAXELS_PER_TRIANGLE), -1, np.int32)
+        for name in board_names
+    }
+    board_parts: dict[str, list[int]] = {name: [] for name in board_names}
+    triangles: list[TriangleLayout] = []
+    parts: list[PartLayout] = []
+    columns: list[_Columns] = []
+    taxel = 0
+    for part_number, (part_name, part) in enumerate(settings.parts.items()):
+        start = taxel
+        shelf_mm = 0.0
+        used: list[int] = []
+        for patch_number, patch in enumerate(part.patches):
+            where = f"parts.{part_name}.patches[{patch_number}]"
+            kind = kinds.get(patch.kind)
+            if kind is None:
+                known = ", ".join(kinds)
+                raise ConfigurationError(
+                    f'{where}.kind: no kind "{patch.kind}"; there are: {known}'
+                )
+            numbers = parse_triangles(patch.triangles)
+            column, shelf_mm = _patch_columns(where, patch, kind, len(numbers), shelf_mm, folder)
+            board = settings.boards[patch.board]
+            column.no_load[:] = board.no_load
+            reference = settings.processing.pressure
+            column.sensitivity[:] = (kind.radius_mm / reference.pad_radius_mm) ** 2 * (
+                reference.foam_mm / part.foam_mm
+            )
+            column.unit_ff[:] = settings.processing.pressure.code_ff * 2**patch.shift
+            columns.append(column)
+            board_number = board_names.index(patch.board)
+            if board_number not in used:
+                used.append(board_number)
+                board_parts[patch.board].append(part_number)
+            for i, number in enumerate(numbers):
+                first = taxel + TAXELS_PER_TRIANGLE * i
+                board_index[patch.board][number] = np.arange(first, first + TAXELS_PER_TRIANGLE)
+                triangles.append(
+                    TriangleLayout(
+                        part_number,
+                        board_number,
+                        number,
+                        patch.kind,
+                        first,
+                        patch.shift,
+                        patch.cdc_offset,
+                        column.outlines_m[i],
+                    )
+                )
+            taxel += TAXELS_PER_TRIANGLE * len(numbers)
+        parts.append(
+            PartLayout(part_name, part.node, start, taxel, tuple(used), part.covered, part.foam_mm)
+        )
+    position_m = np.concatenate([column.position_m for column in columns])
+    normal = np.concatenate([column.normal for column in columns])
+    pitch_mm = np.concatenate([column.pitch_mm for column in columns])
+    neighbour_start, neighbour = _neighbours(position_m, normal, pitch_mm, parts)
+    return Layout(
+        robot=settings.robot,
+        parts=tuple(parts),
+        boards=tuple(
+            _board_layout(name, settings.boards[name], board_index[name], board_parts[name])
+            for name in board_names
+        ),
+        triangles=tuple(triangles),
+        position_m=position_m,
+        normal=normal,
+        area_mm2=np.concatenate([column.area_mm2 for column in columns]),
+        radius_mm=np.concatenate([column.radius_mm for column in columns]),
+        pad_kind=np.concatenate([column.pad_kind for column in columns]),
+        unit_ff=np.concatenate([column.unit_ff for column in columns]),
+        sensitivity=np.concatenate([column.sensitivity for column in columns]),
+        no_load=np.concatenate([column.no_load for column in columns]),
+        triangle_of=np.repeat(np.arange(len(triangles), dtype=np.int32), TAXELS_PER_TRIANGLE),
+        neighbour_start=neighbour_start,
+        neighbour=neighbour,
+    )
+
+
+@dataclass(slots=True)
+class _Columns:
+    """The taxels of one patch."""
+
+    position_m: Floats
+    normal: Floats
+    pad_kind: NDArray[np.uint8]
+    area_mm2: Floats
+    radius_mm: Floats
+    pitch_mm: Floats
+    unit_ff: Floats
+    sensitivity: Floats
+    no_load: NDArray[np.uint8]
+    outlines_m: list[Floats]
+
+
+def _board_layout(
+    name: str, board: Board, taxel_index: NDArray[np.int32], parts: list[int]
+) -> BoardLayout:
+    used = tuple(int(number) for number in np.flatnonzero(taxel_index[:, 0] >= 0))
+    return BoardLayout(
+        name, board, used, sum(1 << number for number in used), taxel_index, tuple(parts)
+    )
+
+
+def _patch_columns(
+    where: str, patch: Patch, kind: Kind, n_triangles: int, shelf_mm: float, folder: Path
+) -> tuple[_Columns, float]:
+    """Taxels of one patch, and the height at which the next patch without places may start."""
+    _check_kind(patch.kind, kind)
+    per_unit = len(kind.pads_mm) // TAXELS_PER_TRIANGLE
+    n_units, rest = divmod(n_triangles, per_unit)
+    if rest:
+        raise ConfigurationError(
+            f'{where}.triangles: {n_triangles} triangles; "{patch.kind}" takes them by {per_unit}'
+        )
+    if patch.places and len(patch.places) != n_units:
+        raise ConfigurationError(
+            f"{where}.places: {len(patch.places)} places for {n_units} units of "
+            f'"{patch.kind}" ({per_unit} triangle(s) each)'
+        )
+    pads, outline = np.array(kind.pads_mm), np.array(kind.outline_mm)
+    n = TAXELS_PER_TRIANGLE * n_triangles
+    if patch.positions is not None:
+        position_m, normal = read_positions(where, folder / patch.positions, n)
+        by_unit = zip(np.split(position_m, n_units), np.split(normal, n_units), strict=True)
+        outlines = [fitted_outline(kind, *unit) for unit in by_unit]
+    else:
+        places = patch.places
+        if not places:
+            places, shelf_mm = tile(kind, n_units, shelf_mm)
+        laid = []
+        outlines = []
+        for number, place in enumerate(places):
+            try:
+                laid.append(lay(pads, place))
+                outlines.append(lay(outline, place)[0] * 1e-3)
+            except ConfigurationError as error:
+                raise ConfigurationError(f"{where}.places[{number}]: {error}") from None
+        position_m = np.concatenate([position for position, _ in laid]) * 1e-3
+        normal = np.concatenate([normal for _, normal in laid])
+    pad_kind = np.full(len(pads), PadKind.PRESSURE, np.uint8)
+    pad_kind[kind.thermal] = PadKind.THERMAL
+    columns = _Columns(
+        position_m=position_m,
+        normal=normal,
+        pad_kind=np.tile(pad_kind, n_units),
+        area_mm2=np.full(n, kind.area_mm2),
+        radius_mm=np.full(n, kind.radius_mm),
+        pitch_mm=np.full(n, kind.pitch_mm),
+        unit_ff=np.empty(n),
+        sensitivity=np.empty(n),
+        no_load=np.empty(n, np.uint8),
+        outlines_m=[outlines[i // per_unit] for i in range(n_triangles)],
+    )
+    return columns, shelf_mm
+
+
+def _check_kind(name: str, kind: Kind) -> None:
+    """Check properties of a user's own kind that types cannot express."""
+    n = len(kind.pads_mm)
+    if n == 0 or n % TAXELS_PER_TRIANGLE:
+        raise ConfigurationError(f"kinds.{name}.pads_mm: {n} pads; wanted a multiple of 12")
+    if len(kind.outline_mm) < 3:
+        raise ConfigurationError(
+            f"kinds.{name}.outline_mm: {len(kind.outline_mm)} corners; wanted 3 or more"
+        )
+    if any(not 0 <= pad < n for pad in kind.thermal):
+        raise ConfigurationError(f"kinds.{name}.thermal: {kind.thermal}; pads are 0 to {n - 1}")
+
+
+def _neighbours(
+    position_m: Floats, normal: Floats, pitch_mm: Floats, parts: list[PartLayout]
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Which taxels of a part are near each other and on the same side of it."""
+    counts = []
+    found = []
+    for part in parts:
+        taxels = slice(part.start, part.stop)
+        apart = position_m[taxels, None, :] - position_m[None, taxels, :]
+        distance_m = np.sqrt(np.einsum("ijk,ijk->ij", apart, apart))
+        reach_mm = NEIGHBOUR_PITCHES * np.maximum(pitch_mm[taxels, None], pitch_mm[None, taxels])
+        near = distance_m * 1e3 <= reach_mm
+        near &= normal[taxels] @ normal[taxels].T > 0
+        np.fill_diagonal(near, val=False)
+        counts.append(near.sum(axis=1))
+        found.append(np.nonzero(near)[1] + part.start)
+    start = np.concatenate([[0], np.cumsum(np.concatenate(counts))])
+    return start.astype(np.int32), np.concatenate(found).astype(np.int32)
+
+
+def parts_of(layout: Layout, node: str) -> list[int]:
+    """Indices of the parts that belong to a node.
+
+    Raises:
+        ConfigurationError: none does.
+    """
+    parts = [i for i, part in enumerate(layout.parts) if part.node == node]
+    if not parts:
+        known = ", ".join(sorted({part.node for part in layout.parts}))
+        raise ConfigurationError(f'no part belongs to node "{node}"; there are: {known}')
+    return parts

@@ -1,0 +1,147 @@
+"""Positions of a unit's pads: tiled, placed manually, or read from a file."""
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.config.settings import Kind, Place
+from skin_host.errors import ConfigurationError
+
+#: Pads closer than this many pitches touch the same object: they are neighbours.
+NEIGHBOUR_PITCHES = 1.6
+#: A tiled patch without places has at most this many triangles in a row.
+TILED_IN_A_ROW = 8
+
+Floats = NDArray[np.float64]
+
+
+def tile(kind: Kind, n_units: int, shelf_mm: float) -> tuple[list[Place], float]:
+    """Return places side by side: triangles as a mesh, other shapes with a gap between them."""
+    outline = np.array(kind.outline_mm)
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    width_mm, height_mm = high - low
+    if len(outline) == 3:
+        places = []
+        n_rows = -(-n_units // TILED_IN_A_ROW)
+        for i in range(n_units):
+            row, column = divmod(i, -(-n_units // n_rows))
+            # Every second triangle is upside down, with its centroid a third higher.
+            on_tip = (row + column) % 2 == 1
+            places.append(
+                Place(
+                    x_mm=column * width_mm / 2,
+                    y_mm=shelf_mm + row * height_mm - low[1] + (height_mm / 3 if on_tip else 0.0),
+                    turn_deg=180.0 if on_tip else 0.0,
+                )
+            )
+        return places, shelf_mm + height_mm * n_rows
+    step_mm = width_mm + NEIGHBOUR_PITCHES * kind.pitch_mm
+    places = [Place(x_mm=i * step_mm, y_mm=shelf_mm - low[1]) for i in range(n_units)]
+    return places, shelf_mm + height_mm + NEIGHBOUR_PITCHES * kind.pitch_mm
+
+
+def lay(points_mm: Floats, place: Place) -> tuple[Floats, Floats]:
+    """Points [k, 2] of a unit's frame as positions [k, 3] (mm) and normals [k, 3].
+
+    Raises:
+        ConfigurationError: the place's normal is (0, 0, 0).
+    """
+    flat = points_mm * [-1.0 if place.mirror else 1.0, 1.0]
+    turn = np.deg2rad(place.turn_deg)
+    cos, sin = np.cos(turn), np.sin(turn)
+    turned = np.column_stack(
+        [cos * flat[:, 0] - sin * flat[:, 1], sin * flat[:, 0] + cos * flat[:, 1]]
+    )
+    if not np.any(place.normal):
+        raise ConfigurationError(f"normal: {list(place.normal)}; wanted a direction")
+    rotation = _rotation_from_z(np.array(place.normal))
+    position = turned @ rotation[:, :2].T + [place.x_mm, place.y_mm, place.z_mm]
+    return position, np.tile(rotation[:, 2], (len(points_mm), 1))
+
+
+def _rotation_from_z(normal: Floats) -> Floats:
+    """Shortest rotation [3, 3] that lays the z axis along `normal` (Rodrigues)."""
+    x, y, z = normal / np.linalg.norm(normal)
+    side = np.hypot(x, y)
+    if side == 0:
+        return np.diag([1.0, np.sign(z), np.sign(z)])
+    # With u = (x, y) / side this is exact near -z too, where 1 / (1 + z) is not.
+    u, v = x / side, y / side
+    k = 1 - z
+    return np.array([[1 - k * u * u, -k * u * v, x], [-k * u * v, 1 - k * v * v, y], [-x, -y, z]])
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """Position of a flat unit: `origin_m` [3], its x and y `axes` [3, 2], and how well it fits."""
+
+    origin_m: Floats
+    axes: Floats
+    rms_m: float
+
+    def place(self, points_mm: Floats) -> Floats:
+        """Points [k, 2] of the unit's frame as positions [k, 3] (m)."""
+        position: Floats = self.origin_m + points_mm * 1e-3 @ self.axes.T
+        return position
+
+
+def fit_unit(pads_mm: Floats, position_m: Floats, normal: Floats) -> Fit:
+    """Fit a flat unit so that its pads [k, 2] come closest to known places [k, 3].
+
+    Least squares over rotations and shifts (Kabsch); the result may be mirrored, as some units are.
+    Where the places are too few to decide, `normal` [3] decides.
+    """
+    centre_m, middle_m = position_m.mean(axis=0), pads_mm.mean(axis=0) * 1e-3
+    flat = pads_mm * 1e-3 - middle_m
+    left, strength, right = np.linalg.svd((position_m - centre_m).T @ flat, full_matrices=False)
+    if strength[0] < 1e-9:  # m^2: all at one place
+        axes = _rotation_from_z(normal)[:, :2]
+    else:
+        if strength[1] < 1e-3 * strength[0]:  # in one line
+            along = left[:, 0]
+            across = np.cross(normal, along)
+            if np.linalg.norm(across) < 1e-6:
+                across = np.cross(np.eye(3)[np.argmin(np.abs(along))], along)
+            across *= np.linalg.det(right) / np.linalg.norm(across)
+            left = np.column_stack([along, across])
+        axes = left @ right
+    apart = position_m - centre_m - flat @ axes.T
+    rms_m = float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
+    return Fit(centre_m - axes @ middle_m, axes, rms_m)
+
+
+def fitted_outline(kind: Kind, position_m: Floats, normal: Floats) -> Floats:
+    """The outline [k, 3] (m) of a unit whose pads lie at `position_m` [n, 3]."""
+    mean = normal.mean(axis=0)
+    up = mean if np.linalg.norm(mean) > 0 else normal[0]
+    return fit_unit(np.array(kind.pads_mm), position_m, up).place(np.array(kind.outline_mm))
+
+
+def read_positions(where: str, path: Path, n: int) -> tuple[Floats, Floats]:
+    """Read n rows `x y z nx ny nz` (m), the normals of any length; (0, 0, 0) counts as +z.
+
+    Raises:
+        ConfigurationError: unreadable, wrong in shape, or with a number that is not finite.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # numpy warns of an empty file; its shape is checked
+            table = np.loadtxt(path, ndmin=2)
+    except OSError as error:
+        reason = error.strerror or "not found"
+        raise ConfigurationError(f"{where}.positions: {path}: cannot be read: {reason}") from None
+    except ValueError as error:
+        raise ConfigurationError(f"{where}.positions: {path}: {error}") from None
+    if table.shape != (n, 6):
+        raise ConfigurationError(
+            f"{where}.positions: {path}: {table.shape[0]} rows of {table.shape[1]} numbers; "
+            f"wanted {n} rows x y z nx ny nz"
+        )
+    if not np.isfinite(table).all():
+        raise ConfigurationError(f"{where}.positions: {path}: holds a number that is not finite")
+    length = np.linalg.norm(table[:, 3:], axis=1, keepdims=True)
+    normal = np.where(length > 0, table[:, 3:] / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
+    return table[:, :3], normal

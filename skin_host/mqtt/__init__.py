@@ -1,0 +1,1 @@
+"""Messages and the broker: payloads, topics, the publisher and its connection."""

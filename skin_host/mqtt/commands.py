@@ -1,0 +1,189 @@
+"""Requests to a node and their answers. Requests are not trusted and are bounded.
+
+A request is a JSON object of at most `MAX_REQUEST_BYTES` (an empty payload counts as `{}`). Its
+key `id`, if it has one, comes back in the answer. The answer is a JSON object:
+`{"schema":"skin.result/1","command":..,"id":..,"ok":true,"result":{..}}`, or with
+`"ok":false` and `"error"`, one line with the reason.
+"""
+
+import asyncio
+import logging
+import re
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import UNSET, Meta, Struct, UnsetType
+
+from skin_host.errors import SkinError
+from skin_host.mqtt.payload import MessageError, decode, one_line
+
+RESULT_SCHEMA = "skin.result/1"
+MAX_REQUEST_BYTES = 64 * 1024
+#: At most this many commands run at a time.
+MAX_RUNNING = 8
+#: This many requests are taken at once, and this many a second in the long run.
+BURST = 20
+PER_SECOND = 10.0
+
+#: Answers a command: takes its name and its request, a JSON object as bytes. The return value
+#: becomes `result`; a `SkinError` becomes `error`.
+Handler = Callable[[str, bytes], Awaitable[Mapping[str, Any]]]
+#: Sends the payload of an answer.
+Answer = Callable[[bytes], None]
+
+_log = logging.getLogger(__name__)
+_NAME = re.compile(r"[a-z0-9_-]{1,32}")
+
+
+class Result(Struct, omit_defaults=True):
+    """The answer to a request."""
+
+    schema: Annotated[str, Meta(max_length=32)]
+    command: Annotated[str, Meta(max_length=64)]
+    ok: bool
+    id: str | int | UnsetType = UNSET
+    result: dict[str, Any] | UnsetType = UNSET
+    error: str | UnsetType = UNSET
+
+
+class _Identified(Struct):
+    id: Annotated[str, Meta(max_length=64)] | int | UnsetType = UNSET
+
+
+_result_decoder = msgspec.json.Decoder(Result)
+
+
+def encode_request(arguments: Mapping[str, Any]) -> bytes:
+    """Write the request of a command."""
+    return msgspec.json.encode(dict(arguments))
+
+
+def decode_result(payload: bytes) -> Result:
+    """Read the answer to a request.
+
+    Raises:
+        MessageError: it is not one.
+    """
+    result = decode(_result_decoder, payload, "result")
+    if result.schema != RESULT_SCHEMA:
+        raise MessageError(f'result: schema "{result.schema}"; wanted {RESULT_SCHEMA}')
+    return result
+
+
+class CommandHandler:
+    """Takes requests, runs the handler in separate tasks, and sends its answers.
+
+    Attributes:
+        taken: requests that were given to the handler.
+        refused: requests that were not: too large, too many, retained, or not JSON.
+    """
+
+    def __init__(self, handler: Handler) -> None:
+        self._handler = handler
+        self._running: set[asyncio.Task[None]] = set()
+        self._tokens = float(BURST)
+        self._filled_s: float | None = None
+        self._flooded = False
+        self._met_retained = False
+        self.taken = 0
+        self.refused = 0
+
+    def take(self, name: str, payload: bytes, answer: Answer) -> None:
+        """Start a request. Above the rate a request is counted and not answered.
+
+        An answer to each of a flood of requests would make the flood twice as large.
+        """
+        if not self._token():
+            if not self._flooded:
+                _log.warning("requests come faster than %g a second: not all are taken", PER_SECOND)
+            self._flooded = True
+            self.refused += 1
+            return
+        refusal = self._refusal(name, payload)
+        identity: str | int | UnsetType = UNSET
+        if refusal is None:
+            try:
+                identity = msgspec.json.decode(payload or b"{}", type=_Identified).id
+            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+                refusal = f"the request is not a JSON object as it should be: {error}"
+        if refusal is not None:
+            self.refused += 1
+            _log.info("command %s refused: %s", _printable(name), one_line(refusal))
+            answer(_failure(name, identity, refusal))
+            return
+        self.taken += 1
+        task = asyncio.get_running_loop().create_task(self._run(name, payload, identity, answer))
+        self._running.add(task)
+        task.add_done_callback(self._running.discard)
+
+    def ignore_retained(self, topic: str) -> None:
+        """Count a request that was published as retained: it may be from any time."""
+        if not self._met_retained:
+            self._met_retained = True
+            _log.warning(
+                "a retained request on %s is ignored; clear it with: mosquitto_pub -r -n -t %s",
+                *[one_line(topic)] * 2,
+            )
+        self.refused += 1
+
+    async def close(self) -> None:
+        """Cancel what is still running."""
+        running = list(self._running)
+        for task in running:
+            task.cancel()
+        await asyncio.gather(*running, return_exceptions=True)
+
+    async def _run(
+        self, name: str, payload: bytes, identity: str | int | UnsetType, answer: Answer
+    ) -> None:
+        try:
+            result = dict(await self._handler(name, payload))
+            reply = Result(RESULT_SCHEMA, name, ok=True, id=identity, result=result)
+            encoded = msgspec.json.encode(reply)
+        except SkinError as error:
+            _log.info("command %s refused: %s", name, one_line(str(error)))
+            answer(_failure(name, identity, str(error)))
+        except Exception as error:
+            # An error in one command must neither stop the service nor remain without an answer.
+            _log.exception("command %s failed", name)
+            answer(_failure(name, identity, f"failed: {type(error).__name__}; see the log"))
+        else:
+            _log.info("command %s done", name)
+            answer(encoded)
+
+    def _refusal(self, name: str, payload: bytes) -> str | None:
+        if not _NAME.fullmatch(name):
+            return "a command's name has up to 32 of a-z, 0-9, _ and -"
+        if len(payload) > MAX_REQUEST_BYTES:
+            return f"the request has {len(payload)} bytes; wanted at most {MAX_REQUEST_BYTES}"
+        if len(self._running) >= MAX_RUNNING:
+            return f"{MAX_RUNNING} commands are running already; try again later"
+        return None
+
+    def _token(self) -> bool:
+        now_s = asyncio.get_running_loop().time()
+        if self._filled_s is not None:
+            earned = (now_s - self._filled_s) * PER_SECOND
+            self._tokens = min(self._tokens + earned, float(BURST))
+        self._filled_s = now_s
+        self._flooded = self._flooded and self._tokens < BURST
+        if self._tokens < 1.0:
+            return False
+        self._tokens -= 1.0
+        return True
+
+
+def answer_too_large(answer: bytes) -> bytes:
+    """Return the replacement for an answer that is too large for the broker."""
+    result = msgspec.json.decode(answer, type=Result)
+    return _failure(result.command, result.id, "the answer is larger than the broker takes")
+
+
+def _failure(name: str, identity: str | int | UnsetType, why: str) -> bytes:
+    command = name if _NAME.fullmatch(name) else "?"
+    return msgspec.json.encode(Result(RESULT_SCHEMA, command, ok=False, id=identity, error=why))
+
+
+def _printable(name: str) -> str:
+    return name[:32] if name.isprintable() else "?"

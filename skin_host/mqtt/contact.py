@@ -1,0 +1,87 @@
+"""Contact state of a part, which fails safe. Pure: takes frames and events, returns the state."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.layout import Layout, PadKind
+from skin_host.mqtt.messages import ContactState
+from skin_host.processing.contacts import LOST_NS
+from skin_host.processing.events import TouchEvent
+from skin_host.processing.pipeline import PressureFrame
+
+_NEVER_NS = -(1 << 62)
+
+
+class PartContact:
+    """The contact state of one part.
+
+    ON: a taxel is touched. OFF: none is, and every triangle has a valid taxel, and where a contact
+    was lost all taxels are valid again. UNKNOWN: all other cases. A triangle may miss frames for
+    `LOST_NS`, as a contact may; a part without any valid taxel is UNKNOWN at once.
+
+    Args:
+        layout: the skin.
+        part: index of the part.
+    """
+
+    def __init__(self, layout: Layout, part: int) -> None:
+        here = layout.parts[part]
+        pads: list[NDArray[np.intp]] = []
+        for triangle in layout.triangles:
+            if triangle.part == part:
+                row = layout.boards[triangle.board].taxel_index[triangle.number]
+                taxels = row[row >= 0]
+                taxels = taxels[layout.pad_kind[taxels] == PadKind.PRESSURE]
+                if len(taxels):
+                    pads.append((taxels - here.start).astype(np.intp))
+        #: Pressure pads triangle by triangle, and where each triangle begins among them.
+        self._pads = np.concatenate(pads)
+        self._starts = np.cumsum([0, *(len(one) for one in pads[:-1])])
+        self._felt_ns = np.full(len(pads), _NEVER_NS, np.int64)
+        self._lost = np.zeros(here.n_taxels, np.bool_)
+        self._present: set[int] = set()
+        self._last_ns = 0
+        #: By how much the clock was set forward since the last frame.
+        self._jump_ns = 0
+
+    def step(self, frame: PressureFrame, events: Iterable[TouchEvent]) -> ContactState:
+        """Take a frame and the events of its contacts; return the state."""
+        for event in events:
+            if event.event == "end":
+                self._present.discard(event.id)
+                if event.reason == "lost":
+                    self._lost[event.taxels] = True
+            else:
+                self._present.add(event.id)
+        if frame.t_ns - self._last_ns > self._jump_ns > 0:
+            felt = self._felt_ns != _NEVER_NS
+            self._felt_ns[felt] += self._jump_ns
+            self._jump_ns = 0
+        self._last_ns = frame.t_ns
+        np.minimum(self._felt_ns, frame.t_ns, out=self._felt_ns)  # the clock may be set back
+        feels = np.logical_or.reduceat(frame.valid[self._pads], self._starts)
+        self._felt_ns[feels] = frame.t_ns
+        self._lost &= ~frame.valid
+        if frame.touched.any():
+            return "ON"
+        if not feels.any():
+            return "UNKNOWN"
+        if self._present:  # frames of the touched place were lost, for less than `LOST_NS`
+            return "ON"
+        blind = frame.t_ns - self._felt_ns >= LOST_NS
+        return "UNKNOWN" if blind.any() or self._lost.any() else "OFF"
+
+    def follow_clock(self, jump_ns: int) -> None:
+        """The clock by which frames have their times was set: no time has passed by that.
+
+        Some frames from before may come still.
+        """
+        self._jump_ns = max(0, self._jump_ns + jump_ns)
+
+    def stop(self, events: Iterable[TouchEvent]) -> ContactState:
+        """End the contacts, because no data of the part will come for a while."""
+        self._present.difference_update(event.id for event in events)
+        self._felt_ns[:] = _NEVER_NS
+        return "UNKNOWN"

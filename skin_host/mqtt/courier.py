@@ -1,0 +1,400 @@
+"""Sends the content of an outbox over one connection after the other.
+
+Frames are encoded and written right after the turn of the event loop that produced them: touches
+first, then all frames of that turn in one write. While the socket is full they stay in the outbox,
+where a newer frame of a part replaces the one before, which is counted.
+
+Messages that were in flight when the broker ended a connection are sent one at a time over the
+next: if one of them is the reason, it is found, dropped after `trials.TRIES`, counted and named.
+"""
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import Callable
+from itertools import islice
+from typing import Literal, NamedTuple
+
+from skin_host.clock import SYSTEM, Clock
+from skin_host.mqtt.commands import answer_too_large
+from skin_host.mqtt.connection import (
+    TIMEOUT_S,
+    Connection,
+    MessageProperties,
+    MqttError,
+    PackedProperties,
+    within,
+)
+from skin_host.mqtt.frames import encode_frame
+from skin_host.mqtt.outbox import Outbox
+from skin_host.mqtt.packets import publish_head, publish_packet
+from skin_host.mqtt.topics import Topics
+from skin_host.processing.pipeline import PressureFrame
+
+#: Limit of unacknowledged messages. Together less than the 20 that mosquitto and paho allow, so
+#: that touches never wait behind health.
+TOUCH_WINDOW = 10
+#: Frames that are encoded and written at a time; then other tasks of the loop run.
+FRAME_WINDOW = 8
+RETAINED_WINDOW = 6
+#: How long suspected frames are waited for.
+FRAME_PATIENCE_S = 1.0
+
+_log = logging.getLogger(__name__)
+
+
+class FrameForm(NamedTuple):
+    """How frames are written."""
+
+    encoding: Literal["json", "cbor"]
+    properties: PackedProperties | None
+
+
+class _InFlight(NamedTuple):
+    """A message on its way: done when it is acknowledged, which must be before `until_s`."""
+
+    done: "asyncio.Future[None]"
+    until_s: float
+
+
+class Courier:
+    """Sends an outbox.
+
+    Args:
+        outbox: the messages to send.
+        topics: of the robot.
+        status: the topic of the node's status, which is never dropped.
+        form: how frames are written.
+        state_properties: of a topic's retained payload.
+        after_states: called when all retained messages have been acknowledged.
+        clock: by which raw frames end.
+
+    Attributes:
+        too_large: topics whose last message was larger than the broker takes.
+    """
+
+    def __init__(
+        self,
+        outbox: Outbox,
+        topics: Topics,
+        status: str,
+        form: FrameForm,
+        state_properties: Callable[[str, bytes], MessageProperties | None],
+        after_states: Callable[[Connection], None],
+        clock: Clock = SYSTEM,
+    ) -> None:
+        self._clock = clock
+        self._outbox = outbox
+        self._topics = topics
+        self._status = status
+        self._form = form
+        self._state_properties = state_properties
+        self._after_states = after_states
+        self._raw_until_s = 0.0
+        self._events_out: deque[_InFlight] = deque()  # of the first events in the queue
+        self._states_out: dict[str, asyncio.Future[None]] = {}
+        self._frames_out: dict[str, None] = {}  # parts whose frames this connection has sent
+        #: To be sent one at a time: this many of the first events, these states, these parts'
+        #: frames.
+        self._events_alone = 0
+        self._states_alone: dict[str, None] = {}
+        self._frames_alone: dict[str, None] = {}
+        self._frame_tried: str | None = None
+        #: The connection for frames, while they may be written.
+        self._frames_to: Connection | None = None
+        self._is_writing_due = False
+        self._suspect_came = asyncio.Event()
+        #: By part: the bytes before the payload of its frames.
+        self._heads: dict[str, bytes] = {}
+        outbox.on_frame = self._note_frame
+        #: The broker has acknowledged something over this connection; otherwise it may end
+        #: connections for other reasons, as a node of a broken cluster does.
+        self._works = False
+        self.too_large: dict[str, None] = {}
+
+    def use(self, form: FrameForm) -> None:
+        """Write frames in this form from now on."""
+        self._form = form
+        self._heads.clear()
+
+    def show_raw(self, seconds: float) -> None:
+        """Send the boards' own bytes with the frames for this time; 0 ends it."""
+        self._raw_until_s = self._clock.monotonic_s() + seconds
+
+    def repeat_events(self) -> None:
+        """Send recent events again, because the next connection is to another broker, which may not
+        have them.
+        """
+        n = self._outbox.repeat_events()
+        if self._events_alone:
+            self._events_alone += n
+
+    async def carry(self, connection: Connection) -> None:
+        """Send until cancelled.
+
+        Raises:
+            MqttError: the connection is lost.
+        """
+        self._events_out.clear()
+        self._states_out.clear()
+        self._frames_out.clear()
+        self._works = False
+        await self._try_alone(connection)
+        self._frames_to = connection
+        connection.when_clear = self._note_frame
+        self._note_frame()
+        try:
+            async with asyncio.TaskGroup() as group:
+                group.create_task(self._send_states(connection))
+                group.create_task(self._send_events(connection))
+        finally:
+            self._frames_to = None
+
+    def note_end(self, connection: Connection) -> str | None:
+        """Note the end of the connection; return the topic of a publication that was dropped
+        because of it.
+        """
+        outbox = self._outbox
+        outbox.drop_frames()
+        out = min(len(self._events_out), len(outbox.events))
+        answers = sum(not event.is_touch for event in islice(outbox.events, out))
+        states = [topic for topic, done in self._states_out.items() if not done.done()]
+        outbox.drop_answers()
+        if not connection.ended_by_broker:
+            return None
+        events = out - answers
+        if out + len(states) == 1 and not answers and self._works and states != [self._status]:
+            topic = outbox.events[0].topic if events else states[0]
+            payload = outbox.events[0].payload if events else outbox.retained[topic]
+            if outbox.trials.strike(topic, payload):
+                if events:
+                    outbox.give_up_event()
+                    self._events_alone = max(0, self._events_alone - 1)
+                else:
+                    outbox.give_up_state(topic)
+                    self._states_alone.pop(topic, None)
+                return topic
+        if out + len(states) == 0:
+            return self._judge_frames()
+        self._events_alone = max(self._events_alone, events)
+        self._states_alone |= dict.fromkeys(states)
+        return None
+
+    def _judge_frames(self) -> str | None:
+        """Judge frames, if nothing else was in flight."""
+        part, self._frame_tried = self._frame_tried, None
+        if part is None:
+            self._frames_alone |= self._frames_out
+            return None
+        topic = self._topics.part("frame", part)
+        if not self._outbox.trials.strike(topic, b""):
+            return None
+        self._outbox.trials.withhold(topic)
+        self._outbox.counters.rejected += 1
+        self._frames_alone.pop(part, None)
+        return topic
+
+    def _fits(self, connection: Connection, topic: str, payload: bytes) -> bool:
+        """Whether the broker's limit lets a message through; names the topic if it does not."""
+        if connection.fits(topic, payload):
+            if self.too_large:
+                self.too_large.pop(topic, None)
+            return True
+        if topic not in self.too_large:
+            self.too_large[topic] = None
+            _log.warning(
+                "not published: %s: %d bytes; the broker takes packets of up to %d",
+                topic,
+                len(payload),
+                connection.packet_limit,
+            )
+        return False
+
+    def _drop_large_event(self, number: int) -> None:
+        """Drop an event that is too large; the answer to a command becomes a short refusal."""
+        event = self._outbox.events[number]
+        if event.is_touch:
+            self._outbox.give_up_event(number)
+        else:
+            self._outbox.events[number] = event._replace(payload=answer_too_large(event.payload))
+
+    async def _try_alone(self, connection: Connection) -> None:
+        """Send suspected messages, one at a time, after the others."""
+        outbox = self._outbox
+        if self._events_alone or self._states_alone or self._frames_alone:
+            status = {self._status: outbox.retained[self._status]}
+            await within(
+                TIMEOUT_S, self._send_state(connection, self._status, status[self._status])
+            )
+            outbox.states_sent(status)
+            self._states_alone.pop(self._status, None)
+            self._works = True
+        while self._events_alone and outbox.events:
+            event = outbox.events[0]
+            if not self._fits(connection, event.topic, event.payload):
+                self._drop_large_event(0)
+                self._events_alone -= event.is_touch
+                continue
+            done = connection.send(event.topic, event.payload, qos=1, properties=event.properties)
+            self._events_out.append(_InFlight(done, 0.0))
+            await within(TIMEOUT_S, done)
+            self._events_out.popleft()
+            outbox.event_sent()
+            self._events_alone -= 1
+        self._events_alone = 0
+        while self._states_alone:
+            topic = next(iter(self._states_alone))
+            states = {topic: outbox.retained[topic]}
+            if not self._fits(connection, topic, states[topic]):
+                outbox.give_up_state(topic)
+                del self._states_alone[topic]
+                continue
+            self._states_out[topic] = self._send_state(connection, topic, states[topic])
+            await within(TIMEOUT_S, self._states_out[topic])
+            del self._states_out[topic]
+            outbox.states_sent(states)
+            del self._states_alone[topic]
+        if self._frames_alone:
+            try:
+                async with self._clock.timeout(FRAME_PATIENCE_S):
+                    await self._try_frames(connection)
+            except TimeoutError:  # some parts send none
+                self._frames_alone.clear()
+
+    async def _try_frames(self, connection: Connection) -> None:
+        """Send one frame of each suspected part, with QoS 1: an acknowledgement clears it."""
+        outbox = self._outbox
+        while self._frames_alone:
+            await self._suspect_came.wait()
+            self._suspect_came.clear()
+            for part in [part for part in self._frames_alone if part in outbox.frames]:
+                self._frame_tried = part
+                await self._send_suspect(connection, outbox.frames.pop(part))
+                self._frame_tried = None
+                outbox.trials.arrived(self._topics.part("frame", part))
+                del self._frames_alone[part]
+
+    async def _send_suspect(self, connection: Connection, frame: PressureFrame) -> None:
+        """Send a frame with QoS 1 and wait for its acknowledgement."""
+        payload = self._encoded(connection, frame)
+        if payload is None:
+            return
+        topic = self._topics.part("frame", frame.part)
+        properties = self._form.properties
+        done = connection.send(topic, payload, qos=1, properties=properties)
+        self._frames_out[frame.part] = None
+        self._outbox.counters.frames_sent += 1
+        await within(TIMEOUT_S, done)
+
+    def _note_frame(self) -> None:
+        """Write frames when everything of this turn of the loop has been put."""
+        self._suspect_came.set()
+        if self._frames_to is not None and not self._is_writing_due:
+            self._is_writing_due = True
+            asyncio.get_running_loop().call_soon(self._write_frames)
+
+    def _write_frames(self) -> None:
+        """Write the frames of the outbox, touches first, as far as the socket takes them."""
+        self._is_writing_due = False
+        connection, outbox = self._frames_to, self._outbox
+        if connection is None or not outbox.frames:
+            return
+        try:
+            self._fill_window(connection)
+        except MqttError:
+            return  # the reader of the connection finds it lost
+        if not connection.is_clear():
+            return
+        frames, packets = [], []
+        for _ in range(min(FRAME_WINDOW, len(outbox.frames))):
+            frame = outbox.take_frame()
+            payload = self._encoded(connection, frame)
+            if payload is not None:
+                frames.append(frame)
+                packets.append(publish_packet(self._head(frame.part), payload))
+        taken = connection.write_now(packets) if packets else 0
+        for frame in frames[:taken]:
+            self._frames_out[frame.part] = None
+        outbox.counters.frames_sent += taken
+        outbox.put_back(frames[taken:])
+        if taken == len(packets) and outbox.frames:
+            self._note_frame()
+
+    def _head(self, part: str) -> bytes:
+        head = self._heads.get(part)
+        if head is None:
+            properties = self._form.properties
+            packed = None if properties is None else properties.pack()
+            head = self._heads[part] = publish_head(self._topics.part("frame", part), packed)
+        return head
+
+    def _encoded(self, connection: Connection, frame: PressureFrame) -> bytes | None:
+        """The payload of a frame; None for one that the broker does not take, which is counted."""
+        raw = self._clock.monotonic_s() < self._raw_until_s
+        payload = encode_frame(frame, self._form.encoding, raw=raw)
+        topic = self._topics.part("frame", frame.part)
+        if self._outbox.trials.withholds(topic) or not self._fits(connection, topic, payload):
+            self._outbox.counters.frames_skipped += 1
+            return None
+        return payload
+
+    async def _send_events(self, connection: Connection) -> None:
+        """Send the queue in order. Events that were not acknowledged stay and are sent again."""
+        outbox = self._outbox
+        in_flight = self._events_out
+        outbox.events_put.set()
+        while True:
+            try:
+                async with self._clock.timeout_at(in_flight[0].until_s if in_flight else None):
+                    await outbox.events_put.wait()
+            except TimeoutError:
+                await within(0.0, in_flight[0].done)
+            outbox.events_put.clear()
+            while in_flight and in_flight[0].done.done():
+                in_flight.popleft()
+                outbox.event_sent()
+                self._works = True
+            self._fill_window(connection)
+
+    def _fill_window(self, connection: Connection) -> None:
+        """Send events, in order, until as many are on their way as may be."""
+        outbox, in_flight = self._outbox, self._events_out
+        until_s = asyncio.get_running_loop().time() + TIMEOUT_S
+        news = False
+        while len(in_flight) < min(len(outbox.events), TOUCH_WINDOW):
+            event = outbox.events[len(in_flight)]
+            if not self._fits(connection, event.topic, event.payload):
+                self._drop_large_event(len(in_flight))
+                continue
+            done = connection.send(event.topic, event.payload, qos=1, properties=event.properties)
+            done.add_done_callback(lambda _: outbox.events_put.set())
+            in_flight.append(_InFlight(done, until_s))
+            news = True
+        if news:
+            connection.flush()  # a touch must not wait for the encoding of frames
+
+    async def _send_states(self, connection: Connection) -> None:
+        outbox = self._outbox
+        outbox.retained_put.set()
+        while True:
+            await outbox.retained_put.wait()
+            outbox.retained_put.clear()
+            while states := outbox.take_states(RETAINED_WINDOW):
+                for topic, payload in list(states.items()):
+                    if not self._fits(connection, topic, payload):
+                        outbox.give_up_state(topic)
+                        del states[topic]
+                        continue
+                    self._states_out[topic] = self._send_state(connection, topic, payload)
+                for done in self._states_out.values():
+                    await within(TIMEOUT_S, done)
+                self._states_out.clear()
+                self._works = True
+                outbox.states_sent(states)
+                self._after_states(connection)
+
+    def _send_state(
+        self, connection: Connection, topic: str, payload: bytes
+    ) -> "asyncio.Future[None]":
+        properties = self._state_properties(topic, payload)
+        return connection.send(topic, payload, qos=1, retain=True, properties=properties)

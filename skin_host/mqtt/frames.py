@@ -1,0 +1,208 @@
+"""Pressure of a part: the payload of `<part>/frame`, JSON or CBOR. Pure: arrays to bytes and back.
+
+A mask of taxels is a hexadecimal number in which bit i is taxel i of the part (bit 0 the
+lowest); it is written with its most significant digit first, in lower case, padded with
+zeros to one digit for every four taxels. Three taxels of which only the first is valid
+are "1"; twelve of which all but the last are valid are "7ff".
+"""
+
+import re
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta, Struct
+from numpy.typing import NDArray
+
+from skin_host.errors import SkinError
+from skin_host.mqtt.cbor import check_cbor
+from skin_host.mqtt.payload import MAX_TAXELS, Count, Int64, MessageError, check_size, decode
+
+if TYPE_CHECKING:
+    from skin_host.processing.pipeline import PressureFrame
+
+FRAME_SCHEMA: Final = "skin.frame/1"
+#: One unit of the values of a frame.
+SCALE_KPA = 0.01
+#: RFC 8746, section 2.1: typed arrays of little-endian signed 16-bit and 32-bit integers.
+_TYPED_ARRAYS: dict[int, np.dtype[Any]] = {77: np.dtype("<i2"), 78: np.dtype("<i4")}
+_INT32 = 2**31 - 1
+_HEX = re.compile("[0-9a-f]*")
+
+Mask = NDArray[np.bool_]
+HexMask = Annotated[str, Meta(max_length=MAX_TAXELS // 4)]
+
+
+class Frame(Struct, frozen=True, eq=False):
+    """A received frame. Arrays have one entry per taxel [m], in the part's order.
+
+    Attributes:
+        pressure_kpa: float64; 0 where not valid.
+        valid: the taxel was received and is reliable.
+        beyond_range: the pressure is above the calibrated range: its order is right, its
+            value an estimate.
+        raw: uint8, the bytes as the boards sent them; None unless they were requested
+            (command `raw`).
+        missed: how many sweeps of the part lie between this frame and the one received
+            before it. They were lost, or left out on purpose (`mqtt.frame_hz`).
+    """
+
+    part: str
+    seq: int
+    t_ns: int
+    pressure_kpa: NDArray[np.float64]
+    valid: Mask
+    beyond_range: Mask
+    missed: int = 0
+    raw: NDArray[np.uint8] | None = None
+
+
+class _FrameFields(Struct, omit_defaults=True):
+    """The keys of a frame without its values, which JSON and CBOR store differently."""
+
+    schema: Annotated[str, Meta(max_length=32)]
+    seq: Count
+    t_ns: Int64
+    unit: Literal["kPa"]
+    scale: Annotated[float, Meta(gt=0, le=1000)]
+    values: Any
+    valid: HexMask
+    beyond_range: HexMask = ""
+    #: One byte per taxel; base64 in JSON. Empty if they were not requested.
+    raw: Annotated[bytes, Meta(max_length=MAX_TAXELS)] = b""
+
+
+_Value = Annotated[int, Meta(ge=-(2**31), le=_INT32)]
+_Values = Annotated[list[_Value], Meta(max_length=MAX_TAXELS)]
+
+
+class _JsonFrame(_FrameFields, omit_defaults=True):
+    values: _Values
+
+
+_encoder = msgspec.json.Encoder()
+_decoder = msgspec.json.Decoder(_JsonFrame)
+
+
+def encode_mask(mask: Mask) -> str:
+    """Write a mask [m] as hexadecimal digits; see the head of this module."""
+    number = int.from_bytes(np.packbits(mask, bitorder="little").tobytes(), "little")
+    return f"{number:0{(len(mask) + 3) // 4}x}" if len(mask) else ""
+
+
+def decode_mask(text: str, n: int) -> Mask:
+    """Read a mask of `n` taxels.
+
+    Raises:
+        MessageError: it has not the digits of `n` taxels, or bits beyond them.
+    """
+    if len(text) != (n + 3) // 4:
+        raise MessageError(f"a mask has {len(text)} digits; wanted {(n + 3) // 4} for {n} taxels")
+    if not _HEX.fullmatch(text):
+        raise MessageError("a mask holds something else than digits 0-9 and a-f")
+    number = int(text or "0", 16)
+    if number >> n:
+        raise MessageError(f"a mask has bits beyond its {n} taxels")
+    octets = np.frombuffer(number.to_bytes((n + 7) // 8, "little"), np.uint8)
+    return np.unpackbits(octets, count=n, bitorder="little").astype(np.bool_)
+
+
+def encode_frame(
+    frame: "PressureFrame", encoding: Literal["json", "cbor"] = "json", *, raw: bool = False
+) -> bytes:
+    """Write the payload of `<part>/frame`, with the boards' own bytes if `raw`.
+
+    A pressure that is not a finite number is sent as 0 and not valid. The key
+    `beyond_range` is there only when a taxel is beyond its calibrated range.
+
+    Raises:
+        SkinError: CBOR is wanted and cbor2 is not installed.
+    """
+    scaled = frame.pressure_kpa.astype(np.float64) / SCALE_KPA
+    valid = frame.valid
+    finite = np.isfinite(scaled)
+    if not finite.all():
+        valid = valid & finite
+        scaled = np.where(finite, scaled, 0.0)
+    values = np.clip(np.rint(scaled), -_INT32, _INT32).astype(np.int32)
+    fields = _FrameFields(
+        FRAME_SCHEMA, frame.seq, frame.t_ns, "kPa", SCALE_KPA, None, encode_mask(valid)
+    )
+    if frame.beyond_range.any():
+        fields.beyond_range = encode_mask(frame.beyond_range)
+    if raw:
+        fields.raw = frame.raw.tobytes()
+    if encoding == "json":
+        fields.values = values.tolist()
+        return _encoder.encode(fields)
+    cbor2 = load_cbor2()
+    small = bool(np.abs(values).max(initial=0) < 2**15)
+    tag = 77 if small else 78
+    fields.values = cbor2.CBORTag(tag, values.astype(_TYPED_ARRAYS[tag]).tobytes())
+    keys = {key: getattr(fields, key) for key in fields.__struct_fields__}
+    for key in ("beyond_range", "raw"):
+        if not keys[key]:
+            del keys[key]
+    encoded: bytes = cbor2.dumps(keys)
+    return encoded
+
+
+def decode_frame(part: str, payload: bytes) -> Frame:
+    """Read the payload of `<part>/frame`, JSON or CBOR.
+
+    Raises:
+        MessageError: it is not such a payload.
+        SkinError: it is CBOR and cbor2 is not installed.
+    """
+    # A CBOR map starts with 0xA0 to 0xBF, a JSON object with a brace or white space.
+    if payload[:1] >= b"\xa0":
+        fields, values = _decode_cbor_frame(payload)
+    else:
+        fields = decode(_decoder, payload, "frame")
+        values = np.array(fields.values, np.int32)
+    if fields.schema != FRAME_SCHEMA:
+        raise MessageError(f'frame: schema "{fields.schema}"; this program reads {FRAME_SCHEMA}')
+    n = len(values)
+    beyond = decode_mask(fields.beyond_range, n) if fields.beyond_range else np.zeros(n, np.bool_)
+    pressure_kpa = values.astype(np.float64) * fields.scale
+    valid = decode_mask(fields.valid, n)
+    raw = np.frombuffer(fields.raw, np.uint8) if fields.raw else None
+    if raw is not None and len(raw) != n:
+        raise MessageError(f"frame: {len(raw)} raw bytes for {n} taxels")
+    return Frame(part, fields.seq, fields.t_ns, pressure_kpa, valid, beyond, raw=raw)
+
+
+def load_cbor2() -> Any:
+    """Import cbor2, which is an extra.
+
+    Raises:
+        SkinError: it is not installed.
+    """
+    try:
+        import cbor2
+    except ImportError:
+        raise SkinError(
+            "CBOR frames need the package cbor2, which is not installed; "
+            "mend it with: pip install 'skin-host[cbor]'"
+        ) from None
+    return cbor2
+
+
+def _decode_cbor_frame(payload: bytes) -> tuple[_FrameFields, NDArray[np.int32]]:
+    check_size(payload, "frame")
+    cbor2 = load_cbor2()
+    check_cbor(payload, "frame")
+    try:
+        keys = cbor2.loads(payload)
+        fields = msgspec.convert(keys, _FrameFields)
+    except (cbor2.CBORDecodeError, ValueError, TypeError, ArithmeticError, RecursionError) as error:
+        raise MessageError(f"frame: {error}") from None
+    tagged = fields.values
+    item = _TYPED_ARRAYS.get(tagged.tag) if isinstance(tagged, cbor2.CBORTag) else None
+    data = tagged.value if item else None
+    if item is None or not isinstance(data, bytes) or len(data) % item.itemsize:
+        raise MessageError("frame: values: wanted a typed array of RFC 8746 with tag 77 or 78")
+    values = np.frombuffer(data, item).astype(np.int32)
+    if len(values) > MAX_TAXELS:
+        raise MessageError(f"frame: {len(values)} taxels; wanted at most {MAX_TAXELS}")
+    return fields, values

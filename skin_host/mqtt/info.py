@@ -1,0 +1,272 @@
+"""Description of a node: its parts, the order and places of their taxels, units and rates.
+
+The payload of `nodes/<node>/info`, retained. With it a subscriber can draw the skin and locate each
+entry of a frame without any file of the robot's.
+"""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta, Struct
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from skin_host.mqtt.frames import SCALE_KPA
+from skin_host.mqtt.payload import MessageError, Vector, decode
+
+if TYPE_CHECKING:
+    from skin_host.config.fingertips import Fingertip
+    from skin_host.layout import Layout, PartLayout
+
+INFO_SCHEMA: Final = "skin.info/1"
+#: 100 000 taxels and their triangles fit.
+MAX_BYTES = 32 * 1024 * 1024
+MAX_PIECES = 10_000
+#: Positions to 0.001 mm, areas and radii to 0.01, normals to 0.0001.
+_M, _MM, _NORMAL = 6, 2, 4
+
+
+class CalibrationInfo(Struct, frozen=True):
+    """Which calibration is in use, and when it was taken (ISO 8601, UTC)."""
+
+    id: str
+    time: str
+
+
+class TriangleInfo(Struct, frozen=True):
+    """A triangle: its board and number, its first taxel in the part, its outline [k, 3] (m).
+
+    `no_load` is the byte of an untouched taxel, as configured; None from older nodes.
+    """
+
+    board: str
+    number: int
+    kind: str
+    first: int
+    outline_m: list[Vector]
+    no_load: int | None = None
+
+
+class PartInfo(Struct, frozen=True):
+    """A part. Lists have one entry a taxel, in the order of the values of a frame.
+
+    Attributes:
+        period_ms: time between two frames as configured, of its slowest board.
+        pads: `pressure` or `thermal`; thermal pads are never valid in frames.
+        position_m, normal: in the part's own frame.
+        radius_mm, area_mm2: of the pad; of the skin that it answers for.
+    """
+
+    period_ms: int
+    pads: list[Literal["pressure", "thermal"]]
+    position_m: list[Vector]
+    normal: list[Vector]
+    radius_mm: list[float]
+    area_mm2: list[float]
+    triangles: list[TriangleInfo]
+
+
+class FingertipInfo(Struct, frozen=True):
+    """A fingertip on a force/torque board: it has no frames, but touches, slips and health.
+
+    Attributes:
+        period_ms: between two samples of its board.
+        shape: sphere, cylinder (about z), ellipsoid (axes along x, y, z) or plane (faces z).
+        size_mm: radius, semi-axes, or nothing for a plane.
+        array: the part whose skin covers it, in the same frame.
+        friction: known coefficient of static friction, or None.
+        threshold_n, over_n: where a contact begins, and where it presses too hard.
+    """
+
+    period_ms: int
+    shape: str
+    size_mm: list[float]
+    array: str | None
+    friction: float | None
+    threshold_n: float
+    over_n: float
+
+
+class NodeInfo(Struct, frozen=True, kw_only=True):
+    """The payload of `nodes/<node>/info`.
+
+    Attributes:
+        version: of skin-host.
+        configuration: hash of what a calibration belongs to (`settings.skin_hash`).
+        scale: one unit of the values of a frame, in `unit`.
+        frame_hz: frames are thinned to this rate; 0 means that every one is sent.
+        calibration: None before the first.
+        commands: whether the node takes commands (`mqtt.commands`).
+        pieces: number of documents, if one would be too large for the broker. The others are at
+            `nodes/<node>/2/info` and so on, equal except for `parts` and `fingertips`.
+    """
+
+    schema: Literal["skin.info/1"] = INFO_SCHEMA
+    robot: str
+    node: str
+    version: str
+    configuration: str
+    unit: Literal["kPa"] = "kPa"
+    scale: float = SCALE_KPA
+    encoding: Literal["json", "cbor"] = "json"
+    frame_hz: float = 0.0
+    calibration: CalibrationInfo | None = None
+    commands: bool = True
+    pieces: Annotated[int, Meta(ge=1, le=MAX_PIECES)] = 1
+    parts: Annotated[dict[str, PartInfo], Meta(max_length=10_000)]
+    fingertips: Annotated[dict[str, FingertipInfo], Meta(max_length=10_000)] = {}
+
+
+_decoder = msgspec.json.Decoder(NodeInfo)
+
+
+def node_info(
+    layout: "Layout",
+    node: str,
+    *,
+    version: str,
+    configuration: str,
+    encoding: Literal["json", "cbor"] = "json",
+    frame_hz: float = 0.0,
+    calibration: CalibrationInfo | None = None,
+    commands: bool = True,
+    fingertips: Mapping[str, "Fingertip"] | None = None,
+) -> NodeInfo:
+    """Describe the parts of `layout`, and of `fingertips` those, that belong to `node`."""
+    parts = {
+        part.name: _part_info(layout, number, part)
+        for number, part in enumerate(layout.parts)
+        if part.node == node
+    }
+    return NodeInfo(
+        robot=layout.robot,
+        node=node,
+        version=version,
+        configuration=configuration,
+        encoding=encoding,
+        frame_hz=frame_hz,
+        calibration=calibration,
+        commands=commands,
+        parts=parts,
+        fingertips={
+            name: _fingertip_info(tip)
+            for name, tip in (fingertips or {}).items()
+            if tip.node == node
+        },
+    )
+
+
+def encode_info(info: NodeInfo) -> bytes:
+    """Write the payload of `nodes/<node>/info`."""
+    return msgspec.json.encode(info)
+
+
+def encode_pieces(info: NodeInfo, limit: int | None) -> list[bytes]:
+    """Write an info as one payload, or as several of at most `limit` bytes.
+
+    A part that is longer by itself follows as a piece that is not counted in `pieces`.
+    """
+    whole = encode_info(info)
+    if limit is None or len(whole) <= limit:
+        return [whole]
+    bare = replace(info, parts={}, fingertips={}, pieces=MAX_PIECES)
+    room = limit - len(encode_info(bare))
+    pieces: list[NodeInfo] = []
+    large: list[NodeInfo] = []
+    free = 0
+    for key in ("parts", "fingertips"):
+        for name, value in getattr(info, key).items():
+            size = len(msgspec.json.encode({name: value}))
+            if size > room:
+                large.append(replace(bare, **{key: {name: value}}))
+                continue
+            if size > free:
+                pieces.append(bare)
+                free = room
+            free -= size
+            pieces[-1] = replace(pieces[-1], **{key: getattr(pieces[-1], key) | {name: value}})
+    pieces = pieces or [bare]
+    return [encode_info(replace(one, pieces=len(pieces))) for one in [*pieces, *large]]
+
+
+def join_pieces(found: Mapping[int, NodeInfo]) -> NodeInfo | None:
+    """Put pieces together by their numbers; None while some are missing or of another skin."""
+    first = found.get(1)
+    if first is None or first.pieces == 1:
+        return first
+    pieces = [found.get(number) for number in range(1, first.pieces + 1)]
+    parts: dict[str, PartInfo] = {}
+    fingertips: dict[str, FingertipInfo] = {}
+    for one in pieces:
+        if one is None or (one.configuration, one.pieces) != (first.configuration, first.pieces):
+            return None
+        parts |= one.parts
+        fingertips |= one.fingertips
+    return replace(first, pieces=1, parts=parts, fingertips=fingertips)
+
+
+def decode_info(payload: bytes) -> NodeInfo:
+    """Read the payload of `nodes/<node>/info`.
+
+    Raises:
+        MessageError: it is not such a payload.
+    """
+    info = decode(_decoder, payload, "info", MAX_BYTES)
+    for name, part in info.parts.items():
+        n = len(part.pads)
+        lists: tuple[list[Any], ...] = (part.position_m, part.normal, part.radius_mm, part.area_mm2)
+        if any(len(values) != n for values in lists):
+            raise MessageError(f"info: parts.{name}: its lists differ in length")
+    return info
+
+
+def _part_info(layout: "Layout", number: int, part: "PartLayout") -> PartInfo:
+    from skin_host.layout import PadKind
+
+    mine = slice(part.start, part.stop)
+    return PartInfo(
+        period_ms=max(layout.boards[board].settings.period_ms for board in part.boards),
+        pads=[
+            "thermal" if kind == PadKind.THERMAL else "pressure" for kind in layout.pad_kind[mine]
+        ],
+        position_m=_vectors(layout.position_m[mine], _M),
+        normal=_vectors(layout.normal[mine], _NORMAL),
+        radius_mm=_rounded(layout.radius_mm[mine], _MM),
+        area_mm2=_rounded(layout.area_mm2[mine], _MM),
+        triangles=[
+            TriangleInfo(
+                layout.boards[triangle.board].name,
+                triangle.number,
+                triangle.kind,
+                triangle.first - part.start,
+                _vectors(triangle.outline_m, _M),
+                layout.boards[triangle.board].settings.no_load,
+            )
+            for triangle in layout.triangles
+            if triangle.part == number
+        ],
+    )
+
+
+def _fingertip_info(tip: "Fingertip") -> FingertipInfo:
+    size = tip.semi_axes_mm or (() if tip.radius_mm is None else (tip.radius_mm,))
+    return FingertipInfo(
+        tip.period_ms,
+        tip.shape,
+        list(size),
+        tip.array,
+        tip.friction,
+        tip.threshold_n,
+        tip.over_n,
+    )
+
+
+def _rounded(values: NDArray[np.float64], decimals: int) -> Any:
+    # Adding 0 turns a rounded -0.0 into 0.0.
+    return (np.round(values, decimals) + 0.0).tolist()
+
+
+def _vectors(values: NDArray[np.float64], decimals: int) -> list[Vector]:
+    return [(x, y, z) for x, y, z in _rounded(values, decimals)]

@@ -1,0 +1,212 @@
+"""Messages of touches, contact and health. Pure: converts data to payload bytes and back.
+
+`docs/mqtt.md` is the contract.
+"""
+
+import math
+from typing import Annotated, Any, Final, Literal, get_args
+
+import msgspec
+from msgspec import UNSET, Meta, Struct, UnsetType
+
+from skin_host.mqtt.payload import (
+    MAX_TAXELS,
+    Count,
+    Int64,
+    MessageError,
+    Vector,
+    decode,
+    decode_event,
+)
+from skin_host.processing.events import Load, Reason, TouchEvent
+
+TOUCH_SCHEMA: Final = "skin.touch/1"
+#: ON: touched; OFF: not touched; UNKNOWN: some of the part cannot feel.
+ContactState = Literal["ON", "OFF", "UNKNOWN"]
+HEALTH_SCHEMA: Final = "skin.health/1"
+#: Decimals of kPa, of mm2, of m (0.001 mm), of N, of N m and of the parts of a unit vector.
+KPA_DECIMALS = 3
+MM2_DECIMALS = 2
+M_DECIMALS = 6
+N_DECIMALS = 4
+NM_DECIMALS = 6
+NORMAL_DECIMALS = 4
+
+
+class LoadMessage(Struct, frozen=True, kw_only=True):
+    """Force/torque data of the contact on a fingertip.
+
+    Attributes:
+        verdict: whether one push on the surface gives this force and torque.
+        force_n, torque_nm: of the touching object on the fingertip, about the origin of its frame.
+        shear_n: the share of the force along the surface; None without a place.
+        flags: of the finger: search, move, touch, slip, over.
+    """
+
+    verdict: Literal["contact", "no_single_contact", "several_contacts", "saturated"]
+    force_n: Vector
+    torque_nm: Vector
+    shear_n: Vector | None
+    flags: Annotated[list[Annotated[str, Meta(max_length=16)]], Meta(max_length=16)]
+
+
+class TouchMessage(Struct, frozen=True, kw_only=True):
+    """A contact begins, moves or ends: the payload of `<part>/touch`.
+
+    Attributes:
+        id: of the contact, among those of its part.
+        seq, t_ns: of the frame in which it happened.
+        count: number of events of the part from this node so far, this one included. A gap is a
+            loss; it starts again at 1 with the node.
+        taxels: numbers within the part.
+        area_mm2, peak_kpa, mean_kpa: None on a fingertip without skin.
+        sigma_m: radial standard error of `centroid_m`; None where it is not known.
+        reason: why it ended, only with an end.
+    """
+
+    schema: Literal["skin.touch/1"] = TOUCH_SCHEMA
+    event: Literal["begin", "move", "end"]
+    id: Count
+    seq: Count
+    t_ns: Int64
+    count: Count = 0
+    part: Annotated[str, Meta(max_length=64)]
+    taxels: Annotated[list[Annotated[int, Meta(ge=0, le=MAX_TAXELS)]], Meta(max_length=MAX_TAXELS)]
+    centroid_m: Vector | None
+    normal: Vector | None
+    area_mm2: float | None
+    peak_kpa: float | None
+    mean_kpa: float | None
+    force_n: float
+    sigma_m: Annotated[float, Meta(ge=0)] | None = None
+    reason: Reason | UnsetType | None = UNSET
+
+
+class FingertipTouchMessage(TouchMessage, frozen=True, kw_only=True):
+    """As `TouchMessage`, for a fingertip on a force/torque board, with the board's data."""
+
+    load: LoadMessage
+
+
+class Touch(TouchMessage, frozen=True, kw_only=True):
+    """A received event; `missed` events of its part were lost just before it.
+
+    Only fingertips on force/torque boards have a `load`, only an end has a `reason`.
+    """
+
+    reason: Reason | None = None
+    load: LoadMessage | None = None
+    missed: int = 0
+
+
+_encoder = msgspec.json.Encoder()
+_CONTACT_STATES: dict[bytes, ContactState] = {
+    state.encode(): state for state in get_args(ContactState)
+}
+_touch_decoder = msgspec.json.Decoder(Touch)
+_health_decoder = msgspec.json.Decoder(dict[str, Any])
+
+
+def touch_message(event: TouchEvent, count: int) -> TouchMessage:
+    """Return the message of an event; `count` as in `TouchMessage`. Numbers are rounded as
+    above.
+    """
+    said: dict[str, Any] = {
+        "event": event.event,
+        "id": event.id,
+        "seq": event.seq,
+        "t_ns": event.t_ns,
+        "count": count,
+        "part": event.part,
+        "taxels": event.taxels,
+        "centroid_m": _vector(event.centroid_m, M_DECIMALS),
+        "normal": _vector(event.normal, NORMAL_DECIMALS),
+        "area_mm2": _known(event.area_mm2, MM2_DECIMALS),
+        "peak_kpa": _known(event.peak_kpa, KPA_DECIMALS),
+        "mean_kpa": _known(event.mean_kpa, KPA_DECIMALS),
+        "force_n": round(event.force_n, N_DECIMALS),
+        "sigma_m": None if event.sigma_m is None else round(event.sigma_m, M_DECIMALS),
+        "reason": UNSET if event.reason is None else event.reason,
+    }
+    if event.load is None:
+        return TouchMessage(**said)
+    return FingertipTouchMessage(**said, load=_load_message(event.load))
+
+
+def encode_touch(event: TouchEvent, count: int) -> bytes:
+    """Write the payload of `<part>/touch`."""
+    return _encoder.encode(touch_message(event, count))
+
+
+def decode_touch(payload: bytes) -> Touch:
+    """Read the payload of `<part>/touch`.
+
+    Raises:
+        MessageError: it is not such a payload.
+    """
+    return decode_event(_touch_decoder, payload, "touch")
+
+
+def encode_contact(state: ContactState) -> bytes:
+    """Write the payload of `<part>/contact`."""
+    return state.encode()
+
+
+def decode_contact(payload: bytes) -> ContactState:
+    """Read the payload of `<part>/contact`.
+
+    Raises:
+        MessageError: it is not a contact state.
+    """
+    state = _CONTACT_STATES.get(payload)
+    if state is None:
+        raise MessageError(f"contact: {payload[:16]!r}; wanted ON, OFF or UNKNOWN")
+    return state
+
+
+def health_keys(record: Any) -> dict[str, Any]:
+    """Return the keys of a health message: the record, after our schema."""
+    keys: dict[str, Any] = msgspec.to_builtins(record)
+    return {"schema": HEALTH_SCHEMA} | keys
+
+
+def encode_health(record: Any) -> bytes:
+    """Write the payload of `<part>/health`."""
+    return _encoder.encode(health_keys(record))
+
+
+def decode_health(payload: bytes) -> dict[str, Any]:
+    """Read the payload of `<part>/health`.
+
+    Raises:
+        MessageError: it is not such a payload.
+    """
+    record = decode(_health_decoder, payload, "health")
+    if record.get("schema") != HEALTH_SCHEMA:
+        raise MessageError(f"health: wanted the schema {HEALTH_SCHEMA}")
+    return record
+
+
+def _load_message(load: Load) -> LoadMessage:
+    return LoadMessage(
+        verdict=load.verdict,
+        force_n=_rounded(load.force_n, N_DECIMALS),
+        torque_nm=_rounded(load.torque_nm, NM_DECIMALS),
+        shear_n=_vector(load.shear_n, N_DECIMALS),
+        flags=load.flags,
+    )
+
+
+def _known(value: float, decimals: int) -> float | None:
+    return None if math.isnan(value) else round(value, decimals)
+
+
+def _vector(values: list[float] | None, decimals: int) -> Vector | None:
+    if values is None:
+        return None
+    return _rounded(values, decimals)
+
+
+def _rounded(values: list[float], decimals: int) -> Vector:
+    x, y, z = (round(value, decimals) + 0.0 for value in values)
+    return x, y, z

@@ -1,0 +1,120 @@
+"""Numbers that show which of two messages of a node is newer, whichever broker they came from.
+
+Brokers that failed and came back send stored messages, last wills too, and a cluster sends a
+message to a subscriber several times from several nodes. User properties of MQTT 5 put them in
+order:
+
+- `run`, of events and frames: the number of this run of the node; within it `count` or `seq` rises.
+- `stamp`, of retained messages: two numbers with a dot between, that of the connection and that of
+  the message in it.
+
+Runs and connections have rising numbers: nanoseconds since 1970, by the clock of the node.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+
+from skin_host.mqtt.connection import Will
+
+STAMP = "stamp"
+RUN = "run"
+#: Longer numbers are not nanoseconds.
+_MAX_DIGITS = 19
+
+
+class Stamp(NamedTuple):
+    """When a retained message was published: the greater one is newer."""
+
+    connection: int
+    message: int
+
+
+class Numbers:
+    """Gives the numbers of a node.
+
+    Args:
+        now_ns: time of day; it may be set back.
+    """
+
+    def __init__(self, now_ns: Callable[[], int]) -> None:
+        self._now_ns = now_ns
+        self._last = 0
+        self._message = 0
+        self.run = self.connection = self._next()
+
+    def _next(self) -> int:
+        self._last = max(self._now_ns(), self._last + 1)
+        return self._last
+
+    def connect(self) -> None:
+        """Continue with the numbers of the next connection."""
+        self.connection = self._next()
+        self._message = len(("online", "offline"))
+
+    @property
+    def online(self) -> Stamp:
+        """Return the stamp of the status while the connection lasts."""
+        return Stamp(self.connection, 0)
+
+    @property
+    def offline(self) -> Stamp:
+        """Return the stamp of the status at its end."""
+        return Stamp(self.connection, 1)
+
+    def state(self) -> Stamp:
+        """Return the stamp of any other retained message."""
+        self._message += 1
+        return Stamp(self.connection, self._message)
+
+    def overtake(self, stamp: Stamp) -> bool:
+        """Begin a run that is newer than one that left a message, if that one looks newer."""
+        if stamp.connection <= self.connection:
+            return False
+        self._last = max(self._last, stamp.connection)
+        self.run = self._next()
+        return True
+
+
+def put_run(properties: Properties | None, run: int) -> None:
+    """Add the number of the run to a message; MQTT 3.1.1 has no place for it."""
+    if properties is not None:
+        properties.UserProperty = (RUN, str(run))
+
+
+def put_stamp(properties: Properties | None, stamp: Stamp) -> None:
+    """Add the stamp to a retained message; MQTT 3.1.1 has no place for it."""
+    if properties is not None:
+        properties.UserProperty = (STAMP, f"{stamp.connection}.{stamp.message}")
+
+
+def last_will(topic: str, payload: bytes, stamp: Stamp | None) -> Will:
+    """Return the broker's message for a node that vanishes; without a stamp for MQTT 3.1.1."""
+    properties = None
+    if stamp is not None:
+        properties = Properties(PacketTypes.WILLMESSAGE)  # type: ignore[no-untyped-call]
+        put_stamp(properties, stamp)
+    return Will(topic, payload, qos=1, retain=True, properties=properties)
+
+
+def run_of(properties: Any) -> int | None:
+    """Return the number of a message's run, if it has one."""
+    return _number(_user_property(properties, RUN))
+
+
+def stamp_of(properties: Any) -> Stamp | None:
+    """Return the stamp of a retained message, if it has one."""
+    text, _, rest = _user_property(properties, STAMP).partition(".")
+    connection, message = _number(text), _number(rest)
+    return None if connection is None or message is None else Stamp(connection, message)
+
+
+def _user_property(properties: Any, name: str) -> str:
+    return next((v for key, v in getattr(properties, "UserProperty", ()) if key == name), "")
+
+
+def _number(text: str) -> int | None:
+    fit = len(text) <= _MAX_DIGITS and text.isascii() and text.isdecimal()
+    return int(text) if fit else None

@@ -1,0 +1,286 @@
+"""Messages that wait to be published. Putting is cheap and never waits.
+
+For frames it holds the newest of each part, for events that must arrive a bounded queue whose
+losses are counted, and for retained messages the newest of each topic.
+"""
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import NamedTuple
+
+from skin_host.clock import SYSTEM, Clock
+from skin_host.fingertip.events import OverEvent, SlipEvent
+from skin_host.mqtt.connection import MessageProperties
+from skin_host.mqtt.grasping import encode_grasp
+from skin_host.mqtt.messages import encode_touch
+from skin_host.mqtt.trials import Trials
+from skin_host.processing.events import TouchEvent
+from skin_host.processing.pipeline import PressureFrame
+
+#: Events that are sent again to another broker: acknowledged within this time, and at most this
+#: many. A frozen broker is noticed after 3 s.
+REPEAT_S = 10.0
+REPEATED = 1000
+#: `move` events may fill half of the queue, because a begin or an end is more important.
+MOVE_SHARE = 0.5
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class PublisherCounters:
+    """Results of everything that was put.
+
+    Attributes:
+        connections: how often the broker was reached.
+        frames_skipped: a newer frame came before they could be sent, or there was no broker.
+        touches_waiting: events in the queue now.
+        touches_dropped: events that found the queue full, or were left at the end.
+        refused: publications that the broker refused; `last_error` gives the reason.
+        rejected: publications that were dropped because the broker ended the connection
+            whenever they were sent.
+        withheld: topics to which nothing is sent because of that, or of the size of the message.
+        name_taken: connections are ended as if another client used this node's name.
+        answers_dropped: answers to commands that were lost with a connection.
+    """
+
+    connected: bool = False
+    connections: int = 0
+    last_error: str = ""
+    frames_sent: int = 0
+    frames_skipped: int = 0
+    touches_sent: int = 0
+    touches_waiting: int = 0
+    touches_dropped: int = 0
+    retained_sent: int = 0
+    refused: int = 0
+    rejected: int = 0
+    withheld: list[str] = field(default_factory=list)
+    name_taken: bool = False
+    answers_dropped: int = 0
+    commands_taken: int = 0
+    commands_refused: int = 0
+
+
+class Event(NamedTuple):
+    """Something that must arrive: an event of a part, or the answer to a command."""
+
+    topic: str
+    payload: bytes
+    properties: MessageProperties | None
+    is_touch: bool
+
+
+class Outbox:
+    """Everything that a publisher still has to send.
+
+    Args:
+        event_limit: how many events may wait.
+        frame_hz: frames are thinned to this rate; 0 lets all pass.
+
+    Attributes:
+        frames: the newest frame of each part.
+        events: messages that must arrive, in order.
+        retained: the payload of every retained topic, sent or not.
+        passed_on: recently acknowledged events.
+        pending: the topics of `retained` that are to be sent.
+        on_frame: called when there is a new frame.
+        events_put, retained_put: set when there is something new.
+        emptied: set when no event and nothing retained is left to send.
+        counters: results of everything that was put.
+        trials: which topics are withheld.
+    """
+
+    def __init__(self, event_limit: int, frame_hz: float = 0.0, clock: Clock = SYSTEM) -> None:
+        self.frames: dict[str, PressureFrame] = {}
+        self.events: deque[Event] = deque()
+        self.retained: dict[str, bytes] = {}
+        self.passed_on: deque[tuple[float, Event]] = deque(maxlen=REPEATED)
+        self.pending: dict[str, None] = {}
+        self.on_frame: Callable[[], None] = lambda: None
+        self.events_put = asyncio.Event()
+        self.retained_put = asyncio.Event()
+        self.emptied = asyncio.Event()
+        self.counters = PublisherCounters()
+        self.trials = Trials(clock.monotonic_s)
+        self._clock = clock
+        self._event_limit = event_limit
+        self._move_limit = int(event_limit * MOVE_SHARE)
+        self._overflowing = False
+        self._counts: dict[str, int] = {}
+        #: Payloads that the broker did not take, by topic.
+        self._given_up: dict[str, bytes] = {}
+        self._frame_ns = int(1e9 / frame_hz) if frame_hz else 0
+        self._frame_due_ns: dict[str, int] = {}
+
+    def put_frame(self, frame: PressureFrame) -> None:
+        """Take a frame, unless it is earlier than the rate allows or there is no connection."""
+        if not self._is_due(frame):
+            return
+        if not self.counters.connected:
+            self.counters.frames_skipped += 1
+            return
+        self.counters.frames_skipped += frame.part in self.frames
+        self.frames[frame.part] = frame
+        self.on_frame()
+
+    def take_frame(self) -> PressureFrame:
+        """Take out the frame of the part that has waited longest."""
+        return self.frames.pop(next(iter(self.frames)))
+
+    def put_back(self, frames: list[PressureFrame]) -> None:
+        """Put back frames that could not be sent, before all others."""
+        self.frames = {frame.part: frame for frame in frames} | self.frames
+
+    def drop_frames(self) -> None:
+        """Drop all frames, which would be old when a broker comes back."""
+        self.counters.frames_skipped += len(self.frames)
+        self.frames.clear()
+
+    def put_touch(
+        self, topic: str, touch: TouchEvent, properties: MessageProperties | None
+    ) -> None:
+        """Take a touch event, or count it as lost; either way it is numbered."""
+        limit = self._move_limit if touch.event == "move" else self._event_limit
+        self._put_counted(topic, lambda n: encode_touch(touch, n), properties, limit)
+
+    def put_grasp(
+        self, topic: str, event: SlipEvent | OverEvent, properties: MessageProperties | None
+    ) -> None:
+        """Take an event of a slip, or of pressing too hard, in the same way."""
+        limit = self._event_limit
+        self._put_counted(topic, lambda n: encode_grasp(event, n), properties, limit)
+
+    def _put_counted(
+        self,
+        topic: str,
+        encode: Callable[[int], bytes],
+        properties: MessageProperties | None,
+        limit: int,
+    ) -> None:
+        count = self._counts[topic] = self._counts.get(topic, 0) + 1
+        if self.trials.withholds(topic):
+            self.counters.touches_dropped += 1
+            self.counters.rejected += 1
+            return
+        if len(self.events) < limit:
+            self.put_event(Event(topic, encode(count), properties, is_touch=True))
+            return
+        self.counters.touches_dropped += 1
+        if not self._overflowing:
+            self._overflowing = True
+            _log.warning("touch events are lost: %d wait for the broker already", limit)
+
+    def put_event(self, event: Event) -> None:
+        """Take a message that must arrive."""
+        self.events.append(event)
+        self.events_put.set()
+
+    def event_sent(self) -> None:
+        """Note that the first event has arrived."""
+        event = self.events.popleft()
+        self.counters.touches_sent += event.is_touch
+        if event.is_touch:
+            self.passed_on.append((self._clock.monotonic_s(), event))
+        self.trials.arrived(event.topic)
+        if not self.events:
+            self._overflowing = False
+            self.emptied.set()
+
+    def give_up_event(self, number: int = 0) -> None:
+        """Drop the first event, or another one, which the broker does not take."""
+        self.counters.rejected += 1
+        self.counters.touches_dropped += self.events[number].is_touch
+        del self.events[number]
+        if not self.events:
+            self.emptied.set()
+
+    def drop_answers(self) -> None:
+        """Drop answers: their askers have lost the connection, or the answer is why we lost
+        ours.
+        """
+        kept = [event for event in self.events if event.is_touch]
+        self.counters.answers_dropped += len(self.events) - len(kept)
+        self.events = deque(kept)
+
+    def repeat_events(self) -> int:
+        """Put recently acknowledged events before all waiting ones; return how many events.
+
+        They may have been lost with their broker: an acknowledgement means that the broker has an
+        event, not that subscribers have it.
+        """
+        since_s = self._clock.monotonic_s() - REPEAT_S
+        again = [event for at_s, event in self.passed_on if at_s >= since_s]
+        self.passed_on.clear()
+        self.counters.touches_sent -= len(again)
+        self.events.extendleft(reversed(again))
+        self.events_put.set()
+        return len(again)
+
+    def put_state(self, topic: str, payload: bytes) -> None:
+        """Take a retained message; it replaces the one of the topic."""
+        self.retained[topic] = payload
+        if not self.trials.withholds(topic):
+            self.pending[topic] = None
+            self.retained_put.set()
+
+    def take_states(self, most: int) -> dict[str, bytes]:
+        """Return up to `most` topics and payloads to be sent; they stay until `states_sent`."""
+        return {topic: self.retained[topic] for topic in islice(self.pending, most)}
+
+    def states_sent(self, states: dict[str, bytes]) -> None:
+        """Note that these have arrived. Newer payloads of their topics are still to be sent."""
+        self.counters.retained_sent += len(states)
+        for topic, payload in states.items():
+            if self.retained[topic] is payload:
+                self.pending.pop(topic, None)
+            self.trials.arrived(topic)
+        if not self.pending:
+            self.emptied.set()
+
+    def repeat_states(self) -> None:
+        """Send all retained messages again, to a broker that may have lost them."""
+        self.pending = {topic: None for topic in self.retained if not self._is_given_up(topic)}
+        self.retained_put.set()
+
+    def give_up_state(self, topic: str) -> None:
+        """Drop a retained message that the broker does not take, until it changes."""
+        self.counters.rejected += 1
+        self._given_up[topic] = self.retained[topic]
+        self.pending.pop(topic, None)
+        if not self.pending:
+            self.emptied.set()
+
+    def _is_given_up(self, topic: str) -> bool:
+        return self.trials.withholds(topic) or self._given_up.get(topic) is self.retained[topic]
+
+    async def drained(self) -> None:
+        """Wait until every event and everything retained has arrived."""
+        while self.events or self.pending:
+            self.emptied.clear()
+            await self.emptied.wait()
+
+    def counted(self, topic: str) -> int:
+        """Return how many events of a topic there have been."""
+        return self._counts.get(topic, 0)
+
+    def touches_waiting(self) -> int:
+        """How many touch events are in the queue."""
+        return sum(event.is_touch for event in self.events)
+
+    def _is_due(self, frame: PressureFrame) -> bool:
+        """Thin the frames by their own times; a little early is on time."""
+        if not self._frame_ns:
+            return True
+        due_ns = self._frame_due_ns.get(frame.part, frame.t_ns)
+        early_ns = due_ns - frame.t_ns
+        if self._frame_ns // 10 < early_ns <= self._frame_ns * 2:
+            return False
+        # After a gap, or when the clock was set back, counting starts again.
+        from_ns = due_ns if abs(early_ns) <= self._frame_ns else frame.t_ns
+        self._frame_due_ns[frame.part] = from_ns + self._frame_ns
+        return True

@@ -1,0 +1,431 @@
+"""MQTT publisher: one task that sends queued messages to the broker.
+
+The acquisition is not affected if the broker is absent, frozen or lost, and messages that must
+arrive are sent again. Frames are encoded only while there is a connection.
+"""
+
+import asyncio
+import logging
+from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import msgspec
+
+from skin_host.clock import SYSTEM, Clock
+from skin_host.config.settings import Mqtt
+from skin_host.errors import SkinError
+from skin_host.fingertip.events import OverEvent, SlipEvent
+from skin_host.mqtt.address import Broker, CredentialError
+from skin_host.mqtt.commands import CommandHandler, Handler
+from skin_host.mqtt.connection import (
+    FIRST_RETRY_S,
+    GOOD_S,
+    Connection,
+    Message,
+    MessageProperties,
+    MqttError,
+    PackedProperties,
+    Retry,
+    connect,
+    explain,
+    first_error,
+    message_properties,
+)
+from skin_host.mqtt.courier import Courier, FrameForm
+from skin_host.mqtt.frames import load_cbor2
+from skin_host.mqtt.home_assistant import discovery
+from skin_host.mqtt.info import MAX_PIECES, NodeInfo, encode_pieces
+from skin_host.mqtt.messages import ContactState, encode_contact, encode_health
+from skin_host.mqtt.order import Numbers, last_will, put_run, put_stamp, stamp_of
+from skin_host.mqtt.outbox import Event, Outbox, PublisherCounters
+from skin_host.mqtt.payload import CBOR_TYPE, JSON_TYPE
+from skin_host.mqtt.topics import OFFLINE, ONLINE, Topics
+from skin_host.mqtt.trials import TRIES
+from skin_host.processing.events import TouchEvent
+from skin_host.processing.pipeline import PressureFrame
+
+FRAME_EXPIRY_S = 1
+#: A request of 64 KiB, with its topic and properties.
+MAX_PACKET_BYTES = 80_000
+MAX_CORRELATION_BYTES = 1024
+#: Waiting times after another daemon has taken this node's name, from the first to the longest.
+FIRST_TAKEN_S = 2.0
+LAST_TAKEN_S = 30.0
+#: At most this many withheld topics are named.
+MAX_NAMED = 8
+
+#: Makes a connection to a broker, see `connection.connect`.
+Connect = Callable[..., AbstractAsyncContextManager[Connection]]
+
+_log = logging.getLogger(__name__)
+
+
+class Publisher:
+    """Publishes for one node. Use from the event loop's own thread:
+
+        async with Publisher(settings.mqtt, settings.robot, "main") as publisher:
+            publisher.put_frame(frame)
+
+    Leaving the block sends waiting messages, for at most `drain_s`, and publishes `offline`.
+
+    Args:
+        settings: table `mqtt` of the configuration.
+        robot: whose topics.
+        node: the name of this daemon.
+        handler: answers commands; without it, or with `mqtt.commands` off, none are taken.
+        folder: where relative file names in `settings` start.
+        drain_s: how long leaving may take.
+        clock: for time and waiting.
+        connect: makes the connections.
+
+    Raises:
+        ConfigurationError: a name cannot be part of a topic, or a named file cannot be used.
+        SkinError: frames in CBOR are requested and cbor2 is not installed.
+    """
+
+    def __init__(
+        self,
+        settings: Mqtt,
+        robot: str,
+        node: str = "main",
+        *,
+        handler: Handler | None = None,
+        folder: Path = Path(),
+        drain_s: float = 2.0,
+        clock: Clock = SYSTEM,
+        connect: Connect = connect,
+    ) -> None:
+        self._clock = clock
+        self._connect = connect
+        self.topics = Topics(settings.base, robot)
+        self._name = f"{robot}/{node}"
+        self._brokers = _addresses(settings, folder, self._name)
+        self._broker = self._brokers[0]
+        self._settings = settings
+        self._folder = folder
+        self._encoding = settings.encoding
+        if self._encoding == "cbor":
+            load_cbor2()
+        self._node = node
+        self._discovery_prefix = settings.discovery_prefix
+        self._identifier = f"skin-{robot}-{node}"
+        self._command_handler = CommandHandler(handler) if handler and settings.commands else None
+        self._drain_s = drain_s
+        self._status = self.topics.node("status", node)
+        self._commands = self.topics.command(node, "+").removesuffix("/+")
+
+        self._outbox = Outbox(settings.event_queue, settings.frame_hz, clock)
+        self._outbox.put_state(self._status, ONLINE)
+        self._numbers = Numbers(clock.now_ns)
+        self._turn = 0  # index of the broker in use
+        self._untried = len(self._brokers)
+        self._last_broker: str | None = None
+        self._info: NodeInfo | None = None
+        self._pieces = 0
+        self._name_taken_until_s = 0.0
+        self._was_ended = False
+        self._closed_in_a_row = 0
+        self._closing = asyncio.Event()
+        self._connection: Connection | None = None
+        self._task: asyncio.Task[None] | None = None
+
+        self._courier = Courier(
+            self._outbox,
+            self.topics,
+            self._status,
+            FrameForm(self._encoding, None),
+            self._state_properties,
+            self._note_refusals,
+            clock,
+        )
+        self._number_messages()
+
+    def _number_messages(self) -> None:
+        """Add the number of this run of the node to events and frames."""
+        run = self._numbers.run
+        events = message_properties(self._broker, JSON_TYPE)
+        put_run(events, run)
+        self._event_properties = PackedProperties.of(events)
+        cbor = self._encoding == "cbor"
+        frames = message_properties(self._broker, CBOR_TYPE if cbor else JSON_TYPE, text=not cbor)
+        if frames is not None:
+            frames.MessageExpiryInterval = FRAME_EXPIRY_S
+        put_run(frames, run)
+        self._courier.use(FrameForm(self._encoding, PackedProperties.of(frames)))
+
+    @property
+    def counters(self) -> PublisherCounters:
+        """Return a copy of the counters."""
+        known, handler, connection = self._outbox.counters, self._command_handler, self._connection
+        return replace(
+            known,
+            touches_waiting=self._outbox.touches_waiting(),
+            withheld=[*self._outbox.trials.withheld, *self._courier.too_large][:MAX_NAMED],
+            name_taken=self._clock.monotonic_s() < self._name_taken_until_s,
+            refused=known.refused + (connection.refused if connection else 0),
+            commands_taken=handler.taken if handler else 0,
+            commands_refused=known.commands_refused
+            + (handler.refused if handler else 0)
+            + (connection.discarded if connection else 0),
+        )
+
+    def put_info(self, info: NodeInfo) -> None:
+        """Publish the description of this node; again whenever it changes."""
+        self._info = info
+        self._publish_info()
+        if self._discovery_prefix is not None:
+            for topic, payload in discovery(self._discovery_prefix, self.topics, info).items():
+                self._outbox.put_state(topic, payload)
+
+    def _publish_info(self) -> None:
+        """Publish the info in pieces that the broker takes, and delete superfluous pieces."""
+        if self._info is None:
+            return
+        topic = self.topics.info(self._node, MAX_PIECES)
+        room = None if self._connection is None else self._connection.room(topic)
+        pieces = encode_pieces(self._info, room)
+        for number, payload in enumerate(pieces, 1):
+            self._outbox.put_state(self.topics.info(self._node, number), payload)
+        for number in range(len(pieces) + 1, self._pieces + 1):
+            self._outbox.put_state(self.topics.info(self._node, number), b"")
+        self._pieces = max(self._pieces, len(pieces))
+
+    def put_frame(self, frame: PressureFrame) -> None:
+        """Send a frame, unless a newer one of its part comes first. It must not change any more."""
+        self._outbox.put_frame(frame)
+
+    def show_raw(self, seconds: float) -> None:
+        """Send the boards' own bytes with the frames for this time; 0 ends it."""
+        self._courier.show_raw(seconds)
+
+    def put_touch(self, event: TouchEvent) -> None:
+        """Send a touch event; those of a part arrive in order, and at least once."""
+        topic = self.topics.part("touch", event.part)
+        self._outbox.put_touch(topic, event, self._event_properties)
+
+    def put_grasp(self, event: SlipEvent | OverEvent) -> None:
+        """Send an event of a slip or of pressing too hard, as reliably as a touch event."""
+        kind: Literal["slip", "over"] = "slip" if isinstance(event, SlipEvent) else "over"
+        topic = self.topics.part(kind, event.part)
+        self._outbox.put_grasp(topic, event, self._event_properties)
+
+    def put_contact(self, part: str, state: ContactState) -> None:
+        """Publish whether a part is touched, if that has changed."""
+        topic = self.topics.part("contact", part)
+        payload = encode_contact(state)
+        if self._outbox.retained.get(topic) != payload:
+            self._outbox.put_state(topic, payload)
+
+    def put_health(self, part: str, record: Any) -> None:
+        """Publish the health of a part: a record with keys that JSON can hold."""
+        self._outbox.put_state(self.topics.part("health", part), encode_health(record))
+
+    async def __aenter__(self) -> Self:
+        self._task = asyncio.create_task(self._run(), name="mqtt publisher")
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        assert self._task is not None
+        self._closing.set()
+        hopeful = self._outbox.counters.connected or self._outbox.events
+        await asyncio.wait([self._task], timeout=self._drain_s if hopeful else 0.0)
+        self._task.cancel()
+        await asyncio.gather(self._task, return_exceptions=True)
+        if self._command_handler is not None:
+            await self._command_handler.close()
+        if hopeful and self._outbox.pending:
+            _log.warning(
+                "stopped before the broker took the last state of %d topics",
+                len(self._outbox.pending),
+            )
+        left = self._outbox.touches_waiting()
+        if left:
+            self._outbox.counters.touches_dropped += left
+            _log.warning("stopped with %d touch events that the broker did not take", left)
+
+    async def _run(self) -> None:
+        retry = Retry(self._clock)
+        clock = self._clock
+        why: str | None = ""
+        while True:
+            since_s: float | None = None
+            said, why = why, None
+            try:
+                # Read again for each connection: passwords and certificates may appear late and
+                # change.
+                self._brokers = await clock.in_thread(
+                    Broker.all_from_settings, self._settings, self._folder, self._name
+                )
+                self._broker = self._brokers[self._turn % len(self._brokers)]
+                self._numbers.connect()
+                stamp = self._numbers.offline if self._broker.v5 else None
+                async with self._connect(
+                    self._broker,
+                    identifier=self._identifier,
+                    will=last_will(self._status, OFFLINE, stamp),
+                    max_packet=MAX_PACKET_BYTES,
+                    clock=clock,
+                ) as link:
+                    since_s = clock.monotonic_s()
+                    said = ""
+                    await self._talk(link)
+                    properties = self._state_properties(self._status, OFFLINE)
+                    await link.publish(
+                        self._status, OFFLINE, qos=1, retain=True, properties=properties
+                    )
+            except* Exception as group:
+                # No error may end the publishing.
+                why = self._note_loss(first_error(group), said, was_connected=since_s is not None)
+            finally:
+                self._forget_connection()
+            if why is None or (self._closing.is_set() and not self._outbox.events):
+                return
+            up_s = 0.0 if since_s is None else clock.monotonic_s() - since_s
+            wait_s = self._turn_on(up_s)
+            if wait_s is None:
+                wait_s = retry.delay_s(up_s)
+            await clock.sleep(max(wait_s, self._give_way_s(up_s)))
+
+    def _turn_on(self, up_s: float) -> float | None:
+        """Select the next broker; return how long to wait, None after all have been tried."""
+        self._turn += 1
+        self._untried = (len(self._brokers) if up_s >= GOOD_S else self._untried) - 1
+        if self._untried <= 0:
+            self._untried = len(self._brokers)
+            return None
+        return self._clock.uniform(0.0, FIRST_RETRY_S)
+
+    def _give_way_s(self, up_s: float) -> float:
+        """How long to leave the name to another daemon that seems to have taken it.
+
+        Not every broker gives a reason when it closes the older of two connections of one name.
+        Over a publication it closes no more than `TRIES` + 1 in a row.
+        """
+        ended, self._was_ended = self._was_ended, False
+        self._closed_in_a_row = self._closed_in_a_row + 1 if ended and up_s < GOOD_S else 0
+        over = self._closed_in_a_row - (TRIES + 1)
+        if over <= 0:
+            return 0.0
+        self._name_taken_until_s = self._clock.monotonic_s() + 2 * LAST_TAKEN_S
+        return min(FIRST_TAKEN_S * 2.0**over, LAST_TAKEN_S) * self._clock.uniform(0.5, 1.0)
+
+    def _note_loss(self, error: BaseException, said: str | None, *, was_connected: bool) -> str:
+        """Log in one line why there is no broker, unless that was logged last."""
+        why = self._outbox.counters.last_error = explain(error)
+        if why != said:
+            what = "connection lost" if was_connected else "cannot connect"
+            unknown = None if isinstance(error, MqttError | SkinError) else error
+            _log.warning(
+                "broker %s: %s: %s; trying again", self._broker, what, why, exc_info=unknown
+            )
+        return why
+
+    async def _talk(self, connection: Connection) -> None:
+        """Send and listen until the end of the publisher; an error means a lost broker."""
+        self._connection = connection
+        self._outbox.counters.connected = True
+        self._outbox.counters.connections += 1
+        _log.info("broker %s: connected", self._broker)
+        self._publish_info()
+        self._outbox.repeat_states()
+        if self._last_broker not in (None, str(self._broker)):
+            self._courier.repeat_events()
+        self._last_broker = str(self._broker)
+        async with asyncio.TaskGroup() as group:
+            workers = [
+                group.create_task(self._courier.carry(connection)),
+                group.create_task(self._listen(connection)),
+                group.create_task(connection.lost()),
+            ]
+            await self._closing.wait()
+            await self._outbox.drained()
+            for worker in workers:
+                worker.cancel()
+
+    def _forget_connection(self) -> None:
+        counters, connection = self._outbox.counters, self._connection
+        counters.connected = False
+        if connection is None:
+            return
+        self._was_ended = connection.taken_over or connection.ended_by_broker
+        counters.refused += connection.refused
+        counters.commands_refused += connection.discarded
+        self._connection = None
+        topic = self._courier.note_end(connection)
+        if topic is not None:
+            self._closed_in_a_row = 0
+            why = f"the broker ends the connection when this is published: {topic}"
+            counters.last_error = why
+            _log.warning("broker %s: %s; given up", self._broker, why)
+
+    def _note_refusals(self, connection: Connection) -> None:
+        why = f"the broker refuses what we publish: {connection.refusal}"
+        if connection.refused and why != self._outbox.counters.last_error:
+            self._outbox.counters.last_error = why
+            _log.warning("broker %s: %s; check its access rules", self._broker, why)
+
+    def _state_properties(self, topic: str, payload: bytes) -> MessageProperties | None:
+        kind = JSON_TYPE if payload.startswith(b"{") else "text/plain"
+        properties = message_properties(self._broker, kind)
+        if topic != self._status:
+            put_stamp(properties, self._numbers.state())
+        else:
+            online = payload == ONLINE
+            put_stamp(properties, self._numbers.online if online else self._numbers.offline)
+        return properties
+
+    async def _listen(self, connection: Connection) -> None:
+        wanted = [self._status]
+        if self._command_handler is not None:
+            wanted.append(self.topics.command(self._node, "+"))
+        for topic in wanted:
+            if not await connection.listen_to(topic):
+                _log.warning("broker %s: may not subscribe to %s", self._broker, topic)
+        async for message in connection.messages:
+            self._take(message)
+
+    def _take(self, message: Message) -> None:
+        topic = message.topic.value
+        payload = message.payload if isinstance(message.payload, bytes) else b""
+        if topic == self._status:
+            # The last will of our earlier connection can arrive late, but we are online.
+            if payload != ONLINE:
+                self._outbox.put_state(self._status, ONLINE)
+            stamp = stamp_of(message.properties)
+            if message.retain and stamp is not None and self._numbers.overtake(stamp):
+                self._number_messages()
+                raise MqttError("an earlier run of this node had a clock that was ahead of ours")
+            return
+        commands, _, name = topic.rpartition("/")
+        if self._command_handler is None or commands != self._commands:
+            return  # brokers may send topics without a subscription
+        if message.retain:
+            self._command_handler.ignore_retained(topic)
+            return
+        reply_to: str = getattr(message.properties, "ResponseTopic", "")
+        correlation: bytes = getattr(message.properties, "CorrelationData", b"")
+        if not self.topics.may_reply_to(self._node, reply_to):
+            # If the response topic is not allowed, the answer goes to the default result topic.
+            reply_to = self.topics.result(self._node, name)
+        if len(correlation) > MAX_CORRELATION_BYTES:
+            correlation = b""
+        self._command_handler.take(name, payload, partial(self._answer, reply_to, correlation))
+
+    def _answer(self, topic: str, correlation: bytes, payload: bytes) -> None:
+        properties = message_properties(self._broker, JSON_TYPE)
+        if properties is not None and correlation:
+            properties.CorrelationData = correlation
+        self._outbox.put_event(Event(topic, payload, properties, is_touch=False))
+
+
+def _addresses(settings: Mqtt, folder: Path, name: str) -> list[Broker]:
+    """Return the configured brokers; a password that cannot be read yet is read later."""
+    try:
+        return Broker.all_from_settings(settings, folder, name)
+    except CredentialError:
+        without = msgspec.structs.replace(settings, username=None, password_file=None)
+        return Broker.all_from_settings(without, folder, name)

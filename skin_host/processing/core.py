@@ -1,0 +1,443 @@
+"""Turns CAN frames into pressure and touch events: runs the pure packages in order.
+
+One engine serves both the daemon and the replay of recordings. It has no clock and no socket: it
+takes frames and times, and returns frames of pressure and events.
+"""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.bus.assembler import Assembler, Sweep
+from skin_host.bus.ledger import BoardLedger
+from skin_host.bus.wire import TRIANGLES, FrameBatch, StatusError
+from skin_host.config.settings import Settings, skin_hash
+from skin_host.fingertip.engine import FingertipEngine
+from skin_host.fingertip.events import FingertipEvent
+from skin_host.layout import Layout
+from skin_host.processing.calibration import Calibration, Calibrator, with_zeros
+from skin_host.processing.contacts import ContactTracker
+from skin_host.processing.events import TouchEvent
+from skin_host.processing.intake import Intake, PartSample
+from skin_host.processing.liveness import PADS
+from skin_host.processing.masks import Mask
+from skin_host.processing.pipeline import Pipeline, PressureFrame
+from skin_host.processing.pressure import PressureCurve, vertex
+from skin_host.processing.rezero import Rezero
+from skin_host.processing.validity import Validity
+
+#: A calibration takes at least this many samples of each part, even if its boards are slow: the
+#: 95th percentile of fewer would be the largest.
+FEWEST_SAMPLES = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """Result of one sample of a part.
+
+    Attributes:
+        part: index into `Layout.parts`.
+        frame: its pressure.
+        events: of its contacts.
+    """
+
+    part: int
+    frame: PressureFrame
+    events: list[TouchEvent]
+
+
+class Output(NamedTuple):
+    """Complete result of one call.
+
+    Attributes:
+        sweeps: of boards, completed or closed.
+        steps: samples of parts that were processed, each with the events of its contacts.
+        samples: (number of the fingertip, time) of force/torque samples.
+        grasps: events of fingertips on force/torque boards.
+        answers: (identifier, payload) of frames in which boards answer.
+    """
+
+    sweeps: list[Sweep]
+    steps: list[Step]
+    samples: list[tuple[int, int]]
+    grasps: list[FingertipEvent]
+    answers: list[tuple[int, bytes]]
+
+    @property
+    def frames(self) -> list[PressureFrame]:
+        """Pressure of parts, in the order of their samples."""
+        return [step.frame for step in self.steps]
+
+    @property
+    def events(self) -> list[FingertipEvent]:
+        """Touches of the skin in the order of its frames, then events of the fingertips."""
+        return [event for step in self.steps for event in step.events] + self.grasps
+
+
+@dataclass(slots=True)
+class _CalibrationRun:
+    calibrator: Calibrator
+    duration_ns: int
+    since_ns: int | None = None
+    last_ns: int = 0
+    #: By part, for the parts that have sent any.
+    samples: dict[int, int] = field(default_factory=dict)
+
+
+class Engine:
+    """Assemblers, intake, pipeline and contact trackers of one daemon's share of a skin.
+
+    Args:
+        settings: the configuration.
+        layout: its skin.
+        parts: indices of the parts that this node reads.
+        calibration: of this skin, or None: then there is no output until one is taken.
+        after: the engine that this one replaces, see `settings.needs_restart`: its knowledge of
+            boards, its zero, its learnt values and its contacts continue. It must not be fed again.
+
+    Attributes:
+        boards: indices of the boards of these parts.
+        assemblers: of each bus, by its name.
+        ledger: of these boards.
+        validity: which of their taxels are valid.
+        disabled: parts without output.
+        touch_only: parts whose pressures are not subscribed while nothing touches them.
+        fingertips: those of these parts' nodes, if there are any.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        layout: Layout,
+        parts: list[int],
+        calibration: Calibration | None = None,
+        after: "Engine | None" = None,
+    ) -> None:
+        self.settings = settings
+        self.layout = layout
+        self.parts = parts
+        self.configuration = skin_hash(settings)
+        self.calibration = calibration
+        self.boards = sorted({board for part in parts for board in layout.parts[part].boards})
+        made = FingertipEngine(settings, layout, parts) if settings.fingertips else None
+        self.fingertips = made if made is not None and made.tips else None
+        buses = {layout.boards[i].settings.bus for i in self.boards}
+        if self.fingertips is not None:
+            buses |= self.fingertips.buses
+        self.assemblers = {
+            bus: Assembler(
+                [
+                    (i, layout.boards[i])
+                    for i in self.boards
+                    if layout.boards[i].settings.bus == bus
+                ],
+                settings.receive.close_periods,
+                frozenset() if self.fingertips is None else self.fingertips.identifiers(bus),
+            )
+            for bus in sorted(buses)
+        }
+        #: Contacts of fingertips that a new zero ended; they are part of the next output.
+        self._ended: list[FingertipEvent] = []
+        self.disabled: set[int] = set()
+        self.touch_only: set[int] = set()
+        receive = settings.receive
+        self.ledger = BoardLedger(
+            [(i, layout.boards[i]) for i in self.boards], receive.silent_periods, receive.poll_ms
+        )
+        curve = settings.processing.pressure
+        self.validity = Validity(
+            layout,
+            self.boards,
+            self.ledger,
+            float(vertex(curve.a_kpa_per_ff2, curve.b_kpa_per_ff)),
+        )
+        self._intake = Intake(layout, parts, self.ledger, receive.silent_periods)
+        self._rezeros: dict[int, Rezero] = {}
+        self._unanswered: dict[int, Mask] = {}
+        self._touched = np.zeros(layout.n_taxels, np.bool_)
+        self._run: _CalibrationRun | None = None
+        self._pipeline: Pipeline | None = None
+        self._trackers = {part: ContactTracker(layout, part, settings) for part in parts}
+        if after is not None:
+            self._go_on(after)
+        elif calibration is not None:
+            self.use(calibration)
+
+    def _go_on(self, after: "Engine") -> None:
+        """Take over everything but settings and layout, which may differ only in values."""
+        self.assemblers = after.assemblers
+        self.ledger = after.ledger
+        self.validity.go_on(after.validity)
+        self._intake = after._intake
+        self.fingertips = after.fingertips
+        if self.fingertips is not None:
+            self.fingertips.renew(self.settings)
+        self._ended = after._ended
+        self.disabled = after.disabled
+        self._rezeros = after._rezeros
+        self._unanswered = after._unanswered
+        self._touched = after._touched
+        self._run = after._run
+        for part, tracker in self._trackers.items():
+            tracker.go_on(after._trackers[part])
+        self.calibration = after.calibration
+        self._pipeline = after._pipeline
+        if self.calibration is not None:
+            self._renew_pipeline(np.zeros(self.layout.n_taxels, np.bool_))
+
+    @property
+    def pipeline(self) -> Pipeline | None:
+        """The pipeline in use, if there is a calibration."""
+        return self._pipeline
+
+    @property
+    def calibrating(self) -> bool:
+        """Whether a calibration is being taken."""
+        return self._run is not None
+
+    def use(self, calibration: Calibration, boards: list[int] | None = None) -> None:
+        """Use this calibration from now on; frame numbers continue.
+
+        Args:
+            calibration: the new one.
+            boards: those whose zero it has measured; all by default.
+        """
+        self.calibration = calibration
+        boards = self.boards if boards is None else boards
+        self.validity.use(calibration.noise, np.isin(self.boards, boards))
+        for board in boards:
+            self._rezeros.pop(board, None)
+        if self.fingertips is not None and boards == self.boards:
+            self._ended += self.fingertips.use(calibration.zeros)
+        self._renew_pipeline(self.taxels_of(boards))
+
+    def _renew_pipeline(self, zeroed: NDArray[np.bool_]) -> None:
+        """Apply settings and calibration to the pipeline; taxels bool[n] were zeroed."""
+        assert self.calibration is not None
+        processing = self.settings.processing
+        if self._pipeline is None:
+            self._pipeline = Pipeline(self.layout, processing, self.calibration)
+        else:
+            self._pipeline.renew(processing, self.calibration, zeroed, self.layout)
+
+    def taxels_of(self, boards: list[int]) -> NDArray[np.bool_]:
+        """Return which taxels bool[n] of the skin some boards read."""
+        found = np.zeros(self.layout.n_taxels, np.bool_)
+        for board in boards:
+            taxels = self._taxels_of(board)
+            found[taxels[taxels >= 0]] = True
+        return found
+
+    def begin_calibration(self, seconds: float) -> None:
+        """Start to collect samples; see `end_calibration`."""
+        processing = self.settings.processing
+        curve = PressureCurve(
+            self.layout.unit_ff / self.layout.sensitivity,
+            a=processing.pressure.a_kpa_per_ff2,
+            b=processing.pressure.b_kpa_per_ff,
+        )
+        calibrator = Calibrator(
+            self.layout, processing.calibration.percentile, processing.touch, curve.beyond_units
+        )
+        self._run = _CalibrationRun(calibrator, int(seconds * 1e9))
+        if self.fingertips is not None:
+            self.fingertips.begin_zero()
+
+    def calibration_progress(self) -> float:
+        """Share of the wanted time, and of the fewest samples, that has been collected, 0 to 1."""
+        run = self._run
+        if run is None or run.since_ns is None:
+            return 0.0
+        time_share = (run.last_ns - run.since_ns) / run.duration_ns
+        return min(1.0, time_share, min(run.samples.values()) / FEWEST_SAMPLES)
+
+    def end_calibration(self, time: str) -> Calibration:
+        """Return a calibration from the collected samples and stop collecting.
+
+        Args:
+            time: now, ISO 8601 in UTC.
+        """
+        assert self._run is not None
+        run, self._run = self._run, None
+        found = run.calibrator.finish(self.configuration, time)
+        return found if self.fingertips is None else with_zeros(found, self.fingertips.end_zero())
+
+    def feed(self, bus: str, batch: FrameBatch) -> Output:
+        """Process a batch of frames of one bus."""
+        samples: list[tuple[int, int]] = []
+        grasps, self._ended = self._ended, []
+        if self.fingertips is not None:
+            felt = self.fingertips.feed(bus, batch)
+            samples = felt.samples
+            grasps += felt.events
+        sweeps, answers = self.assemblers[bus].feed(batch)
+        steps = self._process(self._take(sweeps)) if sweeps else []
+        return Output(sweeps, steps, samples, grasps, answers)
+
+    def missing(self) -> list[list[int]]:
+        """Of each part, the boards whose sweeps its next sample waits for."""
+        return self._intake.missing()
+
+    def judge(self) -> None:
+        """Do deferred work between sweeps, so that the next one does not wait for it."""
+        self.validity.judge_whole()
+
+    def expire(self, now_ns: int) -> Output:
+        """Return what has waited too long, on the clock of the frames' time stamps.
+
+        Everything received up to `now_ns` has been fed.
+        """
+        self.ledger.look(now_ns)
+        sweeps = [
+            sweep for assembler in self.assemblers.values() for sweep in assembler.expire(now_ns)
+        ]
+        grasps, self._ended = self._ended, []
+        if self.fingertips is not None:
+            grasps += self.fingertips.expire(now_ns)
+        samples = self._take(sweeps)
+        samples += self._intake.expire(now_ns)
+        return Output(sweeps, self._process(samples) if samples else [], [], grasps, [])
+
+    def flush(self) -> Output:
+        """Return everything that waits, at the end of a recording."""
+        sweeps = [sweep for assembler in self.assemblers.values() for sweep in assembler.flush()]
+        grasps, self._ended = self._ended, []
+        steps = self._process(self._take(sweeps) + self._intake.flush())
+        return Output(sweeps, steps, [], grasps, [])
+
+    def rezero(self, board: int, believed: bool = True) -> int:
+        """Find the new untouched readings after a board was zeroed.
+
+        For two seconds, longer for slow boards, none of its taxels is valid. Taxels that were
+        touched just before stay invalid until they are calibrated.
+
+        Args:
+            board: its index.
+            believed: whether touches just before are real. Touches of a board that was not set up,
+                by this start of the daemon or an earlier one, are not.
+
+        Returns:
+            How many taxels were touched.
+        """
+        if self.calibration is None:
+            return 0
+        taxels = self._taxels_of(board)
+        touched: NDArray[np.bool_] = self._touched[taxels] & (taxels >= 0) & believed
+        before = self._rezeros.get(board)
+        if before is not None:
+            touched |= before.doubted.reshape(TRIANGLES, PADS)
+        no_load = np.full(taxels.size, float(self.layout.boards[board].settings.no_load))
+        self._rezeros[board] = Rezero(touched.ravel(), no_load)
+        self.validity.veto[self.ledger.row[board]] = np.ones((TRIANGLES, PADS), np.bool_)
+        return int(np.count_nonzero(touched))
+
+    def in_doubt(self, board: int) -> NDArray[np.bool_]:
+        """Return taxels bool[16, 12] of a board whose zero is unknown."""
+        rezero = self._rezeros.get(board)
+        if rezero is None:
+            return np.zeros((TRIANGLES, PADS), np.bool_)
+        return rezero.doubted.reshape(TRIANGLES, PADS)
+
+    def end_part(self, part: int, t_ns: int) -> list[TouchEvent]:
+        """End every contact of a part."""
+        seq = self._pipeline.seq(part) if self._pipeline else 0
+        events = self._trackers[part].end_all(seq, t_ns)
+        if self.fingertips is not None:
+            self.fingertips.note_skin(part, events, t_ns)
+        return events
+
+    def _taxels_of(self, board: int) -> NDArray[np.int32]:
+        return self.layout.boards[board].taxel_index
+
+    def _take(self, sweeps: list[Sweep]) -> list[PartSample]:
+        samples: list[PartSample] = []
+        for sweep in sweeps:
+            row = self.ledger.note(sweep)
+            if self.ledger.flagged[row] or self._unanswered:
+                self._note_unanswered(sweep, row)
+            if self._rezeros:
+                rezero = self._rezeros.get(sweep.board)
+                if rezero is not None:
+                    self._find_zero(sweep, row, rezero)
+            valid, received = self.validity.take(row, sweep.raw)
+            samples += self._intake.take(sweep, valid, received)
+        return samples
+
+    def _note_unanswered(self, sweep: Sweep, row: int) -> None:
+        """Detect that a board zeroed itself, which it does after missing acknowledges (section
+        4.5).
+        """
+        now = self.ledger.error[row] & StatusError.NO_ACK != 0
+        before = self._unanswered.get(sweep.board)
+        if now.any():
+            self._unanswered[sweep.board] = now
+        else:
+            self._unanswered.pop(sweep.board, None)
+        if before is not None and (before & ~now & self.ledger.present[row]).any():
+            self.rezero(sweep.board)
+
+    def _find_zero(self, sweep: Sweep, row: int, rezero: Rezero) -> None:
+        if self._pipeline is None or self.calibration is None:
+            return
+        ledger = self.ledger
+        here = np.repeat(ledger.present[row] & (ledger.error[row] == 0), PADS)
+        ledger.rezeros[row] += not rezero.begun
+        if rezero.step(sweep.raw.ravel(), here, sweep.t_ns):
+            taxels = self._taxels_of(sweep.board).ravel()
+            fitted = taxels >= 0
+            baseline = np.where(fitted, self._pipeline.baseline[taxels], 0.0)
+            found = rezero.finish(baseline, self.calibration.noise[taxels])
+            self._pipeline.set_zero(taxels[fitted], found[fitted])
+        elif rezero.settled(sweep.t_ns):
+            self.validity.veto[row] = self.in_doubt(sweep.board)
+
+    def _process(self, samples: list[PartSample]) -> list[Step]:
+        steps = []
+        for sample in samples:
+            if self._run is not None:
+                self._collect(self._run, sample)
+            if self._pipeline is not None and sample.part not in self.disabled:
+                frame = self._pipeline.step(
+                    sample.part,
+                    sample.raw,
+                    sample.present,
+                    sample.t_ns,
+                    pressures=sample.part not in self.touch_only,
+                )
+                events = self._trackers[sample.part].step(frame)
+                if self.fingertips is not None:
+                    self.fingertips.note_skin(sample.part, events, frame.t_ns)
+                self._note_touched(sample.part, frame)
+                steps.append(Step(sample.part, frame, events))
+        return steps
+
+    def _note_touched(self, index: int, frame: PressureFrame) -> None:
+        """Pass the touched pads to the liveness decision, but only when they change."""
+        part = self.layout.parts[index]
+        touched = self._touched[part.start : part.stop]
+        if np.array_equal(touched, frame.touched):
+            return
+        touched[:] = frame.touched
+        for board in part.boards:
+            taxels = self._taxels_of(board)
+            pads = self._touched[taxels] & (taxels >= 0)
+            row = self.ledger.row[board]
+            if pads.any():
+                self.validity.touched[row] = pads
+            else:
+                self.validity.touched.pop(row, None)
+
+    @staticmethod
+    def _collect(run: _CalibrationRun, sample: PartSample) -> None:
+        if not sample.received.any():
+            return
+        if run.since_ns is None:
+            run.since_ns = sample.t_ns
+        samples = run.samples.setdefault(sample.part, 0)
+        in_time = 0 <= sample.t_ns - run.since_ns <= run.duration_ns
+        if in_time or samples < FEWEST_SAMPLES:
+            run.calibrator.add(sample.part, sample.raw, sample.received, sample.t_ns)
+            run.samples[sample.part] += 1
+        run.last_ns = max(run.last_ns, sample.t_ns)

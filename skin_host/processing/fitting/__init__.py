@@ -1,0 +1,1 @@
+"""Fits curves, gains and the foam's memory to known pressures. Pure."""

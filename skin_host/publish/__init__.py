@@ -1,1 +1,0 @@
-"""Output: messages, MQTT, recordings."""

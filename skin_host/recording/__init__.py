@@ -1,0 +1,1 @@
+"""What was recorded: captured, played, processed, exported and drawn again."""

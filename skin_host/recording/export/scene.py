@@ -1,0 +1,416 @@
+"""Recordings as three-dimensional scenes, for common robotics tools.
+
+An `.mcap` file for Foxglove holds, besides the recording's own messages, a point cloud of each
+part, its contacts as arrows, the parts' transforms and health, in Foxglove's own Protobuf schemas:
+no custom panel is needed. An `.rrd` file holds the same for Rerun.
+
+A configuration does not contain where on the body a part is: the parts lie side by side, each in
+its frame.
+"""
+
+import contextlib
+import os
+from collections.abc import Iterator
+from heapq import merge
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.errors import RequestError, SkinError
+from skin_host.extras import required
+from skin_host.mqtt.info import PartInfo
+from skin_host.mqtt.messages import TouchMessage
+from skin_host.recording.export.series import HealthLine, Series
+
+ROOT = "robot"
+#: Distance of two parts that lie side by side.
+GAP_M = 0.03
+#: Length of a contact's arrow per newton.
+ARROW_M_PER_N = 0.01
+SHAFT_M, HEAD_M = 0.0015, 0.004
+#: From no pressure to the highest of the recording, by the square root: cividis, as on the page.
+RAMP = np.array(
+    [
+        [0x20, 0x3F, 0x6C],
+        [0x57, 0x5C, 0x6D],
+        [0x8A, 0x87, 0x79],
+        [0xC4, 0xB5, 0x6C],
+        [253, 233, 69],
+    ],
+    np.float64,
+)
+INVALID_RGBA = (150, 150, 150, 60)
+ARROW_RGBA = (255, 110, 80, 255)
+#: The scale ends at this pressure or above.
+LEAST_TOP_KPA = 20.0
+
+#: x, y, z (m), pressure (kPa, 0 where not valid), valid (0 or 1), colour.
+POINT = np.dtype(
+    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("kpa", "<f4"), ("valid", "u1")]
+    + [(name, "u1") for name in ("red", "green", "blue", "alpha")]
+)
+
+Floats = NDArray[np.floating[Any]]
+
+
+class Arrow(NamedTuple):
+    """A contact at an instant: its place, and its force (N) into the skin."""
+
+    id: int
+    at_m: tuple[float, float, float]
+    force_n: tuple[float, float, float]
+
+
+class Points(NamedTuple):
+    """A part at an instant: a record of `POINT` a taxel."""
+
+    part: str
+    t_ns: int
+    points: NDArray[np.void]
+
+
+class Arrows(NamedTuple):
+    """The contacts of a part from an instant on."""
+
+    part: str
+    t_ns: int
+    arrows: list[Arrow]
+
+
+Item = Points | Arrows | HealthLine
+
+
+class Scene:
+    """Items of a recording for a viewer, in the order of time.
+
+    Attributes:
+        origins_m: where the frame of each part lies in the robot's.
+        top_kpa: pressure at the end of the colour scale.
+
+    Raises:
+        RequestError: the recording has no positions of its taxels.
+    """
+
+    def __init__(self, series: Series) -> None:
+        self._series = series
+        missing = [name for name in series.parts if name not in series.shapes]
+        if missing:
+            raise RequestError(
+                f"the recording has no positions of the taxels of {', '.join(missing)}; name "
+                "its configuration with --config, or record `nodes/<node>/info` too"
+            )
+        peak_kpa = max(
+            (float(np.nanmax(part.pressure_kpa, initial=0.0)) for part in series.parts.values()),
+            default=0.0,
+        )
+        self.top_kpa = max(LEAST_TOP_KPA, peak_kpa)
+        self.origins_m = _side_by_side({name: series.shapes[name] for name in series.parts})
+
+    @property
+    def start_ns(self) -> int:
+        """Time of the first frame."""
+        return min(int(part.t_ns[0]) for part in self._series.parts.values())
+
+    def items(self) -> Iterator[Item]:
+        """Everything, in the order of time."""
+        courses: list[Iterator[Item]] = [self._points(name) for name in self._series.parts]
+        courses += [self._arrows(name) for name in self._series.parts]
+        courses.append(iter(self._series.health))
+        yield from merge(*courses, key=lambda item: item.t_ns)
+
+    def _points(self, name: str) -> Iterator[Item]:
+        part, shape = self._series.parts[name], self._series.shapes[name]
+        feels = np.array([pad == "pressure" for pad in shape.pads], np.bool_)
+        points = np.zeros(int(feels.sum()), POINT)
+        places_m = np.array(shape.position_m, np.float64)[feels]
+        for axis, key in enumerate("xyz"):
+            points[key] = places_m[:, axis]
+        for t_ns, all_kpa in zip(part.t_ns.tolist(), part.pressure_kpa, strict=True):
+            kpa = all_kpa[feels]
+            points["valid"] = np.isfinite(kpa)
+            points["kpa"] = np.nan_to_num(kpa)
+            for key, values in zip(POINT.names[5:], self._colours(kpa).T, strict=True):  # type: ignore[index]
+                points[key] = values
+            yield Points(name, t_ns, points.copy())
+
+    def _colours(self, kpa: Floats) -> NDArray[np.uint8]:
+        """Red, green, blue, alpha uint8[n, 4]."""
+        share = np.sqrt(np.clip(np.nan_to_num(kpa) / self.top_kpa, 0.0, 1.0))
+        stops = np.linspace(0.0, 1.0, len(RAMP))
+        colours = np.full((len(kpa), 4), 255, np.uint8)
+        for channel in range(3):
+            colours[:, channel] = np.interp(share, stops, RAMP[:, channel]).round()
+        colours[~np.isfinite(kpa)] = INVALID_RGBA
+        return colours
+
+    def _arrows(self, name: str) -> Iterator[Item]:
+        there: dict[int, Arrow] = {}
+        mine = (touch for touch in self._series.touches if touch.part == name)
+        for t_ns, touches in groupby(mine, key=lambda touch: touch.t_ns):
+            for touch in touches:
+                there.pop(touch.id, None)
+                arrow = _arrow(touch)
+                if arrow is not None:
+                    there[touch.id] = arrow
+            yield Arrows(name, t_ns, list(there.values()))
+
+
+def _arrow(touch: TouchMessage) -> Arrow | None:
+    if touch.event == "end" or touch.centroid_m is None:
+        return None
+    x, y, z = touch.normal or (0.0, 0.0, 1.0)
+    force_n = (-x * touch.force_n, -y * touch.force_n, -z * touch.force_n)
+    return Arrow(touch.id, touch.centroid_m, force_n)
+
+
+def _side_by_side(shapes: dict[str, PartInfo]) -> dict[str, tuple[float, float, float]]:
+    origins: dict[str, tuple[float, float, float]] = {}
+    x_m = 0.0
+    for name, shape in shapes.items():
+        places_m = np.array(shape.position_m, np.float64)
+        low_m, high_m = places_m[:, 0].min(), places_m[:, 0].max()
+        origins[name] = (float(x_m - low_m), 0.0, 0.0)
+        x_m += float(high_m - low_m) + GAP_M
+    return origins
+
+
+def write_foxglove(series: Series, recording: Path | None, output: Path) -> None:
+    """Write an MCAP file with what Foxglove's 3D, plot and log panels show as they are.
+
+    Args:
+        series: what was recorded.
+        recording: where it was read; if it is MCAP its own messages are taken along.
+        output: the new file.
+
+    Raises:
+        SkinError: a package of the extra `foxglove` is not installed, or writing fails.
+        RequestError: see `Scene`.
+    """
+    required("mcap_protobuf", "scenes for Foxglove", "foxglove")
+    required("foxglove_schemas_protobuf", "scenes for Foxglove", "foxglove")
+    from mcap.reader import make_reader
+    from mcap.writer import Writer
+
+    scene = Scene(series)
+    with _new(output) as growing, growing.open("wb") as file:
+        writer: Any = Writer(file)
+        writer.start(profile="", library="skin-host")
+        if recording is not None and recording.suffix == ".mcap":
+            with recording.open("rb") as own:
+                _copy(make_reader(own), writer)
+        _Foxglove(writer).write(scene)
+        writer.finish()
+
+
+def _copy(reader: Any, writer: Any) -> None:
+    """Every message of a file as it is."""
+    schemas: dict[int, int] = {}
+    channels: dict[int, int] = {}
+    for schema, channel, message in reader.iter_messages():
+        if channel.id not in channels:
+            if schema is not None and schema.id not in schemas:
+                schemas[schema.id] = writer.register_schema(
+                    schema.name, schema.encoding, schema.data
+                )
+            channels[channel.id] = writer.register_channel(
+                topic=channel.topic,
+                message_encoding=channel.message_encoding,
+                schema_id=0 if schema is None else schemas[schema.id],
+            )
+        writer.add_message(
+            channel_id=channels[channel.id],
+            log_time=message.log_time,
+            publish_time=message.publish_time,
+            sequence=message.sequence,
+            data=message.data,
+        )
+
+
+class _Foxglove:
+    """Writes items as Foxglove's Protobuf messages."""
+
+    def __init__(self, writer: Any) -> None:
+        self._writer = writer
+        self._channels: dict[str, int] = {}
+
+    def write(self, scene: Scene) -> None:
+        self._add("/tf", scene.start_ns, _transforms(scene))
+        for item in scene.items():
+            match item:
+                case Points(part, t_ns, _):
+                    self._add(f"/{part}/points", t_ns, _cloud(item))
+                case Arrows(part, t_ns, _):
+                    self._add(f"/{part}/contacts", t_ns, _update(item))
+                case HealthLine():
+                    self._add("/health", item.t_ns, _log(item))
+
+    def _add(self, topic: str, t_ns: int, message: Any) -> None:
+        from mcap_protobuf.schema import register_schema
+
+        if topic not in self._channels:
+            self._channels[topic] = self._writer.register_channel(
+                topic=topic,
+                message_encoding="protobuf",
+                schema_id=register_schema(self._writer, type(message)),
+            )
+        self._writer.add_message(
+            channel_id=self._channels[topic],
+            log_time=t_ns,
+            publish_time=t_ns,
+            data=message.SerializeToString(),
+        )
+
+
+def _transforms(scene: Scene) -> Any:
+    from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+    from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+
+    message = FrameTransforms()
+    for part, (x, y, z) in scene.origins_m.items():
+        one = FrameTransform(parent_frame_id=ROOT, child_frame_id=part)
+        one.timestamp.FromNanoseconds(scene.start_ns)
+        one.translation.x, one.translation.y, one.translation.z = x, y, z
+        one.rotation.w = 1.0
+        message.transforms.append(one)
+    return message
+
+
+def _cloud(item: Points) -> Any:
+    from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
+    from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+
+    kinds = {np.dtype("<f4"): PackedElementField.FLOAT32, np.dtype("u1"): PackedElementField.UINT8}
+    message = PointCloud(
+        frame_id=item.part, point_stride=POINT.itemsize, data=item.points.tobytes()
+    )
+    message.timestamp.FromNanoseconds(item.t_ns)
+    message.pose.orientation.w = 1.0
+    assert POINT.fields is not None
+    for name, (kind, offset, *_) in POINT.fields.items():
+        message.fields.append(PackedElementField(name=name, offset=offset, type=kinds[kind]))
+    return message
+
+
+def _update(item: Arrows) -> Any:
+    from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
+    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+
+    # One entity a part: the next one of its id replaces it, so that contacts end.
+    entity = SceneEntity(id=item.part, frame_id=item.part)
+    entity.timestamp.FromNanoseconds(item.t_ns)
+    for arrow in item.arrows:
+        force_n = np.array(arrow.force_n)
+        size_n = float(np.linalg.norm(force_n))
+        shown = entity.arrows.add()
+        start_m = np.array(arrow.at_m) - force_n * ARROW_M_PER_N
+        where = shown.pose.position
+        where.x, where.y, where.z = start_m.tolist()
+        turn = shown.pose.orientation
+        turn.x, turn.y, turn.z, turn.w = _turned_from_x(force_n)
+        shown.shaft_length = max(0.0, size_n * ARROW_M_PER_N - HEAD_M)
+        shown.shaft_diameter = SHAFT_M
+        shown.head_length = min(HEAD_M, size_n * ARROW_M_PER_N)
+        shown.head_diameter = 2 * SHAFT_M
+        _paint(shown.color)
+        words = entity.texts.add()
+        words.text = f"#{arrow.id} {size_n:.2f} N"
+        place = words.pose.position
+        place.x, place.y, place.z = start_m.tolist()
+        words.pose.orientation.w = 1.0
+        words.billboard = True
+        words.font_size = 12.0
+        words.scale_invariant = True
+        _paint(words.color)
+    return SceneUpdate(entities=[entity])
+
+
+def _paint(colour: Any) -> None:
+    colour.r, colour.g, colour.b, colour.a = (channel / 255 for channel in ARROW_RGBA)
+
+
+def _turned_from_x(direction: Floats) -> tuple[float, float, float, float]:
+    """The quaternion x, y, z, w of the shortest turn from the x axis to a direction."""
+    size = float(np.linalg.norm(direction))
+    if size == 0:
+        return 0.0, 0.0, 0.0, 1.0
+    x, y, z = (direction / size).tolist()
+    if x < -1 + 1e-9:
+        return 0.0, 0.0, 1.0, 0.0
+    turn = np.array([0.0, -z, y, 1.0 + x])
+    ix, iy, iz, w = (turn / np.linalg.norm(turn)).tolist()
+    return ix, iy, iz, w
+
+
+def _log(item: HealthLine) -> Any:
+    from foxglove_schemas_protobuf.Log_pb2 import Log
+
+    level = Log.INFO if item.state == "ok" else Log.WARNING
+    message = Log(level=level, name=item.part, message=item.text)
+    message.timestamp.FromNanoseconds(item.t_ns)
+    return message
+
+
+def write_rerun(series: Series, output: Path) -> None:
+    """Write a recording for Rerun: points, arrows of contacts, forces over time, health.
+
+    Raises:
+        SkinError: the package of the extra `rerun` is not installed, or the file cannot be written.
+        RequestError: see `Scene`.
+    """
+    rr = required("rerun", "recordings for Rerun", "rerun")
+    scene = Scene(series)
+    with _new(output) as growing:
+        stream = rr.RecordingStream("skin-host")
+        stream.save(growing)
+        stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        for part, origin_m in scene.origins_m.items():
+            stream.log(f"{ROOT}/{part}", rr.Transform3D(translation=origin_m), static=True)
+        for item in scene.items():
+            stream.set_time("time", timestamp=np.datetime64(item.t_ns, "ns"))
+            where = f"{ROOT}/{item.part}"
+            match item:
+                case Points(part, _, points):
+                    places_m = np.stack([points[axis] for axis in "xyz"], axis=1)
+                    colours = np.stack([points[key] for key in POINT.names[5:]], axis=1)  # type: ignore[index]
+                    radius_m = float(np.mean(series.shapes[part].radius_mm)) * 1e-3
+                    cloud = rr.Points3D(places_m, colors=colours, radii=radius_m)
+                    stream.log(f"{where}/taxels", cloud)
+                    stream.log(f"kpa/{part}", rr.Scalars(float(points["kpa"].max(initial=0.0))))
+                case Arrows(part, _, arrows):
+                    forces_n = np.array([one.force_n for one in arrows]).reshape(-1, 3)
+                    starts_m = np.array([one.at_m for one in arrows]).reshape(-1, 3)
+                    shown = rr.Arrows3D(
+                        origins=starts_m - forces_n * ARROW_M_PER_N,
+                        vectors=forces_n * ARROW_M_PER_N,
+                        colors=[ARROW_RGBA] * len(arrows),
+                        labels=[f"#{one.id} {np.linalg.norm(one.force_n):.2f} N" for one in arrows],
+                    )
+                    stream.log(f"{where}/contacts", shown)
+                    total_n = float(np.linalg.norm(forces_n, axis=1).sum())
+                    stream.log(f"force_n/{part}", rr.Scalars(total_n))
+                case HealthLine():
+                    level = "INFO" if item.state == "ok" else "WARN"
+                    stream.log("health", rr.TextLog(item.text, level=level))
+        stream.flush()
+        stream.disconnect()
+
+
+@contextlib.contextmanager
+def _new(output: Path) -> Iterator[Path]:
+    """Yield a temporary path for a file that gets its name when it is complete.
+
+    Raises:
+        SkinError: it cannot be written.
+    """
+    growing = output.with_name(f".{output.stem}.growing{output.suffix}")
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        yield growing
+        os.replace(growing, output)
+    except OSError as error:
+        raise SkinError(f"{output}: cannot be written: {error.strerror}") from None
+    finally:
+        growing.unlink(missing_ok=True)

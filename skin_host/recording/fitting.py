@@ -1,0 +1,381 @@
+"""Fits parameters to recordings: the foam's relaxation, and the pressure curve of each taxel.
+
+The recording begins with some seconds of untouched skin, which serve as its calibration.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.config.relaxation import RELAXATION_SCHEMA
+from skin_host.config.settings import Settings
+from skin_host.errors import LogError, RequestError
+from skin_host.files import write_atomic
+from skin_host.layout import Layout, PadKind
+from skin_host.processing.calibration import Calibration, Verdict, with_curves, with_gains
+from skin_host.processing.core import Engine
+from skin_host.processing.curves import Curves
+from skin_host.processing.fitting.course import (
+    Course,
+    activations,
+    find_lag,
+    fit_course,
+    median_of_moving,
+)
+from skin_host.processing.fitting.gains import GainFit, fit_gains
+from skin_host.processing.fitting.hold import Fit, HoldRecord, fit, merge
+from skin_host.processing.pressure import PressureCurve
+from skin_host.processing.relaxation import make_model, parameters_of
+from skin_host.recording.load_table import check_course, on_clock_of
+from skin_host.recording.replay import calibrate_from_log, steps
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+#: A taxel takes part in a hold if its reading is at least this share of the strongest.
+TAKES_PART = 0.6
+#: Quantile of a taxel's readings that represents its pressed time: the recording may be mostly
+#: rest.
+PRESSED_QUANTILE = 0.95
+#: A hold has at least this pressure, for at least this share of its time.
+LEAST_KPA = 10.0
+HELD_SHARE = 0.98
+#: Pressure moves if it changes by more than this share of the hold's from one sample to the next.
+MOVING_SHARE = 0.1
+#: A plateau of known pressure lasts at least this long, and is steady to this share of itself.
+PLATEAU_S = 1.0
+STEADY_SHARE = 0.05
+STEADY_KPA = 3.5
+#: Less than this, or than this share of the earlier press, is the residual of that press.
+PRESSED_KPA = 4.0
+IMPRINT_SHARE = 0.07
+#: The first part of a plateau, in which the pressure settles, is left out.
+SETTLING_SHARE = 0.3
+
+
+@dataclass(frozen=True)
+class Samples:
+    """A recording as bytes at equal distances: t samples of the n taxels of the skin.
+
+    Attributes:
+        dt_s: distance of the samples.
+        start_s: time of the first sample, on the recording's clock.
+        raw: uint8[t, n]; the last known value where none was received.
+        zero: float64[n], the untouched reading.
+        received: bool[n], taxels that were received at all.
+        usable: bool[n], usable taxels.
+        calibration: of the untouched skin at the beginning.
+    """
+
+    dt_s: float
+    start_s: float
+    raw: NDArray[np.uint8]
+    zero: Floats
+    received: Mask
+    usable: Mask
+    calibration: Calibration
+
+    def units(self, rows: slice, taxels: Mask) -> Floats:
+        """Activations above the baseline of some samples and taxels."""
+        units: Floats = self.zero[taxels] - self.raw[rows, taxels]
+        return units
+
+
+def read_samples(
+    log: Path,
+    settings: Settings,
+    layout: Layout,
+    seconds: float,
+    progress: Callable[[float], None] = lambda _: None,
+) -> Samples:
+    """Read a recording whose first `seconds` are untouched.
+
+    Args:
+        log: the recording.
+        settings, layout: of its skin.
+        seconds: how long it is untouched.
+        progress: called now and then with the number of minutes read.
+
+    Raises:
+        LogError: unreadable, or with too little of this skin in it.
+    """
+    calibration = calibrate_from_log(log, settings, layout, seconds)
+    engine = Engine(settings, layout, list(range(len(layout.parts))), calibration)
+    times_ns: list[list[int]] = [[] for _ in layout.parts]
+    raws: list[list[NDArray[np.uint8]]] = [[] for _ in layout.parts]
+    valids: list[list[Mask]] = [[] for _ in layout.parts]
+    for step in steps(log, engine):
+        times_ns[step.part].append(step.frame.t_ns)
+        raws[step.part].append(step.frame.raw)
+        valids[step.part].append(step.frame.valid)
+        if step.frame.seq % 500 == 0:
+            progress((step.frame.t_ns - times_ns[step.part][0]) / 60e9)
+    heard = [part for part, times in enumerate(times_ns) if len(times) > 10]
+    if not heard:
+        raise LogError(f"{log}: ten sweeps or fewer; wanted a recording of a hold or of levels")
+    first_ns = min(times_ns[part][0] for part in heard)
+    last_ns = max(times_ns[part][-1] for part in heard)
+    step_ns = round(min(float(np.median(np.diff(times_ns[part]))) for part in heard))
+    grid_ns = np.arange(first_ns, last_ns, step_ns)
+    raw = np.zeros((len(grid_ns), layout.n_taxels), dtype=np.uint8)
+    usable = np.zeros(layout.n_taxels, dtype=np.bool_)
+    for part in heard:
+        mine = slice(layout.parts[part].start, layout.parts[part].stop)
+        valid = np.array(valids[part])
+        index = np.searchsorted(times_ns[part], grid_ns, side="right").clip(1) - 1
+        raw[:, mine] = _held(np.array(raws[part]), valid)[index]
+        usable[mine] = calibration.usable[mine] & (valid.mean(axis=0) > 0.5)
+    zero = layout.no_load - calibration.baseline
+    received = ~np.isin(calibration.verdict, (Verdict.ABSENT, Verdict.TOO_FEW))
+    return Samples(step_ns * 1e-9, first_ns * 1e-9, raw, zero, received, usable, calibration)
+
+
+def hold_record(
+    samples: Samples,
+    curve: PressureCurve,
+    load: tuple[Floats, Floats] | None,
+    weight_kpa: float | None,
+) -> HoldRecord:
+    """Find the hold and the release in a recording.
+
+    Args:
+        samples: of the recording.
+        curve: of its taxels.
+        load: a load cell's times (s, on the recording's clock or from its start) and
+            pressures (kPa), if there was one.
+        weight_kpa: the pressure of a dead weight that was laid on and taken off again.
+
+    Raises:
+        RequestError: nothing was pressed for long, or more than once, or it was not released.
+    """
+    # Some thousand samples show which taxels take part; only for those the whole is used.
+    thin = slice(None, None, max(len(samples.raw) // 4000, 1))
+    everyone = np.ones_like(samples.usable)
+    strongest = np.quantile(curve.kpa(samples.units(thin, everyone)), PRESSED_QUANTILE, axis=0)
+    strongest *= samples.usable
+    chosen = strongest >= max(TAKES_PART * strongest.max(), LEAST_KPA)
+    if not chosen.any():
+        raise RequestError(
+            f"no taxel was held above {LEAST_KPA:g} kPa; wanted a hold and a release, "
+            "the first seconds untouched"
+        )
+    momentary = curve.part(chosen).kpa(samples.units(slice(None), chosen)).mean(axis=1)
+    held = momentary > 0.5 * strongest[chosen].mean()
+    start = int(np.argmax(held))
+    release = len(held) - int(np.argmax(held[::-1]))
+    if release >= len(held) - 10 / samples.dt_s:
+        raise RequestError("the recording ends before the release; wanted 10 s of rest or more")
+    presses = int(np.count_nonzero(held[start + 1 : release] & ~held[start : release - 1])) + 1
+    if np.mean(held[start:release]) < HELD_SHARE:
+        raise RequestError(
+            f"the skin was pressed {presses} times; wanted one hold at one level and its release"
+        )
+    pressure = np.full(len(momentary), np.nan)
+    pressure[release:] = 0.0
+    if weight_kpa is not None:
+        pressure[start:release] = weight_kpa
+    elif load is not None:
+        time_s, load_kpa = load
+        now_s = np.arange(len(momentary)) * samples.dt_s
+        if time_s[0] >= samples.start_s - 1.0:
+            now_s += samples.start_s
+        inside = (now_s >= time_s[0]) & (now_s <= time_s[-1])
+        pressure = np.where(inside, np.interp(now_s, time_s, load_kpa), pressure)
+    # During movement, reading and load cell are not of the same moment.
+    moving = np.abs(np.diff(momentary)) > MOVING_SHARE * strongest[chosen].mean()
+    pressure[:-1][moving] = np.nan
+    pressure[1:][moving] = np.nan
+    record = merge(samples.dt_s, momentary, pressure, start, release)
+    held_units = np.median(samples.units(slice(start, release), chosen), axis=0)
+    half = 0.5 * np.array([[-1.0], [1.0]])
+    low, high = curve.part(chosen).kpa(held_units + half)
+    unit_rms_kpa = float(np.mean(high - low) / np.sqrt(12.0 * np.count_nonzero(chosen)))
+    return replace(record, unit_rms_kpa=unit_rms_kpa)
+
+
+def fit_relaxation(record: HoldRecord, models: Sequence[str]) -> list[Fit]:
+    """Fit models to a record, the best first."""
+    fits = [fit(model, record) for model in models]
+    return sorted(fits, key=_error)
+
+
+def save_relaxation(path: Path, found: Fit, settings: Settings, record: HoldRecord) -> None:
+    """Write a file for `processing.relaxation.file`, completely or not at all."""
+    chosen = found.parameters
+    document: dict[str, Any] = {
+        "schema": RELAXATION_SCHEMA,
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "robot": settings.robot,
+        "model": found.model,
+        "beta": list(chosen.beta),
+        "tau_s": list(chosen.tau_s),
+        "beta_unload": list(chosen.beta_unload),
+        "tau_unload_s": list(chosen.tau_unload_s),
+        "rms_hold_kpa": _finite(found.rms_hold_kpa),
+        "rms_rest_kpa": _finite(found.rms_rest_kpa),
+        "hold_s": record.hold_s,
+        "rest_s": record.rest_s,
+        "uncertain": found.uncertain,
+        "remarks": list(found.remarks),
+    }
+    write_atomic(path, msgspec.json.format(msgspec.json.encode(document), indent=1) + b"\n")
+
+
+def fit_pressures(
+    samples: Samples, settings: Settings, layout: Layout, levels_kpa: list[float]
+) -> tuple[Calibration, GainFit]:
+    """Fit gain and bend of every taxel to plateaus of known uniform pressure, in their order.
+
+    Raises:
+        RequestError: another number of plateaus than of levels was found.
+    """
+    pressure = settings.processing.pressure
+    unit_ff = layout.unit_ff / layout.sensitivity
+    curve = PressureCurve(unit_ff, 1.0, pressure.a_kpa_per_ff2, pressure.b_kpa_per_ff)
+    typical = _typical_kpa(samples, curve, settings)
+    found = plateaus(typical, samples.dt_s)
+    if len(found) != len(levels_kpa):
+        seen = ", ".join(
+            f"{typical[part].mean():.0f} kPa at {part.start * samples.dt_s:.0f} s" for part in found
+        )
+        raise RequestError(
+            f"plateaus of pressure in the recording: {len(found)} ({seen or 'none'}), "
+            f"levels given: {len(levels_kpa)}; wanted one level for each, in their order"
+        )
+    everyone = np.ones_like(samples.usable)
+    linear, square = [], []
+    for part, kept in zip(found, _kept_shares(samples, curve, settings, found), strict=True):
+        ff = samples.units(part, everyone).mean(axis=0) * unit_ff
+        linear.append(kept * pressure.b_kpa_per_ff * ff)
+        square.append(kept * pressure.a_kpa_per_ff2 * ff**2)
+    result = fit_gains(np.array(levels_kpa), np.array(linear), np.array(square), samples.usable)
+    return with_gains(samples.calibration, result.gain, result.bend), result
+
+
+def fit_curves(
+    samples: Samples,
+    settings: Settings,
+    layout: Layout,
+    load: tuple[Floats, Floats],
+    path: Path,
+) -> tuple[Calibration, Curves]:
+    """Fit a curve to every pad, and the foam's memory, from any course of known pressure.
+
+    Args:
+        samples: of the recording.
+        settings, layout: of its skin.
+        load: times in s, and pressures in kPa on all pads alike.
+        path: of the table that they were read from, for messages.
+
+    Raises:
+        RequestError: the table is no course of pressure, not of this recording, or nothing is
+            pressed.
+    """
+    time_s, kpa = load
+    check_course(path, time_s, kpa)
+    end_s = samples.start_s + samples.dt_s * len(samples.raw)
+    time_s = on_clock_of(time_s, samples.start_s, end_s, path)
+    pads = samples.received & (layout.pad_kind == PadKind.PRESSURE)
+    course = Course(samples.dt_s, samples.raw, samples.zero, pads, np.zeros(len(samples.raw)))
+    units, _ = activations(course)
+    now_s: Floats = samples.start_s + samples.dt_s * np.arange(len(samples.raw), dtype=np.float64)
+    try:
+        lag_s = find_lag(median_of_moving(units[:, pads], samples.dt_s), now_s, (time_s, kpa))
+        pressure = np.interp(now_s + lag_s, time_s, kpa)
+        course = replace(course, pressure_kpa=pressure, lag_s=lag_s)
+        curves = fit_course(course, settings.processing.pressure.smoothing_s)
+    except RequestError as error:
+        raise RequestError(f"{path}: {error}") from None
+    return with_curves(samples.calibration, curves), curves
+
+
+def plateaus(pressure_kpa: Floats, dt_s: float) -> list[slice]:
+    """Return where a pressed skin is steady.
+
+    Args:
+        pressure_kpa: float64[t], pressure on a typical taxel, corrected for relaxation; otherwise
+            the residual of a high pressure would be taken for a low one.
+        dt_s: distance of the samples.
+
+    Returns:
+        The plateaus in their order, without the settling time at the beginning of each.
+    """
+    length = max(round(PLATEAU_S / dt_s), 2)
+    if len(pressure_kpa) <= length:
+        return []
+    windows = np.lib.stride_tricks.sliding_window_view(pressure_kpa, length)
+    spread = windows.max(axis=1) - windows.min(axis=1)
+    level = windows.mean(axis=1)
+    limit = np.maximum(STEADY_KPA, STEADY_SHARE * level)
+    before = np.maximum.accumulate(level)
+    steady = (spread <= limit) & (level > np.maximum(PRESSED_KPA, IMPRINT_SHARE * before))
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], steady, [False]]).astype(np.int8)))
+    pieces: list[tuple[int, int]] = []
+    for first, last in edges.reshape(-1, 2):
+        begin, end = int(first), int(last) + length - 1
+        # A moment of noise does not divide a plateau: it continues at the same pressure.
+        if pieces and begin - pieces[-1][1] <= length:
+            earlier = float(pressure_kpa[slice(*pieces[-1])].mean())
+            if abs(float(pressure_kpa[begin:end].mean()) - earlier) <= limit[first]:
+                begin = pieces.pop()[0]
+        pieces.append((begin, end))
+    return [slice(begin + round(SETTLING_SHARE * (end - begin)), end) for begin, end in pieces]
+
+
+def _typical_kpa(samples: Samples, curve: PressureCurve, settings: Settings) -> Floats:
+    """Return the pressure [t] on the median taxel, corrected for relaxation."""
+    curve = curve.part(samples.usable)
+    blocks = [slice(row, row + 1000) for row in range(0, len(samples.raw), 1000)]
+    momentary = np.concatenate(
+        [np.median(curve.kpa(samples.units(block, samples.usable)), axis=1) for block in blocks]
+    )
+    chosen = settings.processing.relaxation
+    model = make_model(chosen.model, 1, parameters_of(chosen))
+    pressure: Floats = momentary.copy()
+    for row in range(len(momentary)):
+        pressure[row] -= model.step(momentary[row : row + 1], samples.dt_s)[0]
+    return pressure
+
+
+def _kept_shares(
+    samples: Samples, curve: PressureCurve, settings: Settings, parts: list[slice]
+) -> list[Floats]:
+    """Return the mean share [n] of the momentary pressure that remains after relaxation, for each
+    plateau.
+    """
+    chosen = settings.processing.relaxation
+    n = samples.raw.shape[1]
+    model = make_model(chosen.model, n, parameters_of(chosen))
+    sums = [np.zeros(n) for _ in parts]
+    for row, raw in enumerate(samples.raw):
+        momentary = curve.kpa(samples.zero - raw)
+        relaxation = model.step(momentary, samples.dt_s)
+        for part, total in zip(parts, sums, strict=True):
+            if part.start <= row < part.stop:
+                np.add(
+                    total,
+                    np.clip(1.0 - relaxation / np.maximum(momentary, 1.0), 0.3, 1.0),
+                    out=total,
+                )
+    return [total / (part.stop - part.start) for part, total in zip(parts, sums, strict=True)]
+
+
+def _held(values: NDArray[np.uint8], valid: Mask) -> NDArray[np.uint8]:
+    """Values [t, n] with the last valid one in place of the invalid."""
+    rows = np.where(valid, np.arange(len(values))[:, np.newaxis], 0)
+    return np.take_along_axis(values, np.maximum.accumulate(rows, axis=0), axis=0)
+
+
+def _error(found: Fit) -> float:
+    known = [x for x in (found.rms_hold_kpa, found.rms_rest_kpa) if np.isfinite(x)]
+    return float(np.sqrt(np.mean(np.square(known))))
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None

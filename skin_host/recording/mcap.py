@@ -1,0 +1,340 @@
+"""Recordings in MCAP: MQTT messages and CAN frames, with their schemas.
+
+Foxglove and every MCAP reader open them. Messages keep their topic and, in JSON, their bytes;
+frames in CBOR are stored as equivalent JSON. CAN frames are in channels `can/<channel>`, with some
+milliseconds per message. A recording is written under a temporary name and renamed when it is
+closed; an interrupted one can be repaired with `mcap recover`.
+"""
+
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any, NamedTuple, Self, get_args
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+
+from skin_host.bus.wire import FrameBatch
+from skin_host.errors import LogError, SkinError
+from skin_host.extras import required
+from skin_host.mqtt.frames import Frame, decode_frame, encode_frame
+from skin_host.mqtt.grasping import decode_over, decode_slip
+from skin_host.mqtt.messages import decode_touch
+from skin_host.mqtt.topics import PartTopic, Topics
+from skin_host.processing.pipeline import PressureFrame
+from skin_host.recording.schemas import SCHEMAS
+
+SUFFIX = ".mcap"
+CAN = "can/"
+#: Nothing that is worth recording is longer.
+MAX_PAYLOAD = 32 * 1024 * 1024
+MAX_BATCH = 100_000
+#: A chunk of a recording is no larger when decompressed; writers make chunks of some MB.
+MAX_CHUNK_BYTES = 64_000_000
+
+_log = logging.getLogger(__name__)
+
+
+class RecordedMessage(NamedTuple):
+    """One message of a recording: topic, time of reception, and its bytes."""
+
+    topic: str
+    t_ns: int
+    payload: bytes
+
+
+class _Text(Struct):
+    text: str
+
+
+class _CanFrames(Struct):
+    t_ns: list[int]
+    id: list[int]
+    data: list[str]
+    dropped: int = 0
+
+
+class Recorder:
+    """A recording in progress.
+
+    Attributes:
+        messages: recorded so far, by kind.
+        unreadable: messages whose payload did not fit their topic; they are left out.
+        gaps: times that the broker was lost.
+
+    Raises:
+        SkinError: mcap is not installed, or the file cannot be made.
+    """
+
+    def __init__(self, path: Path) -> None:
+        mcap_writer = _mcap("mcap.writer")
+        self.messages: dict[str, int] = {}
+        self.unreadable = 0
+        self.gaps = 0
+        self._path = path
+        self._growing = path.with_name(f".{path.stem}.growing{path.suffix}")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file: IO[bytes] = self._growing.open("wb")
+        except OSError as error:
+            raise SkinError(f"{path}: cannot be recorded to: {error.strerror}") from None
+        self._writer = mcap_writer.Writer(self._file)
+        self._writer.start(profile="", library="skin-host")
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self._numbers: dict[str, int] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None and not self.messages:
+            self._file.close()
+            self._growing.unlink()
+        else:
+            self.close()
+
+    def say(self, topic: str, t_ns: int, payload: bytes) -> None:
+        """Record a message received at `t_ns`; an unreadable one is counted.
+
+        Raises:
+            SkinError: the disk is full or gone.
+        """
+        kind = _kind(topic)
+        if kind is None or len(payload) > MAX_PAYLOAD:
+            return
+        try:
+            data, sent_ns = _checked(topic, kind, payload, t_ns)
+        except (SkinError, msgspec.DecodeError, UnicodeDecodeError):
+            self.unreadable += 1
+            return
+        self._add(topic, kind, t_ns, sent_ns, data)
+
+    def can(self, channel: str, batch: FrameBatch) -> None:
+        """Record CAN frames of a channel.
+
+        Raises:
+            SkinError: the disk is full or gone.
+        """
+        if not len(batch):
+            return
+        frames = _CanFrames(
+            batch.t_ns.tolist(),
+            batch.id.tolist(),
+            [
+                row[:dlc].tobytes().hex()
+                for row, dlc in zip(batch.data, batch.dlc.tolist(), strict=True)
+            ],
+            batch.dropped,
+        )
+        last_ns = int(batch.t_ns[-1])
+        self._add(CAN + channel, "can", last_ns, last_ns, msgspec.json.encode(frames))
+
+    def close(self) -> None:
+        """End the recording and give it its name.
+
+        Raises:
+            SkinError: the disk is full or gone.
+        """
+        if self._file.closed:
+            return
+        with self._told(), self._file:
+            counts = {f"messages_{kind}": str(n) for kind, n in sorted(self.messages.items())}
+            told = counts | {"unreadable": str(self.unreadable), "gaps": str(self.gaps)}
+            self._writer.add_metadata("skin", told)
+            self._writer.finish()
+            self._file.flush()
+            os.fsync(self._file.fileno())
+        os.replace(self._growing, self._path)
+
+    def _add(self, topic: str, kind: str, t_ns: int, sent_ns: int, data: bytes) -> None:
+        with self._told():
+            if topic not in self._channels:
+                if kind not in self._schemas:
+                    name, schema = SCHEMAS[kind]
+                    encoded = msgspec.json.encode(schema)
+                    self._schemas[kind] = self._writer.register_schema(name, "jsonschema", encoded)
+                self._channels[topic] = self._writer.register_channel(
+                    topic=topic, message_encoding="json", schema_id=self._schemas[kind]
+                )
+            number = self._numbers[topic] = self._numbers.get(topic, 0) + 1
+            self._writer.add_message(
+                channel_id=self._channels[topic],
+                log_time=max(0, t_ns),
+                publish_time=max(0, sent_ns),
+                sequence=number % 2**32,
+                data=data,
+            )
+        self.messages[kind] = self.messages.get(kind, 0) + 1
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise SkinError(f"{self._path}: cannot be recorded to: {error.strerror}") from None
+
+
+def read_messages_of(path: Path) -> Iterator[RecordedMessage]:
+    """Yield the messages of a recording in the order of reception.
+
+    Raises:
+        LogError: it cannot be read, or breaks off.
+    """
+    for topic, t_ns, data in _messages(path):
+        kind = _kind(topic)
+        if kind in ("contact", "status"):
+            yield RecordedMessage(topic, t_ns, _decode(path, topic, data, _Text).text.encode())
+        elif kind is not None:
+            yield RecordedMessage(topic, t_ns, data)
+
+
+def read_can(path: Path) -> Iterator[tuple[str, FrameBatch]]:
+    """The CAN frames of a recording: the name of their channel, and a batch as a bus gives.
+
+    Raises:
+        LogError: it cannot be read, breaks off, or holds no CAN frames.
+    """
+    found = False
+    for topic, _, data in _messages(path):
+        if not topic.startswith(CAN):
+            continue
+        found = True
+        frames = _decode(path, topic, data, _CanFrames)
+        n = len(frames.id)
+        if n > MAX_BATCH or not n == len(frames.t_ns) == len(frames.data):
+            raise LogError(f"{path}: {topic}: {n} identifiers, but another number of frames")
+        try:
+            rows = [
+                (can_id, bytes.fromhex(text)[:8], t_ns)
+                for can_id, text, t_ns in zip(frames.id, frames.data, frames.t_ns, strict=True)
+            ]
+            batch = FrameBatch.of(rows)
+        except (ValueError, OverflowError) as error:
+            raise LogError(f"{path}: {topic}: {error}") from None
+        batch.dropped = frames.dropped
+        yield topic.removeprefix(CAN), batch
+    if not found:
+        raise LogError(
+            f"{path}: holds no CAN frames: it was recorded from a broker alone; play it to a "
+            "broker, or record the buses too"
+        )
+
+
+def _messages(path: Path) -> Iterator[tuple[str, int, bytes]]:
+    """(topic, time, data) of every message, in order of time."""
+    reader = _mcap("mcap.reader")
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror}") from None
+    with file:
+        try:
+            _check_chunks(path, file)
+            for _, channel, message in reader.make_reader(file).iter_messages():
+                yield channel.topic, message.log_time, message.data
+        except LogError:
+            raise
+        except Exception as error:  # whatever a damaged file makes of its readers
+            what = (str(error) or type(error).__name__).splitlines()[0]
+            raise LogError(
+                f"{path}: no whole MCAP file: {what}; `mcap recover` may repair it"
+            ) from None
+
+
+def _check_chunks(path: Path, file: IO[bytes]) -> None:
+    """Refuse a recording with a chunk that decompresses to an unreasonable size.
+
+    The reader decompresses whole chunks.
+
+    Raises:
+        LogError: there is such a chunk.
+    """
+    chunk = _mcap("mcap.records").Chunk
+    for record in _mcap("mcap.stream_reader").StreamReader(file, emit_chunks=True).records:
+        if not isinstance(record, chunk):
+            continue
+        size = record.uncompressed_size
+        if record.compression == "zstd":
+            zstandard = _mcap("zstandard")
+            declared = zstandard.get_frame_parameters(record.data).content_size
+            size = max(size, 0 if declared == zstandard.CONTENTSIZE_UNKNOWN else declared)
+        elif record.compression == "lz4":
+            decompressor = _mcap("lz4.frame").LZ4FrameDecompressor()
+            size = max(size, len(decompressor.decompress(record.data, MAX_CHUNK_BYTES + 1)))
+        if size > MAX_CHUNK_BYTES:
+            raise LogError(
+                f"{path}: a chunk of {len(record.data)} bytes decompresses to more than "
+                f"{MAX_CHUNK_BYTES} bytes"
+            )
+    file.seek(0)
+
+
+def _kind(topic: str) -> str | None:
+    """Return frame, touch, ... by the end of a topic; None for topics that are not recorded."""
+    head, _, last = topic.rpartition("/")
+    if last in ("frame", "touch", "slip", "over", "contact", "health"):
+        return last
+    if last in ("status", "info") and "/nodes/" in head:
+        return last
+    return None
+
+
+def _checked(topic: str, kind: str, payload: bytes, t_ns: int) -> tuple[bytes, int]:
+    """The data to record, and when it was sent."""
+    if kind == "frame":
+        part = topic.split("/")[-2]
+        frame = decode_frame(part, payload)
+        if payload[:1] >= b"\xa0":
+            payload = _as_json(frame)
+        return payload, frame.t_ns
+    if kind == "touch":
+        return payload, decode_touch(payload).t_ns
+    if kind in ("slip", "over"):
+        found = decode_slip(payload) if kind == "slip" else decode_over(payload)
+        return payload, found.t_ns
+    if kind in ("contact", "status"):
+        return msgspec.json.encode(_Text(payload.decode())), t_ns
+    msgspec.json.decode(payload, type=dict[str, Any])
+    return payload, t_ns
+
+
+def _as_json(frame: Frame) -> bytes:
+    none = np.zeros(len(frame.valid), np.bool_)
+    raw = frame.raw if frame.raw is not None else np.zeros(len(frame.valid), np.uint8)
+    whole = PressureFrame(
+        frame.part,
+        frame.seq,
+        frame.t_ns,
+        raw,
+        frame.pressure_kpa.astype(np.float32),
+        none,
+        frame.valid,
+        frame.beyond_range,
+    )
+    return encode_frame(whole, raw=frame.raw is not None)
+
+
+def _decode(path: Path, topic: str, data: bytes, kind: type[Any]) -> Any:
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise LogError(f"{path}: {topic}: {error}") from None
+
+
+def recorded_topics(base: str, robot: str) -> list[str]:
+    """Return the topics to subscribe to for a whole recording of a robot."""
+    topics = Topics(base, robot)
+    return [
+        *(topics.part(kind, "+") for kind in get_args(PartTopic)),
+        topics.node("status", "+"),
+        topics.info("+"),
+        topics.info("+", "+"),
+    ]
+
+
+def _mcap(name: str) -> Any:
+    return required(name, "MCAP recordings", "record")

@@ -1,0 +1,147 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skin_host.bus.commands import SetTxMode
+from skin_host.bus.strain import (
+    FullScale,
+    GetFullScale,
+    StrainMode,
+    StrainType,
+    WrenchAssembler,
+    encode_strain,
+    parse_full_scale,
+    parse_strain,
+    start_frames,
+)
+from skin_host.bus.wire import FrameBatch
+
+MS = 1_000_000
+SCALE = np.array([2000.0, 2000, 1000, 40, 40, 20])
+values = st.tuples(*[st.integers(-0x8000, 0x7FFF)] * 3)
+
+
+@given(board=st.integers(1, 14), kind=st.sampled_from(list(StrainType)), value=values)
+def test_a_frame_comes_back_as_it_was(board, kind, value):
+    can_id, payload = encode_strain(board, kind, value)
+    frames = parse_strain(FrameBatch.of([(can_id, payload, 5)]))
+    assert frames.value.tolist() == [list(value)]
+    assert (frames.board[0], frames.type[0]) == (board, kind)
+    assert not frames.saturated[0]
+
+
+def test_the_bytes_are_those_of_the_wire():
+    can_id, payload = encode_strain(13, StrainType.FORCE, (0, 1, -0x8000))
+    assert can_id == 0x3DA
+    assert payload.hex() == "008001800000"
+    assert encode_strain(13, StrainType.TORQUE, (0, 0, 0), overflow=3)[1].hex() == "00800080008003"
+
+
+@pytest.mark.parametrize("value", [(0, 0, 0x8000), (0, 0, -0x8001), (0, 0)])
+def test_values_beyond_a_word_are_refused(value):
+    with pytest.raises(ValueError, match="wanted three values"):
+        encode_strain(1, StrainType.FORCE, value)
+
+
+def test_commands_have_their_bytes():
+    assert SetTxMode(StrainMode.STOP).encode().hex() == "0701"
+    assert GetFullScale(3).encode().hex() == "1803"
+    frames = start_frames(13, 10)
+    assert {can_id for can_id, _ in frames} == {0x20D}
+    assert [data.hex() for _, data in frames[-3:]] == ["1805", "080a", "0700"]
+
+
+def test_a_full_scale_has_its_high_byte_first():
+    assert parse_full_scale(0x2D0, bytes([0x18, 4, 0x07, 0xD0])) == (13, FullScale(4, 2000))
+
+
+@pytest.mark.parametrize(
+    ("can_id", "payload"),
+    [
+        (0x20D, bytes([0x18, 4])),  # the question, not the answer
+        (0x2D0, bytes([0x18, 4, 7])),
+        (0x2D0, bytes([0x18, 9, 7, 0])),
+        (0x2D0, bytes([0x07, 0, 0, 0])),
+        (0x200, bytes([0x18, 4, 7, 0])),
+        (0x2D0, b""),
+    ],
+)
+def test_other_answers_are_not_full_scales(can_id, payload):
+    assert parse_full_scale(can_id, payload) is None
+
+
+@given(
+    frames=st.lists(
+        st.tuples(
+            st.one_of(st.integers(0x300, 0x3FF), st.integers(0, 0x7FF)),
+            st.binary(max_size=8),
+        ),
+        max_size=30,
+    )
+)
+def test_no_traffic_on_the_bus_can_break_the_assembler(frames):
+    batch = FrameBatch.of([(can_id, data, i * MS) for i, (can_id, data) in enumerate(frames)])
+    assembler = WrenchAssembler(13, 10, SCALE)
+    for sample in assembler.add(batch):
+        assert np.isfinite(sample.force_n).all()
+        assert (np.abs(sample.force_n) <= SCALE[:3]).all()
+    strain = [
+        data
+        for can_id, data in frames
+        if can_id >> 8 == 3 and can_id >> 4 & 15 and 8 <= can_id & 15 <= 11
+    ]
+    assert assembler.counters.wrong_length == sum(len(data) not in (6, 7) for data in strain)
+
+
+def stream(*entries):
+    """Frames of board 13: (milliseconds, "f" or "t", first value, payload bytes more)."""
+    rows = []
+    for t_ms, kind, value, *more in entries:
+        type_ = StrainType.FORCE if kind == "f" else StrainType.TORQUE
+        can_id, payload = encode_strain(13, type_, (value, 0, 0))
+        rows.append((can_id, payload + bytes(more), int(t_ms * MS)))
+    return FrameBatch.of(rows)
+
+
+@pytest.mark.parametrize("order", ["ft", "tf"])
+def test_force_and_torque_are_paired_in_either_order_and_scaled(order):
+    assembler = WrenchAssembler(13, 10, SCALE)
+    value = {"f": 0x4000, "t": -0x2000}
+    samples = assembler.add(
+        stream(*[(10 * i + 0.1 * k, o, value[o]) for i in range(3) for k, o in enumerate(order)])
+    )
+    assert len(samples) == 3
+    assert samples[0].force_n[0] == 1000.0
+    assert samples[0].torque_nm[0] == -10.0
+    assert samples[2].t_ns == 20_100_000
+    assert assembler.counters.lone == 0
+
+
+def test_a_lost_half_never_joins_two_samples():
+    assembler = WrenchAssembler(13, 10, SCALE)
+    samples = assembler.add(
+        stream(
+            (0, "f", 1), (0.1, "t", 1), (10, "f", 2), (20.1, "t", 3), (30, "f", 4), (30.1, "t", 4)
+        )
+    )
+    assert [s.force_n[0] / s.torque_nm[0] for s in samples] == [2000 / 40, 2000 / 40]
+    assert assembler.counters.samples == 2
+    assert assembler.counters.lone == 2
+
+
+def test_pairs_may_be_split_over_batches_and_other_boards_are_not_mixed_in():
+    assembler = WrenchAssembler(13, 10, SCALE)
+    assert assembler.add(stream((0, "f", 1))) == []
+    other_id, payload = encode_strain(12, StrainType.TORQUE, (5, 5, 5))
+    assert assembler.add(FrameBatch.of([(other_id, payload, 50_000)])) == []
+    assert len(assembler.add(stream((0.1, "t", 1)))) == 1
+
+
+def test_saturation_is_told():
+    assembler = WrenchAssembler(13, 10, SCALE)
+    samples = assembler.add(
+        stream((0, "f", 0x7FFF, 1), (0.1, "t", 0), (10, "f", 1, 0), (10.1, "t", 0))
+    )
+    assert [sample.saturated for sample in samples] == [True, False]
+    assert assembler.counters.saturated == 1

@@ -1,0 +1,193 @@
+"""What a user sees who asks for the wrong thing: one clear line and the right status."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from skin_host.cli import main, watch
+from skin_host.config.settings import skin_hash
+from skin_host.processing.calibration import Calibrator
+from tests.support.broker import free_port
+
+ROOT = Path(__file__).parents[2]
+DEMO = ROOT / "config/demo.toml"
+
+
+def skin(*arguments: str, **environment: str) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run(
+        [sys.executable, "-m", "skin_host", *arguments],
+        check=False,
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env=os.environ | environment,
+        timeout=60,
+    )
+
+
+def refused(result: "subprocess.CompletedProcess[str]", status: int, *wanted: str) -> None:
+    lines = result.stderr.strip().splitlines()
+    assert result.returncode == status, result.stderr
+    assert len(lines) == 1, result.stderr
+    assert "Traceback" not in result.stderr
+    for text in wanted:
+        assert text in lines[0]
+
+
+def changed(tmp_path: Path, old: str, new: str) -> str:
+    text = DEMO.read_text()
+    assert old in text
+    path = tmp_path / "changed.toml"
+    path.write_text(text.replace(old, new, 1))
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "path", "seen"),
+    [
+        ("address = 14", "address = 15", "boards.hand.address", "seen 15, wanted `int` <= 14"),
+        ("address = 14", "adress = 14", "boards.hand", "adress"),
+        ("address = 14", 'address = "x"', "boards.hand.address", "seen 'x', wanted `int`"),
+        ('triangles = "0-4"', 'triangles = "0-40"', "parts.left_hand.patches[0].triangles", "40"),
+        ('kind = "fingertip"', 'kind = "finger"', "parts.left_hand.patches[0].kind", "finger"),
+        ('bus = "can0"', 'bus = "can9"', "boards.hand.bus", "can9"),
+        ('robot = "demo"', "robot = demo", "TOML", "line"),
+    ],
+)
+def test_a_wrong_configuration_is_named_by_file_and_key(tmp_path, old, new, path, seen):
+    config = changed(tmp_path, old, new)
+    refused(skin("check", config), 2, config, path, seen)
+
+
+@pytest.mark.parametrize("config", sorted((ROOT / "config").glob("*.toml")), ids=lambda at: at.stem)
+def test_every_configuration_of_the_project_is_right(config, capsys):
+    assert main(["check", str(config)]) == 0, capsys.readouterr().err
+
+
+def test_a_missing_interface_is_waited_for_and_named_with_what_mends_it(tmp_path):
+    config = changed(tmp_path, 'interface = "virtual"', 'interface = "socketcan"')
+    result = skin("run", config, "--calibrate", "--duration", "3", XDG_STATE_HOME=str(tmp_path))
+    assert "Traceback" not in result.stderr
+    assert "skin-demo" in result.stderr
+    assert not list(tmp_path.rglob("*.calibration.json"))
+
+
+def test_an_unknown_interface_kind_is_refused(tmp_path):
+    config = changed(tmp_path, 'interface = "virtual"', 'interface = "pigeon"')
+    refused(skin("run", config, "--calibrate", XDG_STATE_HOME=str(tmp_path)), 2, "pigeon")
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("absent.log", None), ("empty.log", b""), ("noise.log", bytes(range(256))), ("x.asc", b"?")],
+)
+def test_an_unreadable_log_is_refused_and_leaves_no_output(tmp_path, name, content):
+    log = tmp_path / name
+    if content is not None:
+        log.write_bytes(content)
+    output = tmp_path / "out.jsonl"
+    result = skin("replay", str(log), "--config", str(DEMO), "--output", str(output))
+    refused(result, 2, str(log))
+    assert not output.exists()
+    assert {path.name for path in tmp_path.iterdir()} <= {name}
+
+
+def test_a_log_of_another_robot_is_refused(tmp_path):
+    log = tmp_path / "other.log"
+    log.write_text("(1700000000.000000) can0 410#40F0F0F0F0F0F0F0\n")
+    refused(skin("replay", str(log), "--config", str(DEMO)), 2, "no sweep of this skin")
+
+
+def test_a_calibration_of_another_configuration_is_refused(tmp_path):
+    calibration = tmp_path / "calibration.json"
+    log = tmp_path / "x.log"
+    log.write_text("(1700000000.000000) can0 4E0#40F0F0F0F0F0F0F0\n")
+    calibration.write_text("{}")
+    result = skin("replay", str(log), "--config", str(DEMO), "--calibration", str(calibration))
+    refused(result, 2, str(calibration), "skin calibrate")
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        (["calibrat"], "meant calibrate?"),
+        (["bench", "recieve"], "meant receive?"),
+        (["run", str(DEMO), "--duraton", "3"], "meant --duration?"),
+        (["run", str(DEMO), "--duration", "-3"], "seen -3, wanted a number above 0"),
+        (["calibrate", str(DEMO), "--seconds", "0"], "seen 0, wanted a number above 0"),
+        (["emulate", str(DEMO), "--speed", "fast"], "seen fast, wanted a number above 0"),
+    ],
+)
+def test_a_mistyped_word_comes_with_what_was_meant(typed, meant, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(typed)
+    assert ended.value.code == 2
+    assert meant in capsys.readouterr().err
+
+
+def test_a_status_without_broker_waits_for_none(capsys):
+    assert main(["status", "--broker", f"mqtt://127.0.0.1:{free_port()}"]) == 1
+    assert "no broker listens there" in capsys.readouterr().err
+    assert watch.PATIENCE_S < 2
+
+
+@pytest.mark.parametrize(("options", "status"), [([], 0), (["--strict"], 1)])
+def test_a_calibration_of_touched_skin_is_a_warning(options, status, tmp_path, monkeypatch, capsys):
+    async def touched(settings, layout, *_):
+        calibrator = Calibrator(layout)
+        raw = np.full(layout.parts[0].n_taxels, 240, np.uint8)
+        for sweep in range(100):
+            raw[3] = 240 if sweep < 70 else 150  # a finger comes and stays
+            calibrator.add(0, raw, np.full(len(raw), fill_value=True))
+        return calibrator.finish(skin_hash(settings), "2026-01-01T00:00:00+00:00")
+
+    monkeypatch.setattr("skin_host.daemon.calibrate.take_calibration", touched)
+    kept = tmp_path / "kept.json"
+    assert main(["calibrate", str(DEMO), "--output", str(kept), *options]) == status
+    assert kept.exists()
+    (warning,) = (line for line in capsys.readouterr().err.splitlines() if "warning" in line)
+    assert "taxel 3 of left_hand" in warning
+    assert "repeat" in warning
+
+
+@pytest.mark.parametrize("arguments", [[], ["fly"], ["replay"], ["run"], ["emulate", "nope.toml"]])
+def test_a_wrong_command_is_one_line_and_status_2(arguments):
+    refused(skin(*arguments), 2)
+
+
+def help_of(capsys: pytest.CaptureFixture[str], *command: str) -> str:
+    with pytest.raises(SystemExit) as ended:
+        main([*command, "--help"])
+    assert ended.value.code == 0
+    return capsys.readouterr().out
+
+
+def test_every_command_has_help_with_an_example(capsys):
+    commands = re.findall(r"^    ([a-z]+)", help_of(capsys), flags=re.MULTILINE)
+    assert {"run", "calibrate", "check", "replay", "emulate", "demo", "scan"} <= set(commands)
+    for command in commands:
+        assert f"Example: skin {command}" in help_of(capsys, command)
+
+
+def test_a_reader_that_leaves_early_is_no_error():
+    check = f"{sys.executable} -m skin_host check {DEMO} | head -n 1"
+    result = subprocess.run(
+        check, shell=True, check=False, capture_output=True, text=True, cwd=ROOT
+    )
+    assert result.stderr == ""
+
+
+def test_a_kept_calibration_of_another_skin_stops_the_daemon_before_it_begins(tmp_path):
+    kept = tmp_path / "skin-host/demo-main.calibration.json"
+    kept.parent.mkdir()
+    content = '{"schema":"skin.calibration/1","id":"a","time":"b","robot":"other",'
+    content += '"configuration":"0","parts":{}}'
+    kept.write_text(content)
+    result = skin("run", str(DEMO), XDG_STATE_HOME=str(tmp_path))
+    refused(result, 2, str(kept), "skin calibrate")
+    assert kept.read_text() == content

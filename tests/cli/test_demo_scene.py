@@ -1,0 +1,58 @@
+"""The demo's scene, worked out without a clock: what is pressed is told, and nothing else."""
+
+from pathlib import Path
+
+from msgspec.structs import replace
+
+from emulator.probes.scene import Scene
+from emulator.probes.scene import load as load_scene
+from emulator.robot import Robot
+from skin_host.config.settings import load
+from skin_host.layout import build_layout
+from skin_host.processing.core import Engine
+
+CONFIG = Path(__file__).parents[2] / "config"
+CALIBRATION_S = 4.5
+LASTS_S = 38.0
+#: When something begins to press what nothing presses yet, by part.
+PRESSES = {
+    "left_forearm": [6, 8, 11, 14, 17, 28, 30, 33, 36],
+    "left_hand": [7, 7, 8, 16, 16, 17, 25, 25, 26, 34, 34, 35],
+}
+
+
+def begun_in(scene: Scene) -> dict[str, list[float]]:
+    """When contacts begin, s, by part."""
+    settings = load(CONFIG / "demo.toml")
+    layout = build_layout(settings, CONFIG)
+    robot = Robot(settings, layout, scene)
+    engine = Engine(settings, layout, list(range(len(layout.parts))))
+    robot.bring_up()
+    begun: dict[str, list[float]] = {part: [] for part in PRESSES}
+    calibrated = False
+    engine.begin_calibration(CALIBRATION_S)
+    while robot.t_ns < LASTS_S * 1e9:
+        if not calibrated and engine.calibration_progress() >= 1.0:
+            engine.use(engine.end_calibration("2026-01-01T00:00:00+00:00"))
+            calibrated = True
+        for step in engine.feed("can0", robot.step(0.02)["can0"]).steps:
+            for event in step.events:
+                if event.event == "begin":
+                    begun[event.part].append(event.t_ns * 1e-9)
+    return begun
+
+
+def test_every_press_is_one_contact() -> None:
+    scene = replace(load_scene(CONFIG / "scenes" / "demo.toml"), quiet=True)
+    begun = begun_in(scene)
+    for part, at_s in PRESSES.items():
+        late_s = [begin - wanted for begin, wanted in zip(begun[part], at_s, strict=True)]
+        assert all(0.0 < late < 0.4 for late in late_s), (part, begun[part])
+
+
+def test_no_press_is_missed_or_late_on_pads_as_noisy_as_real_ones() -> None:
+    begun = begun_in(load_scene(CONFIG / "scenes" / "demo.toml"))
+    for part, at_s in PRESSES.items():
+        for wanted in at_s:
+            assert any(0.0 < begin - wanted < 0.4 for begin in begun[part]), (part, wanted)
+        assert min(begun[part]) > min(at_s)

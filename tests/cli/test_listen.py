@@ -1,0 +1,97 @@
+"""`skin listen` prints what skin and fingertips say, as lines for people or programs."""
+
+import asyncio
+import json
+import sys
+from pathlib import Path
+
+from skin_host.cli.lines import missed_line
+from skin_host.config.settings import Mqtt, load
+from skin_host.fingertip.events import OverEvent, SlipEvent
+from skin_host.layout import build_layout
+from skin_host.mqtt.grasping import Slip
+from skin_host.mqtt.info import node_info
+from skin_host.mqtt.publisher import Publisher
+from skin_host.processing.events import TouchEvent
+from tests.support.broker import Mosquitto
+
+ROOT = Path(__file__).parents[2]
+CONFIG = ROOT / "config" / "fingertips.toml"
+NAN = float("nan")
+BEGUN = TouchEvent(
+    "begin", 4, 1, 5, "index", [], [0.001, 0.002, 0.013], [0, 0, 1.0], NAN, NAN, NAN, 2.0
+)
+SLIP = SlipEvent("begin", 4, 6, "index", "fall", 2.01, 1.14, -4.8)
+SLIP_END = SlipEvent("end", 4, 7, "index", "fall", 2.0, 0.6, 0.0)
+OVER = OverEvent("begin", 4, 8, "index", 10.4)
+ENDED = BEGUN.ended(9, 9)
+LINES = """\
+index          begin #4    (   1.0,   2.0) mm               2.00 N
+index          slip  #4    begins, by the fall of the tangential force: 2.01 N normal, \
+1.14 N tangential, -4.8 N/s
+index          slip  #4    ends
+index          over  #4    begins: 10.40 N normal
+index          end   #4    (   1.0,   2.0) mm
+""".splitlines()
+
+
+async def listened(broker: Mosquitto, *options: str) -> list[str]:
+    """What the command prints of a grasp in which something slips, ten lines of it."""
+    command = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "skin_host", "listen", "--count", "10", *options),
+        *("--robot", "fingertips", "--broker", f"mqtt://{broker.host}:{broker.port}"),
+        cwd=ROOT,
+        stdout=asyncio.subprocess.PIPE,
+    )
+    said = asyncio.create_task(command.communicate())
+    settings = Mqtt(host=broker.host, port=broker.port)
+    async with Publisher(settings, "fingertips", "main") as publisher:
+        layout = build_layout(load(CONFIG), CONFIG.parent)
+        publisher.put_info(node_info(layout, "main", version="1", configuration="x"))
+        # Events are not retained: they are told again until the command listens.
+        async with asyncio.timeout(30):
+            while not said.done():
+                publisher.put_touch(BEGUN)
+                for event in (SLIP, SLIP_END, OVER):
+                    publisher.put_grasp(event)
+                publisher.put_touch(ENDED)
+                await asyncio.wait([said], timeout=0.2)
+    out, _ = await said
+    assert command.returncode == 0
+    return out.decode().splitlines()
+
+
+async def test_a_slip_and_an_excess_stand_between_begin_and_end_of_their_touch(
+    mosquitto: Mosquitto,
+) -> None:
+    seen = await listened(mosquitto, "--part", "index")
+    begin = seen.index(LINES[0])
+    assert seen[begin : begin + 5] == LINES
+
+
+async def test_programs_get_each_event_as_a_document(mosquitto: Mosquitto) -> None:
+    documents = [json.loads(line) for line in await listened(mosquitto, "--json")]
+    kinds = {(one["schema"], one["event"]) for one in documents}
+    assert kinds >= {("skin.slip/1", "begin"), ("skin.slip/1", "end"), ("skin.over/1", "begin")}
+    slip = next(one for one in documents if one["schema"] == "skin.slip/1")
+    assert (slip["cause"], slip["force_n"], slip["shear_n"]) == ("fall", 2.01, 1.14)
+
+
+def test_what_was_missed_is_said_by_kind_and_part() -> None:
+    slip = Slip(
+        event="end",
+        id=1,
+        t_ns=2,
+        part="thumb",
+        cause="rate",
+        force_n=1,
+        shear_n=1,
+        shear_rate_n_s=0,
+        missed=3,
+    )
+    assert missed_line(slip, as_json=False) == "(3 slip events of thumb were missed)"
+    assert json.loads(missed_line(slip, as_json=True)) == {
+        "missed": 3,
+        "part": "thumb",
+        "kind": "slip",
+    }

@@ -1,0 +1,53 @@
+"""A calibration's verdicts, a triangle a line."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from skin_host.cli import verdicts
+from skin_host.config.settings import load
+from skin_host.layout import build_layout
+from skin_host.processing.calibration import Calibration, Verdict
+
+CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
+LAYOUT = build_layout(load(CONFIG), CONFIG.parent)
+
+
+def calibration(**bad: list[int]) -> Calibration:
+    """All well but for these flat taxels."""
+    verdict = np.full(LAYOUT.n_taxels, Verdict.OK, np.uint8)
+    for name, taxels in bad.items():
+        verdict[taxels] = Verdict[name.upper()]
+    zeros = np.zeros(LAYOUT.n_taxels)
+    return Calibration("x", "y", "z", *[zeros] * 6, verdict)
+
+
+def test_triangles_that_are_well_are_one_line_a_board() -> None:
+    said = verdicts.table(verdicts.triangle_verdicts(calibration(), LAYOUT, [0, 1]))
+    assert said.splitlines() == [
+        "part          board          triangles  verdict",
+        "left_hand     hand           0-4,8-11   ok",
+        "left_forearm  forearm_outer  0-15       ok",
+        "left_forearm  forearm_inner  0-7        ok",
+    ]
+
+
+def test_a_triangle_with_bad_taxels_has_its_own_line_and_names_them() -> None:
+    bad = calibration(noisy=[13, 14], stuck=[15], absent=list(range(24, 36)))
+    found = verdicts.triangle_verdicts(bad, LAYOUT, [0])
+    assert verdicts.table(found).splitlines()[1:] == [
+        "left_hand  hand   0,3-4,8-11  ok",
+        "left_hand  hand   1           2 noisy: 13, 14; 1 stuck: 15",
+        "left_hand  hand   2           absent",
+    ]
+    assert [one["verdict"] for one in found[:4]] == ["ok", "stuck", "absent", "ok"]
+    assert found[1]["taxels"] == {"noisy": [13, 14], "stuck": [15]}
+
+
+@pytest.mark.parametrize("pad", [6, 10])
+def test_thermal_pads_have_no_verdict(pad: int) -> None:
+    first = LAYOUT.part("left_forearm").start
+    (triangle, *_) = verdicts.triangle_verdicts(calibration(stuck=[first + pad]), LAYOUT, [1])
+    assert triangle["pressure_taxels"] == 10
+    assert triangle["verdict"] == "ok"

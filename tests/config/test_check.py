@@ -1,0 +1,143 @@
+"""What `skin check` counts and warns of."""
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from skin_host.config import check
+from skin_host.config.settings import Settings
+from skin_host.layout import build_layout
+
+
+def described(
+    boards: dict[str, dict[str, object]],
+    parts: dict[str, object],
+    buses: dict[str, object] | None = None,
+    folder: Path = Path(),
+) -> check.Description:
+    settings = msgspec.convert(
+        {"robot": "test", "buses": buses or {"can0": {}}, "boards": boards, "parts": parts},
+        Settings,
+    )
+    return check.describe(settings, build_layout(settings, folder))
+
+
+def full_boards(n: int, **more: object) -> check.Description:
+    """`n` boards of 16 triangles on one bus."""
+    names = [f"mtb{i}" for i in range(1, n + 1)]
+    return described(
+        {
+            name: {"bus": "can0", "address": i, "skin_type": 2, **more}
+            for i, name in enumerate(names, 1)
+        },
+        {name: {"patches": [{"board": name, "triangles": "0-15"}]} for name in names},
+    )
+
+
+def test_seven_full_boards_at_50_ms_load_a_bus_by_half() -> None:
+    """The wire's reference reckons 50 .. 60 %."""
+    bus = full_boards(7)["buses"][0]
+    assert bus["frames_per_s"] == 7 * 32 * 20
+    assert bus["load"] == pytest.approx((0.497, 0.605), abs=1e-3)
+
+
+def test_a_bus_loaded_beyond_80_percent_is_warned_of() -> None:
+    assert full_boards(9)["warnings"] == []
+    (warning,) = full_boards(10)["warnings"]
+    assert warning.startswith("buses.can0: skin frames take 71 .. 86 % of the bus")
+
+
+def test_a_slower_bus_is_loaded_more() -> None:
+    fast = full_boards(1)["buses"][0]["load"]
+    slow = described(
+        {"mtb": {"bus": "can0", "address": 1, "skin_type": 2}},
+        {"arm": {"patches": [{"board": "mtb", "triangles": "0-15"}]}},
+        {"can0": {"bitrate": 500_000}},
+    )["buses"][0]["load"]
+    assert list(slow) == pytest.approx([2 * load for load in fast], abs=2e-3)
+
+
+def test_a_period_shorter_than_the_chips_conversion_is_warned_of() -> None:
+    (warning,) = full_boards(1, period_ms=20)["warnings"]
+    assert warning.startswith("boards.mtb1.period_ms: 20; the chips need 36.86 ms")
+
+
+def test_a_thermometer_that_feels_pressure_is_warned_of() -> None:
+    (warning,) = full_boards(1, skin_type=8)["warnings"]
+    assert warning.startswith("boards.mtb1.skin_type: 8 takes pad 6 as a thermometer")
+    assert "triangles 0-15 feels pressure" in warning
+
+
+def test_an_unused_bus_and_a_board_of_two_daemons_are_warned_of() -> None:
+    description = described(
+        {"mtb": {"bus": "can0", "address": 1, "skin_type": 2}},
+        {
+            "arm": {"patches": [{"board": "mtb", "triangles": "0"}]},
+            "hand": {"node": "second", "patches": [{"board": "mtb", "triangles": "1"}]},
+        },
+        {"can0": {}, "can1": {"channel": "can1"}},
+    )
+    assert [warning.split(";")[0] for warning in description["warnings"]] == [
+        "buses.can1: no board is on this bus",
+        "boards.mtb: feeds parts of the nodes main, second",
+    ]
+
+
+def test_taxels_at_one_place_and_taxels_alone_are_warned_of(tmp_path: Path) -> None:
+    rows = np.zeros((12, 6))
+    rows[2:, 0] = np.arange(1, 11)
+    np.savetxt(tmp_path / "arm.txt", rows)
+    description = described(
+        {"mtb": {"bus": "can0", "address": 1, "skin_type": 2}},
+        {"arm": {"patches": [{"board": "mtb", "triangles": "0", "positions": "arm.txt"}]}},
+        folder=tmp_path,
+    )
+    assert [warning.split(";")[0] for warning in description["warnings"]] == [
+        "parts.arm: 10 taxel(s) have no neighbour",
+        "parts.arm: 1 taxel(s) lie where another one lies",
+    ]
+
+
+def test_the_table_holds_totals_and_warnings() -> None:
+    text = check.table(full_boards(10))
+    total = next(line for line in text.splitlines() if line.startswith("total"))
+    assert total.split()[:5] == ["total", "10", "160", "1920", "0"]
+    assert "warning: buses.can0" in text
+    assert all(line == line.rstrip() for line in text.splitlines())
+
+
+def test_a_fingertip_is_listed_and_its_samples_load_the_bus() -> None:
+    settings = msgspec.convert(
+        {
+            "robot": "test",
+            "buses": {"can0": {}, "can1": {"channel": "can1"}},
+            "boards": {"hand": {"bus": "can0", "address": 1, "skin_type": 2}},
+            "parts": {"palm": {"patches": [{"board": "hand", "triangles": "0-3"}]}},
+            "fingertips": {
+                "index": {"bus": "can1", "address": 3, "shape": "sphere", "radius_mm": 9}
+            },
+        },
+        Settings,
+    )
+    description = check.describe(settings, build_layout(settings, Path()))
+    assert description["buses"][1]["frames_per_s"] == 400
+    assert description["buses"][1]["load"] == pytest.approx((0.038, 0.046))
+    assert description["warnings"] == []
+    assert "index      main  can1        3    5 ms  sphere  -" in check.table(description)
+
+
+def test_two_buses_on_one_channel_are_a_warning():
+    buses = {"a": {"channel": "can0"}, "b": {"channel": "can0"}}
+    boards = {name: {"bus": name, "address": 1, "skin_type": 2} for name in buses}
+    parts = {name: {"patches": [{"board": name, "triangles": "0"}]} for name in buses}
+    (warning,) = described(boards, parts, buses)["warnings"]
+    assert warning.startswith("buses.b.channel: can0 is that of buses.a too")
+
+
+def test_foam_in_metres_is_a_warning():
+    boards = {"mtb": {"bus": "can0", "address": 1, "skin_type": 2}}
+    parts = {"arm": {"foam_mm": 0.002, "patches": [{"board": "mtb", "triangles": "0-1"}]}}
+    (warning,) = described(boards, parts)["warnings"]
+    assert warning.startswith("parts.arm.foam_mm: 0.002")

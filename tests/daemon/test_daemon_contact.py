@@ -1,0 +1,92 @@
+"""What the daemon publishes as contact, from its start to its end, over real buses and faults."""
+
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+
+from emulator.probes.scene import Fault, Place, Probe, Scene
+from skin_host.config.settings import Bus
+from tests.support.broker import Mosquitto
+from tests.support.live import Live, living
+from tests.support.subscriber import Subscriber
+
+
+@pytest.fixture
+async def subscriber(mosquitto: Mosquitto) -> AsyncIterator[Subscriber]:
+    listening = Subscriber(mosquitto.host, mosquitto.port, "skin/demo/#")
+    yield listening
+    listening.close()
+
+
+def touched_scene() -> Scene:
+    press = Probe(
+        part="left_hand",
+        at=Place(triangle=4),
+        diameter_mm=10,
+        pressure_kpa=[(0, 0), (0.1, 60), (1000, 60)],
+        start_s=4.0,
+    )
+    return Scene(probe=[press], quiet=True)
+
+
+async def until_contact(live: Live, subscriber: Subscriber, part: str, state: bytes) -> None:
+    await live.wait(lambda: subscriber.payloads(f"{part}/contact")[-1:] == [state])
+
+
+async def test_a_board_that_dies_during_a_touch_never_looks_untouched(
+    can_bus_settings: Bus, tmp_path: Path, mosquitto: Mosquitto, subscriber: Subscriber
+) -> None:
+    async with living(
+        can_bus_settings, tmp_path, port=mosquitto.port, scene=touched_scene()
+    ) as live:
+        await until_contact(live, subscriber, "left_hand", b"ON")
+        live.robot.inject(Fault(name="board_silent", board="hand"))
+        await until_contact(live, subscriber, "left_hand", b"UNKNOWN")
+        await live.wait(lambda: subscriber.documents("left_hand/touch")[-1]["event"] == "end")
+        assert subscriber.documents("left_hand/touch")[-1]["reason"] == "lost"
+        assert subscriber.payloads("left_forearm/contact")[-1] == b"OFF"
+    subscriber.catch_up()
+    assert b"OFF" not in subscriber.payloads("left_hand/contact")[3:]
+
+
+async def test_after_a_restart_a_silent_board_is_unknown_whatever_the_broker_kept(
+    can_bus_settings: Bus, tmp_path: Path, mosquitto: Mosquitto
+) -> None:
+    before = Subscriber(mosquitto.host, mosquitto.port, "skin/demo/+/contact")
+    async with living(can_bus_settings, tmp_path, port=mosquitto.port) as live:
+        await until_contact(live, before, "left_hand", b"OFF")
+        await until_contact(live, before, "left_forearm", b"OFF")
+    before.close()
+    kept = Subscriber(mosquitto.host, mosquitto.port, "skin/demo/+/contact")
+    assert set(kept.wait_for(2).values()) == {b"UNKNOWN"}  # stopped in good order
+    kept.close()
+    kept = Subscriber(mosquitto.host, mosquitto.port, "skin/demo/+/contact")
+    async with living(can_bus_settings, tmp_path, port=mosquitto.port, hung=["hand"]) as live:
+        await until_contact(live, kept, "left_forearm", b"OFF")
+        await live.until("board_absent")
+        assert set(kept.payloads("left_hand/contact")) == {b"UNKNOWN"}
+    kept.close()
+
+
+async def test_a_touch_that_lasts_at_the_end_is_stopped_not_released(
+    can_bus_settings: Bus, tmp_path: Path, mosquitto: Mosquitto, subscriber: Subscriber
+) -> None:
+    async with living(
+        can_bus_settings, tmp_path, port=mosquitto.port, scene=touched_scene()
+    ) as live:
+        await until_contact(live, subscriber, "left_hand", b"ON")
+    await live.wait(lambda: subscriber.payloads("main/status")[-1:] == [b"offline"])
+    assert subscriber.documents("left_hand/touch")[-1]["reason"] == "stopped"
+    assert subscriber.payloads("left_hand/contact")[-1] == b"UNKNOWN"
+
+
+async def test_a_part_that_is_disabled_is_unknown(
+    can_bus_settings: Bus, tmp_path: Path, mosquitto: Mosquitto, subscriber: Subscriber
+) -> None:
+    async with living(can_bus_settings, tmp_path, port=mosquitto.port) as live:
+        await until_contact(live, subscriber, "left_hand", b"OFF")
+        await live.daemon.control.handle("disable", b'{"part":"left_hand"}')
+        await until_contact(live, subscriber, "left_hand", b"UNKNOWN")
+        await live.daemon.control.handle("enable", b'{"part":"left_hand"}')
+        await until_contact(live, subscriber, "left_hand", b"OFF")

@@ -1,0 +1,64 @@
+"""The pitfalls of the boards' firmware are met by the daemon, not by its user."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from emulator.probes.scene import Fault
+from skin_host.config.settings import Bus
+from tests.support.live import CONFIG, Live, living
+
+LATELY = frozenset({"board_reset", "board_rezeroed", "board_lost_set_up"})
+NO_LOAD = 240
+
+
+def changed(tmp_path: Path, old: str, new: str) -> Path:
+    """The demo's configuration with something else in it."""
+    text = CONFIG.read_text()
+    assert old in text
+    config = tmp_path / "changed.toml"
+    config.write_text(text.replace(old, new))
+    return config
+
+
+def counted(live: Live) -> dict[str, tuple[int, int, int]]:
+    """Of each board: how often it was set up, fell silent, and lost its set-up."""
+    records = live.daemon.link.boards["can0"].records.values()
+    ledger = live.daemon.engine.ledger
+    return {
+        one.layout.name: (
+            one.configurations,
+            int(ledger.silences[one.row]),
+            int(ledger.lost_set_ups[one.row]),
+        )
+        for one in records
+    }
+
+
+async def test_boards_of_the_mtb3_are_set_up_once_and_a_reset_one_is_found(
+    can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    """They fall silent after class 7, and lose commands that come close together."""
+    config = changed(tmp_path, 'model = "mtb4"', 'model = "mtb3"')
+    async with living(can_bus_settings, tmp_path, config=config) as live:
+        await live.until_well(but=LATELY)
+        assert set(counted(live).values()) == {(1, 0, 0)}
+        live.robot.inject(Fault(name="board_reset", board="hand"))
+        await live.wait(lambda: counted(live)["hand"][0] == 2)
+        await live.until_well(but=LATELY)
+        assert counted(live)["forearm_outer"] == counted(live)["forearm_inner"] == (1, 0, 0)
+
+
+@pytest.mark.parametrize("model", ["mtb3", "mtb4", "mtb4c"])
+async def test_a_zero_that_a_new_cdc_offset_would_spoil_is_taken_again(
+    can_bus_settings: Bus, tmp_path: Path, model: str
+) -> None:
+    """An MTB4 takes it before the first conversion with the new offset."""
+    config = changed(tmp_path, 'kind = "palml"\n', 'kind = "palml"\ncdc_offset = 0x2000\n')
+    config.write_text(config.read_text().replace('model = "mtb4"', f'model = "{model}"'))
+    async with living(can_bus_settings, tmp_path, config=config) as live:
+        await live.until_well(but=LATELY)
+        raw = live.daemon.engine.pipeline is not None and live.daemon.health._watch.parts[0].raw
+        assert isinstance(raw, np.ndarray)
+        assert np.abs(raw.astype(int) - NO_LOAD).max() < 40

@@ -1,0 +1,163 @@
+"""Files of the state directory: damaged ones are set aside, newer ones left alone, all reported."""
+
+import asyncio
+import json
+import logging
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from skin_host.cli import main
+from skin_host.config.settings import Bus, Mqtt, changed, load
+from skin_host.daemon import metrics
+from skin_host.daemon.calibrate import calibration_path, stored_calibration
+from skin_host.daemon.state import State, load_state
+from skin_host.errors import NewerFileError, OtherSkinError
+from skin_host.layout import build_layout
+from skin_host.mqtt.publisher import Publisher
+from skin_host.processing import calibration as calibrations
+from tests.support.broker import Mosquitto, free_port
+from tests.support.fault_bench import FaultBench
+from tests.support.live import CONFIG, living
+from tests.support.waiting import until
+
+STATE = {"schema": "skin.state/1", "disabled": ["left_hand"]}
+NEWER: list[dict[str, Any]] = [
+    STATE | {"schema": "skin.state/2"},
+    STATE | {"sensitivity": 3},
+    STATE | {"thresholds": {"votes_of_9": 1}},
+]
+
+
+@pytest.mark.parametrize("content", NEWER)
+def test_a_state_of_a_newer_version_is_refused_and_left_as_it_is(
+    tmp_path: Path, content: dict[str, Any]
+) -> None:
+    path = tmp_path / "state.json"
+    path.write_text(json.dumps(content))
+    with pytest.raises(NewerFileError, match="start that version, or move the file away with: mv"):
+        load_state(path)
+    assert json.loads(path.read_text()) == content
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[" * 100_000, b'{"schema":"x"}', b"\xff" * 10])
+def test_a_damaged_state_is_set_aside(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "state.json"
+    path.write_bytes(content)
+    assert load_state(path) == State()
+    (aside,) = tmp_path.iterdir()
+    assert aside.name.startswith("state.json.damaged-")
+    assert aside.read_bytes() == content
+
+
+def calibrated(tmp_path: Path) -> tuple[Any, Any, Path]:
+    bench = FaultBench(1.0)
+    settings = changed(load(CONFIG), {"service.state_directory": str(tmp_path)})
+    layout = build_layout(settings, CONFIG.parent)
+    path = calibration_path(settings, "main")
+    assert bench.engine.calibration is not None
+    calibrations.save(path, bench.engine.calibration, layout)
+    return settings, layout, path
+
+
+def test_a_calibration_of_another_robot_is_refused(tmp_path: Path) -> None:
+    settings, layout, path = calibrated(tmp_path)
+    assert stored_calibration(settings, layout, "main") is not None
+    path.write_text(path.read_text().replace('"robot": "demo"', '"robot": "other"'))
+    with pytest.raises(OtherSkinError, match=r'of robot "other", this is .* of robot "demo"'):
+        stored_calibration(settings, layout, "main")
+
+
+def test_a_calibration_of_a_newer_version_is_refused_and_a_damaged_one_set_aside(
+    tmp_path: Path,
+) -> None:
+    settings, layout, path = calibrated(tmp_path)
+    whole = path.read_text()
+    for newer in (
+        whole.replace("skin.calibration/1", "skin.calibration/2"),
+        whole.replace('"robot"', '"colour": 1,\n "robot"'),
+    ):
+        path.write_text(newer)
+        with pytest.raises(NewerFileError):
+            stored_calibration(settings, layout, "main")
+        assert path.read_text() == newer
+    path.write_text(whole[:1000])
+    assert stored_calibration(settings, layout, "main") is None
+    (aside,) = tmp_path.iterdir()
+    assert ".damaged-" in aside.name
+    assert aside.read_text() == whole[:1000]
+
+
+@pytest.mark.parametrize("command", ["run", "calibrate"])
+def test_no_command_overwrites_a_newer_calibration(
+    tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "demo-main.calibration.json"
+    path.write_text('{"schema":"skin.calibration/2"}')
+    config = tmp_path / "robot.toml"
+    config.write_text(CONFIG.read_text() + f'\n[service]\nstate_directory = "{tmp_path}"\n')
+    assert main([command, str(config)]) == 2
+    assert "of a newer version" in capsys.readouterr().err
+    assert path.read_text() == '{"schema":"skin.calibration/2"}'
+
+
+async def test_what_could_not_be_kept_is_answered_and_a_fault_until_it_is(
+    can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    blocked = tmp_path / "state"
+    blocked.write_text("a file where a folder is wanted")
+    async with living(can_bus_settings, blocked) as live:
+        handle = live.daemon.control.handle
+        told = await live.until("state_not_kept")
+        assert ("state_not_kept", "calibration") in told
+        assert (await handle("calibrate", b'{"seconds":0.3}'))["kept"] is False
+        assert (await handle("thresholds", b'{"reset":true}'))["kept"] is False
+        assert ("state_not_kept", "state") in live.faults()
+        blocked.unlink()
+        assert (await handle("calibrate", b'{"seconds":0.3}'))["kept"] is True
+        assert (await handle("thresholds", b'{"reset":true}'))["kept"] is True
+        assert not {code for code, _ in live.faults()} & {"state_not_kept"}
+
+
+async def test_a_metrics_port_in_use_is_waited_for(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(metrics, "RETRY_S", 0.01)
+    port = free_port()
+    with socket.create_server(("127.0.0.1", port)):
+        serving = asyncio.create_task(metrics.serve(port, dict))
+        await until(lambda: "no metrics" in caplog.text)
+        await asyncio.sleep(0.1)
+    said = [r for r in caplog.records if r.levelno >= logging.WARNING]
+    assert len(said) == 1
+
+    async def answers() -> bool:
+        try:
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        except OSError:
+            return False
+        writer.write(b"GET /metrics HTTP/1.0\r\n\r\n")
+        found = await reader.read()
+        writer.close()
+        return found.startswith(b"HTTP/1.0 200")
+
+    async with asyncio.timeout(20):
+        while not await answers():  # noqa: ASYNC110  # the port tells nobody
+            await asyncio.sleep(0.05)
+    serving.cancel()
+    await asyncio.gather(serving, return_exceptions=True)
+
+
+async def test_a_password_that_comes_late_is_read_then(
+    mosquitto: Mosquitto, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    keys = Mqtt(host=mosquitto.host, port=mosquitto.port, username="skin", password_file="password")
+    async with Publisher(keys, "robot", folder=tmp_path) as publisher:
+        await until(lambda: "No such file" in publisher.counters.last_error)
+        (tmp_path / "password").write_text("sesame")
+        await until(lambda: publisher.counters.connected)
+    assert "Traceback" not in caplog.text
+    assert "sesame" not in caplog.text

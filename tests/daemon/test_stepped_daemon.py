@@ -1,0 +1,124 @@
+"""The whole daemon lives by the clock that it is given: robot, buses and host in one event loop."""
+
+from pathlib import Path
+
+from emulator.probes.scene import Place, Probe, Scene
+from skin_host.clock import EPOCH_NS, SteppedClock
+from skin_host.config.settings import Bus
+from skin_host.mqtt.messages import ContactState
+from skin_host.processing.events import TouchEvent
+from tests.support.live import living
+from tests.support.stepped import stepped
+
+PRESS = Probe(
+    part="left_hand",
+    at=Place(triangle=4),
+    diameter_mm=10,
+    pressure_kpa=[(0, 0), (0.1, 60), (0.5, 60), (0.6, 0)],
+    start_s=6.0,
+    repeat_s=2.0,
+)
+LATELY = frozenset({"board_rezeroed"})
+
+
+async def lived(clock: SteppedClock, state: Path, channel: str) -> list[object]:
+    """Some seconds of a robot that is pressed now and then, as its touches were published."""
+    said: list[object] = []
+    bus = Bus(interface="virtual", channel=channel)
+    async with living(bus, state, scene=Scene(quiet=True, probe=[PRESS]), clock=clock) as live:
+        put = live.daemon.publisher.put_touch
+
+        def note(event: TouchEvent) -> None:
+            said.append((event.event, event.id, event.t_ns, event.taxels, event.force_n))
+            put(event)
+
+        live.daemon.publisher.put_touch = note  # type: ignore[method-assign]
+        await live.until_well(but=LATELY)
+        await clock.sleep(8.0)
+    return said
+
+
+def run(state: Path, channel: str) -> list[object]:
+    clock = SteppedClock()
+    with clock.runner() as runner:
+        return runner.run(lived(clock, state, channel))
+
+
+def test_the_life_of_a_daemon_is_the_same_every_time(tmp_path: Path) -> None:
+    first = run(tmp_path / "a", "stepped-a")
+    kinds = [event[0] for event in first]  # type: ignore[index]
+    assert kinds.count("begin") >= 2
+    assert kinds.count("begin") == kinds.count("end")
+    assert first[0][2] > EPOCH_NS  # type: ignore[index]
+    assert run(tmp_path / "b", "stepped-b") == first
+
+
+@stepped
+async def test_a_process_that_stood_still_takes_no_board_for_silent(
+    clock: SteppedClock, tmp_path: Path
+) -> None:
+    async with living(
+        Bus(interface="virtual", channel="stepped-c"),
+        tmp_path,
+        scene=Scene(quiet=True),
+        clock=clock,
+    ) as live:
+        await live.until_well(but=LATELY)
+        ledger = live.daemon.engine.ledger
+        clock.advance(3.0)
+        await clock.sleep(0.5)
+        assert not ledger.silences.any()
+
+
+@stepped
+async def test_a_clock_that_is_set_costs_no_board(clock: SteppedClock, tmp_path: Path) -> None:
+    async with living(
+        Bus(interface="virtual", channel="stepped-d"),
+        tmp_path,
+        scene=Scene(quiet=True),
+        clock=clock,
+    ) as live:
+        await live.until_well(but=LATELY)
+        ledger = live.daemon.engine.ledger
+        for jump_s in (3600.0, -7200.0):
+            clock.set(jump_s)
+            await clock.sleep(1.0)
+            assert not ledger.silences.any()
+            await live.until_well(but=LATELY)
+
+
+@stepped
+async def test_a_clock_that_is_set_changes_no_contact(clock: SteppedClock, tmp_path: Path) -> None:
+    lasting = Probe(
+        part="left_hand",
+        at=Place(triangle=4),
+        diameter_mm=10,
+        pressure_kpa=[(0, 0), (0.1, 60), (1000, 60)],
+        start_s=4.0,
+    )
+    async with living(
+        Bus(interface="virtual", channel="stepped-e"),
+        tmp_path,
+        scene=Scene(quiet=True, probe=[lasting]),
+        clock=clock,
+    ) as live:
+        await live.until_well(but=LATELY)
+        await clock.sleep(4.0)
+        publisher = live.daemon.publisher
+        put_contact, put_touch = publisher.put_contact, publisher.put_touch
+        said: set[tuple[str, str]] = set()
+
+        def note_contact(part: str, state: ContactState) -> None:
+            said.add((part, state))
+            put_contact(part, state)
+
+        def note_touch(event: TouchEvent) -> None:
+            said.add((event.part, event.event))
+            put_touch(event)
+
+        publisher.put_contact = note_contact  # type: ignore[method-assign]
+        publisher.put_touch = note_touch  # type: ignore[method-assign]
+        for jump_s in (-0.7, 3600.0, *[10.0] * 48, -20.0):  # also between the frames of a sweep
+            clock.set(jump_s)
+            await clock.sleep(0.1511)
+        assert said == {("left_hand", "ON"), ("left_hand", "move"), ("left_forearm", "OFF")}

@@ -1,0 +1,141 @@
+"""One node in several processes: buses are shared out, and it is one service and one robot."""
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import socket
+import sys
+from pathlib import Path
+
+import aiomqtt
+import pytest
+
+from skin_host.config.settings import Settings, load
+from skin_host.daemon.sharing import share_of, share_out
+from skin_host.daemon.workers import Merged
+from tests.support.broker import Mosquitto
+from tests.support.waiting import PATIENCE_S
+
+ROBOT = """
+robot = "body"
+[mqtt]
+host = "127.0.0.1"
+port = {port}
+[service]
+state_directory = "{state}"
+"""
+
+
+def body(path: Path, places: list[tuple[str, list[int]]], port: int = 1883) -> Path:
+    """A robot: of each part its name and the buses of its boards, of 16 triangles each."""
+    lines = [ROBOT.format(port=port, state=path.parent)]
+    buses = sorted({bus for _, boards in places for bus in boards})
+    lines += [
+        f'[buses.can{bus}]\ninterface = "virtual"\nchannel = "workers-{bus}"' for bus in buses
+    ]
+    address = dict.fromkeys(buses, 0)
+    for part, boards in places:
+        for number, bus in enumerate(boards):
+            address[bus] += 1
+            lines.append(f'[boards.{part}{number}]\nbus = "can{bus}"\naddress = {address[bus]}')
+            lines.append(f'[[parts.{part}.patches]]\nboard = "{part}{number}"\ntriangles = "0-15"')
+    path.write_text("\n".join(lines))
+    return path
+
+
+def settings(tmp_path: Path, places: list[tuple[str, list[int]]]) -> Settings:
+    return load(body(tmp_path / "body.toml", places))
+
+
+def test_buses_of_one_part_stay_together_and_shares_are_even(tmp_path: Path) -> None:
+    places = [("a", [0, 1]), ("b", [1]), ("c", [2]), ("d", [3]), ("e", [4])]
+    shares = share_out(settings(tmp_path, places), "main", 2)
+    assert [sorted(buses) for buses in shares] == [["can0", "can1"], ["can2", "can3", "can4"]]
+    assert len(share_out(settings(tmp_path, places), "main", 9)) == 4
+    assert share_out(settings(tmp_path, places), "other", 2) == []
+
+
+def test_shares_are_nodes_that_have_every_part_once(tmp_path: Path) -> None:
+    whole = settings(tmp_path, [("a", [0]), ("b", [1]), ("c", [2]), ("d", [1])])
+    owners = [
+        (name, part.node)
+        for number in (1, 2, 3)
+        for name, part in share_of(whole, "main", number, 3).parts.items()
+        if part.node == f"main-{number}"
+    ]
+    assert sorted(name for name, _ in owners) == ["a", "b", "c", "d"]
+    assert dict(owners)["b"] == dict(owners)["d"]
+    assert len({node for _, node in owners}) == 3
+
+
+def test_the_service_is_ready_with_the_last_and_fed_by_all() -> None:
+    merged = Merged(["main-1", "main-2"])
+    assert merged.take("main-1", "READY=1") == []
+    assert merged.take("main-2", "READY=1") == ["READY=1"]
+    assert merged.take("main-1", "WATCHDOG=1") == []
+    assert merged.take("main-1", "WATCHDOG=1") == []
+    assert merged.take("main-2", "WATCHDOG=1") == ["WATCHDOG=1"]
+    assert merged.take("main-2", "WATCHDOG=1") == []
+    assert merged.take("main-2", "STATUS=12 frames/s") == [
+        "STATUS=main-1: starting; main-2: 12 frames/s"
+    ]
+    reloading = "RELOADING=1\nMONOTONIC_USEC=5"
+    assert merged.take("main-1", reloading) == [reloading]
+    assert merged.take("main-2", reloading) == []
+    assert merged.take("main-2", "READY=1") == []
+    assert merged.take("main-1", "READY=1") == ["READY=1"]
+    assert merged.take("main-2", "STOPPING=1") == ["STOPPING=1"]
+    assert merged.take("main-1", "STOPPING=1") == []
+
+
+async def states(broker: Mosquitto) -> dict[str, bytes]:
+    """What is retained of the robot, once both nodes have said how their parts are."""
+    found: dict[str, bytes] = {}
+    wanted = {f"skin/body/nodes/main-{number}/status" for number in (1, 2)}
+    wanted |= {"skin/body/a/health", "skin/body/b/health"}
+    async with asyncio.timeout(PATIENCE_S), aiomqtt.Client(broker.host, broker.port) as client:
+        await client.subscribe("skin/#")
+        async for message in client.messages:
+            found[str(message.topic)] = bytes(message.payload)  # type: ignore[arg-type]
+            if wanted <= found.keys():
+                return found
+    raise AssertionError
+
+
+async def test_a_service_of_two_workers_is_one_robot(mosquitto: Mosquitto, tmp_path: Path) -> None:
+    config = body(tmp_path / "body.toml", [("a", [0]), ("b", [1])], mosquitto.port)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / "notify"))
+        systemd.settimeout(PATIENCE_S)
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "skin_host", "run", config, "--workers", "2"),
+            env=os.environ | {"NOTIFY_SOCKET": str(tmp_path / "notify")},
+            stderr=asyncio.subprocess.DEVNULL,
+        )
+        try:
+            found = await states(mosquitto)
+            assert found["skin/body/nodes/main-1/status"] == b"online"
+            assert list(json.loads(found["skin/body/nodes/main-1/info"])["parts"]) == ["a"]
+            while (await asyncio.to_thread(systemd.recv, 4096)) != b"READY=1":
+                pass
+            process.send_signal(signal.SIGTERM)
+            assert await asyncio.wait_for(process.wait(), PATIENCE_S) == 0
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                process.kill()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [(["--workers", "0"], "wanted 1 or more"), (["--workers", "2", "--node", "x"], 'node "x"')],
+)
+def test_workers_that_cannot_be_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], said: str
+) -> None:
+    from skin_host.cli import main
+
+    config = body(tmp_path / "body.toml", [("a", [0])])
+    assert main(["run", str(config), *options]) == 2
+    assert said in capsys.readouterr().err

@@ -1,0 +1,187 @@
+"""Fingertips of an emulated robot: what the host reads is what lies on them."""
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from emulator.faults import parse
+from emulator.probes.scene import Probe, Scene
+from emulator.robot import Robot
+from skin_host.bus.strain import start_frames
+from skin_host.bus.wire import FrameBatch
+from skin_host.config.settings import load
+from skin_host.errors import ConfigurationError
+from skin_host.fingertip.events import SlipEvent
+from skin_host.layout import build_layout
+from skin_host.processing.core import Engine
+from skin_host.processing.events import TouchEvent
+
+CONFIG = Path(__file__).parents[3] / "config"
+PATH = CONFIG / "fingertips.toml"
+
+
+class World:
+    """The robot of the shipped configuration and an engine that has been calibrated."""
+
+    def __init__(self, *probes: dict[str, Any]) -> None:
+        self.settings = load(PATH)
+        layout = build_layout(self.settings, CONFIG)
+        scene = Scene(
+            probe=[msgspec.convert(probe, Probe) for probe in probes], spread=False, quiet=True
+        )
+        self.robot = Robot(self.settings, layout, scene)
+        self.robot.bring_up()
+        for tip in self.settings.fingertips.values():
+            for can_id, data in start_frames(tip.address, tip.period_ms):
+                self.robot.receive("can0", can_id, data)
+        self.engine = Engine(self.settings, layout, [0])
+        self.engine.begin_calibration(1.0)
+        self.events: list[Any] = []
+        self.run(1.2)
+        self.engine.use(self.engine.end_calibration("2026-01-01T00:00:00+00:00"))
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / 0.02)):
+            self.events += self.engine.feed("can0", self.step()).grasps
+            self.events += self.engine.expire(self.robot.t_ns).grasps
+
+    def step(self) -> FrameBatch:
+        return self.robot.step(0.02)["can0"]
+
+    def touches(self, part: str) -> list[TouchEvent]:
+        return [one for one in self.events if isinstance(one, TouchEvent) and one.part == part]
+
+    def slips(self) -> list[SlipEvent]:
+        return [one for one in self.events if isinstance(one, SlipEvent)]
+
+
+def test_the_host_finds_the_press_on_a_bare_fingertip_where_it_is() -> None:
+    direction = np.array([0.3, 0.4, 0.87])
+    direction /= np.linalg.norm(direction)
+    world = World(
+        {
+            "part": "index",
+            "at": {"towards": direction.tolist()},
+            "force_n": [[2, 0], [2.3, 2], [4, 2], [4.3, 0]],
+        }
+    )
+    world.run(4.0)
+    told = world.touches("index")
+    assert [told[0].event, told[-1].event] == ["begin", "end"]
+    held = [one for one in told if 2_600_000_000 < one.t_ns < 4_000_000_000]
+    place_mm = 1e3 * np.array([one.centroid_m for one in held])
+    assert np.abs(place_mm - 13.0 * direction).max() < 0.4
+    assert np.mean([one.force_n for one in held]) == pytest.approx(2.0, abs=0.02)
+    assert not world.slips()
+
+
+def test_an_object_that_is_pulled_too_hard_slips_and_the_host_tells_before_a_millimetre() -> None:
+    world = World(
+        {
+            "part": "index",
+            "force_n": [[2, 0], [2.3, 2], [5, 2]],
+            "tangential_n": [[2, 0], [3, 0], [4.5, 1.3], [4.6, 0], [5, 0]],
+        }
+    )
+    while not world.slips() and world.robot.t_ns < 5_000_000_000:
+        world.run(0.02)
+    assert 0.0 < world.robot.fingertips.slipped_mm("index") < 0.5
+    assert world.slips()[0].event == "begin"
+    assert world.slips()[0].t_ns == pytest.approx(4_390_000_000, abs=20_000_000)
+
+
+def test_skin_and_board_of_the_thumb_make_one_estimate_in_one_frame() -> None:
+    world = World(
+        {
+            "part": "thumb_skin",
+            "at": {"x_mm": 3, "y_mm": -2},
+            "diameter_mm": 8,
+            "force_n": [[2, 0], [2.3, 3], [4, 3], [4.3, 0]],
+        }
+    )
+    world.run(4.0)
+    held = [one for one in world.touches("thumb") if 2_800_000_000 < one.t_ns < 4_000_000_000]
+    assert held
+    for one in held:
+        assert one.load is not None and one.load.verdict == "contact"
+        assert one.taxels
+        assert one.centroid_m is not None
+        np.testing.assert_allclose(1e3 * np.array(one.centroid_m), [3, -2, 0], atol=0.4)
+    assert held[-1].force_n == pytest.approx(3.0, rel=0.03)
+
+
+def test_a_contact_of_the_skin_that_was_ended_is_not_joined_any_more() -> None:
+    world = World(
+        {"part": "thumb_skin", "diameter_mm": 8, "force_n": [[2, 0], [2.3, 3], [60, 3]]},
+    )
+    world.run(1.5)
+    assert world.touches("thumb")[-1].taxels
+    world.engine.disabled.add(0)
+    world.engine.end_part(0, world.robot.t_ns)
+    world.run(0.06)
+    world.engine.disabled.clear()
+    world.run(1.2)  # the skin begins a new contact, the only one
+    last = world.touches("thumb")[-1]
+    assert last.load is not None and last.load.verdict == "contact"
+
+
+def test_without_a_host_the_boards_stream_too() -> None:
+    settings = load(PATH)
+    robot = Robot(settings, build_layout(settings, CONFIG))
+    robot.bring_up()
+    batch = robot.step(0.3)["can0"]
+    assert np.count_nonzero(batch.id == 0x31A) == pytest.approx(100, abs=2)
+    assert np.count_nonzero(batch.id == 0x32B) == pytest.approx(30, abs=2)
+
+
+def test_frames_of_configured_boards_are_no_strangers() -> None:
+    world = World()
+    counters = world.engine.assemblers["can0"].counters
+    assert counters.force_torque == pytest.approx(2 * (120 + 400), abs=12)
+    # Answers: four to the bring-up at the most, and six full scales of each board.
+    assert counters.other < 30
+    assert counters.short == counters.unknown_board == 0
+
+
+def test_a_silent_board_is_known_and_its_touch_ends() -> None:
+    world = World({"part": "index", "force_n": [[2.0, 0], [2.1, 2], [60, 2]]})
+    world.run(1.0)
+    assert world.engine.fingertips is not None
+    state = world.engine.fingertips.tips["index"]
+    assert state.tip.touched
+    mend = world.robot.inject(parse("board_silent board=index"))
+    world.run(1.0)
+    assert (state.alive, state.silenced, state.tip.touched) == (False, 1, False)
+    mend()
+    world.run(0.2)
+    assert state.alive and state.tip.touched
+
+
+@pytest.mark.parametrize(
+    ("probe", "said"),
+    [
+        ({"part": "index", "depth_mm": [[0, 1]]}, "probe[0].depth_mm"),
+        ({"part": "thumb", "force_n": [[0, 1]]}, 'probe[0].part: "thumb" is covered'),
+        ({"part": "index", "force_n": [[0, 1]], "at": {"taxel": 1}}, "probe[0].at"),
+        (
+            {"part": "index", "force_n": [[0, 1]], "at": {"towards": [0, 0, 0]}},
+            "probe[0].at.towards",
+        ),
+        (
+            {"part": "index", "force_n": [[0, 1]], "at": {"x_mm": 20}},
+            "probe[0].at: from there the fingertip is not reached",
+        ),
+        ({"part": "ring", "force_n": [[0, 1]]}, "probe[0].part"),
+    ],
+)
+def test_a_probe_that_cannot_be_on_its_fingertip_is_refused(
+    probe: dict[str, Any], said: str
+) -> None:
+    settings = load(PATH)
+    scene = Scene(probe=[msgspec.convert(probe, Probe)])
+    with pytest.raises(ConfigurationError) as caught:
+        Robot(settings, build_layout(settings, CONFIG), scene)
+    assert str(caught.value).startswith(said)

@@ -1,0 +1,138 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emulator.probes.scene import Place, Probe, Scene, Script, check, load, tangents
+from skin_host.errors import ConfigurationError
+
+SCENES = Path(__file__).parents[3] / "config" / "scenes"
+
+
+@pytest.mark.parametrize("path", sorted(SCENES.glob("*.toml")), ids=lambda path: path.stem)
+def test_the_scenes_that_come_with_the_project_are_right(path: Path) -> None:
+    assert load(path).probe
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("sed = 1", "unknown key `sed`; meant `seed`"),
+        ("seed = 'x'", "seed: seen 'x', wanted `int`"),
+        ("[[probe]]\npart = 'a'\ndiameter_mm = -1", r"probe\[0\].diameter_mm: seen -1, wanted"),
+        ("[[probe]]\npart = 'a'", r"probe\[0\]: driven by none; wanted one of force_n"),
+        (
+            "[[probe]]\npart = 'a'\nforce_n = [[0, 1]]\ndepth_mm = [[0, 1]]",
+            r"probe\[0\]: driven by force_n and depth_mm; wanted one of",
+        ),
+        (
+            "[[probe]]\npart = 'a'\nforce_n = [[1, 1], [0, 1]]",
+            r"probe\[0\].force_n: times run backwards",
+        ),
+        ("[[probe]]\npart = 'a'\nforce_n = [[0, -1]]", "a probe cannot pull"),
+        (
+            "[[probe]]\npart = 'a'\nforce_n = [[0, 1]]\nat = { taxel = 1, triangle = 2 }",
+            r"probe\[0\].at: has both",
+        ),
+        ("[temperature]\nkeyframes_c = []", "temperature.keyframes_c: is empty"),
+        (
+            "[[probe]]\npart = 'a'\nforce_n = [[0, nan]]",
+            r"force_n\[0\]\[1\]: seen nan, wanted a finite",
+        ),
+        ("seed = ", "not TOML"),
+    ],
+)
+def test_a_wrong_scene_is_refused_with_its_file_and_key(
+    tmp_path: Path, text: str, message: str
+) -> None:
+    path = tmp_path / "scene.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigurationError, match=message) as error:
+        load(path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert "\n" not in str(error.value)
+
+
+def test_a_missing_scene_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="cannot be read: No such file"):
+        load(tmp_path / "none.toml")
+
+
+def force_n(script: Script, t_s: float) -> float:
+    """Force of the only probe of a script, 0 while it does not touch."""
+    return float(script.at(t_s).drive.sum())
+
+
+def test_a_probe_presses_between_its_keyframes_and_not_outside() -> None:
+    script = Script([Probe(part="a", force_n=[(0, 0), (1, 10), (3, 10), (4, 0)], start_s=2)])
+    times_s = (0.0, 1.9, 2.5, 3.0, 4.9, 5.5, 6.0, 100.0)
+    assert [force_n(script, t_s) for t_s in times_s] == pytest.approx([0, 0, 5, 10, 10, 5, 0, 0])
+
+
+def test_a_pressure_is_a_force_on_the_probes_area() -> None:
+    disc = Probe(part="a", diameter_mm=10, pressure_kpa=[(0, 100), (1, 100)])
+    plate = Probe(part="a", size_mm=(10, 20), pressure_kpa=[(0, 100), (1, 100)])
+    assert Script([disc, plate]).at(0.5).drive == pytest.approx([np.pi * 25 * 0.1, 20])
+
+
+def test_a_repeated_probe_presses_again_for_ever() -> None:
+    script = Script([Probe(part="a", force_n=[(0, 1), (1, 1)], start_s=2, repeat_s=5)])
+    times_s = (2.5, 3.5, 7.5, 2 + 5000 * 5 + 0.5)
+    assert [force_n(script, t_s) for t_s in times_s] == pytest.approx([1, 0, 1, 1])
+
+
+def test_a_sliding_probe_moves_along_its_path() -> None:
+    probe = Probe(part="a", force_n=[(0, 1), (2, 1)], slide_mm=[(0, 0, 0), (2, 10, -4)])
+    script = Script([probe])
+    script.at(0.3)
+    assert script.at(1.0).offset_mm == pytest.approx(np.array([[5, -2]]))
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.lists(st.sampled_from([0.0, 1.0, 2.0]), min_size=1, max_size=5),
+            st.integers(0, 3000).map(lambda start_ms: start_ms * 1e-3),
+            st.sampled_from([0.0, 6.0]),
+        ),
+        min_size=1,
+        max_size=4,
+    ),
+    st.floats(0, 20),
+)
+def test_nothing_changes_before_the_time_that_still_until_promises(
+    probes: list[tuple[list[float], float, float]], t_s: float
+) -> None:
+    script = Script(
+        [
+            Probe(
+                part="a",
+                force_n=[(float(i), force) for i, force in enumerate(forces)],
+                start_s=start_s,
+                repeat_s=repeat_s,
+            )
+            for forces, start_s, repeat_s in probes
+        ]
+    )
+    now = script.at(t_s)
+    until_s = min(script.still_until_s(t_s), t_s + 30)
+    for share in (0.25, 0.5, 0.999):
+        later = script.at(t_s + share * (until_s - t_s))
+        assert later.number.tolist() == now.number.tolist()
+        assert later.drive == pytest.approx(now.drive)
+
+
+@given(st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(-1, 1)))
+def test_tangents_lie_along_the_skin(direction: tuple[float, float, float]) -> None:
+    length = np.linalg.norm(direction)
+    normal = np.array([0.0, 0.0, 1.0]) if length < 1e-3 else np.array(direction) / length
+    along = tangents(normal)
+    assert along @ along.T == pytest.approx(np.eye(2), abs=1e-9)
+    assert along @ normal == pytest.approx(np.zeros(2), abs=1e-9)
+
+
+def test_a_scene_made_in_python_is_checked_like_a_file() -> None:
+    with pytest.raises(ConfigurationError, match="wanted one of"):
+        check(Scene(probe=[Probe(part="a", at=Place(taxel=1))]))

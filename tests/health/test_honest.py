@@ -1,0 +1,109 @@
+"""Health accuses nobody wrongly: own stalls are own, sentences are about now, `ok` is ok."""
+
+from typing import Any
+
+import numpy as np
+
+from emulator.probes.scene import Place, Probe, Scene
+from emulator.robot import Robot
+from skin_host.bus.wire import FrameBatch
+from skin_host.health import LATELY_NS, STALLED_NS, Health
+from tests.support.fault_bench import FaultBench
+
+OUTPUT: dict[str, Any] = {"connected": True, "touches_dropped": 0, "refused": 0, "last_error": ""}
+
+
+def codes(health: Health, now_ns: int, **output: Any) -> set[str]:
+    record = health.record(0, now_ns, {}, {}, OUTPUT | output)
+    return {fault["code"] for fault in record["faults"]}
+
+
+def test_a_stall_of_this_computer_is_its_own_and_passes(bench: FaultBench) -> None:
+    """The robot went on meanwhile; what was lost on the way may have been lost here."""
+    bench.inject("frame_loss", bus="can0")
+    bench.run(1.0)
+    assert "bus_loses_frames" in codes(bench.health, bench.now_ns)
+    later_ns = bench.now_ns + 700_000_000
+    bench.health.tick(later_ns, {}, {})
+    bench.health._held.clear()
+    record = bench.health.record(0, later_ns, {}, {})
+    (stall,) = record["faults"]
+    assert stall["code"] == "host_stalls"
+    assert "700 ms" in record["sentences"][0] or "for 7" in record["sentences"][0]
+    assert "host_stalls" not in codes(bench.health, later_ns + STALLED_NS + 1)
+
+
+def test_losses_of_the_output_are_faults_for_a_minute(bench: FaultBench) -> None:
+    now_ns = bench.now_ns
+    assert codes(bench.health, now_ns) == set()
+    assert codes(bench.health, now_ns, touches_dropped=3, refused=1) == {
+        "touches_dropped",
+        "broker_refuses",
+    }
+    assert codes(bench.health, now_ns + LATELY_NS, touches_dropped=3, refused=1) == set()
+    assert codes(bench.health, now_ns + 2 * LATELY_NS, touches_dropped=4, refused=1) == {
+        "touches_dropped"
+    }
+
+
+def test_a_part_with_complaints_is_not_ok(bench: FaultBench) -> None:
+    assert bench.health.record(0, bench.now_ns, {}, {}, OUTPUT)["state"] == "ok"
+    away = OUTPUT | {"connected": False}
+    assert bench.health.record(0, bench.now_ns, {}, {}, away)["state"] == "warning"
+    bench.inject("chip_gone", board="hand", triangle=0)
+    bench.run(1.0)
+    assert bench.health.record(0, bench.now_ns, {}, {}, away)["state"] == "degraded"
+
+
+def test_two_boards_at_one_address_are_called_by_name(bench: FaultBench) -> None:
+    """Their frames cut each other's sweeps, which looks like losses of the bus."""
+    twin = Robot(bench.engine.settings, bench.layout, Scene(quiet=True, seed=7))
+    twin.bring_up()
+    twin.step(0.013)
+    step = bench.robot.step
+
+    def both(seconds: float) -> dict[str, FrameBatch]:
+        batches = step(seconds)
+        (bus,) = batches
+        mine, other = batches[bus], twin.step(seconds)[bus]
+        same = (other.id >> 4 & 0xF) == bench.layout.boards[0].settings.address
+        t_ns = np.concatenate([mine.t_ns, other.t_ns[same] - twin.t_ns + bench.robot.t_ns])
+        order = np.argsort(t_ns, kind="stable")
+        return {
+            bus: FrameBatch(
+                np.concatenate([mine.id, other.id[same]])[order],
+                np.concatenate([mine.dlc, other.dlc[same]])[order],
+                np.concatenate([mine.data, other.data[same]])[order],
+                t_ns[order],
+            )
+        }
+
+    bench.robot.step = both  # type: ignore[method-assign]
+    bench.run(3.0)
+    bench.first_told.clear()
+    bench.run(4.0)
+    name = bench.layout.boards[0].name
+    assert ("board_twice", name) in bench.told
+    codes = {code for code, _ in bench.told}
+    assert not codes & {"bus_loses_frames", "board_period", "board_jitter"}
+    bench.robot.step = step  # type: ignore[method-assign]
+    bench.run(5.0)
+    assert ("board_twice", name) not in bench.told
+
+
+def test_what_pressed_as_a_board_took_its_zero_is_no_fault_of_its_triangle() -> None:
+    press = Probe(
+        part="left_hand",
+        at=Place(triangle=4),
+        diameter_mm=12,
+        pressure_kpa=[(0, 0), (0.2, 60), (2.0, 60), (2.2, 0)],
+        start_s=9.0,
+    )
+    bench = FaultBench(3.0, Scene(quiet=True, probe=[press]), settle_s=5.0)
+    bench.run(10.0 - bench.t_s)
+    assert bench.touched["left_hand"].any()
+    bench.inject("chip_gone", board="hand", triangle=0, value=0)  # after which it takes a zero
+    bench.run(5.0)
+    assert ("board_in_doubt", "hand") in bench.told
+    assert not {where for code, where in bench.first_told if "out_of_range" in code}
+    assert not bench.valid["left_hand"][48:60].all()

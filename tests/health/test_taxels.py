@@ -1,0 +1,95 @@
+"""Zeros of taxels that go astray over minutes are told, with what to do about them."""
+
+from pathlib import Path
+
+import pytest
+
+from emulator.probes.scene import Air, Fault, Scene, load
+from skin_host.health.diagnosis import diagnose
+from tests.support.fault_bench import FaultBench
+
+HELD_SCENE = """
+about = "Something is put on the forearm and stays."
+spread = false
+
+[[probe]]
+part = "left_forearm"
+at = { taxel = 27 }
+diameter_mm = 3
+pressure_kpa = [[0, 0], [0.2, 100], [600, 100]]
+start_s = 12
+"""
+
+
+def codes(bench: FaultBench, part: str) -> set[str]:
+    return {fault["code"] for fault in bench.records[part]["faults"]}
+
+
+@pytest.fixture
+def close_limit() -> FaultBench:
+    """A robot whose baselines may move by two units only."""
+    bench = FaultBench()
+    bench.reload({"processing.drift.limit_units": 2.0})
+    bench.run(2.0)
+    return bench
+
+
+def test_a_zero_that_drifts_is_told_and_told_again_when_it_can_follow_no_farther(
+    close_limit: FaultBench,
+) -> None:
+    bench = close_limit
+    assert not codes(bench, "left_hand") & {"taxel_drifting", "taxel_at_limit"}
+    # In steps: what a large one touches is followed slowly.
+    for more_c in (1.0, 2.0, 3.0):
+        bench.robot.inject(Fault(name="temperature_step", value=more_c))
+        bench.run(8.0)
+    for _ in range(60):
+        bench.run(1.0)
+        if "taxel_at_limit" in codes(bench, "left_hand"):
+            break
+    first = {code: since_s for (code, part), since_s in bench.first_told.items()}
+    assert first["taxel_drifting"] < first["taxel_at_limit"]
+    record = bench.records["left_hand"]
+    assert set(record["baseline_at_limit"]) <= set(record["taxel_faults"]["drifting"])
+    (says,) = (line for line in record["sentences"] if "cannot follow any farther" in line)
+    assert "calibrate" in says
+
+
+def test_a_touch_that_never_ends_hides_a_zero_and_that_is_told(tmp_path: Path) -> None:
+    scene = tmp_path / "held.toml"
+    scene.write_text(HELD_SCENE)
+    bench = FaultBench(scene=load(scene))
+    bench.reload({"processing.drift.frozen_report_s": 4.0})
+    while bench.t_s < 14.0:
+        bench.run(0.5)
+    assert "taxel_held" not in codes(bench, "left_forearm")
+    bench.run(4.0)
+    assert "taxel_held" in codes(bench, "left_forearm")
+    assert 27 in bench.records["left_forearm"]["baseline_frozen"]
+    # It is touched all the same, and believed.
+    assert bench.touched["left_forearm"][27]
+    assert bench.valid["left_forearm"][27]
+
+
+def test_a_part_that_is_degraded_always_says_why() -> None:
+    bench = FaultBench()
+    bench.run(1.0)
+    record = bench.records["left_hand"]
+    # A pad that failed under pressure: no board, triangle or taxel fault tells of it.
+    without = diagnose({**record, "state": "degraded", "invalid": [7], "faults": []})
+    (fault,) = (fault for fault in without if fault.code == "taxel_unproven")
+    assert fault.sentence.startswith("taxel 7 of left_hand: not valid")
+    bench.inject("chip_gone", board="hand", triangle=2)
+    bench.run(2.0)
+    codes_now = codes(bench, "left_hand")
+    assert bench.records["left_hand"]["state"] == "degraded"
+    assert "taxel_unproven" not in codes_now
+    assert codes_now
+
+
+def test_a_press_on_the_whole_part_is_no_change_of_its_temperature() -> None:
+    air = Air(part="left_hand", pressure_kpa=[(0, 0), (9, 0), (10, 40), (60, 40)])
+    bench = FaultBench(2.0, Scene(quiet=True, air=[air]), settle_s=3.0)
+    bench.run(9.0)
+    assert bench.touched["left_hand"].sum() > 60
+    assert "part_temperature" not in codes(bench, "left_hand")

@@ -1,0 +1,272 @@
+"""Where taxels lie, who their neighbours are, and what a bad layout is told."""
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skin_host.config.settings import Place, Settings
+from skin_host.errors import ConfigurationError
+from skin_host.layout import Layout, PadKind, build_layout, builtin_kinds
+from skin_host.layout.geometry import fitted_outline, lay, tile
+
+HERE = Path()
+angles_deg = st.floats(-360, 360)
+lengths_mm = st.floats(-500, 500)
+directions = st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(-1, 1)).filter(
+    lambda vector: np.linalg.norm(vector) > 0.1
+)
+
+
+def skin(*patches: dict[str, object], **more: object) -> Settings:
+    """A robot of one part and one board."""
+    return msgspec.convert(
+        {
+            "robot": "test",
+            "buses": {"can0": {}},
+            "boards": {"mtb": {"bus": "can0", "address": 1}},
+            "parts": {"arm": {"patches": [{"board": "mtb", **patch} for patch in patches]}},
+            **more,
+        },
+        Settings,
+    )
+
+
+def neighbours(layout: Layout, taxel: int) -> set[int]:
+    start, stop = layout.neighbour_start[taxel : taxel + 2]
+    return set(layout.neighbour[start:stop].tolist())
+
+
+def test_a_triangle_without_a_place_lies_flat_and_faces_up() -> None:
+    layout = build_layout(skin({"triangles": "3"}), HERE)
+    kind = builtin_kinds()["triangle"]
+    shift = layout.position_m[0, :2] * 1e3 - kind.pads_mm[0]
+    assert layout.position_m[:, :2] * 1e3 - shift == pytest.approx(np.array(kind.pads_mm))
+    assert (layout.normal == [0, 0, 1]).all()
+    assert (layout.position_m[:, 2] == 0).all()
+
+
+def test_taxels_follow_the_order_of_the_patches_and_of_their_triangles() -> None:
+    layout = build_layout(skin({"triangles": "7,2"}, {"triangles": "0"}), HERE)
+    assert [triangle.number for triangle in layout.triangles] == [7, 2, 0]
+    board = layout.boards[0]
+    assert board.taxel_index[7].tolist() == list(range(12))
+    assert board.taxel_index[2].tolist() == list(range(12, 24))
+    assert board.taxel_index[0].tolist() == list(range(24, 36))
+    assert (board.taxel_index[1] == -1).all()
+    assert board.enabled == 0b1000_0101
+    assert layout.triangle_of.tolist() == [0] * 12 + [1] * 12 + [2] * 12
+
+
+def test_the_unit_of_a_taxel_doubles_with_each_shift() -> None:
+    layout = build_layout(
+        skin({"triangles": "0", "shift": 0}, {"triangles": "1", "shift": 3}), HERE
+    )
+    assert layout.unit_ff[12] == pytest.approx(2.88)
+    assert layout.unit_ff[12] == 8 * layout.unit_ff[0]
+
+
+def test_thermal_pads_are_marked() -> None:
+    layout = build_layout(skin({"triangles": "0-1", "kind": "triangle_10pad"}), HERE)
+    assert np.flatnonzero(layout.pad_kind == PadKind.THERMAL).tolist() == [6, 10, 18, 22]
+
+
+def test_a_palm_takes_four_triangles_and_has_thermal_pads_11_23_35_43() -> None:
+    layout = build_layout(skin({"triangles": "8-11", "kind": "palml"}), HERE)
+    assert np.flatnonzero(layout.pad_kind == PadKind.THERMAL).tolist() == [11, 23, 35, 43]
+
+
+@pytest.mark.parametrize("name", sorted(builtin_kinds()))
+def test_pads_of_a_kind_lie_apart_and_within_its_outline(name: str) -> None:
+    kind = builtin_kinds()[name]
+    pads = np.array(kind.pads_mm)
+    apart = np.linalg.norm(pads[:, None] - pads[None], axis=2)
+    np.fill_diagonal(apart, np.inf)
+    assert apart.min() > 2 * kind.radius_mm * 0.8
+    outline = np.array(kind.outline_mm)
+    inside = np.zeros(len(pads), bool)
+    for a, b in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        crosses = (a[1] > pads[:, 1]) != (b[1] > pads[:, 1])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            at = (b[0] - a[0]) * (pads[:, 1] - a[1]) / (b[1] - a[1]) + a[0]
+        inside ^= crosses & (pads[:, 0] < at)
+    assert inside.all()
+
+
+@given(x=lengths_mm, y=lengths_mm, z=lengths_mm, turn=angles_deg, normal=directions)
+def test_placing_keeps_distances_and_lays_the_plane_along_the_normal(
+    x: float, y: float, z: float, turn: float, normal: tuple[float, float, float]
+) -> None:
+    points = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 5.0]])
+    placed, normals = lay(points, Place(x_mm=x, y_mm=y, z_mm=z, turn_deg=turn, normal=normal))
+    assert placed[0] == pytest.approx([x, y, z])
+    along, across = placed[1] - placed[0], placed[2] - placed[0]
+    assert np.linalg.norm(along) == pytest.approx(10)
+    assert np.linalg.norm(across) == pytest.approx(5)
+    unit = normal / np.linalg.norm(normal)
+    assert np.cross(along, across) / 50 == pytest.approx(unit, abs=1e-9)
+    assert normals[0] == pytest.approx(unit, abs=1e-12)
+
+
+def test_a_mirrored_unit_has_its_x_axis_turned_round() -> None:
+    points = np.array([[3.0, 4.0]])
+    placed, _ = lay(points, Place(mirror=True))
+    assert placed.tolist() == [[-3, 4, 0]]
+
+
+def test_a_turn_is_counted_against_the_clock() -> None:
+    placed, _ = lay(np.array([[1.0, 0.0]]), Place(turn_deg=90))
+    assert placed[0] == pytest.approx([0, 1, 0])
+
+
+def test_tiled_triangles_share_edges_and_do_not_overlap() -> None:
+    kind = builtin_kinds()["triangle"]
+    corners = [
+        {tuple(np.round(corner, 2)) for corner in lay(np.array(kind.outline_mm), place)[0]}
+        for place in tile(kind, 16, 0.0)[0]
+    ]
+    centres = np.array([np.mean(list(triangle), axis=0) for triangle in corners])
+    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2) + 99 * np.eye(16)
+    assert apart.min() == pytest.approx(30 / np.sqrt(3), rel=1e-3)
+    for i in (*range(7), *range(8, 15)):
+        assert len(corners[i] & corners[i + 1]) == 2
+
+
+def test_neighbours_reach_the_next_pads_of_a_triangle_and_no_further() -> None:
+    layout = build_layout(skin({"triangles": "0", "places": [{}]}), HERE)
+    assert neighbours(layout, 3) >= {0, 2, 4, 6, 7, 11}
+    assert 9 not in neighbours(layout, 3)
+    assert 3 not in neighbours(layout, 3)
+
+
+def test_neighbours_are_mutual() -> None:
+    layout = build_layout(skin({"triangles": "0-15"}), HERE)
+    pairs = {(i, j) for i in range(layout.n_taxels) for j in neighbours(layout, i)}
+    assert pairs == {(j, i) for i, j in pairs}
+
+
+def test_neighbours_reach_across_the_edge_of_two_triangles() -> None:
+    layout = build_layout(skin({"triangles": "0-1"}), HERE)
+    assert any(j >= 12 for i in range(12) for j in neighbours(layout, i))
+
+
+def test_the_two_sides_of_a_limb_are_no_neighbours() -> None:
+    places = [{}, {"z_mm": -2, "normal": [0, 0, -1]}]
+    layout = build_layout(skin({"triangles": "0-1", "places": places}), HERE)
+    assert all(j < 12 for i in range(12) for j in neighbours(layout, i))
+
+
+def test_two_parts_at_one_place_are_no_neighbours() -> None:
+    patch = {"board": "mtb", "places": [{}]}
+    settings = skin({"triangles": "5"})
+    parts = {
+        name: {"patches": [{**patch, "triangles": number}]}
+        for name, number in (("arm", "0"), ("hand", "1"))
+    }
+    both = msgspec.convert({**msgspec.to_builtins(settings), "parts": parts}, Settings)
+    layout = build_layout(both, HERE)
+    assert all(j < 12 for i in range(12) for j in neighbours(layout, i))
+
+
+def write_rows(path: Path, rows: np.ndarray) -> None:
+    np.savetxt(path, rows)
+
+
+def test_positions_from_a_file_are_taken_as_they_stand(tmp_path: Path) -> None:
+    rows = np.column_stack([np.arange(36).reshape(12, 3) * 1e-3, np.tile([0, 3, 4], (12, 1))])
+    write_rows(tmp_path / "arm.txt", rows)
+    layout = build_layout(skin({"triangles": "0", "positions": "arm.txt"}), tmp_path)
+    assert layout.position_m == pytest.approx(rows[:, :3])
+    assert layout.normal == pytest.approx(np.tile([0, 0.6, 0.8], (12, 1)))
+
+
+@given(turn=angles_deg, normal=directions, mirror=st.booleans())
+def test_the_outline_is_fitted_to_positions_from_a_file(
+    turn: float, normal: tuple[float, float, float], mirror: bool
+) -> None:
+    kind = builtin_kinds()["triangle_10pad"]
+    place = Place(x_mm=40, y_mm=-20, z_mm=7, turn_deg=turn, normal=normal, mirror=mirror)
+    position_mm, normals = lay(np.array(kind.pads_mm), place)
+    outline_mm, _ = lay(np.array(kind.outline_mm), place)
+    fitted_m = fitted_outline(kind, position_mm * 1e-3, normals)
+    assert fitted_m * 1e3 == pytest.approx(outline_mm, abs=1e-6)
+
+
+def test_an_outline_can_be_drawn_where_all_taxels_lie_at_one_place() -> None:
+    kind = builtin_kinds()["triangle"]
+    outline = fitted_outline(kind, np.zeros((12, 3)), np.tile([0.0, 0, 1], (12, 1)))
+    assert np.isfinite(outline).all()
+    assert np.linalg.norm(outline[0] - outline[1]) == pytest.approx(0.03)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (None, "cannot be read"),
+        ("", "0 rows of"),
+        ("1 2 3 4 5 6\n" * 11, "11 rows of 6 numbers; wanted 12 rows x y z nx ny nz"),
+        ("1 2 3\n" * 12, "12 rows of 3 numbers"),
+        ("1 2 3 4 5 6\n" * 11 + "1 2 x 4 5 6\n", "could not convert string 'x'"),
+        ("1 2 3 4 5 6\n" * 11 + "1 2 nan 4 5 6\n", "a number that is not finite"),
+    ],
+)
+def test_a_bad_positions_file_is_named(tmp_path: Path, text: str | None, said: str) -> None:
+    if text is not None:
+        (tmp_path / "arm.txt").write_text(text)
+    with pytest.raises(ConfigurationError) as caught:
+        build_layout(skin({"triangles": "0", "positions": "arm.txt"}), tmp_path)
+    assert str(caught.value).startswith("parts.arm.patches[0].positions: ")
+    assert "arm.txt" in str(caught.value)
+    assert said in str(caught.value)
+
+
+KIND = {
+    "about": "a test",
+    "pads_mm": [[5.0 * i, 0.0] for i in range(12)],
+    "pitch_mm": 5,
+    "radius_mm": 2,
+    "area_mm2": 25,
+    "outline_mm": [[0, 0], [60, 0], [0, 5]],
+}
+
+
+def test_a_kind_of_the_users_own_is_laid_out() -> None:
+    layout = build_layout(
+        skin({"triangles": "0", "kind": "row", "places": [{}]}, kinds={"row": KIND}), HERE
+    )
+    assert layout.position_m[:, 0] == pytest.approx(np.arange(12) * 5e-3)
+    assert neighbours(layout, 5) == {4, 6}
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"pads_mm": [[0, 0]] * 11}, "kinds.row.pads_mm: 11 pads; wanted a multiple of 12"),
+        ({"pads_mm": []}, "kinds.row.pads_mm: 0 pads; wanted a multiple of 12"),
+        ({"outline_mm": [[0, 0], [1, 1]]}, "kinds.row.outline_mm: 2 corners; wanted 3 or more"),
+        ({"thermal": [12]}, "kinds.row.thermal: [12]; pads are 0 to 11"),
+    ],
+)
+def test_a_bad_kind_is_named(change: dict[str, object], said: str) -> None:
+    settings = skin({"triangles": "0", "kind": "row"}, kinds={"row": KIND | change})
+    with pytest.raises(ConfigurationError) as caught:
+        build_layout(settings, HERE)
+    assert str(caught.value) == said
+
+
+@pytest.mark.parametrize(
+    ("patch", "said"),
+    [
+        ({"kind": "plam"}, '.kind: no kind "plam"; there are: triangle'),
+        ({"kind": "palml"}, '.triangles: 1 triangles; "palml" takes them by 4'),
+        ({"places": [{}, {}]}, ".places: 2 places for 1 units"),
+        ({"places": [{"normal": [0, 0, 0]}]}, ".places[0]: normal: [0.0, 0.0, 0.0]"),
+    ],
+)
+def test_a_patch_that_cannot_be_laid_out_is_named(patch: dict[str, object], said: str) -> None:
+    with pytest.raises(ConfigurationError) as caught:
+        build_layout(skin({"triangles": "0", **patch}), HERE)
+    assert str(caught.value).startswith(f"parts.arm.patches[0]{said}")

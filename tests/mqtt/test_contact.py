@@ -1,0 +1,162 @@
+"""A part is called untouched only where all of it can feel."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from emulator.probes.scene import Place, Probe, Scene
+from skin_host.layout import PadKind
+from skin_host.mqtt.contact import PartContact
+from skin_host.processing.contacts import LOST_NS
+from skin_host.processing.core import Output
+from skin_host.processing.events import TouchEvent
+from skin_host.processing.pipeline import PressureFrame
+from tests.support.fault_bench import FaultBench
+
+BENCH = FaultBench(1.0)
+LAYOUT = BENCH.layout
+PART = LAYOUT.parts.index(LAYOUT.part("left_forearm"))
+N = LAYOUT.parts[PART].n_taxels
+PADS = LAYOUT.pad_kind[LAYOUT.parts[PART].start : LAYOUT.parts[PART].stop] == PadKind.PRESSURE
+MS = 1_000_000
+
+
+def frame(t_ns: int, touched: list[int] | None = None, blind: slice | None = None) -> PressureFrame:
+    valid = PADS.copy()
+    if blind is not None:
+        valid[blind] = False
+    touches = np.zeros(N, np.bool_)
+    touches[touched or []] = True
+    none = np.zeros(N, np.bool_)
+    kpa = np.zeros(N, np.float32)
+    return PressureFrame("left_forearm", 1, t_ns, np.zeros(N, np.uint8), kpa, touches, valid, none)
+
+
+def begin(taxels: list[int]) -> TouchEvent:
+    return TouchEvent("begin", 1, 1, 1, "left_forearm", taxels, None, None, 1.0, 1.0, 1.0, 1.0)
+
+
+def test_a_part_that_feels_is_on_or_off() -> None:
+    contact = PartContact(LAYOUT, PART)
+    assert contact.step(frame(0), []) == "OFF"
+    assert contact.step(frame(1, [3]), [begin([3])]) == "ON"
+    assert contact.step(frame(2), [begin([3]).ended(2, 2)]) == "OFF"
+
+
+def test_without_a_valid_taxel_it_is_unknown_at_once() -> None:
+    contact = PartContact(LAYOUT, PART)
+    assert contact.step(frame(0), []) == "OFF"
+    assert contact.step(frame(50 * MS, blind=slice(0, N)), []) == "UNKNOWN"
+    assert contact.step(frame(100 * MS), []) == "OFF"
+
+
+def test_a_triangle_that_was_never_felt_makes_it_unknown() -> None:
+    contact = PartContact(LAYOUT, PART)
+    assert contact.step(frame(0, blind=slice(0, 12)), []) == "UNKNOWN"
+    assert contact.step(frame(50 * MS, [30], blind=slice(0, 12)), [begin([30])]) == "ON"
+
+
+def test_a_clock_that_is_set_forward_makes_nothing_unfelt() -> None:
+    contact = PartContact(LAYOUT, PART)
+    hour_ns = 3600 * 1000 * MS
+    assert contact.step(frame(0), []) == "OFF"
+    contact.follow_clock(hour_ns)
+    assert contact.step(frame(50 * MS), []) == "OFF"  # from before
+    assert contact.step(frame(hour_ns + 100 * MS, blind=slice(0, 12)), []) == "OFF"
+    late_ns = hour_ns + 100 * MS + LOST_NS
+    assert contact.step(frame(late_ns, blind=slice(0, 12)), []) == "UNKNOWN"
+
+
+def test_frames_that_are_lost_for_a_moment_change_nothing() -> None:
+    contact = PartContact(LAYOUT, PART)
+    contact.step(frame(0), [])
+    states = [
+        contact.step(frame(t_ns, blind=slice(0, 12)), [])
+        for t_ns in range(50 * MS, LOST_NS + 50 * MS, 50 * MS)
+    ]
+    assert states == ["OFF"] * (len(states) - 1) + ["UNKNOWN"]
+
+
+def test_a_contact_whose_frames_are_lost_stays_on_until_it_is_lost_itself() -> None:
+    contact = PartContact(LAYOUT, PART)
+    contact.step(frame(0, [3]), [begin([3])])
+    assert contact.step(frame(50 * MS, blind=slice(0, 12)), []) == "ON"
+    lost = begin([3]).ended(2, 600 * MS, "lost")
+    assert contact.step(frame(600 * MS, blind=slice(0, 12)), [lost]) == "UNKNOWN"
+    assert contact.step(frame(650 * MS), []) == "OFF"
+
+
+def test_where_a_contact_was_lost_the_same_taxels_must_come_back() -> None:
+    contact = PartContact(LAYOUT, PART)
+    contact.step(frame(0, [3]), [begin([3])])
+    only = slice(3, 4)
+    lost = begin([3]).ended(2, 1, "lost")
+    assert contact.step(frame(600 * MS, blind=only), [lost]) == "UNKNOWN"
+    assert contact.step(frame(9000 * MS, blind=only), []) == "UNKNOWN"
+    assert contact.step(frame(9050 * MS), []) == "OFF"
+
+
+def test_a_clock_that_is_set_back_hides_no_dead_triangle() -> None:
+    contact = PartContact(LAYOUT, PART)
+    contact.step(frame(10**15), [])
+    contact.step(frame(0, blind=slice(0, 12)), [])
+    assert contact.step(frame(LOST_NS, blind=slice(0, 12)), []) == "UNKNOWN"
+
+
+def test_a_part_that_was_stopped_must_be_felt_again() -> None:
+    contact = PartContact(LAYOUT, PART)
+    contact.step(frame(0, [3]), [begin([3])])
+    assert contact.stop([begin([3]).ended(1, 1, "stopped")]) == "UNKNOWN"
+    assert contact.step(frame(1), []) == "OFF"
+
+
+HERE = {"board": "forearm_outer", "triangle": 3}
+
+
+@pytest.mark.parametrize(
+    ("fault", "arguments"),
+    [
+        ("board_silent", {"board": "forearm_outer"}),
+        ("bus_off", {"bus": "can0"}),
+        ("chip_gone", HERE),
+        ("chip_gone", HERE | {"value": 0}),
+        ("chip_gone", HERE | {"value": 0x8000}),
+        ("shorted_finger", HERE),
+        ("swapped_lines", HERE),
+    ],
+)
+def test_no_board_or_triangle_that_dies_while_it_is_touched_looks_untouched(
+    fault: str, arguments: dict[str, Any]
+) -> None:
+    press = Probe(
+        part="left_forearm",
+        at=Place(taxel=39),
+        diameter_mm=3,
+        pressure_kpa=[(0, 0), (0.1, 100), (100, 100)],
+        start_s=9.0,
+    )
+    bench = FaultBench(1.0, Scene(probe=[press], quiet=True))
+    contact = PartContact(bench.layout, PART)
+    events: list[TouchEvent] = []
+    states: list[str] = []
+    note = bench._note
+
+    def watch(output: Output) -> None:
+        note(output)
+        for step in output.steps:
+            if step.part == PART:
+                events.extend(step.events)
+                states.append(contact.step(step.frame, step.events))
+
+    bench._note = watch  # type: ignore[method-assign]
+    bench.run(3.0)
+    assert [one.event for one in events if one.event != "move"] == ["begin"]
+    assert states[-1] == "ON"
+    states.clear()
+    bench.inject(fault, **arguments)
+    bench.run(4.0)
+    (end,) = [one for one in events if one.event == "end"]
+    assert end.reason == "lost"
+    assert "OFF" not in states
+    assert states[-1] == "UNKNOWN"

@@ -1,0 +1,101 @@
+"""What waits to be published: the newest frame, every event or its count, the last state."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec import json
+
+from skin_host.mqtt.outbox import Outbox
+from skin_host.processing.events import TouchEvent
+from skin_host.processing.pipeline import PressureFrame
+
+
+def frame(part: str, seq: int, t_ns: int = 0) -> PressureFrame:
+    mask = np.zeros(1, np.bool_)
+    return PressureFrame(
+        part, seq, t_ns, np.zeros(1, np.uint8), np.zeros(1, np.float32), mask, ~mask, mask
+    )
+
+
+def touch(event: str, part: str = "palm") -> TouchEvent:
+    return TouchEvent(event, 1, 1, 1, part, [1], None, None, 1.0, 1.0, 1.0, 0.1)  # type: ignore[arg-type]
+
+
+def connected(event_limit: int = 16, frame_hz: float = 0.0) -> Outbox:
+    outbox = Outbox(event_limit, frame_hz)
+    outbox.counters.connected = True
+    return outbox
+
+
+@given(st.lists(st.sampled_from(["a", "b", "c"])))
+def test_every_frame_is_taken_or_counted(parts: list[str]) -> None:
+    outbox = connected()
+    newest = {}
+    for seq, part in enumerate(parts):
+        outbox.put_frame(frame(part, seq))
+        newest[part] = seq
+    taken = [outbox.take_frame() for _ in range(len(outbox.frames))]
+    assert {one.part: one.seq for one in taken} == newest
+    assert len(taken) + outbox.counters.frames_skipped == len(parts)
+
+
+def test_a_part_that_comes_often_does_not_keep_the_others_waiting() -> None:
+    outbox = connected()
+    for seq, part in enumerate(["slow", "fast", "fast", "fast"]):
+        outbox.put_frame(frame(part, seq))
+    assert outbox.take_frame().part == "slow"
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    rate_hz=st.sampled_from([1.0, 10.0, 25.0, 50.0]),
+    jitter_ns=st.lists(st.integers(0, 1_500_000), min_size=500, max_size=500),
+)
+def test_frames_are_thinned_to_the_rate_despite_jitter(
+    rate_hz: float, jitter_ns: list[int]
+) -> None:
+    outbox = connected(frame_hz=rate_hz)
+    passed = 0
+    for seq, jitter in enumerate(jitter_ns):  # ten seconds at 50 Hz
+        outbox.put_frame(frame("palm", seq, seq * 20_000_000 + jitter))
+        passed += len(outbox.frames)
+        outbox.frames.clear()
+    assert abs(passed - 10 * rate_hz) <= 1
+
+
+@given(st.lists(st.tuples(st.sampled_from(["begin", "move", "end"]), st.sampled_from("ab"))))
+def test_every_event_waits_or_is_counted_and_leaves_a_gap(events: list[tuple[str, str]]) -> None:
+    outbox = connected()
+    for event, part in events:
+        outbox.put_touch(part, touch(event, part), None)
+    waiting = [json.decode(event.payload) for event in outbox.events]
+    assert len(waiting) <= 16
+    assert len(waiting) + outbox.counters.touches_dropped == len(events)
+    for part in "ab":
+        put = sum(where == part for _, where in events)
+        counts = [one["count"] for one in waiting if one["part"] == part]
+        assert counts == sorted(set(counts))
+        assert set(counts) <= set(range(1, put + 1))
+
+
+def test_moves_leave_room_for_begins_and_ends() -> None:
+    outbox = connected()
+    for _ in range(20):
+        outbox.put_touch("t", touch("move"), None)
+    for _ in range(8):
+        outbox.put_touch("t", touch("end"), None)
+    kinds = [json.decode(event.payload)["event"] for event in outbox.events]
+    assert kinds == ["move"] * 8 + ["end"] * 8
+
+
+def test_a_state_that_changes_on_its_way_is_sent_again() -> None:
+    outbox = connected()
+    outbox.put_state("t", b"ON")
+    states = outbox.take_states(6)
+    outbox.put_state("t", b"OFF")
+    outbox.states_sent(states)
+    assert outbox.take_states(6) == {"t": b"OFF"}
+    outbox.states_sent({"t": outbox.retained["t"]})
+    assert outbox.take_states(6) == {}
+    outbox.repeat_states()
+    assert outbox.take_states(6) == {"t": b"OFF"}

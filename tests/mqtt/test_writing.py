@@ -1,0 +1,160 @@
+"""Frames are written past paho, and never into the middle of what it writes."""
+
+import asyncio
+import contextlib
+import socket
+import ssl
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from paho.mqtt.client import Client
+from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
+
+from skin_host.mqtt.address import Broker
+from skin_host.mqtt.connection import PackedProperties, connect, message_properties
+from skin_host.mqtt.packets import publish_head, publish_packet
+from tests.support.certificates import authority, certificate
+from tests.support.waiting import PATIENCE_S, until
+
+CONNECT, PUBLISH, DISCONNECT = 0x10, 0x30, 0xE0
+
+
+@dataclass
+class SlowBroker:
+    """Takes a connection, and reads nothing more until it is told to."""
+
+    reading: asyncio.Event = field(default_factory=asyncio.Event)
+    packets: list[tuple[int, bytes]] = field(default_factory=list)
+    port: int = 0
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
+            while True:
+                command = (await reader.readexactly(1))[0]
+                length = shift = 0
+                while True:
+                    byte = (await reader.readexactly(1))[0]
+                    length |= (byte & 0x7F) << shift
+                    shift += 7
+                    if byte < 0x80:
+                        break
+                packet = await reader.readexactly(length)
+                self.packets.append((command, packet))
+                if command == CONNECT:
+                    writer.write(b"\x20\x03\x00\x00\x00")
+                    await self.reading.wait()
+                elif command & 0x06:
+                    topic_end = 2 + int.from_bytes(packet[:2], "big")
+                    writer.write(b"\x40\x02" + packet[topic_end : topic_end + 2])
+        writer.close()
+
+    def payloads(self, topic: str) -> list[bytes]:
+        """Of what came with QoS 0, in order."""
+        head = publish_head(topic, b"\x00")
+        return [
+            packet[len(head) :]
+            for command, packet in self.packets
+            if command == PUBLISH and packet.startswith(head)
+        ]
+
+
+@asynccontextmanager
+async def slow_broker(tls: ssl.SSLContext | None) -> AsyncIterator[SlowBroker]:
+    broker = SlowBroker()
+    listener = socket.socket()
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 20_000)
+    listener.bind(("127.0.0.1", 0))
+    server = await asyncio.start_server(broker.serve, sock=listener, ssl=tls, limit=20_000)
+    broker.port = listener.getsockname()[1]
+    yield broker
+    server.close()
+
+
+@pytest.fixture(params=["plain", "tls"])
+def contexts(
+    request: pytest.FixtureRequest, tmp_path: Path
+) -> tuple[ssl.SSLContext | None, ssl.SSLContext | None]:
+    """Of the broker, and of its client."""
+    if request.param == "plain":
+        return None, None
+    authority(tmp_path, "ca")
+    certificate(tmp_path, "server", "IP:127.0.0.1")
+    server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    server.load_cert_chain(tmp_path / "server.crt", tmp_path / "server.key")
+    return server, ssl.create_default_context(cafile=str(tmp_path / "ca.crt"))
+
+
+def numbered(number: int, size: int) -> bytes:
+    return number.to_bytes(4, "big") + bytes([number % 251]) * size
+
+
+async def test_no_packet_is_cut_by_another_when_the_socket_is_full(
+    contexts: tuple[ssl.SSLContext | None, ssl.SSLContext | None],
+) -> None:
+    head = publish_head("f", b"\x00")
+    async with slow_broker(contexts[0]) as broker:
+        address = Broker("127.0.0.1", broker.port, tls=contexts[1])
+        async with connect(address, identifier="writer") as connection:
+            cleared = asyncio.Event()
+            connection.when_clear = cleared.set
+            written: list[int] = []
+            events: list[asyncio.Future[None]] = []
+            number = 0
+            # More and more, until the socket is full; then the same with the broker reading.
+            for tries in range(4):
+                taken = size = 1
+                while taken == size:
+                    frames = [number, number + 1, number + 2]
+                    number += 3
+                    packets = [publish_packet(head, numbered(n, 30_011)) for n in frames]
+                    size = len(packets)
+                    taken = connection.write_now(packets)
+                    written += frames[:taken]
+                    if len(events) < 10 * (tries + 1):
+                        events.append(connection.send("e", numbered(number, 3001), qos=1))
+                    await asyncio.sleep(0)
+                broker.reading.set()
+                await asyncio.wait_for(cleared.wait(), PATIENCE_S)
+                cleared.clear()
+            await asyncio.wait_for(asyncio.gather(*events), PATIENCE_S)
+        await until(lambda: broker.packets[-1][0] == DISCONNECT)
+        payloads = broker.payloads("f")
+        assert [int.from_bytes(payload[:4], "big") for payload in payloads] == written
+        assert all(
+            payload == numbered(n, 30_011) for payload, n in zip(payloads, written, strict=True)
+        )
+        events_seen = [packet for command, packet in broker.packets if command & 0xF6 == 0x32]
+        assert len(events_seen) == len(events)
+
+
+@pytest.mark.parametrize("size", [0, 1, 100, 127, 128, 16_383, 16_384, 70_000])
+@pytest.mark.parametrize("version", ["5", "3.1.1"])
+def test_a_frame_has_the_bytes_that_paho_would_write(
+    size: int, version: Literal["5", "3.1.1"]
+) -> None:
+    broker = Broker(protocol=version)
+    properties = PackedProperties.of(message_properties(broker, "application/json"))
+    protocol = MQTTProtocolVersion.MQTTv5 if broker.v5 else MQTTProtocolVersion.MQTTv311
+    client = Client(CallbackAPIVersion.VERSION2, protocol=protocol)
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        client._sock = ours
+        client.publish("skin/robot/palm/frame", b"x" * size, properties=properties)
+        expected = theirs.recv(200_000)
+        client._sock = None
+    packed = None if properties is None else properties.pack()
+    head = publish_head("skin/robot/palm/frame", packed)
+    assert publish_packet(head, b"x" * size) == expected
+
+
+def test_a_packet_longer_than_mqtt_knows_is_refused() -> None:
+    class Endless(bytes):
+        def __len__(self) -> int:
+            return 2**28
+
+    with pytest.raises(ValueError, match="wanted at most"):
+        publish_packet(b"", Endless())

@@ -1,0 +1,189 @@
+"""Curves, memory and verdicts from any course of known pressure."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skin_host.errors import RequestError
+from skin_host.processing.curves import (
+    KNOTS_UNITS,
+    CurveVerdict,
+    Memory,
+    TableCurve,
+    rising,
+)
+from skin_host.processing.fitting.course import (
+    Course,
+    find_lag,
+    fit_course,
+    median_of_moving,
+    read_course,
+)
+from skin_host.processing.relaxation import PlayRelaxation
+from skin_host.processing.smoothing import StepFilter
+
+DT_S = 0.05
+ZERO = 237.0
+MEMORY = Memory((20.0,), (0.3,))
+
+
+def staircase(top_kpa=300.0, steps=12, hold_s=5.0):
+    """Untouched, up, down and untouched again, as a valve gives it [t]."""
+    levels = np.concatenate([[0.0], np.linspace(0.0, top_kpa, steps + 1)[1:]])
+    levels = np.concatenate([levels, levels[-2::-1]])
+    course = np.repeat(levels, round(hold_s / DT_S))
+    width = round(2.0 / DT_S)
+    return np.convolve(np.pad(course, width, mode="edge"), np.ones(width) / width, "same")[
+        width:-width
+    ]
+
+
+def softening(units):
+    """A curve that bends the other way than equation (1)."""
+    return 16.0 * units * np.exp(-units / 8.0) + 8.0 * units * (1.0 - np.exp(-units / 8.0))
+
+
+def under(reading_kpa, n=6, noise=0.8, seed=0):
+    """A foam with hysteresis: the pressure [t] of a loading curve's kPa, and pads' readings."""
+    memory = PlayRelaxation(1, radius_kpa=MEMORY.radius_kpa, weight=MEMORY.weight)
+    relaxation = [memory.step(np.array([kpa]), DT_S)[0] for kpa in reading_kpa]
+    fine = np.linspace(0.0, 80.0, 4001)
+    units = np.interp(reading_kpa, softening(fine), fine)
+    gains = np.linspace(0.8, 1.2, n)
+    noisy = np.random.default_rng(seed).normal(0.0, noise, (len(units), n))
+    return np.maximum(reading_kpa - relaxation, 0.0), units[:, np.newaxis] * gains + noisy
+
+
+def as_course(units, pressure):
+    raw = np.clip(np.rint(ZERO - units), 0, 255).astype(np.uint8)
+    n = units.shape[1]
+    return Course(DT_S, raw, np.full(n, ZERO), np.ones(n, np.bool_), pressure)
+
+
+@pytest.fixture(scope="module")
+def pressed():
+    pressure, units = under(staircase())
+    return units, pressure
+
+
+def test_curves_of_another_shape_than_the_papers_and_hysteresis_carry_over(pressed):
+    units, pressure = pressed
+    curves = fit_course(as_course(units, pressure), 0.5)
+    assert (curves.verdict == CurveVerdict.GOOD).all()
+    assert curves.error_kpa.max() < 6.5
+    # Another course, not fitted: quick cycles that turn back half way.
+    t = np.arange(0.0, 60.0, DT_S)
+    cycles = 20.0 + 120.0 * (1.0 - np.cos(2 * np.pi * t / 12.0)) * (0.6 + 0.4 * np.sin(t / 9.0))
+    known, other = under(cycles, seed=1)
+    read = read_course(curves, np.arange(6), np.rint(other), 0.5, DT_S)
+    rms = np.sqrt(np.mean((read - known[:, np.newaxis]) ** 2, axis=0))
+    assert np.median(rms) < 10.0
+
+
+def test_each_pad_gets_its_verdict(pressed):
+    units, pressure = pressed
+    units = units.copy()
+    rng = np.random.default_rng(2)
+    units[:, 1] = 0.0
+    units[1500:2500, 2] += 25.0
+    units[:, 3] += 15.0 * rng.choice([-1.0, 1.0], len(units))
+    units[:, 4] *= 8.0
+    verdict = fit_course(as_course(units, pressure), 0.5).verdict
+    expected = ("GOOD", "DEAD", "JUMPS", "NOISY", "SATURATES", "GOOD")
+    assert [CurveVerdict(number).name for number in verdict] == list(expected)
+
+
+def test_taxels_that_were_not_received_keep_the_common_curve(pressed):
+    units, pressure = pressed
+    course = as_course(units, pressure)
+    course.there[2:] = False
+    curves = fit_course(course, 0.5)
+    assert list(np.flatnonzero(curves.own)) == [0, 1]
+    assert curves.usable.all()
+
+
+def test_the_clock_of_the_table_is_found_to_a_fraction_of_a_second(pressed):
+    units, pressure = pressed
+    time_s = np.arange(len(pressure)) * DT_S
+    median = median_of_moving(np.rint(units), DT_S)
+    for lag_s in (-7.3, 0.0, 12.6):
+        assert find_lag(median, time_s, (time_s + lag_s, pressure)) == pytest.approx(lag_s, abs=0.3)
+
+
+def test_a_table_of_something_else_and_an_unpressed_recording_are_refused(pressed):
+    units, pressure = pressed
+    time_s = np.arange(len(pressure)) * DT_S
+    other = 100.0 + 50.0 * np.sin(time_s / 2.0)
+    with pytest.raises(RequestError, match="do not follow"):
+        find_lag(median_of_moving(units, DT_S), time_s, (time_s, other))
+    with pytest.raises(RequestError, match="nothing is pressed"):
+        median_of_moving(np.zeros_like(units), DT_S)
+
+
+@given(
+    slopes=st.lists(st.floats(0.0, 50.0), min_size=len(KNOTS_UNITS), max_size=len(KNOTS_UNITS)),
+    units=st.floats(-100.0, 300.0),
+)
+def test_a_curve_rises_and_has_an_inverse(slopes, units):
+    table = rising(np.cumsum(slopes)[np.newaxis])
+    curve = TableCurve(table, np.array([40.0]))
+    kpa = curve.kpa(units)
+    assert curve.kpa(units + 1.0) > kpa
+    assert curve.kpa(curve.units(kpa)) == pytest.approx(kpa, rel=1e-6, abs=1e-6)
+
+
+@given(
+    st.lists(
+        st.floats(-500.0, 500.0) | st.sampled_from([np.nan, np.inf, -np.inf]),
+        min_size=1,
+        max_size=80,
+    )
+)
+def test_plays_are_bounded_finite_and_fade_only_by_readings(values):
+    model = PlayRelaxation(1, radius_kpa=(5.0, 20.0, 60.0), weight=(0.3, 0.2, 0.1))
+    bound = 2.0 * (5.0 * 0.3 + 20.0 * 0.2 + 60.0 * 0.1)
+    for reading in values:
+        relaxation = model.step(np.array([reading]), 0.02)[0]
+        assert 0.0 <= relaxation <= bound + 1e-9
+        assert model.step(np.array([reading]), 3600.0)[0] == relaxation
+
+
+@given(st.lists(st.floats(0.0, 400.0), max_size=30), st.floats(0.0, 400.0), st.floats(0.01, 50.0))
+def test_a_higher_reading_is_a_higher_pressure(history, reading, more):
+    pressures = []
+    for last in (reading, reading + more):
+        model = PlayRelaxation(1, radius_kpa=(5.0, 20.0), weight=(0.5, 0.3))
+        for value in [*history, last]:
+            relaxation = model.step(np.array([value]), 0.02)[0]
+        pressures.append(last - relaxation)
+    assert pressures[1] > pressures[0]
+
+
+def test_the_first_loading_relaxes_nothing_and_a_million_cycles_drift_nowhere():
+    model = PlayRelaxation(1, radius_kpa=(20.0,), weight=(0.3,), dtype=np.float32)
+    assert all(model.step(np.array([c]), 0.02)[0] == 0.0 for c in np.linspace(0.0, 300.0, 500))
+    once = [model.step(np.array([c]), 0.02)[0] for c in (50.0, 200.0)]
+    for _ in range(5000):
+        later = [model.step(np.array([c]), 0.02)[0] for c in (50.0, 200.0)]
+    assert later == once
+
+
+@given(
+    st.lists(st.floats(-300.0, 300.0), min_size=1, max_size=50),
+    st.floats(0.0, 2.0),
+    st.floats(0.0, 1.0),
+)
+def test_the_filter_is_never_farther_off_than_noise_may_be(values, time_s, dt_s):
+    smoother = StepFilter(np.array([10.0]), time_s)
+    for value in values:
+        smooth = smoother.step(np.array([value]), dt_s)[0]
+        assert abs(smooth - value) <= 10.0 + 1e-9
+
+
+def test_noise_is_smoothed_and_a_step_passes_but_for_the_noise():
+    rng = np.random.default_rng(5)
+    smoother = StepFilter(np.array([16.0]), 0.5)
+    read = [smoother.step(np.array([v]), 0.02)[0] for v in 100.0 + 8.0 * rng.normal(size=500)]
+    assert np.std(read[200:]) < 3.0
+    assert smoother.step(np.array([200.0]), 0.02)[0] > 175.0
