@@ -1,5 +1,6 @@
 """What all tests share: which CAN bus they run on, and a real broker."""
 
+import copy
 import itertools
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
@@ -11,6 +12,7 @@ import pytest
 from skin_host.config.settings import Bus
 from tests.support import programs
 from tests.support.broker import Mosquitto
+from tests.support.fault_bench import FaultBench
 from tests.support.stack import configuration, stack, subscriber  # noqa: F401  (fixtures for all)
 from tests.support.vcan import Vcan
 
@@ -96,3 +98,15 @@ def mosquitto(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Mosqui
     broker.start()
     yield broker
     broker.kill()
+
+
+@pytest.fixture(scope="session")
+def calibrated() -> FaultBench:
+    """A calibrated robot in simulated time that is only copied; its calibration takes a while."""
+    return FaultBench()
+
+
+@pytest.fixture
+def bench(calibrated: FaultBench) -> FaultBench:
+    """One to break."""
+    return copy.deepcopy(calibrated)
