@@ -7,6 +7,9 @@ for loops that communicate with the outside, such as `Robot.run`.
 import asyncio
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from skin_host import clock
 
 NS = 1_000_000_000
@@ -17,6 +20,10 @@ class Clock(Protocol):
 
     def now_ns(self) -> int:
         """Emulated time that has passed."""
+        ...
+
+    def host_ns(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The host's time of day at some emulated times."""
         ...
 
     async def sleep_until_ns(self, t_ns: int) -> None:
@@ -38,6 +45,11 @@ class RealClock:
         """Emulated time that has passed."""
         return int((self._clock.monotonic_ns() - self._start_ns) * self._speed)
 
+    def host_ns(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The host's time of day at some emulated times, as its clock is set now."""
+        ago_ns = ((self.now_ns() - t_ns) / self._speed).astype(np.int64)
+        return np.asarray(self._clock.now_ns() - ago_ns)
+
     async def sleep_until_ns(self, t_ns: int) -> None:
         """Sleep until `t_ns`; a time that has passed still lets other tasks run once."""
         await self._clock.sleep(max(0, t_ns - self.now_ns()) / (NS * self._speed))
@@ -58,6 +70,10 @@ class SteppedClock:
     def now_ns(self) -> int:
         """Emulated time that has passed."""
         return self._t_ns
+
+    def host_ns(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Emulated time is the host's."""
+        return t_ns
 
     async def advance(self, dt_s: float) -> None:
         """Move the time on and wake those whose time has come."""

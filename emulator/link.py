@@ -4,7 +4,10 @@ import logging
 from collections.abc import Iterator
 
 import can
+import numpy as np
 from can.interfaces.socketcan import SocketcanBus
+from can.interfaces.virtual import VirtualBus
+from numpy.typing import NDArray
 
 from skin_host.bus.wire import FrameBatch, MessageClass
 
@@ -36,6 +39,10 @@ class Link:
             # python-can's own filters are not used: with one set, `recv(0)` gives None for a frame
             # that does not pass, as if no other waited.
             bus.set_filters(_FILTERS)
+        if isinstance(bus, VirtualBus):
+            # A frame is stamped when its board sent it, as by a kernel, not when this process got
+            # the processor to pass it on.
+            bus.preserve_timestamps = True
         self._waiting: list[can.Message] = []
         self._failing = False
         self.sent = 0
@@ -56,16 +63,27 @@ class Link:
             if standard and message.arbitration_id >> 4 in _COMMANDS:
                 yield message.arbitration_id, bytes(message.data)
 
-    def send(self, batch: FrameBatch) -> None:
-        """Send frames in their order; frames that the controller does not take wait, or are
-        lost.
+    def send(self, batch: FrameBatch, host_ns: NDArray[np.int64]) -> None:
+        """Send frames in their order; frames that the controller does not take wait, or are lost.
+
+        Args:
+            batch: the frames.
+            host_ns: when they are sent, int64[n], in the host's time of day.
         """
         messages = self._waiting + [
             can.Message(
-                arbitration_id=can_id, data=data[:dlc].tobytes(), dlc=dlc, is_extended_id=False
+                timestamp=t_ns * 1e-9,
+                arbitration_id=can_id,
+                data=data[:dlc].tobytes(),
+                dlc=dlc,
+                is_extended_id=False,
             )
-            for can_id, dlc, data in zip(
-                batch.id.tolist(), batch.dlc.tolist(), batch.data, strict=True
+            for can_id, dlc, data, t_ns in zip(
+                batch.id.tolist(),
+                batch.dlc.tolist(),
+                batch.data,
+                host_ns.tolist(),
+                strict=True,
             )
         ]
         self._waiting = []

@@ -277,11 +277,13 @@ class Robot:
             now_ns = clock.now_ns()
             passed_ns = min(now_ns - last_ns, LONGEST_CATCH_UP_NS)
             last_ns = now_ns
+            # The clock also counts the time that was skipped.
+            behind_ns = now_ns - passed_ns - self.t_ns
             # Commands came one after the other in this time: boards whose computer was busy
             # must not get them all at once, chips convert between them.
             for command in [*commands, None]:
                 for name, batch in self.step(passed_ns / (len(commands) + 1) / NS).items():
-                    links[name].send(batch)
+                    links[name].send(batch, clock.host_ns(batch.t_ns + behind_ns))
                 if command is not None:
                     self.receive(*command)
             await clock.sleep_until_ns(now_ns + POLL_NS)

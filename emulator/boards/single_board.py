@@ -42,7 +42,9 @@ async def run(
         now_ns = clock.now_ns()
         for can_id, data in link.received():
             answers = board.handle(can_id, data, now_ns)
-            link.send(FrameBatch.of([(answer, payload, now_ns) for answer, payload in answers]))
-        link.send(board.step(now_ns))
+            batch = FrameBatch.of([(answer, payload, now_ns) for answer, payload in answers])
+            link.send(batch, clock.host_ns(batch.t_ns))
+        batch = board.step(now_ns)
+        link.send(batch, clock.host_ns(batch.t_ns))
         due_ns = now_ns + POLL_NS if board.due_ns is None else min(board.due_ns, now_ns + POLL_NS)
         await clock.sleep_until_ns(due_ns)

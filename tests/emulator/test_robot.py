@@ -223,6 +223,29 @@ async def test_boards_whose_computer_was_busy_get_their_commands_one_after_the_o
     assert status == {b"\0\0"}
 
 
+async def test_a_busy_computer_delays_frames_but_not_their_time_stamps() -> None:
+    robot = Robot(*load(), Scene(noise=False))
+    robot.bring_up()
+    clock = SteppedClock()
+    with (
+        can.Bus(interface="virtual", channel="test-late") as inside,
+        can.Bus(interface="virtual", channel="test-late") as outside,
+    ):
+        life = asyncio.create_task(robot.run({"can0": inside}, clock))
+        for late_s in (0.05, 0.13, 0.02, 0.2, 0.2, 0.11, 0.07):
+            await clock.advance(late_s)
+        life.cancel()
+        frames = iter(lambda: outside.recv(0), None)
+        stamps_s = [
+            frame.timestamp
+            for frame in frames
+            if frame.arbitration_id == 0x4C0 and frame.data[0] == 0x40
+        ]
+    assert len(stamps_s) >= 14
+    assert np.diff(stamps_s) == pytest.approx(0.05, abs=0.002)
+    assert stamps_s[-1] <= clock.now_ns() * 1e-9
+
+
 def test_a_program_can_press_with_a_probe_of_its_own() -> None:
     settings, layout = load()
     robot = Robot(settings, layout, Scene(noise=False))

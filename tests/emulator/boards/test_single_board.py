@@ -3,7 +3,9 @@
 import asyncio
 
 import can
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from emulator.boards import single_board
 from emulator.chips.ad7147 import AD7147
@@ -29,6 +31,9 @@ class ChipsInTime:
 
     def now_ns(self) -> int:
         return self._clock.now_ns()
+
+    def host_ns(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        return self._clock.host_ns(t_ns)
 
     async def sleep_until_ns(self, t_ns: int) -> None:
         before_ns = self.now_ns()
