@@ -2,14 +2,22 @@
 
 python-can's readers support the formats: candump (.log), Vector ASC and BLF, CSV, PEAK TRC,
 MF4, and the text formats compressed (.gz).
+
+Lines of candump (`candump -L`) of one form are decoded together, as arrays:
+`(1700000000.000125) can0 4E4#40F4F4F3F4F4F3F4`, with six decimals, a standard identifier and whole
+bytes. All other lines (extended identifiers, remote and error frames, CAN FD, damage) go through
+python-can one by one, so that the result does not depend on how a line was read.
 """
 
 import contextlib
 import gzip
+import io
+import re
 from bisect import bisect_left
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import BinaryIO, NamedTuple, cast
 
 import can
 import can.io.player
@@ -17,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.bus.adapters import identifier, nanoseconds, one_line
-from skin_host.bus.candump import Block, Frame, block_of, read_blocks
 from skin_host.bus.wire import FrameBatch, RecordBatch
 from skin_host.errors import LogError
 
@@ -26,6 +33,208 @@ CAPACITY = 1024
 WINDOW_NS = 4_000_000
 #: Frames that are read one by one make a block of so many.
 _BLOCK = 4096
+#: Number of bytes that are read at a time.
+BLOCK_BYTES = 1 << 20
+#: Longer lines are damage.
+_LONGEST_LINE = 1 << 16
+#: For lines of one length, this many forms are decoded together; others one by one.
+_MOST_FORMS = 8
+_LINE = re.compile(
+    rb"\((\d{1,10})\.(\d{6})\) ([!-~]+) ([0-9A-Fa-f]{3})#((?:[0-9A-Fa-f]{2}){0,8})\Z"
+)
+_INVALID = 255
+_HEX = np.full(256, _INVALID, np.uint8)
+_HEX[list(b"0123456789")] = range(10)
+_HEX[list(b"abcdef")] = _HEX[list(b"ABCDEF")] = range(10, 16)
+_NEWLINE = ord("\n")
+
+#: A classic frame as (identifier with flags, data, t_ns); None for any other message.
+Frame = tuple[int, bytes, int]
+Convert = Callable[[can.Message], tuple[str, Frame] | None]
+
+
+class DamageError(Exception):
+    """A line that is not a message, or a file that cannot be read further."""
+
+
+@dataclass(slots=True)
+class Block:
+    """Frames of some lines, in order.
+
+    Attributes:
+        names: channels.
+        channel: uint16[n], index into `names`.
+        batch: the frames.
+        messages: how many messages there were, those that are no classic frames included.
+        damage: why there is nothing after these frames.
+    """
+
+    names: list[str]
+    channel: NDArray[np.uint16]
+    batch: RecordBatch
+    messages: int
+    damage: Exception | None = None
+
+
+def read_blocks(file: BinaryIO, convert: Convert) -> Generator[Block, None, None]:
+    """The blocks of an open log; after one with damage there is no other.
+
+    Args:
+        file: at its begin.
+        convert: gives channel and frame of a message of python-can, or raises an exception.
+    """
+    read = getattr(file, "read1", file.read)
+    names: list[str] = []
+    rest = b""
+    while True:
+        try:
+            text = read(BLOCK_BYTES)
+        except Exception as error:  # each way of compression has errors of its own
+            yield block_of([], names, 0, error)
+            return
+        lines, _newline, left = (rest + text).rpartition(b"\n")
+        if not text or len(left) > _LONGEST_LINE:
+            lines, left = rest + text, b""
+        rest = left
+        if lines:
+            block = _parse(lines, names, convert)
+            yield block
+            if block.damage is not None:
+                return
+        if not text:
+            return
+
+
+def block_of(
+    frames: list[tuple[str, Frame]], names: list[str], messages: int, damage: Exception | None
+) -> Block:
+    """A block of frames that were read one by one, each with its channel."""
+    channel = np.array([code_of(name, names) for name, _ in frames], np.uint16)
+    batch = FrameBatch.of([frame for _, frame in frames])
+    cut = RecordBatch(batch.id, batch.dlc, batch.data, batch.t_ns)
+    return Block(names, channel, cut, messages, damage)
+
+
+class _Rows(NamedTuple):
+    """Results of lines; `kind` is 0 for a line without a result yet, otherwise one of those
+    below.
+    """
+
+    kind: NDArray[np.uint8]
+    channel: NDArray[np.uint16]
+    id: NDArray[np.uint32]
+    dlc: NDArray[np.uint8]
+    data: NDArray[np.uint8]
+    t_ns: NDArray[np.int64]
+
+
+_EMPTY, _FRAME, _NO_FRAME = 1, 2, 3
+
+
+def _parse(text: bytes, names: list[str], convert: Convert) -> Block:
+    buffer = np.frombuffer(text, np.uint8)
+    ends = np.flatnonzero(buffer == _NEWLINE)
+    if not len(ends) or ends[-1] != len(buffer) - 1:
+        ends = np.append(ends, len(buffer))
+    starts = np.append(0, ends[:-1] + 1)
+    lengths = ends - starts
+    n = len(starts)
+    rows = _Rows(
+        np.zeros(n, np.uint8),
+        np.zeros(n, np.uint16),
+        np.zeros(n, np.uint32),
+        np.zeros(n, np.uint8),
+        np.zeros((n, 8), np.uint8),
+        np.zeros(n, np.int64),
+    )
+    rows.kind[lengths == 0] = _EMPTY
+    for length in np.unique(lengths[lengths > 0]).tolist():
+        of_length = np.flatnonzero(lengths == length)
+        lines = buffer[starts[of_length, None] + np.arange(length)] if length < 100 else None
+        if lines is not None:
+            _decode_alike(lines, of_length, rows, names)
+    damage = None
+    for row in np.flatnonzero(rows.kind == 0).tolist():
+        try:
+            _decode_one(text[starts[row] : ends[row]], row, rows, names, convert)
+        except Exception as error:  # python-can has many kinds of errors for a damaged line
+            damage = error
+            rows.kind[row:] = _EMPTY
+            break
+    messages = int(np.count_nonzero(rows.kind != _EMPTY))
+    frames = rows.kind == _FRAME
+    if not frames.all():
+        rows = _Rows(*(column[frames] for column in rows))
+    batch = RecordBatch(rows.id, rows.dlc, rows.data, rows.t_ns)
+    return Block(names, rows.channel, batch, messages, damage)
+
+
+def _decode_alike(
+    lines: NDArray[np.uint8], at: NDArray[np.intp], rows: _Rows, names: list[str]
+) -> None:
+    """Decode lines uint8[k, length], which belong to the rows `at`, form by form."""
+    for _ in range(_MOST_FORMS):
+        if not len(at):
+            return
+        first = lines[0].tobytes()
+        found = _LINE.match(first)
+        if found is None:
+            lines, at = lines[1:], at[1:]
+            continue
+        name = found[3].decode()
+        channel = code_of(str(int(name)) if name.isdigit() else name, names)  # as in python-can
+        seconds, decimals, _, identifier, data = (slice(*found.span(i)) for i in range(1, 6))
+        digits = np.concatenate((lines[:, seconds], lines[:, decimals]), axis=1) - ord("0")
+        nibbles = _HEX[np.concatenate((lines[:, identifier], lines[:, data]), axis=1)]
+        fixed = np.ones(len(first), np.bool_)
+        for varying in (seconds, decimals, identifier, data):
+            fixed[varying] = False
+        alike = (lines[:, fixed] == lines[0, fixed]).all(axis=1)
+        alike &= (digits < 10).all(axis=1) & (nibbles != _INVALID).all(axis=1)
+        if not alike.all():
+            digits, nibbles, into = digits[alike], nibbles[alike], at[alike]
+        else:
+            into = at
+        microseconds = digits.astype(np.int64) @ 10 ** np.arange(digits.shape[1])[::-1]
+        octets = nibbles[:, 3::2] << 4 | nibbles[:, 4::2]
+        rows.kind[into] = _FRAME
+        rows.channel[into] = channel
+        rows.id[into] = nibbles[:, :3] @ np.array([256, 16, 1], np.uint32)
+        rows.dlc[into] = octets.shape[1]
+        rows.data[into, : octets.shape[1]] = octets
+        rows.t_ns[into] = microseconds * 1000
+        lines, at = lines[~alike], at[~alike]
+
+
+def _decode_one(line: bytes, row: int, rows: _Rows, names: list[str], convert: Convert) -> None:
+    rows.kind[row] = _EMPTY
+    for message in can.CanutilsLogReader(io.StringIO(line.decode(), newline=None)):
+        if rows.kind[row] != _EMPTY:
+            raise DamageError("several messages in one line")
+        rows.kind[row] = _NO_FRAME
+        converted = convert(message)
+        if converted is None:
+            continue
+        name, (identifier, data, t_ns) = converted
+        rows.channel[row] = code_of(name, names)
+        rows.kind[row] = _FRAME
+        rows.id[row] = identifier
+        rows.dlc[row] = len(data)
+        rows.data[row, : len(data)] = np.frombuffer(data, np.uint8)
+        rows.t_ns[row] = t_ns
+
+
+def code_of(name: str, names: list[str]) -> int:
+    """The number of a channel, which is one of `names` afterwards.
+
+    Raises:
+        DamageError: there are too many.
+    """
+    if name not in names:
+        if len(names) > np.iinfo(np.uint16).max:
+            raise DamageError(f"more than {len(names)} channels")
+        names.append(name)
+    return names.index(name)
 
 
 def read_channels(path: Path, window_ns: int = WINDOW_NS) -> Iterator[tuple[str, FrameBatch]]:

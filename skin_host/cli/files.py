@@ -109,8 +109,7 @@ def _replay(arguments: argparse.Namespace) -> int:
     if len(arguments.logs) > 1 or arguments.scheduler is not None:
         return _replay_all(arguments)
     from skin_host.processing.core import Engine
-    from skin_host.recording.batch import Task, process, write_lines
-    from skin_host.recording.replay import calibration_for
+    from skin_host.recording.replay import Task, calibration_for, process, write_lines
 
     (log,) = arguments.logs
     progress = Progress("replay")
@@ -133,7 +132,7 @@ def _replay(arguments: argparse.Namespace) -> int:
 
 def _replay_all(arguments: argparse.Namespace) -> int:
     """Process several recordings, each into its own file in the folder OUTPUT."""
-    from skin_host.recording.batch import Task, process_all
+    from skin_host.recording.replay import Task, process_all
 
     if arguments.output == "-":
         raise RequestError("several LOGs go into a folder: wanted --output FOLDER")

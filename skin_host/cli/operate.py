@@ -153,7 +153,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from skin_host.config.settings import Settings
     from skin_host.daemon.calibrate import stored_calibration
     from skin_host.daemon.daemon import Daemon
-    from skin_host.daemon.sharing import share_name, share_of
+    from skin_host.daemon.workers import share_name, share_of
     from skin_host.layout import build_layout
 
     set_up_logging(arguments.verbose)
@@ -210,7 +210,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 def _run_workers(arguments: argparse.Namespace, settings: "Settings") -> int:
     from skin_host.daemon import workers
-    from skin_host.daemon.sharing import share_name, share_out
+    from skin_host.daemon.workers import share_name, share_out
 
     node, n = arguments.node, arguments.workers
     if n < 1:

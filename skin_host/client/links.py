@@ -1,11 +1,14 @@
-"""Connection of a client to one broker: kept up, and subscribed to the wanted topics."""
+"""Connection of a client to one broker: kept up, and subscribed to the wanted topics.
+
+A short connection finds out which robot is meant when none is named.
+"""
 
 import asyncio
 import logging
 from collections.abc import Iterable
 from typing import Protocol
 
-from skin_host.errors import BrokerError, SkinError
+from skin_host.errors import BrokerError, RequestError, SkinError
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import (
     Connection,
@@ -18,11 +21,14 @@ from skin_host.mqtt.connection import (
     is_refusal,
 )
 from skin_host.mqtt.payload import MAX_PACKET_BYTES
+from skin_host.mqtt.topics import ONLINE
 
 MAX_INCOMING = 10_000
 #: The broker keeps touch events for this long while we are disconnected (MQTT 5).
 SESSION_S = 60
 
+#: Retained messages come within this time of a subscription.
+RETAINED_S = 0.5
 _log = logging.getLogger(__name__)
 
 
@@ -150,3 +156,41 @@ class Link:
                 _log.info("broker %s: connected", self.broker)
             self._hearer.note(self)
             await self.again.wait()
+
+
+async def only_robot(connection: Connection, broker: Broker, base: str) -> str:
+    """Find the only robot below the base, by the status of its nodes.
+
+    Of several the only one that is online: the broker remembers who has left.
+
+    Raises:
+        RequestError: there is none, or more than one.
+    """
+    prefix = f"{base}/"
+    known: set[str] = set()
+    online: set[str] = set()
+
+    async def listen() -> None:
+        async for message in connection.messages:
+            robot = message.topic.value.removeprefix(prefix).partition("/")[0]
+            known.add(robot)
+            if message.payload == ONLINE:
+                online.add(robot)
+
+    everybody = f"{prefix}+/nodes/+/status"
+    await connection.subscribe(everybody, qos=1)
+    try:
+        await asyncio.wait_for(listen(), RETAINED_S)
+    except TimeoutError:
+        await connection.unsubscribe(everybody)
+    meant = online or known
+    if not meant:
+        raise RequestError(
+            f'broker {broker}: no robot has published below "{base}"; is `skin run` running?'
+        )
+    if len(meant) > 1:
+        names = ", ".join(sorted(meant)[:20])
+        raise RequestError(
+            f'broker {broker}: wanted one robot below "{base}", there are: {names}; name the robot'
+        )
+    return meant.pop()

@@ -11,10 +11,9 @@ from typing import Any, Literal, Self, TypeVar
 from weakref import WeakSet
 
 from skin_host.client.heard import Health, read
-from skin_host.client.links import Link
+from skin_host.client.links import RETAINED_S, Link, only_robot
 from skin_host.client.order import EventOrder, Newest
 from skin_host.client.presence import Contact, Presence
-from skin_host.client.robots import RETAINED_S, only_robot
 from skin_host.client.streams import Stream
 from skin_host.errors import BrokerError, RequestError, SkinError
 from skin_host.mqtt.address import Broker

@@ -24,7 +24,7 @@ from skin_host.mqtt.publisher import Publisher
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration
 from skin_host.processing.core import Engine
-from skin_host.recording.recorder import Recorder
+from skin_host.recording.capture import FrameRecorder
 
 log = logging.getLogger(__name__)
 
@@ -100,7 +100,7 @@ class Control:
 
     def __init__(self, daemon: _Node) -> None:
         self._daemon = daemon
-        self.recorder: Recorder | None = None
+        self.recorder: FrameRecorder | None = None
         self._keeping = asyncio.Lock()
         self._starting = asyncio.Lock()
         self._commands: dict[str, Callable[[bytes], Awaitable[Answer]]] = {
@@ -221,7 +221,7 @@ class Control:
             if self.recorder is not None and self.recorder.ended is None:
                 raise RequestError(f"{self.recorder.path.name} is being recorded already; stop it")
             self.recorder = await clock.in_thread(
-                Recorder, path, request.seconds, request.max_bytes, clock
+                FrameRecorder, path, request.seconds, request.max_bytes, clock
             )
         log.info("recording to %s for %g s", path, request.seconds)
         return {"file": str(path), "seconds": request.seconds}

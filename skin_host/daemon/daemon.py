@@ -20,8 +20,7 @@ from skin_host.daemon.state import State, Thresholds, load_state, save_state
 from skin_host.errors import ConfigurationError, RequestError, SkinError
 from skin_host.fingertip.health import FingertipRecord
 from skin_host.fingertip.publishing import FingertipPublisher
-from skin_host.health import Health, Record
-from skin_host.health.fault_log import FaultLog
+from skin_host.health import FaultLog, Health, Record
 from skin_host.layout import Layout, build_layout, parts_of
 from skin_host.mqtt.connection import connect
 from skin_host.mqtt.contact import PartContact
@@ -57,8 +56,9 @@ class Daemon:
         configuration: the file that `reload` reads again.
         clock: for time, waiting and threads.
         open_port: opens buses, see `bus.opening.open_port`.
-        connect: connects to the broker, see `publish.connection.connect`.
-        share: makes of a configuration that was read again the one of this daemon, see `sharing`.
+        connect: connects to the broker, see `mqtt.connection.connect`.
+        share: makes of a configuration that was read again the one of this daemon, see
+            `workers.share_of`.
 
     Attributes:
         settings, layout: in use, with the changes that operators made.

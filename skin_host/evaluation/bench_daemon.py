@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from skin_host.bus.wire import TAXELS, TRIANGLES
 from skin_host.config.settings import changed
 from skin_host.daemon.daemon import Daemon
-from skin_host.daemon.sharing import share_name, share_of
+from skin_host.daemon.workers import share_name, share_of
 from skin_host.errors import BrokerError, SkinError
 from skin_host.evaluation.body_stream import Body, send_body
 from skin_host.evaluation.rooms import RoomClock

@@ -12,7 +12,7 @@ import os
 from multiprocessing.connection import Connection
 from typing import Any
 
-from skin_host.daemon.sharing import share_out
+from skin_host.daemon.workers import share_out
 from skin_host.errors import BrokerError, SkinError
 from skin_host.evaluation.bench_daemon import (
     TOUCHED,

@@ -5,6 +5,7 @@ each board was last received, `describe` builds the record of a part from that, 
 finds the faults. The record is published as `<part>/health` and shown by `skin status`.
 """
 
+import logging
 from typing import Any
 
 from skin_host.bus.boards import Boards
@@ -15,8 +16,9 @@ from skin_host.health.record import Record
 from skin_host.health.watch import Watch
 from skin_host.processing.core import Engine, Output
 
-__all__ = ["Health", "Record"]
+__all__ = ["FaultLog", "Health", "Record"]
 
+log = logging.getLogger(__name__)
 #: An intermittent fault stays in the record for this long after it was last seen.
 HOLD_NS = 3_000_000_000
 #: A longer pause between two calls of `tick` means that this computer stalled.
@@ -26,6 +28,12 @@ STALL_NS = 300_000_000
 STALLED_NS = 4_000_000_000
 #: Losses of the output are reported as faults for this long after they happened.
 LATELY_NS = 60_000_000_000
+#: Faults are logged together, at most once in this time.
+LINE_S = 60.0
+#: Ports log these faults themselves, at once.
+LOGGED_BY_PORTS = {"bus_down", "bus_gone", "bus_off"}
+#: A fault is logged only after it has lasted for this long.
+LASTING_S = 2.0
 _ACCUSING = {"board_jitter", "board_period", "bus_loses_frames"}
 _PASSING = {
     "board_jitter",
@@ -156,3 +164,41 @@ class Health:
             if abs(now_ns - seen_ns) > (HOLD_NS if fault.code in _PASSING else 0):
                 del held[key]
         return [fault for fault, _ in held.values()]
+
+
+class FaultLog:
+    """Logs faults that last, and the end of faults that were logged: at most one line a minute."""
+
+    def __init__(self) -> None:
+        self._since_s: dict[tuple[str, str], float] = {}
+        self._logged: set[tuple[str, str]] = set()
+        self._line_s = -LINE_S
+
+    def note(self, present: dict[tuple[str, str], str], now_s: float) -> None:
+        """Take in all present faults: their sentences by code and place."""
+        present = {
+            key: sentence for key, sentence in present.items() if key[0] not in LOGGED_BY_PORTS
+        }
+        self._since_s = {key: self._since_s.get(key, now_s) for key in present}
+        if now_s - self._line_s < LINE_S:
+            return
+        new = [
+            key
+            for key, since_s in self._since_s.items()
+            if key not in self._logged and now_s - since_s >= LASTING_S
+        ]
+        over = [key for key in self._logged if key not in present]
+        if not new and not over:
+            return
+        self._line_s = now_s
+        self._logged = (self._logged - set(over)) | set(new)
+        words = []
+        if new:
+            words.append(present[new[0]])
+            if len(new) > 1:
+                faults = "one more fault" if len(new) == 2 else f"{len(new) - 1} more faults"
+                words[-1] += f" (and {faults}; see `skin status`)"
+        if over:
+            names = ", ".join(f"{code} {where}" for code, where in sorted(over)[:3])
+            words.append(f"over: {names}" + (f" and {len(over) - 3} more" * (len(over) > 3)))
+        log.log(logging.WARNING if new else logging.INFO, "%s", "; ".join(words))

@@ -1,23 +1,94 @@
-"""Processes a recording with the whole pipeline: deterministic, with the same bytes at every
-run.
+"""Processes recordings with the whole pipeline, deterministically: the same bytes at every run.
+
+The lines of `skin replay` are published messages, one JSON object per line with its type. Many
+recordings do not depend on each other, so each is a task for a separate process: the processes of
+this computer, or the workers of an existing Dask cluster (extra `cluster`). A task reads and writes
+files; a cluster's workers must find them under the same absolute paths.
 """
 
-from collections.abc import Iterator
+import contextlib
+import os
+import signal
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
 from datetime import UTC, datetime
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any, BinaryIO
+
+import msgspec
+import numpy as np
 
 from skin_host.bus.logs import read_channels
 from skin_host.bus.wire import FrameBatch
-from skin_host.config.settings import Settings, skin_hash
-from skin_host.errors import LogError
-from skin_host.layout import Layout
+from skin_host.config.settings import Settings, load, skin_hash
+from skin_host.errors import ConfigurationError, LogError, RequestError, SkinError
+from skin_host.extras import required
+from skin_host.fingertip.events import FingertipEvent, SlipEvent
+from skin_host.fingertip.health import FingertipHealth
+from skin_host.health import Health
+from skin_host.layout import Layout, build_layout
+from skin_host.mqtt.grasping import grasp_message
+from skin_host.mqtt.messages import KPA_DECIMALS, health_keys, touch_message
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration
 from skin_host.processing.core import Engine, Output, Step
+from skin_host.processing.events import TouchEvent
+from skin_host.processing.pipeline import PressureFrame
 from skin_host.recording.mcap import SUFFIX, read_can
 
 #: A recording without a calibration file begins with this time of untouched skin.
 UNTOUCHED_S = 5.0
+#: A scheduler that does not answer within this time counts as absent.
+SCHEDULER_S = 10.0
+_encoder = msgspec.json.Encoder()
+
+
+def frame_line(frame: PressureFrame) -> bytes:
+    """Write a frame as a line: arrays of all taxels, kPa with three decimals."""
+    # Adding 0 turns a rounded -0.0 into 0.0.
+    pressure = np.round(frame.pressure_kpa.astype(np.float64), KPA_DECIMALS) + 0.0
+    return _line(
+        "frame",
+        {
+            "part": frame.part,
+            "seq": frame.seq,
+            "t_ns": frame.t_ns,
+            "raw": frame.raw.tolist(),
+            "pressure_kpa": pressure.tolist(),
+            "touched": frame.touched.tolist(),
+            "valid": frame.valid.tolist(),
+        },
+    )
+
+
+def health_line(record: Any) -> bytes:
+    """Write a health record as a line: the payload as published, and its type."""
+    return _line("health", health_keys(record))
+
+
+class EventLines:
+    """Events as lines: the payload as published, and its type; numbered."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[tuple[str, type]] = Counter()
+
+    def line(self, event: FingertipEvent) -> bytes:
+        """A touch, slip, or excess as a line."""
+        key = event.part, type(event)
+        self._counts[key] += 1
+        count = self._counts[key]
+        if isinstance(event, TouchEvent):
+            return _line("touch", msgspec.to_builtins(touch_message(event, count)))
+        kind = "slip" if isinstance(event, SlipEvent) else "over"
+        return _line(kind, msgspec.to_builtins(grasp_message(event, count)))
+
+
+def _line(kind: str, keys: dict[str, Any]) -> bytes:
+    return _encoder.encode({"type": kind} | keys) + b"\n"
 
 
 def read_buses(log: Path, settings: Settings) -> Iterator[tuple[str, FrameBatch]]:
@@ -124,3 +195,146 @@ def steps(log: Path, engine: Engine) -> Iterator[Step]:
     """
     for output in replay(log, engine):
         yield from output.steps
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One recording to be processed.
+
+    Attributes:
+        log: the recording.
+        config: of its skin.
+        output: file of JSON lines to write, completely or not at all.
+        calibration, calibrate_seconds: see `replay.calibration_for`.
+    """
+
+    log: Path
+    config: Path
+    output: Path
+    calibration: Path | None = None
+    calibrate_seconds: float | None = None
+
+
+def write_lines(
+    log: Path, engine: Engine, output: BinaryIO, progress: Callable[[int], None] = lambda _: None
+) -> int:
+    """Write the results of a recording as JSON lines; return the number of frames of pressure.
+
+    Args:
+        log: the recording.
+        engine: calibrated, and not fed yet.
+        output: where to write.
+        progress: called with the number so far.
+
+    Raises:
+        LogError: the recording cannot be read, or ends with damage.
+    """
+    health = Health(engine)
+    lines = EventLines()
+    number = 0
+    for result in replay(log, engine):
+        health.note(result)
+        for step in result.steps:
+            output.write(frame_line(step.frame))
+            output.writelines(map(lines.line, step.events))
+        output.writelines(map(lines.line, result.grasps))
+        number += len(result.steps)
+        progress(number)
+    for part in engine.parts:
+        output.write(health_line(health.replayed(part)))
+    if engine.fingertips is not None:
+        for record in FingertipHealth(engine.fingertips).records(None).values():
+            output.write(health_line(record))
+    return number
+
+
+def process(task: Task, progress: Callable[[int], None] = lambda _: None) -> int:
+    """Do one task; return the number of frames of pressure.
+
+    Raises:
+        LogError, CalibrationError, ConfigurationError: a file is wrong.
+    """
+    settings = load(task.config)
+    try:
+        layout = build_layout(settings, task.config.parent)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{task.config}: {error}") from None
+    found = calibration_for(task.log, settings, layout, task.calibration, task.calibrate_seconds)
+    engine = Engine(settings, layout, list(range(len(layout.parts))), found)
+    with whole_file(task.output) as output:
+        return write_lines(task.log, engine, output, progress)
+
+
+def process_all(
+    tasks: Sequence[Task], scheduler: str | None = None
+) -> Iterator[tuple[Task, int | SkinError]]:
+    """Do many tasks in parallel; yield each with its result when it ends.
+
+    Args:
+        tasks: with different outputs.
+        scheduler: address of a Dask scheduler; without it, processes on all cores of this computer.
+
+    Raises:
+        RequestError: the scheduler cannot be used.
+    """
+    # The longest first, so that no long one is left at the end.
+    ordered = sorted(tasks, key=_size, reverse=True)
+    if scheduler is not None:
+        yield from _on_cluster(ordered, scheduler)
+        return
+    processes = min(len(ordered), len(os.sched_getaffinity(0)))
+    with ProcessPoolExecutor(processes, get_context("spawn"), _leave_interrupts) as pool:
+        futures = {pool.submit(process, task): task for task in ordered}
+        try:
+            for future in as_completed(futures):
+                yield futures[future], _result(future)
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+@contextlib.contextmanager
+def whole_file(path: Path) -> Iterator[BinaryIO]:
+    """Yield a file that appears complete or not at all."""
+    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            yield file
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise
+
+
+def _size(task: Task) -> int:
+    try:
+        return task.log.stat().st_size
+    except OSError:
+        return 0
+
+
+def _result(future: "Future[int] | Any") -> int | SkinError:
+    """Return the result of a task; unexpected errors are raised."""
+    try:
+        number: int = future.result()
+    except SkinError as error:
+        return error
+    return number
+
+
+def _leave_interrupts() -> None:
+    """Ignore Ctrl-C, which the parent process handles."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _on_cluster(tasks: list[Task], scheduler: str) -> Iterator[tuple[Task, int | SkinError]]:
+    distributed = required("distributed", "clusters", "cluster")
+    try:
+        client = distributed.Client(scheduler, timeout=SCHEDULER_S, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise RequestError(f"--scheduler {scheduler}: no scheduler answers: {error}") from None
+    with client:
+        # Not pure: a task is done again, because its files may have changed.
+        futures = dict(zip(client.map(process, tasks, pure=False), tasks, strict=True))
+        for future in distributed.as_completed(futures, loop=client.loop):
+            yield futures[future], _result(future)

@@ -8,7 +8,7 @@ from skin_host.cli import main
 from skin_host.daemon import metrics
 from skin_host.errors import RequestError, SkinError
 from skin_host.mqtt.address import Broker
-from skin_host.recording.recorder import MAX_RECORDINGS, Recorder
+from skin_host.recording.capture import MAX_RECORDINGS, Recorder
 
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
 

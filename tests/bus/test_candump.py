@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from skin_host.bus import candump
+from skin_host.bus import logs
 from skin_host.bus.adapters import identifier, nanoseconds
 from skin_host.bus.logs import CAPACITY, WINDOW_NS, read_channels
 from skin_host.bus.wire import FrameBatch
@@ -81,7 +81,7 @@ def test_any_lines_make_the_same_batches(
     block: int,
     is_ended: bool,
 ) -> None:
-    monkeypatch.setattr(candump, "BLOCK_BYTES", block)
+    monkeypatch.setattr(logs, "BLOCK_BYTES", block)
     path = tmp_path / "a.log"
     path.write_text(newline.join(lines) + newline * is_ended, newline="")
     expected: Read = []
@@ -105,5 +105,5 @@ def test_what_is_alike_is_not_read_line_by_line(
     lines = [f"({10 + i // 9}.{i:06d}) can{i % 3} {0x400 + i % 16:X}#" for i in range(3000)]
     path.write_text("".join(f"{line}{'F4' * (i % 9)}\n" for i, line in enumerate(lines)))
     expected = list(line_by_line(path))
-    monkeypatch.setattr(candump, "_decode_one", None)
+    monkeypatch.setattr(logs, "_decode_one", None)
     assert in_blocks(path) == expected

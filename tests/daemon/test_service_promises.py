@@ -16,9 +16,9 @@ from skin_host.bus.wire import FrameBatch, encode_sweep
 from skin_host.config.settings import Bus, Touch, changed
 from skin_host.daemon import metrics, service
 from skin_host.daemon.state import State, Thresholds, load_state, save_state
-from skin_host.health.fault_log import LINE_S, FaultLog
-from skin_host.importing.writing import configuration_text
-from skin_host.recording.recorder import Recorder, candump_lines
+from skin_host.health import LINE_S, FaultLog
+from skin_host.importing.run import configuration_text
+from skin_host.recording.capture import FrameRecorder, candump_lines
 from tests.support.fault_bench import FaultBench
 from tests.support.live import living
 
@@ -82,7 +82,7 @@ async def test_a_recording_ends_by_its_size(tmp_path: Path) -> None:
     )
     batch = FrameBatch(ids, np.full(32, 8, np.uint8), data, np.full(32, 10**18))
     assert candump_lines("can0", batch).count(b"\n") == 32
-    recorder = Recorder(tmp_path / "x.log", 10.0, 3000)
+    recorder = FrameRecorder(tmp_path / "x.log", 10.0, 3000)
     for _ in range(4):
         recorder.put("can0", batch)
     recorder.finish()

@@ -13,7 +13,7 @@ import pytest
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import Bus, Mqtt
 from skin_host.mqtt.publisher import Publisher
-from skin_host.recording.recorder import Recorder
+from skin_host.recording.capture import FrameRecorder
 from tests.support.live import living
 from tests.support.waiting import until
 
@@ -78,7 +78,7 @@ async def test_sweeps_go_on_while_the_disk_does_not_answer(
 async def test_a_recording_that_the_disk_does_not_take_ends_without_waiting(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gate: Gate
 ) -> None:
-    recorder = Recorder(tmp_path / "x.log", 60.0, 10_000)
+    recorder = FrameRecorder(tmp_path / "x.log", 60.0, 10_000)
     monkeypatch.setattr(recorder, "_append", gate)
     recorder.put("can0", FrameBatch.of([(0x4E0, bytes(8), 1)]))
     await until(gate.reached.is_set)

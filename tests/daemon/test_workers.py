@@ -13,8 +13,7 @@ import aiomqtt
 import pytest
 
 from skin_host.config.settings import Settings, load
-from skin_host.daemon.sharing import share_of, share_out
-from skin_host.daemon.workers import Merged
+from skin_host.daemon.workers import Merged, share_of, share_out
 from tests.support.broker import Mosquitto
 from tests.support.waiting import PATIENCE_S
 

@@ -107,7 +107,7 @@ def test_a_request_that_cannot_be_met_is_refused(
 ) -> None:
     if "--scheduler" in arguments:
         pytest.importorskip("distributed")
-        monkeypatch.setattr("skin_host.recording.batch.SCHEDULER_S", 0.1)
+        monkeypatch.setattr("skin_host.recording.replay.SCHEDULER_S", 0.1)
     monkeypatch.chdir(tmp_path)
     assert main(["replay", *arguments, "--config", str(config)]) == 2
     (line,) = capsys.readouterr().err.splitlines()

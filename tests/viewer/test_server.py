@@ -14,7 +14,7 @@ import pytest
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import InvalidStatus
 
-from skin_host.client.robots import RETAINED_S
+from skin_host.client.links import RETAINED_S
 from skin_host.config.settings import Mqtt, load
 from skin_host.errors import RequestError, SkinError
 from skin_host.layout import Layout, build_layout

@@ -8,8 +8,7 @@ import pytest
 
 from skin_host.config.settings import Bus, changed, load
 from skin_host.importing.report import Findings
-from skin_host.importing.run import import_files
-from skin_host.importing.writing import configuration_text
+from skin_host.importing.run import configuration_text, import_files
 from tests.support.broker import Mosquitto
 from tests.support.devtools import Page
 from tests.support.stack import ROOT, Stack

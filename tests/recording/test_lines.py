@@ -4,7 +4,7 @@ import numpy as np
 from msgspec import json
 
 from skin_host.mqtt.messages import encode_touch
-from skin_host.recording.lines import EventLines, frame_line
+from skin_host.recording.replay import EventLines, frame_line
 from tests.support.said import make_event, make_frame
 
 
