@@ -62,11 +62,11 @@ clean:  ## the virtual environment, the lane's machine and caches
 	rm -rf .venv .lane site .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# The stamps are newer than pyproject.toml once its dependencies are installed.
+# The stamps are newer than what they depend on once it is installed, the page's libraries too.
 .venv/dev.stamp: EXTRAS := [dev]
 .venv/fuzz.stamp: EXTRAS := [fuzz]
 .venv/docs.stamp: EXTRAS := [docs]
-.venv/%.stamp: pyproject.toml | .venv/bin/python
+.venv/%.stamp: pyproject.toml hatch_build.py skin_host/viewer/npm/package-lock.json | .venv/bin/python
 	@echo "installing skin-host$(EXTRAS) into .venv"
 	@$(PIP) install --editable '.$(EXTRAS)'
 	@touch $@

@@ -37,7 +37,13 @@ COMMAND_S = 120.0
 #: Raw values are requested again before this time ends.
 RAW_LEASE_S = 30.0
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
-TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
+TYPES = {
+    "html": "text/html",
+    "css": "text/css",
+    "js": "text/javascript",
+    "svg": "image/svg+xml",
+    "txt": "text/plain",
+}
 SECURITY = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
     "connect-src 'self'; img-src 'self' data:; base-uri 'none'; frame-ancestors 'none'",
@@ -246,13 +252,15 @@ def _is_no_idle_visit(record: logging.LogRecord) -> bool:
 
 
 def _page_files() -> dict[str, tuple[str, bytes]]:
-    """The page's files by name: their type and content."""
-    folder = resources.files("skin_host.viewer").joinpath("page")
+    """The page's files by name: their type and content; its libraries are in a folder `vendor`."""
+    page = resources.files("skin_host.viewer").joinpath("page")
     files = {}
-    for file in folder.iterdir():
-        kind = TYPES.get(file.name.rpartition(".")[2])
-        if kind is not None:
-            files[file.name] = f"{kind}; charset=utf-8", file.read_bytes()
+    for prefix, folder in (("", page), ("vendor/", page.joinpath("vendor"))):
+        # Where neither npm nor PyPI was reached there are no libraries; the page says so.
+        for file in folder.iterdir() if folder.is_dir() else ():
+            kind = TYPES.get(file.name.rpartition(".")[2])
+            if kind is not None:
+                files[prefix + file.name] = f"{kind}; charset=utf-8", file.read_bytes()
     return files
 
 

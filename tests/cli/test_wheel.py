@@ -90,3 +90,11 @@ def test_the_metadata_say_what_it_is(site):
     }
     # The first command, `skin demo`, needs no extra.
     assert {"amqtt", "websockets"} <= needed
+
+
+def test_the_page_comes_with_its_libraries_and_their_licences(site):
+    page = site / "skin_host/viewer/page"
+    names = {path.name for path in (page / "vendor").iterdir()}
+    assert {"uPlot.iife.min.js", "uPlot.LICENSE.txt"} <= names
+    assert {"three.module.min.js", "three.core.min.js", "three.LICENSE.txt"} <= names
+    assert not (page.parent / "npm").exists()

@@ -91,6 +91,35 @@ class Page:
                 "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1
             )
 
+    async def drag(self, *points: tuple[float, float]) -> None:
+        """Press the left button at the first point, move over the others, release at the last."""
+        kinds = ["mousePressed", *["mouseMoved"] * (len(points) - 1), "mouseReleased"]
+        for kind, (x, y) in zip(kinds, (*points, points[-1]), strict=True):
+            await self.call(
+                "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1
+            )
+
+    async def touch(self, *points: tuple[float, float]) -> None:
+        """Put a finger on the first point, move it over the others, and lift it."""
+        for kind, point in zip(
+            ["touchStart", *["touchMove"] * (len(points) - 1)], points, strict=True
+        ):
+            at = [{"x": point[0], "y": point[1]}]
+            await self.call("Input.dispatchTouchEvent", type=kind, touchPoints=at)
+        await self.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
+    async def box(self, selector: str) -> tuple[float, float, float, float]:
+        """Left, top, width and height of an element, scrolled into the window."""
+        left, top, width, height = await self.run(
+            f"""(() => {{
+                const element = document.querySelector({json.dumps(selector)});
+                element.scrollIntoView({{ block: "center" }});
+                const box = element.getBoundingClientRect();
+                return [box.left, box.top, box.width, box.height];
+            }})()"""
+        )
+        return left, top, width, height
+
     async def picture(self) -> bytes:
         """What the page looks like, as PNG."""
         answer = await self.call("Page.captureScreenshot", format="png")

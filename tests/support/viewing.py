@@ -10,6 +10,8 @@ from tests.support.broker import Mosquitto
 from tests.support.devtools import Page, browser
 from tests.support.stack import ROOT
 
+VENDOR = ROOT / "skin_host" / "viewer" / "page" / "vendor"
+LIBRARIES = f"{VENDOR} has no libraries: run `pip install --editable .` where npm or PyPI answers"
 LIVE = 'document.getElementById("status").dataset.level === "ok"'
 
 
@@ -21,6 +23,7 @@ async def viewing(
 
     `watch` is a script that the page runs before its own.
     """
+    assert (VENDOR / "lock.sha256").exists(), LIBRARIES
     view = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "skin_host", "view", "--robot", robot, "--port", "0"),
         *("--broker", f"mqtt://{broker.host}:{broker.port}"),

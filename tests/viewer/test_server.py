@@ -26,6 +26,7 @@ from skin_host.viewer.server import Viewer
 from tests.support.broker import Mosquitto, free_port
 from tests.support.waiting import PATIENCE_S, until
 
+PAGE = Path(server.__file__).parent / "page"
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
 
 
@@ -105,6 +106,8 @@ async def test_every_file_that_the_page_names_is_served() -> None:
             ("main.js", "text/javascript"),
             ("page.css", "text/css"),
             ("icon.svg", "image/svg+xml"),
+            ("vendor/uPlot.iife.min.js", "text/javascript"),
+            ("vendor/uPlot.min.css", "text/css"),
         ):
             assert name.encode() in body
             status, headers, file = await fetch(url + name)
@@ -119,13 +122,17 @@ async def test_every_file_that_the_page_names_is_served() -> None:
 
 async def test_the_page_asks_nothing_of_the_net() -> None:
     async with Viewer(nowhere(), robot="demo").serving(port=0) as url:
-        for name in ("", "main.js", "map.js", "page.css", "panels.js", "store.js", "strip.js"):
-            _, _, body = await fetch(url + name)
+        for name in ("", *(file.name for file in PAGE.glob("*.*") if file.suffix != ".svg")):
+            status, _, body = await fetch(url + name)
+            assert status == 200
             assert b"http://" not in body
             assert b"https://" not in body
 
 
-@pytest.mark.parametrize("path", ["nothing", "../settings.py", "%2e%2e/server.py", "live/x"])
+@pytest.mark.parametrize(
+    "path",
+    ["nothing", "../settings.py", "%2e%2e/server.py", "live/x", "vendor/", "npm/package.json"],
+)
 async def test_nothing_else_is_served(path: str) -> None:
     async with Viewer(nowhere(), robot="demo").serving(port=0) as url:
         assert (await fetch(url + path))[0] == 404

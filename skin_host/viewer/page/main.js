@@ -1,15 +1,17 @@
 // Wiring: the WebSocket, the tools, the keys, and when to draw.
 import { DASHES, paper, ramp, shareOf, theme } from "./colours.js";
 import { SkinMap } from "./map.js";
-import { showContacts, showHealth, showParts } from "./panels.js";
+import { put, showContacts, showHealth, showParts } from "./panels.js";
 import { Store } from "./store.js";
-import { drawPlot, drawStrip, lineColour, roundTicks } from "./strip.js";
+import { HAS_PLOTS, lineColour, Plot, roundTicks, valueAt } from "./strip.js";
 
 const $ = (id) => document.getElementById(id);
 const MOST_CHOSEN = 6;
 const RAW_AGAIN_MS = 20000;
 /** The scale follows the highest pressure of this time. */
 const AUTO_MS = 10000;
+/** Plots are drawn again after this time. */
+const PLOT_MS = 100;
 
 const store = new Store();
 const map = new SkinMap($("map"), store);
@@ -20,6 +22,13 @@ let busy = false;
 let notice = null;
 let peaks = [];
 let restored = false;
+/** Plots end now, or at the time when they were held. */
+let heldMs = null;
+let held = new Map();
+/** Where the plots' cursor is, in ms before their end. */
+let agoMs = null;
+const strip = new Plot($("strip"), { unit: "kPa", least: 5, point: pointTo });
+const force = new Plot($("force"), { unit: "N", least: 1, point: pointTo });
 
 // --- the server -------------------------------------------------------------------------------
 
@@ -275,22 +284,90 @@ function showScale(nowMs) {
   }
 }
 
-function showForce(nowMs) {
-  const parts = shownParts().filter((part) => part.contacts.length || part.forces.last > -Infinity);
-  // One course for all parts: each part's force counts until it says another.
-  const events = parts.flatMap((part, k) => [...part.forces].map(([t, value]) => [t, k, value])).sort((a, b) => a[0] - b[0]);
-  const now = new Array(parts.length).fill(0);
-  let sum = 0;
-  const course = events.map(([t, k, value]) => {
-    sum += value - now[k];
-    now[k] = value;
-    return [t, Math.max(0, sum)];
+// --- plots ------------------------------------------------------------------------------------
+
+function pointTo(ms) {
+  if (ms !== agoMs) dirty = true;
+  agoMs = ms;
+}
+
+function hold(on) {
+  heldMs = on ? performance.now() : null;
+  held = new Map();
+  $("pause").setAttribute("aria-pressed", String(on));
+  dirty = true;
+}
+
+/** A course between two times; of held plots what was seen when they were held. */
+function courseOf(key, take) {
+  if (heldMs === null) return take();
+  if (!held.has(key)) held.set(key, take());
+  return held.get(key);
+}
+
+function showPlots(nowMs) {
+  const endMs = heldMs ?? nowMs;
+  const seconds = Number($("length").value);
+  const fromMs = endMs - seconds * 1000;
+  const chosen = map.chosen.map(({ part, taxel, colour }, i) => ({
+    course: courseOf(`${part} ${taxel} ${map.raw} ${seconds}`, () => store.part(part)?.course(taxel, map.raw, fromMs, endMs) ?? []),
+    colour,
+    dash: DASHES[i % DASHES.length],
+  }));
+  [strip.unit, strip.least] = map.raw ? ["units", 20] : ["kPa", 5];
+  strip.show(chosen, endMs, seconds);
+  const forces = forceLines(seconds, fromMs, endMs);
+  force.show(forces, endMs, seconds);
+  const atMs = agoMs === null ? null : endMs - agoMs;
+  const reachMs = Math.max(700, seconds * 10);
+  const at = (course) => valueAt(course, atMs, reachMs);
+  $("at").hidden = atMs === null && heldMs === null && HAS_PLOTS;
+  const words = [heldMs === null ? "" : `held ${((nowMs - heldMs) / 1000).toFixed(0)} s ago`, atMs === null ? "" : `at −${(agoMs / 1000).toFixed(agoMs < 100000 ? 1 : 0)} s`];
+  put($("at"), HAS_PLOTS ? words.filter(Boolean).join(", ") : "There are no plots: this installation lacks uPlot. Install it again where npm or PyPI can be reached.");
+  map.chosen.forEach(({ part, taxel }, i) => {
+    const text = $("chosen").children[i]?.querySelector("span");
+    const of = store.part(part);
+    if (!text || !of) return;
+    const seen = atMs === null ? null : at(chosen[i].course);
+    const then = seen === null ? "–" : map.raw ? `${signed(-Math.round(seen))} units` : `${seen.toFixed(1)} kPa`;
+    put(text, `${part} ${taxel}: ${atMs === null ? value(of, taxel) : then}`);
   });
+  const list = $("forces");
+  const key = JSON.stringify([theme(), forces.map(({ name }) => name)]);
+  if (list.dataset.shown !== key) {
+    list.dataset.shown = key;
+    list.replaceChildren(...forces.map(({ colour, dash }) => {
+      const item = document.createElement("li");
+      item.append(sample(colour, dash), document.createElement("span"));
+      return item;
+    }));
+  }
+  forces.forEach(({ name, course }, i) => {
+    const seen = atMs === null ? course.at(-1)?.[1] ?? null : at(course);
+    put(list.children[i].lastChild, `${name}: ${seen === null ? "–" : `${seen.toFixed(2)} N`}`);
+  });
+}
+
+/** Force of all contacts of the parts that are shown, and of the selected one. */
+function forceLines(seconds, fromMs, endMs) {
   const look = paper();
-  const lines = [{ course, colour: look.text, dash: [] }];
+  const total = courseOf(`force ${map.shown} ${seconds}`, () => {
+    const courses = shownParts().map((part) => part.forces.between(fromMs, endMs));
+    if (courses.length === 1) return courses[0];
+    // One course for all parts: each part's force counts until it says another.
+    const events = courses.flatMap((course, k) => course.map(([t, value]) => [t, k, value])).sort((a, b) => a[0] - b[0]);
+    const now = new Array(courses.length).fill(0);
+    let sum = 0;
+    return events.map(([t, k, value]) => {
+      sum += value - now[k];
+      now[k] = value;
+      return [t, Math.max(0, sum)];
+    });
+  });
+  const lines = [{ name: "total", course: total, colour: look.text, dash: [] }];
   const one = map.selected && store.part(map.selected.part)?.forceOf.get(map.selected.id);
-  if (one) lines.push({ course: [...one], colour: look.alarm, dash: [6, 3] });
-  drawPlot($("force"), lines, nowMs, { unit: "N", least: 1 });
+  if (one) lines.push({ name: `#${map.selected.id}`, course: courseOf(`force of ${map.selected.part} ${map.selected.id} ${seconds}`, () => one.between(fromMs, endMs)), colour: look.alarm, dash: [6, 3] });
+  return lines;
 }
 
 /** The parts whose contacts and health are shown: the chosen one, or all. */
@@ -313,6 +390,7 @@ function showRamp() {
 }
 
 let drawnMs = 0;
+let plottedMs = 0;
 
 function frame(nowMs) {
   // Ages must go on when nothing comes.
@@ -327,14 +405,11 @@ function frame(nowMs) {
     showStatus(nowMs);
     showParts($("parts"), store, map.shown, nowMs, pick);
     showContacts($("contacts"), $("no-contacts"), shownParts(), map, nowMs, pointAt, select);
-    showForce(nowMs);
     showHealth($("health"), $("shared"), shownParts(), nowMs);
-    drawStrip($("strip"), store, map.chosen, map.raw, nowMs);
-    map.chosen.forEach(({ part, taxel }, i) => {
-      const text = $("chosen").children[i]?.querySelector("span");
-      const of = store.part(part);
-      if (text && of) text.textContent = `${part} ${taxel}: ${value(of, taxel)}`;
-    });
+    if (nowMs - plottedMs > PLOT_MS) {
+      plottedMs = nowMs;
+      showPlots(nowMs);
+    }
     $("calibrate").hidden = !store.status.commands;
     $("calibrate").disabled = busy || !mayCommand();
     $("show-raw").disabled = !map.raw && !mayCommand();
@@ -430,7 +505,7 @@ const keys = {
   "+": () => zoom(1.25), "=": () => zoom(1.25), "-": () => zoom(0.8), f: () => { map.fit(); dirty = true; },
   ",": () => walk(-1), ".": () => walk(1), Enter: () => choose(map.cursor),
   Escape: () => { map.chosen = []; map.cursor = null; map.selected = null; showChosen(); },
-  r: () => setRaw(!map.raw), c: calibrate, t: () => { setTheme(theme() === "dark" ? "light" : "dark"); remember("theme", theme()); },
+  p: () => hold(heldMs === null), r: () => setRaw(!map.raw), c: calibrate, t: () => { setTheme(theme() === "dark" ? "light" : "dark"); remember("theme", theme()); },
   "?": () => $("keys").showModal(),
 };
 
@@ -449,6 +524,8 @@ $("zoom-out").addEventListener("click", () => zoom(0.8));
 $("zoom-fit").addEventListener("click", keys.f);
 $("calibrate").addEventListener("click", calibrate);
 $("theme").addEventListener("click", keys.t);
+$("pause").addEventListener("click", keys.p);
+$("length").addEventListener("change", () => { remember("length", $("length").value); plottedMs = 0; dirty = true; });
 $("help").addEventListener("click", keys["?"]);
 $("scale").addEventListener("change", () => { peaks = []; dirty = true; });
 window.addEventListener("resize", () => { map.arrange(); dirty = true; });
@@ -459,5 +536,6 @@ const ofSystem = () => { if (!remembered("theme")) setTheme(light.matches ? "lig
 light.addEventListener("change", () => { ofSystem(); dirty = true; });
 setTheme(remembered("theme") ?? (light.matches ? "light" : "dark"));
 map.shown = remembered("part") || null;
+if ([...$("length").options].some(({ value }) => value === remembered("length"))) $("length").value = remembered("length");
 connect();
 requestAnimationFrame(frame);

@@ -13,7 +13,7 @@ function keep(list, n, make) {
   return [...list.children];
 }
 
-function put(element, text) {
+export function put(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 

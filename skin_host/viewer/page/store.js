@@ -1,26 +1,9 @@
-// What the server has told: parts, their last values, and the last minute of each taxel.
-export const HISTORY_S = 60;
-const SLOTS = HISTORY_S * 26;
+// What the server has told: parts, their last values, and their past.
+import { Course, History, LONGEST_S } from "./history.js";
+
 const HEAD = 32;
 const VALID = 1;
 const BEYOND = 2;
-
-/** Values over the last minute: [time, value], oldest first. */
-class Course {
-  constructor() { this.points = []; this.first = 0; }
-
-  get last() { return this.points.at(-1)?.[0] ?? -Infinity; }
-
-  add(nowMs, value) {
-    // Two pictures of one moment are one.
-    if (nowMs - this.last < 5) this.points.pop();
-    this.points.push([nowMs, value]);
-    while (this.points[this.first]?.[0] < nowMs - HISTORY_S * 1000) this.first++;
-    if (this.first > 1000) { this.points = this.points.slice(this.first); this.first = 0; }
-  }
-
-  *[Symbol.iterator]() { for (let k = this.first; k < this.points.length; k++) yield this.points[k]; }
-}
 
 export class Part {
   constructor(info) {
@@ -47,11 +30,8 @@ export class Part {
     this.forceOf = new Map(); // of each contact by its id
     this.noLoad = this.triangles.length ? Float32Array.from({ length: this.n }, (_, i) => this.triangleOf(i)?.no_load ?? 240) : new Float32Array(this.n);
     this.health = null;
-    this.times = new Float64Array(SLOTS);
-    this.past = new Float32Array(SLOTS * this.n);
+    this.past = new History(this.n);
     this.pastRaw = null;
-    this.at = 0;
-    this.filled = 0;
   }
 
   takeContacts(contacts, nowMs) {
@@ -65,7 +45,7 @@ export class Part {
       if (!this.forceOf.has(contact.id)) this.forceOf.set(contact.id, new Course());
       this.forceOf.get(contact.id).add(nowMs, contact.force_n);
     }
-    for (const [id, course] of this.forceOf) if (course.last < nowMs - HISTORY_S * 1000) this.forceOf.delete(id);
+    for (const [id, course] of this.forceOf) if (course.last < nowMs - LONGEST_S * 1000) this.forceOf.delete(id);
   }
 
   valid(i) { return (this.bits[i] & VALID) !== 0; }
@@ -94,25 +74,17 @@ export class Part {
   }
 
   remember(nowMs) {
-    const row = this.at * this.n;
-    this.times[this.at] = nowMs;
-    for (let i = 0; i < this.n; i++) this.past[row + i] = this.bits[i] & VALID ? this.pressure[i] : NaN;
-    if (this.raw) {
-      this.pastRaw ??= new Float32Array(SLOTS * this.n).fill(NaN);
-      this.pastRaw.set(this.raw, row);
-    } else if (this.pastRaw) this.pastRaw.fill(NaN, row, row + this.n);
-    this.at = (this.at + 1) % SLOTS;
-    this.filled = Math.min(this.filled + 1, SLOTS);
+    this.past.add(nowMs, this.pressure.map((value, i) => (this.bits[i] & VALID ? value : NaN)));
+    if (!this.raw) return;
+    this.pastRaw ??= new History(this.n);
+    this.pastRaw.add(nowMs, this.raw);
   }
 
-  /** [time, value] of a taxel over the last minute, oldest first; NaN where there is none. */
-  *course(taxel, raw) {
-    const past = raw ? this.pastRaw : this.past;
-    if (!past) return;
-    for (let k = 0; k < this.filled; k++) {
-      const slot = (this.at - this.filled + k + SLOTS) % SLOTS;
-      yield [this.times[slot], past[slot * this.n + taxel]];
-    }
+  /** [time, value] of a taxel between two times: kPa, or raw values less those of untouched skin. */
+  course(taxel, raw, fromMs, toMs) {
+    if (!raw) return this.past.course(taxel, fromMs, toMs);
+    const course = this.pastRaw?.course(taxel, fromMs, toMs) ?? [];
+    return course.map(([t, value]) => [t, value === null ? null : this.noLoad[taxel] - value]);
   }
 
   /** Frames a second that came here over the last two seconds. */
@@ -144,7 +116,7 @@ export class Store {
       const before = old.get(part.name);
       // A new calibration gives a new layout of the same taxels: their past stays.
       if (before && before.n === part.n) {
-        for (const key of ["pressure", "bits", "raw", "heardMs", "received", "missed", "arrivals", "contacts", "forces", "forceOf", "health", "faults", "times", "past", "pastRaw", "at", "filled"]) part[key] = before[key];
+        for (const key of ["pressure", "bits", "raw", "heardMs", "received", "missed", "arrivals", "contacts", "forces", "forceOf", "health", "faults", "past", "pastRaw"]) part[key] = before[key];
       }
       return part;
     });

@@ -1,75 +1,108 @@
-// Courses over the last minute: of chosen taxels, and of the contacts' force.
+// Plots over the last minutes, by uPlot.
 import { DASHES, LINES, paper, theme } from "./colours.js";
-import { HISTORY_S } from "./store.js";
 
-const LEFT = 34;
-const BOTTOM = 22;
-/** Noise below zero has this much room, and stays clear of the labels. */
-const BELOW = 5;
-/** Points farther apart than this are not joined: nothing was heard between. */
-const GAP_MS = 700;
+/** Without the library, which is not in the repository, there is no plot. */
+export const HAS_PLOTS = typeof globalThis.uPlot === "function";
+/** Noise below zero has this share of the height. */
+const BELOW = 0.06;
+const FONT = "11px system-ui, sans-serif";
+const STEP_PX = 8;
 
 export function lineColour(i) { return LINES[theme()][i % DASHES.length]; }
 
-/** The chosen taxels: kPa, or raw values less those of untouched skin. */
-export function drawStrip(canvas, store, chosen, raw, nowMs) {
-  const lines = chosen.map(({ part, taxel }, i) => {
-    const of = store.part(part);
-    const course = [...(of?.course(taxel, raw) ?? [])].map(([t, value]) => [t, raw ? of.noLoad[taxel] - value : value]);
-    return { course, colour: lineColour(i), dash: DASHES[i % DASHES.length] };
-  });
-  drawPlot(canvas, lines, nowMs, raw ? { unit: "units", least: 20 } : { unit: "kPa", least: 5 });
+/** One plot: lines of [time in ms, value], seen from `seconds` before a time to that time. */
+export class Plot {
+  /** `point` is told where the cursor is, in ms before the end, or null; `label` is read aloud. */
+  constructor(box, { unit, least, point }) {
+    this.box = box;
+    this.unit = unit;
+    this.least = least;
+    this.point = point;
+    this.key = "";
+    this.plot = null;
+    this.top = least;
+    this.seconds = 60;
+    box.addEventListener("keydown", (event) => this.walk(event));
+    // A finger that moves sideways over the plot moves the cursor.
+    box.addEventListener("pointermove", (event) => {
+      if (event.pointerType !== "mouse" && this.plot) this.move(event.clientX - this.plot.over.getBoundingClientRect().left);
+    });
+  }
+
+  show(lines, endMs, seconds) {
+    if (!HAS_PLOTS) return;
+    this.seconds = seconds;
+    let peak = 0;
+    for (const { course } of lines) for (const [, value] of course) if (value > peak) peak = value;
+    this.top = nice(Math.max(peak * 1.05, this.least));
+    const tables = lines.map(({ course }) => [
+      Float64Array.from(course, ([t]) => (t - endMs) / 1000),
+      course.map(([, value]) => value),
+    ]);
+    const data = tables.length ? uPlot.join(tables) : [[]];
+    const { clientWidth: width, clientHeight: height } = this.box;
+    const key = JSON.stringify([theme(), width, height, lines.map(({ colour, dash }) => [colour, dash])]);
+    if (key === this.key) { this.plot.setData(data); return; }
+    this.key = key;
+    const at = this.plot?.cursor.left ?? -1;
+    this.plot?.destroy();
+    this.plot = new uPlot(this.options(lines, width, height), data, this.box);
+    if (at >= 0) this.move(at);
+  }
+
+  options(lines, width, height) {
+    const look = paper();
+    const axis = { stroke: look.dim, font: FONT, labelFont: FONT, ticks: { show: false }, grid: { stroke: look.line, width: 1 } };
+    return {
+      width, height,
+      padding: [8, 8, 0, 0],
+      legend: { show: false },
+      cursor: { sync: { key: "skin" }, drag: { x: false, y: false }, y: false, points: { show: false } },
+      scales: {
+        x: { time: false, range: () => [-this.seconds, 0] },
+        y: { range: () => [-BELOW * this.top, this.top] },
+      },
+      axes: [
+        { ...axis, size: 22, gap: 2, splits: () => this.times(), values: (_, splits) => splits.map((s) => this.timeText(s)) },
+        { ...axis, size: 52, gap: 4, splits: () => [0, this.top / 2, this.top], values: (_, splits) => splits.map((value) => `${+value.toPrecision(3)}${value === this.top ? ` ${this.unit}` : ""}`) },
+      ],
+      series: [{}, ...lines.map(({ colour, dash }) => ({ stroke: colour, dash, width: 2, points: { show: false } }))],
+      hooks: { setCursor: [(plot) => this.point(plot.cursor.left >= 0 ? -1000 * plot.posToVal(plot.cursor.left, "x") : null)] },
+    };
+  }
+
+  times() { return [-1, -2 / 3, -1 / 3, 0].map((share) => share * this.seconds); }
+
+  timeText(s) {
+    if (s === 0) return "0";
+    return this.seconds > 60 ? `−${+(-s / 60).toFixed(1)} min` : `−${Math.round(-s)} s`;
+  }
+
+  move(left) {
+    const { width, height } = this.plot.over.getBoundingClientRect();
+    this.plot.setCursor({ left: Math.min(width, Math.max(0, left)), top: height / 2 });
+  }
+
+  walk(event) {
+    if (!this.plot || event.ctrlKey || event.metaKey || event.altKey) return;
+    const wide = this.plot.over.clientWidth;
+    const at = this.plot.cursor.left >= 0 ? this.plot.cursor.left : wide;
+    const to = { ArrowLeft: at - STEP_PX, ArrowRight: at + STEP_PX, Home: 0, End: wide }[event.key];
+    if (to !== undefined) this.move(to);
+    else if (event.key === "Escape" && this.plot.cursor.left >= 0) this.plot.setCursor({ left: -10, top: -10 });
+    else return;
+    event.preventDefault();
+    event.stopPropagation();
+  }
 }
 
-/** Courses over the last minute: what is below zero is noise. */
-export function drawPlot(canvas, lines, nowMs, { unit, least }) {
-  const ratio = window.devicePixelRatio || 1;
-  const { clientWidth: w, clientHeight: h } = canvas;
-  canvas.width = Math.round(w * ratio);
-  canvas.height = Math.round(h * ratio);
-  const ctx = canvas.getContext("2d");
-  const look = paper();
-  ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
-  let peak = 0;
-  for (const { course } of lines) for (const [, value] of course) if (value > peak) peak = value;
-  const top = nice(Math.max(peak * 1.1, least));
-  const x = (t) => LEFT + ((t - nowMs) / 1000 / HISTORY_S + 1) * (w - LEFT - 4);
-  const y = (value) => Math.min(6 + (1 - value / top) * (h - BOTTOM - 6), h - BOTTOM + BELOW);
-  ctx.font = "11px system-ui, sans-serif";
-  ctx.fillStyle = look.dim;
-  ctx.strokeStyle = look.line;
-  ctx.lineWidth = 1;
-  for (const share of [0, 0.5, 1]) {
-    const level = Math.round(y(top * share)) + 0.5;
-    ctx.beginPath();
-    ctx.moveTo(LEFT, level);
-    ctx.lineTo(w, level);
-    ctx.stroke();
-    ctx.textAlign = "right";
-    ctx.textBaseline = "middle";
-    ctx.fillText(String(+(top * share).toPrecision(3)), LEFT - 5, level);
+/** The value of a line at a time: that of its nearest point, null where nothing is near. */
+export function valueAt(course, t, reachMs) {
+  let best = null;
+  for (const [time, value] of course) {
+    if (value !== null && (best === null || Math.abs(time - t) <= Math.abs(best[0] - t))) best = [time, value];
   }
-  ctx.textBaseline = "bottom";
-  for (const s of [-60, -40, -20, 0]) {
-    ctx.textAlign = s === 0 ? "right" : s === -60 ? "left" : "center";
-    ctx.fillText(s === 0 ? `now, ${unit}` : `${s} s`, x(nowMs + s * 1000), h);
-  }
-  for (const { course, colour, dash } of lines) {
-    ctx.beginPath();
-    let last = null;
-    for (const [t, value] of course) {
-      if (nowMs - t > HISTORY_S * 1000) continue;
-      if (Number.isNaN(value)) { last = null; continue; }
-      if (last === null || t - last > GAP_MS) ctx.moveTo(x(t), y(value));
-      else ctx.lineTo(x(t), y(value));
-      last = t;
-    }
-    ctx.strokeStyle = colour;
-    ctx.setLineDash(dash);
-    ctx.lineWidth = 2;
-    ctx.stroke();
-  }
-  ctx.setLineDash([]);
+  return best && Math.abs(best[0] - t) <= reachMs ? best[1] : null;
 }
 
 /** The next round number, whose half is round too. */

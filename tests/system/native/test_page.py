@@ -172,6 +172,70 @@ async def test_a_press_is_seen_and_parts_and_values_can_be_chosen(
         assert len(await seen.picture()) > 20_000
 
 
+async def choose_two(seen: Page) -> None:
+    """Choose two taxels of the first part."""
+    await seen.run('document.getElementById("map").focus()')
+    for _ in range(2):
+        await seen.press(".")
+        await seen.press("Enter")
+    await seen.until('document.querySelectorAll("#chosen button").length === 2')
+
+
+AT = 'document.getElementById("at").textContent'
+LEGENDS = '[...document.querySelectorAll("#chosen span, #forces span")].map(one => one.textContent)'
+
+
+async def test_plots_are_held_read_and_as_long_as_wanted(robot: Stack, tmp_path: Path) -> None:
+    start(robot)
+    async with page(robot, tmp_path / "profile") as seen:
+        await seen.until(LIVE)
+        await choose_two(seen)
+        left, top, width, height = await seen.box("#strip .u-over")
+        # By mouse: the values under the cursor stand in the legends of both plots.
+        for share in (0.5, 0.99):
+            x, y = left + share * width, top + height / 2
+            await seen.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+            await seen.until(f"/^at −{'0' if share > 0.9 else '(29|30)'}[.]/.test({AT})")
+        await seen.until(f"{LEGENDS}.every(text => /: [-0-9.]+ (kPa|N)$/.test(text))")
+        await seen.call("Input.dispatchMouseEvent", type="mouseMoved", x=1, y=1)
+        await seen.until('document.getElementById("at").hidden')
+        # By keyboard: held values stay.
+        await seen.press("p")
+        await seen.until(f"/^held/.test({AT})")
+        await seen.run('document.getElementById("strip").focus()')
+        await seen.press("End")
+        await seen.until(f"/ at −0/.test({AT})")
+        held = await seen.run(LEGENDS)
+        draws = int(await seen.run("document.body.dataset.draws"))
+        await seen.until(f"Number(document.body.dataset.draws) > {draws + 20}")
+        assert await seen.run(LEGENDS) == held
+        await seen.press("Home")
+        await seen.until(f"/at −60/.test({AT})")
+        await seen.press("ArrowRight")
+        await seen.until(f"/at −5[789]/.test({AT})")
+        assert await seen.run('document.querySelector("#parts button").ariaCurrent') == "true"
+        await seen.press("Escape")
+        await seen.until(f"!/ at /.test({AT})")
+        assert await seen.run('document.querySelectorAll("#chosen button").length') == 2
+        await seen.press("p")
+        await seen.until('document.getElementById("at").hidden')
+        # By touch, over the length that is chosen, which a reload does not forget.
+        await seen.run(
+            """(() => {
+                const length = document.getElementById("length");
+                length.value = "300";
+                length.dispatchEvent(new Event("change"));
+            })()"""
+        )
+        await seen.call("Emulation.setTouchEmulationEnabled", enabled=True)
+        left, top, width, height = await seen.box("#strip .u-over")
+        middle = (left + width / 2, top + height / 2)
+        await seen.touch((left + width / 4, middle[1]), middle)
+        await seen.until(f"/^at −(149|150|151) s$/.test({AT})")
+        await seen.call("Page.reload")
+        await seen.until('document.getElementById("length")?.value === "300"')
+
+
 async def test_stopped_data_are_called_stale_and_everything_comes_back(
     robot: Stack, tmp_path: Path, mosquitto: Mosquitto
 ) -> None:
