@@ -13,47 +13,24 @@ latencies and losses of that row are the machine's, not the daemon's.
 """
 
 import asyncio
-import gc
 import json
-import logging
-import multiprocessing
-import resource
 import statistics
-import tempfile
 import time
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 from itertools import product
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from skin_host.bus.wire import TAXELS, TRIANGLES
-from skin_host.config.settings import changed
-from skin_host.daemon.daemon import Daemon
-from skin_host.daemon.workers import share_name, share_of
-from skin_host.errors import BrokerError, SkinError
-from skin_host.evaluation.body_stream import Body, send_body
-from skin_host.evaluation.rooms import RoomClock
-from skin_host.evaluation.stand_in import register
-from skin_host.evaluation.touch_listener import PLAIN_TOPIC, collected, listen, publish_plain
-from skin_host.evaluation.wakeups import Wakeups
-from skin_host.layout import build_layout
-from skin_host.mqtt.broker import find_mosquitto, mosquitto_broker
+from skin_host.evaluation.body_stream import Body
+from skin_host.evaluation.measured_daemon import TOUCHED, running
+from skin_host.evaluation.touch_listener import PLAIN_TOPIC, collected, publish_plain
 
 SIZES = (192, 2000, 10_000)
 RATES_HZ = (20, 50)
-TOUCHED = ("untouched", "hand", "all")
-#: A hand of an iCub has about so many triangles.
-HAND_TRIANGLES = 9
 _READY_S = 60.0
-_CALIBRATION_S = 1.0
 #: Contacts begin and are reported in this time after a scene begins; then the measurement starts.
 _SETTLE_S = 0.7
-_PERIODS = 20
 
 Row = dict[str, Any]
 
@@ -125,34 +102,16 @@ def _ms(value: float | None) -> str:
 
 
 async def _measure(body: Body, hz: int, seconds: float, touched: tuple[str, ...]) -> list[Row]:
-    context = multiprocessing.get_context("spawn")
-    async with broker_with_subscriber() as port:
-        ends = [context.Pipe() for _ in range(3)]
-        (listener, listener_child), (daemon, daemon_child), (sender, sender_child) = ends
-        processes = [
-            context.Process(target=listen, args=(listener_child, port), daemon=True),
-            context.Process(target=run_daemon, args=(daemon_child, body, port), daemon=True),
-            context.Process(target=send_body, args=(sender_child, body, scenes(body)), daemon=True),
-        ]
-        try:
-            for process in processes:
-                process.start()
-            if not await asyncio.to_thread(listener.poll, _READY_S):
-                raise SkinError(f"the daemon did not calibrate within {_READY_S:g} s")
-            listener.recv()
+    async with running(body, len(TOUCHED), ready_s=_READY_S) as bench:
+        (daemon,), (sender,) = bench.daemons, bench.senders
+        rows = []
+        for name in touched:
+            sender.send(TOUCHED.index(name))
             sender.recv()
-            rows = []
-            for name in touched:
-                sender.send(TOUCHED.index(name))
-                sender.recv()
-                await asyncio.sleep(_SETTLE_S)
-                row = {"taxels": body.taxels, "hz": hz, "touched": name, "buses": len(body.ports)}
-                rows.append(row | await _row(listener, daemon, port, seconds))
-            return rows
-        finally:
-            for process in processes:
-                process.terminate()
-                process.join()
+            await asyncio.sleep(_SETTLE_S)
+            row = {"taxels": body.taxels, "hz": hz, "touched": name, "buses": len(body.ports)}
+            rows.append(row | await _row(bench.listener, daemon, bench.port, seconds))
+        return rows
 
 
 async def _row(listener: Connection, daemon: Connection, port: int, seconds: float) -> Row:
@@ -193,122 +152,3 @@ async def _yardstick_us(seconds: float) -> float:
         times_us.append((time.thread_time_ns() - began_ns) * 1e-3)
         await asyncio.sleep(0.1)
     return round(statistics.median(times_us), 1)
-
-
-def scenes(body: Body) -> list[NDArray[np.uint8]]:
-    """Untouched; a hand that rests on the first board; everything touched."""
-    shape = (_PERIODS, body.boards, TRIANGLES, TAXELS)
-    quiet = np.random.default_rng(0).integers(239, 242, shape)
-    depth = 50.0 + 20.0 * np.sin(2 * np.pi * np.arange(_PERIODS) / _PERIODS)
-    pressed = depth.astype(int)[:, None, None]
-    hand, everything = quiet.copy(), quiet.copy()
-    hand[:, 0, : min(HAND_TRIANGLES, body.triangles)] -= pressed
-    everything -= pressed[..., None]
-    return [scene.astype(np.uint8) for scene in (quiet, hand, everything)]
-
-
-def run_daemon(
-    parent: Connection, body: Body, broker_port: int, number: int = 1, shares: int = 1
-) -> None:
-    """Process: `skin run`, measured on the parent's commands.
-
-    Args:
-        parent: sends `begin`, `end` (answered with figures of the time between) and `count`
-            (answered with CAN frames read and dropped since the start).
-        body: whose frames it reads.
-        broker_port: of the broker on this machine.
-        number, shares: this is one of several workers, from 1.
-    """
-    register()
-    logging.disable(logging.WARNING)  # no board of this stream answers commands
-    with tempfile.TemporaryDirectory(prefix="skin-bench-") as state:
-        settings = changed(
-            body.settings(),
-            {
-                "mqtt.host": "127.0.0.1",
-                "mqtt.port": broker_port,
-                "processing.calibration.seconds": _CALIBRATION_S,
-                "service.state_directory": state,
-            },
-        )
-        node = "main"
-        if shares > 1:
-            settings, node = share_of(settings, node, number, shares), share_name(node, number)
-        daemon = Daemon(settings, build_layout(settings, Path()), node)
-        gc.freeze()  # as `skin run` does
-        wakeups = Wakeups()
-        with wakeups.runner() as runner:
-            runner.run(_obey(parent, daemon, wakeups))
-
-
-async def _obey(parent: Connection, daemon: Daemon, wakeups: Wakeups) -> None:
-    rooms = RoomClock()
-    began: list[tuple[float, ...]] = []
-
-    def now() -> tuple[float, ...]:
-        sleeps = resource.getrusage(resource.RUSAGE_SELF).ru_nvcsw
-        dropped = sum(port.counters.dropped for port in daemon.link.ports.values())
-        counters = daemon.publisher.counters
-        skipped = counters.frames_skipped
-        return time.monotonic(), time.process_time(), _waited_s(), sleeps, dropped, skipped
-
-    def order() -> None:
-        wanted = parent.recv()
-        if wanted == "count":
-            counters = [port.counters for port in daemon.link.ports.values()]
-            parent.send((sum(one.frames for one in counters), sum(one.dropped for one in counters)))
-            return
-        if wanted == "begin":
-            began[:] = [now()]
-            wakeups.counts.clear()
-            rooms.begin()
-            return
-        shares = rooms.end()
-        wall_s, cpu_s, waited_s, sleeps, dropped, skipped = (
-            end - begin for end, begin in zip(now(), began[0], strict=True)
-        )
-        causes = {cause: round(n / wall_s, 1) for cause, n in wakeups.counts.most_common()}
-        percent = 100 * cpu_s / wall_s
-        parent.send(
-            {
-                "cpu_percent": round(percent, 2),
-                "by_room": {room: round(share * percent, 2) for room, share in shares.items()},
-                "waited_percent": round(100 * waited_s / wall_s, 2),
-                "wakeups_hz": round(sleeps / wall_s),
-                "wakeups_by_cause_hz": causes,
-                "us_per_wakeup": round(1e6 * cpu_s / max(sleeps, 1)),
-                "frames_dropped": dropped,
-                "messages_skipped": skipped,
-            }
-        )
-
-    asyncio.get_running_loop().add_reader(parent.fileno(), order)
-    await daemon.run(asyncio.Event(), calibrate=True)
-
-
-def _waited_s() -> float:
-    """How long this thread was ready to run without a core."""
-    return int(Path("/proc/self/schedstat").read_text().split()[1]) * 1e-9
-
-
-@asynccontextmanager
-async def broker_with_subscriber() -> AsyncIterator[int]:
-    """Mosquitto with one subscriber on all frames; the port."""
-    program = find_mosquitto()
-    if program is None:
-        raise BrokerError("mosquitto is not installed; `apt install mosquitto`")
-    async with mosquitto_broker(program) as broker:
-        command = ["mosquitto_sub", "-p", str(broker.port), "-t", "skin/bench/+/frame"]
-        try:
-            subscriber = await asyncio.create_subprocess_exec(
-                *command, stdout=asyncio.subprocess.DEVNULL
-            )
-        except FileNotFoundError:
-            raise BrokerError(
-                "mosquitto_sub is not installed; `apt install mosquitto-clients`"
-            ) from None
-        try:
-            yield broker.port
-        finally:
-            subscriber.terminate()
-            await subscriber.wait()

@@ -4,7 +4,6 @@ from typing import Any
 
 from skin_host.evaluation import speed
 from skin_host.evaluation.machine import machine
-from skin_host.evaluation.report import select
 
 Row = dict[str, Any]
 
@@ -25,7 +24,8 @@ def with_ratios(models: list[Row], pipeline: list[Row]) -> dict[str, list[Row]]:
     """The rows with their ratio to a copy in memory."""
     copies = {
         (row["dtype"], row["taxels"]): row["ns_per_taxel_step"]
-        for row in select(models, model="memory_copy")
+        for row in models
+        if row["model"] == "memory_copy"
     }
 
     def ratio(row: Row, dtype: str) -> Row:

@@ -7,21 +7,14 @@ what was read and what the kernel reports as dropped; the rest is `uncounted`. `
 """
 
 import asyncio
-import multiprocessing
 import os
 from multiprocessing.connection import Connection
 from typing import Any
 
 from skin_host.daemon.workers import share_out
 from skin_host.errors import BrokerError, SkinError
-from skin_host.evaluation.bench_daemon import (
-    TOUCHED,
-    broker_with_subscriber,
-    run_daemon,
-    scenes,
-)
-from skin_host.evaluation.body_stream import PAUSE, Body, send_body
-from skin_host.evaluation.touch_listener import listen
+from skin_host.evaluation.body_stream import PAUSE, Body
+from skin_host.evaluation.measured_daemon import TOUCHED, running
 
 SIZES = (10_000, 30_000, 100_000)
 HZ = 20
@@ -97,33 +90,9 @@ def describe(document: dict[str, Any]) -> str:
 
 async def _measure(body: Body, workers: int, seconds: float) -> Row:
     workers = len(share_out(body.settings(), "main", workers))
-    n_senders = max(1, round(body.frames_per_s / _SENDER_HZ))
-    context = multiprocessing.get_context("spawn")
-    async with broker_with_subscriber() as port:
-        listener, listener_child = context.Pipe()
-        daemons = [context.Pipe() for _ in range(workers)]
-        senders = [context.Pipe() for _ in range(n_senders)]
-        made = scenes(body)[:2]
-        processes = [context.Process(target=listen, args=(listener_child, port, workers))]
-        processes += [
-            context.Process(target=run_daemon, args=(child, body, port, number + 1, workers))
-            for number, (_, child) in enumerate(daemons)
-        ]
-        processes += [
-            context.Process(target=send_body, args=(child, body, made, number, n_senders))
-            for number, (_, child) in enumerate(senders)
-        ]
-        try:
-            for process in processes:
-                process.daemon = True
-                process.start()
-            if not await asyncio.to_thread(listener.poll, _READY_S):
-                raise SkinError(f"the daemons did not calibrate within {_READY_S:g} s")
-            row = await _row([one for one, _ in daemons], [one for one, _ in senders], seconds)
-        finally:
-            for process in processes:
-                process.terminate()
-                process.join()
+    senders = max(1, round(body.frames_per_s / _SENDER_HZ))
+    async with running(body, 2, daemons=workers, senders=senders, ready_s=_READY_S) as bench:
+        row = await _row(bench.daemons, bench.senders, seconds)
     rate = round(row.pop("sent_in_time") / seconds)
     return {
         "taxels": body.taxels,
@@ -136,8 +105,6 @@ async def _measure(body: Body, workers: int, seconds: float) -> Row:
 
 
 async def _row(daemons: list[Connection], senders: list[Connection], seconds: float) -> Row:
-    for sender in senders:
-        await asyncio.to_thread(sender.recv)
     sent_before = await _scene(senders, PAUSE)
     await asyncio.sleep(_DRAIN_S)
     read_before, dropped_before = await _counted(daemons)

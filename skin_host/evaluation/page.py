@@ -1,35 +1,13 @@
 """The report for readers: one list of sections, written as Markdown and as HTML, with plots."""
 
-import html
-import json
-import re
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from skin_host.evaluation import plots, tables
-from skin_host.evaluation.tables import Report, Table
-from skin_host.files import write_atomic
+from skin_host.evaluation.document import Section
+from skin_host.evaluation.document import write as write_document
+from skin_host.evaluation.tables import Report
 
 PICTURES = "accuracy"
-STYLE = """
-body{font:16px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;
-color:#1b1f24}
-table{border-collapse:collapse;margin:1rem 0;font-size:.85rem;display:block;overflow-x:auto}
-td{white-space:nowrap}
-td,th{padding:.25rem .6rem;border-bottom:1px solid #d8dee4;text-align:right}
-td:first-child,th:first-child{text-align:left}
-img{max-width:100%}
-"""
-
-
-@dataclass(frozen=True)
-class Section:
-    """A heading, paragraphs, tables of (head, rows), and the path of a picture."""
-
-    title: str
-    text: list[str]
-    tables: list[Table] = field(default_factory=list)
-    picture: str | None = None
 
 
 def write(report: Report, folder: Path) -> None:
@@ -38,25 +16,10 @@ def write(report: Report, folder: Path) -> None:
     Raises:
         OSError: the folder cannot be written.
     """
-    for name, picture in plots.draw(report).items():
-        write_atomic(folder / PICTURES / name, picture)
+    pictures = {f"{PICTURES}/{name}": picture for name, picture in plots.draw(report).items()}
+    title = "How accurate, how fast"
     sections = _sections(report)
-    write_atomic(folder / "report.json", json.dumps(report, indent=1).encode() + b"\n")
-    write_atomic(folder / "accuracy.md", markdown(sections, "How accurate, how fast").encode())
-    write_atomic(folder / "report.html", to_html(sections, "How accurate, how fast").encode())
-
-
-def write_sections(
-    sections: list[Section], title: str, folder: Path, name: str, document: Report
-) -> None:
-    """Write NAME.json, NAME.html and NAME.md.
-
-    Raises:
-        OSError: the folder cannot be written.
-    """
-    write_atomic(folder / f"{name}.json", json.dumps(document, indent=1).encode() + b"\n")
-    write_atomic(folder / f"{name}.md", markdown(sections, title).encode())
-    write_atomic(folder / f"{name}.html", to_html(sections, title).encode())
+    write_document(sections, title, report, folder, "report", pictures, markdown_name="accuracy")
 
 
 def real_skin(document: Report) -> Section:
@@ -123,50 +86,6 @@ def remarks_on_real(document: Report) -> list[str]:
             f"{grasps['touches']} touches begin, {grasps['early']} of them early."
         )
     return lines
-
-
-def markdown(sections: list[Section], title: str) -> str:
-    """The sections as Markdown."""
-    lines = [f"# {title}", ""]
-    for section in sections:
-        lines += [f"## {section.title}", ""]
-        for paragraph in section.text:
-            lines += [paragraph, ""]
-        for head, rows in section.tables:
-            lines.append("| " + " | ".join(head) + " |")
-            lines.append("|" + "---|" * len(head))
-            lines += ["| " + " | ".join(row) + " |" for row in rows]
-            lines.append("")
-        if section.picture:
-            lines += [f"![{section.title}]({section.picture})", ""]
-    return "\n".join(lines)
-
-
-def to_html(sections: list[Section], title: str) -> str:
-    """The sections as a page of HTML; pictures lie beside it."""
-    name = html.escape(title)
-    parts = [
-        f"<!doctype html><html lang=en><meta charset=utf-8><title>{name}</title>",
-        "<meta name=viewport content='width=device-width,initial-scale=1'>",
-        f"<style>{STYLE}</style><h1>{name}</h1>",
-    ]
-    for section in sections:
-        parts.append(f"<h2>{html.escape(section.title)}</h2>")
-        parts += [f"<p>{_code(html.escape(paragraph))}</p>" for paragraph in section.text]
-        for head, rows in section.tables:
-            parts.append("<table><tr>" + "".join(f"<th>{html.escape(h)}</th>" for h in head))
-            parts += [
-                "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) for row in rows
-            ]
-            parts.append("</table>")
-        if section.picture:
-            alt = html.escape(section.title)
-            parts.append(f'<p><img src="{section.picture}" alt="{alt}"></p>')
-    return "\n".join(parts)
-
-
-def _code(text: str) -> str:
-    return re.sub("`([^`]+)`", r"<code>\1</code>", text)
 
 
 def _sections(report: Report) -> list[Section]:

@@ -1,9 +1,10 @@
 """The pictures of the report, as PNG files in memory."""
 
-import io
 from typing import Any
 
 import numpy as np
+
+from skin_host.evaluation.document import new_figure, png
 
 Row = dict[str, Any]
 Report = dict[str, Any]
@@ -31,19 +32,8 @@ def draw(report: Report) -> dict[str, bytes]:
 
 
 def _figure(width: float = 7.0, height: float = 3.8) -> tuple[Any, Any]:
-    # The object-oriented interface: no window system, nothing global.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(width, height)
     return figure, figure.add_subplot()
-
-
-def _png(figure: Any) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()
 
 
 def _pareto(report: Report) -> bytes:
@@ -78,7 +68,7 @@ def _pareto(report: Report) -> bytes:
     )
     axes.margins(x=0.1, y=0.15)
     axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    return _png(figure)
+    return png(figure)
 
 
 def _errors(report: Report) -> bytes:
@@ -107,7 +97,7 @@ def _errors(report: Report) -> bytes:
         np.arange(len(places)), [f"{truth} {name}" for truth, name in places], rotation=70
     )
     axes.legend(ncols=len(models), fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.0))
-    return _png(figure)
+    return png(figure)
 
 
 def _cycles(report: Report) -> bytes:
@@ -133,7 +123,7 @@ def _cycles(report: Report) -> bytes:
         title="Does the error grow? Truth F solid, S dashed",
     )
     axes.legend(fontsize=7)
-    return _png(figure)
+    return png(figure)
 
 
 def _touched(report: Report) -> bytes:
@@ -158,7 +148,7 @@ def _touched(report: Report) -> bytes:
         title="Cost against touch; crosses: pressures not wanted",
     )
     axes.legend()
-    return _png(figure)
+    return png(figure)
 
 
 def _false_touches(report: Report) -> bytes:
@@ -180,7 +170,7 @@ def _false_touches(report: Report) -> bytes:
         title="False touches of untouched skin",
     )
     axes.legend()
-    return _png(figure)
+    return png(figure)
 
 
 def _drift(report: Report) -> bytes:
@@ -201,4 +191,4 @@ def _drift(report: Report) -> bytes:
         title="Lag of the baseline behind a steady drift",
     )
     axes.legend()
-    return _png(figure)
+    return png(figure)

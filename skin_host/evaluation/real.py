@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from skin_host.config.settings import Settings
 from skin_host.errors import RequestError
 from skin_host.evaluation import emulated, insole, page, tables
+from skin_host.evaluation.document import as_text, write
 from skin_host.evaluation.goals import goal
 from skin_host.evaluation.insole import Recording
 from skin_host.evaluation.machine import cores, machine
@@ -159,7 +160,7 @@ def run(
         "seconds": round(time.perf_counter() - start_s, 1),
     }
     if output is not None:
-        page.write_sections([page.real_skin(document)], "Real skin", output, "real", document)
+        write([page.real_skin(document)], "Real skin", document, output, "real")
     return document
 
 
@@ -168,7 +169,7 @@ def describe(document: Row) -> str:
     if document["absent"] is not None:
         return f"{document['absent']}: no recordings of real skin here; --recordings names a folder"
     head, rows = tables.real(document)
-    lines = [tables.as_text(head, rows), *page.remarks_on_real(document)]
+    lines = [as_text(head, rows), *page.remarks_on_real(document)]
     return "\n".join([*lines, f"in {document['seconds']} s on {document['machine']['processor']}"])
 
 

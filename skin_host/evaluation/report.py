@@ -18,8 +18,9 @@ import numpy as np
 
 from emulator.probes.viscoelastic import TruthKind
 from skin_host.config.relaxation import MODELS
-from skin_host.evaluation import accuracy, hard_cases, page, real, speed, tables, touching
+from skin_host.evaluation import accuracy, page, real, speed, tables, touching
 from skin_host.evaluation.accuracy import DEFAULT, Plan, Variant
+from skin_host.evaluation.document import as_text
 from skin_host.evaluation.goals import goal
 from skin_host.evaluation.histories import TRUTHS
 from skin_host.evaluation.localization_trials import Case, errors, localizer_for
@@ -118,7 +119,7 @@ def _jobs(quick: bool) -> list[Job]:
             if kind in accuracy.HELD_OUT or scenario == accuracy.FITTED_FOAM
         ]
     jobs += [("long holds", touching.long_hold, case) for case in touching.hold_cases(quick)]
-    jobs += [("hard cases", case, (asked,)) for case, asked in hard_cases.cases(quick)]
+    jobs += [("hard cases", case, (asked,)) for case, asked in touching.hard_cases(quick)]
     jobs += [
         ("false touches", touching.false_touches, (0.02 if quick else 0.25, (2,), (None,), 4, hz))
         for hz in NOISE_HZ
@@ -297,7 +298,7 @@ def select(rows: Iterable[Row], **wanted: Any) -> list[Row]:
 def describe(report: Report) -> str:
     """Real skin, the goals and the summary as text for a terminal."""
     head, rows = tables.summary(report)
-    lines = [real.describe(report["real_skin"]), "", tables.as_text(head, rows), ""]
+    lines = [real.describe(report["real_skin"]), "", as_text(head, rows), ""]
     lines += [f"{line[0]}: {' '.join(line[1:4])}: {line[4]}" for line in tables.goals(report)[1]]
     lines.append(f"in {report['seconds']} s on {report['machine']['processor']}")
     return "\n".join(lines)

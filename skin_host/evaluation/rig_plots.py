@@ -1,7 +1,6 @@
 """Recordings of `skin report --rig` and their pictures, one for each figure of section VI."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 from emulator.probes.bench import NAMED_PADS, PalmRig
 from emulator.probes.experiments import Presses, Scan
 from skin_host.evaluation.cup_grasp import Grasp
+from skin_host.evaluation.document import new_figure, png
 
 Floats = NDArray[np.float64]
 
@@ -47,27 +47,34 @@ class Results:
     grasps: list[Grasp]
 
 
-def plot(results: Results, output: Path) -> list[str]:
-    """Write all pictures; their file names."""
+def draw(results: Results) -> dict[str, bytes]:
+    """Every picture, PNG, by its file name.
+
+    Raises:
+        ImportError: matplotlib is not installed (the extra `plots`).
+    """
     import matplotlib as mpl
 
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    plt.rcParams.update({"axes.spines.top": False, "axes.spines.right": False, "font.size": 9})
-    names = []
-    for name, draw, size in (
-        ("rig_11_12.png", _draw_scans, (10, 4)),
-        ("rig_13_16.png", _draw_presses, (10, 7)),
-        ("rig_17.png", lambda figure, all_: _draw_hold(figure, all_.fig_17, "Fig. 17"), (10, 5)),
-        ("rig_18.png", lambda figure, all_: _draw_hold(figure, all_.fig_18, "Fig. 18"), (10, 5)),
-    ):
-        figure = plt.figure(figsize=size, layout="constrained")
-        draw(figure, results)
-        figure.savefig(output / name, dpi=130)
-        plt.close(figure)
-        names.append(name)
-    return names
+    pictures = {}
+    with mpl.rc_context({"axes.spines.top": False, "axes.spines.right": False, "font.size": 9}):
+        for name, drawn, size in (
+            ("rig_11_12.png", _draw_scans, (10, 4)),
+            ("rig_13_16.png", _draw_presses, (10, 7)),
+            (
+                "rig_17.png",
+                lambda figure, all_: _draw_hold(figure, all_.fig_17, "Fig. 17"),
+                (10, 5),
+            ),
+            (
+                "rig_18.png",
+                lambda figure, all_: _draw_hold(figure, all_.fig_18, "Fig. 18"),
+                (10, 5),
+            ),
+        ):
+            figure = new_figure(*size)
+            drawn(figure, results)
+            pictures[name] = png(figure, 130)
+    return pictures
 
 
 def _draw_scans(figure: Any, results: Results) -> None:

@@ -22,7 +22,8 @@ from skin_host.config.relaxation import FITTED
 from skin_host.demo import configuration
 from skin_host.evaluation.cup_grasp import Grasp
 from skin_host.evaluation.cup_grasp import run as grasp_cups
-from skin_host.evaluation.rig_plots import Corrected, Results, plot
+from skin_host.evaluation.document import Section, Table, as_text, write
+from skin_host.evaluation.rig_plots import Corrected, Results, draw
 from skin_host.processing.fitting.hold import fit, merge
 from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.relaxation import make_model
@@ -31,6 +32,12 @@ Row = dict[str, Any]
 Floats = NDArray[np.float64]
 
 PRESS_KPA = 155.0
+_FIGURES = {
+    "rig_11_12.png": "Figures 11 and 12",
+    "rig_13_16.png": "Figures 13 to 16",
+    "rig_17.png": "Figure 17",
+    "rig_18.png": "Figure 18",
+}
 #: Fig. 17: one hour at about 65 kPa and 75 minutes of rest.
 HOUR_DEPTH_MM = 1.05
 HOUR: list[tuple[float, float]] = [(HOUR_DEPTH_MM, 3600.0), (0.0, 4500.0)]
@@ -44,19 +51,16 @@ def run(*, quick: bool = False, output: Path | None = None) -> list[Row]:
 
     Args:
         quick: a coarser map, Figs. 17 and 18 at a tenth of their length, one grasp.
-        output: folder for PNG files and `rig.md`; needs matplotlib.
+        output: folder for rig.md, rig.html, rig.json and the pictures; needs matplotlib.
     """
     results = measure(quick=quick)
     rows = facts(results)
     if output is not None:
-        from skin_host.files import write_atomic
-
-        output.mkdir(parents=True, exist_ok=True)
-        names = plot(results, output)
-        page = "\n".join(
-            ["# The paper's test rig", "", _table(rows), ""] + [f"![]({name})" for name in names]
-        )
-        write_atomic(output / "rig.md", page.encode())
+        pictures = draw(results)
+        sections = [Section("The facts", [], [_table(rows)])]
+        sections += [Section(_FIGURES[name], [], picture=name) for name in pictures]
+        document = {"facts": rows}
+        write(sections, "The paper's test rig", document, output, "rig", pictures)
     return rows
 
 
@@ -342,14 +346,19 @@ def _row(
 
 def describe(rows: list[Row]) -> str:
     """The rows as text."""
-    return _table(rows)
+    return as_text(*_table(rows))
 
 
-def _table(rows: list[Row]) -> str:
-    lines = ["| Fig. | fact | paper | emulated | unit | agrees |", "|---|---|---|---|---|---|"]
-    lines += [
-        f"| {row['figure']} | {row['fact']} | {row['paper']} | {row['ours']:.4g} | {row['unit']} | "
-        f"{'yes' if row['agrees'] else 'NO'} |"
+def _table(rows: list[Row]) -> Table:
+    head = ["fig.", "fact", "paper", "emulated", "unit", "agrees"]
+    return head, [
+        [
+            row["figure"],
+            row["fact"],
+            str(row["paper"]),
+            f"{row['ours']:.4g}",
+            row["unit"],
+            "yes" if row["agrees"] else "NO",
+        ]
         for row in rows
     ]
-    return "\n".join(lines)

@@ -14,6 +14,7 @@ from skin_host.evaluation.accuracy import (
     VARIANTS,
     Variant,
 )
+from skin_host.evaluation.document import Table
 from skin_host.evaluation.histories import HISTORIES
 
 #: RMSE of a pad over a recording, then over usable pads; RMS of the mean over usable pads.
@@ -21,7 +22,6 @@ ERRORS_KPA = ("median_rmse_kpa", "p95_rmse_kpa", "skin_rms_kpa")
 
 Row = dict[str, Any]
 Report = dict[str, Any]
-Table = tuple[list[str], list[list[str]]]
 
 IN_COMMON = {"law": "its law", "cause": "a cause", "none": "nothing"}
 
@@ -73,18 +73,6 @@ def published(document: Report) -> Table:
         for row in document["published"]
     ]
     return ["method", "recording", "pads", "median kPa", "95 % kPa", "source"], rows
-
-
-def as_text(head: list[str], rows: list[list[str]]) -> str:
-    """A table for a terminal: a line for each row, columns as wide as they need."""
-    widths = [max(len(cells[column]) for cells in [head, *rows]) for column in range(len(head))]
-    return "\n".join(
-        "  ".join(
-            cell.ljust(width) if column == 0 else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(cells, widths, strict=True))
-        )
-        for cells in [head, *rows]
-    )
 
 
 def _number(value: float | None, form: str) -> str:
@@ -294,16 +282,15 @@ def pipeline(report: Report) -> Table:
 
 def own_curves(report: Report) -> Table:
     """Cost of the whole pipeline with curves of the pads' own."""
-    rows = [
-        [
-            row["curve"],
-            f"{row['taxels']:,}",
-            f"{row['touched']:,}",
-            f"{row['ns_per_taxel_step']:.2f}",
-        ]
-        for row in report["own_curves"]
-    ]
-    return ["pressure by", "taxels", "touched", "ns per taxel-step"], rows
+    return _by_columns(
+        report["own_curves"],
+        {
+            "pressure by": ("curve", ""),
+            "taxels": ("taxels", ","),
+            "touched": ("touched", ","),
+            "ns per taxel-step": ("ns_per_taxel_step", ".2f"),
+        },
+    )
 
 
 def false_touches(report: Report) -> Table:
@@ -323,48 +310,43 @@ def false_touches(report: Report) -> Table:
 
 def measured_noise(report: Report) -> Table:
     """False touches with noise as it was measured on real skin, by rate."""
-    rows = [
-        [
-            f"{row['hz']:g}",
-            f"{row['touches_per_taxel_hour']:.3g}",
-            f"{row['samples_per_taxel_hour']:.3g}",
-            f"{row['usable_share']:.1%}",
-            f"{row['taxel_hours']:.0f}",
-        ]
-        for row in report["false_touches"]
-        if row["noise_units"] is None
-    ]
-    head = ["sweeps a second", "touches begun per taxel-hour", "touched samples per taxel-hour"]
-    return [*head, "usable taxels", "taxel-hours"], rows
+    return _by_columns(
+        [row for row in report["false_touches"] if row["noise_units"] is None],
+        {
+            "sweeps a second": ("hz", "g"),
+            "touches begun per taxel-hour": ("touches_per_taxel_hour", ".3g"),
+            "touched samples per taxel-hour": ("samples_per_taxel_hour", ".3g"),
+            "usable taxels": ("usable_share", ".1%"),
+            "taxel-hours": ("taxel_hours", ".0f"),
+        },
+    )
 
 
 def detection(report: Report) -> Table:
     """Delays against the height of a press."""
-    rows = [
-        [
-            f"{row['height_units']:g}",
-            f"{row['height_kpa']:.1f}",
-            f"{row['told_within_2_s']:.2f}",
-            "" if row["median_sweeps"] is None else f"{row['median_sweeps']:g}",
-            "" if row["p95_sweeps"] is None else f"{row['p95_sweeps']:g}",
-        ]
-        for row in report["detection"]
-    ]
-    return ["units", "kPa", "reported within 2 s", "median sweeps", "95 % within sweeps"], rows
+    return _by_columns(
+        report["detection"],
+        {
+            "units": ("height_units", "g"),
+            "kPa": ("height_kpa", ".1f"),
+            "reported within 2 s": ("told_within_2_s", ".2f"),
+            "median sweeps": ("median_sweeps", "g"),
+            "95 % within sweeps": ("p95_sweeps", "g"),
+        },
+    )
 
 
 def drift(report: Report) -> Table:
     """Lag of the baselines against the rate of drift."""
-    rows = [
-        [
-            row["rule"],
-            f"{row['rate_units_per_s']:g}",
-            f"{row['lag_units']:.2f}",
-            f"{row['touched_share']:.2g}",
-        ]
-        for row in report["drift"]
-    ]
-    return ["rule", "units per s", "lag, units", "share reported as touched"], rows
+    return _by_columns(
+        report["drift"],
+        {
+            "rule": ("rule", ""),
+            "units per s": ("rate_units_per_s", "g"),
+            "lag, units": ("lag_units", ".2f"),
+            "share reported as touched": ("touched_share", ".2g"),
+        },
+    )
 
 
 def holds(report: Report) -> Table:
@@ -397,11 +379,15 @@ def holds(report: Report) -> Table:
 
 def localization(report: Report) -> Table:
     """Errors of place against the size of the probe."""
-    rows = [
-        [row["method"], f"{row['probe_mm']:g}", f"{row['rms_mm']:.2f}", f"{row['p95_mm']:.2f}"]
-        for row in report["localization"]
-    ]
-    return ["method", "probe mm", "RMS mm", "95 % within mm"], rows
+    return _by_columns(
+        report["localization"],
+        {
+            "method": ("method", ""),
+            "probe mm": ("probe_mm", "g"),
+            "RMS mm": ("rms_mm", ".2f"),
+            "95 % within mm": ("p95_mm", ".2f"),
+        },
+    )
 
 
 def fits(report: Report) -> Table:
@@ -425,6 +411,14 @@ def fits(report: Report) -> Table:
     ]
     head = ["model", "truth", "RMS hold / rest", "beta", "tau s", "beta unload", "tau unload s"]
     return [*head, "not known"], rows
+
+
+def _by_columns(rows: list[Row], columns: dict[str, tuple[str, str]]) -> Table:
+    """A line for each row: under each heading a key's value in a format, nothing for None."""
+    return list(columns), [
+        ["" if row[key] is None else format(row[key], form) for key, form in columns.values()]
+        for row in rows
+    ]
 
 
 def _states(update_s: float) -> str:

@@ -9,7 +9,6 @@ import pytest
 from skin_host.evaluation import (
     accuracy,
     bench_processing,
-    hard_cases,
     page,
     report,
     speed,
@@ -48,7 +47,7 @@ def small():
         "holds": [
             touching.long_hold("F", "short", 600.0, 0.0, 5.0, alone) for alone in (False, True)
         ],
-        "hard_cases": hard_cases.negative(2.0),
+        "hard_cases": touching.negative(2.0),
         "localization": report._localization(20),
         "real_skin": {"absent": "nowhere", "real": [], "published": [], "grasps": None},
         "seconds": 1.0,
@@ -243,10 +242,10 @@ def test_the_rig_has_the_noise_of_real_skin_if_asked():
 @pytest.mark.parametrize(
     ("case", "asked"),
     [
-        (hard_cases.renewal, 20.0),
-        (hard_cases.silence, 5.0),
-        (hard_cases.fast_drift, 0.2),
-        (hard_cases.absorbed_load, 1.0),
+        (touching.renewal, 20.0),
+        (touching.silence, 5.0),
+        (touching.fast_drift, 0.2),
+        (touching.absorbed_load, 1.0),
     ],
 )
 def test_a_hard_case_comes_to_figures_with_their_goals(case, asked):

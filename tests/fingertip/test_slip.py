@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from skin_host.evaluation.papers.slip_trials import DETECTORS, false_alarms_per_hour, slip_trials
+from skin_host.evaluation.papers.grasp_loops import DETECTORS, false_alarms_per_hour, slip_trials
 from skin_host.fingertip.slip import RatioDrop, ShearRate, friction_used
 
 

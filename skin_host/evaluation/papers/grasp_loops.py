@@ -1,12 +1,16 @@
-"""Closed loops of fingers and emulated objects: a held object, and a bottle's cap."""
+"""Closed loops of fingers and emulated objects, and slips found in them (Ohka et al.).
 
-from dataclasses import dataclass
+A held object under a rising load; a bottle's cap that two round fingertips close, whose contacts
+stick and slip as in `emulator.probes.held_objects`; how soon a slip is found, and how often one is
+reported for nothing. Lengths in mm, forces in N, time in s.
+"""
+
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.probes.held_objects import Friction, HeldObjects
-from skin_host.evaluation.papers.cap import Cap, CapWorld
+from emulator.probes.held_objects import Friction, HeldObjects, StickSlip
 from skin_host.evaluation.papers.three_axis import (
     ThreeAxisSensor,
     dome,
@@ -16,15 +20,123 @@ from skin_host.evaluation.papers.three_axis import (
 )
 from skin_host.evaluation.papers.truth import OpticalDome
 from skin_host.fingertip.grasp import FingerFlags, Flags, GraspEvent, Thresholds, finger_velocity
-from skin_host.fingertip.slip import ShearRate
+from skin_host.fingertip.slip import RatioDrop, ShearRate, friction_used
 
 Floats = NDArray[np.float64]
+
 
 #: Force sensors are read at the servo rate of Son et al., cameras at a video rate.
 FORCE_HZ = 300.0
 CAMERA_HZ = 30.0
 #: 0.4 units of the skin are this much force on one of its pads: 2.345 kPa times 13.9 mm2.
 NOISE_N = 0.4 * 2.345e-3 * np.pi * 2.1**2
+#: Thresholds under test: rate of the shear force, and safe share of known friction.
+SHEAR_RATE_N_S = 6.0
+SAFE_SHARE = 0.8
+DETECTORS = ("shear rate", "ratio drop", "known friction")
+
+
+@dataclass
+class Cap:
+    """A bottle's cap about the origin: it turns lightly until it is closed, then hard.
+
+    Torques in N mm.
+    """
+
+    radius_mm: float = 14.0
+    closes_at_rad: float = 0.8
+    light_nmm: float = 2.0
+    stiffness_nmm_rad: float = 120.0
+    damping_nmm_s: float = 4.0
+    angle_rad: float = 0.0
+
+    @property
+    def resistance_nmm(self) -> float:
+        """Torque that it takes to close the cap further."""
+        return self.light_nmm + self.stiffness_nmm_rad * max(
+            self.angle_rad - self.closes_at_rad, 0.0
+        )
+
+    def turn(self, torque_nmm: float, dt_s: float) -> float:
+        """Turn under a torque for a short time; return the speed, rad/s. The thread holds."""
+        excess = abs(torque_nmm) - (self.resistance_nmm if torque_nmm > 0 else self.light_nmm)
+        if excess <= 0.0 or (torque_nmm < 0.0 and self.angle_rad > self.closes_at_rad):
+            return 0.0
+        speed = float(np.sign(torque_nmm)) * excess / self.damping_nmm_s
+        self.angle_rad += speed * dt_s
+        return speed
+
+
+@dataclass
+class CapWorld:
+    """Two round fingertips in the plane of a cap between them.
+
+    Attributes:
+        cap: between the fingers.
+        tip_mm: float64[2, 2], centres of the fingertips.
+        normal_n: float64[2], force of each fingertip on the cap along the contact normal.
+        shear_n: float64[2], tangential force of each fingertip on the cap, positive when it
+            closes the cap.
+        outward: float64[2, 2], unit vectors from the cap's axis to the fingertips.
+    """
+
+    cap: Cap = field(default_factory=Cap)
+    friction: Friction = field(default_factory=Friction)
+    tip_radius_mm: float = 20.0
+    stiffness_n_mm: float = 2.0
+    dt_s: float = 1 / 3000
+    tip_mm: Floats = field(default_factory=lambda: np.array([[37.0, -5.0], [-37.0, 5.0]]))
+    normal_n: Floats = field(default_factory=lambda: np.zeros(2))
+    shear_n: Floats = field(default_factory=lambda: np.zeros(2))
+    outward: Floats = field(default_factory=lambda: np.zeros((2, 2)))
+
+    def __post_init__(self) -> None:
+        self._contact = StickSlip(2, self.friction)
+        self._spin = 0.0
+
+    @property
+    def slipped_mm(self) -> Floats:
+        """float64[2], how far each fingertip has slid over the cap."""
+        return self._contact.slipped_mm
+
+    def advance(self, velocity_mm_s: Floats, dt_s: float) -> None:
+        """Move the fingertips with velocities float64[2, 2] for a while."""
+        for _ in range(max(1, round(dt_s / self.dt_s))):
+            self.tip_mm = self.tip_mm + velocity_mm_s * self.dt_s
+            distance = np.linalg.norm(self.tip_mm, axis=1)
+            self.outward = self.tip_mm / distance[:, None]
+            deep = self.cap.radius_mm + self.tip_radius_mm - distance
+            self.normal_n = self.stiffness_n_mm * np.maximum(deep, 0.0)
+            around = np.stack([-self.outward[:, 1], self.outward[:, 0]], axis=1)
+            # The fingertip does not roll: its surface moves as its centre does.
+            sliding = (velocity_mm_s * around).sum(axis=1) - self._spin * self.cap.radius_mm
+            self.shear_n = self._contact.step(sliding[:, None], self.normal_n, self.dt_s)[:, 0]
+            torque = float(self.shear_n.sum()) * self.cap.radius_mm
+            self._spin = self.cap.turn(torque, self.dt_s)
+
+    def element_forces(self, finger: int, normals: Floats, south: Floats, east: Floats) -> Floats:
+        """Forces on the elements of a dome, float64[n, 3]: south, east and normal, N.
+
+        The contact's load spreads over the elements around it. Fingertips are mounted with
+        their vertex (z of the dome) towards the cap and the dome's x along the way that
+        closes the cap.
+
+        Args:
+            finger: 0 or 1.
+            normals, south, east: float64[n, 3], axes of the elements.
+        """
+        vertex = np.array([-1.0, 0.0]) if finger == 0 else np.array([1.0, 0.0])
+        closing = np.array([0.0, 1.0]) if finger == 0 else np.array([0.0, -1.0])
+        inward = -self.outward[finger]
+        contact = np.array([inward @ closing, 0.0, inward @ vertex])
+        around = np.stack([-self.outward[finger, 1], self.outward[finger, 0]])
+        push = -self.normal_n[finger] * inward  # of the cap on the fingertip
+        drag = -self.shear_n[finger] * around
+        total = push + drag
+        force = np.array([total @ closing, 0.0, total @ vertex])
+        near = np.exp(-0.5 * (np.arccos(np.clip(normals @ contact, -1, 1)) / 0.2) ** 2)
+        share = near / near.sum()
+        return np.stack([share * (axes @ force) for axes in (south, east, normals)], axis=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,3 +321,107 @@ def _in_the_plane(normals: Floats, vertex: Floats, closing: Floats) -> Floats:
     """Normals of the elements in the plane of the cap: z is towards it, x closes it."""
     flat: Floats = normals[:, 2:] * vertex + normals[:, :1] * closing
     return flat
+
+
+@dataclass(frozen=True, slots=True)
+class SlipTrials:
+    """Slid way, and time since the object began to move, when each detector spoke.
+
+    One row a detector of `DETECTORS`, one column a trial; infinite where it stayed silent,
+    negative times where it spoke before.
+    """
+
+    slipped_mm: Floats
+    delay_s: Floats
+
+
+class _Detectors:
+    """The three detectors over n contacts; `step` gives bool[3, n]."""
+
+    def __init__(self, n: int, friction: float) -> None:
+        self._rate = ShearRate(n, FORCE_HZ)
+        self._drop = RatioDrop(n, force_sd_n=NOISE_N)
+        self._friction = friction
+
+    def step(self, normal_n: Floats, shear_n: Floats) -> NDArray[np.bool_]:
+        return np.stack(
+            [
+                self._rate.step(shear_n) > SHEAR_RATE_N_S,
+                self._drop.step(normal_n, shear_n),
+                friction_used(normal_n, shear_n, self._friction) > SAFE_SHARE,
+            ]
+        )
+
+
+def slip_trials(
+    rng: np.random.Generator,
+    n: int = 200,
+    *,
+    noise_n: float = NOISE_N,
+    sliding_share: float = 0.85,
+) -> SlipTrials:
+    """Let n objects slip under a rising load, with various grips and rates.
+
+    Static friction is 0.6, and all begin well within their limit.
+
+    Args:
+        rng: of grips, loads and noise.
+        n: objects.
+        noise_n: of each force reading.
+        sliding_share: sliding over static friction. Near 1 a slip leaves hardly a trace in
+            the forces.
+    """
+    law = Friction(static=0.6, sliding=0.6 * sliding_share)
+    objects = HeldObjects(n, law)
+    grip = rng.uniform(2.0, 8.0, n)
+    rate = rng.uniform(0.3, 2.0, n)
+    start = 0.5 * law.static * grip
+    detectors = _Detectors(n, law.static)
+    slipped = np.full((3, n), np.inf)
+    spoke_s = np.full((3, n), np.inf)
+    began_s = np.full(n, np.inf)
+    # The load is laid on gently, then rises until every object is well under way.
+    seconds = 2.5 + float(((0.62 * grip - start) / rate).max())
+    for i in range(int(seconds * FORCE_HZ)):
+        t = i / FORCE_HZ
+        laid_on = 0.5 - 0.5 * np.cos(np.pi * min(t / 2.0, 1.0))
+        load = start * laid_on + rate * max(t - 2.0, 0.0)
+        shear = objects.advance(load, grip, 1 / FORCE_HZ)
+        began_s[(objects.slipped_mm > 0.0) & np.isinf(began_s)] = t
+        seen = np.zeros((n, 2))
+        seen[:, 0] = shear
+        seen += noise_n * rng.normal(size=(n, 2))
+        cries = detectors.step(grip + noise_n * rng.normal(size=n), seen)
+        new = cries & np.isinf(spoke_s)
+        slipped[new] = np.broadcast_to(objects.slipped_mm, new.shape)[new]
+        spoke_s[new] = t
+    return SlipTrials(slipped, spoke_s - began_s)
+
+
+def false_alarms_per_hour(
+    rng: np.random.Generator, hours: float = 1.0, *, noise_n: float = NOISE_N, contacts: int = 200
+) -> Floats:
+    """False alarms per contact and hour of holding, float64[3], one a detector.
+
+    Objects of various weights are carried about: grip and shear sway by 10 % within
+    seconds, and nothing slips. A train of cries within 0.1 s is one alarm.
+    """
+    n = int(3600.0 * hours * FORCE_HZ / contacts)
+    grip, share = rng.uniform(2.0, 8.0, contacts), rng.uniform(0.3, 0.6, contacts)
+    phase = rng.uniform(0.0, 2.0 * np.pi, (3, contacts))
+    speed = 2.0 * np.pi * rng.uniform(0.2, 1.0, (3, contacts))
+    detectors = _Detectors(contacts, 0.6)
+    last = np.full((3, contacts), -np.inf)
+    alarms = np.zeros(3)
+    for i in range(n):
+        t = i / FORCE_HZ
+        sway = 0.1 * np.sin(speed * t + phase)
+        normal = grip * (1.0 + sway[0])
+        shear = (0.6 * share * grip)[:, None] * np.stack([1.0 + sway[1], 0.5 * sway[2]], axis=1)
+        cries = detectors.step(
+            normal + noise_n * rng.normal(size=contacts),
+            shear + noise_n * rng.normal(size=shear.shape),
+        )
+        alarms += (cries & (t - last > 0.1)).sum(axis=1)
+        last[cries] = t
+    return alarms / (n * contacts / FORCE_HZ / 3600.0)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from skin_host.evaluation.papers.cap import Cap, CapWorld
+from skin_host.evaluation.papers.grasp_loops import Cap, CapWorld
 
 
 def test_a_cap_turns_lightly_until_it_is_closed_and_does_not_spring_back():

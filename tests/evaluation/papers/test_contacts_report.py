@@ -11,8 +11,7 @@ from skin_host.evaluation.localization_trials import (
     localizer_for,
     separation,
 )
-from skin_host.evaluation.papers import contacts_page
-from skin_host.evaluation.papers.contacts_report import SCHEMA, Plan, describe, measure
+from skin_host.evaluation.papers.contacts_report import SCHEMA, Plan, describe, measure, write_page
 
 
 @pytest.mark.parametrize(("probe_mm", "limit_mm"), [(10.0, 0.3), (6.0, 0.8)])
@@ -80,7 +79,7 @@ def test_intrinsic_errors_fall_as_the_force_grows_and_are_foreseen(report):
 def test_page_pictures_and_numbers_are_written(report, tmp_path):
     folder = tmp_path / "new"
     document = {"schema": SCHEMA, "quick": True, "seconds": 1.0, "tables": report}
-    contacts_page.write(document, folder)
+    write_page(document, folder)
     assert json.loads((folder / "contacts.json").read_bytes()) == document
     page = (folder / "contacts.html").read_text()
     pictures = sorted(folder.glob("*.png"))

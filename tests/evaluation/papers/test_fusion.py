@@ -3,10 +3,18 @@ import pytest
 
 from skin_host.errors import CalibrationError
 from skin_host.evaluation.papers.array import strip_array
-from skin_host.evaluation.papers.fingertip_trials import SINGLE_METHODS, Fingertip, rms, task_errors
+from skin_host.evaluation.papers.fingertip_trials import (
+    RADIUS_MM,
+    RATE_HZ,
+    SINGLE_METHODS,
+    TASKS,
+    Fingertip,
+    make_task,
+    rms,
+    task_errors,
+)
 from skin_host.evaluation.papers.fusion import calibrate_fusion, shear_ratio
 from skin_host.evaluation.papers.planar import contact_angle
-from skin_host.evaluation.papers.tasks import RADIUS_MM, RATE_HZ, TASKS, make_task
 from skin_host.evaluation.papers.truth import planar_load
 
 AROUND = strip_array().around_mm

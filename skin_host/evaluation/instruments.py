@@ -1,13 +1,16 @@
-"""Which room of a running program takes the CPU.
+"""Which room of a running program takes the CPU, and what wakes its event loop how often.
 
 A timer on the process's own CPU time interrupts it some hundred times a second; each time the
 innermost function of this project, or of its MQTT libraries, names the room. It costs nothing
 between two samples, unlike a profiler that is called at each function.
 """
 
+import asyncio
+import selectors
 import signal
 from collections import Counter
 from types import FrameType
+from typing import Any
 
 #: Rooms by the beginning of a module's name; the first that fits counts.
 ROOMS = {
@@ -34,6 +37,16 @@ ROOMS = {
 }
 #: The event loop itself, and everything that runs outside of these rooms.
 LOOP = "loop"
+#: Causes by the beginning of the module whose function is called; the first that fits counts.
+_CAUSES = {
+    "skin_host.bus": "plan",
+    "skin_host.clock": "plan",
+    "skin_host.mqtt": "mqtt",
+    "aiomqtt": "mqtt",
+    "asyncio": "thread",
+}
+#: A timer of the loop itself.
+TIMER = "timer"
 _INTERVAL_S = 0.002
 
 
@@ -78,3 +91,31 @@ def _room_of(module: str) -> str:
         if module.startswith(start):
             return room
     return ""
+
+
+class Wakeups(selectors.DefaultSelector):
+    """A selector that counts how often its loop slept, by what ended the sleep.
+
+    Attributes:
+        counts: sleeps by cause. Turns of the loop between which it did not sleep are not counted.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counts: Counter[str] = Counter()
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        found = super().select(timeout)
+        if timeout != 0:
+            self.counts[_cause(found[0][0].data) if found else TIMER] += 1
+        return found
+
+    def runner(self) -> asyncio.Runner:
+        """Runs coroutines in a loop with this selector."""
+        return asyncio.Runner(loop_factory=lambda: asyncio.SelectorEventLoop(self))
+
+
+def _cause(handles: Any) -> str:
+    callback = next(handle for handle in handles if handle is not None)._callback
+    module = getattr(callback, "__module__", None) or type(callback).__module__
+    return next((cause for start, cause in _CAUSES.items() if module.startswith(start)), module)

@@ -1,0 +1,221 @@
+"""A daemon in a process of its own under the frames of a whole body, measured from inside.
+
+`skin bench daemon` and `skin bench scale` run it beside mosquitto, a subscriber of all frames, one
+of all touches, and senders.
+"""
+
+import asyncio
+import gc
+import logging
+import multiprocessing
+import resource
+import tempfile
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.bus.wire import TAXELS, TRIANGLES
+from skin_host.config.settings import changed
+from skin_host.daemon.daemon import Daemon
+from skin_host.daemon.workers import share_name, share_of
+from skin_host.errors import BrokerError, SkinError
+from skin_host.evaluation.body_stream import Body, send_body
+from skin_host.evaluation.instruments import RoomClock, Wakeups
+from skin_host.evaluation.stand_in import register
+from skin_host.evaluation.touch_listener import listen
+from skin_host.layout import build_layout
+from skin_host.mqtt.broker import find_mosquitto, mosquitto_broker
+
+TOUCHED = ("untouched", "hand", "all")
+
+
+#: A hand of an iCub has about so many triangles.
+HAND_TRIANGLES = 9
+
+
+_CALIBRATION_S = 1.0
+
+
+_PERIODS = 20
+
+
+def scenes(body: Body) -> list[NDArray[np.uint8]]:
+    """Untouched; a hand that rests on the first board; everything touched."""
+    shape = (_PERIODS, body.boards, TRIANGLES, TAXELS)
+    quiet = np.random.default_rng(0).integers(239, 242, shape)
+    depth = 50.0 + 20.0 * np.sin(2 * np.pi * np.arange(_PERIODS) / _PERIODS)
+    pressed = depth.astype(int)[:, None, None]
+    hand, everything = quiet.copy(), quiet.copy()
+    hand[:, 0, : min(HAND_TRIANGLES, body.triangles)] -= pressed
+    everything -= pressed[..., None]
+    return [scene.astype(np.uint8) for scene in (quiet, hand, everything)]
+
+
+def run_daemon(
+    parent: Connection, body: Body, broker_port: int, number: int = 1, shares: int = 1
+) -> None:
+    """Process: `skin run`, measured on the parent's commands.
+
+    Args:
+        parent: sends `begin`, `end` (answered with figures of the time between) and `count`
+            (answered with CAN frames read and dropped since the start).
+        body: whose frames it reads.
+        broker_port: of the broker on this machine.
+        number, shares: this is one of several workers, from 1.
+    """
+    register()
+    logging.disable(logging.WARNING)  # no board of this stream answers commands
+    with tempfile.TemporaryDirectory(prefix="skin-bench-") as state:
+        settings = changed(
+            body.settings(),
+            {
+                "mqtt.host": "127.0.0.1",
+                "mqtt.port": broker_port,
+                "processing.calibration.seconds": _CALIBRATION_S,
+                "service.state_directory": state,
+            },
+        )
+        node = "main"
+        if shares > 1:
+            settings, node = share_of(settings, node, number, shares), share_name(node, number)
+        daemon = Daemon(settings, build_layout(settings, Path()), node)
+        gc.freeze()  # as `skin run` does
+        wakeups = Wakeups()
+        with wakeups.runner() as runner:
+            runner.run(_obey(parent, daemon, wakeups))
+
+
+async def _obey(parent: Connection, daemon: Daemon, wakeups: Wakeups) -> None:
+    rooms = RoomClock()
+    began: list[tuple[float, ...]] = []
+
+    def now() -> tuple[float, ...]:
+        sleeps = resource.getrusage(resource.RUSAGE_SELF).ru_nvcsw
+        dropped = sum(port.counters.dropped for port in daemon.link.ports.values())
+        counters = daemon.publisher.counters
+        skipped = counters.frames_skipped
+        return time.monotonic(), time.process_time(), _waited_s(), sleeps, dropped, skipped
+
+    def order() -> None:
+        wanted = parent.recv()
+        if wanted == "count":
+            counters = [port.counters for port in daemon.link.ports.values()]
+            parent.send((sum(one.frames for one in counters), sum(one.dropped for one in counters)))
+            return
+        if wanted == "begin":
+            began[:] = [now()]
+            wakeups.counts.clear()
+            rooms.begin()
+            return
+        shares = rooms.end()
+        wall_s, cpu_s, waited_s, sleeps, dropped, skipped = (
+            end - begin for end, begin in zip(now(), began[0], strict=True)
+        )
+        causes = {cause: round(n / wall_s, 1) for cause, n in wakeups.counts.most_common()}
+        percent = 100 * cpu_s / wall_s
+        parent.send(
+            {
+                "cpu_percent": round(percent, 2),
+                "by_room": {room: round(share * percent, 2) for room, share in shares.items()},
+                "waited_percent": round(100 * waited_s / wall_s, 2),
+                "wakeups_hz": round(sleeps / wall_s),
+                "wakeups_by_cause_hz": causes,
+                "us_per_wakeup": round(1e6 * cpu_s / max(sleeps, 1)),
+                "frames_dropped": dropped,
+                "messages_skipped": skipped,
+            }
+        )
+
+    asyncio.get_running_loop().add_reader(parent.fileno(), order)
+    await daemon.run(asyncio.Event(), calibrate=True)
+
+
+def _waited_s() -> float:
+    """How long this thread was ready to run without a core."""
+    return int(Path("/proc/self/schedstat").read_text().split()[1]) * 1e-9
+
+
+@asynccontextmanager
+async def broker_with_subscriber() -> AsyncIterator[int]:
+    """Mosquitto with one subscriber on all frames; the port."""
+    program = find_mosquitto()
+    if program is None:
+        raise BrokerError("mosquitto is not installed; `apt install mosquitto`")
+    async with mosquitto_broker(program) as broker:
+        command = ["mosquitto_sub", "-p", str(broker.port), "-t", "skin/bench/+/frame"]
+        try:
+            subscriber = await asyncio.create_subprocess_exec(
+                *command, stdout=asyncio.subprocess.DEVNULL
+            )
+        except FileNotFoundError:
+            raise BrokerError(
+                "mosquitto_sub is not installed; `apt install mosquitto-clients`"
+            ) from None
+        try:
+            yield broker.port
+        finally:
+            subscriber.terminate()
+            await subscriber.wait()
+
+
+class Running(NamedTuple):
+    """What runs: the broker's port, and the parent's end to each process."""
+
+    port: int
+    listener: Connection
+    daemons: list[Connection]
+    senders: list[Connection]
+
+
+@asynccontextmanager
+async def running(
+    body: Body, shown: int, *, daemons: int = 1, senders: int = 1, ready_s: float
+) -> AsyncIterator[Running]:
+    """Broker, subscribers, daemons and senders, each a process; calibrated, and sending.
+
+    Args:
+        body: whose frames are sent.
+        shown: how many of `scenes` the senders know.
+        daemons, senders: how many processes.
+        ready_s: time for all of them to start and calibrate.
+
+    Raises:
+        BrokerError: mosquitto is not installed.
+        SkinError: the daemons did not come up: this computer is too slow, or has no time.
+    """
+    context = multiprocessing.get_context("spawn")
+    async with broker_with_subscriber() as port:
+        listener, listener_child = context.Pipe()
+        daemon_pipes = [context.Pipe() for _ in range(daemons)]
+        sender_pipes = [context.Pipe() for _ in range(senders)]
+        made = scenes(body)[:shown]
+        processes = [context.Process(target=listen, args=(listener_child, port, daemons))]
+        processes += [
+            context.Process(target=run_daemon, args=(child, body, port, number + 1, daemons))
+            for number, (_, child) in enumerate(daemon_pipes)
+        ]
+        processes += [
+            context.Process(target=send_body, args=(child, body, made, number, senders))
+            for number, (_, child) in enumerate(sender_pipes)
+        ]
+        try:
+            for process in processes:
+                process.daemon = True
+                process.start()
+            if not await asyncio.to_thread(listener.poll, ready_s):
+                raise SkinError(f"not calibrated within {ready_s:g} s (daemons: {daemons})")
+            listener.recv()
+            ends = [one for one, _ in sender_pipes]
+            for sender in ends:
+                await asyncio.to_thread(sender.recv)
+            yield Running(port, listener, [one for one, _ in daemon_pipes], ends)
+        finally:
+            for process in processes:
+                process.terminate()
+                process.join()
