@@ -2,6 +2,7 @@
 
 import argparse
 import asyncio
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -48,7 +49,14 @@ def add_commands(commands: Commands) -> None:
     add_broker(view)
     view.add_argument("--host", default="127.0.0.1", help="address to listen on")
     view.add_argument("--port", type=int, default=8080, help="port to listen on")
-    view.add_argument("--read-only", action="store_true", help="no calibrate button")
+    view.add_argument("--read-only", action="store_true", help="pages calibrate and record nothing")
+    view.add_argument(
+        "--recordings",
+        type=Path,
+        default=Path("recordings"),
+        metavar="FOLDER",
+        help="for what is recorded from the page (recordings)",
+    )
     add_log_level(view)
     view.set_defaults(run=_view)
 
@@ -155,7 +163,12 @@ def _view(arguments: argparse.Namespace) -> int:
     async def work() -> None:
         stop = asyncio.Event()
         stop_on_signals(stop)
-        viewer = Viewer(arguments.broker, robot=arguments.robot, commands=not arguments.read_only)
+        viewer = Viewer(
+            arguments.broker,
+            robot=arguments.robot,
+            commands=not arguments.read_only,
+            recordings=arguments.recordings,
+        )
         await viewer.run(
             stop, arguments.host, arguments.port, lambda url: print(f"the page: {url}", flush=True)
         )

@@ -29,6 +29,7 @@ from skin_host.recording.schemas import SCHEMAS
 
 SUFFIX = ".mcap"
 CAN = "can/"
+MARKS = "marks"
 #: Nothing that is worth recording is longer.
 MAX_PAYLOAD = 32 * 1024 * 1024
 MAX_BATCH = 100_000
@@ -132,6 +133,20 @@ class Recorder:
         )
         last_ns = int(batch.t_ns[-1])
         self._add(CAN + channel, "can", last_ns, last_ns, msgspec.json.encode(frames))
+
+    @property
+    def size_bytes(self) -> int:
+        """How large the file is, without what waits to be compressed."""
+        return self._file.tell()
+
+    def mark(self, t_ns: int, text: str) -> None:
+        """Record that somebody marked this moment.
+
+        Raises:
+            SkinError: the disk is full or gone.
+        """
+        mark = {"schema": "skin.mark/1", "t_ns": t_ns, "text": text}
+        self._add(MARKS, "mark", t_ns, t_ns, msgspec.json.encode(mark))
 
     def close(self) -> None:
         """End the recording and give it its name.

@@ -66,6 +66,16 @@ SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
             reason=_about(_STRING, "of an end: released, lost or stopped"),
         ),
     ),
+    "mark": (
+        "skin.mark/1",
+        _object(
+            "skin.mark/1",
+            "A moment that somebody marked",
+            schema=_STRING,
+            t_ns=_INTEGER,
+            text=_STRING,
+        ),
+    ),
     "slip": (
         "skin.slip/1",
         _object(

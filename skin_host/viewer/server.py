@@ -8,13 +8,14 @@ import asyncio
 import contextlib
 import logging
 import os
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from http import HTTPStatus
 from importlib import resources
-from typing import Any, Literal, TypeVar
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
-from msgspec import Struct
+from msgspec import Meta, Struct
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
@@ -24,6 +25,7 @@ from skin_host.client import SkinClient, Stream
 from skin_host.errors import BrokerError, RequestError, SkinError
 from skin_host.mqtt.address import Broker
 from skin_host.viewer.picture import Cursor, Picture
+from skin_host.viewer.recording import MAX_AGO_S, Recording
 
 #: Pages get new messages this often; screens show no more.
 TICK_S = 0.04
@@ -32,6 +34,8 @@ NODES_S = 0.25
 RETRY_S = 2.0
 MAX_PAGES = 32
 MAX_REQUEST_BYTES = 4096
+#: A page's requests that are carried out at a time.
+MAX_WISHES = 8
 #: The longest calibration that a page waits for, and the timeout of other commands.
 COMMAND_S = 120.0
 #: Raw values are requested again before this time ends.
@@ -57,10 +61,17 @@ _log = logging.getLogger(__name__)
 
 
 class _Wish(Struct, forbid_unknown_fields=True):
-    """A request of a page."""
+    """A request of a page.
 
-    do: Literal["calibrate", "raw"]
-    node: str
+    `node` carries out calibrate and raw, `part` limits a calibration. The server itself records;
+    a mark has a text and is so many seconds old.
+    """
+
+    do: Literal["calibrate", "raw", "record", "mark", "stop"]
+    node: str = ""
+    part: str | None = None
+    text: Annotated[str, Meta(max_length=200)] = ""
+    ago_s: Annotated[float, Meta(ge=0.0, le=MAX_AGO_S)] = 0.0
 
 
 class Viewer:
@@ -69,7 +80,8 @@ class Viewer:
     Args:
         broker: URL or `Broker`, see `SkinClient`.
         robot: its name; without one the only robot that the broker knows.
-        commands: whether pages may calibrate and ask for raw values.
+        commands: whether pages may calibrate, ask for raw values, and record.
+        recordings: a folder for recordings that pages ask for.
     """
 
     def __init__(
@@ -78,7 +90,10 @@ class Viewer:
         *,
         robot: str | None = None,
         commands: bool = True,
+        recordings: Path = Path("recordings"),
     ) -> None:
+        self._broker = broker
+        self._recording = Recording(recordings)
         self._new_client: Callable[[], SkinClient] = lambda: SkinClient(broker, robot=robot)
         self._commands = commands
         self._picture = Picture()
@@ -123,6 +138,7 @@ class Viewer:
             finally:
                 listening.cancel()
                 await asyncio.gather(listening, return_exceptions=True)
+                await self._recording.close()
 
     async def run(
         self, stop: asyncio.Event, host: str, port: int, ready: Callable[[str], None]
@@ -159,15 +175,21 @@ class Viewer:
         """Send one page its new messages until it closes, and take its requests."""
         self._pages += 1
         telling = asyncio.create_task(self._tell(page))
+        wishes: set[asyncio.Task[None]] = set()
         try:
             async for message in page:
-                await self._take_wish(page, message)
+                # A mark does not wait for a calibration.
+                wishes.add(wish := asyncio.create_task(self._take_wish(page, message)))
+                wish.add_done_callback(wishes.discard)
+                if len(wishes) >= MAX_WISHES:
+                    await asyncio.wait(wishes, return_when=asyncio.FIRST_COMPLETED)
         except ConnectionClosed:
             pass
         finally:
             self._pages -= 1
-            telling.cancel()
-            await asyncio.gather(telling, return_exceptions=True)
+            for task in (telling, *wishes):
+                task.cancel()
+            await asyncio.gather(telling, *wishes, return_exceptions=True)
 
     async def _tell(self, page: ServerConnection) -> None:
         cursor = Cursor()
@@ -181,21 +203,36 @@ class Viewer:
             await asyncio.sleep(due_s - now_s())
 
     async def _take_wish(self, page: ServerConnection, message: str | bytes) -> None:
+        answer: dict[str, Any] = {"type": "answer"}
         try:
             wish = msgspec.json.decode(message, type=_Wish)
+            answer["do"] = wish.do
             if not self._commands:
                 raise RequestError("commands are switched off; start the page with them allowed")
             if self._client is None:
                 raise BrokerError(self._why)
-            arguments: dict[str, Any] = {"seconds": RAW_LEASE_S} if wish.do == "raw" else {}
-            result = await self._client.command(
-                wish.do, node=wish.node, timeout_s=COMMAND_S, **arguments
-            )
+            answer |= {"ok": True, "result": await self._carry_out(wish, self._client)}
         except (SkinError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-            answer: dict[str, Any] = {"ok": False, "error": str(error)}
-        else:
-            answer = {"ok": True, "do": wish.do, "result": result}
-        await page.send(msgspec.json.encode({"type": "answer"} | answer).decode())
+            answer |= {"ok": False, "error": str(error)}
+        with contextlib.suppress(ConnectionClosed):
+            await page.send(msgspec.json.encode(answer).decode())
+
+    async def _carry_out(self, wish: _Wish, client: SkinClient) -> Mapping[str, Any]:
+        recording = self._recording
+        match wish.do:
+            case "record":
+                broker, base = self._broker, None
+                if isinstance(broker, str):
+                    broker, base = Broker.from_url(broker)
+                return recording.start(broker, base or "skin", client.robot)
+            case "mark":
+                return recording.mark(wish.text, wish.ago_s)
+            case "stop":
+                return await recording.stop()
+        arguments: dict[str, Any] = {"seconds": RAW_LEASE_S} if wish.do == "raw" else {}
+        if wish.part is not None:
+            arguments["part"] = wish.part
+        return await client.command(wish.do, node=wish.node, timeout_s=COMMAND_S, **arguments)
 
     async def _listen(self) -> None:
         """Receive from the robot; look for the broker again whenever it cannot be found."""
@@ -237,6 +274,7 @@ class Viewer:
                 "connected": connected,
                 "error": "" if connected else self._why,
                 "commands": self._commands,
+                "recording": self._recording.state,
             }
         )
 

@@ -81,7 +81,8 @@ class Page:
     async def press(self, key: str) -> None:
         """Press and release a key."""
         for kind in ("keyDown", "keyUp"):
-            text = {"text": key} if len(key) == 1 and kind == "keyDown" else {}
+            typed = "\r" if key == "Enter" else key
+            text = {"text": typed} if len(typed) == 1 and kind == "keyDown" else {}
             await self.call("Input.dispatchKeyEvent", type=kind, key=key, **text)
 
     async def click(self, x: float, y: float) -> None:

@@ -27,6 +27,7 @@ async def viewing(
     view = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "skin_host", "view", "--robot", robot, "--port", "0"),
         *("--broker", f"mqtt://{broker.host}:{broker.port}"),
+        *("--recordings", str(profile.parent / "recordings")),
         cwd=ROOT,
         stdout=asyncio.subprocess.PIPE,
     )

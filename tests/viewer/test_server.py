@@ -1,6 +1,7 @@
 """The page's server: files and a WebSocket, for its own page only."""
 
 import asyncio
+import time
 import urllib.error
 import urllib.request
 from collections.abc import AsyncIterator, Callable, Mapping
@@ -11,6 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import InvalidStatus
 
@@ -18,9 +20,12 @@ from skin_host.client.links import RETAINED_S
 from skin_host.config.settings import Mqtt, load
 from skin_host.errors import RequestError, SkinError
 from skin_host.layout import Layout, build_layout
+from skin_host.mqtt.commands import Handler
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.pipeline import PressureFrame
+from skin_host.recording.mcap import read_messages_of
+from skin_host.viewer import recording as viewer_recording
 from skin_host.viewer import server
 from skin_host.viewer.server import Viewer
 from tests.support.broker import Mosquitto, free_port
@@ -82,9 +87,11 @@ async def answer(name: str, payload: bytes) -> Mapping[str, Any]:
 
 
 @asynccontextmanager
-async def node(broker: Mosquitto, layout: Layout) -> AsyncIterator[Publisher]:
+async def node(
+    broker: Mosquitto, layout: Layout, handler: Handler = answer
+) -> AsyncIterator[Publisher]:
     settings = Mqtt(host=broker.host, port=broker.port)
-    async with Publisher(settings, layout.robot, handler=answer) as publisher:
+    async with Publisher(settings, layout.robot, handler=handler) as publisher:
         publisher.put_info(node_info(layout, "main", version="1", configuration="x"))
         yield publisher
 
@@ -218,6 +225,103 @@ async def test_the_page_may_calibrate(mosquitto: Mosquitto) -> None:
         assert "no raw here" in told["error"]
 
 
+async def test_a_part_alone_is_calibrated(mosquitto: Mosquitto) -> None:
+    broker = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    asked: list[bytes] = []
+
+    async def note(name: str, payload: bytes) -> Mapping[str, Any]:
+        asked.append(payload)
+        return await answer(name, payload)
+
+    async with (
+        node(mosquitto, skin(), note),
+        Viewer(broker, robot="demo").serving(port=0) as url,
+        page(url) as socket,
+    ):
+        await heard(socket, of_type("layout"))
+        await until(lambda: mosquitto.subscriptions("skin/demo/nodes/main/cmd/+"))
+        await socket.send('{"do":"calibrate","node":"main","part":"left_hand"}')
+        assert (await heard(socket, of_type("answer")))["ok"]
+        assert msgspec.json.decode(asked[0])["part"] == "left_hand"
+
+
+def recording_is(wanted: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda m: of_type("status")(m) and wanted(m["recording"])
+
+
+async def test_a_page_records_marks_and_stops(mosquitto: Mosquitto, tmp_path: Path) -> None:
+    layout = skin()
+    broker = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    async with (
+        node(mosquitto, layout) as publisher,
+        Viewer(broker, robot="demo", recordings=tmp_path / "new").serving(port=0) as url,
+        page(url) as socket,
+    ):
+        await heard(socket, of_type("layout"))
+
+        async def wish(**words: Any) -> Any:
+            await socket.send(msgspec.json.encode(words).decode())
+            return await heard(socket, of_type("answer"))
+
+        assert "nothing is being recorded" in (await wish(do="mark"))["error"]
+        assert "nothing is being recorded" in (await wish(do="stop"))["error"]
+        assert (await wish(do="record"))["ok"]
+        assert "already" in (await wish(do="record"))["error"]
+        began = await heard(socket, recording_is(lambda now: now is not None))
+        assert began["recording"]["marks"] == 0
+        before_ns = time.time_ns()
+        assert (await wish(do="mark", text="a <b>knock</b>", ago_s=2.5))["result"] == {"marks": 1}
+        await until(lambda: mosquitto.subscriptions("skin/demo/+/frame") >= 2)
+        publisher.put_frame(pressed(layout, 1))
+        publisher.put_health("left_hand", {"part": "left_hand", "state": "ok"})
+        await heard(socket, of_type("health"))
+        told = (await wish(do="stop"))["result"]
+        await heard(socket, recording_is(lambda now: now is None))
+    assert told["marks"] == 1
+    file = Path(told["file"])
+    assert file.parent == tmp_path / "new"
+    assert [path.name for path in file.parent.iterdir()] == [file.name]
+    topics = {message.topic for message in read_messages_of(file)}
+    assert "skin/demo/nodes/main/info" in topics
+    with file.open("rb") as stream:  # noqa: ASYNC230
+        ((_, _, mark),) = make_reader(stream).iter_messages(topics=["marks"])
+    assert msgspec.json.decode(mark.data)["text"] == "a <b>knock</b>"
+    assert -2.6e9 < mark.log_time - before_ns < PATIENCE_S * 1e9
+
+
+async def test_a_recording_that_becomes_too_long_ends_and_says_so(
+    mosquitto: Mosquitto, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(viewer_recording, "MAX_S", 0.1)
+    broker = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    async with (
+        node(mosquitto, skin()),
+        Viewer(broker, robot="demo", recordings=tmp_path).serving(port=0) as url,
+        page(url) as socket,
+    ):
+        await heard(socket, of_type("layout"))
+        await socket.send('{"do":"record"}')
+        ended = await heard(socket, recording_is(lambda now: now is not None and "ended" in now))
+        assert "min" in ended["recording"]["ended"]
+        assert len(list(tmp_path.glob("*.mcap"))) == 1  # noqa: ASYNC240
+
+
+async def test_a_full_folder_of_recordings_takes_no_more(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    for i in range(100):
+        (tmp_path / f"{i}.mcap").touch()
+    broker = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    async with (
+        node(mosquitto, skin()),
+        Viewer(broker, robot="demo", recordings=tmp_path).serving(port=0) as url,
+        page(url) as socket,
+    ):
+        await heard(socket, of_type("layout"))
+        await socket.send('{"do":"record"}')
+        assert "move some away" in (await heard(socket, of_type("answer")))["error"]
+
+
 async def test_a_page_without_leave_may_not(mosquitto: Mosquitto) -> None:
     broker = f"mqtt://{mosquitto.host}:{mosquitto.port}"
     async with (
@@ -226,9 +330,10 @@ async def test_a_page_without_leave_may_not(mosquitto: Mosquitto) -> None:
         page(url) as socket,
     ):
         assert (await heard(socket, of_type("status")))["commands"] is False
-        await socket.send('{"do":"calibrate","node":"main"}')
-        told = await heard(socket, of_type("answer"))
-        assert "switched off" in told["error"]
+        for do in ("calibrate", "record", "mark", "stop"):
+            await socket.send('{"do":"' + do + '","node":"main"}')
+            told = await heard(socket, of_type("answer"))
+            assert "switched off" in told["error"]
 
 
 @pytest.mark.parametrize(
@@ -259,7 +364,10 @@ async def test_a_wish_for_no_node_costs_neither_page_nor_broker(
     [
         "",
         "{}",
-        '{"do":"stop","node":"main"}',
+        '{"do":"reload","node":"main"}',
+        '{"do":"mark","ago_s":1e9}',
+        '{"do":"mark","text":"' + "x" * 201 + '"}',
+        '{"do":"record","file":"/etc/passwd"}',
         "[1]",
         "\x00",
         b'{"do":"raw","node":"\xff"}',

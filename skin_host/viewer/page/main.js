@@ -19,6 +19,9 @@ let socket = null;
 let link = "connecting";
 let dirty = true;
 let busy = false;
+/** The part whose calibration is going on, null for the whole skin. */
+let calibrating = null;
+let endedSaid = "";
 let notice = null;
 let peaks = [];
 let restored = false;
@@ -76,16 +79,25 @@ function send(wish) {
 
 function answered(message) {
   if (message.do === "raw" && message.ok) return;
-  busy = false;
+  if (!message.do || message.do === "calibrate") busy = false;
   if (!message.ok) {
     say(message.error, 8000);
-    if (map.raw) setRaw(false);
+    if (map.raw && message.do === "raw") setRaw(false);
     return;
   }
-  const counts = Object.entries(message.result.verdicts ?? {}).map(([part, verdicts]) => `${part}: ${Object.entries(verdicts).map(([verdict, n]) => `${n} ${verdict.replaceAll("_", " ")}`).join(", ")}`);
-  const touched = Object.entries(message.result.verdicts ?? {}).filter(([, verdicts]) => verdicts.touched);
+  if (message.do === "record") return say(`Recording to ${message.result.file}`, 4000, "ok");
+  if (message.do === "mark") return say(`Mark ${message.result.marks}`, 2000, "ok");
+  if (message.do === "stop") {
+    const { file, messages, marks, gaps } = message.result;
+    const lost = gaps ? `, the broker was lost ${gaps} times` : "";
+    return say(`Recorded ${messages} messages, ${marks} of them marks${lost}: ${file}`, 10000, gaps ? "warn" : "ok");
+  }
+  // The verdicts are of all parts; those of another calibration are not news.
+  const verdicts = Object.entries(message.result.verdicts ?? {}).filter(([part]) => !calibrating || part === calibrating);
+  const counts = verdicts.map(([part, found]) => `${part}: ${Object.entries(found).map(([verdict, n]) => `${n} ${verdict.replaceAll("_", " ")}`).join(", ")}`);
+  const touched = verdicts.filter(([, found]) => found.touched);
   if (touched.length) {
-    const which = touched.map(([part, verdicts]) => `${verdicts.touched} taxels of ${part}`).join(", ");
+    const which = touched.map(([part, found]) => `${found.touched} taxels of ${part}`).join(", ");
     return say(`Touched while it was calibrated: ${which}. Take away what touches the skin and calibrate again.`, 15000, "warn");
   }
   say(`Calibrated. ${counts.length > 3 ? `${counts.length} parts` : counts.join("; ")}`, 6000, "ok");
@@ -127,16 +139,56 @@ function askRaw() {
 
 setInterval(() => { if (map.raw) askRaw(); }, RAW_AGAIN_MS);
 
-async function calibrate() {
-  if (busy || !mayCommand()) return;
-  const dialog = $("confirm");
+/** Open a dialog; whether it was confirmed. */
+async function asked(dialog) {
   dialog.returnValue = "";
   dialog.showModal();
   await new Promise((done) => dialog.addEventListener("close", done, { once: true }));
-  if (dialog.returnValue !== "yes") return;
+  return dialog.returnValue === "yes";
+}
+
+/** What a calibration from here is of: the part that is shown, or the whole skin. */
+async function calibrate() {
+  if (busy || !mayCommand()) return;
+  const part = store.part(map.shown) && !store.part(map.shown).fingertip ? map.shown : null;
+  put($("confirm-title"), `Calibrate ${part ?? "the whole skin"}?`);
+  put($("confirm-words"), `Leave ${part ?? "the whole skin"} untouched until it is done. The new calibration replaces the old one.`);
+  const nodes = nodesShown();
+  if (!await asked($("confirm"))) return;
   busy = true;
-  say("Calibrating: leave the skin untouched.", 120000, "ok");
-  for (const node of nodesShown()) send({ do: "calibrate", node });
+  calibrating = part;
+  say(`Calibrating: leave ${part ?? "the skin"} untouched.`, 120000, "ok");
+  for (const node of nodes) send(part ? { do: "calibrate", node, part } : { do: "calibrate", node });
+}
+
+function record() {
+  if (!$("record").hidden) send({ do: recording() ? "stop" : "record" });
+}
+
+/** The recording in progress, or nothing. */
+function recording() { return store.status.recording?.seconds === undefined ? null : store.status.recording; }
+
+async function mark() {
+  if (!recording()) return;
+  const began = performance.now();
+  $("note-text").value = "";
+  if (!await asked($("note"))) return;
+  const agoS = Math.min(600, (performance.now() - began) / 1000);
+  send({ do: "mark", text: $("note-text").value.slice(0, 200), ago_s: agoS });
+}
+
+function showRecording() {
+  const now = recording();
+  const button = $("record");
+  button.hidden = !store.status.commands || !store.status.connected && !now;
+  button.setAttribute("aria-pressed", String(Boolean(now)));
+  const minutes = now ? `${Math.floor(now.seconds / 60)}:${String(now.seconds % 60).padStart(2, "0")}` : "";
+  put(button, now ? `stop ${minutes}` : "record");
+  button.title = now ? `${now.file}, ${now.marks} marks: end the recording (o)` : "Record the robot's messages (o)";
+  $("mark").hidden = !now;
+  const ended = store.status.recording?.ended ?? "";
+  if (ended && ended !== endedSaid) say(ended, 15000, "warn");
+  endedSaid = ended;
 }
 
 function choose(found) {
@@ -410,6 +462,7 @@ function frame(nowMs) {
       plottedMs = nowMs;
       showPlots(nowMs);
     }
+    showRecording();
     $("calibrate").hidden = !store.status.commands;
     $("calibrate").disabled = busy || !mayCommand();
     $("show-raw").disabled = !map.raw && !mayCommand();
@@ -505,7 +558,7 @@ const keys = {
   "+": () => zoom(1.25), "=": () => zoom(1.25), "-": () => zoom(0.8), f: () => { map.fit(); dirty = true; },
   ",": () => walk(-1), ".": () => walk(1), Enter: () => choose(map.cursor),
   Escape: () => { map.chosen = []; map.cursor = null; map.selected = null; showChosen(); },
-  p: () => hold(heldMs === null), r: () => setRaw(!map.raw), c: calibrate, t: () => { setTheme(theme() === "dark" ? "light" : "dark"); remember("theme", theme()); },
+  p: () => hold(heldMs === null), r: () => setRaw(!map.raw), c: calibrate, o: record, m: mark, t: () => { setTheme(theme() === "dark" ? "light" : "dark"); remember("theme", theme()); },
   "?": () => $("keys").showModal(),
 };
 
@@ -523,6 +576,9 @@ $("zoom-in").addEventListener("click", () => zoom(1.25));
 $("zoom-out").addEventListener("click", () => zoom(0.8));
 $("zoom-fit").addEventListener("click", keys.f);
 $("calibrate").addEventListener("click", calibrate);
+$("record").addEventListener("click", record);
+$("mark").addEventListener("click", mark);
+$("note-cancel").addEventListener("click", () => $("note").close());
 $("theme").addEventListener("click", keys.t);
 $("pause").addEventListener("click", keys.p);
 $("length").addEventListener("change", () => { remember("length", $("length").value); plottedMs = 0; dirty = true; });

@@ -9,6 +9,7 @@ import pytest
 from skin_host.config.settings import Bus, changed, load
 from skin_host.importing.report import Findings
 from skin_host.importing.run import configuration_text, import_files
+from skin_host.recording.mcap import read_messages_of
 from tests.support.broker import Mosquitto
 from tests.support.devtools import Page
 from tests.support.stack import ROOT, Stack
@@ -261,12 +262,82 @@ async def test_the_skin_can_be_calibrated_from_the_page(robot: Stack, tmp_path: 
         await seen.until(LIVE)
         # The daemon calibrates at its start, and takes one calibration at a time.
         await seen.until("!document.getElementById('calibrate').disabled")
+        # The part that is chosen alone, whose name stands above the question and in the answer.
+        await seen.press("1")
+        await seen.press("c")
+        await seen.until('document.getElementById("confirm").open')
+        title = await seen.run('document.getElementById("confirm-title").textContent')
+        assert title == "Calibrate left_hand?"
+        await seen.run('document.querySelector("#confirm button.do").click()')
+        done = "/^Calibrated. left_hand: [^;]*$|^Touched .* [0-9]+ taxels of left_hand[.]/"
+        await seen.until(f'{done}.test(document.getElementById("banner").textContent)')
+        # And the whole skin.
+        await seen.press("0")
         await seen.run('document.getElementById("calibrate").click()')
         await seen.until('document.getElementById("confirm").open')
+        title = await seen.run('document.getElementById("confirm-title").textContent')
+        assert title == "Calibrate the whole skin?"
         await seen.run('document.querySelector("#confirm button.do").click()')
         # The scene presses on meanwhile, which is told.
-        done = "/^Calibrated|^Touched while it was calibrated/"
+        done = "/^Calibrated. .*left_forearm|^Touched while it was calibrated: /"
         await seen.until(f'{done}.test(document.getElementById("banner").textContent)')
+
+
+RECORD = 'document.getElementById("record").textContent'
+BANNER = 'document.getElementById("banner").textContent'
+
+
+async def centre(seen: Page, selector: str) -> tuple[float, float]:
+    left, top, width, height = await seen.box(selector)
+    return left + width / 2, top + height / 2
+
+
+@pytest.mark.parametrize("by", ["mouse", "touch", "keyboard"])
+async def test_a_recording_is_begun_marked_and_ended_from_the_page(
+    robot: Stack, tmp_path: Path, by: str
+) -> None:
+    start(robot)
+    async with page(robot, tmp_path / "profile", width=400 if by == "touch" else 1280) as seen:
+        await seen.until(LIVE)
+        await seen.call("Emulation.setTouchEmulationEnabled", enabled=by == "touch")
+
+        async def use(button: str, key: str) -> None:
+            if by == "keyboard":
+                await seen.press(key)
+            elif by == "touch":
+                await seen.touch(await centre(seen, f"#{button}"))
+            else:
+                await seen.click(*await centre(seen, f"#{button}"))
+
+        await use("record", "o")
+        await seen.until(f"/^stop 0:0[1-9]/.test({RECORD})")
+        await use("mark", "m")
+        await seen.until('document.getElementById("note").open')
+        await seen.call("Input.insertText", text="a knock, <b>bold</b>")
+        await seen.press("Enter")
+        await seen.until(f"{BANNER} === 'Mark 1'")
+        await use("record", "o")
+        told = f"/^Recorded [0-9]+ messages, 1 of them marks: .*/.exec({BANNER})?.[0]"
+        name = (await seen.until(told)).rpartition("/")[2]
+        await seen.until(f"{RECORD} === 'record'")
+    recorded = list(read_messages_of(tmp_path / "recordings" / name))
+    assert any(message.topic == "skin/demo/left_hand/frame" for message in recorded)
+
+
+async def test_what_is_touched_is_44_pixels_large(robot: Stack, tmp_path: Path) -> None:
+    start(robot)
+    async with page(robot, tmp_path / "profile", width=400) as seen:
+        await seen.until(LIVE)
+        await choose_two(seen)
+        for width in (400, 1280):
+            await seen.resize(width, 800)
+            await seen.call("Emulation.setTouchEmulationEnabled", enabled=True)
+            small = """[...document.querySelectorAll("button, select, summary, tbody tr")]
+                .filter(one => one.checkVisibility())
+                .map(one => [one.id || one.textContent, one.getBoundingClientRect()])
+                .filter(([, box]) => box.width < 44 || box.height < 44).map(([name]) => name)"""
+            await seen.until(f"({CONTACTS}).length")
+            assert await seen.run(small) == []
 
 
 async def test_a_phone_shows_everything_without_scrolling_sideways(
