@@ -5,6 +5,10 @@ order, so the end of a sweep is inferred: a slot (triangle and half) that comes 
 the age of the sweep's first frame starts a new one. A sweep is returned as soon as every awaited
 triangle is complete. A triangle that has been missing for a while is no longer awaited, so that it
 causes no delay, until it sends again.
+
+A board usually sends its frames in the same order. Once that order is known, a run of frames in it
+is recognised by one comparison of bytes and copied as a whole; all other frames are taken one by
+one, with the same result.
 """
 
 from collections import Counter
@@ -15,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.bus.wire import (
+    HEAD_BYTES,
     HEADER_A,
     HEADER_B,
     MAX_STANDARD_ID,
@@ -22,8 +27,10 @@ from skin_host.bus.wire import (
     TAXELS,
     TRIANGLES,
     VALUES_A,
+    Bytes,
     FrameBatch,
     MessageClass,
+    Records,
 )
 from skin_host.layout import BoardLayout
 
@@ -34,10 +41,24 @@ PAUSE_PERIODS = 0.5
 PATIENCE_SWEEPS = 3
 #: Expands a triangle's bit in a mask of triangles to its A and B bits in a mask of halves.
 _BOTH = 1 << TRIANGLES | 1
-#: The bytes of a frame after its header, and of two frames together.
-_NOTHING = bytes(7)
-_TRIANGLE = np.dtype([("raw", np.uint8, TAXELS), ("status", ">u2")])
+#: The bytes of a frame after its header.
+_PAYLOAD = 7
+_NOTHING = bytes(_PAYLOAD)
+_HALF = np.dtype((np.uint8, _PAYLOAD))
+_SWEEP = 2 * TRIANGLES * _PAYLOAD
+_NO_STATUS = bytes(2 * TRIANGLES)
+#: The status words of a sweep without any.
+NO_STATUS = np.zeros(TRIANGLES, np.uint16)
+NO_STATUS.flags.writeable = False
 _SMALLEST_DLC_B = 6
+#: Fewer frames are taken one by one: that costs no more.
+_SHORTEST_RUN = 5
+#: Where a frame's head has its length.
+_DLC_AT = 4
+#: After so many sweeps in another order than the known one, which lost frames cause too, the order
+#: is learnt again, after a pause of so many sweeps.
+_MOST_STRAY_SWEEPS = 4
+_LEARN_AFTER_SWEEPS = 64
 #: Classes of A and of B frames: the stream, the legacy stream, and the class in which a special
 #: firmware sends B frames.
 _CLASSES = {
@@ -110,6 +131,22 @@ class AssemblerCounters:
     missed: int = 0
 
 
+class _Order(NamedTuple):
+    """The order in which a board sends the frames of its sweeps.
+
+    Attributes:
+        heads: of all frames, `HEAD_BYTES` each.
+        places: of each frame, its place among the board's values.
+        rows: the same as an array, or None if they rise from 0 by 1.
+        missing: masks of the halves that are missing before each frame, and after the last.
+    """
+
+    heads: bytes
+    places: list[int]
+    rows: NDArray[np.intp] | None
+    missing: list[int]
+
+
 @dataclass(slots=True)
 class _BoardState:
     """One board's sweep in progress; masks have bits 0-15 for A frames, 16-31 for B frames.
@@ -119,6 +156,12 @@ class _BoardState:
         awaited: halves without which a sweep is not complete.
         missing: halves of `awaited` that have not arrived; 0 between sweeps.
         values: received bytes of each triangle, A and B in turn.
+        order: in which it sends, once that is known.
+        came: (head, place, missing before it) of the frames of a sweep from which it is learnt.
+        done: frames of the sweep that came in this order; the next has the place `expected`, which
+            is -1 while runs are not looked for.
+        stray: sweeps in succession with frames in another order.
+        learn_after: so many sweeps pass before the order is learnt.
     """
 
     index: int
@@ -137,6 +180,12 @@ class _BoardState:
     last_place: int = -1
     values: list[bytes] = field(default_factory=lambda: [_NOTHING] * 2 * TRIANGLES)
     absent_for: list[int] = field(default_factory=lambda: [0] * TRIANGLES)
+    order: _Order | None = None
+    came: list[tuple[bytes, int, int]] | None = None
+    done: int = 0
+    expected: int = -1
+    stray: int = 0
+    learn_after: int = 1
 
 
 class Assembler:
@@ -189,38 +238,56 @@ class Assembler:
         """Process the frames of a batch; this is the only loop over them."""
         # One frame after the other: for the thirty to hundred frames of a read, this costs less
         # than masks and scatters over arrays, and a batch may span several sweeps.
-        self.counters.frames += len(batch)
         sweeps: list[Sweep] = []
         answers: list[tuple[int, bytes]] = []
         motors: list[int] = []
+        n = len(batch)
+        if not n:
+            return Assembled(sweeps, answers)
+        self.counters.frames += n
         slots = self._slots
-        for seconds, nanoseconds, identifier, dlc, header, payload in batch.frames():
-            slot = slots.get(identifier << 8 | header)
-            if slot is None or dlc < 8:
-                if not self._usable(identifier, dlc, header):
-                    message_class = identifier >> 8
-                    if message_class in _ANSWERS:
-                        answers.append((identifier, (bytes((header,)) + payload)[:dlc]))
-                    elif message_class < MessageClass.ANALOG_COMMAND:
-                        motors.append(identifier)
+        records = batch.records()
+        heads = records.octets[:, records.head : records.head + HEAD_BYTES].tobytes()
+        rising = batch.rising
+        at = 0
+        while at < n:
+            left = records.form.iter_unpack(records.octets[at:].data)
+            for seconds, nanoseconds, identifier, dlc, header, payload in left:
+                at += 1
+                slot = slots.get(identifier << 8 | header)
+                if slot is None or dlc < 8:
+                    if not self._usable(identifier, dlc, header):
+                        message_class = identifier >> 8
+                        if message_class in _ANSWERS:
+                            answers.append((identifier, (bytes((header,)) + payload)[:dlc]))
+                        elif message_class < MessageClass.ANALOG_COMMAND:
+                            motors.append(identifier)
+                        continue
+                    assert slot is not None
+                    # Old firmware sends no status; the bytes after the DLC are not defined.
+                    payload = payload[: TAXELS - VALUES_A] + b"\0\0"  # noqa: PLW2901
+                state, place, bit = slot
+                if place == state.expected and rising:
+                    taken = self._take_run(state, records, heads, at - 1, sweeps)
+                    if taken:
+                        at += taken - 1
+                        break
+                t_ns = seconds * NS_PER_S + nanoseconds
+                if place == state.last_place and self._is_doubled(state, bit, payload, t_ns):
                     continue
-                assert slot is not None
-                # Old firmware sends no status; the bytes after the DLC are not defined.
-                payload = payload[: TAXELS - VALUES_A] + b"\0\0"  # noqa: PLW2901
-            t_ns = seconds * NS_PER_S + nanoseconds
-            state, place, bit = slot
-            if place == state.last_place and self._is_doubled(state, bit, payload, t_ns):
-                continue
-            if (bit & state.missing and t_ns <= state.certain_until_ns) or self._belongs(
-                state, bit, t_ns, sweeps
-            ):
-                state.values[place] = payload
-                state.last_place = place
-                state.last_ns = t_ns
-                state.missing ^= bit
-                if not state.missing:
-                    self._close(state, sweeps)
-        if 2 * len(motors) > len(batch):
+                if (bit & state.missing and t_ns <= state.certain_until_ns) or self._belongs(
+                    state, bit, t_ns, sweeps
+                ):
+                    if state.came is not None:
+                        head = heads[(at - 1) * HEAD_BYTES : at * HEAD_BYTES]
+                        state.came.append((head, place, state.missing))
+                    state.values[place] = payload
+                    state.last_place = place
+                    state.last_ns = t_ns
+                    state.missing ^= bit
+                    if not state.missing:
+                        self._close(state, sweeps)
+        if 2 * len(motors) > n:
             ((self.stranger_id, _),) = Counter(motors).most_common(1)
         return Assembled(sweeps, answers)
 
@@ -293,6 +360,69 @@ class Assembler:
         self.counters.doubled += 1
         return True
 
+    @staticmethod
+    def _expect_order(state: _BoardState) -> None:
+        """A sweep begins: expect its frames in the known order, or learn the order from it."""
+        state.came = None
+        if state.order is not None:
+            state.done, state.expected = 1, state.order.places[1]
+        elif state.learn_after:
+            state.learn_after -= 1
+        elif state.awaited == state.wanted:
+            state.came = []
+
+    def _take_run(
+        self, state: _BoardState, records: Records, heads: bytes, at: int, sweeps: list[Sweep]
+    ) -> int:
+        """Take the frames from `at` on that come in the board's order; return how many.
+
+        They are taken if none of them would need a closer look alone.
+        """
+        order = state.order
+        assert order is not None
+        done = state.done
+        n = min(len(order.places) - done, len(records.octets) - at)
+        begin, end = done * HEAD_BYTES, (done + n) * HEAD_BYTES
+        state.expected = -1
+        if state.missing != order.missing[done] or not heads.startswith(
+            order.heads[begin:end], at * HEAD_BYTES
+        ):
+            state.stray += 1
+            if state.stray == _MOST_STRAY_SWEEPS:
+                state.order, state.stray, state.learn_after = None, 0, _LEARN_AFTER_SWEEPS
+            return 0
+        if n < _SHORTEST_RUN:
+            return 0
+        size = records.form.size
+        last = records.form.unpack_from(records.octets.data, (at + n - 1) * size)
+        t_ns = last[0] * NS_PER_S + last[1]
+        if t_ns > state.certain_until_ns:
+            return 0
+        payload = records.octets[at : at + n, records.head + HEAD_BYTES : size].tobytes()
+        places = order.places[done : done + n]
+        whole = None
+        if n == len(order.places) - 1:
+            payload = state.values[order.places[0]] + payload
+            if order.rows is None:
+                whole = np.frombuffer(bytearray(payload.ljust(_SWEEP, b"\0")), np.uint8)
+            else:
+                whole = np.zeros((2 * TRIANGLES, _PAYLOAD), np.uint8)
+                whole[order.rows] = np.frombuffer(payload, _HALF)
+            state.values[places[-1]] = payload[-_PAYLOAD:]
+        else:
+            for number, place in enumerate(places):
+                state.values[place] = payload[number * _PAYLOAD : (number + 1) * _PAYLOAD]
+        done += n
+        state.last_place = places[-1]
+        state.last_ns = t_ns
+        state.missing = order.missing[done]
+        state.stray = 0
+        if state.missing:
+            state.done, state.expected = done, order.places[done]
+        else:
+            self._close(state, sweeps, whole)
+        return n
+
     def _belongs(self, state: _BoardState, bit: int, t_ns: int, sweeps: list[Sweep]) -> bool:
         """Handle a frame that is not the next one of a sweep in progress.
 
@@ -321,10 +451,12 @@ class Assembler:
                 self.crowded[state.index] += 1
             state.missing = state.awaited
             state.first_ns = t_ns
+            self._expect_order(state)
         state.certain_until_ns = min(t_ns + state.pause_ns, state.first_ns + state.close_ns)
         return True
 
-    def _close(self, state: _BoardState, sweeps: list[Sweep]) -> None:
+    def _close(self, state: _BoardState, sweeps: list[Sweep], values: Bytes | None = None) -> None:
+        """End a sweep; `values` uint8[32 * 7] are given if they are not those of the state."""
         got = state.awaited & ~state.missing
         present = got & got >> TRIANGLES
         missed = 0
@@ -334,23 +466,40 @@ class Assembler:
         counters = self.counters
         counters.sweeps += 1
         counters.missed += missed
-        triangles = np.frombuffer(bytearray().join(state.values), _TRIANGLE)
+        if values is None:
+            values = np.frombuffer(bytearray().join(state.values), np.uint8)
+        triangles = values.reshape(TRIANGLES, 2 * _PAYLOAD)
+        state.expected = -1
         if got != state.wanted:
             counters.incomplete += state.missing != 0
             counters.halves += (got ^ present * _BOTH).bit_count()
             triangles[[not present >> triangle & 1 for triangle in range(TRIANGLES)]] = 0
             self._note_absent(state, present)
-        elif any(state.absent_for):
-            state.absent_for = [0] * TRIANGLES
+        else:
+            if any(state.absent_for):
+                state.absent_for = [0] * TRIANGLES
+            if state.came is not None:
+                self._learn_order(state, state.came)
         if present:
-            status = triangles["status"].astype(np.uint16)
-            sweeps.append(
-                Sweep(state.index, triangles["raw"], status, present, state.last_ns, missed)
-            )
+            raw, status = triangles[:, :TAXELS], NO_STATUS
+            if triangles[:, TAXELS:].tobytes() != _NO_STATUS:
+                status = triangles[:, TAXELS:].copy().view(">u2")[:, 0].astype(np.uint16)
+            sweeps.append(Sweep(state.index, raw, status, present, state.last_ns, missed))
         state.sent = got
         state.sent_first_ns = state.first_ns
         state.sent_last_ns = state.last_ns
         state.missing = 0
+
+    @staticmethod
+    def _learn_order(state: _BoardState, came: list[tuple[bytes, int, int]]) -> None:
+        """Note the order of a complete sweep, if its frames are of full length."""
+        state.came = None
+        heads, places, missing = zip(*came, strict=True)
+        if len(places) < _SHORTEST_RUN or any(head[_DLC_AT] < 8 for head in heads):
+            state.learn_after = _LEARN_AFTER_SWEEPS
+            return
+        rows = None if places == tuple(range(len(places))) else np.array(places, np.intp)
+        state.order = _Order(b"".join(heads), list(places), rows, [*missing, 0])
 
     @staticmethod
     def _note_absent(state: _BoardState, present: int) -> None:

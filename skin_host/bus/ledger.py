@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.bus.assembler import Sweep
+from skin_host.bus.assembler import NO_STATUS, Sweep
 from skin_host.bus.wire import TAXELS, TRIANGLES, out_of_range, status_error
 from skin_host.layout import BoardLayout
 
@@ -123,7 +123,7 @@ class BoardLedger:
             enabled = self._enabled[row] >> _BITS & 1
             self.absent[row] = (self.absent[row] + enabled) * ~self.present[row]
         # Comparing bytes costs a tenth of numpy's `any`.
-        flagged = sweep.status.tobytes() != _NO_STATUS
+        flagged = sweep.status is not NO_STATUS and sweep.status.tobytes() != _NO_STATUS
         if flagged or self.flagged[row]:
             self.flagged[row] = flagged
             self.error[row] = status_error(sweep.status)

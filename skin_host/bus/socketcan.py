@@ -13,7 +13,7 @@ import os
 import socket
 import struct
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from skin_host.bus.interfaces import can_interfaces
 from skin_host.bus.port import SKIN_CLASSES, LinkState, Port
-from skin_host.bus.wire import NS_PER_S, FrameBatch
+from skin_host.bus.wire import NS_PER_S, FrameBatch, Records
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Bus, Receive
 from skin_host.errors import BusError
@@ -110,11 +110,11 @@ _recvmmsg.argtypes = [
 class _ReceivedBatch(FrameBatch):
     """Records as the kernel wrote them; each array is made when it is first read."""
 
-    __slots__ = ("_bytes", "_records")
+    __slots__ = ("_octets", "_records")
 
-    def __init__(self, records: NDArray[np.void], as_bytes: memoryview, dropped: int) -> None:
+    def __init__(self, records: NDArray[np.void], octets: NDArray[np.uint8], dropped: int) -> None:
         self._records = records
-        self._bytes = as_bytes
+        self._octets = octets
         self.dropped = dropped
 
     def __len__(self) -> int:
@@ -133,8 +133,12 @@ class _ReceivedBatch(FrameBatch):
         setattr(self, name, array)
         return array
 
-    def frames(self) -> Iterator[tuple[int, int, int, int, int, bytes]]:
-        return _RECORD.iter_unpack(self._bytes)
+    @property
+    def rising(self) -> bool:
+        return True  # the kernel stamps them in this order
+
+    def records(self) -> Records:
+        return Records(self._octets, _RECORD, _CONTROL_SIZE)
 
 
 class BatchReceiver:
@@ -169,8 +173,8 @@ class BatchReceiver:
         self._headers = headers.ctypes.data
         self._control_length = message["control_length"]
         self._records = records
-        self._bytes = records.view(np.uint8).data
-        self._flags = self._bytes[_FLAGS_AT :: _RECORD_ARRAY.itemsize]
+        self._octets = records.view(np.uint8).reshape(capacity, _RECORD_ARRAY.itemsize)
+        self._flags = self._octets.reshape(-1).data[_FLAGS_AT :: _RECORD_ARRAY.itemsize]
 
     def read(self) -> FrameBatch:
         """Return the frames that wait, without blocking; the batch is valid until the next read.
@@ -187,8 +191,7 @@ class BatchReceiver:
         dropped = self._newly_dropped(n)
         # The kernel wrote the lengths it used; reset them to the whole buffer for the next read.
         self._control_length[:n] = _CONTROL_SIZE
-        size = n * _RECORD_ARRAY.itemsize
-        return _ReceivedBatch(self._records[:n], self._bytes[:size], dropped)
+        return _ReceivedBatch(self._records[:n], self._octets[:n], dropped)
 
     def saw_flags(self, n: int) -> bool:
         """Return whether any of the `n` frames just read is not a standard data frame."""

@@ -18,6 +18,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,10 +59,33 @@ class StatusError(IntFlag):
     NOT_CONNECTED = 2
 
 
-_RECORD = struct.Struct("=qqIBB7s")
+#: A frame as it is laid out for walking through: its time, then `struct can_frame`.
+_RECORD = struct.Struct("=qqIB3xB7s")
+_HEAD = 16
 _RECORD_ARRAY = np.dtype(
-    [("seconds", "=i8"), ("nanoseconds", "=i8"), ("id", "=u4"), ("dlc", "u1"), ("data", "u1", 8)]
+    {
+        "names": ["seconds", "nanoseconds", "id", "dlc", "data"],
+        "formats": ["=i8", "=i8", "=u4", "u1", ("u1", 8)],
+        "offsets": [0, 8, _HEAD, _HEAD + 4, _HEAD + 8],
+        "itemsize": _RECORD.size,
+    }
 )
+#: Bytes of `struct can_frame` up to the first byte of data, the header.
+HEAD_BYTES = 9
+
+
+class Records(NamedTuple):
+    """The frames of a batch as they lie in memory, one after the other.
+
+    Attributes:
+        octets: uint8[n, size], contiguous.
+        form: unpacks one into (seconds, nanoseconds, id, DLC, first byte, the other seven).
+        head: where in each its `struct can_frame` begins: `HEAD_BYTES`, then seven bytes of data.
+    """
+
+    octets: Bytes
+    form: struct.Struct
+    head: int
 
 
 @dataclass(slots=True)
@@ -86,16 +110,24 @@ class FrameBatch:
     def __len__(self) -> int:
         return len(self.id)
 
+    @property
+    def rising(self) -> bool:
+        """Whether no frame is older than the one before."""
+        return _rising(self.t_ns)
+
+    def records(self) -> Records:
+        """Return the frames laid out for walking through them."""
+        octets = _octets_of(self.id, self.dlc, self.data, self.t_ns)
+        return Records(octets, _RECORD, _HEAD)
+
     def frames(self) -> Iterator[tuple[int, int, int, int, int, bytes]]:
         """Yield each frame as (seconds, nanoseconds, id, DLC, first byte, the other seven).
 
         A read of a live bus returns some dozen frames. Looping over them costs less than even a few
         operations on arrays; see docs/receive.md.
         """
-        records = np.empty(len(self), _RECORD_ARRAY)
-        records["seconds"], records["nanoseconds"] = np.divmod(self.t_ns, NS_PER_S)
-        records["id"], records["dlc"], records["data"] = self.id, self.dlc, self.data
-        return _RECORD.iter_unpack(records.data)
+        octets, form, _ = self.records()
+        return form.iter_unpack(octets.data)
 
     @classmethod
     def of(cls, frames: list[tuple[int, bytes, int]]) -> "FrameBatch":
@@ -118,7 +150,7 @@ class FrameBatch:
 class RecordBatch(FrameBatch):
     """A batch that is cut into others: its frames are laid out for walking through once."""
 
-    __slots__ = ("_records",)
+    __slots__ = ("_octets", "_rising")
 
     def __init__(
         self,
@@ -126,19 +158,22 @@ class RecordBatch(FrameBatch):
         dlc: Bytes,
         data: Bytes,
         t_ns: NDArray[np.int64],
-        records: "NDArray[np.void] | None" = None,
+        octets: Bytes | None = None,
+        rising: bool | None = None,
     ) -> None:
         super().__init__(identifier, dlc, data, t_ns)
-        if records is None:
-            records = np.empty(len(identifier), _RECORD_ARRAY)
-            records["seconds"], records["nanoseconds"] = np.divmod(t_ns, NS_PER_S)
-            records["id"], records["dlc"], records["data"] = identifier, dlc, data
-        self._records = records
+        self._octets = _octets_of(identifier, dlc, data, t_ns) if octets is None else octets
+        self._rising = _rising(t_ns) if rising is None else rising
 
     def __getitem__(self, rows: "slice | NDArray[np.intp]") -> "RecordBatch":
-        """Some of the frames."""
+        """Some of the frames, in their order."""
         return RecordBatch(
-            self.id[rows], self.dlc[rows], self.data[rows], self.t_ns[rows], self._records[rows]
+            self.id[rows],
+            self.dlc[rows],
+            self.data[rows],
+            self.t_ns[rows],
+            self._octets[rows],
+            self._rising or None,
         )
 
     def joined(self, other: "RecordBatch") -> "RecordBatch":
@@ -148,11 +183,29 @@ class RecordBatch(FrameBatch):
             np.concatenate((self.dlc, other.dlc)),
             np.concatenate((self.data, other.data)),
             np.concatenate((self.t_ns, other.t_ns)),
-            np.concatenate((self._records, other._records)),
+            np.concatenate((self._octets, other._octets)),
         )
 
-    def frames(self) -> Iterator[tuple[int, int, int, int, int, bytes]]:
-        return _RECORD.iter_unpack(self._records.data)
+    @property
+    def rising(self) -> bool:
+        return self._rising
+
+    def records(self) -> Records:
+        return Records(self._octets, _RECORD, _HEAD)
+
+
+def _rising(t_ns: NDArray[np.int64]) -> bool:
+    return bool((t_ns[1:] >= t_ns[:-1]).all())
+
+
+def _octets_of(
+    identifier: NDArray[np.uint32], dlc: Bytes, data: Bytes, t_ns: NDArray[np.int64]
+) -> Bytes:
+    n = len(identifier)
+    records = np.zeros(n, _RECORD_ARRAY)
+    records["seconds"], records["nanoseconds"] = np.divmod(t_ns, NS_PER_S)
+    records["id"], records["dlc"], records["data"] = identifier, dlc, data
+    return np.ndarray((n, _RECORD.size), np.uint8, records)
 
 
 def skin_id(board: int, triangle: int) -> int:

@@ -276,7 +276,7 @@ class Engine:
         steps = self._process(self._take(sweeps)) if sweeps else []
         return Output(sweeps, steps, samples, grasps, answers)
 
-    def missing(self) -> list[list[int]]:
+    def missing(self) -> list[dict[int, int]]:
         """Of each part, the boards whose sweeps its next sample waits for."""
         return self._intake.missing()
 

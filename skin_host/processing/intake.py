@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from skin_host.bus.assembler import Sweep
 from skin_host.bus.ledger import BoardLedger
+from skin_host.bus.wire import TAXELS, TRIANGLES
 from skin_host.layout import Layout
 from skin_host.processing.masks import Mask
 
@@ -40,32 +41,24 @@ class PartSample:
 
 
 @dataclass(slots=True)
-class _Feed:
-    """Where one board's 192 values belong in one part."""
-
-    row: int
-    source: NDArray[np.intp]
-    target: NDArray[np.intp]
-    fresh: bool = False
-
-
-@dataclass(slots=True)
 class _PartState:
     """A part's sample in progress.
 
     Attributes:
+        rows: of its boards, by their index.
+        waits: boards (index: row) whose sweep it waits for.
+        source: intp[m], where its values are among those of all boards.
         stamped_ns: time of the last sample that was returned.
         silence_ns: time of the first sample of silence after the last sweep.
         reported_ns: when silence was reported last, on the ledger's clock; -1 if it was not.
     """
 
     index: int
-    feeds: dict[int, _Feed]
+    rows: dict[int, int]
+    waits: dict[int, int]
+    source: NDArray[np.intp]
     period_ns: int
     silence_ns: int
-    raw: NDArray[np.uint8]
-    present: Mask
-    received: Mask
     first_ns: int = 0
     last_ns: int = 0
     stamped_ns: int = 0
@@ -89,23 +82,27 @@ class Intake:
         self._ledger = ledger
         self._states: list[_PartState] = []
         self._of_board: dict[int, list[_PartState]] = {}
+        # The last sweep of each board, by its row in the ledger.
+        shape = (len(ledger.row), TRIANGLES * TAXELS)
+        self._raw = np.zeros(shape, np.uint8)
+        self._present = np.zeros(shape, np.bool_)
+        self._received = np.zeros(shape, np.bool_)
         for index in parts:
             part = layout.parts[index]
-            feeds: dict[int, _Feed] = {}
-            for board in part.boards:
+            source = np.zeros(part.n_taxels, np.intp)
+            rows = {board: ledger.row[board] for board in part.boards}
+            for board, row in rows.items():
                 flat = layout.boards[board].taxel_index.ravel()
-                source = np.flatnonzero((flat >= part.start) & (flat < part.stop))
-                target = (flat[source] - part.start).astype(np.intp)
-                feeds[board] = _Feed(ledger.row[board], source, target)
+                mine = np.flatnonzero((flat >= part.start) & (flat < part.stop))
+                source[flat[mine] - part.start] = row * flat.size + mine
             period_ms = max(layout.boards[board].settings.period_ms for board in part.boards)
             state = _PartState(
                 index,
-                feeds,
+                rows,
+                rows.copy(),
+                source,
                 period_ms * 1_000_000,
                 int(silent_periods * period_ms * 1_000_000),
-                np.zeros(part.n_taxels, np.uint8),
-                np.zeros(part.n_taxels, np.bool_),
-                np.zeros(part.n_taxels, np.bool_),
             )
             self._states.append(state)
             for board in part.boards:
@@ -118,32 +115,31 @@ class Intake:
             sweep: of one board.
             valid, received: bool[192], see `PartSample`.
         """
+        board, t_ns = sweep.board, sweep.t_ns
+        states = self._of_board[board]
+        row = self._ledger.row[board]
+        # Samples that the board's second sweep completes, before it replaces the first.
+        completed = [self._sample(state) if board not in state.waits else None for state in states]
+        self._raw[row] = sweep.raw.ravel()
+        self._present[row] = valid
+        self._received[row] = received
         samples: list[PartSample] = []
-        raw = sweep.raw.ravel()
-        for state in self._of_board[sweep.board]:
-            feed = state.feeds[sweep.board]
-            if feed.fresh:
-                self._emit(state, samples)
+        for state, sample in zip(states, completed, strict=True):
+            if sample is not None:
+                samples.append(sample)
             if not state.pending:
-                state.first_ns = sweep.t_ns
-                state.last_ns = sweep.t_ns
+                state.first_ns = t_ns
+                state.last_ns = t_ns
                 state.pending = True
-            feed.fresh = True
-            state.raw[feed.target] = raw[feed.source]
-            state.present[feed.target] = valid[feed.source]
-            state.received[feed.target] = received[feed.source]
-            state.last_ns = max(state.last_ns, sweep.t_ns)
-            is_silent = self._ledger.is_silent
-            if all(other.fresh or is_silent(other.row) for other in state.feeds.values()):
-                self._emit(state, samples)
+            del state.waits[board]
+            state.last_ns = max(state.last_ns, t_ns)
+            if not state.waits or all(map(self._ledger.is_silent, state.waits.values())):
+                samples.append(self._sample(state))
         return samples
 
-    def missing(self) -> list[list[int]]:
+    def missing(self) -> list[dict[int, int]]:
         """Of each part, the boards whose sweeps its next sample waits for."""
-        return [
-            [board for board, feed in state.feeds.items() if not feed.fresh]
-            for state in self._states
-        ]
+        return [state.waits for state in self._states]
 
     def expire(self, now_ns: int) -> list[PartSample]:
         """Return samples that have waited for a whole period, and report which parts are silent."""
@@ -152,11 +148,11 @@ class Intake:
         for state in self._states:
             if state.pending:
                 if abs(now_ns - state.first_ns) > state.period_ns:
-                    self._emit(state, samples)
+                    samples.append(self._sample(state))
                 continue
             if state.reported_ns >= 0 and ledger.now_ns - state.reported_ns < SILENCE_REPEAT_NS:
                 continue
-            if not all(ledger.is_silent(feed.row) for feed in state.feeds.values()):
+            if not all(map(ledger.is_silent, state.rows.values())):
                 continue
             # The first sample of silence has the time at which the wait ended, because late frames
             # may still be newer.
@@ -164,38 +160,31 @@ class Intake:
             t_ns = min(now_ns, state.last_ns + state.silence_ns) if first else now_ns
             state.reported_ns = ledger.now_ns
             state.stamped_ns = t_ns
-            none = np.zeros(len(state.raw), np.bool_)
-            samples.append(PartSample(state.index, np.zeros_like(state.raw), none, none, t_ns))
+            none = np.zeros(len(state.source), np.bool_)
+            nothing = np.zeros(len(state.source), np.uint8)
+            samples.append(PartSample(state.index, nothing, none, none, t_ns))
         return samples
 
     def flush(self) -> list[PartSample]:
         """Return all samples in progress, at the end of a recording."""
-        samples: list[PartSample] = []
-        for state in self._states:
-            if state.pending:
-                self._emit(state, samples)
-        return samples
+        return [self._sample(state) for state in self._states if state.pending]
 
-    def _emit(self, state: _PartState, samples: list[PartSample]) -> None:
-        for feed in state.feeds.values():
-            if not feed.fresh:
-                state.raw[feed.target] = 0
-                state.present[feed.target] = False
-                state.received[feed.target] = False
-            feed.fresh = False
+    def _sample(self, state: _PartState) -> PartSample:
+        """Return a part's sample in progress, and begin the next."""
+        source = state.source
+        raw = self._raw.ravel()[source]
+        present = self._present.ravel()[source]
+        received = self._received.ravel()[source]
+        if state.waits:
+            lost = np.isin(source // self._raw.shape[1], list(state.waits.values()))
+            raw[lost] = 0
+            present[lost] = received[lost] = False
         if 0 <= state.stamped_ns - state.last_ns < 4 * state.period_ns:
             # A sweep that came after its sample was returned. Times of a part only rise, unless a
             # clock is set back.
             state.last_ns = state.stamped_ns + 1
         state.stamped_ns = state.last_ns
-        samples.append(
-            PartSample(
-                state.index,
-                state.raw.copy(),
-                state.present.copy(),
-                state.received.copy(),
-                state.last_ns,
-            )
-        )
+        state.waits = state.rows.copy()
         state.pending = False
         state.reported_ns = -1
+        return PartSample(state.index, raw, present, received, state.last_ns)

@@ -54,6 +54,9 @@ class Validity:
         self.touched: dict[int, Mask] = {}
         n = len(boards)
         self._waiting = np.zeros(n, np.bool_)
+        self._n_waiting = 0
+        #: By row: which triangles were received, as bytes, and bool[16, 12] made of that.
+        self._usual: list[tuple[bytes, Mask]] = [(b"", np.zeros((TRIANGLES, PADS), np.bool_))] * n
         self._raw = np.zeros((n, TRIANGLES, PADS), np.uint8)
         self._here = np.zeros((n, TRIANGLES), np.bool_)
         self._erring = np.zeros((n, TRIANGLES), np.bool_)
@@ -95,19 +98,30 @@ class Validity:
         """
         if self._waiting[row]:
             self.judge()
-        last = self._ledger.last[row]
+        ledger = self._ledger
+        last = ledger.last[row]
         if last is not None and last.missed:
             self.liveness.note_gap(row)
-        here = self.here(row, raw)
-        received = np.repeat(here[:, None], PADS, axis=1)
-        ledger = self._ledger
-        if ledger.flagged[row]:
-            received &= ~ledger.far[row]
-            self._erring[row] = ledger.error[row]
         doubted = self.liveness.doubted
-        if doubted is not None:
-            received &= ~doubted[TRIANGLES * row : TRIANGLES * (row + 1)]
+        flagged = ledger.flagged[row]
+        if flagged or doubted is not None:
+            here = self.here(row, raw)
+            received = np.repeat(here[:, None], PADS, axis=1)
+            if flagged:
+                received &= ~ledger.far[row]
+                self._erring[row] = ledger.error[row]
+            if doubted is not None:
+                received &= ~doubted[TRIANGLES * row : TRIANGLES * (row + 1)]
+        else:
+            # Most sweeps have nothing but the triangles of the one before.
+            here = ledger.present[row]
+            key, received = self._usual[row]
+            if key != (present := here.tobytes()):
+                received = np.repeat(here[:, None], PADS, axis=1)
+                received.flags.writeable = False
+                self._usual[row] = present, received
         self._waiting[row] = True
+        self._n_waiting += 1
         self._raw[row] = raw
         self._here[row] = here
         if row in self.touched:
@@ -131,14 +145,17 @@ class Validity:
 
     def judge_whole(self) -> None:
         """Judge which chips live if every board that has not timed out has sent since."""
-        if (self._waiting | self._ledger.silent).all():
+        n = len(self._waiting)
+        if self._n_waiting == n or (
+            self._n_waiting and (self._waiting | self._ledger.silent).all()
+        ):
             self.judge()
 
     def judge(self) -> None:
         """Judge which chips live by the sweeps since the last judgement."""
-        waiting = self._waiting
-        if not waiting.any():
+        if not self._n_waiting:
             return
+        waiting = self._waiting
         felt: Mask | None = None
         if self._felt:
             felt = np.zeros((TRIANGLES * len(waiting), PADS), np.bool_)
@@ -149,12 +166,13 @@ class Validity:
             self._here.ravel(),
             self._erring.ravel(),
             felt,
-            None if waiting.all() else waiting.copy(),
+            None if self._n_waiting == len(waiting) else waiting.copy(),
         )
         self._felt.clear()
         self._here[:] = False
         self._erring[:] = False
         waiting[:] = False
+        self._n_waiting = 0
 
     def _new_liveness(self, noise: NDArray[np.float64] | None) -> Liveness:
         encodings = []
