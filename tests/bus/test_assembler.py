@@ -1,5 +1,6 @@
 """Frames to sweeps: pairing, completeness, and an account of everything that went wrong."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -209,3 +210,38 @@ def test_any_identifier_is_survived(garbage):
     assert feed(assembler, [(garbage, b"\x40" + bytes(7), PERIOD)]) == []
     counters = assembler.counters
     assert counters.other + counters.unknown_board == 1
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_frames_in_the_usual_order_are_taken_together_with_the_same_result(data):
+    """Fed one by one no frame is part of a run; orders, losses, repeats and times vary."""
+    rng = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
+    harm = data.draw(st.sampled_from([0.0, 0.01, 0.05]))
+    order = rng.permutation(16) if data.draw(st.booleans()) else np.arange(16)
+    n_boards = data.draw(st.integers(1, 2))
+    sent: list[tuple[int, bytes, int]] = []
+    for number in range(30):
+        for board in range(1, n_boards + 1):
+            swept = frames(values(8, number), number * PERIOD + board * 3 * MS, board=board)
+            times = [t_ns for _, _, t_ns in swept]
+            if rng.random() < harm:
+                times[rng.integers(16)] += int(rng.integers(-60, 60)) * MS
+            came = [swept[i] for i in order]
+            sent += [
+                (one, payload, t_ns) for (one, payload, _), t_ns in zip(came, times, strict=True)
+            ]
+    sent = [frame for frame in sent if rng.random() >= harm]
+    sent = [again for frame in sent for again in [frame] * (1 + (rng.random() < harm))]
+    alone, together = make("0-7", n_boards), make("0-7", n_boards)
+    expected = [sweep for frame in sent for sweep in feed(alone, [frame])]
+    cuts = sorted(rng.integers(0, len(sent), data.draw(st.integers(0, 40))).tolist())
+    found = [
+        sweep
+        for begin, end in pairwise([0, *cuts, len(sent)])
+        for sweep in feed(together, sent[begin:end])
+    ]
+    assert together.counters == alone.counters
+    assert together.crowded == alone.crowded
+    for mine, its in zip(found, expected, strict=True):
+        assert all(map(np.array_equal, mine, its))
