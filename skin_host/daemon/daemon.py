@@ -344,30 +344,46 @@ class Daemon:
         """Supervise the boards, publish health, log faults, set the status line."""
         said: dict[int, tuple[object, ...]] = {}
         said_s = dict.fromkeys(self.engine.parts, 0.0)
+        of_parts: dict[tuple[str, str], str] = {}
+        pulse: tuple[object, ...] = ()
         while True:
             await self.clock.sleep(LOOK_S)
             self.link.supervise()
             now_s = self.clock.monotonic_s()
             self.health.tick(self.link.read_ns, self.link.ports, self.link.boards)
             told = self.fingertips.publish_health(self.link.read_ns)
-            for part in self.engine.parts:
-                await self.clock.sleep(0)  # the reader must not wait for all parts
-                record = self._record_of(part)
-                told |= {
-                    (fault["code"], fault["where"]): says
-                    for fault, says in zip(record["faults"], record["sentences"], strict=True)
-                }
-                # Without the sentences, because numbers in them change all the time.
-                state = (record["state"], {(one["code"], one["where"]) for one in record["faults"]})
-                if said.get(part) != state or now_s - said_s[part] >= HEALTH_S:
-                    said[part], said_s[part] = state, now_s
-                    self.publisher.put_health(self.layout.parts[part].name, record)
+            before, pulse = pulse, self._pulse()
+            if pulse != before or now_s - min(said_s.values()) >= HEALTH_S:
+                of_parts.clear()
+                for part in self.engine.parts:
+                    await self.clock.sleep(0)  # the reader must not wait for all parts
+                    record = self._record_of(part)
+                    of_parts |= {
+                        (fault["code"], fault["where"]): says
+                        for fault, says in zip(record["faults"], record["sentences"], strict=True)
+                    }
+                    # Without the sentences, because numbers in them change all the time.
+                    faults = {(one["code"], one["where"]) for one in record["faults"]}
+                    state = (record["state"], faults)
+                    if said.get(part) != state or now_s - said_s[part] >= HEALTH_S:
+                        said[part], said_s[part] = state, now_s
+                        self.publisher.put_health(self.layout.parts[part].name, record)
+            told |= of_parts
             if self.engine.calibrating:
                 told = {key: says for key, says in told.items() if key[0] not in _UNTIL_CALIBRATED}
             self._fault_log.note(told, now_s)
             if now_s - self._status_s >= HEALTH_S:
                 self._status_s = now_s
                 service.notify("STATUS=" + self._status(len(told)))
+
+    def _pulse(self) -> tuple[object, ...]:
+        """Return a value that differs from the last one when a fault may have begun or ended."""
+        output = self.publisher.counters
+        return (
+            *self.health.pulse(self.link.ports, self.link.boards),
+            (output.connected, output.last_error, output.touches_dropped, output.refused),
+            (tuple(output.withheld), output.name_taken, tuple(self.unkept)),
+        )
 
     def _record_of(self, part: int) -> Record:
         link = self.link

@@ -12,6 +12,7 @@ from skin_host.bus.boards import Boards
 from skin_host.bus.port import Port
 from skin_host.health.describe import Describer
 from skin_host.health.diagnosis import Fault, diagnose
+from skin_host.health.pulse import pulse
 from skin_host.health.record import Record
 from skin_host.health.watch import Watch
 from skin_host.processing.core import Engine, Output
@@ -57,6 +58,7 @@ class Health:
     """
 
     def __init__(self, engine: Engine) -> None:
+        self._engine = engine
         self._watch = Watch(engine)
         self._describer = Describer(engine, self._watch)
         self._held: dict[int, dict[tuple[str, str], tuple[Fault, int]]] = {}
@@ -68,6 +70,7 @@ class Health:
 
     def use(self, engine: Engine) -> None:
         """Continue with another engine, after a reload."""
+        self._engine = engine
         self._watch.use(engine)
         self._describer = Describer(engine, self._watch)
 
@@ -82,6 +85,10 @@ class Health:
             self._stall_ns, self._stalled_ns = pause_ns, now_ns
         self._ticked_ns = now_ns
         self._watch.tick(now_ns, ports, boards)
+
+    def pulse(self, ports: dict[str, Port], boards: dict[str, Boards]) -> tuple[object, ...]:
+        """Return a value that differs from the last one when a fault may have begun or ended."""
+        return (self._stalled_ns, *pulse(self._engine, self._watch, ports, boards))
 
     def record(
         self,

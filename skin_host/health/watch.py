@@ -147,6 +147,12 @@ class Watch:
             for bus in engine.assemblers
         }
 
+        ledger_row = engine.ledger.row
+        self._rows = {
+            bus: np.array([ledger_row[i] for i in self._boards_of(bus)], np.intp)
+            for bus in engine.assemblers
+        }
+
     def use(self, engine: Engine) -> None:
         """Continue with another engine, after a reload."""
         self._engine = engine
@@ -167,8 +173,6 @@ class Watch:
 
     def _totals(self, bus: str, port: Port | None) -> dict[str, int]:
         counters = self._engine.assemblers[bus].counters
-        ledger = self._engine.ledger
-        rows = [ledger.row[i] for i in self._boards_of(bus)]
         return {
             "frames": counters.frames,
             "sweeps": counters.sweeps,
@@ -177,7 +181,7 @@ class Watch:
             "halves": counters.halves,
             "missed": counters.missed,
             "unknown": counters.unknown_board + counters.unknown_triangle,
-            "spikes": int(self._engine.validity.liveness.spikes[rows].sum()),
+            "spikes": int(self._engine.validity.liveness.spikes[self._rows[bus]].sum()),
             "dropped": 0 if port is None else port.counters.dropped,
             "error_frames": 0 if port is None else port.counters.error_frames,
         }

@@ -340,6 +340,12 @@ class Engine:
             return np.zeros((TRIANGLES, PADS), np.bool_)
         return rezero.doubted.reshape(TRIANGLES, PADS)
 
+    def doubts(self) -> dict[int, int]:
+        """Return how many taxels of each board that was zeroed have an unknown zero, by index."""
+        return {
+            board: int(np.count_nonzero(rezero.doubted)) for board, rezero in self._rezeros.items()
+        }
+
     def end_part(self, part: int, t_ns: int) -> list[TouchEvent]:
         """End every contact of a part."""
         seq = self._pipeline.seq(part) if self._pipeline else 0
