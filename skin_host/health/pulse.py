@@ -9,7 +9,7 @@ import numpy as np
 
 from skin_host.bus.boards import Boards
 from skin_host.bus.port import Port
-from skin_host.engine import Engine
+from skin_host.processing.core import Engine
 from skin_host.health.describe import ABSENT_SWEEPS
 from skin_host.health.watch import Watch
 

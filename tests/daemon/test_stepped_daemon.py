@@ -1,10 +1,12 @@
 """The whole daemon lives by the clock that it is given: robot, buses and host in one event loop."""
 
 from pathlib import Path
+from typing import Any
 
-from emulator.probes.scene import Place, Probe, Scene
+from emulator.probes.scene import Fault, Place, Probe, Scene
 from skin_host.clock import EPOCH_NS, SteppedClock
 from skin_host.config.settings import Bus
+from skin_host.health import Record
 from skin_host.mqtt.messages import ContactState
 from skin_host.processing.events import TouchEvent
 from tests.support.live import living
@@ -122,3 +124,32 @@ async def test_a_clock_that_is_set_changes_no_contact(clock: SteppedClock, tmp_p
             clock.set(jump_s)
             await clock.sleep(0.1511)
         assert said == {("left_hand", "ON"), ("left_hand", "move"), ("left_forearm", "OFF")}
+
+
+@stepped
+async def test_health_that_does_not_change_is_worked_out_once_a_second(
+    clock: SteppedClock, tmp_path: Path
+) -> None:
+    async with living(
+        Bus(interface="virtual", channel="stepped-h"),
+        tmp_path,
+        scene=Scene(quiet=True),
+        clock=clock,
+    ) as live:
+        await live.until_well(but=LATELY)
+        health = live.daemon.health
+        record = health.record
+        recorded: list[int] = []
+
+        def noted(part: int, *others: Any) -> Record:
+            recorded.append(part)
+            return record(part, *others)
+
+        health.record = noted  # type: ignore[method-assign]
+        await clock.sleep(10.05)
+        # A hundred looks; the absent broker is tried again between them.
+        assert 10 <= recorded.count(0) <= 25
+        recorded.clear()
+        live.robot.inject(Fault(name="board_silent", board="hand"))
+        await clock.sleep(0.5)
+        assert recorded.count(0) >= 2
