@@ -110,8 +110,9 @@ stepped time by `python -m tests.support.fault_matrix`, which writes this page, 
 eight triangles with quiet pads. Times are of the first report of the expected code, in brackets
 what else was reported by then; `chip_back`: until the code is gone. `within` is the time by which
 the code is expected on every firmware and fidelity; a cell that is later, or in which the code
-did not come, is bold. Health is worked out every 0.1 s here. The daemon looks as often for changes, but
-works out periods, temperatures and baselines once a second. [scenes.md](scenes.md) explains the faults."""
+did not come, is bold. Health is worked out every 0.1 s here. The daemon looks for changes as often,
+and works out periods, temperatures and baselines once a second. [scenes.md](scenes.md) explains
+the faults."""
 
 REASONS = """\
 ## What is expected
