@@ -9,9 +9,9 @@ import numpy as np
 
 from skin_host.bus.boards import Boards
 from skin_host.bus.port import Port
-from skin_host.processing.core import Engine
 from skin_host.health.describe import ABSENT_SWEEPS
 from skin_host.health.watch import Watch
+from skin_host.processing.core import Engine
 
 #: What a bus gains in a second through faults.
 _LOSSES = ("wrong", "halves", "spikes", "dropped", "error_frames")
