@@ -1,6 +1,5 @@
 """What all tests share: which CAN bus they run on, and a real broker."""
 
-import copy
 import itertools
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
@@ -11,6 +10,7 @@ import pytest
 
 from skin_host.config.settings import Bus
 from tests.support import programs
+from tests.support.branch import branch
 from tests.support.broker import Mosquitto
 from tests.support.fault_bench import FaultBench
 from tests.support.stack import configuration, stack, subscriber  # noqa: F401  (fixtures for all)
@@ -109,4 +109,4 @@ def calibrated() -> FaultBench:
 @pytest.fixture
 def bench(calibrated: FaultBench) -> FaultBench:
     """One to break."""
-    return copy.deepcopy(calibrated)
+    return branch(calibrated)

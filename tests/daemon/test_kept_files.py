@@ -53,18 +53,19 @@ def test_a_damaged_state_is_set_aside(tmp_path: Path, content: bytes) -> None:
     assert aside.read_bytes() == content
 
 
-def calibrated(tmp_path: Path) -> tuple[Any, Any, Path]:
-    bench = FaultBench(1.0)
+@pytest.fixture
+def kept(calibrated: FaultBench, tmp_path: Path) -> tuple[Any, Any, Path]:
+    """Settings, layout and the file of the robot's calibration."""
     settings = changed(load(CONFIG), {"service.state_directory": str(tmp_path)})
     layout = build_layout(settings, CONFIG.parent)
     path = calibration_path(settings, "main")
-    assert bench.engine.calibration is not None
-    calibrations.save(path, bench.engine.calibration, layout)
+    assert calibrated.engine.calibration is not None
+    calibrations.save(path, calibrated.engine.calibration, layout)
     return settings, layout, path
 
 
-def test_a_calibration_of_another_robot_is_refused(tmp_path: Path) -> None:
-    settings, layout, path = calibrated(tmp_path)
+def test_a_calibration_of_another_robot_is_refused(kept: tuple[Any, Any, Path]) -> None:
+    settings, layout, path = kept
     assert stored_calibration(settings, layout, "main") is not None
     path.write_text(path.read_text().replace('"robot": "demo"', '"robot": "other"'))
     with pytest.raises(OtherSkinError, match=r'of robot "other", this is .* of robot "demo"'):
@@ -72,9 +73,9 @@ def test_a_calibration_of_another_robot_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_calibration_of_a_newer_version_is_refused_and_a_damaged_one_set_aside(
-    tmp_path: Path,
+    kept: tuple[Any, Any, Path],
 ) -> None:
-    settings, layout, path = calibrated(tmp_path)
+    settings, layout, path = kept
     whole = path.read_text()
     for newer in (
         whole.replace("skin.calibration/1", "skin.calibration/2"),
@@ -86,7 +87,7 @@ def test_a_calibration_of_a_newer_version_is_refused_and_a_damaged_one_set_aside
         assert path.read_text() == newer
     path.write_text(whole[:1000])
     assert stored_calibration(settings, layout, "main") is None
-    (aside,) = tmp_path.iterdir()
+    (aside,) = path.parent.iterdir()
     assert ".damaged-" in aside.name
     assert aside.read_text() == whole[:1000]
 

@@ -1,6 +1,5 @@
 """A configuration that is read again takes effect whole, or is refused by the key that differs."""
 
-import copy
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import pytest
 from skin_host.cli import main
 from skin_host.config.settings import changed, load, load_running, needs_restart
 from skin_host.errors import RequestError
+from tests.support.branch import branch
 from tests.support.fault_bench import FaultBench
 
 CONFIG = Path(__file__).parents[2] / "config"
@@ -114,7 +114,7 @@ def test_contacts_keep_their_numbers_over_a_reload(bench: FaultBench) -> None:
 def test_thicker_foam_and_other_codes_take_effect_at_once(bench: FaultBench) -> None:
     def pressed_kpa() -> np.ndarray:
         """What the hand feels where every byte is five units below its zero."""
-        pipeline = copy.deepcopy(bench.engine.pipeline)
+        pipeline = branch(bench.engine.pipeline)
         assert pipeline is not None
         part = bench.layout.parts[0]
         mine = slice(part.start, part.stop)

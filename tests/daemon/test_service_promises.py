@@ -92,8 +92,7 @@ async def test_a_recording_ends_by_its_size(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("jump_s", [-86_400.0, -3.0, 3.0, 86_400.0])
-def test_a_clock_that_jumps_costs_a_moment(jump_s: float) -> None:
-    bench = FaultBench()
+def test_a_clock_that_jumps_costs_a_moment(bench: FaultBench, jump_s: float) -> None:
     bench.t_s += jump_s
     bench.run(1.0)
     assert bench.valid["left_forearm"].sum() == 240
@@ -174,8 +173,9 @@ def _drain(systemd: socket.socket) -> list[str]:
             return heard
 
 
-async def test_metrics_are_served_on_localhost_alone(unused_tcp_port: int) -> None:
-    bench = FaultBench()
+async def test_metrics_are_served_on_localhost_alone(
+    bench: FaultBench, unused_tcp_port: int
+) -> None:
     bench.inject("board_silent", board="hand")
     bench.run(1.0)
     port = unused_tcp_port

@@ -29,6 +29,7 @@ from tests.support.world import SAMPLES, World
 
 WHILE_S = 0.3
 PATIENCE_S = 30.0
+SIMULATED_S = 5.0
 FOLLOWED = [
     page
     for page in PAGES
@@ -133,6 +134,8 @@ def _adapt(arguments: argparse.Namespace, world: World) -> None:
     for name in ("duration", "seconds"):
         if name in given:
             setattr(arguments, name, WHILE_S)
+    if "until" in given:
+        arguments.until = SIMULATED_S
     match given["command"]:
         case "run" | "calibrate":
             arguments.config = world.bare

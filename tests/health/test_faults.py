@@ -120,9 +120,8 @@ def test_a_taxel_that_the_calibration_refused_is_told(bench: FaultBench) -> None
     assert "taxel 5 of left_hand" in faults["taxel_refused"].sentence
 
 
-def test_the_new_zero_of_a_board_is_found_by_itself() -> None:
+def test_the_new_zero_of_a_board_is_found_by_itself(bench: FaultBench) -> None:
     """The zero is one noisy snapshot; without finding it anew some taxels would be touched."""
-    bench = FaultBench()  # a copy's arrays would no longer be views of one
     bench.inject("chip_gone", **HERE, value=0)
     bench.run(6.0)
     assert ("board_rezeroed", "forearm_outer") in bench.told

@@ -26,9 +26,8 @@ def codes(bench: FaultBench, part: str) -> set[str]:
 
 
 @pytest.fixture
-def close_limit() -> FaultBench:
+def close_limit(bench: FaultBench) -> FaultBench:
     """A robot whose baselines may move by two units only."""
-    bench = FaultBench()
     bench.reload({"processing.drift.limit_units": 2.0})
     bench.run(2.0)
     return bench
@@ -71,8 +70,7 @@ def test_a_touch_that_never_ends_hides_a_zero_and_that_is_told(tmp_path: Path) -
     assert bench.valid["left_forearm"][27]
 
 
-def test_a_part_that_is_degraded_always_says_why() -> None:
-    bench = FaultBench()
+def test_a_part_that_is_degraded_always_says_why(bench: FaultBench) -> None:
     bench.run(1.0)
     record = bench.records["left_hand"]
     # A pad that failed under pressure: no board, triangle or taxel fault tells of it.

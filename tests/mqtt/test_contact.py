@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 
 from emulator.probes.scene import Place, Probe, Scene
-from skin_host.layout import PadKind
+from skin_host.config.settings import load
+from skin_host.layout import PadKind, build_layout
 from skin_host.mqtt.contact import PartContact
 from skin_host.processing.contacts import LOST_NS
 from skin_host.processing.core import Output
 from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
-from tests.support.fault_bench import FaultBench
+from tests.support.branch import branch
+from tests.support.fault_bench import CONFIG, FaultBench
 
-BENCH = FaultBench(1.0)
-LAYOUT = BENCH.layout
+LAYOUT = build_layout(load(CONFIG), CONFIG.parent)
 PART = LAYOUT.parts.index(LAYOUT.part("left_forearm"))
 N = LAYOUT.parts[PART].n_taxels
 PADS = LAYOUT.pad_kind[LAYOUT.parts[PART].start : LAYOUT.parts[PART].stop] == PadKind.PRESSURE
@@ -114,6 +115,19 @@ def test_a_part_that_was_stopped_must_be_felt_again() -> None:
 HERE = {"board": "forearm_outer", "triangle": 3}
 
 
+@pytest.fixture(scope="module")
+def soon_pressed() -> FaultBench:
+    """A calibrated robot that is pressed a moment later, and not let go."""
+    press = Probe(
+        part="left_forearm",
+        at=Place(taxel=39),
+        diameter_mm=3,
+        pressure_kpa=[(0, 0), (0.1, 100), (100, 100)],
+        start_s=9.0,
+    )
+    return FaultBench(1.0, Scene(probe=[press], quiet=True))
+
+
 @pytest.mark.parametrize(
     ("fault", "arguments"),
     [
@@ -127,16 +141,9 @@ HERE = {"board": "forearm_outer", "triangle": 3}
     ],
 )
 def test_no_board_or_triangle_that_dies_while_it_is_touched_looks_untouched(
-    fault: str, arguments: dict[str, Any]
+    soon_pressed: FaultBench, fault: str, arguments: dict[str, Any]
 ) -> None:
-    press = Probe(
-        part="left_forearm",
-        at=Place(taxel=39),
-        diameter_mm=3,
-        pressure_kpa=[(0, 0), (0.1, 100), (100, 100)],
-        start_s=9.0,
-    )
-    bench = FaultBench(1.0, Scene(probe=[press], quiet=True))
+    bench = branch(soon_pressed)
     contact = PartContact(bench.layout, PART)
     events: list[TouchEvent] = []
     states: list[str] = []

@@ -13,6 +13,7 @@ from skin_host.processing.patches import MANY, Patches
 ICUB = Path(__file__).parents[2] / "config" / "icub.toml"
 
 
+@pytest.fixture(scope="module")
 def neighbours() -> list[list[int]]:
     layout = build_layout(load(ICUB), ICUB.parent)
     part = max(layout.parts, key=lambda part: part.n_taxels)
@@ -21,15 +22,12 @@ def neighbours() -> list[list[int]]:
     return [near[begin:end] for begin, end in pairwise(start)]
 
 
-NEIGHBOURS = neighbours()
-
-
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.8, 0.95, 0.99, 1.0])
-def test_blocks_change_nothing(share: float) -> None:
+def test_blocks_change_nothing(neighbours: list[list[int]], share: float) -> None:
     rng = np.random.default_rng(round(100 * share))
-    patches = Patches(NEIGHBOURS)
+    patches = Patches(neighbours)
     for _ in range(20):
-        touched = np.flatnonzero(rng.random(len(NEIGHBOURS)) < share)
+        touched = np.flatnonzero(rng.random(len(neighbours)) < share)
         assert len(touched) >= MANY
         assert patches.find(touched) == patches._walk(touched.tolist())
 

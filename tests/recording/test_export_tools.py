@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rerun.chunk import McapReader, RrdReader
 
 from skin_host.cli import main
 from skin_host.errors import RequestError, SkinError
@@ -128,6 +127,8 @@ def chunks(reader: Any) -> dict[str, set[str]]:
 
 
 def test_rerun_reads_what_was_exported(series: Series, tmp_path: Path) -> None:
+    from rerun.chunk import RrdReader
+
     output = tmp_path / "grasp.rrd"
     assert export(series, output) == [output]
     seen = chunks(RrdReader(output))
@@ -139,6 +140,8 @@ def test_rerun_reads_what_was_exported(series: Series, tmp_path: Path) -> None:
 
 
 def test_rerun_reads_the_file_for_foxglove_too(series: Series, tmp_path: Path) -> None:
+    from rerun.chunk import McapReader
+
     export(series, tmp_path / "shown.mcap")
     seen = chunks(McapReader(tmp_path / "shown.mcap"))
     assert {"Points3D:positions", "CoordinateFrame:frame"} <= seen["/arm/points"]

@@ -6,14 +6,12 @@ rclpy, launch and colcon are on no package index: the node itself was not run.
 import ast
 import importlib.util
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from skin_host.client import Contact, Frame, Health, PartInfo, Touch
 from skin_host.mqtt.info import TriangleInfo
@@ -33,16 +31,39 @@ def module(path: Path) -> Any:
 
 
 messages = module(ROS2 / "skin_host_ros/skin_host_ros/messages.py")
-store = get_typestore(Stores.ROS2_HUMBLE)
-for path in sorted((ROS2 / "skin_host_msgs/msg").glob("*.msg")):
-    store.register(get_types_from_msg(path.read_text(), f"skin_host_msgs/msg/{path.stem}"))
 
 
 def as_array(code: str, values: Sequence[Any]) -> Any:
     return np.frombuffer(values, np.uint8) if isinstance(values, bytes) else np.array(values, code)
 
 
-made = messages.Messages(store.types.__getitem__, as_array, int)
+@pytest.fixture(scope="module")
+def store() -> Any:
+    """The types of ROS 2 and of this project; hundreds of them, read only here."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    for path in sorted((ROS2 / "skin_host_msgs/msg").glob("*.msg")):
+        types.register(get_types_from_msg(path.read_text(), f"skin_host_msgs/msg/{path.stem}"))
+    return types
+
+
+@pytest.fixture(scope="module")
+def made(store: Any) -> Any:
+    return messages.Messages(store.types.__getitem__, as_array, int)
+
+
+@pytest.fixture
+def again(store: Any) -> Callable[[Any], Any]:
+    """A message as another process reads it: CDR and back."""
+
+    def read(message: Any) -> Any:
+        name = message.__msgtype__
+        return store.deserialize_cdr(store.serialize_cdr(message, name), name)
+
+    return read
+
+
 SHAPE = PartInfo(
     period_ms=50,
     pads=["pressure", "pressure", "thermal"],
@@ -77,13 +98,7 @@ TOUCH = Touch(
 )
 
 
-def again(message: Any) -> Any:
-    """A message as another process reads it: CDR and back."""
-    name = message.__msgtype__
-    return store.deserialize_cdr(store.serialize_cdr(message, name), name)
-
-
-def test_taxels_keep_what_is_valid_and_their_time() -> None:
+def test_taxels_keep_what_is_valid_and_their_time(made: Any, again: Callable[[Any], Any]) -> None:
     seen = again(made.taxels(FRAME))
     np.testing.assert_array_equal(seen.pressure_kpa, np.array([1.5, 20, np.nan], np.float32))
     assert seen.valid.tolist() == [True, True, False]
@@ -96,7 +111,7 @@ def test_taxels_keep_what_is_valid_and_their_time() -> None:
     assert layout.thermal.tolist() == [False, False, True]
 
 
-def test_a_point_cloud_has_a_row_a_taxel() -> None:
+def test_a_point_cloud_has_a_row_a_taxel(made: Any, again: Callable[[Any], Any]) -> None:
     seen = again(made.cloud(FRAME, SHAPE))
     points = np.frombuffer(seen.data, "<f4").reshape(seen.width, -1)
     assert seen.point_step == 16 == 4 * len(seen.fields)
@@ -106,7 +121,7 @@ def test_a_point_cloud_has_a_row_a_taxel() -> None:
     assert not seen.is_dense
 
 
-def test_contacts_and_their_wrench() -> None:
+def test_contacts_and_their_wrench(store: Any, made: Any, again: Callable[[Any], Any]) -> None:
     seen = again(made.contacts(Contact("arm", "ON"), [TOUCH], T_NS))
     (contact,) = seen.contacts
     assert (seen.state, seen.state) == (store.types["skin_host_msgs/msg/ContactArray"].ON, 1)
@@ -118,7 +133,7 @@ def test_contacts_and_their_wrench() -> None:
     assert wrench.torque.y == pytest.approx(0.2)
 
 
-def test_health_is_diagnostics() -> None:
+def test_health_is_diagnostics(made: Any, again: Callable[[Any], Any]) -> None:
     record: Any = {"state": "degraded", "sentences": ["taxel 3: stuck"], "rate_hz": 20.0}
     (status,) = again(made.diagnostics({"arm": Health("arm", record)}, T_NS)).status
     assert (status.level, status.hardware_id) == (messages.WARN, "arm")
@@ -126,7 +141,9 @@ def test_health_is_diagnostics() -> None:
     assert {pair.key: pair.value for pair in status.values}["rate_hz"] == "20.0"
 
 
-def test_they_can_be_kept_in_a_bag(tmp_path: Path) -> None:
+def test_they_can_be_kept_in_a_bag(store: Any, made: Any, tmp_path: Path) -> None:
+    from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as bag:
         for topic, message in (
             ("arm/taxels", made.taxels(FRAME)),

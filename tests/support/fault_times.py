@@ -4,13 +4,13 @@ python -m tests.support.fault_times [--trials 24] [--names stuck_taxel,...]
 """
 
 import argparse
-import copy
 from typing import Any
 
 import numpy as np
 
 from emulator.faults import KINDS
 from skin_host.processing.calibration import Verdict
+from tests.support.branch import branch
 from tests.support.fault_bench import FaultBench
 
 #: What must be told of each; a word that a dead chip reads as makes three kinds of one.
@@ -83,7 +83,7 @@ def trial(
     calibrated: FaultBench, name: str, value: float | None, code: str, rng: np.random.Generator
 ) -> tuple[float, float]:
     """Seconds until the fault is told, and until nothing is believed that must not be."""
-    bench = copy.deepcopy(calibrated)
+    bench = branch(calibrated)
     bench.run(float(rng.integers(20)) * 0.05)
     where = arguments(name, bench, rng)
     taxels = places(name, where, bench)

@@ -45,7 +45,7 @@ def test_probes_farther_apart_are_told_apart_more_often():
 
 @pytest.fixture(scope="module")
 def report():
-    return measure(Plan(5, 2_000, 1, 1.0, 10, 0.01))
+    return measure(Plan(2, 2_000, 1, 1.0, 5, 0.01))
 
 
 def test_the_report_has_every_table_and_numbers_in_all_of_them(report):
