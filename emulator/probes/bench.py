@@ -145,7 +145,7 @@ class PalmRig:
             contact,
             np.concatenate([one.covered for one in single]),
             np.concatenate([one.share for one in single]),
-            np.concatenate([one.bears_mm2 for one in single]),
+            np.concatenate([one.weight for one in single]),
             np.concatenate([one.area_mm2 for one in single]),
             np.concatenate([one.edge for one in single]),
         )

@@ -1,11 +1,13 @@
-"""Computes which pads the probes of a scene cover, for all probes at once.
+"""Computes which pads the probes of a scene cover, for all probes and some steps at once.
 
 The pads within reach of a probe are found once and kept while it slides by less than
-`MARGIN_MM`; each step then costs one pass over those pads.
+`MARGIN_MM`. Where probes go in the next steps is mostly known, so that these steps are computed
+together; what then remains to be done in each of them costs hardly more than in a press.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +30,8 @@ FACING = 0.3
 REACH_MM = 15.0
 #: How far a probe slides before what is within its reach is found again.
 MARGIN_MM = 3.0
+#: So many pads times steps are computed at once: more would not stay in the processor's cache.
+MOST_AT_ONCE = 1 << 14
 #: A pad of which less than this share is covered counts as not covered.
 LEAST_SHARE = 1e-6
 
@@ -86,55 +90,82 @@ class Coverage:
 
     def footprint(self, numbers: Ints, offset_mm: Floats) -> Footprint:
         """What some probes [c] cover that have slid by `offset_mm` [c, 2] from their places."""
-        self._find(numbers, offset_mm)
+        return self.footprints(numbers, offset_mm[None])[0]
+
+    def footprints(self, numbers: Ints, path_mm: Floats) -> list[Footprint]:
+        """What some probes [c] cover along their path [k, c, 2], offsets from their places.
+
+        Returns:
+            The footprints of the first steps of the path: one at least.
+        """
+        path_mm = path_mm[: self._find(numbers, path_mm)]
         if self._membrane_mm:
-            return self._with_membrane(offset_mm)
-        along_mm = self._place_mm - offset_mm[self._contact]
-        distance_mm = np.hypot(along_mm[:, 0], along_mm[:, 1])
-        rows = np.flatnonzero(distance_mm < self._reach_mm)
-        area_mm2 = self._area_mm2(rows, along_mm[rows], distance_mm[rows])
-        covered = area_mm2 / self._pad_mm2[rows]
-        hit = covered > LEAST_SHARE
-        rows, covered, area_mm2 = rows[hit], covered[hit], area_mm2[hit]
-        return Footprint(
-            self._taxel[rows],
-            self._contact[rows],
-            covered,
-            np.ones(len(rows)),
-            area_mm2,
-            self._contact_mm2,
-            np.ones(len(numbers)),
-        )
+            return [self._with_membrane(path_mm[0])]
+        middle_mm = path_mm[len(path_mm) // 2]
+        away_mm = np.hypot(*np.moveaxis(path_mm - middle_mm, 2, 0)).max(axis=0)
+        distance_mm = np.hypot(*(self._place_mm - middle_mm[self._contact]).T)
+        near = np.flatnonzero(distance_mm < self._reach_mm + away_mm[self._contact])
+        path_mm = path_mm[: max(1, MOST_AT_ONCE // max(1, len(near)))]
+        along_mm = self._place_mm[near] - path_mm[:, self._contact[near]]
+        distance_mm = np.hypot(along_mm[..., 0], along_mm[..., 1])
+        area_mm2 = self._area_mm2(near, along_mm, distance_mm)
+        covered = area_mm2 / self._pad_mm2[near]
+        hit = (distance_mm < self._reach_mm[near]) & (covered > LEAST_SHARE)
+        turns = np.flatnonzero((hit[1:] != hit[:-1]).any(axis=1)) + 1
+        found = []
+        for start, stop in pairwise([0, *turns.tolist(), len(hit)]):
+            columns = np.flatnonzero(hit[start])
+            rows = near[columns]
+            # The same pads as before are the same object, see `Footprint`.
+            if not np.array_equal(rows, self._rows):
+                self._rows = rows
+                self._pads = self._taxel[rows], self._contact[rows], np.ones(len(rows))
+            taxel, contact, ones = self._pads
+            covered_here = covered[start:stop, columns]
+            weight = _shares(area_mm2[start:stop, columns], contact)
+            found += [
+                Footprint(taxel, contact, of_pad, ones, share, self._contact_mm2, self._no_edge)
+                for of_pad, share in zip(covered_here, weight, strict=True)
+            ]
+        return found
 
     def _area_mm2(self, rows: Ints, along_mm: Floats, distance_mm: Floats) -> Floats:
+        """Area common to pads and probes, [k, rows]."""
         contact = self._contact[rows]
         radius_mm = self._pad_radius_mm[rows]
-        if not self._is_rectangle.any():
-            return lens_area_mm2(distance_mm, radius_mm, self._edge_mm[contact])
-        area_mm2 = np.empty(len(rows))
         rectangle = self._is_rectangle[contact]
+        if not rectangle.any():
+            return lens_area_mm2(distance_mm, radius_mm, self._edge_mm[contact])
+        area_mm2 = np.empty(distance_mm.shape)
         disc = ~rectangle
-        area_mm2[disc] = lens_area_mm2(
-            distance_mm[disc], radius_mm[disc], self._edge_mm[contact[disc]]
+        area_mm2[:, disc] = lens_area_mm2(
+            distance_mm[:, disc], radius_mm[disc], self._edge_mm[contact[disc]]
         )
-        contact = contact[rectangle]
-        area_mm2[rectangle] = rectangle_area_mm2(
-            along_mm[rectangle], radius_mm[rectangle], self._size_mm[contact], self._turn[contact]
-        )
+        contact, radius_mm = contact[rectangle], radius_mm[rectangle]
+        for step, of_step_mm in enumerate(along_mm[:, rectangle]):
+            area_mm2[step, rectangle] = rectangle_area_mm2(
+                of_step_mm, radius_mm, self._size_mm[contact], self._turn[contact]
+            )
         return area_mm2
 
-    def _find(self, numbers: Ints, offset_mm: Floats) -> None:
-        """Gather the pads near these probes, where they are not known."""
+    def _find(self, numbers: Ints, path_mm: Floats) -> int:
+        """Gather the pads near these probes where they are not known; for how many steps."""
+        away_mm = np.abs(path_mm - path_mm[0]).max(axis=(1, 2), initial=0.0)
+        beyond = away_mm >= MARGIN_MM / 2
+        steps = int(beyond.argmax()) if beyond.any() else len(path_mm)
+        path_mm = path_mm[:steps]
         same = self._gathered and np.array_equal(numbers, self._numbers)
-        if same and np.abs(offset_mm - self._found_mm).max(initial=0.0) < MARGIN_MM / 2:
-            return
+        if same and np.abs(path_mm - self._found_mm).max(initial=0.0) < MARGIN_MM / 2:
+            return steps
         found = []
-        for number, offset in zip(numbers.tolist(), offset_mm, strict=True):
+        for number, own_mm in zip(numbers.tolist(), np.moveaxis(path_mm, 1, 0), strict=True):
             near = self._near.get(number)
-            if near is None or np.abs(offset - near.offset_mm).max() >= MARGIN_MM / 2:
-                near = self._near[number] = self._look(number, offset)
+            # Those that are half way to their margin are looked for with those beyond it.
+            if near is None or np.abs(own_mm - near.offset_mm).max() >= MARGIN_MM / 4:
+                near = self._near[number] = self._look(number, own_mm[0])
             found.append(near)
-        self._gather(numbers, found)
+        self._gather(numbers, found, same=same)
+        return steps
 
     def _look(self, number: int, offset_mm: Floats) -> _Near:
         point_mm, along, taxels = self._places[number]
@@ -147,8 +178,8 @@ class Coverage:
         near = np.hypot(apart_mm[:, 0], apart_mm[:, 1]) < reach_mm + self._radius_mm[taxels]
         return _Near(offset_mm.copy(), taxels[near], place_mm[near])
 
-    def _gather(self, numbers: Ints, found: Sequence[_Near]) -> None:
-        self._numbers, self._gathered = numbers.copy(), True
+    def _gather(self, numbers: Ints, found: Sequence[_Near], *, same: bool) -> None:
+        self._rows = np.full(1, -1, np.intp)
         shapes = [self._shapes[number] for number in numbers]
         none = np.zeros((0, 2))
         self._found_mm = np.array([near.offset_mm for near in found]).reshape(-1, 2)
@@ -157,7 +188,15 @@ class Coverage:
         self._contact = np.repeat(np.arange(len(found)), [len(near.taxel) for near in found])
         self._pad_radius_mm = self._radius_mm[self._taxel]
         self._pad_mm2 = np.pi * self._pad_radius_mm**2
+        if not same:
+            self._set_contacts(numbers, shapes)
+        reach_mm = np.array([shape.reach_mm for shape in shapes])
+        self._reach_mm = reach_mm[self._contact] + self._pad_radius_mm
+
+    def _set_contacts(self, numbers: Ints, shapes: Sequence[Shape]) -> None:
+        self._numbers, self._gathered = numbers.copy(), True
         self._contact_mm2 = np.array([shape.area_mm2 for shape in shapes])
+        self._no_edge = np.ones(len(shapes))
         self._edge_mm = np.array([shape.edge_radius_mm for shape in shapes])
         self._is_rectangle = np.array([isinstance(shape, Rectangle) for shape in shapes], bool)
         self._size_mm = np.array(
@@ -166,8 +205,6 @@ class Coverage:
         self._turn = np.deg2rad(
             [shape.turn_deg if isinstance(shape, Rectangle) else 0.0 for shape in shapes]
         )
-        reach_mm = np.array([shape.reach_mm for shape in shapes])
-        self._reach_mm = reach_mm[self._contact] + self._pad_radius_mm
 
     def _with_membrane(self, offset_mm: Floats) -> Footprint:
         """What a drawn-down surface adds is found contact by contact."""
@@ -188,6 +225,16 @@ class Coverage:
             np.repeat(np.arange(len(singles)), rows),
             *(
                 np.concatenate([np.zeros(0), *(getattr(one, name) for _, one in singles)])
-                for name in ("covered", "share", "bears_mm2", "area_mm2", "edge")
+                for name in ("covered", "share", "weight", "area_mm2", "edge")
             ),
         )
+
+
+def _shares(area_mm2: Floats, contact: Ints) -> Floats:
+    """Share of each pad in what its contact covers, [k, m]; the pads of a contact together."""
+    if not len(contact):
+        return area_mm2
+    is_first = np.append(True, contact[1:] != contact[:-1])
+    sums_mm2 = np.add.reduceat(area_mm2, np.flatnonzero(is_first), axis=1)
+    shares: Floats = area_mm2 / sums_mm2[:, np.cumsum(is_first) - 1]
+    return shares

@@ -39,6 +39,7 @@ _DENSE_KPA = 2000.0
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +81,11 @@ class Foam:
 
     def elastic_kpa(self, strain: Floats) -> Floats:
         """sigma(x) for strains [n] below the pole."""
-        return self.elastic_kpa_and_slope(strain)[0]
+        value = self.e0_kpa * strain * (1 + self.stiffening * strain * strain)
+        if strain.max(initial=0.0) > DENSE_STRAIN:
+            over = np.maximum(strain - DENSE_STRAIN, 0.0)
+            value += _DENSE_KPA * over**2 / (POLE_STRAIN - strain)
+        return value
 
     def strain(self, elastic_kpa: Floats) -> Floats:
         """The inverse of `elastic_kpa`, for pressures [n] >= 0."""
@@ -117,12 +122,17 @@ class Foam:
 class Footprint:
     """Which pads c contacts cover: m rows, one for each pad (or zone of a pad) of a contact.
 
+    Contacts that slide have a new footprint at each step. Where two footprints share the object
+    `area_mm2`, they are of the same contacts; where they share `taxel` too, their rows are of the
+    same pads. That saves finding it out.
+
     Attributes:
         taxel, contact: int[m], indices of the pad and of the contact.
         covered: float64[m], fraction of the pad's area in this row.
         share: float64[m], strain here as a fraction of the strain under the contact: 1 under
             it, less in the zone around it that a membrane draws down.
-        bears_mm2: float64[m], covered area that bears the contact; 0 in the zone around.
+        weight: float64[m], share of this row in the area that bears its contact: they add up to
+            1 for a contact with any pad under it; 0 in the zone around.
         area_mm2: float64[c], the contact's whole area.
         edge: float64[c], force on the contact over force on its area alone; 1 without membrane.
     """
@@ -131,7 +141,7 @@ class Footprint:
     contact: Ints
     covered: Floats
     share: Floats
-    bears_mm2: Floats
+    weight: Floats
     area_mm2: Floats
     edge: Floats
 
@@ -146,27 +156,31 @@ class Footprint:
 class Drive:
     """How c rigid probes are driven: arrays [c].
 
-    A probe is driven by force where `force_n` is a number. Where it is NaN, `depth_mm` is
-    commanded (below the undeformed surface) and reached through a spring in series: load
-    cell, arm, or the object itself.
+    A probe that is driven by depth is commanded below the undeformed surface and reaches that
+    through a spring in series: load cell, arm, or the object itself.
+
+    Attributes:
+        value: float64[c], force (N) or depth (mm).
+        is_depth: bool[c], which of the two.
+        compliance_mm_per_n: float64[c], of the springs.
     """
 
-    depth_mm: Floats
-    force_n: Floats
+    value: Floats
+    is_depth: Mask
     compliance_mm_per_n: Floats
 
     @classmethod
     def by_force(cls, force_n: ArrayLike) -> "Drive":
         """Probes pushed with given forces [c] (N)."""
         force = np.atleast_1d(np.asarray(force_n, np.float64))
-        return cls(np.zeros(len(force)), force, np.zeros(len(force)))
+        return cls(force, np.zeros(len(force), bool), np.zeros(len(force)))
 
     @classmethod
     def by_depth(cls, depth_mm: ArrayLike, compliance_mm_per_n: ArrayLike = 0.0) -> "Drive":
         """Probes moved to given depths [c] (mm) by robots of given compliance."""
         depth = np.atleast_1d(np.asarray(depth_mm, np.float64))
         compliance = np.broadcast_to(compliance_mm_per_n, depth.shape).astype(np.float64)
-        return cls(depth, np.full(len(depth), np.nan), compliance)
+        return cls(depth, np.ones(len(depth), bool), compliance)
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,12 +218,14 @@ class FoamLayer:
         self._imprint_strain = np.zeros(len(foam))
         self._covered = np.zeros(len(foam))
         self._touched = self._recovering = np.zeros(0, np.intp)
+        #: Since recovering foam was last worked out; foam that was left since then is ahead.
         self._waited_s = 0.0
-        self._strain = np.zeros(0)
-        #: Those of the two steps before the last one.
-        self._strains_before = self._strain, self._strain
+        self._ahead_s = np.zeros(len(foam))
         self._mean_thickness_mm = float(foam.thickness_mm.mean()) if len(foam) else 1.0
-        self._place(Footprint.empty(), 0.0)
+        self._footprint = Footprint.empty()
+        self._drive = Drive.by_force([])
+        self._cover(self._footprint)
+        self._meet(0)
 
     def step(self, footprint: Footprint, drive: Drive, dt_s: float) -> Felt:
         """Let `dt_s` pass while `footprint`'s contacts go where `drive` takes them.
@@ -217,31 +233,29 @@ class FoamLayer:
         A footprint object that stays the same from step to step saves finding out what it
         covers; make a new one only for contacts that moved, came or went.
         """
-        if footprint is not self._footprint:
-            self._place(footprint, dt_s)
-        else:
-            self._waited_s += dt_s
-            if self._waited_s >= self.RECOVERY_STEP_S:
-                self._recovering = self._free(self._recovering, self._waited_s)
-                self._waited_s = 0.0
+        self._take(footprint, drive, dt_s)
+        self._waited_s += dt_s
+        if self._waited_s >= self.RECOVERY_STEP_S:
+            self._recover()
         rows = footprint
-        strain = self._press(drive)[rows.contact] * rows.share
-        # Where the foam has not come back to the probe's depth, they do not touch.
         imprint = self.truth.relaxation_kpa[rows.taxel]
+        strain = self._press(drive, imprint)[rows.contact] * rows.share
+        # Where the foam has not come back to the probe's depth, they do not touch.
         elastic = np.maximum(self._law.elastic_kpa(strain), imprint)
         loose = elastic <= imprint
-        if loose.any():
+        is_loose = bool(loose.any())
+        if is_loose:
             strain = np.where(loose, self._law.strain(elastic), strain)
         if self._repeats:
             deepest = np.zeros(len(self.foam))
             np.maximum.at(deepest, rows.taxel, elastic)
-            elastic = deepest[self._touched]
-            pressure = self.truth.step(elastic, dt_s, self._touched)
+            pressure = self.truth.step(deepest[self._touched], dt_s, self._touched)
             self.pressure_kpa[self._touched] = np.maximum(pressure, 0.0)
+            pressure = self.pressure_kpa[rows.taxel]
         else:
-            pressure = self.truth.step(elastic, dt_s, rows.taxel)
-            self.pressure_kpa[rows.taxel] = np.maximum(pressure, 0.0)
-        borne = self._weight * np.where(loose, 0.0, self.pressure_kpa[rows.taxel])
+            pressure = np.maximum(self.truth.step(elastic, dt_s, rows.taxel), 0.0)
+            self.pressure_kpa[rows.taxel] = pressure
+        borne = rows.weight * (np.where(loose, 0.0, pressure) if is_loose else pressure)
         mean_kpa = np.bincount(rows.contact, borne, len(rows.area_mm2))
         if len(self._between):
             mean_kpa[~self._bears] = self._between.elastic_kpa(self._strain[~self._bears])
@@ -250,40 +264,34 @@ class FoamLayer:
             return Felt(rows.taxel, strain, rows.covered)
         left = self._recovering
         return Felt(
-            np.concatenate([rows.taxel, left]),
+            self._felt_taxel,
             np.concatenate([strain, self._imprint_strain[left]]),
             np.concatenate([rows.covered, self._covered[left]]),
         )
 
-    def _press(self, drive: Drive) -> Floats:
+    def _press(self, drive: Drive, imprint: Floats) -> Floats:
         """The strain under each contact, [c]: a x + b p(x) = d by Newton's method.
 
         p is the mean pressure under the contact. It is convex in x, so the steps overshoot at
         most once and then come down to the root.
         """
-        rows, n_contacts = self._footprint, len(self._footprint.area_mm2)
-        forced = ~np.isnan(drive.force_n) & self._bears
-        softness = drive.compliance_mm_per_n * self._bears_n_per_kpa / self._thickness_mm
-        a = np.where(forced, 0.0, 1.0)
-        b = np.where(forced, 1.0, softness)
-        depth = drive.depth_mm / self._thickness_mm
-        d = np.maximum(np.where(forced, drive.force_n / self._bears_n_per_kpa, depth), 0.0)
+        contact, weight, n_contacts = self._footprint.contact, self._footprint.weight, len(self._a)
+        a, b, law = self._a, self._b, self._law
+        d = np.maximum(drive.value / self._unit, 0.0)
         if len(self._between):
-            bare = np.flatnonzero(~self._bears)
-            by_force = bare[~np.isnan(drive.force_n[bare])]
-            pressed = np.maximum(drive.force_n / self._bears_n_per_kpa, 0.0)
-            d[by_force] = Foam.uniform(len(by_force)).strain(pressed[by_force])
-            b[bare] = 0.0
-        imprint = self.truth.relaxation_kpa[rows.taxel]
+            bare = np.flatnonzero(~self._bears & ~drive.is_depth)
+            pressed = np.maximum(drive.value[bare] / self._bears_n_per_kpa[bare], 0.0)
+            d[bare] = Foam.uniform(len(bare)).strain(pressed)
         # Start value: the contact continues nearly as in the last three steps.
         last, before, earlier = self._strain, *self._strains_before
         strain = 3 * (last - before) + earlier
         strain = np.minimum(np.maximum(strain, 0.0), 0.5 * (last + POLE_STRAIN))
         for _ in range(60):
-            value, slope = self._law.elastic_kpa_and_slope(strain[rows.contact])
-            weight = np.where(value > imprint, self._weight, 0.0)
-            mean = np.bincount(rows.contact, weight * (value - imprint), n_contacts)
-            mean_slope = np.bincount(rows.contact, weight * slope, n_contacts)
+            value, slope = law.elastic_kpa_and_slope(strain[contact])
+            over = value - imprint
+            bearing = np.where(over > 0, weight, 0.0)
+            mean = np.bincount(contact, bearing * over, n_contacts)
+            mean_slope = np.bincount(contact, bearing * slope, n_contacts)
             newton = (a * strain + b * mean - d) / np.maximum(a + b * mean_slope, 1e-9)
             # Half way to the pole at most, so that no step jumps over it.
             nearest = 0.5 * (strain + POLE_STRAIN)
@@ -296,40 +304,96 @@ class FoamLayer:
         self.depth_mm = strain * self._thickness_mm
         return strain
 
-    def _place(self, footprint: Footprint, dt_s: float) -> None:
-        """Take over a footprint: gather its foam, release what it no longer covers."""
+    def _take(self, footprint: Footprint, drive: Drive, dt_s: float) -> None:
+        """Take over what has changed in a footprint and a drive."""
+        before, self._footprint = self._footprint, footprint
+        changed = footprint is not before
+        if footprint.taxel is not before.taxel:
+            self._release(before, footprint, dt_s)
+            self._cover(footprint)
+        elif changed and not self._is_even:
+            self._set_thickness(footprint)
+        else:
+            changed = False
+        if footprint.area_mm2 is not before.area_mm2:
+            self._meet(len(footprint.area_mm2))
+        if (
+            changed
+            or drive.is_depth is not self._drive.is_depth
+            or drive.compliance_mm_per_n is not self._drive.compliance_mm_per_n
+        ):
+            self._set_drive(drive)
+        self._drive = drive
+
+    def _release(self, before: Footprint, footprint: Footprint, dt_s: float) -> None:
+        """Let go of the foam that a new footprint no longer covers; it has `dt_s` to come back."""
         is_touched = np.zeros(len(self.foam), bool)
         is_touched[footprint.taxel] = True
-        touched = np.flatnonzero(is_touched)
         left = self._touched[~is_touched[self._touched]]
-        met = is_touched[self._recovering]
-        self._free(self._recovering[met], self._waited_s)
-        recovering = self._free(self._recovering[~met], self._waited_s + dt_s)
-        self._recovering = np.concatenate([recovering, self._free(left, dt_s)])
-        self._waited_s = 0.0
+        self._touched = np.flatnonzero(is_touched)
+        if len(left):
+            self._covered[left] = 0.0
+            np.add.at(self._covered, before.taxel, before.covered)
+        is_met = is_touched[self._recovering]
+        if is_met.any():
+            met = self._recovering[is_met]
+            self._free(met, self._waited_s - self._ahead_s[met])
+            self._recovering = self._recovering[~is_met]
+        if not len(self._recovering):
+            self._waited_s = 0.0
+        if len(left):
+            self._ahead_s[left] = self._waited_s + dt_s
+            left = self._free(left, dt_s)
+            self._recovering = np.concatenate([self._recovering, left])
 
-        rows = self._footprint = footprint
+    def _cover(self, rows: Footprint) -> None:
+        """Gather the foam under a footprint."""
         n_contacts = len(rows.area_mm2)
-        self._touched = touched
-        self._repeats = len(touched) < len(rows.taxel)
-        self._covered[touched] = 0.0
-        np.add.at(self._covered, rows.taxel, rows.covered)
+        self._repeats = len(self._touched) < len(rows.taxel)
+        self._felt_taxel = np.concatenate([rows.taxel, self._recovering])
         self._law = self.foam.take(rows.taxel)
-        bears_mm2 = np.bincount(rows.contact, rows.bears_mm2, n_contacts)
-        self._bears = bears_mm2 > 0
-        self._weight = rows.bears_mm2 / np.where(self._bears, bears_mm2, 1.0)[rows.contact]
-        thickness_mm = np.bincount(rows.contact, self._weight * self._law.thickness_mm, n_contacts)
-        self._thickness_mm = np.where(self._bears, thickness_mm, self._mean_thickness_mm)
+        self._bears = np.bincount(rows.contact, rows.weight, n_contacts) > 0
         # A probe between the pads has foam under it too: nominal, and purely elastic.
         self._between = Foam.uniform(int(np.count_nonzero(~self._bears)))
         self._bears_n_per_kpa = rows.area_mm2 * rows.edge * 1e-3
+        self._set_thickness(rows)
+
+    def _set_thickness(self, rows: Footprint) -> None:
+        """Of the foam under each contact; whether it is the same all over each of them."""
+        of_row = self._law.thickness_mm
+        thickness_mm = np.full(len(rows.area_mm2), self._mean_thickness_mm)
+        thickness_mm[rows.contact] = of_row
+        self._is_even = bool((thickness_mm[rows.contact] == of_row).all())
+        if not self._is_even:
+            mean_mm = np.bincount(rows.contact, rows.weight * of_row, len(rows.area_mm2))
+            thickness_mm = np.where(self._bears, mean_mm, self._mean_thickness_mm)
+        self._thickness_mm = thickness_mm
+
+    def _meet(self, n_contacts: int) -> None:
+        """Of new contacts nothing is known."""
         self._strain = np.full(n_contacts, 0.3)
+        #: Those of the two steps before the last one.
         self._strains_before = self._strain, self._strain
 
-    def _free(self, taxels: Ints, dt_s: float) -> Ints:
+    def _set_drive(self, drive: Drive) -> None:
+        """What `_press` has to solve, but for the present value of the drive."""
+        forced = ~drive.is_depth & self._bears
+        softness = drive.compliance_mm_per_n * self._bears_n_per_kpa / self._thickness_mm
+        self._a = np.where(forced, 0.0, 1.0)
+        self._b = np.where(forced, 1.0, np.where(self._bears, softness, 0.0))
+        self._unit = np.where(forced, self._bears_n_per_kpa, self._thickness_mm)
+
+    def _recover(self) -> None:
+        """Bring recovering foam to the present."""
+        if len(self._recovering):
+            late_s = self._waited_s - self._ahead_s[self._recovering]
+            self._recovering = self._free(self._recovering, late_s)
+            self._felt_taxel = np.concatenate([self._footprint.taxel, self._recovering])
+            self._ahead_s[self._recovering] = 0.0
+        self._waited_s = 0.0
+
+    def _free(self, taxels: Ints, dt_s: float | Floats) -> Ints:
         """Let untouched foam come back for `dt_s`; returns where a residual is left."""
-        if not len(taxels):
-            return taxels
         elastic = self.truth.step_pressure(np.zeros(len(taxels)), dt_s, taxels)
         self.pressure_kpa[taxels] = 0.0
         self._imprint_strain[taxels] = self.foam.take(taxels).strain(elastic)

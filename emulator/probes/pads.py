@@ -245,7 +245,8 @@ class Pads:
         # Beside the pads, the foam of those it draws down stands for what is under it.
         beside = np.bincount(contact, bears_mm2, len(shapes)) == 0
         bears_mm2 = np.where(beside[contact], covered_mm2, bears_mm2)
-        return Footprint(taxel, contact, covered, share, bears_mm2, area_mm2, edge)
+        weight = bears_mm2 / np.bincount(contact, bears_mm2, len(shapes))[contact]
+        return Footprint(taxel, contact, covered, share, weight, area_mm2, edge)
 
     def _zones(self, shape: Shape) -> Iterator[tuple[Ints, Floats, Floats]]:
         """Pads, covered fractions and shares of the depth: the contact, then what it draws down."""

@@ -279,6 +279,12 @@ class Script:
         values = self._from[number] + self._rate[number] * since_s[:, None]
         return Moment(number, np.maximum(values[:, 0], 0.0), values[:, 1:])
 
+    def path_mm(self, number: NDArray[np.intp], times_s: Floats) -> Floats:
+        """Where some probes [c] are, [k, c, 2], at k times after `at`, if no keyframe comes."""
+        since_s = times_s[:, None] - self._begin_s[number]
+        path_mm: Floats = self._from[number, 1:] + self._rate[number, 1:] * since_s[:, :, None]
+        return path_mm
+
     def still_until_s(self, t_s: float) -> float:
         """After `at(t_s)`: when something may change next; `t_s` itself if it does now."""
         if self._moves:

@@ -4,6 +4,7 @@ Mechanics runs for contacts and for foam that still recovers; a pad that nobody 
 its capacitance and costs nothing.
 """
 
+from collections import deque
 from collections.abc import Collection
 from pathlib import Path
 
@@ -41,6 +42,8 @@ STEP_C = 0.01
 MOVING_NS = 5_000_000
 #: While probes are held, foam recovers or the temperature moves, this is enough, after a time.
 HOLDING_NS = 50_000_000
+#: So many steps of sliding probes are foreseen at most.
+MOST_FORESEEN = 64
 #: Air changes slowly enough for this.
 AIR_NS = 20_000_000
 SETTLING_SHARE = 10
@@ -143,9 +146,11 @@ class Skin:
         self._active = np.zeros(0, np.intp)
         self._offset_mm = np.zeros((0, 2))
         self._footprint = Footprint.empty()
+        #: Footprints of the next steps of sliding probes, with the offsets that they are for.
+        self._foreseen: deque[tuple[Floats, Footprint]] = deque()
+        self._came_true = 0
         self._by_depth_now = np.zeros(0, bool)
-        self._any_by_depth = False
-        self._no_drive = self._compliance_now = np.zeros(0)
+        self._compliance_now = np.zeros(0)
         self._idle = True
         self._still_until_s = 0.0
         self._changed_ns = self._t_ns
@@ -290,12 +295,8 @@ class Skin:
         number = moment.number
         same = number is self._active or np.array_equal(number, self._active)
         if not same or (moment.offset_mm != self._offset_mm).any():
-            self._place(moment)
-        depth_mm, force_n = self._no_drive, moment.drive
-        if self._any_by_depth:
-            depth_mm = np.where(self._by_depth_now, moment.drive, 0.0)
-            force_n = np.where(self._by_depth_now, np.nan, moment.drive)
-        drive = Drive(depth_mm, force_n, self._compliance_now)
+            self._place(moment, same=same)
+        drive = Drive(moment.drive, self._by_depth_now, self._compliance_now)
         felt = self._foam.step(self._footprint, drive, dt_s)
         rise_ff = self._pads.rise_ff(felt, self._footprint, self._grounded[number])
         if felt.taxel is not self._felt and not np.array_equal(felt.taxel, self._felt):
@@ -313,18 +314,35 @@ class Skin:
         self.capacitance_ff[touched] = self.resting_ff[touched] + rise_ff + drifted_ff
         return touched
 
-    def _place(self, moment: Moment) -> None:
+    def _place(self, moment: Moment, *, same: bool) -> None:
         """Find out what the probes cover, when some came, went or slid."""
         self._active, self._offset_mm = moment.number, moment.offset_mm
-        self._by_depth_now = self._by_depth[moment.number]
-        self._any_by_depth = bool(self._by_depth_now.any())
-        self._no_drive = np.zeros(len(moment.number))
-        self._compliance_now = self._compliance[moment.number]
-        self._footprint = self._coverage.footprint(moment.number, moment.offset_mm)
-        under = self._footprint.bears_mm2 > 0
-        self._covered = np.bincount(
-            self._footprint.taxel[under], self._footprint.covered[under], self._layout.n_taxels
-        ).astype(np.float64)
+        if not same:
+            self._by_depth_now = self._by_depth[moment.number]
+            self._compliance_now = self._compliance[moment.number]
+            self._foreseen.clear()
+        before, self._footprint = self._footprint, self._foresee(moment)
+        rows = self._footprint
+        self._covered[before.taxel] = 0.0
+        np.add.at(self._covered, rows.taxel, np.where(rows.weight > 0, rows.covered, 0.0))
+
+    def _foresee(self, moment: Moment) -> Footprint:
+        """What probes cover now; with it, if it is new, what they will cover in the next steps."""
+        if self._foreseen:
+            offset_mm, footprint = self._foreseen.popleft()
+            if (offset_mm == moment.offset_mm).all():
+                self._came_true += 1
+                return footprint
+            self._foreseen.clear()
+        # Twice as far ahead as what was foreseen came true.
+        steps = min(2 * self._came_true, MOST_FORESEEN)
+        self._came_true = 1
+        times_s = (self._t_ns + MOVING_NS * np.arange(1, steps)) * 1e-9
+        ahead_mm = self._script.path_mm(moment.number, times_s)
+        path_mm = np.concatenate([moment.offset_mm[None], ahead_mm])
+        footprints = self._coverage.footprints(moment.number, path_mm)
+        self._foreseen.extend(zip(path_mm[1:], footprints[1:], strict=False))
+        return footprints[0]
 
 
 def _truth(scene: Scene, n: int, rng: np.random.Generator | None) -> FoamTruth:

@@ -51,6 +51,7 @@ COLE_TAUS_S = np.geomspace(1e-4, 1e8, 49)
 SOFTENING = 0.03
 SOFTENING_KPA = 40.0
 HEALING_S = 1800.0
+_NONE = np.zeros(0)
 
 
 def _cole_cole() -> Floats:
@@ -84,7 +85,10 @@ _LAWS: dict[str, _Law] = {
 
 
 class _States(NamedTuple):
-    """What k taxels remember: modes [k, modes], plays [k, 3], highest compression [k]."""
+    """What k taxels remember: modes [k, modes], plays [k, 3], highest compression [k].
+
+    The last two are empty in a law that has no use for them.
+    """
 
     modes: Floats
     plays: Floats
@@ -154,11 +158,11 @@ class FoamTruth:
         return self._store(elastic, self._stepped(elastic, dt_s, taxels), taxels)
 
     def step_pressure(
-        self, pressure_kpa: ArrayLike, dt_s: float, taxels: Ints | slice = slice(None)
+        self, pressure_kpa: ArrayLike, dt_s: float | Floats, taxels: Ints | slice = slice(None)
     ) -> Floats:
         """Pressure-driven: find the C [k] that leaves P = `pressure_kpa` after `dt_s`.
 
-        With P = 0 it is free foam, and C its residual.
+        With P = 0 it is free foam, and C its residual. `dt_s` may be [k], a time for each.
         """
         pressure = np.asarray(pressure_kpa, np.float64)
         return self._solve(pressure, 0.0, dt_s, taxels)
@@ -180,7 +184,7 @@ class FoamTruth:
         return self._solve(command / (1 + compliance), 1 / (1 + compliance), dt_s, taxels)
 
     def _solve(
-        self, offset: Floats, pressed_share: float, dt_s: float, taxels: Ints | slice
+        self, offset: Floats, pressed_share: float, dt_s: float | Floats, taxels: Ints | slice
     ) -> Floats:
         """Find C = max(offset + (1 - pressed_share) R, R) with R at the end of the step."""
         relaxation = self.relaxation_kpa[taxels]
@@ -193,15 +197,15 @@ class FoamTruth:
         self._store(elastic, states, taxels)
         return elastic
 
-    def _stepped(self, elastic: Floats, dt_s: float, taxels: Ints | slice) -> _States:
+    def _stepped(self, elastic: Floats, dt_s: float | Floats, taxels: Ints | slice) -> _States:
         """The states after C went to `elastic`; nothing is stored."""
         law = self._law
         modes = self._modes[taxels]
-        dt_s *= self._speed
+        dt_s = dt_s * self._speed
         # C in the middle of a straight line stands for the line: exact to second order.
         middle = 0.5 * (self.elastic_kpa[taxels] + elastic)[:, None]
         away = middle - modes
-        rate = dt_s / law.tau_s
+        rate = (dt_s[:, None] if isinstance(dt_s, np.ndarray) else dt_s) / law.tau_s
         if law.time_shift:
             rate = rate * np.exp((np.minimum(middle, SHIFT_LIMIT_KPA) - 30.0) / 40.0)
         if law.unloading_ratio != 1.0:
@@ -209,11 +213,12 @@ class FoamTruth:
         if law.overstress_per_kpa:
             rate = rate * (1 + law.overstress_per_kpa * np.abs(away))
         modes = modes - np.expm1(-rate) * away
-        plays = self._plays[taxels]
+        plays = peak = _NONE
         if law.plays:
-            plays = np.clip(plays, elastic[:, None] - PLAY_KPA, elastic[:, None] + PLAY_KPA)
-        peak = self._peak_kpa[taxels]
+            low, high = elastic[:, None] - PLAY_KPA, elastic[:, None] + PLAY_KPA
+            plays = np.clip(self._plays[taxels], low, high)
         if law.softens:
+            peak = self._peak_kpa[taxels]
             healed = peak + np.expm1(-dt_s / HEALING_S) * (peak - elastic)
             peak = np.maximum(healed, elastic)
         return _States(modes, plays, peak)
@@ -237,8 +242,10 @@ class FoamTruth:
         relaxation = self._relaxation(elastic, states, taxels)
         pressure = elastic - relaxation
         self._modes[taxels] = states.modes
-        self._plays[taxels] = states.plays
-        self._peak_kpa[taxels] = states.peak_kpa
+        if self._law.plays:
+            self._plays[taxels] = states.plays
+        if self._law.softens:
+            self._peak_kpa[taxels] = states.peak_kpa
         self.elastic_kpa[taxels] = elastic
         self.relaxation_kpa[taxels] = relaxation
         self.pressure_kpa[taxels] = pressure
