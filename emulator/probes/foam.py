@@ -224,6 +224,10 @@ class FoamLayer:
         self._mean_thickness_mm = float(foam.thickness_mm.mean()) if len(foam) else 1.0
         self._footprint = Footprint.empty()
         self._drive = Drive.by_force([])
+        self._a = self._b = self._unit = np.zeros(0)
+        #: Strains of the last step, and of the two before it.
+        self._strain = np.zeros(0)
+        self._strains_before = self._strain, self._strain
         self._cover(self._footprint)
         self._meet(0)
 
@@ -372,7 +376,6 @@ class FoamLayer:
     def _meet(self, n_contacts: int) -> None:
         """Of new contacts nothing is known."""
         self._strain = np.full(n_contacts, 0.3)
-        #: Those of the two steps before the last one.
         self._strains_before = self._strain, self._strain
 
     def _set_drive(self, drive: Drive) -> None:

@@ -177,15 +177,23 @@ def lens_area_mm2(apart_mm: Floats, radius_a_mm: ArrayLike, radius_b_mm: ArrayLi
     """Area common to two circles, broadcast over distances and radii."""
     a, b = np.asarray(radius_a_mm, np.float64), np.asarray(radius_b_mm, np.float64)
     small, large = np.minimum(a, b), np.maximum(a, b)
+    inside = large - small
     # Inside each other, or apart, the formula holds at the nearest touching distance.
-    d = np.clip(apart_mm, large - small, large + small)
-    d = np.where(d > 0, d, 1.0)
-    along = (d * d + small * small - large * large) / (2 * d)
-    at_small = np.arccos(np.clip(along / small, -1.0, 1.0))
-    at_large = np.arccos(np.clip((d - along) / large, -1.0, 1.0))
+    d = np.minimum(np.maximum(apart_mm, np.maximum(inside, 1e-9)), large + small)
+    along = 0.5 * (d - inside * (large + small) / d)
     half_chord = np.sqrt(np.maximum(small * small - along * along, 0.0))
-    lens: Floats = small * small * at_small + large * large * at_large - d * half_chord
-    return np.where(apart_mm <= large - small, np.pi * small * small, np.maximum(lens, 0.0))
+    lens: Floats = small * small * _arccos(along / small)
+    lens += large * large * _arccos((d - along) / large)
+    lens -= d * half_chord
+    np.maximum(lens, 0.0, out=lens)
+    np.copyto(lens, np.pi * small * small, where=apart_mm <= inside)
+    return lens
+
+
+def _arccos(cosine: Floats) -> Floats:
+    """The angle of a cosine that rounding may have carried beyond 1."""
+    angle: Floats = np.arccos(np.minimum(np.maximum(cosine, -1.0), 1.0))
+    return angle
 
 
 class Pads:

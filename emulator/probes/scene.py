@@ -6,6 +6,7 @@ centre, or a taxel. `docs/scenes.md` explains every key.
 """
 
 from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass
 from heapq import heapify, heapreplace
 from itertools import pairwise
@@ -236,54 +237,52 @@ class Script:
     """The scene's probes over time. Time only goes forward; work is done where keyframes are."""
 
     def __init__(self, probes: list[Probe]) -> None:
-        self._probes = probes
-        self._drives = [probe.drive for probe in probes]
-        self._drive_times_s = [[t_s for t_s, _ in drive] for drive in self._drives]
-        self._slide_times_s = [[t_s for t_s, _, _ in probe.slide_mm] for probe in probes]
+        self._courses = [_Course.of(probe) for probe in probes]
         n = len(probes)
-        #: Of each probe's present stretch: begin (s), then drive, x and y there and per second.
-        self._begin_s = np.zeros(n)
-        self._from = np.zeros((n, 3))
-        self._rate = np.zeros((n, 3))
+        #: The straight line that each probe follows now, as in `_Course`.
+        self._lines = np.zeros((n, _LINE))
         self._touches = np.zeros(n, bool)
-        self._number = np.zeros(0, np.intp)
-        self._moves = False
-        #: When the stretches end, the next one first.
-        self._ends = [(probe.start_s, number) for number, probe in enumerate(probes)]
+        self._gather()
+        #: When the lines end, the next one first.
+        self._ends = [(course.start_s, number) for number, course in enumerate(self._courses)]
         heapify(self._ends)
 
     def add_live(self) -> int:
         """One more probe, which `set_live` moves; its number."""
-        self._begin_s = np.append(self._begin_s, 0.0)
-        self._from = np.append(self._from, np.zeros((1, 3)), axis=0)
-        self._rate = np.append(self._rate, np.zeros((1, 3)), axis=0)
+        self._lines = np.append(self._lines, np.zeros((1, _LINE)), axis=0)
         self._touches = np.append(self._touches, False)
         return len(self._touches) - 1
 
     def set_live(self, number: int, drive: float, x_mm: float, y_mm: float) -> None:
         """Let a live probe press like this from now on; a drive of 0 lifts it."""
-        self._from[number] = drive, x_mm, y_mm
+        self._lines[number, 1:4] = drive, x_mm, y_mm
         self._touches[number] = drive > 0
-        self._number = np.flatnonzero(self._touches)
+        self._gather()
 
     def at(self, t_s: float) -> Moment:
-        """What presses at `t_s`, which is not before that of the last call."""
+        """What presses at `t_s`, which is not before that of the last call.
+
+        Of probes that do not slide, the offsets are the same object as at the last call.
+        """
         if self._ends and self._ends[0][0] <= t_s:
             while self._ends[0][0] <= t_s:
-                probe = self._ends[0][1]
-                heapreplace(self._ends, (self._enter(probe, t_s), probe))
-            self._number = np.flatnonzero(self._touches)
-            self._moves = bool(self._rate[self._number].any())
-        number = self._number
-        since_s = t_s - self._begin_s[number]
-        values = self._from[number] + self._rate[number] * since_s[:, None]
-        return Moment(number, np.maximum(values[:, 0], 0.0), values[:, 1:])
+                number = self._ends[0][1]
+                course = self._courses[number]
+                self._lines[number], self._touches[number], end_s = course.at(t_s)
+                heapreplace(self._ends, (end_s, number))
+            self._gather()
+        since_s = t_s - self._begin_s
+        drive = np.maximum(self._drive + self._drive_rate * since_s, 0.0)
+        offset_mm = (
+            (self._offset_mm + self._offset_rate * since_s).T if self._slides else self._at_mm
+        )
+        return Moment(self._number, drive, offset_mm)
 
-    def path_mm(self, number: NDArray[np.intp], times_s: Floats) -> Floats:
-        """Where some probes [c] are, [k, c, 2], at k times after `at`, if no keyframe comes."""
-        since_s = times_s[:, None] - self._begin_s[number]
-        path_mm: Floats = self._from[number, 1:] + self._rate[number, 1:] * since_s[:, :, None]
-        return path_mm
+    def path_mm(self, times_s: Floats) -> Floats:
+        """Where the probes that press at the last `at` are, [k, c, 2], if no keyframe comes."""
+        since_s = times_s[:, None] - self._begin_s
+        path_mm: Floats = self._offset_mm + self._offset_rate * since_s[:, None]
+        return np.moveaxis(path_mm, 1, 2)
 
     def still_until_s(self, t_s: float) -> float:
         """After `at(t_s)`: when something may change next; `t_s` itself if it does now."""
@@ -291,49 +290,85 @@ class Script:
             return t_s
         return self._ends[0][0] if self._ends else np.inf
 
-    def _enter(self, number: int, t_s: float) -> float:
-        """Set up the stretch between keyframes in which `t_s` lies; answers when it ends."""
-        probe = self._probes[number]
-        phase_s = t_s - probe.start_s
-        if probe.repeat_s:
-            phase_s %= probe.repeat_s
-        # A nanosecond ahead, so that rounding never enters a stretch that is over.
-        ahead_s = phase_s + 1e-9
-        low, share, rate_hz, end_s = _stretch(self._drive_times_s[number], ahead_s)
-        drive = self._drives[number]
-        high = min(low + 1, len(drive) - 1)
-        self._begin_s[number] = t_s
-        change = drive[high][1] - drive[low][1]
-        self._from[number, 0] = drive[low][1] + share * change
-        self._rate[number, 0] = rate_hz * change
-        inside = 0 <= low < len(drive) - 1
-        self._touches[number] = inside and max(drive[low][1], drive[high][1]) > 0
-        if probe.slide_mm:
-            low, share, rate_hz, slide_end_s = _stretch(self._slide_times_s[number], ahead_s)
-            first = np.array(probe.slide_mm[max(low, 0)][1:])
-            change_mm = np.array(probe.slide_mm[min(low + 1, len(probe.slide_mm) - 1)][1:]) - first
-            self._from[number, 1:] = first + share * change_mm
-            self._rate[number, 1:] = rate_hz * change_mm
-            end_s = min(end_s, slide_end_s)
-        if probe.repeat_s:
-            end_s = min(end_s, probe.repeat_s)
-        return t_s + (end_s - phase_s)
+    def _gather(self) -> None:
+        """Collect the lines of the probes that touch."""
+        self._number = np.flatnonzero(self._touches)
+        lines = self._lines[self._number].T.copy()
+        self._begin_s, self._drive, self._drive_rate = lines[0], lines[1], lines[4]
+        self._offset_mm, self._offset_rate = lines[2:4], lines[5:7]
+        self._slides = bool(self._offset_rate.any())
+        self._moves = self._slides or bool(self._drive_rate.any())
+        self._at_mm = self._offset_mm.T
 
 
-def _stretch(times_s: list[float], t_s: float) -> tuple[int, float, float, float]:
-    """Between which keyframes `t_s` lies.
+#: Numbers of a line: when it began (s); drive, x and y (mm) there; their rates (1/s).
+_LINE = 7
 
-    Returns:
-        Index of the one before (-1: none yet), share of the way to the next, shares per
-        second, and when it ends.
+
+@dataclass(frozen=True, slots=True)
+class _Course:
+    """What a probe does, in straight lines: one before its first keyframe, one after the last.
+
+    Attributes:
+        start_s: when its keyframes begin to count.
+        repeat_s: after which time they start again; 0 is never.
+        ends_s: when each line is over, counted from the keyframes' zero.
+        lines: float64[m, 7].
+        touches: whether the probe presses on each of them.
     """
-    low = bisect_right(times_s, t_s) - 1
-    if low < 0:
-        return low, 0.0, 0.0, times_s[0]
-    if low == len(times_s) - 1:
-        return low, 0.0, 0.0, np.inf
-    length_s = times_s[low + 1] - times_s[low]
-    return low, (t_s - times_s[low]) / length_s, 1 / length_s, times_s[low + 1]
+
+    start_s: float
+    repeat_s: float
+    ends_s: list[float]
+    lines: Floats
+    touches: list[bool]
+
+    @classmethod
+    def of(cls, probe: Probe) -> "_Course":
+        """The course of a probe of a scene."""
+        drive, slide = probe.drive, probe.slide_mm or [(0.0, 0.0, 0.0)]
+        drive_s, slide_s = ([keyframe[0] for keyframe in keyframes] for keyframes in (drive, slide))
+        begins_s = sorted({*drive_s, *slide_s})
+        lines: list[tuple[float, ...]] = []
+        touches: list[bool] = []
+        for begin_s in (0.0, *begins_s):
+            # The first line is that before all keyframes.
+            before = not lines
+            after = 0 if before else bisect_right(drive_s, begin_s)
+            pressed, press_rate = _line(drive, after, begin_s)
+            slid, slide_rate = _line(
+                slide, 0 if before else bisect_right(slide_s, begin_s), begin_s
+            )
+            lines.append((begin_s, *pressed, *slid, *press_rate, *slide_rate))
+            is_between = 0 < after < len(drive)
+            touches.append(is_between and max(drive[after - 1][1], drive[after][1]) > 0)
+        ends_s = [*begins_s, np.inf]
+        return cls(probe.start_s, probe.repeat_s, ends_s, np.array(lines), touches)
+
+    def at(self, t_s: float) -> tuple[Floats, bool, float]:
+        """The line on which `t_s` lies, whether the probe presses, and when the line ends."""
+        # A nanosecond ahead, so that rounding never finds a line that is over.
+        since_s = t_s - self.start_s + 1e-9
+        cycle_s = since_s // self.repeat_s * self.repeat_s if self.repeat_s else 0.0
+        zero_s = self.start_s + cycle_s
+        number = bisect_right(self.ends_s, since_s - cycle_s)
+        end_s = self.ends_s[number]
+        line = self.lines[number].copy()
+        line[0] += zero_s
+        return line, self.touches[number], zero_s + min(end_s, self.repeat_s or end_s)
+
+
+def _line(
+    keyframes: Sequence[tuple[float, ...]], after: int, t_s: float
+) -> tuple[list[float], list[float]]:
+    """Values at `t_s`, and their rates of change, where keyframe `after` is the next."""
+    low_s, *low = keyframes[max(after - 1, 0)]
+    high_s, *high = keyframes[min(after, len(keyframes) - 1)]
+    if not 0 < after < len(keyframes):
+        return low, [0.0] * len(low)
+    rates = [(end - begin) / (high_s - low_s) for begin, end in zip(low, high, strict=True)]
+    values = [begin + rate * (t_s - low_s) for begin, rate in zip(low, rates, strict=True)]
+    return values, rates
 
 
 def resolve(place: Place, part: str, layout: Layout) -> tuple[Floats, Floats]:

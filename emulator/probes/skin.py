@@ -4,7 +4,6 @@ Mechanics runs for contacts and for foam that still recovers; a pad that nobody 
 its capacitance and costs nothing.
 """
 
-from collections import deque
 from collections.abc import Collection
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from emulator.boards.arithmetic import TAXELS
 from emulator.chips.noise import SENT_UNIT_FF, PadNoise
 from emulator.probes.air import Course, read_course
-from emulator.probes.coverage import Coverage
+from emulator.probes.coverage import MOST_AT_ONCE, Coverage
 from emulator.probes.foam import INFINERGY_LOSS, Drive, Foam, FoamLayer, Footprint
 from emulator.probes.pads import (
     Jumps,
@@ -146,8 +145,9 @@ class Skin:
         self._active = np.zeros(0, np.intp)
         self._offset_mm = np.zeros((0, 2))
         self._footprint = Footprint.empty()
-        #: Footprints of the next steps of sliding probes, with the offsets that they are for.
-        self._foreseen: deque[tuple[Floats, Footprint]] = deque()
+        #: Footprints of the next steps of sliding probes, with the offsets that they are for; the
+        #: next one last.
+        self._foreseen: list[tuple[Floats, Footprint]] = []
         self._came_true = 0
         self._by_depth_now = np.zeros(0, bool)
         self._compliance_now = np.zeros(0)
@@ -294,7 +294,8 @@ class Skin:
     def _press(self, moment: Moment, dt_s: float) -> Ints:
         number = moment.number
         same = number is self._active or np.array_equal(number, self._active)
-        if not same or (moment.offset_mm != self._offset_mm).any():
+        slid = moment.offset_mm is not self._offset_mm
+        if not same or (slid and (moment.offset_mm != self._offset_mm).any()):
             self._place(moment, same=same)
         drive = Drive(moment.drive, self._by_depth_now, self._compliance_now)
         felt = self._foam.step(self._footprint, drive, dt_s)
@@ -321,27 +322,28 @@ class Skin:
             self._by_depth_now = self._by_depth[moment.number]
             self._compliance_now = self._compliance[moment.number]
             self._foreseen.clear()
-        before, self._footprint = self._footprint, self._foresee(moment)
-        rows = self._footprint
-        self._covered[before.taxel] = 0.0
-        np.add.at(self._covered, rows.taxel, np.where(rows.weight > 0, rows.covered, 0.0))
+        self._footprint = rows = self._foresee(moment)
+        bears = rows.covered
+        if self._membrane_mm:
+            bears = np.where(rows.weight > 0, rows.covered, 0.0)
+        n = self._layout.n_taxels
+        self._covered = np.bincount(rows.taxel, bears, n).astype(np.float64, copy=False)
 
     def _foresee(self, moment: Moment) -> Footprint:
         """What probes cover now; with it, if it is new, what they will cover in the next steps."""
         if self._foreseen:
-            offset_mm, footprint = self._foreseen.popleft()
+            offset_mm, footprint = self._foreseen.pop()
             if (offset_mm == moment.offset_mm).all():
                 self._came_true += 1
                 return footprint
             self._foreseen.clear()
         # Twice as far ahead as what was foreseen came true.
-        steps = min(2 * self._came_true, MOST_FORESEEN)
+        steps = min(2 * self._came_true, MOST_FORESEEN, MOST_AT_ONCE // max(1, len(moment.number)))
         self._came_true = 1
-        times_s = (self._t_ns + MOVING_NS * np.arange(1, steps)) * 1e-9
-        ahead_mm = self._script.path_mm(moment.number, times_s)
-        path_mm = np.concatenate([moment.offset_mm[None], ahead_mm])
+        times_s = (self._t_ns + MOVING_NS * np.arange(1, steps)).astype(np.float64) * 1e-9
+        path_mm = np.concatenate([moment.offset_mm[None], self._script.path_mm(times_s)])
         footprints = self._coverage.footprints(moment.number, path_mm)
-        self._foreseen.extend(zip(path_mm[1:], footprints[1:], strict=False))
+        self._foreseen = list(zip(path_mm[1:], footprints[1:], strict=False))[::-1]
         return footprints[0]
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from emulator import state
 from emulator.faults import parse
+from emulator.probes.scene import Place, Probe, Scene
 from emulator.probes.scene import load as load_scene
 from emulator.robot import Robot
 from emulator.state import StateError
@@ -62,6 +63,24 @@ def test_branches_from_one_state_send_the_same_bytes(
     for branch in branches:
         assert sent(branch, 25) == wanted
         np.testing.assert_array_equal(branch.skin.capacitance_ff, robot.skin.capacitance_ff)
+
+
+def test_a_slide_goes_on_from_its_state_as_if_it_had_not_been_saved() -> None:
+    settings, layout = skin()
+    probe = Probe(
+        part=layout.parts[0].name,
+        at=Place(taxel=17),
+        diameter_mm=9.0,
+        force_n=[(0.0, 1.0), (9.0, 3.0)],
+        slide_mm=[(0.0, -10.0, 0.0), (9.0, 20.0, 5.0)],
+    )
+    robot = Robot(settings, layout, Scene(probe=[probe]))
+    robot.bring_up()
+    robot.step(0.123)
+    branch = Robot.restore(robot.save(), settings, layout)
+
+    assert sent(branch, 40) == sent(robot, 40)
+    np.testing.assert_array_equal(branch.skin.capacitance_ff, robot.skin.capacitance_ff)
 
 
 def test_a_state_of_another_configuration_is_refused() -> None:

@@ -62,3 +62,36 @@ def test_sliding_probes_cover_what_their_outlines_cover(
             )
             wanted = moved.covered_mm2(pads.centre_mm, pads.radius_mm) / pads.area_mm2
             np.testing.assert_allclose(covered, wanted, atol=2e-6)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(probes(), min_size=1, max_size=5),
+    st.tuples(MM, MM),
+    st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)),
+    st.integers(1, 40),
+)
+def test_a_path_covers_at_each_step_what_its_places_cover(
+    drawn: list[tuple[Probe, Disc | Rectangle]],
+    start_mm: tuple[float, float],
+    step_mm: tuple[float, float],
+    steps: int,
+) -> None:
+    at_once, one_by_one = (Coverage(LAYOUT, THICKNESS_MM, 0.0) for _ in range(2))
+    for probe, _ in drawn:
+        at_once.add(probe)
+        one_by_one.add(probe)
+    numbers = np.arange(len(drawn))
+    share = np.linspace(0.5, 1.0, len(drawn))[:, None]
+    path_mm = start_mm + np.arange(steps)[:, None, None] * share * step_mm
+    found = at_once.footprints(numbers, path_mm)
+    assert 1 <= len(found) <= steps
+    for footprint, offset_mm in zip(found, path_mm, strict=False):
+        alone = one_by_one.footprint(numbers, offset_mm)
+        assert footprint.taxel.tolist() == alone.taxel.tolist()
+        assert footprint.contact.tolist() == alone.contact.tolist()
+        np.testing.assert_allclose(footprint.covered, alone.covered, rtol=1e-9)
+        np.testing.assert_allclose(footprint.weight, alone.weight, rtol=1e-9)
+        sums = np.bincount(footprint.contact, footprint.weight, len(drawn))
+        under = np.bincount(footprint.contact, minlength=len(drawn)) > 0
+        np.testing.assert_allclose(sums[under], 1.0)

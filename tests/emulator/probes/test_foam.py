@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -125,6 +127,27 @@ class TestFoamLayer:
         layer.step(footprint, Drive.by_depth([0.7, 0.7]), 0.0)
         assert layer.depth_mm == pytest.approx([0.7, 0.7])
         assert layer.force_n[0] == pytest.approx(layer.force_n[1])
+
+    def test_foam_left_behind_comes_back_alike_under_a_still_and_a_sliding_probe(self):
+        def left_behind(places_mm):
+            pads, layer = layer_of([[0, 0], [20, 0]])
+            first = pads.footprint([Disc(0, 0, 5)])
+            hold(layer, first, Drive.by_force(2.0), 20.0)
+            still = pads.footprint([Disc(20, 0, 5)])
+            for x_mm in places_mm:
+                footprint = still
+                if x_mm:
+                    slid = pads.footprint([Disc(20 + x_mm, 0, 5)])
+                    footprint = replace(
+                        slid, taxel=still.taxel, contact=still.contact, area_mm2=still.area_mm2
+                    )
+                felt = layer.step(footprint, Drive.by_force(1.0), 0.005)
+            return felt.strain[felt.taxel == 0]
+
+        steps = 1000
+        sliding = left_behind(np.linspace(0, 1, steps))
+        assert sliding == pytest.approx(left_behind(np.zeros(steps)), rel=1e-12)
+        assert sliding[0] > 0.03
 
     def test_untouched_taxels_stay_out_of_the_work(self):
         grid = np.stack(np.meshgrid(np.arange(30) * 5.0, np.arange(30) * 5.0), -1).reshape(-1, 2)
