@@ -1,14 +1,20 @@
-"""The emulator's side of a python-can bus."""
+"""The emulator's side of a python-can bus, and a single board that lives on one.
+
+A board on real chips and a real bus makes an MTB of a single-board computer.
+"""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import can
 import numpy as np
 from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.virtual import VirtualBus
 from numpy.typing import NDArray
+from smbus2 import SMBus
 
+from emulator.boards.mtb import I2cChips, make_board
+from emulator.clock import Clock, RealClock
 from skin_host.bus.wire import FrameBatch, MessageClass
 
 log = logging.getLogger(__name__)
@@ -21,6 +27,8 @@ _COMMANDS = {
 _FILTERS: list[can.typechecking.CanFilter] = [
     {"can_id": command << 4, "can_mask": 0x7F0, "extended": False} for command in _COMMANDS
 ]
+#: How often the bus is looked at for commands.
+POLL_NS = 2_000_000
 #: Frames kept for a controller that does not take them now.
 WAITING_FRAMES = 2000
 
@@ -103,3 +111,35 @@ class Link:
         if not self._failing:
             log.warning("bus %s: %s; frames wait or are lost until it works", self._name, error)
         self._failing = True
+
+
+async def run_board(
+    model: str, address: int, lines: Sequence[SMBus], bus: can.BusABC, clock: Clock | None = None
+) -> None:
+    """Be a board made of a single-board computer, until cancelled: the firmware on real chips.
+
+    Args:
+        model: "mtb3", "mtb4" or "mtb4c".
+        address: CAN address, 1..14.
+        lines: its I2C buses, one for each data line of a board: triangle t is the chip at
+            0x2C + t % 4 of line t // 4. A computer with one bus has triangles 0 to 3.
+        bus: an open python-can bus.
+        clock: time to live in; the machine's own, if not given. Chips that are real live in
+            real time.
+
+    Raises:
+        ValueError: there is no such model.
+    """
+    clock = clock or RealClock()
+    board = make_board(model, address, I2cChips(lines))
+    link = Link(f"of board {address}", bus)
+    while True:
+        now_ns = clock.now_ns()
+        for can_id, data in link.received():
+            answers = board.handle(can_id, data, now_ns)
+            batch = FrameBatch.of([(answer, payload, now_ns) for answer, payload in answers])
+            link.send(batch, clock.host_ns(batch.t_ns))
+        batch = board.step(now_ns)
+        link.send(batch, clock.host_ns(batch.t_ns))
+        due_ns = now_ns + POLL_NS if board.due_ns is None else min(board.due_ns, now_ns + POLL_NS)
+        await clock.sleep_until_ns(due_ns)

@@ -63,9 +63,7 @@ _PARTS = (
 )
 _DOORS = (
     "emulator.chips.cuse",
-    "emulator.chips.i2c_dev",
     "emulator.link",
-    "emulator.boards.single_board",
 )
 _NAME = re.compile(r"_?[a-z][a-z0-9_]*")
 

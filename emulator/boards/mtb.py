@@ -1,8 +1,10 @@
 """MTB boards by name: `make_board("mtb4", ...)` gives the firmware of that model.
 
-The models differ in commands, arithmetic, order of frames and pitfalls; see
-`emulator.boards`.
+The models differ in commands, arithmetic, order of frames and pitfalls; see `emulator.boards`.
+`set_up` gives the commands of a careful host before boards stream, for robots without a host.
 """
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -10,7 +12,16 @@ from emulator.boards.board import Burst, Frame, Mtb, join
 from emulator.boards.chip_access import Chips, I2cChips
 from emulator.boards.mtb3 import Mtb3
 from emulator.boards.mtb4 import Mtb4, Mtb4c
+from skin_host.bus.commands import (
+    Message,
+    SetBoardConfig,
+    SetTriangleConfig,
+    TriangleFlags,
+)
+from skin_host.layout import Layout
 
+#: An MTB3 takes commands between calibrations of two periods; chips convert in 37 ms.
+SETTLE_PERIODS = 4
 __all__ = ["Burst", "Chips", "Frame", "I2cChips", "Mtb", "join", "make_board"]
 
 
@@ -36,3 +47,47 @@ def make_board(
             return kind(address, chips, random or np.random.default_rng(0))
         case _:
             raise ValueError(f'no board "{model}"; there are: mtb3, mtb4, mtb4c')
+
+
+def set_up(
+    layout: Layout, send: Callable[[int, Message], None], wait: Callable[[float], object]
+) -> None:
+    """Configure all boards of a robot; this takes a second or two of emulated time.
+
+    Args:
+        layout: the boards and their set-up.
+        send: sends a command to one of them, by its index in the layout.
+        wait: lets seconds pass.
+    """
+    boards = layout.boards
+    settle_s = SETTLE_PERIODS * 1e-3 * max(board.settings.period_ms for board in boards)
+    for number, board in enumerate(boards):
+        own = board.settings
+        send(number, SetBoardConfig(own.skin_type, own.period_ms, own.no_load))
+    wait(settle_s)
+    set_ups = [triangle_set_ups(layout, number) for number in range(len(boards))]
+    # Twice: the first one may take its baseline before the chips have converted again.
+    for _ in range(2):
+        for turn in range(max(map(len, set_ups))):
+            for number, own_set_ups in enumerate(set_ups):
+                if turn < len(own_set_ups):
+                    send(number, own_set_ups[turn])
+            wait(settle_s)
+
+
+def triangle_set_ups(layout: Layout, board: int) -> list[SetTriangleConfig]:
+    """Command 50 for each run of a board's triangles that are set up alike."""
+    fitted = {
+        triangle.number: (triangle.shift, triangle.cdc_offset)
+        for triangle in layout.triangles
+        if triangle.board == board
+    }
+    commands: list[SetTriangleConfig] = []
+    for number, (shift, cdc_offset) in sorted(fitted.items()):
+        first = number
+        if commands:
+            last = commands[-1]
+            if (last.last, last.shift, last.cdc_offset) == (number - 1, shift, cdc_offset):
+                first = commands.pop().first
+        commands.append(SetTriangleConfig(first, number, shift, TriangleFlags.ENABLE, cdc_offset))
+    return commands

@@ -17,13 +17,13 @@ from typing import NoReturn
 
 from skin_host import __version__, emulator_path
 from skin_host.cli import (
+    calibrate,
     completion,
     emulation,
     files,
     measure,
     operate,
     recordings,
-    simulation,
     watch,
 )
 from skin_host.daemon import service
@@ -76,7 +76,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(
         title="commands", metavar="COMMAND", required=True, parser_class=_Parser
     )
-    for room in (operate, watch, files, recordings, emulation, simulation, measure, completion):
+    for room in (operate, calibrate, watch, files, recordings, emulation, measure, completion):
         room.add_commands(commands)
     return parser
 

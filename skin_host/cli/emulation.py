@@ -143,11 +143,11 @@ def _on_real_chips(
 ) -> Work:
     from smbus2 import SMBus
 
-    from emulator.boards import single_board
+    from emulator import link
 
     board = settings.boards[arguments.board]
     lines = [opened.enter_context(SMBus(path.strip())) for path in arguments.i2c.split(",")]
-    return lambda buses: single_board.run(board.model, board.address, lines, buses[board.bus])
+    return lambda buses: link.run_board(board.model, board.address, lines, buses[board.bus])
 
 
 def _on_emulated_chips(

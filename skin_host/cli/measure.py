@@ -1,10 +1,12 @@
-"""Commands that measure: bench, report."""
+"""Commands that measure and try out: bench, report, simulate."""
 
 import argparse
+import logging
 from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from skin_host.cli.common import Commands, add_command, print_json
+from skin_host.cli.common import Commands, Progress, add_command, load_skin, print_json
 from skin_host.errors import RequestError
 
 BENCHMARKS = {
@@ -17,6 +19,9 @@ BENCHMARKS = {
     "fleet": "1000 robots over three brokers, one of them killed, one frozen",
     "emulator": "simulated seconds per second",
 }
+
+
+HOUR_S = 3600.0
 
 
 def add_commands(commands: Commands) -> None:
@@ -49,6 +54,31 @@ def add_commands(commands: Commands) -> None:
     report.add_argument("--output", type=Path, metavar="DIR", help="folder for page and plots")
     report.add_argument("--json", action="store_true", help="one JSON document")
     report.set_defaults(run=_report)
+
+    simulate = add_command(
+        commands,
+        "simulate",
+        "let a robot and its daemon live through faults in stepped time, all from one seed",
+        "skin simulate --seed 1 --hours 0.01",
+    )
+    simulate.add_argument(
+        "config",
+        metavar="CONFIG",
+        type=Path,
+        nargs="?",
+        help="configuration file (TOML); the demo's if not given",
+    )
+    simulate.add_argument("--seed", type=int, default=1, help="decides everything that happens")
+    simulate.add_argument("--seeds", type=int, default=1, metavar="N", help="so many, from --seed")
+    simulate.add_argument("--hours", type=float, default=1.0, metavar="H", help="of each seed")
+    simulate.add_argument(
+        "--until",
+        type=float,
+        metavar="S",
+        help="end the run at this simulated time, with the daemon's log on stderr",
+    )
+    simulate.add_argument("--json", action="store_true", help="one JSON document")
+    simulate.set_defaults(run=_simulate)
 
 
 def _bench(arguments: argparse.Namespace) -> int:
@@ -85,3 +115,96 @@ def _report(arguments: argparse.Namespace) -> int:
     if output is not None:
         print(f"written to {output}")
     return 0
+
+
+if TYPE_CHECKING:
+    from skin_host.evaluation.simulate.run import Result
+
+
+def _simulate(arguments: argparse.Namespace) -> int:
+    from skin_host.demo import configuration
+    from skin_host.evaluation.simulate.run import simulate
+
+    if arguments.seeds < 1 or arguments.hours <= 0 or arguments.seed < 0:
+        raise RequestError("wanted --seed of 0 or more, --seeds of 1 or more and --hours above 0")
+    if arguments.until is not None and arguments.seeds != 1:
+        raise RequestError("--until goes with one seed")
+    config: Path = arguments.config or configuration("demo.toml")
+    settings, layout = load_skin(config)
+    if arguments.until is None:
+        logging.disable(logging.CRITICAL)
+    else:
+        logging.basicConfig(level=logging.DEBUG, format="%(levelname)-7s %(name)s: %(message)s")
+    progress = Progress("simulating")
+    results: list[Result] = []
+    try:
+        for number in range(arguments.seeds):
+            progress.update(number / arguments.seeds, f"seed {arguments.seed + number}")
+            result = simulate(
+                settings,
+                layout,
+                config,
+                arguments.seed + number,
+                arguments.hours * HOUR_S,
+                until_s=arguments.until,
+            )
+            results.append(result)
+            if not arguments.json:
+                progress.close()
+                print(_line(result), flush=True)
+                if result.broken:
+                    print(_story(result, config), flush=True)
+    finally:
+        progress.close()
+        logging.disable(logging.NOTSET)
+    broken = [result for result in results if result.broken]
+    if arguments.json:
+        print_json(_document(results))
+    elif arguments.seeds > 1:
+        print(f"{len(results) - len(broken)} of {len(results)} seeds kept every promise")
+    return 1 if broken else 0
+
+
+def _line(result: "Result") -> str:
+    speed = result.simulated_s / max(result.cpu_s, 1e-9)
+    outcome = "a promise was broken" if result.broken else "every promise held"
+    return (
+        f"seed {result.seed}: {outcome}; {result.simulated_s:.0f} s in {result.cpu_s:.1f} s of CPU "
+        f"({speed:.0f} x), {sum(result.troubles.values())} troubles, {result.touches} touch "
+        f"events, {result.deaths} ends of the daemon; {result.events} events, hash {result.digest}"
+    )
+
+
+def _story(result: "Result", config: Path) -> str:
+    """Return the events before a broken promise, and the command that repeats it."""
+    again = max(0.0, result.simulated_s - 1.0)
+    return "\n".join(
+        [
+            *(f"  {line}" for line in result.last),
+            f"  broken at {result.simulated_s:.3f} s: {result.broken}",
+            f"  with logs: skin simulate {config} --seed {result.seed} --until {again:.1f}",
+        ]
+    )
+
+
+def _document(results: "list[Result]") -> dict[str, Any]:
+    return {
+        "seeds": len(results),
+        "kept": sum(result.broken is None for result in results),
+        "simulated_s": round(sum(result.simulated_s for result in results), 3),
+        "cpu_s": round(sum(result.cpu_s for result in results), 3),
+        "runs": [
+            {
+                "seed": result.seed,
+                "broken": result.broken,
+                "simulated_s": round(result.simulated_s, 6),
+                "events": result.events,
+                "hash": result.digest,
+                "troubles": result.troubles,
+                "named": result.named,
+                "touches": result.touches,
+                "deaths": result.deaths,
+            }
+            for result in results
+        ],
+    }

@@ -1,4 +1,4 @@
-"""Commands that work on the real skin: run, calibrate, scan."""
+"""Commands that work on the real skin: run, scan, command."""
 
 import argparse
 import asyncio
@@ -6,15 +6,12 @@ import gc
 import json
 import logging
 import signal
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from skin_host.cli import fit
 from skin_host.cli.common import (
     Commands,
-    Progress,
     add_command,
     add_config,
     add_log_level,
@@ -23,7 +20,6 @@ from skin_host.cli.common import (
     print_json,
     set_up_logging,
     stop_on_signals,
-    warn,
 )
 from skin_host.daemon import service
 from skin_host.errors import OtherSkinError, RequestError, SkinError
@@ -60,24 +56,6 @@ def add_commands(commands: Commands) -> None:
     run.add_argument("--share", help=argparse.SUPPRESS)
     add_log_level(run)
     run.set_defaults(run=_run)
-
-    calibrate = add_command(
-        commands,
-        "calibrate",
-        "calibrate the untouched skin and keep the result",
-        "skin calibrate config/icub.toml --seconds 5",
-    )
-    add_config(calibrate)
-    calibrate.add_argument("--node", default="main", help="which parts to calibrate")
-    calibrate.add_argument("--seconds", type=positive, default=5.0, help="how long to look")
-    calibrate.add_argument("--output", type=Path, metavar="FILE", help="keep it here instead")
-    calibrate.add_argument("--json", action="store_true", help="one JSON document")
-    calibrate.add_argument(
-        "--strict", action="store_true", help="exit status 1 if the skin was touched meanwhile"
-    )
-    fit.add_arguments(calibrate)
-    add_log_level(calibrate)
-    calibrate.set_defaults(run=_calibrate)
 
     scan = add_command(
         commands,
@@ -233,60 +211,6 @@ def _run_workers(arguments: argparse.Namespace, settings: "Settings") -> int:
         for number in range(1, len(shares) + 1)
     }
     return asyncio.run(workers.run(commands))
-
-
-def _calibrate(arguments: argparse.Namespace) -> int:
-    from skin_host.cli import verdicts
-    from skin_host.daemon.calibrate import calibration_path, take_calibration
-    from skin_host.files import refuse_newer
-    from skin_host.layout import parts_of
-    from skin_host.processing import calibration as calibrations
-
-    set_up_logging(arguments.verbose)
-    if arguments.relaxation is not None or arguments.pressure is not None:
-        return fit.run(arguments)
-    settings, layout = load_skin(arguments.config)
-    parts = parts_of(layout, arguments.node)
-    path = arguments.output or calibration_path(settings, arguments.node)
-    refuse_newer(path, calibrations.SCHEMA, "calibration")
-    progress = Progress("calibrating, keep the skin untouched")
-    try:
-        found = asyncio.run(
-            take_calibration(settings, layout, parts, arguments.seconds, progress.update)
-        )
-    finally:
-        progress.close()
-    found = calibrations.with_gains_of(found, path, layout)
-    calibrations.save(path, found, layout)
-    triangles = verdicts.triangle_verdicts(found, layout, parts)
-    tips = {
-        name: name in found.zeros
-        for name, tip in settings.fingertips.items()
-        if tip.node == arguments.node
-    }
-    if arguments.json:
-        print_json(
-            {
-                "file": str(path),
-                "id": found.id,
-                "time": found.time,
-                "verdicts": calibrations.summary(found, layout),
-                "triangles": triangles,
-                "fingertips": tips,
-            }
-        )
-    else:
-        print(verdicts.table(triangles))
-        for name, zeroed in tips.items():
-            print(f"{name}: " + ("zero taken" if zeroed else "its board sent nothing; no zero"))
-        print(f"calibration {found.id} kept in {path}")
-    touched = verdicts.touched(triangles)
-    if touched:
-        warn(
-            f"the skin was touched while it was calibrated: {touched}; take away what touches it "
-            "and repeat: these read too little until then"
-        )
-    return 1 if touched and arguments.strict else 0
 
 
 def _scan(arguments: argparse.Namespace) -> int:

@@ -22,7 +22,6 @@ ROOMS = {
     "skin_host.processing.validity": "liveness",
     "skin_host.processing.liveness": "liveness",
     "skin_host.processing.stuck": "liveness",
-    "skin_host.processing.repeats": "liveness",
     "skin_host.processing.contacts": "contacts",
     "skin_host.processing.localization": "contacts",
     "skin_host.processing.core": "daemon",

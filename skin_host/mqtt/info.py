@@ -2,8 +2,14 @@
 
 The payload of `nodes/<node>/info`, retained. With it a subscriber can draw the skin and locate each
 entry of a frame without any file of the robot's.
+
+Discovery messages let Home Assistant find the skin automatically: two entities per part, grouped by
+node, show whether anything touches it, and whether it has a problem. Source: Home Assistant's
+documentation of the MQTT integration ("MQTT discovery") and of its binary sensor. Only names of the
+configuration are included.
 """
 
+import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
@@ -15,12 +21,23 @@ from numpy.typing import NDArray
 
 from skin_host.mqtt.frames import SCALE_KPA
 from skin_host.mqtt.payload import MessageError, Vector, decode
+from skin_host.mqtt.topics import Topics
 
 if TYPE_CHECKING:
     from skin_host.config.fingertips import Fingertip
     from skin_host.layout import Layout, PartLayout
 
 INFO_SCHEMA: Final = "skin.info/1"
+#: As on the page and in `skin status`: anything but `ok` is a problem, with its sentences.
+PROBLEM: Final = "{{ 'OFF' if value_json.state == 'ok' else 'ON' }}"
+WHY: Final = "{{ {'state': value_json.state, 'sentences': value_json.sentences} | tojson }}"
+#: A part that cannot feel is not "not touched": its contact is unavailable.
+FEELS: Final = (
+    "{{ 'online' if value_json.state in ('ok', 'warning', 'degraded', 'saturated') "
+    "else 'offline' }}"
+)
+#: For Home Assistant the text None is an unknown state.
+STATE: Final = "{{ 'None' if value == 'UNKNOWN' else value }}"
 #: 100 000 taxels and their triangles fit.
 MAX_BYTES = 32 * 1024 * 1024
 MAX_PIECES = 10_000
@@ -270,3 +287,58 @@ def _rounded(values: NDArray[np.float64], decimals: int) -> Any:
 
 def _vectors(values: NDArray[np.float64], decimals: int) -> list[Vector]:
     return [(x, y, z) for x, y, z in _rounded(values, decimals)]
+
+
+def discovery(prefix: str, topics: Topics, info: NodeInfo) -> dict[str, bytes]:
+    """Return topics and payloads, to be retained, that announce the parts and fingertips of a node.
+
+    Args:
+        prefix: of Home Assistant's discovery, `homeassistant` by default.
+        topics: of the robot.
+        info: of the node.
+    """
+    skin = _identifier(topics.base)
+    alive = {"topic": topics.node("status", info.node)}
+    messages: dict[str, dict[str, Any]] = {}
+    for part in [*info.parts, *info.fingertips]:
+        health = topics.part("health", part)
+        messages[f"{skin}_{part}_contact"] = {
+            "name": f"{part} contact",
+            "icon": "mdi:gesture-tap",
+            "state_topic": topics.part("contact", part),
+            "value_template": STATE,
+            "availability": [alive, {"topic": health, "value_template": FEELS}],
+            "availability_mode": "all",
+        }
+        messages[f"{skin}_{part}_problem"] = {
+            "name": f"{part} problem",
+            "device_class": "problem",
+            "entity_category": "diagnostic",
+            "state_topic": health,
+            "value_template": PROBLEM,
+            "json_attributes_topic": health,
+            "json_attributes_template": WHY,
+            "availability": [alive],
+        }
+    common = {
+        "qos": 1,
+        "device": {
+            "identifiers": [f"{skin}_nodes_{info.node}"],
+            "name": f"{info.robot} skin, node {info.node}",
+            "sw_version": info.version,
+        },
+        "origin": {"name": "skin-host", "sw_version": info.version},
+    }
+    return {
+        f"{prefix}/binary_sensor/{name}/config": msgspec.json.encode(
+            {"unique_id": name} | message | common
+        )
+        for name, message in messages.items()
+    }
+
+
+def _identifier(base: str) -> str:
+    """Return a name of letters, digits, `_` and `-`, which are all that a discovery topic may
+    have.
+    """
+    return re.sub(r"[^a-zA-Z0-9_-]", "_", base)

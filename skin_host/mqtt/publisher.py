@@ -37,8 +37,7 @@ from skin_host.mqtt.connection import (
 )
 from skin_host.mqtt.courier import Courier, FrameForm
 from skin_host.mqtt.frames import load_cbor2
-from skin_host.mqtt.home_assistant import discovery
-from skin_host.mqtt.info import MAX_PIECES, NodeInfo, encode_pieces
+from skin_host.mqtt.info import MAX_PIECES, NodeInfo, discovery, encode_pieces
 from skin_host.mqtt.messages import ContactState, encode_contact, encode_health
 from skin_host.mqtt.order import Numbers, last_will, put_run, put_stamp, stamp_of
 from skin_host.mqtt.outbox import Event, Outbox, PublisherCounters

@@ -2,28 +2,37 @@
 
 A curve is linear between knots over the activation. It belongs to pad and foam, so it stays valid
 when zeros change. `skin calibrate --pressure LOG --load CSV` finds it, together with the faults of
-each pad, its expected error, and the memory of the foam (see `PlayRelaxation`).
+each pad, its expected error, and the memory of the foam (see `PlayRelaxation`). In use, a `Reader`
+converts the bytes of a part to momentary pressures: by a parabola or a table per taxel.
 """
 
 from copy import copy
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skin_host.config.settings import Pressure
 from skin_host.layout import Layout
+from skin_host.processing.masks import Mask
 from skin_host.processing.pressure import PressureCurve
 
 Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+Floats32 = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
 Taxels = slice | Mask
 
 #: Dense where foam is soft; the straight end covers a byte's whole range.
 KNOTS_UNITS: Floats = np.array([0.0, 0.75, 1.5, 3.0, 5.0, 7.5, *np.arange(10.0, 256.0, 3.0)])
 #: A curve rises by at least this much per unit, so that it has an inverse.
 LEAST_SLOPE = 1e-3
+
+
+#: A table is computed again when its taxel's baseline has moved this far: a quarter of a kPa.
+STALE_UNITS = 1 / 32
+CODES = np.arange(256.0)[:, np.newaxis]
 
 
 class CurveVerdict(IntEnum):
@@ -111,12 +120,6 @@ class TableCurve:
         self.linear: Floats = (table_kpa[:, 1] - table_kpa[:, 0]) / steps[0]
         self._last_slope: Floats = (table_kpa[:, -1] - table_kpa[:, -2]) / steps[-1]
 
-    @property
-    def steepest(self) -> Floats:
-        """Greatest slope [n], kPa per unit."""
-        slopes: Floats = np.max(np.diff(self.table_kpa, axis=1) / np.diff(KNOTS_UNITS), axis=1)
-        return slopes
-
     def part(self, taxels: Taxels) -> "TableCurve":
         """Return the curves of some of the taxels."""
         chosen = copy(self)
@@ -184,3 +187,86 @@ def with_own(common: PressureCurve, curves: Curves) -> TableCurve:
     own = curves.own
     table = np.where(own[:, np.newaxis], curves.kpa, common.kpa(KNOTS_UNITS[:, np.newaxis]).T)
     return TableCurve(rising(table), np.where(own, curves.beyond_units, common.beyond_units))
+
+
+class Reader(Protocol):
+    """Converts the bytes of m taxels into kPa."""
+
+    def renew(self, offset: Floats32) -> None:
+        """Set the bytes [m] of the untouched taxels, with fractions."""
+        ...
+
+    def lower(self, relaxation_kpa: Floats32) -> None:
+        """Subtract a relaxation [m] from all pressures until the next `renew`."""
+        ...
+
+    def kpa(self, raw: Bytes, out: Floats32) -> None:
+        """Write the momentary pressures [m] for bytes [m]."""
+        ...
+
+
+class Parabolas:
+    """Equation (1): with the byte r that is (square r + slope) r + level.
+
+    Below zero activation the square is negligible. Beyond the calibrated range it is wrong; see
+    `PressureCurve`.
+    """
+
+    def __init__(self, curve: PressureCurve, believed: Mask) -> None:
+        # An unusable taxel has a flat curve, so that no masks are needed later.
+        self._square = np.where(believed, curve.square, 0.0).astype(np.float32)
+        self._linear = np.where(believed, curve.linear, 0.0).astype(np.float32)
+        self._slope = np.empty_like(self._square)
+        self._level = np.empty_like(self._square)
+        self._bytes = np.empty_like(self._square)
+
+    def renew(self, offset: Floats32) -> None:
+        slope, level = self._slope, self._level
+        np.multiply(self._square, offset, out=slope)
+        np.add(slope, self._linear, out=level)
+        np.multiply(level, offset, out=level)
+        np.add(slope, slope, out=slope)
+        np.add(slope, self._linear, out=slope)
+        np.negative(slope, out=slope)
+
+    def lower(self, relaxation_kpa: Floats32) -> None:
+        np.subtract(self._level, relaxation_kpa, out=self._level)
+
+    def kpa(self, raw: Bytes, out: Floats32) -> None:
+        self._bytes[...] = raw
+        np.multiply(self._bytes, self._square, out=out)
+        np.add(out, self._slope, out=out)
+        np.multiply(out, self._bytes, out=out)
+        np.add(out, self._level, out=out)
+
+
+class Tables:
+    """A table of 256 pressures per taxel, shifted when its baseline moves."""
+
+    def __init__(self, curve: TableCurve, believed: Mask) -> None:
+        m = len(believed)
+        self._curve = curve
+        self._believed = believed
+        self._offset = np.full(m, np.inf, np.float32)
+        self._table = np.zeros((m, 256), np.float32)
+        self._flat = self._table.reshape(-1)
+        self._row = np.arange(0, 256 * m, 256)
+        self._index = np.empty(m, np.intp)
+        self._lowered: Floats32 | None = None
+
+    def renew(self, offset: Floats32) -> None:
+        self._lowered = None
+        stale = (np.abs(offset - self._offset) > STALE_UNITS) & self._believed
+        if stale.any():
+            self._offset[stale] = offset[stale]
+            kpa = self._curve.part(stale).kpa(self._offset[stale] - CODES)
+            self._table[stale] = kpa.T
+
+    def lower(self, relaxation_kpa: Floats32) -> None:
+        self._lowered = relaxation_kpa.copy()
+
+    def kpa(self, raw: Bytes, out: Floats32) -> None:
+        np.add(self._row, raw, out=self._index)
+        self._flat.take(self._index, out=out, mode="clip")
+        if self._lowered is not None:
+            np.subtract(out, self._lowered, out=out)

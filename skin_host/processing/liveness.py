@@ -30,10 +30,11 @@ from numpy.typing import NDArray
 
 from skin_host.bus.compensation import NO_GAIN
 from skin_host.processing.masks import Mask, any_of
-from skin_host.processing.repeats import Encoding, Repeats
 from skin_host.processing.stuck import (
     MOST_RATE,
     TOUCHED_PACE,
+    Encoding,
+    Repeats,
     Rows,
     StuckPads,
     inside,

@@ -17,13 +17,20 @@ from skin_host.config.relaxation import Relaxation
 from skin_host.config.settings import Processing
 from skin_host.layout import Layout, PadKind, PartLayout
 from skin_host.processing.calibration import Calibration
-from skin_host.processing.curves import Curves, TableCurve, common_curve, with_own
+from skin_host.processing.curves import (
+    Curves,
+    Parabolas,
+    Reader,
+    TableCurve,
+    Tables,
+    common_curve,
+    with_own,
+)
 from skin_host.processing.drift import BaselineTracker
 from skin_host.processing.erratic import Erratic, step_kpa
 from skin_host.processing.fitting.course import limit_kpa, make_memory
 from skin_host.processing.masks import Mask, any_of
 from skin_host.processing.pressure import PressureCurve
-from skin_host.processing.readers import Parabolas, Reader, Tables
 from skin_host.processing.relaxation import OWN_MEANS, make_model, parameters_of
 from skin_host.processing.relaxation import Relaxation as Model
 from skin_host.processing.smoothing import StepFilter

@@ -17,7 +17,7 @@ from skin_host.bus.wire import TRIANGLES
 from skin_host.layout import Layout
 from skin_host.processing.liveness import PADS, Liveness
 from skin_host.processing.masks import Mask
-from skin_host.processing.repeats import Encoding, Repeats
+from skin_host.processing.stuck import Encoding, Repeats
 
 #: This many pads far below zero pressure are not an accident.
 LIFTED_PADS = 2

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emulator.chips.i2c_dev import Caller, I2cDevice, Ioctl
+from emulator.chips.cuse import Caller, I2cDevice, Ioctl
 from emulator.faults import KINDS, parse
 from emulator.probes.scene import Fault, Scene
 from emulator.robot import Robot

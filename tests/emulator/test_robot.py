@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from smbus2 import i2c_msg
 
-from emulator.boards.bring_up import triangle_set_ups
+from emulator.boards.mtb import triangle_set_ups
 from emulator.clock import SteppedClock
 from emulator.probes import scene as scenes
 from emulator.probes.scene import Place, Probe, Scene

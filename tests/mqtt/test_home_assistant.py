@@ -11,8 +11,7 @@ import pytest
 
 from skin_host.config.settings import Mqtt, load
 from skin_host.layout import build_layout
-from skin_host.mqtt.home_assistant import discovery
-from skin_host.mqtt.info import FingertipInfo, NodeInfo, node_info
+from skin_host.mqtt.info import FingertipInfo, NodeInfo, discovery, node_info
 from skin_host.mqtt.publisher import Publisher
 from skin_host.mqtt.topics import Topics
 from tests.support.broker import Mosquitto

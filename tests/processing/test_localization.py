@@ -7,9 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skin_host.layout import builtin_kinds
-from skin_host.processing.localization import Method, make_localizer, separate
+from skin_host.processing.localization import Method, covered_share, make_localizer, separate
 from skin_host.processing.localization_centroid import quadratic_peak, tangent_plane
-from skin_host.processing.localization_template import covered_share
 
 METHODS = get_args(Method)
 RADIUS_MM = 2.1

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from emulator.boards.arithmetic import transmit_16, transmit_32
 from skin_host.bus.compensation import GAIN, GAIN_V2, NO_GAIN, THERMAL_TAXEL
 from skin_host.processing import stuck
-from skin_host.processing.repeats import Encoding, Repeats
-from skin_host.processing.stuck import StuckPads
+from skin_host.processing.stuck import Encoding, Repeats, StuckPads
 
 K = 8
 SHAPE = (K, 12)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from emulator.boards import single_board
+from emulator import link
 from emulator.chips.ad7147 import AD7147
 from emulator.chips.i2c import build_lines
 from emulator.clock import Clock, SteppedClock
@@ -68,7 +68,7 @@ async def test_one_i2c_bus_and_a_can_interface_are_a_board_of_four_triangles() -
             can_id, data = command_frame(command, 3)
             host.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
 
-        life = asyncio.create_task(single_board.run("mtb4", 3, lines, inside, clock))
+        life = asyncio.create_task(link.run_board("mtb4", 3, lines, inside, clock))
         say(Discover())
         (answer,) = await listen(host, clock, 0.1)
         assert (answer.arbitration_id, answer.data.hex()) == (0x730, "ff0b011900")
@@ -96,4 +96,4 @@ async def test_one_i2c_bus_and_a_can_interface_are_a_board_of_four_triangles() -
 async def test_an_unknown_model_is_refused() -> None:
     with can.Bus(interface="virtual", channel="single-board") as bus:
         with pytest.raises(ValueError, match="there are: mtb3"):
-            await single_board.run("mtb9", 1, [], bus)
+            await link.run_board("mtb9", 1, [], bus)

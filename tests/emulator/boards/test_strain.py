@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from emulator.boards.strain import StrainBoard
+from emulator.boards.fingertips import StrainBoard
 from skin_host.bus.answers import Discovered, parse_answer
 from skin_host.bus.commands import BoardType, Discover, command_frame
 from skin_host.bus.strain import (

@@ -6,9 +6,8 @@ import struct
 import pytest
 
 from emulator.chips.ad7147 import AD7147
-from emulator.chips.cuse import CuseBus, answer
+from emulator.chips.cuse import CuseBus, I2cDevice, answer
 from emulator.chips.i2c import EmulatedSMBus
-from emulator.chips.i2c_dev import I2cDevice
 from skin_host.errors import BusError
 
 I2C_SLAVE, I2C_FUNCS, I2C_RDWR, I2C_SMBUS = 0x0703, 0x0705, 0x0707, 0x0720

@@ -1,17 +1,17 @@
 import numpy as np
 import pytest
 
-from skin_host.evaluation.papers.design import (
+from skin_host.evaluation.papers.force_torque import (
     CYLINDER_AZIMUTH_DEG,
     CYLINDER_DECOUPLING,
     CYLINDER_ROW,
     CYLINDER_TURN_SIGN,
     PlanarStructure,
+    condition_number,
     cylinder_response,
     pattern_search,
     six_gauge_cylinder,
 )
-from skin_host.evaluation.papers.force_torque import condition_number
 
 
 @pytest.mark.parametrize(
