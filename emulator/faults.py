@@ -28,7 +28,7 @@ from skin_host.layout import TAXELS_PER_TRIANGLE
 Mend = Callable[[], object]
 
 
-class Robot(Protocol):
+class FaultyRobot(Protocol):
     """The parts of a robot that can fail; `emulator.robot.Robot` has all of them."""
 
     t_ns: int
@@ -62,7 +62,7 @@ class Kind:
 
     about: str
     needs: tuple[str, ...]
-    begin: Callable[[Robot, Fault], Mend]
+    begin: Callable[[FaultyRobot, Fault], Mend]
     value: float | None = None
     least: float = -np.inf
     most: float = np.inf
@@ -110,7 +110,7 @@ def check(fault: Fault) -> None:
         raise ConfigurationError("until_s: wanted a time after at_s")
 
 
-def check_targets(robot: Robot, fault: Fault) -> None:
+def check_targets(robot: FaultyRobot, fault: Fault) -> None:
     """Check that the robot has what the fault names.
 
     Raises:
@@ -130,7 +130,7 @@ def check_targets(robot: Robot, fault: Fault) -> None:
         _chip(robot, fault)
 
 
-def begin(robot: Robot, fault: Fault) -> Mend:
+def begin(robot: FaultyRobot, fault: Fault) -> Mend:
     """Start a fault now; the returned function ends it.
 
     Raises:
@@ -146,11 +146,11 @@ def begin(robot: Robot, fault: Fault) -> Mend:
 # ---------------------------------------------------------------------- chips and pads
 
 
-def _board(robot: Robot, fault: Fault) -> int:
+def _board(robot: FaultyRobot, fault: Fault) -> int:
     return list(robot.boards).index(fault.board or "")
 
 
-def _chip(robot: Robot, fault: Fault) -> int:
+def _chip(robot: FaultyRobot, fault: Fault) -> int:
     """The chip that the fault names, as the layout numbers it."""
     number = _board(robot, fault)
     slot = robot.boards[fault.board or ""].slot(fault.triangle or 0)
@@ -160,26 +160,26 @@ def _chip(robot: Robot, fault: Fault) -> int:
     return chip
 
 
-def _taxels(robot: Robot, fault: Fault) -> slice:
+def _taxels(robot: FaultyRobot, fault: Fault) -> slice:
     first = TAXELS_PER_TRIANGLE * _chip(robot, fault)
     if fault.taxel is None:
         return slice(first, first + TAXELS_PER_TRIANGLE)
     return slice(first + fault.taxel, first + fault.taxel + 1)
 
 
-def _chip_gone(robot: Robot, fault: Fault) -> Mend:
+def _chip_gone(robot: FaultyRobot, fault: Fault) -> Mend:
     chips = robot.converters
     chip = _chip(robot, fault)
     chips.force(chip, round(fault.value or 0))
     return partial(chips.force, chip, None)
 
 
-def _chip_back(robot: Robot, fault: Fault) -> Mend:
+def _chip_back(robot: FaultyRobot, fault: Fault) -> Mend:
     robot.converters.force(_chip(robot, fault), None)
     return _nothing
 
 
-def _shorted_finger(robot: Robot, fault: Fault) -> Mend:
+def _shorted_finger(robot: FaultyRobot, fault: Fault) -> Mend:
     """SDA is held low: all four chips of the line read 0, whatever they would send."""
     number = _board(robot, fault)
     chip_of_slot = robot.converters.chip_of_slot[number]
@@ -190,15 +190,15 @@ def _shorted_finger(robot: Robot, fault: Fault) -> Mend:
     return partial(_force, robot, own, None)
 
 
-def _force(robot: Robot, chips: list[int], word: int | None) -> None:
+def _force(robot: FaultyRobot, chips: list[int], word: int | None) -> None:
     for chip in chips:
         robot.converters.force(chip, word)
 
 
-def _rewired(change: Callable[[Robot, Fault, int, np.ndarray], None]) -> Callable[..., Mend]:
+def _rewired(change: Callable[[FaultyRobot, Fault, int, np.ndarray], None]) -> Callable[..., Mend]:
     """A fault that changes which chip sits at which slot of a board."""
 
-    def begin_rewired(robot: Robot, fault: Fault) -> Mend:
+    def begin_rewired(robot: FaultyRobot, fault: Fault) -> Mend:
         number = _board(robot, fault)
         before = robot.converters.chip_of_slot[number].copy()
         after = before.copy()
@@ -209,7 +209,7 @@ def _rewired(change: Callable[[Robot, Fault, int, np.ndarray], None]) -> Callabl
     return begin_rewired
 
 
-def _wrong_address(robot: Robot, fault: Fault, _: int, chip_of_slot: np.ndarray) -> None:
+def _wrong_address(robot: FaultyRobot, fault: Fault, _: int, chip_of_slot: np.ndarray) -> None:
     slot = robot.boards[fault.board or ""].slot(fault.triangle or 0)
     other = _other_slot(slot, fault)
     chip_of_slot[other], chip_of_slot[slot] = chip_of_slot[slot], -1
@@ -223,14 +223,14 @@ def _other_slot(slot: int, fault: Fault) -> int:
     return other
 
 
-def _swapped_lines(robot: Robot, fault: Fault, _: int, chip_of_slot: np.ndarray) -> None:
+def _swapped_lines(robot: FaultyRobot, fault: Fault, _: int, chip_of_slot: np.ndarray) -> None:
     one = robot.boards[fault.board or ""].slot(fault.triangle or 0) // CHIPS_PER_LINE
     other = round(fault.value or 0) % CHIPS_PER_LINE
     lines = chip_of_slot.reshape(-1, CHIPS_PER_LINE)
     lines[[one, other]] = lines[[other, one]]
 
 
-def _stuck_taxel(robot: Robot, fault: Fault) -> Mend:
+def _stuck_taxel(robot: FaultyRobot, fault: Fault) -> Mend:
     taxels = _taxels(robot, fault)
     skin = robot.skin
     held_ff = skin.capacitance_ff[taxels].copy()
@@ -241,7 +241,7 @@ def _stuck_taxel(robot: Robot, fault: Fault) -> Mend:
     return partial(_hold, robot, chip, taxels, np.nan)
 
 
-def _hold(robot: Robot, chip: int, taxels: slice, held_ff: np.ndarray | float) -> None:
+def _hold(robot: FaultyRobot, chip: int, taxels: slice, held_ff: np.ndarray | float) -> None:
     """Let taxels of a chip measure always the same; NaN ends it."""
     robot.skin.held_ff[taxels] = held_ff
     own = slice(TAXELS_PER_TRIANGLE * chip, TAXELS_PER_TRIANGLE * (chip + 1))
@@ -249,11 +249,11 @@ def _hold(robot: Robot, chip: int, taxels: slice, held_ff: np.ndarray | float) -
     robot.pass_on(taxels)
 
 
-def _noisy_taxel(robot: Robot, fault: Fault) -> Mend:
+def _noisy_taxel(robot: FaultyRobot, fault: Fault) -> Mend:
     return _noise(robot, fault, UNIT_FF * (fault.value or 0.0))
 
 
-def _noise(robot: Robot, fault: Fault, noise_ff: float) -> Mend:
+def _noise(robot: FaultyRobot, fault: Fault, noise_ff: float) -> Mend:
     taxels = _taxels(robot, fault)
     chip = _chip(robot, fault)
     before = robot.skin.noise_ff[taxels].copy()
@@ -261,20 +261,20 @@ def _noise(robot: Robot, fault: Fault, noise_ff: float) -> Mend:
     return partial(_set_noise, robot, chip, taxels, before)
 
 
-def _set_noise(robot: Robot, chip: int, taxels: slice, noise_ff: np.ndarray | float) -> None:
+def _set_noise(robot: FaultyRobot, chip: int, taxels: slice, noise_ff: np.ndarray | float) -> None:
     noise = robot.skin.noise_ff
     noise[taxels] = noise_ff
     own = slice(TAXELS_PER_TRIANGLE * chip, TAXELS_PER_TRIANGLE * (chip + 1))
     robot.converters.set_noise_ff(chip, noise[own])
 
 
-def _temperature_step(robot: Robot, fault: Fault) -> Mend:
+def _temperature_step(robot: FaultyRobot, fault: Fault) -> Mend:
     step_c = fault.value or 0.0
     _warm(robot, step_c)
     return partial(_warm, robot, -step_c)
 
 
-def _warm(robot: Robot, by_c: float) -> None:
+def _warm(robot: FaultyRobot, by_c: float) -> None:
     robot.skin.temperature_step_c += by_c
     robot.work_out_now()
 
@@ -282,49 +282,49 @@ def _warm(robot: Robot, by_c: float) -> None:
 # ---------------------------------------------------------------------- the wires to the chips
 
 
-def _place(robot: Robot, fault: Fault) -> tuple[DataLine, int]:
+def _place(robot: FaultyRobot, fault: Fault) -> tuple[DataLine, int]:
     """The data line of the chip that the fault names, and its address."""
     slot = robot.boards[fault.board or ""].slot(fault.triangle or 0)
     line = robot.converters.i2c_wire(_board(robot, fault)).lines[slot // CHIPS_PER_LINE]
     return line, ADDRESSES[slot % CHIPS_PER_LINE]
 
 
-def _no_acknowledge(robot: Robot, fault: Fault) -> Mend:
+def _no_acknowledge(robot: FaultyRobot, fault: Fault) -> Mend:
     line, address = _place(robot, fault)
     line.refuse(address, round(fault.value or 0))
     return partial(line.refuse, address, None)
 
 
-def _clock_stretched(robot: Robot, fault: Fault) -> Mend:
+def _clock_stretched(robot: FaultyRobot, fault: Fault) -> Mend:
     line, address = _place(robot, fault)
     line.stretch(address, round(1e3 * (fault.value or 0.0)))
     return partial(line.stretch, address, None)
 
 
-def _data_held_low(robot: Robot, fault: Fault) -> Mend:
+def _data_held_low(robot: FaultyRobot, fault: Fault) -> Mend:
     line, _ = _place(robot, fault)
     line.hold(round(fault.value or 0) or FOR_EVER)
     return partial(line.hold, 0)
 
 
-def _bit_flipped(robot: Robot, fault: Fault) -> Mend:
+def _bit_flipped(robot: FaultyRobot, fault: Fault) -> Mend:
     line, _ = _place(robot, fault)
     line.flip(fault.value or 0.0)
     return partial(line.flip, 0.0)
 
 
-def _slow_rise(robot: Robot, fault: Fault) -> Mend:
+def _slow_rise(robot: FaultyRobot, fault: Fault) -> Mend:
     line, _ = _place(robot, fault)
     line.rise_slowly(round(fault.value or 0))
     return partial(line.rise_slowly, 0)
 
 
-def _brown_out(robot: Robot, fault: Fault) -> Mend:
+def _brown_out(robot: FaultyRobot, fault: Fault) -> Mend:
     robot.converters.brown_out(_chip(robot, fault))
     return _nothing
 
 
-def _shared_address(robot: Robot, fault: Fault) -> Mend:
+def _shared_address(robot: FaultyRobot, fault: Fault) -> Mend:
     """The chip's own place is empty; at the other one a 0 of either chip wins."""
     number, chip = _board(robot, fault), _chip(robot, fault)
     slot = robot.boards[fault.board or ""].slot(fault.triangle or 0)
@@ -337,7 +337,7 @@ def _shared_address(robot: Robot, fault: Fault) -> Mend:
     return partial(_separate, robot, number, other, before)
 
 
-def _separate(robot: Robot, number: int, slot: int, before: NDArray[np.intp]) -> None:
+def _separate(robot: FaultyRobot, number: int, slot: int, before: NDArray[np.intp]) -> None:
     """Each chip answers at its own address again."""
     robot.converters.answer_second(number, slot, None)
     robot.rewire(number, before)
@@ -346,12 +346,12 @@ def _separate(robot: Robot, number: int, slot: int, before: NDArray[np.intp]) ->
 # ---------------------------------------------------------------------- boards and buses
 
 
-def _board_reset(robot: Robot, fault: Fault) -> Mend:
+def _board_reset(robot: FaultyRobot, fault: Fault) -> Mend:
     robot.boards[fault.board or ""].reset(robot.t_ns)
     return _nothing
 
 
-def _board_silent(robot: Robot, fault: Fault) -> Mend:
+def _board_silent(robot: FaultyRobot, fault: Fault) -> Mend:
     name = fault.board or ""
     if name in robot.fingertips.boards:
         robot.fingertips.hung.add(name)
@@ -361,43 +361,43 @@ def _board_silent(robot: Robot, fault: Fault) -> Mend:
     return partial(robot.hung.discard, number)
 
 
-def _late_period(robot: Robot, fault: Fault) -> Mend:
+def _late_period(robot: FaultyRobot, fault: Fault) -> Mend:
     number = _board(robot, fault)
     robot.late_ns[number] = round((fault.value or 0.0) * 1e6)
     return partial(robot.late_ns.pop, number, None)
 
 
-def _jittered_period(robot: Robot, fault: Fault) -> Mend:
+def _jittered_period(robot: FaultyRobot, fault: Fault) -> Mend:
     number = _board(robot, fault)
     robot.jitter_ns[number] = (fault.value or 0.0) * 1e6
     return partial(robot.jitter_ns.pop, number, None)
 
 
-def _frame_loss(robot: Robot, fault: Fault) -> Mend:
+def _frame_loss(robot: FaultyRobot, fault: Fault) -> Mend:
     wire = robot.wires[fault.bus or ""]
     wire.loss_share = fault.value or 0.0
     return partial(_clear, wire, "loss_share")
 
 
-def _bit_errors(robot: Robot, fault: Fault) -> Mend:
+def _bit_errors(robot: FaultyRobot, fault: Fault) -> Mend:
     wire = robot.wires[fault.bus or ""]
     wire.error_share = fault.value or 0.0
     return partial(_clear, wire, "error_share")
 
 
-def _bus_off(robot: Robot, fault: Fault) -> Mend:
+def _bus_off(robot: FaultyRobot, fault: Fault) -> Mend:
     wire = robot.wires[fault.bus or ""]
     wire.off = True
     return partial(_clear, wire, "off")
 
 
-def _babbling_node(robot: Robot, fault: Fault) -> Mend:
+def _babbling_node(robot: FaultyRobot, fault: Fault) -> Mend:
     wire = robot.wires[fault.bus or ""]
     wire.babble(fault.value or 0.0, robot.t_ns)
     return partial(_hush, robot, fault.bus or "")
 
 
-def _hush(robot: Robot, bus: str) -> None:
+def _hush(robot: FaultyRobot, bus: str) -> None:
     robot.wires[bus].babble(0.0, robot.t_ns)
 
 

@@ -33,7 +33,7 @@ POLL_NS = 2_000_000
 WAITING_FRAMES = 2000
 
 
-class Link:
+class BoardLink:
     """Sends the frames of boards, and returns the commands of a host.
 
     Attributes:
@@ -132,7 +132,7 @@ async def run_board(
     """
     clock = clock or RealClock()
     board = make_board(model, address, I2cChips(lines))
-    link = Link(f"of board {address}", bus)
+    link = BoardLink(f"of board {address}", bus)
     while True:
         now_ns = clock.now_ns()
         for can_id, data in link.received():

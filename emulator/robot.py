@@ -22,7 +22,7 @@ from emulator.boards.mtb import Mtb, make_board, set_up
 from emulator.boards.recording import load_recordings
 from emulator.chips.converters import Converters, fidelities
 from emulator.clock import Clock, RealClock
-from emulator.link import Link
+from emulator.link import BoardLink
 from emulator.probes.scene import Fault, Probe, Scene, check
 from emulator.probes.skin import NEVER_NS, Skin
 from emulator.state import StateError
@@ -265,7 +265,7 @@ class Robot:
             clock: time to live in; the machine's own, if not given.
         """
         clock = clock or RealClock()
-        links = {name: Link(name, bus) for name, bus in buses.items()}
+        links = {name: BoardLink(name, bus) for name, bus in buses.items()}
         last_ns = clock.now_ns()
         while True:
             commands = [

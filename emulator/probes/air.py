@@ -17,7 +17,7 @@ HIGHEST_KPA = 10_000.0
 Floats = NDArray[np.float64]
 
 
-class Course:
+class AirCourse:
     """Pressure over time: straight lines between samples, nothing before and after them.
 
     Args:
@@ -30,7 +30,7 @@ class Course:
         self._kpa = pressure_kpa
 
     @classmethod
-    def of(cls, keyframes: Sequence[tuple[float, float]], start_s: float) -> "Course":
+    def of(cls, keyframes: Sequence[tuple[float, float]], start_s: float) -> "AirCourse":
         """Return the course of a scene's keyframes (s, kPa), which count from `start_s`."""
         times_s, kpa = np.array(keyframes, np.float64).reshape(-1, 2).T
         return cls(times_s + start_s, kpa)

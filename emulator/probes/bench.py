@@ -73,7 +73,7 @@ class Motion:
 
 
 @dataclass(frozen=True, slots=True)
-class Recording:
+class RigRecording:
     """What the rig recorded: m samples of c contacts and of the k pads that they cover.
 
     Attributes:
@@ -162,11 +162,11 @@ class PalmRig:
             rise_ff[row] = own_pads.rise_ff(felt, footprint)
         return Motion(t_s, force_n, footprint.area_mm2, rise_ff, pad, contact)
 
-    def record(self, motion: Motion) -> Recording:
+    def record(self, motion: Motion) -> RigRecording:
         """Readings of the load cell and the palm for a motion."""
         force_n = motion.force_n
         force_n = force_n + FORCE_NOISE_N * self.rng.standard_normal(force_n.shape)
-        return Recording(
+        return RigRecording(
             motion.t_s,
             force_n * 1e3 / motion.area_mm2,
             self.read_ff(motion.rise_ff, motion.pad),

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from emulator.boards.arithmetic import TAXELS
 from emulator.chips.noise import SENT_UNIT_FF, PadNoise
-from emulator.probes.air import Course, read_course
+from emulator.probes.air import AirCourse, read_course
 from emulator.probes.coverage import MOST_AT_ONCE, Coverage
 from emulator.probes.foam import INFINERGY_LOSS, Drive, Foam, FoamLayer, Footprint
 from emulator.probes.pads import (
@@ -158,7 +158,7 @@ class Skin:
     def _set_air(self, airs: list[Air]) -> None:
         """Where air presses, and its courses."""
         self._air_kpa = np.zeros(self._layout.n_taxels)
-        self._air: list[tuple[Course, Ints]] = []
+        self._air: list[tuple[AirCourse, Ints]] = []
         for number, air in enumerate(airs):
             try:
                 part = self._layout.part(air.part)
@@ -167,7 +167,7 @@ class Skin:
                 raise ConfigurationError(f'air[{number}].part: no part "{air.part}"') from None
             except ConfigurationError as error:
                 raise ConfigurationError(f"air[{number}].file: {error}") from None
-            course = Course.of(keyframes, air.start_s)
+            course = AirCourse.of(keyframes, air.start_s)
             self._air.append((course, np.arange(part.start, part.stop)))
         taxels = [taxels for _, taxels in self._air]
         self._under_air = np.concatenate([np.zeros(0, np.intp), *taxels])

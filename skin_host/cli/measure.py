@@ -118,7 +118,7 @@ def _report(arguments: argparse.Namespace) -> int:
 
 
 if TYPE_CHECKING:
-    from skin_host.evaluation.simulate.run import Result
+    from skin_host.evaluation.simulate.run import RunResult
 
 
 def _simulate(arguments: argparse.Namespace) -> int:
@@ -136,7 +136,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
     else:
         logging.basicConfig(level=logging.DEBUG, format="%(levelname)-7s %(name)s: %(message)s")
     progress = Progress("simulating")
-    results: list[Result] = []
+    results: list[RunResult] = []
     try:
         for number in range(arguments.seeds):
             progress.update(number / arguments.seeds, f"seed {arguments.seed + number}")
@@ -165,7 +165,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
     return 1 if broken else 0
 
 
-def _line(result: "Result") -> str:
+def _line(result: "RunResult") -> str:
     speed = result.simulated_s / max(result.cpu_s, 1e-9)
     outcome = "a promise was broken" if result.broken else "every promise held"
     return (
@@ -175,7 +175,7 @@ def _line(result: "Result") -> str:
     )
 
 
-def _story(result: "Result", config: Path) -> str:
+def _story(result: "RunResult", config: Path) -> str:
     """Return the events before a broken promise, and the command that repeats it."""
     again = max(0.0, result.simulated_s - 1.0)
     return "\n".join(
@@ -187,7 +187,7 @@ def _story(result: "Result", config: Path) -> str:
     )
 
 
-def _document(results: "list[Result]") -> dict[str, Any]:
+def _document(results: "list[RunResult]") -> dict[str, Any]:
     return {
         "seeds": len(results),
         "kept": sum(result.broken is None for result in results),

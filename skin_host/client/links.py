@@ -41,17 +41,17 @@ class Hearer(Protocol):
     def wanted(self) -> Iterable[str]:
         """Return the topics to subscribe to."""
 
-    def take(self, link: "Link", message: Message) -> None:
+    def take(self, link: "BrokerLink", message: Message) -> None:
         """Take a message."""
 
     def unfollow(self, topic: str) -> None:
         """A topic is no longer subscribed."""
 
-    def note(self, link: "Link") -> None:
+    def note(self, link: "BrokerLink") -> None:
         """The link was made, or lost, or could not be made."""
 
 
-class Link:
+class BrokerLink:
     """A connection that is kept up.
 
     Args:

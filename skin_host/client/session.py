@@ -11,7 +11,7 @@ from typing import Any, Literal, Self, TypeVar
 from weakref import WeakSet
 
 from skin_host.client.heard import Health, read
-from skin_host.client.links import RETAINED_S, Link, only_robot
+from skin_host.client.links import RETAINED_S, BrokerLink, only_robot
 from skin_host.client.order import EventOrder, Newest
 from skin_host.client.presence import Contact, Presence
 from skin_host.client.streams import Stream
@@ -123,7 +123,7 @@ class SkinClient:
         self._tasks: list[asyncio.Task[None]] = []
         # Nodes of a cluster share clients' names, so each link has its own.
         self._links = [
-            Link(i, one, self._identifier + f"-{i}" * (len(brokers) > 1), self)
+            BrokerLink(i, one, self._identifier + f"-{i}" * (len(brokers) > 1), self)
             for i, one in enumerate(brokers)
         ]
         self.nodes: dict[str, Node] = {}
@@ -366,7 +366,7 @@ class SkinClient:
             self._robot = await only_robot(connection, broker, self._base)
             self._topics = Topics(self._base, self._robot)
 
-    def note(self, link: Link) -> None:
+    def note(self, link: BrokerLink) -> None:
         if link.last_error:
             self.last_error = link.last_error
         if link.connection is None:
@@ -411,7 +411,7 @@ class SkinClient:
             if part is None or (kind, None) not in asked:
                 yield topics.part(kind, part or "+")
 
-    def take(self, link: Link, message: Message) -> None:
+    def take(self, link: BrokerLink, message: Message) -> None:
         assert self._topics is not None
         place = self._topics.parse(message.topic.value)
         payload = message.payload if isinstance(message.payload, bytes) else b""
@@ -442,7 +442,9 @@ class SkinClient:
             return True
         return self._newest.take(kind, name, stamp_of(message.properties))
 
-    def _take_status(self, name: str, payload: bytes, link: Link, newness: bool | None) -> None:
+    def _take_status(
+        self, name: str, payload: bytes, link: BrokerLink, newness: bool | None
+    ) -> None:
         if newness is False:
             return
         node = self.nodes.setdefault(name, Node())
@@ -470,7 +472,7 @@ class SkinClient:
             answer.set_result(result)
 
     def _take_part(
-        self, kind: PartTopic, part: str, payload: bytes, link: Link, message: Message
+        self, kind: PartTopic, part: str, payload: bytes, link: BrokerLink, message: Message
     ) -> None:
         here = [stream for stream in self._streams if stream.part in (None, part)]
         needed = {one for stream in here for k in stream.kinds for one in _NEEDED.get(k, (k,))}

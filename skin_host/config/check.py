@@ -44,7 +44,7 @@ class BusRecord(TypedDict):
     load: tuple[float, float]
 
 
-class BoardRecord(TypedDict):
+class BoardSummary(TypedDict):
     """One board, and the parts it belongs to."""
 
     name: str
@@ -70,7 +70,7 @@ class PartRecord(TypedDict):
     area_cm2: float
 
 
-class FingertipRecord(TypedDict):
+class FingertipSummary(TypedDict):
     """One fingertip on a force/torque board."""
 
     name: str
@@ -100,9 +100,9 @@ class Description(TypedDict):
     robot: str
     configuration: str
     buses: list[BusRecord]
-    boards: list[BoardRecord]
+    boards: list[BoardSummary]
     parts: list[PartRecord]
-    fingertips: list[FingertipRecord]
+    fingertips: list[FingertipSummary]
     total: Totals
     warnings: list[str]
 
@@ -181,7 +181,7 @@ def _bus(name: str, settings: Settings, layout: Layout) -> BusRecord:
     }
 
 
-def _board(board: BoardLayout, layout: Layout) -> BoardRecord:
+def _board(board: BoardLayout, layout: Layout) -> BoardSummary:
     return {
         "name": board.name,
         "bus": board.settings.bus,

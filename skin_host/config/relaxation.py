@@ -31,7 +31,7 @@ RETIRED = {
 }
 
 
-class Relaxation(Struct, forbid_unknown_fields=True, kw_only=True, frozen=True):
+class RelaxationSettings(Struct, forbid_unknown_fields=True, kw_only=True, frozen=True):
     """Which viscoelastic model corrects the pressure, and its parameters.
 
     `set` names a replacement for the paper's lost Table I; explicit numbers take precedence.
@@ -60,7 +60,7 @@ class RelaxationFile(Struct, kw_only=True):
     tau_unload_s: list[Positive]
 
 
-def wrong_parameters(table: Relaxation) -> str | None:
+def wrong_parameters(table: RelaxationSettings) -> str | None:
     """Return what does not fit together in a table; None if everything does."""
     if (table.beta is None) != (table.tau_s is None):
         return "`beta` and `tau_s` go together"
@@ -71,7 +71,7 @@ def wrong_parameters(table: Relaxation) -> str | None:
     return None
 
 
-def with_file(table: Relaxation, configuration: Path) -> Relaxation:
+def with_file(table: RelaxationSettings, configuration: Path) -> RelaxationSettings:
     """Replace the numbers of a table by those of the file that it names.
 
     Args:

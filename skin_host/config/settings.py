@@ -17,7 +17,7 @@ from msgspec import Meta, Struct, field
 from skin_host.config.explain import Named, explain, not_finite
 from skin_host.config.fields import Name, NotNegative, Positive
 from skin_host.config.fingertips import Fingertip as Fingertip  # noqa: PLC0414 (for others too)
-from skin_host.config.relaxation import Relaxation, with_file, wrong_parameters
+from skin_host.config.relaxation import RelaxationSettings, with_file, wrong_parameters
 from skin_host.errors import ConfigurationError, RequestError
 
 Byte = Annotated[int, Meta(ge=0, le=255)]
@@ -56,7 +56,7 @@ class Board(_Table, frozen=True):
     no_load: Byte = 240
 
 
-class Place(_Table, frozen=True):
+class PlaceSettings(_Table, frozen=True):
     """Where one triangle lies: its origin, its rotation, and the normal of its plane.
 
     The triangle's own frame is rotated about its z axis by `turn_deg`, then its z axis is
@@ -81,12 +81,12 @@ class Patch(_Table, frozen=True):
     shift: Annotated[int, Meta(ge=0, le=8)] = 2
     cdc_offset: Annotated[int, Meta(ge=0, le=0xFFFF)] = 0x2200
     #: One place per triangle. Without them the triangles are tiled side by side.
-    places: list[Place] = []
+    places: list[PlaceSettings] = []
     #: Or a file of taxel positions: one row x y z nx ny nz (m) per taxel of the patch.
     positions: str | None = None
 
 
-class Kind(_Table, frozen=True):
+class KindSettings(_Table, frozen=True):
     """A kind of sensor unit: 12 pads, or 24, 36, 48 where triangles are cut as one."""
 
     about: str
@@ -120,7 +120,7 @@ class Part(_Table, frozen=True):
     )
 
 
-class Calibration(_Table, frozen=True):
+class CalibrationSettings(_Table, frozen=True):
     """How a calibration is taken (paper, section V-A)."""
 
     seconds: Positive = 5.0
@@ -145,7 +145,7 @@ class Pressure(_Table, frozen=True):
     smoothing_s: NotNegative = 0.5
 
 
-class Touch(_Table, frozen=True):
+class TouchSettings(_Table, frozen=True):
     """The touch decision (paper, section V-B), in units of the 8-bit value."""
 
     margin_units: NotNegative = 2.0
@@ -174,10 +174,10 @@ class Drift(_Table, frozen=True):
 class Processing(_Table, frozen=True):
     """Sweeps to pressure to contacts."""
 
-    calibration: Calibration = field(default_factory=Calibration)
+    calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
     pressure: Pressure = field(default_factory=Pressure)
-    relaxation: Relaxation = field(default_factory=Relaxation)
-    touch: Touch = field(default_factory=Touch)
+    relaxation: RelaxationSettings = field(default_factory=RelaxationSettings)
+    touch: TouchSettings = field(default_factory=TouchSettings)
     drift: Drift = field(default_factory=Drift)
 
 
@@ -233,7 +233,7 @@ class Settings(_Table, frozen=True):
     boards: Annotated[dict[Name, Board], Meta(min_length=1)]
     parts: Annotated[dict[Name, Part], Meta(min_length=1)]
     #: Kinds of sensor unit beyond the built-in ones.
-    kinds: dict[Name, Kind] = {}
+    kinds: dict[Name, KindSettings] = {}
     #: Fingertips on force/torque boards.
     fingertips: dict[Name, Fingertip] = {}
     processing: Processing = field(default_factory=Processing)
@@ -303,7 +303,7 @@ def load(path: Path) -> Settings:
         "buses": Bus,
         "boards": Board,
         "parts": Part,
-        "kinds": Kind,
+        "kinds": KindSettings,
         "fingertips": Fingertip,
     }
     settings = read_toml(path, Settings, named)

@@ -17,7 +17,7 @@ from skin_host.clock import Clock
 from skin_host.config.explain import explain
 from skin_host.config.settings import Settings
 from skin_host.daemon import service
-from skin_host.daemon.state import State, Thresholds
+from skin_host.daemon.state import NodeState, Thresholds
 from skin_host.errors import BusError, RequestError, SkinError
 from skin_host.layout import Layout
 from skin_host.mqtt.publisher import Publisher
@@ -92,7 +92,7 @@ class _Node(Protocol):
     def disable(self, part: int) -> None: ...
     def set_thresholds(self, thresholds: Thresholds) -> None: ...
     def status(self) -> Mapping[str, Any]: ...
-    def keep(self, state: State) -> None: ...
+    def keep(self, state: NodeState) -> None: ...
 
 
 class Control:
@@ -244,7 +244,7 @@ class Control:
         """Store what operators changed; report it if that failed. The disk may be slow."""
         daemon = self._daemon
         async with self._keeping:  # the newest is written last
-            state = State(
+            state = NodeState(
                 disabled=[daemon.layout.parts[i].name for i in sorted(daemon.engine.disabled)],
                 thresholds=daemon.thresholds,
             )

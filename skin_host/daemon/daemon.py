@@ -16,7 +16,7 @@ from skin_host.daemon import metrics, service
 from skin_host.daemon.calibrate import calibration_path, collect
 from skin_host.daemon.control import Control
 from skin_host.daemon.link import Link, OpenPort
-from skin_host.daemon.state import State, Thresholds, load_state, save_state
+from skin_host.daemon.state import NodeState, Thresholds, load_state, save_state
 from skin_host.errors import ConfigurationError, RequestError, SkinError
 from skin_host.fingertip.health import FingertipRecord
 from skin_host.fingertip.publishing import FingertipPublisher
@@ -244,7 +244,7 @@ class Daemon:
         await self.configure()
         self.publisher.put_info(self._info())
 
-    def keep(self, state: State) -> None:
+    def keep(self, state: NodeState) -> None:
         """Write what operators changed to the state directory.
 
         Raises:

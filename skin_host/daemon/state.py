@@ -13,7 +13,7 @@ import msgspec
 from msgspec import Meta, Struct, field
 
 from skin_host.config.fields import Name
-from skin_host.config.settings import Settings, Touch, changed
+from skin_host.config.settings import Settings, TouchSettings, changed
 from skin_host.files import read_document, set_aside, write_atomic
 
 log = logging.getLogger(__name__)
@@ -29,7 +29,7 @@ class Thresholds(Struct, forbid_unknown_fields=True, omit_defaults=True):
     hysteresis_units: Annotated[float, Meta(ge=0, le=255)] | None = None
     votes_of_3: Literal[1, 2, 3] | None = None
 
-    def over(self, touch: Touch) -> Touch:
+    def over(self, touch: TouchSettings) -> TouchSettings:
         """Return the settings with these changes."""
         changes = msgspec.structs.asdict(self)
         known = {key: value for key, value in changes.items() if value is not None}
@@ -41,7 +41,7 @@ class Thresholds(Struct, forbid_unknown_fields=True, omit_defaults=True):
         return changed(settings, {"processing.touch": touch})
 
 
-class State(Struct, forbid_unknown_fields=True):
+class NodeState(Struct, forbid_unknown_fields=True):
     """Changes by operators since the configuration was written."""
 
     schema: str = SCHEMA
@@ -49,7 +49,7 @@ class State(Struct, forbid_unknown_fields=True):
     thresholds: Thresholds = field(default_factory=Thresholds)
 
 
-def load_state(path: Path) -> State:
+def load_state(path: Path) -> NodeState:
     """Read the state of a node.
 
     A missing or unreadable file gives an unchanged one; so does a damaged one, which is set aside.
@@ -58,19 +58,19 @@ def load_state(path: Path) -> State:
         NewerFileError: a newer version has written it.
     """
     if not os.access(path, os.F_OK):
-        return State()
+        return NodeState()
     if not os.access(path, os.R_OK):
         log.error("%s: cannot be read: no permission; starting without it", path)
-        return State()
+        return NodeState()
     try:
-        return read_document(path, State, SCHEMA, "state", ValueError)
+        return read_document(path, NodeState, SCHEMA, "state", ValueError)
     except ValueError as error:
         log.error("%s: damaged (%s); starting without it", path, error)
         set_aside(path)
-        return State()
+        return NodeState()
 
 
-def save_state(path: Path, state: State) -> None:
+def save_state(path: Path, state: NodeState) -> None:
     """Store the state of a node.
 
     Raises:

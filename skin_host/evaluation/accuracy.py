@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from emulator.probes.foam import Foam
 from emulator.probes.viscoelastic import FoamTruth, TruthKind
 from skin_host.bus.wire import TAXELS
-from skin_host.config.relaxation import FITTED, MODELS, Relaxation
-from skin_host.evaluation.histories import HISTORIES, Record, calibration_hold, play, record
+from skin_host.config.relaxation import FITTED, MODELS, RelaxationSettings
+from skin_host.evaluation.histories import HISTORIES, PlayedHistory, calibration_hold, play, record
 from skin_host.evaluation.rig import Rig
 from skin_host.processing.fitting.hold import Fit, HoldRecord, fit, merge
 from skin_host.processing.pressure import PressureCurve
@@ -48,7 +48,7 @@ class Variant:
 
 
 #: Default of the pipeline.
-DEFAULT = Variant(Relaxation().model, Relaxation().update_s)
+DEFAULT = Variant(RelaxationSettings().model, RelaxationSettings().update_s)
 VARIANTS = tuple(
     dict.fromkeys([*(Variant(model) for model in MODELS), Variant(DEFAULT.model, 0.0)])
 )
@@ -111,14 +111,14 @@ HELD_OUT: tuple[TruthKind, ...] = ("F", "M")
 
 
 @dataclass(frozen=True)
-class Plan:
+class HistoryPlan:
     """How much is worked out: shares of the histories' length, at this rate."""
 
     scale: float = 1.0
     sample_hz: float = 5.0
 
 
-def score(kind: TruthKind, scenario: Scenario, plan: Plan) -> list[Row]:
+def score(kind: TruthKind, scenario: Scenario, plan: HistoryPlan) -> list[Row]:
     """The rows of errors on a truth: all histories of the fitted foam, else those judged."""
     names = HISTORIES if scenario == FITTED_FOAM else JUDGED_HISTORIES
     pads = PRESSED_PADS if scenario.loss_spread else 1
@@ -233,8 +233,8 @@ class _Skin:
 
     def __init__(
         self,
-        records: dict[str, Record],
-        typical: dict[str, Record],
+        records: dict[str, PlayedHistory],
+        typical: dict[str, PlayedHistory],
         foam: Foam,
         hz: float,
         seed: int,
@@ -313,7 +313,7 @@ class _Skin:
             if name in JUDGED_HISTORIES
         ]
 
-        def error(number: int, one: Record, factor: Floats | float) -> Floats:
+        def error(number: int, one: PlayedHistory, factor: Floats | float) -> Floats:
             t, mine = len(one.resting), slice(number * PRESSED_PADS, (number + 1) * PRESSED_PADS)
             left = self._exact_kpa[:t, mine] - factor * relaxation[:t, mine]
             return np.maximum(left, 0.0) - one.pressure_kpa

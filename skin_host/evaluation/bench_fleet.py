@@ -31,7 +31,7 @@ from typing import Any, NamedTuple, Protocol
 import msgspec
 import numpy as np
 
-from skin_host.client.links import Link
+from skin_host.client.links import BrokerLink
 from skin_host.client.order import EventOrder, Newest
 from skin_host.client.presence import Presence
 from skin_host.client.session import HOLD_S
@@ -81,7 +81,7 @@ class Brokers(Protocol):
 
 
 @dataclass(frozen=True)
-class Plan:
+class FleetPlan:
     """How long and how much.
 
     Attributes:
@@ -112,14 +112,14 @@ class Sent(NamedTuple):
 
 def run(*, quick: bool = False, robots: int | None = None) -> dict[str, Any]:
     """Measure with mosquittos and return the document."""
-    plan = Plan(robots=60, pace=1.0, health_s=1.0, phase_s=6.0) if quick else Plan()
+    plan = FleetPlan(robots=60, pace=1.0, health_s=1.0, phase_s=6.0) if quick else FleetPlan()
     if robots is not None:
         plan = replace(plan, robots=robots)
     with mosquittos() as brokers:
         return measure(brokers, plan)
 
 
-def measure(brokers: Brokers, plan: Plan) -> dict[str, Any]:
+def measure(brokers: Brokers, plan: FleetPlan) -> dict[str, Any]:
     """Let the fleet run through all phases."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, max(soft, 65536)), hard))
@@ -144,11 +144,11 @@ def measure(brokers: Brokers, plan: Plan) -> dict[str, Any]:
             worker.join()
 
 
-async def _conduct(brokers: Brokers, plan: Plan, pipes: list[Pipe]) -> dict[str, Any]:
+async def _conduct(brokers: Brokers, plan: FleetPlan, pipes: list[Pipe]) -> dict[str, Any]:
     logging.getLogger("skin_host.client").setLevel(logging.ERROR)
     ear = _Receiver(plan)
     links = [
-        Link(i, _broker(address, brokers), f"ear-{os.getpid()}-{i}", ear)
+        BrokerLink(i, _broker(address, brokers), f"ear-{os.getpid()}-{i}", ear)
         for i, address in enumerate(brokers.addresses)
     ]
     tasks = [asyncio.create_task(link.run()) for link in links]
@@ -221,7 +221,7 @@ class _Received:
 class _Receiver:
     """Receives all robots from all brokers; a `links.Hearer`."""
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: FleetPlan) -> None:
         self._robots = {f"robot{i}": _Received() for i in range(plan.robots)}
         self._received = 0
         self._delays_s: list[float] = []
@@ -237,14 +237,14 @@ class _Receiver:
     def unfollow(self, topic: str) -> None:
         """Nothing is ever unfollowed."""
 
-    def note(self, link: Link) -> None:
+    def note(self, link: BrokerLink) -> None:
         """Links come and go."""
         if link.connection is None:
             for robot in self._robots.values():
                 robot.presence.take_loss(link.number)
                 robot.note_contact()
 
-    def take(self, link: Link, message: Message) -> None:
+    def take(self, link: BrokerLink, message: Message) -> None:
         """Process a message."""
         words = message.topic.value.split("/")
         robot = self._robots.get(words[1])
@@ -372,7 +372,7 @@ def _wrong(said: list[tuple[float, str]], heard: list[tuple[float, str]]) -> boo
 
 
 def _work(
-    pipe: Pipe, names: list[str], keys: dict[str, Any], password: str | None, plan: Plan
+    pipe: Pipe, names: list[str], keys: dict[str, Any], password: str | None, plan: FleetPlan
 ) -> None:
     """Run some of the robots in a separate process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -386,7 +386,7 @@ def _work(
         asyncio.run(_be(pipe, names, Mqtt(**keys), plan))
 
 
-async def _be(pipe: Pipe, names: list[str], settings: Mqtt, plan: Plan) -> None:
+async def _be(pipe: Pipe, names: list[str], settings: Mqtt, plan: FleetPlan) -> None:
     traffic = [json.loads(line) for line in TRAFFIC.read_text().splitlines()]
     stop = asyncio.Event()
     publishers = {name: Publisher(settings, name) for name in names}
@@ -426,7 +426,7 @@ async def _play(
     publisher: Publisher,
     contacts: list[tuple[float, str]],
     traffic: list[dict[str, Any]],
-    plan: Plan,
+    plan: FleetPlan,
     stop: asyncio.Event,
 ) -> None:
     """Publish the recording in a loop, from a random place in it, until `stop` is set."""

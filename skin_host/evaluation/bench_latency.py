@@ -24,7 +24,7 @@ from skin_host.bus.wire import TAXELS, TRIANGLES
 from skin_host.config.settings import changed
 from skin_host.daemon.daemon import Daemon
 from skin_host.errors import BrokerError, SkinError
-from skin_host.evaluation.can_stream import FULL_BUS_FRAMES_PER_S, Stream, Wire, send
+from skin_host.evaluation.can_stream import FULL_BUS_FRAMES_PER_S, FrameStream, StreamWire, send
 from skin_host.evaluation.touch_listener import PLAIN_TOPIC, collected, listen, publish_plain
 from skin_host.layout import build_layout
 from skin_host.mqtt.broker import find_mosquitto, mosquitto_broker
@@ -63,7 +63,7 @@ def measure(frames_per_s: int, seconds: float) -> Document:
     program = find_mosquitto()
     if program is None:
         raise BrokerError("mosquitto is not installed; `apt install mosquitto`")
-    return asyncio.run(_measure(program, Stream.of(frames_per_s), seconds))
+    return asyncio.run(_measure(program, FrameStream.of(frames_per_s), seconds))
 
 
 def describe(document: Document) -> str:
@@ -87,8 +87,8 @@ def _line(row: Document) -> str:
     )
 
 
-async def _measure(program: str, stream: Stream, seconds: float) -> Document:
-    wire = Wire.here()
+async def _measure(program: str, stream: FrameStream, seconds: float) -> Document:
+    wire = StreamWire.here()
     context = multiprocessing.get_context("spawn")
     async with mosquitto_broker(program) as broker:
         sender_end, sender_child_end = context.Pipe()
@@ -140,7 +140,7 @@ def _row(delays_ns: list[int]) -> Document:
     }
 
 
-def _scenes(stream: Stream) -> list[NDArray[np.uint8]]:
+def _scenes(stream: FrameStream) -> list[NDArray[np.uint8]]:
     """An untouched skin; and one that something presses and leaves, once in 40 periods."""
     shape = (40, stream.boards, TRIANGLES, TAXELS)
     quiet = np.random.default_rng(0).integers(239, 242, shape)
@@ -151,7 +151,7 @@ def _scenes(stream: Stream) -> list[NDArray[np.uint8]]:
     return [quiet.astype(np.uint8), pressed.astype(np.uint8)]
 
 
-def _daemon(wire: Wire, stream: Stream, broker_port: int) -> None:
+def _daemon(wire: StreamWire, stream: FrameStream, broker_port: int) -> None:
     """Process: `skin run`."""
     logging.disable(logging.WARNING)  # no board of this stream answers commands
     settings = stream.settings(wire.bus())

@@ -38,7 +38,7 @@ from skin_host.bus.wire import (
     MessageClass,
 )
 from skin_host.config.settings import Settings
-from skin_host.evaluation.can_stream import BUS, Stream, Wire, send
+from skin_host.evaluation.can_stream import BUS, FrameStream, StreamWire, send
 from skin_host.layout import build_layout
 from skin_host.processing.core import Engine
 
@@ -60,7 +60,7 @@ def run(*, quick: bool = False) -> dict[str, Any]:
     Args:
         quick: 1 s for each instead of 5 s, and 5 s instead of 60 s for the whole pipeline.
     """
-    wire = Wire.here()
+    wire = StreamWire.here()
     seconds, long_s = (1.0, 5.0) if quick else (5.0, 60.0)
     rows = [measure(wire, path, rate, seconds) for rate in RATES for path in PATHS]
     kernel = [measure(wire, "kernel", rate, seconds) for rate in RATES if rate]
@@ -97,7 +97,7 @@ def _line(row: Row, reference_ns: float) -> str:
     )
 
 
-def measure(wire: Wire, path: str, frames_per_s: int, seconds: float) -> Row:
+def measure(wire: StreamWire, path: str, frames_per_s: int, seconds: float) -> Row:
     """Run one path on its own stream: one of `PATHS`, "kernel" or "pipeline".
 
     Args:
@@ -106,7 +106,7 @@ def measure(wire: Wire, path: str, frames_per_s: int, seconds: float) -> Row:
         frames_per_s: pace of the sender, 0 for as fast as it can.
         seconds: of the measurement, after warming up.
     """
-    stream = Stream.of(frames_per_s)
+    stream = FrameStream.of(frames_per_s)
     # Four periods of an untouched skin's noise, because the result does not depend on touches.
     shape = (4, stream.boards, TRIANGLES, TAXELS)
     quiet = np.random.default_rng(0).integers(239, 242, shape).astype(np.uint8)
@@ -164,7 +164,7 @@ class _Meter:
         }
 
 
-def _read(parent: Connection, wire: Wire, path: str, stream: Stream) -> None:
+def _read(parent: Connection, wire: StreamWire, path: str, stream: FrameStream) -> None:
     """Process: read by one path, on the parent's commands."""
     asyncio.run(_PATHS[path](parent, wire, stream))
 
@@ -220,7 +220,7 @@ class _PerFrameDecoder:
             self._meter.delays_ns.append(time.time_ns() - round(message.timestamp * 1e9))
 
 
-async def _notifier_async(parent: Connection, wire: Wire, stream: Stream) -> None:
+async def _notifier_async(parent: Connection, wire: StreamWire, stream: FrameStream) -> None:
     meter = _Meter()
     decoder = _PerFrameDecoder(meter)
     bus = open_bus(BUS, wire.bus())
@@ -238,7 +238,7 @@ async def _notifier_async(parent: Connection, wire: Wire, stream: Stream) -> Non
     bus.shutdown()
 
 
-async def _notifier_callback(parent: Connection, wire: Wire, stream: Stream) -> None:
+async def _notifier_callback(parent: Connection, wire: StreamWire, stream: FrameStream) -> None:
     meter = _Meter()
     bus = open_bus(BUS, wire.bus())
     notifier = can.Notifier(bus, [_PerFrameDecoder(meter).take], loop=asyncio.get_running_loop())
@@ -247,7 +247,7 @@ async def _notifier_callback(parent: Connection, wire: Wire, stream: Stream) -> 
     bus.shutdown()
 
 
-async def _batch(parent: Connection, wire: Wire, stream: Stream) -> None:
+async def _batch(parent: Connection, wire: StreamWire, stream: FrameStream) -> None:
     meter = _Meter()
     settings = stream.settings(wire.bus())
     boards = list(enumerate(build_layout(settings, Path()).boards))
@@ -255,7 +255,7 @@ async def _batch(parent: Connection, wire: Wire, stream: Stream) -> None:
     await _read_batches(parent, settings, meter, lambda batch: assembler.feed(batch).sweeps)
 
 
-async def _kernel(parent: Connection, wire: Wire, stream: Stream) -> None:
+async def _kernel(parent: Connection, wire: StreamWire, stream: FrameStream) -> None:
     meter = _Meter()
     settings = stream.settings(wire.bus())
     port = open_port(BUS, settings.buses[BUS], settings.receive)
@@ -275,7 +275,7 @@ async def _kernel(parent: Connection, wire: Wire, stream: Stream) -> None:
     port.close()
 
 
-async def _pipeline(parent: Connection, wire: Wire, stream: Stream) -> None:
+async def _pipeline(parent: Connection, wire: StreamWire, stream: FrameStream) -> None:
     settings = stream.settings(wire.bus())
     layout = build_layout(settings, Path())
     engine = Engine(settings, layout, list(range(len(layout.parts))))
@@ -320,7 +320,7 @@ async def _read_batches(
     port.close()
 
 
-_PATHS: dict[str, Callable[[Connection, Wire, Stream], Any]] = {
+_PATHS: dict[str, Callable[[Connection, StreamWire, FrameStream], Any]] = {
     "notifier_async": _notifier_async,
     "notifier_callback": _notifier_callback,
     "batch": _batch,

@@ -30,7 +30,7 @@ CAN_FRAME = struct.Struct("=IB3x8s")
 
 
 @dataclass(frozen=True, slots=True)
-class Stream:
+class FrameStream:
     """The sent stream. `frames_per_s` 0 means as fast as the sender can.
 
     Attributes:
@@ -43,7 +43,7 @@ class Stream:
     period_ms: int
 
     @classmethod
-    def of(cls, frames_per_s: int) -> "Stream":
+    def of(cls, frames_per_s: int) -> "FrameStream":
         """The fewest boards that make this rate at a period of 28 ms or more, at most 14."""
         if frames_per_s == 0:
             return cls(0, _MOST_BOARDS, 10)
@@ -89,7 +89,7 @@ class Stream:
 
 
 @dataclass(frozen=True, slots=True)
-class Wire:
+class StreamWire:
     """Where the stream runs: a vcan interface, or a stand-in of datagram sockets.
 
     Attributes:
@@ -101,7 +101,7 @@ class Wire:
     ports: tuple[int, int] = (0, 0)
 
     @classmethod
-    def here(cls) -> "Wire":
+    def here(cls) -> "StreamWire":
         """The first vcan interface that is up, else a new stand-in."""
         for name in can_interfaces():
             flags = NETWORKS / name / "flags"
@@ -137,7 +137,11 @@ class Wire:
 
 
 def send(
-    parent: Connection, wire: Wire, stream: Stream, seconds: float, scenes: list[NDArray[np.uint8]]
+    parent: Connection,
+    wire: StreamWire,
+    stream: FrameStream,
+    seconds: float,
+    scenes: list[NDArray[np.uint8]],
 ) -> None:
     """Process: send for `seconds`; report to the parent the begin and the number of frames.
 

@@ -27,7 +27,7 @@ Holds = list[tuple[float, float]]
 
 
 @dataclass(frozen=True)
-class Record:
+class PlayedHistory:
     """A history as a truth answers it, sampled at equal distances.
 
     Attributes:
@@ -102,14 +102,14 @@ HISTORIES: dict[str, Callable[[float], Holds]] = {
 }
 
 
-def record(kind: TruthKind, holds: Holds, sample_hz: float = SAMPLE_HZ) -> Record:
+def record(kind: TruthKind, holds: Holds, sample_hz: float = SAMPLE_HZ) -> PlayedHistory:
     """Play a history to the truth `kind` under one pad; arrays are [t]."""
     played = play(FoamTruth(kind, 1), holds, sample_hz)
     momentary, pressure = played.momentary_kpa[:, 0], played.pressure_kpa[:, 0]
     return replace(played, momentary_kpa=momentary, pressure_kpa=pressure)
 
 
-def play(truth: FoamTruth, holds: Holds, sample_hz: float = SAMPLE_HZ) -> Record:
+def play(truth: FoamTruth, holds: Holds, sample_hz: float = SAMPLE_HZ) -> PlayedHistory:
     """Play a history to foam that was never touched; arrays are [t, pads]."""
     now_s, level = 0.0, 0.0
     times, momentary, pressure = [0.0], [truth.elastic_kpa.copy()], [truth.pressure_kpa.copy()]
@@ -137,7 +137,7 @@ def play(truth: FoamTruth, holds: Holds, sample_hz: float = SAMPLE_HZ) -> Record
     ends_s = np.cumsum([seconds for _, seconds in holds])
     pressed = np.array([level > 0.0 for level, _ in holds])
     phase = np.minimum(np.searchsorted(ends_s, sampled_s), len(holds) - 1)
-    return Record(
+    return PlayedHistory(
         dt_s,
         _sampled(sampled_s, times, momentary),
         np.maximum(_sampled(sampled_s, times, pressure), 0.0),

@@ -42,7 +42,7 @@ SWEEPS_PER_BATCH = 8
 
 
 @dataclass(frozen=True)
-class Recording:
+class InsoleRecording:
     """One recording.
 
     Attributes:
@@ -86,7 +86,7 @@ class Recording:
             )
 
 
-def read(path: Path) -> Recording:
+def read(path: Path) -> InsoleRecording:
     """Read a recording: arrays `t_s`, `counts` and `pressure_kpa` of an .npz file.
 
     Raises:
@@ -108,7 +108,7 @@ def read(path: Path) -> Recording:
     if not (np.isfinite(pressure).all() and abs(pressure).max() < HIGHEST_KPA):
         raise LogError(f"{path}: pressure_kpa is not finite or above {HIGHEST_KPA:g} kPa")
     t_ns = START_NS + np.rint(t_s * 1e6).astype(np.int64) * 1000
-    return Recording(path.stem, t_ns, counts, pressure)
+    return InsoleRecording(path.stem, t_ns, counts, pressure)
 
 
 def skin() -> tuple[Settings, Layout]:

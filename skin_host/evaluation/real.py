@@ -23,7 +23,7 @@ from skin_host.errors import RequestError
 from skin_host.evaluation import emulated, insole, page, tables
 from skin_host.evaluation.document import as_text, write
 from skin_host.evaluation.goals import goal
-from skin_host.evaluation.insole import Recording
+from skin_host.evaluation.insole import InsoleRecording
 from skin_host.evaluation.machine import cores, machine
 from skin_host.layout import Layout, build_layout
 from skin_host.processing.calibration import Calibration, Verdict, with_pressures_of
@@ -81,7 +81,7 @@ PUBLISHED: tuple[Row, ...] = (
 
 
 @dataclass(frozen=True)
-class Course:
+class PlayedCourse:
     """What the engine made of a recording: f frames of its 280 pads.
 
     Attributes:
@@ -276,7 +276,7 @@ def fit_pressures(path: Path) -> Calibration:
     return fit_curves(samples, settings, layout, load, path)[0]
 
 
-def calibrate(recording: Recording, settings: Settings, layout: Layout) -> Calibration:
+def calibrate(recording: InsoleRecording, settings: Settings, layout: Layout) -> Calibration:
     """The calibration of a recording's first seconds."""
     engine = Engine(settings, layout, [0])
     engine.begin_calibration(ZERO_S)
@@ -288,8 +288,8 @@ def calibrate(recording: Recording, settings: Settings, layout: Layout) -> Calib
 
 
 def play(
-    recording: Recording, settings: Settings, layout: Layout, calibration: Calibration
-) -> Course:
+    recording: InsoleRecording, settings: Settings, layout: Layout, calibration: Calibration
+) -> PlayedCourse:
     """Replay a recording as `skin replay` does."""
     engine = Engine(settings, layout, [0], calibration)
     pads = insole.pads(layout)
@@ -302,7 +302,7 @@ def play(
         valid.append(step.frame.valid[pads])
         begun += [event.t_ns for event in step.events if event.event == "begin"]
     times = np.array(t_ns, np.int64)
-    return Course(
+    return PlayedCourse(
         times,
         np.searchsorted(recording.t_ns, times, side="right") - 1,
         np.array(pressure),
@@ -312,13 +312,13 @@ def play(
     )
 
 
-def live_pads(recording: Recording) -> Mask:
+def live_pads(recording: InsoleRecording) -> Mask:
     """Pads [280] that move at all and never read very low while nothing presses."""
     first = recording.counts[recording.t_ns - recording.t_ns[0] <= ZERO_S * 1e9]
     return np.asarray((first.min(axis=0) >= LOWEST_LIVE) & (np.ptp(first, axis=0) > 0))
 
 
-def touches(recording: Recording, course: Course, live: Mask, usable: Mask) -> Row:
+def touches(recording: InsoleRecording, course: PlayedCourse, live: Mask, usable: Mask) -> Row:
     """Touches of a recording."""
     start_ns = recording.t_ns[0]
     touched = course.touched[:, usable]
@@ -341,7 +341,9 @@ def touches(recording: Recording, course: Course, live: Mask, usable: Mask) -> R
     return row
 
 
-def _detected(recording: Recording, course: Course, usable: Mask, over_kpa: float) -> float | None:
+def _detected(
+    recording: InsoleRecording, course: PlayedCourse, usable: Mask, over_kpa: float
+) -> float | None:
     """Share of usable pads that are reported touched within a second of a lasting pressure."""
     pressure = _without_spikes(recording.pressure_kpa)[: len(recording.t_ns)]
     rest = float(np.median(pressure[recording.t_ns[: len(pressure)] - recording.t_ns[0] <= 5e9]))
@@ -355,7 +357,9 @@ def _detected(recording: Recording, course: Course, usable: Mask, over_kpa: floa
     return float(np.mean(course.touched[within][:, usable].any(axis=0)))
 
 
-def pressure_errors(recording: Recording, course: Course, usable: Mask, why_not: str | None) -> Row:
+def pressure_errors(
+    recording: InsoleRecording, course: PlayedCourse, usable: Mask, why_not: str | None
+) -> Row:
     """Errors in kPa over the whole recording, paired by index; with one lag beside them."""
     row: Row = dict.fromkeys(
         (

@@ -19,7 +19,7 @@ import numpy as np
 from emulator.probes.viscoelastic import TruthKind
 from skin_host.config.relaxation import MODELS
 from skin_host.evaluation import accuracy, page, real, speed, tables, touching
-from skin_host.evaluation.accuracy import DEFAULT, Plan, Variant
+from skin_host.evaluation.accuracy import DEFAULT, HistoryPlan, Variant
 from skin_host.evaluation.document import as_text
 from skin_host.evaluation.goals import goal
 from skin_host.evaluation.histories import TRUTHS
@@ -104,7 +104,7 @@ Job = tuple[str, Callable[..., Any], tuple[Any, ...]]
 
 def _jobs(quick: bool) -> list[Job]:
     """What can be worked out in any process: name, function, arguments. The longest first."""
-    plan = Plan(0.25, 5.0) if quick else Plan()
+    plan = HistoryPlan(0.25, 5.0) if quick else HistoryPlan()
     truths = accuracy.HELD_OUT if quick else TRUTHS
     jobs: list[Job] = []
     for kind in truths:

@@ -67,7 +67,7 @@ class TipState:
         return bool((off[known] > 0.5).any())
 
 
-class Felt(NamedTuple):
+class FingertipOutput(NamedTuple):
     """Samples and events from a batch of frames.
 
     Attributes:
@@ -138,9 +138,9 @@ class FingertipEngine:
             for kind in StrainType
         )
 
-    def feed(self, bus: str, batch: FrameBatch) -> Felt:
+    def feed(self, bus: str, batch: FrameBatch) -> FingertipOutput:
         """Process a batch of frames of one bus."""
-        felt = Felt([], [])
+        felt = FingertipOutput([], [])
         here = self._of_address.get(bus)
         if here is None:
             return felt

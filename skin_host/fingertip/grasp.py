@@ -27,7 +27,7 @@ class Flags(IntFlag):
 
 
 @dataclass(frozen=True, slots=True)
-class Thresholds:
+class GraspThresholds:
     """F1, F2 and dr of Ohka et al., and the times that the paper does not give."""
 
     touch_n: float = 0.2
@@ -40,7 +40,7 @@ class Thresholds:
 
 
 def analyse(
-    normal_n: Floats, shear_rate_n_s: Floats, thresholds: Thresholds, *, slips: bool = False
+    normal_n: Floats, shear_rate_n_s: Floats, thresholds: GraspThresholds, *, slips: bool = False
 ) -> Flags:
     """Return TOUCH, SLIP and OVER of one finger from its elements [n] (Fig. 15).
 
@@ -71,7 +71,7 @@ def next_mode(mode: Flags, *, touch: bool, lost: bool, done: bool) -> Flags:
     Args:
         mode: `Flags.SEARCH` or `Flags.MOVE`.
         touch: every finger of the hand touches.
-        lost: none has touched for `Thresholds.lost_s`.
+        lost: none has touched for `GraspThresholds.lost_s`.
         done: the requested motion is finished.
     """
     if mode == Flags.MOVE:
@@ -95,7 +95,7 @@ class GraspEvent:
 class FingerFlags:
     """The flags of one finger over time."""
 
-    def __init__(self, thresholds: Thresholds) -> None:
+    def __init__(self, thresholds: GraspThresholds) -> None:
         self.flags = Flags.SEARCH
         self._thresholds = thresholds
         self._slipped_ns: int | None = None

@@ -19,7 +19,7 @@ _NEXT, _AFTER = [1, 2, 0], [2, 0, 1]
 PUBLISHED_FRICTION_FACTOR = {0.1: 1.08, 0.3: 1.62, 0.5: 2.30}
 
 
-class Verdict(IntEnum):
+class ContactVerdict(IntEnum):
     """Result of locating one sample of force and torque."""
 
     CONTACT = 0
@@ -119,7 +119,7 @@ class IntrinsicContact:
     """Contacts located from force and torque, one row per sample; NaN where there is none.
 
     Attributes:
-        verdict: uint8[n], see `Verdict`.
+        verdict: uint8[n], see `ContactVerdict`.
         point_mm, normal: float64[n, 3], contact point, and outward normal of the surface.
         normal_n: float64[n], force into the surface, N, not negative.
         tangential_n: float64[n, 3], the rest of the force, in the tangent plane.
@@ -164,13 +164,13 @@ def locate(
     pitch = (direction * torque / safe).sum(axis=1)
     distance, found = surface.enter(arm, direction)
     point = arm + distance[:, None] * direction
-    verdict = np.full(len(force), Verdict.CONTACT, np.uint8)
-    verdict[np.abs(pitch) > pitch_limit_mm] = Verdict.SEVERAL_CONTACTS
-    verdict[~found] = Verdict.NO_SINGLE_CONTACT
-    verdict[~heavy] = Verdict.TOO_LIGHT
-    point[verdict != Verdict.CONTACT] = np.nan
+    verdict = np.full(len(force), ContactVerdict.CONTACT, np.uint8)
+    verdict[np.abs(pitch) > pitch_limit_mm] = ContactVerdict.SEVERAL_CONTACTS
+    verdict[~found] = ContactVerdict.NO_SINGLE_CONTACT
+    verdict[~heavy] = ContactVerdict.TOO_LIGHT
+    point[verdict != ContactVerdict.CONTACT] = np.nan
     normal = surface.normal(point)
-    normal[verdict != Verdict.CONTACT] = np.nan
+    normal[verdict != ContactVerdict.CONTACT] = np.nan
     into = -(force * normal).sum(axis=1)
     return IntrinsicContact(
         verdict, point, normal, into, force + into[:, None] * normal, np.where(heavy, pitch, np.nan)

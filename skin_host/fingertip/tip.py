@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from skin_host.bus.strain import SILENT_NS, Wrench
 from skin_host.config.fingertips import Fingertip
 from skin_host.fingertip.events import Cause, FingertipEvent, OverEvent, SlipEvent
-from skin_host.fingertip.grasp import FingerFlags, Flags, Thresholds
+from skin_host.fingertip.grasp import FingerFlags, Flags, GraspThresholds
 from skin_host.fingertip.intrinsic import (
+    ContactVerdict,
     IntrinsicContact,
     Surface,
-    Verdict,
     locate,
     point_covariance,
 )
@@ -51,7 +51,7 @@ SURFACE_SD_MM = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class ContactPlace:
     """Where a contact is: point and outward normal, float64[3], mm; radial standard error, mm."""
 
     point_mm: Floats
@@ -65,7 +65,7 @@ def locate_with_skin(
     surface: Surface,
     noise: Floats,
     felt: TouchEvent | None,
-) -> Place:
+) -> ContactPlace:
     """Return the place of the contact of one sample.
 
     Args:
@@ -98,14 +98,14 @@ def locate_with_skin(
             point = joined + (1.0 - distance[0]) * normal
             normal = surface.normal(point[None])[0]
             covariance = covariance - gain @ covariance
-    return Place(point, normal, math.sqrt(max(float(np.trace(covariance)), 0.0)))
+    return ContactPlace(point, normal, math.sqrt(max(float(np.trace(covariance)), 0.0)))
 
 
 Told = Literal["contact", "no_single_contact", "several_contacts", "saturated"]
 _VERDICTS: dict[int, Told] = {
-    Verdict.CONTACT: "contact",
-    Verdict.NO_SINGLE_CONTACT: "no_single_contact",
-    Verdict.SEVERAL_CONTACTS: "several_contacts",
+    ContactVerdict.CONTACT: "contact",
+    ContactVerdict.NO_SINGLE_CONTACT: "no_single_contact",
+    ContactVerdict.SEVERAL_CONTACTS: "several_contacts",
 }
 
 
@@ -262,7 +262,7 @@ class Tip:
     def _forget(self) -> None:
         self._restart()
         self._finger = FingerFlags(
-            Thresholds(
+            GraspThresholds(
                 touch_n=self.threshold_n,
                 over_n=self._settings.over_n,
                 slip_n_s=self._watch.threshold_n_s,
@@ -305,7 +305,7 @@ class Tip:
     ) -> list[FingertipEvent]:
         """Update the flags from a sample that is not smoothed."""
         settled = self._reported is not None and t_ns - self._begun_ns > SETTLING_NS
-        located = contact is not None and contact.verdict[0] == Verdict.CONTACT
+        located = contact is not None and contact.verdict[0] == ContactVerdict.CONTACT
         normal = contact.normal[0] if contact is not None and located else None
         seen = self._watch.step(load, normal, settled=settled)
         normal_n = seen.normal_n if touches else 0.0

@@ -20,7 +20,7 @@ from skin_host.config.settings import (
     TRIANGLES_PER_BOARD,
     Board,
     Bus,
-    Kind,
+    KindSettings,
     Part,
     Patch,
     Settings,
@@ -282,7 +282,9 @@ def _locate(
     return msgspec.structs.replace(settings, parts=settings.parts | {name: new})
 
 
-def _unit(table: Table, slots: list[int], kind: Kind, patch: Patch, findings: Findings) -> Floats:
+def _unit(
+    table: Table, slots: list[int], kind: KindSettings, patch: Patch, findings: Findings
+) -> Floats:
     """Return the rows [n, 6] of one unit: measured positions kept, the others fitted."""
     index = np.concatenate(
         [np.arange(TAXELS_PER_TRIANGLE) + TAXELS_PER_TRIANGLE * slot for slot in slots]
@@ -338,7 +340,7 @@ def _own_places(table: Table, index: NDArray[np.intp], rows: Floats) -> NDArray[
     return own
 
 
-def _pressure(kind: Kind) -> NDArray[np.bool_]:
+def _pressure(kind: KindSettings) -> NDArray[np.bool_]:
     pressure = np.ones(len(kind.pads_mm), bool)
     pressure[kind.thermal] = False
     return pressure

@@ -19,7 +19,7 @@ from skin_host.config.settings import (
     Bus,
     Part,
     Patch,
-    Place,
+    PlaceSettings,
     Settings,
     parse_triangles,
 )
@@ -55,7 +55,7 @@ class Unit:
     line: int
     slot: int
     kind: str
-    place: Place
+    place: PlaceSettings
 
     @property
     def n_triangles(self) -> int:
@@ -166,7 +166,7 @@ def _unit(
     if mirrored and words[0] in NEVER_MIRRORED:
         findings.odd(path, number, f"lrMirror 1: the display itself never mirrors a {words[0]}")
         mirrored = False
-    place = Place(x_mm=x_mm, y_mm=y_mm, turn_deg=turn_deg, mirror=mirrored)
+    place = PlaceSettings(x_mm=x_mm, y_mm=y_mm, turn_deg=turn_deg, mirror=mirrored)
     return Unit(number, int(slot), KINDS[words[0]], place)
 
 

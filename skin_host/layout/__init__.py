@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from skin_host.config.settings import (
     TRIANGLES_PER_BOARD,
     Board,
-    Kind,
+    KindSettings,
     Patch,
     Settings,
     parse_triangles,
@@ -137,10 +137,10 @@ class Layout:
 
 
 @cache
-def builtin_kinds() -> dict[str, Kind]:
+def builtin_kinds() -> dict[str, KindSettings]:
     """The kinds of sensor unit that come with the project (`kinds.toml`)."""
     text = resources.files("skin_host.layout").joinpath("kinds.toml").read_bytes()
-    return msgspec.toml.decode(text, type=dict[str, Kind])
+    return msgspec.toml.decode(text, type=dict[str, KindSettings])
 
 
 def build_layout(settings: Settings, folder: Path) -> Layout:
@@ -261,7 +261,7 @@ def _board_layout(
 
 
 def _patch_columns(
-    where: str, patch: Patch, kind: Kind, n_triangles: int, shelf_mm: float, folder: Path
+    where: str, patch: Patch, kind: KindSettings, n_triangles: int, shelf_mm: float, folder: Path
 ) -> tuple[_Columns, float]:
     """Taxels of one patch, and the height at which the next patch without places may start."""
     _check_kind(patch.kind, kind)
@@ -313,7 +313,7 @@ def _patch_columns(
     return columns, shelf_mm
 
 
-def _check_kind(name: str, kind: Kind) -> None:
+def _check_kind(name: str, kind: KindSettings) -> None:
     """Check properties of a user's own kind that types cannot express."""
     n = len(kind.pads_mm)
     if n == 0 or n % TAXELS_PER_TRIANGLE:

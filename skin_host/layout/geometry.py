@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.config.settings import Kind, Place
+from skin_host.config.settings import KindSettings, PlaceSettings
 from skin_host.errors import ConfigurationError
 
 #: Pads closer than this many pitches touch the same object: they are neighbours.
@@ -18,7 +18,7 @@ TILED_IN_A_ROW = 8
 Floats = NDArray[np.float64]
 
 
-def tile(kind: Kind, n_units: int, shelf_mm: float) -> tuple[list[Place], float]:
+def tile(kind: KindSettings, n_units: int, shelf_mm: float) -> tuple[list[PlaceSettings], float]:
     """Return places side by side: triangles as a mesh, other shapes with a gap between them."""
     outline = np.array(kind.outline_mm)
     low, high = outline.min(axis=0), outline.max(axis=0)
@@ -31,7 +31,7 @@ def tile(kind: Kind, n_units: int, shelf_mm: float) -> tuple[list[Place], float]
             # Every second triangle is upside down, with its centroid a third higher.
             on_tip = (row + column) % 2 == 1
             places.append(
-                Place(
+                PlaceSettings(
                     x_mm=column * width_mm / 2,
                     y_mm=shelf_mm + row * height_mm - low[1] + (height_mm / 3 if on_tip else 0.0),
                     turn_deg=180.0 if on_tip else 0.0,
@@ -39,11 +39,11 @@ def tile(kind: Kind, n_units: int, shelf_mm: float) -> tuple[list[Place], float]
             )
         return places, shelf_mm + height_mm * n_rows
     step_mm = width_mm + NEIGHBOUR_PITCHES * kind.pitch_mm
-    places = [Place(x_mm=i * step_mm, y_mm=shelf_mm - low[1]) for i in range(n_units)]
+    places = [PlaceSettings(x_mm=i * step_mm, y_mm=shelf_mm - low[1]) for i in range(n_units)]
     return places, shelf_mm + height_mm + NEIGHBOUR_PITCHES * kind.pitch_mm
 
 
-def lay(points_mm: Floats, place: Place) -> tuple[Floats, Floats]:
+def lay(points_mm: Floats, place: PlaceSettings) -> tuple[Floats, Floats]:
     """Points [k, 2] of a unit's frame as positions [k, 3] (mm) and normals [k, 3].
 
     Raises:
@@ -75,7 +75,7 @@ def _rotation_from_z(normal: Floats) -> Floats:
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
+class PlaneFit:
     """Position of a flat unit: `origin_m` [3], its x and y `axes` [3, 2], and how well it fits."""
 
     origin_m: Floats
@@ -88,7 +88,7 @@ class Fit:
         return position
 
 
-def fit_unit(pads_mm: Floats, position_m: Floats, normal: Floats) -> Fit:
+def fit_unit(pads_mm: Floats, position_m: Floats, normal: Floats) -> PlaneFit:
     """Fit a flat unit so that its pads [k, 2] come closest to known places [k, 3].
 
     Least squares over rotations and shifts (Kabsch); the result may be mirrored, as some units are.
@@ -110,10 +110,10 @@ def fit_unit(pads_mm: Floats, position_m: Floats, normal: Floats) -> Fit:
         axes = left @ right
     apart = position_m - centre_m - flat @ axes.T
     rms_m = float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
-    return Fit(centre_m - axes @ middle_m, axes, rms_m)
+    return PlaneFit(centre_m - axes @ middle_m, axes, rms_m)
 
 
-def fitted_outline(kind: Kind, position_m: Floats, normal: Floats) -> Floats:
+def fitted_outline(kind: KindSettings, position_m: Floats, normal: Floats) -> Floats:
     """The outline [k, 3] (m) of a unit whose pads lie at `position_m` [n, 3]."""
     mean = normal.mean(axis=0)
     up = mean if np.linalg.norm(mean) > 0 else normal[0]

@@ -21,7 +21,7 @@ ONLINE = b"online"
 OFFLINE = b"offline"
 
 
-class Place(NamedTuple):
+class Subject(NamedTuple):
     """What a topic is about: a part's frames, a node's status, ..."""
 
     kind: PartTopic | NodeTopic | Literal["answer"]
@@ -86,7 +86,7 @@ class Topics:
         prefix = self.reply(node, "")
         return topic.startswith(prefix) and _REPLY.fullmatch(topic, len(prefix)) is not None
 
-    def parse(self, topic: str) -> Place | None:
+    def parse(self, topic: str) -> Subject | None:
         """Return what a received topic is about; None if it is not one of ours."""
         if not topic.startswith(f"{self.base}/"):
             return None
@@ -95,11 +95,11 @@ class Topics:
                 part,
                 ("frame" | "touch" | "slip" | "over" | "contact" | "health") as part_kind,
             ]:
-                return Place(part_kind, part)
+                return Subject(part_kind, part)
             case ["nodes", node, ("status" | "info") as node_kind]:
-                return Place(node_kind, node)
+                return Subject(node_kind, node)
             case ["nodes", node, piece, "info"] if _PIECE.fullmatch(piece):
-                return Place("info", node, int(piece))
+                return Subject("info", node, int(piece))
             case ["nodes", node, "cmd", _, "result"] | ["nodes", node, "replies", _]:
-                return Place("answer", node)
+                return Subject("answer", node)
         return None

@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.config.settings import Touch
+from skin_host.config.settings import TouchSettings
 from skin_host.errors import CalibrationError, NewerFileError, OtherSkinError
 from skin_host.files import read_document, write_atomic
 from skin_host.layout import Layout, PadKind
@@ -153,13 +153,13 @@ class Calibrator:
         self,
         layout: Layout,
         percentile: float = 0.95,
-        touch: Touch | None = None,
+        touch: TouchSettings | None = None,
         range_units: Floats | None = None,
     ) -> None:
         n = layout.n_taxels
         self._layout = layout
         self._percentile = percentile
-        self._touch = touch or Touch()
+        self._touch = touch or TouchSettings()
         self._range_units = np.full(n, np.inf) if range_units is None else range_units
         self._received = np.zeros(n, dtype=np.int64)
         self._counts = np.zeros((n, 256), dtype=np.int64)
@@ -321,7 +321,7 @@ class Calibrator:
         return found
 
 
-def _upward_variance(counts: NDArray[np.int64], variance: Floats, touch: Touch) -> Floats:
+def _upward_variance(counts: NDArray[np.int64], variance: Floats, touch: TouchSettings) -> Floats:
     """Return the variance [n] of the normal noise that gives as much evidence of a touch as this.
 
     Noise with occasional jumps towards pressure gives more evidence than its variance suggests, and

@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.config.relaxation import Relaxation
+from skin_host.config.relaxation import RelaxationSettings
 from skin_host.config.settings import Processing
 from skin_host.layout import Layout, PadKind, PartLayout
 from skin_host.processing.calibration import Calibration
@@ -332,7 +332,7 @@ class _PartPipeline:
             return
         # A model that permits it is stepped once a window, because the pipeline takes means anyway.
         # Steps of a second are large enough for float32.
-        chosen: Relaxation = rules.settings.relaxation
+        chosen: RelaxationSettings = rules.settings.relaxation
         own_means = chosen.model in OWN_MEANS
         windowed = chosen.update_s > 0.0 and not own_means
         self._every_sample = not windowed

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.config.settings import Touch
+from skin_host.config.settings import TouchSettings
 from skin_host.processing.conversions import CONVERSION_S, Conversions
 from skin_host.processing.masks import Mask, any_of
 
@@ -76,7 +76,7 @@ class Levels:
         return self.enter + self.span * CONVERSION_S / DECIDE_S
 
 
-def levels(above: Floats, spread: Floats, settings: Touch) -> Levels:
+def levels(above: Floats, spread: Floats, settings: TouchSettings) -> Levels:
     """Return the levels of n taxels.
 
     Args:

@@ -27,7 +27,7 @@ WATCH_S = 0.25
 log = logging.getLogger(__name__)
 
 
-class Recording:
+class PageRecording:
     """At most one recording at a time.
 
     Args:

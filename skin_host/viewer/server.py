@@ -25,7 +25,7 @@ from skin_host.client import SkinClient, Stream
 from skin_host.errors import BrokerError, RequestError, SkinError
 from skin_host.mqtt.address import Broker
 from skin_host.viewer.picture import Cursor, Picture
-from skin_host.viewer.recording import MAX_AGO_S, Recording
+from skin_host.viewer.recording import MAX_AGO_S, PageRecording
 
 #: Pages get new messages this often; screens show no more.
 TICK_S = 0.04
@@ -93,7 +93,7 @@ class Viewer:
         recordings: Path = Path("recordings"),
     ) -> None:
         self._broker = broker
-        self._recording = Recording(recordings)
+        self._recording = PageRecording(recordings)
         self._new_client: Callable[[], SkinClient] = lambda: SkinClient(broker, robot=robot)
         self._commands = commands
         self._picture = Picture()

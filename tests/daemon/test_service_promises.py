@@ -13,9 +13,9 @@ import pytest
 
 from skin_host.bus.logs import read_channels
 from skin_host.bus.wire import FrameBatch, encode_sweep
-from skin_host.config.settings import Bus, Touch, changed
+from skin_host.config.settings import Bus, TouchSettings, changed
 from skin_host.daemon import metrics, service
-from skin_host.daemon.state import State, Thresholds, load_state, save_state
+from skin_host.daemon.state import NodeState, Thresholds, load_state, save_state
 from skin_host.health import LINE_S, FaultLog
 from skin_host.importing.run import configuration_text
 from skin_host.recording.capture import FrameRecorder, candump_lines
@@ -25,12 +25,12 @@ from tests.support.live import living
 
 def test_what_operators_changed_comes_back(tmp_path: Path) -> None:
     path = tmp_path / "a" / "state.json"
-    state = State(disabled=["left_hand"], thresholds=Thresholds(margin_units=0.0, votes_of_3=3))
+    state = NodeState(disabled=["left_hand"], thresholds=Thresholds(margin_units=0.0, votes_of_3=3))
     save_state(path, state)
     assert load_state(path) == state
-    touch = state.thresholds.over(Touch())
+    touch = state.thresholds.over(TouchSettings())
     assert (touch.margin_units, touch.votes_of_3) == (0.0, 3)
-    assert touch.hysteresis_units == Touch().hysteresis_units
+    assert touch.hysteresis_units == TouchSettings().hysteresis_units
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b'{"schema":"x"}', b"\xff" * 10])
@@ -39,7 +39,7 @@ def test_damaged_state_is_an_unchanged_one(
 ) -> None:
     path = tmp_path / "state.json"
     path.write_bytes(content)
-    assert load_state(path) == State()
+    assert load_state(path) == NodeState()
     assert "damaged" in caplog.text
 
 

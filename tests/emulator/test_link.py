@@ -2,7 +2,7 @@
 
 import can
 
-from emulator.link import Link
+from emulator.link import BoardLink
 
 
 def message(identifier: int, data: bytes = b"", **kind: bool) -> can.Message:
@@ -16,7 +16,7 @@ def test_a_command_behind_any_number_of_other_frames_is_received_at_once() -> No
         can.Bus(interface="virtual", channel="emulators-link") as boards,
         can.Bus(interface="virtual", channel="emulators-link") as others,
     ):
-        link = Link("can0", boards)
+        link = BoardLink("can0", boards)
         for _ in range(1000):
             others.send(message(0x4E0, bytes(8)))
         for other in (

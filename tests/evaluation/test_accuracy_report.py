@@ -14,14 +14,14 @@ from skin_host.evaluation import (
     speed,
     touching,
 )
-from skin_host.evaluation.accuracy import DEFAULT, FITTED_FOAM, SCENARIOS, Plan
+from skin_host.evaluation.accuracy import DEFAULT, FITTED_FOAM, SCENARIOS, HistoryPlan
 from skin_host.evaluation.goals import goal
 from skin_host.evaluation.histories import HISTORIES, record
 from skin_host.evaluation.machine import machine
 from skin_host.evaluation.rig import Rig
 from skin_host.processing.pipeline import Pipeline
 
-PLAN = Plan(0.01, 5.0)
+PLAN = HistoryPlan(0.01, 5.0)
 
 
 @pytest.fixture(scope="module")
@@ -116,7 +116,7 @@ def test_the_models_are_run_by_the_pipeline_that_ships(monkeypatch):
         return original(self, *arguments, **named)
 
     monkeypatch.setattr(Pipeline, "step", step)
-    rows = accuracy.score("F", FITTED_FOAM, Plan(0.01, 5.0))
+    rows = accuracy.score("F", FITTED_FOAM, HistoryPlan(0.01, 5.0))
     assert len(set(map(id, stepped))) == len(accuracy.VARIANTS)
     models = {row["model"] for row in rows}
     assert models == {"perfect", "hindsight"} | {v.model for v in accuracy.VARIANTS}

@@ -3,12 +3,12 @@
 import pytest
 
 from skin_host.evaluation.bench_receive import measure
-from skin_host.evaluation.can_stream import Wire
+from skin_host.evaluation.can_stream import StreamWire
 
 
 @pytest.mark.parametrize("path", ["batch", "kernel"])
 def test_a_path_reads_the_whole_stream(path: str) -> None:
-    row = measure(Wire.here(), path, 2000, 0.2)
+    row = measure(StreamWire.here(), path, 2000, 0.2)
     assert row["path"] == path
     assert row["lost"] == 0
     assert row["received_per_s"] > 0

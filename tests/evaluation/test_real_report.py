@@ -10,15 +10,15 @@ import pytest
 from skin_host.cli import main
 from skin_host.errors import LogError
 from skin_host.evaluation import insole, page, real
-from skin_host.evaluation.insole import PADS, Recording
-from skin_host.evaluation.real import Course
+from skin_host.evaluation.insole import PADS, InsoleRecording
+from skin_host.evaluation.real import PlayedCourse
 
 ROOT = Path(__file__).parents[2]
 TOOL = ROOT.parent / "shared" / "tools" / "insole_log"
 PERIOD_NS = 20_400_000
 
 
-def recording(pressure_kpa: np.ndarray, kpa_per_unit: float = 8.0) -> Recording:
+def recording(pressure_kpa: np.ndarray, kpa_per_unit: float = 8.0) -> InsoleRecording:
     """Pads that read a unit for every so many kPa, with noise, under a course of pressure."""
     rng = np.random.default_rng(1)
     t = len(pressure_kpa)
@@ -26,7 +26,7 @@ def recording(pressure_kpa: np.ndarray, kpa_per_unit: float = 8.0) -> Recording:
     activation = pressure_kpa[:, np.newaxis] / kpa_per_unit
     counts = np.rint(rest - activation + rng.normal(0.0, 0.6, (t, PADS))).astype(np.uint8)
     t_ns = insole.START_NS + np.arange(t, dtype=np.int64) * PERIOD_NS
-    return Recording("left_made_up", t_ns, counts, pressure_kpa)
+    return InsoleRecording("left_made_up", t_ns, counts, pressure_kpa)
 
 
 def ramp(seconds: float = 30.0, high_kpa: float = 300.0) -> np.ndarray:
@@ -35,9 +35,11 @@ def ramp(seconds: float = 30.0, high_kpa: float = 300.0) -> np.ndarray:
     return np.interp(t_s, [0.0, 12.0, 20.0, 28.0], [5.0, 5.0, high_kpa, 5.0])
 
 
-def course(made: Recording, pressure_kpa: np.ndarray, touched: np.ndarray | None = None) -> Course:
+def course(
+    made: InsoleRecording, pressure_kpa: np.ndarray, touched: np.ndarray | None = None
+) -> PlayedCourse:
     t = len(made.t_ns)
-    return Course(
+    return PlayedCourse(
         made.t_ns,
         np.arange(t),
         np.broadcast_to(pressure_kpa[:, np.newaxis], (t, PADS)).astype(np.float32),
@@ -47,7 +49,7 @@ def course(made: Recording, pressure_kpa: np.ndarray, touched: np.ndarray | None
     )
 
 
-def write(folder: Path, made: Recording) -> Path:
+def write(folder: Path, made: InsoleRecording) -> Path:
     path = folder / f"{made.name}.npz"
     t_s = (made.t_ns - insole.START_NS) * 1e-9
     np.savez(path, t_s=t_s, counts=made.counts, pressure_kpa=made.pressure_kpa)
@@ -55,12 +57,12 @@ def write(folder: Path, made: Recording) -> Path:
 
 
 @pytest.fixture(scope="module")
-def pressed() -> Recording:
+def pressed() -> InsoleRecording:
     return recording(ramp())
 
 
 @pytest.fixture(scope="module")
-def replayed(pressed: Recording) -> Course:
+def replayed(pressed: InsoleRecording) -> PlayedCourse:
     settings, layout = insole.skin()
     calibration = real.calibrate(pressed, settings, layout)
     return real.play(pressed, settings, layout, calibration)
@@ -68,7 +70,7 @@ def replayed(pressed: Recording) -> Course:
 
 @pytest.mark.skipif(not TOOL.exists(), reason=f"{TOOL} is not here")
 def test_the_skin_and_its_frames_are_those_of_the_tool_that_writes_logs(
-    pressed: Recording, tmp_path: Path
+    pressed: InsoleRecording, tmp_path: Path
 ) -> None:
     from importlib.machinery import SourceFileLoader
     from importlib.util import module_from_spec, spec_from_loader
@@ -88,7 +90,7 @@ def test_the_skin_and_its_frames_are_those_of_the_tool_that_writes_logs(
 
 
 def test_every_recorded_byte_passes_through_the_engine(
-    pressed: Recording, replayed: Course
+    pressed: InsoleRecording, replayed: PlayedCourse
 ) -> None:
     assert sorted(set(replayed.sweep.tolist())) == list(range(len(pressed.counts)))
     settings, layout = insole.skin()
@@ -106,7 +108,7 @@ def test_every_recorded_byte_passes_through_the_engine(
 
 
 def test_quiet_pads_are_detected_and_touch_nothing_before(
-    pressed: Recording, replayed: Course
+    pressed: InsoleRecording, replayed: PlayedCourse
 ) -> None:
     live = real.live_pads(pressed)
     assert live.all()
@@ -116,10 +118,10 @@ def test_quiet_pads_are_detected_and_touch_nothing_before(
     assert 1.0 <= row["begins_per_pad"] < 1.5
 
 
-def test_a_spike_of_the_pressures_own_record_is_no_press(pressed: Recording) -> None:
+def test_a_spike_of_the_pressures_own_record_is_no_press(pressed: InsoleRecording) -> None:
     pressure = pressed.pressure_kpa.copy()
     pressure[100::200] += 70.0
-    spiky = Recording(pressed.name, pressed.t_ns, pressed.counts, pressure)
+    spiky = InsoleRecording(pressed.name, pressed.t_ns, pressed.counts, pressure)
     late = pressed.t_ns - pressed.t_ns[0] > 15e9
     touched = np.broadcast_to(late[:, np.newaxis], (len(late), PADS)).copy()
     everyone = np.ones(PADS, np.bool_)
@@ -162,7 +164,7 @@ def test_a_pad_is_judged_by_the_frames_in_which_it_is_valid() -> None:
 
 
 def test_one_json_document_has_a_row_for_each_recording(
-    pressed: Recording,
+    pressed: InsoleRecording,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,

@@ -6,13 +6,13 @@ import pytest
 from skin_host.fingertip.grasp import (
     FingerFlags,
     Flags,
-    Thresholds,
+    GraspThresholds,
     analyse,
     finger_velocity,
     next_mode,
 )
 
-LIMITS = Thresholds(touch_n=0.2, over_n=2.0, slip_n_s=5.0, slip_hold_s=0.03, lost_s=0.2)
+LIMITS = GraspThresholds(touch_n=0.2, over_n=2.0, slip_n_s=5.0, slip_hold_s=0.03, lost_s=0.2)
 MS = 1_000_000
 
 

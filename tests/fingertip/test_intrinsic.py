@@ -5,9 +5,9 @@ from hypothesis import strategies as st
 
 from skin_host.fingertip.intrinsic import (
     PUBLISHED_FRICTION_FACTOR,
+    ContactVerdict,
     Plane,
     Quadric,
-    Verdict,
     cylinder,
     ellipsoid,
     locate,
@@ -54,7 +54,7 @@ def test_exact_force_and_torque_give_the_contact(name):
     surface = SURFACES[name]
     point, force, torque = random_contacts(surface, 10_000, rng)
     found = locate(force, torque, surface)
-    assert (found.verdict == Verdict.CONTACT).all()
+    assert (found.verdict == ContactVerdict.CONTACT).all()
     assert np.abs(found.point_mm - point).max() < 1e-9
     np.testing.assert_allclose(found.normal, surface.normal(point), atol=1e-10)
     np.testing.assert_allclose(
@@ -77,12 +77,12 @@ def test_each_way_to_have_no_contact_is_said():
     force = np.array([[0, 0, -1.0], [0, 0, -0.05], [0, 0, -1.0], [0, 0, -1.0], [np.nan, 0, 0]])
     torque = np.array([[0, 0, 0.0], [0, 0, 0], [20.0, 0, 0], [0, 0, 5.0], [0, 0, 0]])
     found = locate(force, torque, sphere(13.0))
-    assert [Verdict(v) for v in found.verdict] == [
-        Verdict.CONTACT,
-        Verdict.TOO_LIGHT,
-        Verdict.NO_SINGLE_CONTACT,  # the line of action passes 20 mm from the centre
-        Verdict.SEVERAL_CONTACTS,  # a twist of 5 N mm about 1 N
-        Verdict.TOO_LIGHT,
+    assert [ContactVerdict(v) for v in found.verdict] == [
+        ContactVerdict.CONTACT,
+        ContactVerdict.TOO_LIGHT,
+        ContactVerdict.NO_SINGLE_CONTACT,  # the line of action passes 20 mm from the centre
+        ContactVerdict.SEVERAL_CONTACTS,  # a twist of 5 N mm about 1 N
+        ContactVerdict.TOO_LIGHT,
     ]
     assert np.isfinite(found.point_mm[0]).all()
     assert np.isnan(found.point_mm[1:]).all()
@@ -94,14 +94,14 @@ def test_two_rubbing_fingers_on_one_sphere_show_by_their_twist():
     forces = np.array([[-2.0, 0, 0.6], [0, -2.0, -0.6]])
     total = forces.sum(axis=0)
     torque = np.cross(points, forces).sum(axis=0)
-    assert locate(total, torque, sphere(13.0)).verdict[0] == Verdict.SEVERAL_CONTACTS
+    assert locate(total, torque, sphere(13.0)).verdict[0] == ContactVerdict.SEVERAL_CONTACTS
 
 
 def test_a_pull_on_a_face_and_a_push_beside_it_are_no_contact():
     face = Plane(reach_mm=10.0)
     force = np.array([[0, 0, 1.0], [0, 0, -1.0], [1.0, 0, 0]])
     torque = np.array([[0, 0, 0], [-12.0, 0, 0], [0, 0, 0]])
-    assert (locate(force, torque, face).verdict == Verdict.NO_SINGLE_CONTACT).all()
+    assert (locate(force, torque, face).verdict == ContactVerdict.NO_SINGLE_CONTACT).all()
 
 
 def test_a_push_along_a_cylinder_or_beyond_its_end_is_no_contact_on_its_side():
@@ -109,9 +109,9 @@ def test_a_push_along_a_cylinder_or_beyond_its_end_is_no_contact_on_its_side():
     point = np.array([[10.0, 0, 14.0], [10.0, 0, 16.0]])
     force = np.array([[-1.0, 0, 0]] * 2)
     found = locate(force, np.cross(point, force), short)
-    assert found.verdict.tolist() == [Verdict.CONTACT, Verdict.NO_SINGLE_CONTACT]
+    assert found.verdict.tolist() == [ContactVerdict.CONTACT, ContactVerdict.NO_SINGLE_CONTACT]
     along = locate([[0, 0, 2.0]], [[0, 0, 0.0]], short)
-    assert along.verdict[0] == Verdict.NO_SINGLE_CONTACT
+    assert along.verdict[0] == ContactVerdict.NO_SINGLE_CONTACT
 
 
 @pytest.mark.parametrize("name", SURFACES)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from emulator.probes.scene import Scene
 from emulator.robot import Robot
 from skin_host.config import check
-from skin_host.config.settings import Place, Settings, changed, load, parse_triangles
+from skin_host.config.settings import PlaceSettings, Settings, changed, load, parse_triangles
 from skin_host.errors import ConfigurationError
 from skin_host.importing.report import Findings
 from skin_host.importing.run import configuration_text, import_files
@@ -69,7 +69,7 @@ def test_the_samples_become_an_arm_with_placed_and_located_forearm(tmp_path: Pat
         }
         assert check.describe(settings, layout)["warnings"] == []
     settings, layout = built(placed)
-    assert settings.parts["left_forearm"].patches[0].places[0] == Place(
+    assert settings.parts["left_forearm"].patches[0].places[0] == PlaceSettings(
         x_mm=100, y_mm=-20, turn_deg=30, mirror=True
     )
     settings, layout = built(located)
@@ -120,7 +120,7 @@ def test_placed_triangles_move_to_the_part_that_the_display_names(
     settings, _, said = run("skingui", file, arm)
     tip, palm = settings.parts["hand"].patches
     assert (tip.board, tip.triangles, tip.kind, tip.shift) == ("b14", "0", "fingertip2l", 0)
-    assert tip.places == [Place(x_mm=-32, y_mm=35, turn_deg=30, mirror=True)]
+    assert tip.places == [PlaceSettings(x_mm=-32, y_mm=35, turn_deg=30, mirror=True)]
     assert (palm.triangles, palm.kind) == ("8-11", "palml")
     assert [patch.board for patch in settings.parts["arm"].patches] == ["b13", "b12"]
     assert f"{file}:3: width: of the display's window" in said
@@ -165,7 +165,7 @@ def test_a_display_that_names_its_boards_wrongly_is_read_by_the_triangles_that_a
     assert 'triangles 0 of board "b13" are on but not placed' in said
 
 
-def rows_of(place: Place, kind: str = "triangle_10pad") -> np.ndarray:
+def rows_of(place: PlaceSettings, kind: str = "triangle_10pad") -> np.ndarray:
     position_mm, normal = lay(np.array(builtin_kinds()[kind].pads_mm), place)
     return np.column_stack([position_mm * 1e-3, normal])
 
@@ -175,7 +175,7 @@ def forearm_rows() -> np.ndarray:
     rows = np.zeros((384, 6))
     for i, slot in enumerate((0, 1, 2, 16, 17, 21)):
         rows[12 * slot : 12 * slot + 12] = rows_of(
-            Place(x_mm=30 * i, y_mm=5, z_mm=40, normal=(0, 1, 1), turn_deg=20 * i)
+            PlaceSettings(x_mm=30 * i, y_mm=5, z_mm=40, normal=(0, 1, 1), turn_deg=20 * i)
         )
     return rows
 
@@ -251,7 +251,7 @@ def test_places_of_triangles_that_are_off_and_triangles_without_places_are_named
     tmp_path: Path, forearm: Path
 ) -> None:
     rows = forearm_rows()
-    rows[12 * 3 : 12 * 4] = rows_of(Place(x_mm=300))
+    rows[12 * 3 : 12 * 4] = rows_of(PlaceSettings(x_mm=300))
     rows[12 * 17 : 12 * 18] = 0
     file = tmp_path / "forearm.txt"
     write_rows(file, rows)

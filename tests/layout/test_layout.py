@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skin_host.config.settings import Place, Settings
+from skin_host.config.settings import PlaceSettings, Settings
 from skin_host.errors import ConfigurationError
 from skin_host.layout import Layout, PadKind, build_layout, builtin_kinds
 from skin_host.layout.geometry import fitted_outline, lay, tile
@@ -101,7 +101,9 @@ def test_placing_keeps_distances_and_lays_the_plane_along_the_normal(
     x: float, y: float, z: float, turn: float, normal: tuple[float, float, float]
 ) -> None:
     points = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 5.0]])
-    placed, normals = lay(points, Place(x_mm=x, y_mm=y, z_mm=z, turn_deg=turn, normal=normal))
+    placed, normals = lay(
+        points, PlaceSettings(x_mm=x, y_mm=y, z_mm=z, turn_deg=turn, normal=normal)
+    )
     assert placed[0] == pytest.approx([x, y, z])
     along, across = placed[1] - placed[0], placed[2] - placed[0]
     assert np.linalg.norm(along) == pytest.approx(10)
@@ -113,12 +115,12 @@ def test_placing_keeps_distances_and_lays_the_plane_along_the_normal(
 
 def test_a_mirrored_unit_has_its_x_axis_turned_round() -> None:
     points = np.array([[3.0, 4.0]])
-    placed, _ = lay(points, Place(mirror=True))
+    placed, _ = lay(points, PlaceSettings(mirror=True))
     assert placed.tolist() == [[-3, 4, 0]]
 
 
 def test_a_turn_is_counted_against_the_clock() -> None:
-    placed, _ = lay(np.array([[1.0, 0.0]]), Place(turn_deg=90))
+    placed, _ = lay(np.array([[1.0, 0.0]]), PlaceSettings(turn_deg=90))
     assert placed[0] == pytest.approx([0, 1, 0])
 
 
@@ -188,7 +190,7 @@ def test_the_outline_is_fitted_to_positions_from_a_file(
     turn: float, normal: tuple[float, float, float], mirror: bool
 ) -> None:
     kind = builtin_kinds()["triangle_10pad"]
-    place = Place(x_mm=40, y_mm=-20, z_mm=7, turn_deg=turn, normal=normal, mirror=mirror)
+    place = PlaceSettings(x_mm=40, y_mm=-20, z_mm=7, turn_deg=turn, normal=normal, mirror=mirror)
     position_mm, normals = lay(np.array(kind.pads_mm), place)
     outline_mm, _ = lay(np.array(kind.outline_mm), place)
     fitted_m = fitted_outline(kind, position_mm * 1e-3, normals)

@@ -3,7 +3,7 @@
 import pytest
 
 from skin_host.errors import ConfigurationError
-from skin_host.mqtt.topics import Place, Topics
+from skin_host.mqtt.topics import Subject, Topics
 
 TOPICS = Topics("lab/skin", "icub")
 
@@ -16,8 +16,8 @@ def test_topics_of_parts_and_nodes_are_those_of_the_contract() -> None:
 
 
 def test_a_topic_says_what_it_is_about() -> None:
-    assert TOPICS.parse(TOPICS.part("touch", "palm")) == Place("touch", "palm")
-    assert TOPICS.parse(TOPICS.node("info", "arm")) == Place("info", "arm")
+    assert TOPICS.parse(TOPICS.part("touch", "palm")) == Subject("touch", "palm")
+    assert TOPICS.parse(TOPICS.node("info", "arm")) == Subject("info", "arm")
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skin_host.config.settings import Touch
+from skin_host.config.settings import TouchSettings
 from skin_host.processing.touch import Levels, Residuals, TouchDetector, levels
 
 REST = 200
@@ -162,19 +162,21 @@ def test_the_decision_is_the_evidence_added_up_and_idle_sweeps_may_be_left_out(r
 def test_the_threshold_is_the_papers_for_quiet_taxels():
     # Two units above a mean of 0 and of 0.4: readings of 2, and of 3.
     for rest in (0.0, 0.4):
-        found = levels(np.array([np.ceil(rest) - rest]), np.array([0.1]), Touch())
+        found = levels(np.array([np.ceil(rest) - rest]), np.array([0.1]), TouchSettings())
         first = np.ceil(found.enter + found.span / 2 - 1e-9 + rest)
         assert first == np.ceil(rest) + 2
 
 
 def test_noise_needs_measurements_and_not_pressure():
-    quiet, usual, noisy = levels(np.full(3, 0.6), np.array([0.3, 1.0, 1.5]), Touch()).decides
+    quiet, usual, noisy = levels(
+        np.full(3, 0.6), np.array([0.3, 1.0, 1.5]), TouchSettings()
+    ).decides
     assert usual < quiet + 0.5
     assert noisy < quiet + 1.0
 
 
 def test_settings_of_nothing_make_no_decision_of_noise():
-    still = Touch(margin_units=0.0, minimum_threshold_units=0.0, hysteresis_units=0.0)
+    still = TouchSettings(margin_units=0.0, minimum_threshold_units=0.0, hysteresis_units=0.0)
     found = levels(np.zeros(2), np.array([0.0, 1.0]), still)
     assert np.all(found.leave >= 0.0)
     assert np.all(found.enter > 0.0)
@@ -186,7 +188,7 @@ def test_noise_reaches_its_span_as_rarely_as_it_was_made_for(spread):
     """At odds of 10^4 instead of 10^9, which can be counted."""
     rng = np.random.default_rng(3)
     n, steps = 400, 5000
-    found = levels(np.full(n, 0.5), np.full(n, spread), Touch())
+    found = levels(np.full(n, 0.5), np.full(n, spread), TouchSettings())
     less = np.log(1e4) / np.log(1e9)
     fewer = replace(found, span=found.span * less)
     detector = detector_of(fewer)

@@ -13,7 +13,7 @@ from skin_host.extras import required
 from skin_host.mqtt.info import PartInfo, TriangleInfo
 from skin_host.mqtt.messages import TouchMessage
 from skin_host.recording.export import HealthLine, PartSeries, Series, export
-from skin_host.recording.export.scene import ARROW_M_PER_N, POINT, Scene
+from skin_host.recording.export.scene import ARROW_M_PER_N, POINT, RecordedScene
 
 N, TAXELS = 5, 12
 START_NS = 1_700_000_000_000_000_000
@@ -193,7 +193,7 @@ def test_a_data_set_for_learning_has_an_array_a_step(series: Series, tmp_path: P
 
 def test_what_is_missing_is_said(series: Series, tmp_path: Path) -> None:
     with pytest.raises(RequestError, match="has no positions of the taxels of arm, hand"):
-        Scene(Series(series.parts, [], {}))
+        RecordedScene(Series(series.parts, [], {}))
     with pytest.raises(SkinError, match=r"need the package nowhere.*pip install 'skin-host\[x\]'"):
         required("nowhere", "things", "x")
     with pytest.raises(RequestError, match=r"ends in one of .npz, .parquet, .mcap, .rrd"):

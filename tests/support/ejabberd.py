@@ -162,14 +162,14 @@ def ejabberds() -> Iterator[Ejabberds]:
 def main() -> None:
     """Measure a fleet over the cluster."""
     parser = argparse.ArgumentParser(description=__doc__)
-    plan = bench_fleet.Plan()
+    plan = bench_fleet.FleetPlan()
     parser.add_argument("--robots", type=int, default=plan.robots)
     parser.add_argument("--pace", type=float, default=plan.pace)
     parser.add_argument("--phase", type=float, default=plan.phase_s, metavar="S")
     given = parser.parse_args()
     with ejabberds() as cluster:
         document = bench_fleet.measure(
-            cluster, bench_fleet.Plan(given.robots, given.pace, plan.health_s, given.phase)
+            cluster, bench_fleet.FleetPlan(given.robots, given.pace, plan.health_s, given.phase)
         )
     sys.stdout.write(bench_fleet.describe(document) + "\n")
 

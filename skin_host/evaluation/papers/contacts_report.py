@@ -99,7 +99,7 @@ _SWEEPS: dict[str, list[Case]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class ContactsPlan:
     """How much is measured: presses, samples, fingertips, seconds of a task, objects, hours."""
 
     presses: int
@@ -110,8 +110,8 @@ class Plan:
     hours: float
 
 
-QUICK = Plan(100, 2_000, 2, 4.0, 50, 0.5)
-FULL = Plan(600, 20_000, 8, 8.0, 200, 10.0)
+QUICK = ContactsPlan(100, 2_000, 2, 4.0, 50, 0.5)
+FULL = ContactsPlan(600, 20_000, 8, 8.0, 200, 10.0)
 
 
 def run(*, quick: bool = False, output: Path | None = None) -> dict[str, Any]:
@@ -146,7 +146,7 @@ def describe(document: dict[str, Any]) -> str:
     return text(document)
 
 
-def measure(plan: Plan) -> Report:
+def measure(plan: ContactsPlan) -> Report:
     """Measure everything to the extent of `plan`.
 
     Returns:

@@ -14,7 +14,7 @@ from skin_host.evaluation.papers.force_torque import calibrate
 from skin_host.evaluation.papers.fusion import FingertipFusion, calibrate_fusion
 from skin_host.evaluation.papers.planar import contact_angle
 from skin_host.evaluation.papers.truth import (
-    Patch,
+    LoadPatch,
     PlanarGauges,
     StripArray,
     box_patch,
@@ -49,7 +49,7 @@ TASKS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
+class ManipulationTask:
     """One task over time. Rows are servo samples.
 
     Attributes:
@@ -65,10 +65,10 @@ class Task:
     normal_n: Floats
     tangential_n: Floats
     acceleration_m_s2: Floats
-    patch: Patch
+    patch: LoadPatch
 
 
-def make_task(name: str, rng: np.random.Generator, seconds: float = 8.0) -> Task:
+def make_task(name: str, rng: np.random.Generator, seconds: float = 8.0) -> ManipulationTask:
     """Make one of `TASKS`.
 
     Raises:
@@ -97,7 +97,7 @@ def make_task(name: str, rng: np.random.Generator, seconds: float = 8.0) -> Task
             # Fingers roll on the box while they go up and down (a trapezoid in time).
             place = 1.5 * np.cumsum(velocity[:, 1]) / RATE_HZ / 0.01 - 1.5 + set_up
         patch = pin_patch() if name.startswith("pin") else box_patch(skew=0.2)
-        return Task(name, place, normal, tangential, acceleration, patch)
+        return ManipulationTask(name, place, normal, tangential, acceleration, patch)
     turn = np.deg2rad(20.0) * _triangle(t / 4.0)
     # The fingertip swings on an arm of half the object.
     swing = np.gradient(np.gradient(0.05 * turn, 1 / RATE_HZ), 1 / RATE_HZ)
@@ -105,7 +105,7 @@ def make_task(name: str, rng: np.random.Generator, seconds: float = 8.0) -> Task
     if name.startswith("pin"):
         place = np.full(n, set_up - 3.0 * name.endswith("off centre"))
         lean = turn - place / RADIUS_MM
-        return Task(
+        return ManipulationTask(
             name,
             place,
             grasp * np.cos(lean),
@@ -114,7 +114,7 @@ def make_task(name: str, rng: np.random.Generator, seconds: float = 8.0) -> Task
             pin_patch(),
         )
     # A face that turns rolls over the fingertip; there is no shear but the object's weight.
-    return Task(
+    return ManipulationTask(
         name, RADIUS_MM * 0.9 * turn + set_up, grasp, lift, acceleration, box_patch(skew=0.2)
     )
 
@@ -150,7 +150,7 @@ def _unrest(rng: np.random.Generator, n: int, channels: int, seconds: float) -> 
     return unrest
 
 
-class Fingertip:
+class TrialFingertip:
     """One emulated fingertip of Son et al., calibrated by presses with a pointed indenter.
 
     Args:
@@ -183,7 +183,7 @@ class Fingertip:
             mass_kg=MASS_KG,
         )
 
-    def places(self, task: Task) -> dict[str, Floats]:
+    def places(self, task: ManipulationTask) -> dict[str, Floats]:
         """Where each method puts the contact, mm, at the 300 Hz of the servo.
 
         The array's methods hold their last place between two readings.
@@ -232,7 +232,7 @@ def task_errors(
     }
     settled = int(0.5 * RATE_HZ)
     for seed in range(50, 50 + fingertips):
-        fingertip = Fingertip(seed, presses, place_sd_mm)
+        fingertip = TrialFingertip(seed, presses, place_sd_mm)
         for name in TASKS:
             task = make_task(name, np.random.default_rng(1000 + seed), seconds)
             for method, places in fingertip.places(task).items():

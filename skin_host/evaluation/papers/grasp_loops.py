@@ -19,7 +19,13 @@ from skin_host.evaluation.papers.three_axis import (
     in_element_frame,
 )
 from skin_host.evaluation.papers.truth import OpticalDome
-from skin_host.fingertip.grasp import FingerFlags, Flags, GraspEvent, Thresholds, finger_velocity
+from skin_host.fingertip.grasp import (
+    FingerFlags,
+    Flags,
+    GraspEvent,
+    GraspThresholds,
+    finger_velocity,
+)
 from skin_host.fingertip.slip import RatioDrop, ShearRate, friction_used
 
 Floats = NDArray[np.float64]
@@ -171,7 +177,7 @@ def hold_object(
     """
     objects = HeldObjects(1, Friction(static=friction, sliding=0.85 * friction))
     detector = ShearRate(1, FORCE_HZ)
-    thresholds = Thresholds(touch_n=0.2, over_n=12.0, slip_n_s=6.0)
+    thresholds = GraspThresholds(touch_n=0.2, over_n=12.0, slip_n_s=6.0)
     finger = FingerFlags(thresholds)
     stiffness_n_mm, grip = 2.0, 2.0
     n = int(seconds * FORCE_HZ)
@@ -237,7 +243,9 @@ def close_cap(rng: np.random.Generator, *, twists: int = 4, adapt: bool = True) 
     layout = dome()
     cameras = [OpticalDome(layout.azimuth_rad, layout.latitude_rad, rng) for _ in range(2)]
     sensors = [_calibrated(camera) for camera in cameras]
-    thresholds = Thresholds(touch_n=0.25, over_n=1.0, slip_n_s=1.5, slip_hold_s=0.04, lost_s=0.3)
+    thresholds = GraspThresholds(
+        touch_n=0.25, over_n=1.0, slip_n_s=1.5, slip_hold_s=0.04, lost_s=0.3
+    )
     closing = np.array([[0.0, 1.0], [0.0, -1.0]])
     towards = np.array([[-1.0, 0.0], [1.0, 0.0]])
     dt_s = 1 / CAMERA_HZ

@@ -83,23 +83,23 @@ class OpticalDome:
 
 
 @dataclass(frozen=True, slots=True)
-class Patch:
+class LoadPatch:
     """How a contact's load lies on the skin: points [k, 2] mm about its middle, shares [k]."""
 
     points_mm: Floats
     share: Floats
 
 
-def pin_patch(radius_mm: float = 1.66) -> Patch:
+def pin_patch(radius_mm: float = 1.66) -> LoadPatch:
     """A round Hertz contact: a 1.6 mm tip on rubber of 0.7 MPa under 3 N."""
     axis = np.linspace(-1.0, 1.0, 9)
     points = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
     share = np.sqrt(np.maximum(1.0 - (points**2).sum(axis=1), 0.0))
     kept = share > 0.0
-    return Patch(radius_mm * points[kept], share[kept] / share.sum())
+    return LoadPatch(radius_mm * points[kept], share[kept] / share.sum())
 
 
-def box_patch(half_width_mm: float = 2.4, length_mm: float = 16.0, skew: float = 0.0) -> Patch:
+def box_patch(half_width_mm: float = 2.4, length_mm: float = 16.0, skew: float = 0.0) -> LoadPatch:
     """A line contact along the cylinder, heavier at its ends (edge effect, section 4.4).
 
     `skew` in -1..1 loads one end more than the other.
@@ -110,7 +110,7 @@ def box_patch(half_width_mm: float = 2.4, length_mm: float = 16.0, skew: float =
     edge = 1.0 + 0.8 * (np.abs(points[:, 1]) > 0.45 * length_mm)
     tilt = 1.0 + 2.0 * skew * points[:, 1] / length_mm
     share = np.sqrt(1.0 - (points[:, 0] / half_width_mm) ** 2) * edge * tilt
-    return Patch(points, share / share.sum())
+    return LoadPatch(points, share / share.sum())
 
 
 class StripArray:
@@ -156,7 +156,7 @@ class StripArray:
         self._noise = noise
 
     def read(
-        self, place_mm: ArrayLike, normal_n: ArrayLike, shear_n: ArrayLike, patch: Patch
+        self, place_mm: ArrayLike, normal_n: ArrayLike, shear_n: ArrayLike, patch: LoadPatch
     ) -> Floats:
         """Responses float64[n, rows, columns]; 1 is the peak over a point load of 3 N.
 

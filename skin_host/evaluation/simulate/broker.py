@@ -15,7 +15,7 @@ from paho.mqtt.properties import Properties
 
 from skin_host.clock import Clock
 from skin_host.evaluation.simulate.trace import Trace
-from skin_host.mqtt.address import Broker as Address
+from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import TIMEOUT_S, Connection, Message, MqttError, Will
 
 #: One way.
@@ -24,7 +24,7 @@ LATENCY_S = 0.001
 WAITING_PACKETS = 64
 
 
-class Broker:
+class MemoryBroker:
     """The broker.
 
     Args:
@@ -58,7 +58,7 @@ class Broker:
 
         @asynccontextmanager
         async def connect(
-            address: Address,
+            address: Broker,
             *,
             identifier: str,
             will: Will,
@@ -185,7 +185,7 @@ class Line:
     refusal = ""
 
     def __init__(
-        self, broker: Broker, identifier: str, will: Will, max_incoming: int, *, v5: bool
+        self, broker: MemoryBroker, identifier: str, will: Will, max_incoming: int, *, v5: bool
     ) -> None:
         self.when_clear: Callable[[], object] = lambda: None
         self._is_refusing = False

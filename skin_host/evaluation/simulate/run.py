@@ -47,7 +47,7 @@ LATE_FAULTS = {
 
 
 @dataclass
-class Result:
+class RunResult:
     """What came of a run.
 
     Attributes:
@@ -80,7 +80,7 @@ def simulate(
     seconds: float,
     *,
     until_s: float | None = None,
-) -> Result:
+) -> RunResult:
     """Let a robot and its daemon live for some time; the same arguments give the same events.
 
     Args:
@@ -114,7 +114,7 @@ class _Run:
         self, world: World, state: Path, seed: int, seconds: float, until_s: float | None
     ) -> None:
         self.world = world
-        self.result = Result(seed)
+        self.result = RunResult(seed)
         self._state = state
         self._seconds = seconds
         self._until_s = until_s

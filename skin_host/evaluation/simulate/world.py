@@ -18,7 +18,7 @@ from skin_host.clock import SYSTEM, Clock, SteppedClock
 from skin_host.config.settings import Bus, Receive, Settings
 from skin_host.daemon.calibrate import stored_calibration
 from skin_host.daemon.daemon import Daemon
-from skin_host.evaluation.simulate.broker import Broker, Living
+from skin_host.evaluation.simulate.broker import Living, MemoryBroker
 from skin_host.evaluation.simulate.cables import Cable, SimulatedPort
 from skin_host.evaluation.simulate.disk import SimulatedDisk
 from skin_host.evaluation.simulate.trace import Trace
@@ -110,7 +110,7 @@ class World:
         self.clock = SteppedClock(seed=seed)
         self.trace = Trace()
         self.robot = Robot(settings, layout, scene, seed=seed)
-        self.broker = Broker(self.clock, self.trace)
+        self.broker = MemoryBroker(self.clock, self.trace)
         self.cables = {
             name: Cable(
                 name,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from skin_host.config.relaxation import MODELS
-from skin_host.config.relaxation import Relaxation as Settings
+from skin_host.config.relaxation import RelaxationSettings as Settings
 from skin_host.processing.relaxation.asymmetric import AsymmetricRelaxation
 from skin_host.processing.relaxation.base import Parameters, Relaxation
 from skin_host.processing.relaxation.none import NoRelaxation

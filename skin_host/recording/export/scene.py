@@ -83,7 +83,7 @@ class Arrows(NamedTuple):
 Item = Points | Arrows | HealthLine
 
 
-class Scene:
+class RecordedScene:
     """Items of a recording for a viewer, in the order of time.
 
     Attributes:
@@ -187,14 +187,14 @@ def write_foxglove(series: Series, recording: Path | None, output: Path) -> None
 
     Raises:
         SkinError: a package of the extra `foxglove` is not installed, or writing fails.
-        RequestError: see `Scene`.
+        RequestError: see `RecordedScene`.
     """
     required("mcap_protobuf", "scenes for Foxglove", "foxglove")
     required("foxglove_schemas_protobuf", "scenes for Foxglove", "foxglove")
     from mcap.reader import make_reader
     from mcap.writer import Writer
 
-    scene = Scene(series)
+    scene = RecordedScene(series)
     with _new(output) as growing, growing.open("wb") as file:
         writer: Any = Writer(file)
         writer.start(profile="", library="skin-host")
@@ -236,7 +236,7 @@ class _Foxglove:
         self._writer = writer
         self._channels: dict[str, int] = {}
 
-    def write(self, scene: Scene) -> None:
+    def write(self, scene: RecordedScene) -> None:
         self._add("/tf", scene.start_ns, _transforms(scene))
         for item in scene.items():
             match item:
@@ -264,7 +264,7 @@ class _Foxglove:
         )
 
 
-def _transforms(scene: Scene) -> Any:
+def _transforms(scene: RecordedScene) -> Any:
     from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
     from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 
@@ -358,10 +358,10 @@ def write_rerun(series: Series, output: Path) -> None:
 
     Raises:
         SkinError: the package of the extra `rerun` is not installed, or the file cannot be written.
-        RequestError: see `Scene`.
+        RequestError: see `RecordedScene`.
     """
     rr = required("rerun", "recordings for Rerun", "rerun")
-    scene = Scene(series)
+    scene = RecordedScene(series)
     with _new(output) as growing:
         stream = rr.RecordingStream("skin-host")
         stream.save(growing)

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emulator.probes.air import Course, read_course
+from emulator.probes.air import AirCourse, read_course
 from emulator.probes.scene import Air, Probe, Scene, load
 from emulator.robot import Robot
 from skin_host.config.settings import load as load_settings
@@ -136,7 +136,7 @@ def test_a_wrong_table_is_refused(scene: Scene, wrong: str) -> None:
 
 
 def test_a_course_is_nothing_before_and_after_itself() -> None:
-    course = Course.of([(0, 5), (1, 7)], start_s=2)
+    course = AirCourse.of([(0, 5), (1, 7)], start_s=2)
 
     assert [course.kpa_at(t_s) for t_s in (1.9, 2, 2.5, 3, 3.1)] == [0, 5, 6, 7, 0]
 

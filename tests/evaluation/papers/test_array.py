@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 
 from skin_host.evaluation.papers.array import centroid, peak, smooth_peak, strip_array
-from skin_host.evaluation.papers.truth import Patch, StripArray, box_patch
+from skin_host.evaluation.papers.truth import LoadPatch, StripArray, box_patch
 
 LAYOUT = strip_array()
 AROUND = LAYOUT.around_mm
-POINT = Patch(np.zeros((1, 2)), np.ones(1))
+POINT = LoadPatch(np.zeros((1, 2)), np.ones(1))
 METHODS = {
     "centroid": lambda r: centroid(r, AROUND),
     "half": lambda r: centroid(r, AROUND, share=0.5),

@@ -11,7 +11,13 @@ from skin_host.evaluation.localization_trials import (
     localizer_for,
     separation,
 )
-from skin_host.evaluation.papers.contacts_report import SCHEMA, Plan, describe, measure, write_page
+from skin_host.evaluation.papers.contacts_report import (
+    SCHEMA,
+    ContactsPlan,
+    describe,
+    measure,
+    write_page,
+)
 
 
 @pytest.mark.parametrize(("probe_mm", "limit_mm"), [(10.0, 0.3), (6.0, 0.8)])
@@ -45,7 +51,7 @@ def test_probes_farther_apart_are_told_apart_more_often():
 
 @pytest.fixture(scope="module")
 def report():
-    return measure(Plan(2, 2_000, 1, 1.0, 5, 0.01))
+    return measure(ContactsPlan(2, 2_000, 1, 1.0, 5, 0.01))
 
 
 def test_the_report_has_every_table_and_numbers_in_all_of_them(report):

@@ -8,7 +8,7 @@ from skin_host.evaluation.papers.fingertip_trials import (
     RATE_HZ,
     SINGLE_METHODS,
     TASKS,
-    Fingertip,
+    TrialFingertip,
     make_task,
     rms,
     task_errors,
@@ -62,11 +62,11 @@ def test_the_order_of_table_1_where_it_is_consistent(errors):
 
 def test_the_calibration_learns_the_pull_of_shear_with_its_sign():
     # Shear on the skin is opposite to the outward force's tangential part.
-    assert all(Fingertip(seed).calibration.array[1] < -0.3 for seed in range(3))
+    assert all(TrialFingertip(seed).calibration.array[1] < -0.3 for seed in range(3))
 
 
 def test_the_filter_says_how_sure_it_is():
-    fingertip = Fingertip(7)
+    fingertip = TrialFingertip(7)
     assert fingertip.fusion.sigma_mm == float("inf")
     task = make_task("box rotation", np.random.default_rng(7), seconds=4.0)
     error = fingertip.places(task)["fused"] - task.place_mm
@@ -74,7 +74,7 @@ def test_the_filter_says_how_sure_it_is():
 
 
 def test_before_the_array_answers_there_is_no_contact():
-    fusion = Fingertip(8).fusion
+    fusion = TrialFingertip(8).fusion
     load = planar_load(1.0, 3.0, 0.0, RADIUS_MM)
     assert np.isnan(fusion.step(1 / RATE_HZ, load))
     assert np.isnan(fusion.step(1 / RATE_HZ, load, float("nan")))
@@ -82,7 +82,7 @@ def test_before_the_array_answers_there_is_no_contact():
 
 
 def test_a_light_touch_leaves_the_force_sensor_unasked():
-    fusion = Fingertip(9).fusion
+    fusion = TrialFingertip(9).fusion
     fusion.step(1 / RATE_HZ, planar_load(0.0, 0.1, 0.0, RADIUS_MM), 0.0)
     before = fusion.sigma_mm
     # A force sensor at the noise level would say "5 mm".
@@ -92,7 +92,7 @@ def test_a_light_touch_leaves_the_force_sensor_unasked():
 
 
 def test_a_knock_moves_the_fused_contact_less_than_the_force_sensors():
-    fingertip = Fingertip(10)
+    fingertip = TrialFingertip(10)
     quiet = planar_load(0.0, 3.0, 0.0, RADIUS_MM)
     for i in range(300):
         fingertip.fusion.step(1 / RATE_HZ, quiet, 0.0 if i % 10 == 0 else None)

@@ -4,8 +4,8 @@ import pytest
 from skin_host.evaluation.papers.fingertip_trials import RATE_HZ, TASKS, make_task
 from skin_host.evaluation.papers.truth import (
     PRINTED_MATRIX,
+    LoadPatch,
     OpticalDome,
-    Patch,
     PlanarGauges,
     StripArray,
     box_patch,
@@ -14,7 +14,7 @@ from skin_host.evaluation.papers.truth import (
 )
 
 PLACES = np.linspace(-7, 7, 8)
-POINT = Patch(np.zeros((1, 2)), np.ones(1))
+POINT = LoadPatch(np.zeros((1, 2)), np.ones(1))
 
 
 def plain_array(columns=PLACES, rows=PLACES, **traits):

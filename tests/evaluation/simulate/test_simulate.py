@@ -10,7 +10,7 @@ import pytest
 
 from skin_host.cli.common import load_skin
 from skin_host.demo import configuration
-from skin_host.evaluation.simulate.run import Result, simulate
+from skin_host.evaluation.simulate.run import RunResult, simulate
 
 DEMO = configuration("demo.toml")
 SMALL = Path(__file__).with_name("small.toml")
@@ -20,7 +20,7 @@ SECONDS = 30.0
 FIXED = [(DEMO, 1), (SMALL, 5)]
 
 
-def run(seed: int, config: Path = DEMO, *, until_s: float | None = None) -> Result:
+def run(seed: int, config: Path = DEMO, *, until_s: float | None = None) -> RunResult:
     settings, layout = load_skin(config)
     return simulate(settings, layout, config, seed, SECONDS, until_s=until_s)
 

@@ -22,7 +22,7 @@ from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import Bus, Receive
 from skin_host.errors import BusError
 from skin_host.evaluation.bench_receive import measure
-from skin_host.evaluation.can_stream import Wire
+from skin_host.evaluation.can_stream import StreamWire
 from tests.support.vcan import Vcan
 
 WAIT_S = 60.0
@@ -290,7 +290,7 @@ def test_an_interface_that_is_absent_or_down_at_the_start_is_waited_for(vcan):
 
 def test_a_frame_costs_less_than_half_of_what_it_costs_through_python_can(vcan):
     """Both read the same stream of one full bus; the benchmark tells how much less."""
-    wire = Wire(vcan.name)
+    wire = StreamWire(vcan.name)
     usual, ours = (measure(wire, path, 8000, 1.0) for path in ("notifier_async", "batch"))
     logging.info("notifier_async %s; batch %s", usual, ours)
     assert 0 < 2 * ours["ns_per_frame"] < usual["ns_per_frame"]
