@@ -93,8 +93,11 @@ def off_mm(event: TouchEvent, place: np.ndarray) -> float:
     return float(np.linalg.norm(1e3 * np.array(event.centroid_m[:2]) - place))
 
 
-def first_events(settings: Settings, layout: Layout, frame: PressureFrame) -> list[TouchEvent]:
-    return ContactTracker(layout, 0, settings).step(frame)
+def first_events(tracker: ContactTracker, frame: PressureFrame) -> list[TouchEvent]:
+    """What is told of a frame when no contact was there before it."""
+    events = tracker.step(frame)
+    tracker.end_all(frame.seq, frame.t_ns)
+    return events
 
 
 def test_a_template_is_nearer_to_a_10_mm_press_than_the_centroid(configured):
@@ -118,11 +121,12 @@ def test_a_template_is_nearer_to_a_10_mm_press_than_the_centroid(configured):
 @pytest.mark.parametrize("method", get_args(Method))
 def test_the_error_told_is_of_the_size_of_the_error_made(configured, method):
     settings, layout = configured(f'localization = "{method}"')
+    tracker = ContactTracker(layout, 0, settings)
     palm = PressedPalm(layout)
     made, told = [], []
     for _ in range(60):
         place = palm.inside()
-        event = first_events(settings, layout, palm.press((place, 1.0)))[0]
+        event = first_events(tracker, palm.press((place, 1.0)))[0]
         assert event.sigma_m is not None
         made.append(off_mm(event, place))
         told.append(1e3 * event.sigma_m)
@@ -132,18 +136,20 @@ def test_the_error_told_is_of_the_size_of_the_error_made(configured, method):
 
 def test_one_size_of_probe_may_be_named(configured):
     settings, layout = configured('localization = "template"\nprobe_mm = [10]')
+    tracker = ContactTracker(layout, 0, settings)
     palm = PressedPalm(layout)
     place = palm.inside()
-    (event,) = first_events(settings, layout, palm.press((place, 1.0)))
+    (event,) = first_events(tracker, palm.press((place, 1.0)))
     assert off_mm(event, place) < 0.5
 
 
 def test_of_a_contact_wider_than_any_probe_the_template_says_no_more_than_the_centroid(configured):
     settings, layout = configured('localization = "template"')
+    tracker = ContactTracker(layout, 0, settings)
     palm = PressedPalm(layout)
     for _ in range(20):
         place = palm.inside()
-        (event,) = first_events(settings, layout, palm.press((place, 1.0), diameter_mm=24.0))
+        (event,) = first_events(tracker, palm.press((place, 1.0), diameter_mm=24.0))
         assert off_mm(event, place) < 1.5
         assert event.sigma_m is not None
         assert event.sigma_m > 0.2e-3
@@ -151,11 +157,12 @@ def test_of_a_contact_wider_than_any_probe_the_template_says_no_more_than_the_ce
 
 def test_a_contact_somewhat_wider_than_any_probe_is_told_with_less_certainty(configured):
     settings, layout = configured('localization = "template"')
+    tracker = ContactTracker(layout, 0, settings)
     palm = PressedPalm(layout)
     made, told = [], []
     for _ in range(15):
         place = palm.inside()
-        (event,) = first_events(settings, layout, palm.press((place, 1.0), diameter_mm=14.0))
+        (event,) = first_events(tracker, palm.press((place, 1.0), diameter_mm=14.0))
         made.append(off_mm(event, place))
         told.append(1e3 * (event.sigma_m or 0.0))
     assert np.sqrt(np.mean(np.square(made))) < 2.0 * np.sqrt(np.mean(np.square(told)))
@@ -168,8 +175,8 @@ def test_two_presses_on_one_patch_are_told_apart_unless_the_plain_mean_is_asked_
     middle = palm.centre_mm.mean(axis=0)
     places = [middle - SIDE_MM, middle + SIDE_MM]
     frame = palm.press((places[0], 1.0), (places[1], 0.8))
-    assert len(first_events(plain, layout, frame)) == 1
-    first, second = first_events(template, layout, frame)
+    assert len(first_events(ContactTracker(layout, 0, plain), frame)) == 1
+    first, second = first_events(ContactTracker(layout, 0, template), frame)
     assert not set(first.taxels) & set(second.taxels)
     assert off_mm(first, places[0]) < 1.0
     assert off_mm(second, places[1]) < 1.0
@@ -191,13 +198,14 @@ def test_a_contact_that_parts_keeps_its_name_on_the_stronger_side(configured):
 
 def test_a_lost_taxel_is_not_believed_to_be_untouched(configured):
     settings, layout = configured('localization = "template"')
+    tracker = ContactTracker(layout, 0, settings)
     palm = PressedPalm(layout)
     found = []
     for _ in range(20):
         place = palm.inside()
         away = np.linalg.norm(palm.centre_mm - place, axis=1)
         frame = palm.press((place, 1.0), lost=[int(np.argsort(away)[1])])
-        found.append(off_mm(first_events(settings, layout, frame)[0], place))
+        found.append(off_mm(first_events(tracker, frame)[0], place))
     assert np.sqrt(np.mean(np.square(found))) < 0.6
 
 

@@ -1,6 +1,8 @@
 """From a recording of CAN frames to parameters, and from those to better pressures."""
 
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -56,15 +58,16 @@ def write_log(path, units):
                 file.write(f"({time_s:.6f}) can0 {can_id:03X}#{payload.tobytes().hex().upper()}\n")
 
 
-@pytest.fixture
-def hold(tmp_path):
+@pytest.fixture(scope="module")
+def hold(tmp_path_factory):
     """A hold of four minutes on half a triangle, four minutes of rest, and the load cell."""
+    folder = tmp_path_factory.mktemp("hold")
     played = record("A", [(0.0, 10.0), (60.0, 240.0), (0.0, 240.0)], HZ)
     units = np.zeros((len(played.momentary_kpa), N))
     units[:, :6] = CURVE.units(played.momentary_kpa[:, np.newaxis])
-    log = tmp_path / "hold.log"
+    log = folder / "hold.log"
     write_log(log, units)
-    load_cell = tmp_path / "load.csv"
+    load_cell = folder / "load.csv"
     time_s = np.arange(len(played.pressure_kpa)) / HZ
     np.savetxt(load_cell, np.column_stack([time_s, played.pressure_kpa]), delimiter=",")
     return log, load_cell
@@ -286,18 +289,26 @@ def test_a_sample_taken_while_the_probe_moved_does_not_count(bench, tmp_path, ca
     assert max(found["rms_hold_kpa"] for found in json.loads(said.out)["fits"]) < 0.7
 
 
-@pytest.fixture
-def chamber(tmp_path):
+@pytest.fixture(scope="module")
+def staircase(tmp_path_factory):
     """A skin of another shape of curve under a staircase of air pressure, and its table."""
+    folder = tmp_path_factory.mktemp("staircase")
     levels = np.concatenate([[0.0], np.linspace(0.0, 240.0, 9), np.linspace(210.0, 0.0, 8)])
     kpa = np.repeat(levels, round(8 * HZ))
     kpa = np.convolve(np.pad(kpa, 5, mode="edge"), np.ones(10) / 10, "same")[5:-5]
     units = kpa / 8.0 + 1.5 * (1.0 - np.exp(-kpa / 30.0))
-    log, table = tmp_path / "air.log", tmp_path / "air.csv"
+    log, table = folder / "air.log", folder / "air.csv"
     write_log(log, np.outer(units, np.linspace(0.8, 1.2, N)))
     time_s = np.arange(len(kpa)) / HZ + 1.2
     np.savetxt(table, np.column_stack([time_s, kpa]), delimiter=",", header="time_s,pressure_kpa")
     return log, table
+
+
+@pytest.fixture
+def chamber(staircase, tmp_path):
+    """The recording of the staircase, and a copy of its table to change."""
+    log, table = staircase
+    return log, Path(shutil.copy(table, tmp_path))
 
 
 def test_any_course_of_pressure_becomes_curves_that_a_replay_uses(bench, chamber, tmp_path, capsys):
