@@ -1,7 +1,5 @@
 """Boards that reset, come late, stop or lose their set-up are set up again, alone."""
 
-import asyncio
-import time
 from pathlib import Path
 
 import can
@@ -16,8 +14,10 @@ from skin_host.bus.commands import (
     command_frame,
 )
 from skin_host.bus.wire import FrameBatch
+from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus
 from tests.support.live import living
+from tests.support.stepped import stepped
 
 #: Told for a while afterwards.
 LATELY = frozenset({"board_reset", "board_rezeroed", "board_lost_set_up"})
@@ -25,10 +25,11 @@ LATELY = frozenset({"board_reset", "board_rezeroed", "board_lost_set_up"})
 FRAMES_BEHIND = 1500
 
 
+@stepped
 async def test_a_board_that_resets_is_set_up_again_and_the_others_notice_nothing(
-    can_bus_settings: Bus, tmp_path: Path
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
 ) -> None:
-    async with living(can_bus_settings, tmp_path) as live:
+    async with living(can_bus_settings, tmp_path, clock=clock) as live:
         await live.until_well(but=LATELY)
         known = live.daemon.engine.calibration
         live.robot.inject(Fault(name="board_reset", board="hand"))
@@ -46,8 +47,11 @@ async def test_a_board_that_resets_is_set_up_again_and_the_others_notice_nothing
         assert rezeros[0] == rezeros[1] + 1
 
 
-async def test_a_board_that_comes_back_is_found(can_bus_settings: Bus, tmp_path: Path) -> None:
-    async with living(can_bus_settings, tmp_path) as live:
+@stepped
+async def test_a_board_that_comes_back_is_found(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    async with living(can_bus_settings, tmp_path, clock=clock) as live:
         await live.until_well(but=LATELY)
         live.robot.inject(Fault(name="board_silent", board="hand"))
         told = await live.until("board_silent")
@@ -56,10 +60,11 @@ async def test_a_board_that_comes_back_is_found(can_bus_settings: Bus, tmp_path:
         await live.until_well(but=LATELY)
 
 
+@stepped
 async def test_what_was_touched_at_a_new_zero_is_in_doubt_until_calibrated(
-    can_bus_settings: Bus, tmp_path: Path
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
 ) -> None:
-    async with living(can_bus_settings, tmp_path) as live:
+    async with living(can_bus_settings, tmp_path, clock=clock) as live:
         await live.until_well(but=LATELY)
         engine = live.daemon.engine
         part = engine.layout.part("left_hand")
@@ -84,10 +89,11 @@ async def test_what_was_touched_at_a_new_zero_is_in_doubt_until_calibrated(
         await live.until_well(but=LATELY)
 
 
+@stepped
 async def test_a_board_that_is_set_up_by_command_is_not_called_silent_meanwhile(
-    can_bus_settings: Bus, tmp_path: Path
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
 ) -> None:
-    async with living(can_bus_settings, tmp_path) as live:
+    async with living(can_bus_settings, tmp_path, clock=clock) as live:
         await live.until_well(but=LATELY)
         record = live.daemon.link.boards["can0"].records[14]
         ledger = live.daemon.engine.ledger
@@ -100,10 +106,11 @@ async def test_a_board_that_is_set_up_by_command_is_not_called_silent_meanwhile(
         assert not ledger.silences.any() and not ledger.resets.any()
 
 
+@stepped
 async def test_one_board_is_calibrated_and_the_others_keep_theirs(
-    can_bus_settings: Bus, tmp_path: Path
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
 ) -> None:
-    async with living(can_bus_settings, tmp_path) as live:
+    async with living(can_bus_settings, tmp_path, clock=clock) as live:
         await live.until_well(but=LATELY)
         engine = live.daemon.engine
         before = engine.calibration
@@ -116,37 +123,42 @@ async def test_one_board_is_calibrated_and_the_others_keep_theirs(
         assert not np.array_equal(after.baseline[hand], before.baseline[hand])
 
 
+@stepped
 async def test_a_dead_bus_floods_no_log(
-    can_bus_settings: Bus, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async with living(can_bus_settings, tmp_path) as live:
+    async with living(can_bus_settings, tmp_path, clock=clock) as live:
         await live.until_well(but=LATELY)
-        await asyncio.sleep(0.3)
+        await clock.sleep(0.3)
         caplog.clear()
         live.robot.inject(Fault(name="bus_off", bus="can0"))
         await live.until("bus_silent")
-        await asyncio.sleep(4.0)
+        await clock.sleep(4.0)
         assert live.faults() == {("bus_silent", "can0"), ("broker_away", "broker")}
         lines = [record for record in caplog.records if record.levelname != "DEBUG"]
         assert len(lines) <= 1, [record.getMessage() for record in lines]
 
 
+@stepped
 async def test_a_daemon_that_was_held_up_takes_no_board_for_silent(
-    can_bus_settings: Bus, tmp_path: Path
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
 ) -> None:
-    async with living(can_bus_settings, tmp_path) as live:
+    async with living(can_bus_settings, tmp_path, clock=clock) as live:
         await live.until_well(but=LATELY)
         records = live.daemon.link.boards["can0"].records.values()
         silences = live.daemon.engine.ledger.silences
         before = [record.configurations for record in records], silences.tolist()
         # Nothing in this process runs, the emulated robot included.
-        time.sleep(1.0)  # noqa: ASYNC251
-        await asyncio.sleep(0.5)
+        clock.advance(1.0)
+        await clock.sleep(0.5)
         assert ([record.configurations for record in records], silences.tolist()) == before
 
 
-async def test_a_board_that_paused_keeps_its_zero(can_bus_settings: Bus, tmp_path: Path) -> None:
-    async with living(can_bus_settings, tmp_path) as live:
+@stepped
+async def test_a_board_that_paused_keeps_its_zero(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    async with living(can_bus_settings, tmp_path, clock=clock) as live:
         await live.until_well(but=LATELY)
         record = live.daemon.link.boards["can0"].records[14]
         ledger = live.daemon.engine.ledger
@@ -162,10 +174,11 @@ async def test_a_board_that_paused_keeps_its_zero(can_bus_settings: Bus, tmp_pat
         assert ledger.rezeros.tolist() == zeroes
 
 
+@stepped
 async def test_a_robot_that_starts_after_its_daemon_is_set_up_whole(
-    can_bus_settings: Bus, tmp_path: Path
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
 ) -> None:
-    async with living(can_bus_settings, tmp_path, robot_late_s=0.7) as live:
+    async with living(can_bus_settings, tmp_path, robot_late_s=0.7, clock=clock) as live:
         await live.until_well(but=LATELY)
         records = live.daemon.link.boards["can0"].records.values()
         assert all(record.configurations == 1 for record in records)
@@ -173,11 +186,12 @@ async def test_a_robot_that_starts_after_its_daemon_is_set_up_whole(
         assert not any(live.daemon.engine.in_doubt(record.index).any() for record in records)
 
 
+@stepped
 async def test_while_the_daemon_is_behind_no_board_is_set_up(
-    can_bus_settings: Bus, tmp_path: Path
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
 ) -> None:
     """What it reads then is old, and may have lost its end to the kernel."""
-    async with living(can_bus_settings, tmp_path) as live:
+    async with living(can_bus_settings, tmp_path, clock=clock) as live:
         await live.until_well(but=LATELY)
         link = live.daemon.link
         record = link.boards["can0"].records[14]
@@ -191,7 +205,7 @@ async def test_while_the_daemon_is_behind_no_board_is_set_up(
             waiting.extend((int(i), bytes(data[:n]), int(t_ns)) for i, n, data, t_ns in rows)
             # There is always more to come: if nothing is old enough, a frame of somebody else's.
             old = len(waiting) > FRAMES_BEHIND
-            return FrameBatch.of([waiting.pop(0) if old else (0x100, b"", time.time_ns())])
+            return FrameBatch.of([waiting.pop(0) if old else (0x100, b"", clock.now_ns())])
 
         port.read, port.capacity = read_too_late, 1  # type: ignore[method-assign]
         bus = can.Bus(interface=can_bus_settings.interface, channel=can_bus_settings.channel)
@@ -199,9 +213,9 @@ async def test_while_the_daemon_is_behind_no_board_is_set_up(
         for command in (none, SetTxMode(TxMode.START)):
             identifier, data = command_frame(command, 14)
             bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
-        await asyncio.sleep(0.5)
+        await clock.sleep(0.5)
         read_ns = link.read_ns
-        await asyncio.sleep(2.5)
+        await clock.sleep(2.5)
         assert link.read_ns == read_ns
         assert record.configurations == 1
         assert not live.daemon.engine.ledger.lost_set_ups.any()

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from emulator.probes.scene import Fault
+from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus
 from tests.support.live import CONFIG, Live, living
+from tests.support.stepped import stepped
 
 LATELY = frozenset({"board_reset", "board_rezeroed", "board_lost_set_up"})
 NO_LOAD = 240
@@ -36,12 +38,13 @@ def counted(live: Live) -> dict[str, tuple[int, int, int]]:
     }
 
 
+@stepped
 async def test_boards_of_the_mtb3_are_set_up_once_and_a_reset_one_is_found(
-    can_bus_settings: Bus, tmp_path: Path
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
 ) -> None:
     """They fall silent after class 7, and lose commands that come close together."""
     config = changed(tmp_path, 'model = "mtb4"', 'model = "mtb3"')
-    async with living(can_bus_settings, tmp_path, config=config) as live:
+    async with living(can_bus_settings, tmp_path, config=config, clock=clock) as live:
         await live.until_well(but=LATELY)
         assert set(counted(live).values()) == {(1, 0, 0)}
         live.robot.inject(Fault(name="board_reset", board="hand"))
@@ -51,13 +54,14 @@ async def test_boards_of_the_mtb3_are_set_up_once_and_a_reset_one_is_found(
 
 
 @pytest.mark.parametrize("model", ["mtb3", "mtb4", "mtb4c"])
+@stepped
 async def test_a_zero_that_a_new_cdc_offset_would_spoil_is_taken_again(
-    can_bus_settings: Bus, tmp_path: Path, model: str
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path, model: str
 ) -> None:
     """An MTB4 takes it before the first conversion with the new offset."""
     config = changed(tmp_path, 'kind = "palml"\n', 'kind = "palml"\ncdc_offset = 0x2000\n')
     config.write_text(config.read_text().replace('model = "mtb4"', f'model = "{model}"'))
-    async with living(can_bus_settings, tmp_path, config=config) as live:
+    async with living(can_bus_settings, tmp_path, config=config, clock=clock) as live:
         await live.until_well(but=LATELY)
         raw = live.daemon.engine.pipeline is not None and live.daemon.health._watch.parts[0].raw
         assert isinstance(raw, np.ndarray)

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from skin_host.cli import main
+from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus, Mqtt, changed, load
 from skin_host.daemon import metrics
 from skin_host.daemon.calibrate import calibration_path, stored_calibration
@@ -21,6 +22,7 @@ from skin_host.processing import calibration as calibrations
 from tests.support.broker import Mosquitto, free_port
 from tests.support.fault_bench import FaultBench
 from tests.support.live import CONFIG, living
+from tests.support.stepped import stepped
 from tests.support.waiting import until
 
 STATE = {"schema": "skin.state/1", "disabled": ["left_hand"]}
@@ -105,12 +107,13 @@ def test_no_command_overwrites_a_newer_calibration(
     assert path.read_text() == '{"schema":"skin.calibration/2"}'
 
 
+@stepped
 async def test_what_could_not_be_kept_is_answered_and_a_fault_until_it_is(
-    can_bus_settings: Bus, tmp_path: Path
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
 ) -> None:
     blocked = tmp_path / "state"
     blocked.write_text("a file where a folder is wanted")
-    async with living(can_bus_settings, blocked) as live:
+    async with living(can_bus_settings, blocked, clock=clock) as live:
         handle = live.daemon.control.handle
         told = await live.until("state_not_kept")
         assert ("state_not_kept", "calibration") in told

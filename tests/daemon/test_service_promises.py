@@ -13,6 +13,7 @@ import pytest
 
 from skin_host.bus.logs import read_channels
 from skin_host.bus.wire import FrameBatch, encode_sweep
+from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus, TouchSettings, changed
 from skin_host.daemon import metrics, service
 from skin_host.daemon.state import NodeState, Thresholds, load_state, save_state
@@ -21,6 +22,7 @@ from skin_host.importing.run import configuration_text
 from skin_host.recording.capture import FrameRecorder, candump_lines
 from tests.support.fault_bench import FaultBench
 from tests.support.live import living
+from tests.support.stepped import stepped
 
 
 def test_what_operators_changed_comes_back(tmp_path: Path) -> None:
@@ -43,14 +45,15 @@ def test_damaged_state_is_an_unchanged_one(
     assert "damaged" in caplog.text
 
 
+@stepped
 async def test_commands_work_and_say_so_where_nothing_can_be_written(
-    can_bus_settings: Bus, tmp_path: Path
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
 ) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("a file where a folder is wanted")
-    async with living(can_bus_settings, blocked / "state") as live:
+    async with living(can_bus_settings, blocked / "state", clock=clock) as live:
         handle = live.daemon.control.handle
-        await asyncio.sleep(0.3)  # the first calibration is still being kept
+        await clock.sleep(0.3)  # the first calibration is still being kept
         answer = await handle("thresholds", b'{"set":{"margin_units":5}}')
         assert answer["kept"] is False
         assert answer["touch"]["margin_units"] == 5.0
@@ -65,11 +68,14 @@ async def test_commands_work_and_say_so_where_nothing_can_be_written(
         await live.until_well(but=frozenset({"state_not_kept"}))
 
 
-async def test_a_recording_can_be_replayed(can_bus_settings: Bus, tmp_path: Path) -> None:
-    async with living(can_bus_settings, tmp_path) as live:
+@stepped
+async def test_a_recording_can_be_replayed(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    async with living(can_bus_settings, tmp_path, clock=clock) as live:
         handle = live.daemon.control.handle
         await handle("record", b'{"file":"run.log","seconds":30}')
-        await asyncio.sleep(0.5)
+        await clock.sleep(0.5)
         answer = await handle("stop_recording", b"{}")
     assert answer["lost"] == 0
     path = tmp_path / "recordings" / "run.log"
@@ -131,8 +137,9 @@ def test_systemd_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         assert systemd.recv(100).startswith(b"RELOADING=1\nMONOTONIC_USEC=")
 
 
+@stepped
 async def test_the_watchdog_is_fed_by_the_pipeline(
-    can_bus_settings: Bus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "notify"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
@@ -140,7 +147,7 @@ async def test_the_watchdog_is_fed_by_the_pipeline(
         systemd.setblocking(False)
         monkeypatch.setenv("NOTIFY_SOCKET", str(path))
         monkeypatch.setenv("WATCHDOG_USEC", "400000")
-        async with living(can_bus_settings, tmp_path / "state"):
+        async with living(can_bus_settings, tmp_path / "state", clock=clock):
             heard = await _hear(systemd, 1.5)
             assert heard.count("WATCHDOG=1") >= 5
             assert any(line.startswith("STATUS=") for line in heard)
@@ -204,10 +211,11 @@ async def _get(port: int, request: bytes) -> str:
         writer.close()
 
 
+@stepped
 async def test_a_reload_takes_what_it_can_and_refuses_the_rest(
-    can_bus_settings: Bus, tmp_path: Path
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
 ) -> None:
-    async with living(can_bus_settings, tmp_path / "state") as live:
+    async with living(can_bus_settings, tmp_path / "state", clock=clock) as live:
         daemon = live.daemon
         known, running = daemon.engine.calibration, daemon.settings
         config = tmp_path / "demo.toml"
