@@ -12,11 +12,9 @@ from emulator.boards.board import Burst, Frame, Mtb, join
 from emulator.boards.chip_access import Chips, I2cChips
 from emulator.boards.mtb3 import Mtb3
 from emulator.boards.mtb4 import Mtb4, Mtb4c
+from skin_host.bus.board import configuration
 from skin_host.bus.commands import (
     Message,
-    SetBoardConfig,
-    SetTriangleConfig,
-    TriangleFlags,
 )
 from skin_host.layout import Layout
 
@@ -61,11 +59,14 @@ def set_up(
     """
     boards = layout.boards
     settle_s = SETTLE_PERIODS * 1e-3 * max(board.settings.period_ms for board in boards)
-    for number, board in enumerate(boards):
-        own = board.settings
-        send(number, SetBoardConfig(own.skin_type, own.period_ms, own.no_load))
+    commands = [
+        configuration(board, [one for one in layout.triangles if one.board == number])
+        for number, board in enumerate(boards)
+    ]
+    for number, (of_board, *_) in enumerate(commands):
+        send(number, of_board)
     wait(settle_s)
-    set_ups = [triangle_set_ups(layout, number) for number in range(len(boards))]
+    set_ups = [of_triangles for _, *of_triangles in commands]
     # Twice: the first one may take its baseline before the chips have converted again.
     for _ in range(2):
         for turn in range(max(map(len, set_ups))):
@@ -73,21 +74,3 @@ def set_up(
                 if turn < len(own_set_ups):
                     send(number, own_set_ups[turn])
             wait(settle_s)
-
-
-def triangle_set_ups(layout: Layout, board: int) -> list[SetTriangleConfig]:
-    """Command 50 for each run of a board's triangles that are set up alike."""
-    fitted = {
-        triangle.number: (triangle.shift, triangle.cdc_offset)
-        for triangle in layout.triangles
-        if triangle.board == board
-    }
-    commands: list[SetTriangleConfig] = []
-    for number, (shift, cdc_offset) in sorted(fitted.items()):
-        first = number
-        if commands:
-            last = commands[-1]
-            if (last.last, last.shift, last.cdc_offset) == (number - 1, shift, cdc_offset):
-                first = commands.pop().first
-        commands.append(SetTriangleConfig(first, number, shift, TriangleFlags.ENABLE, cdc_offset))
-    return commands

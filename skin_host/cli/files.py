@@ -170,8 +170,8 @@ def _replay_all(arguments: argparse.Namespace) -> int:
 
 
 def _import(arguments: argparse.Namespace) -> int:
+    from skin_host.importing import import_files
     from skin_host.importing.report import Findings
-    from skin_host.importing.run import import_files
 
     findings = Findings()
     try:

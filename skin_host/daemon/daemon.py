@@ -19,7 +19,7 @@ from skin_host.daemon.link import Link, OpenPort
 from skin_host.daemon.state import NodeState, Thresholds, load_state, save_state
 from skin_host.errors import ConfigurationError, RequestError, SkinError
 from skin_host.fingertip.health import FingertipRecord
-from skin_host.fingertip.publishing import FingertipPublisher
+from skin_host.fingertip.service import FingertipPublisher
 from skin_host.health import FaultLog, Health, Record
 from skin_host.layout import Layout, build_layout, parts_of
 from skin_host.mqtt.connection import connect

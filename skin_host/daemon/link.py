@@ -15,7 +15,7 @@ from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Bus, Receive
 from skin_host.errors import BusError, SkinError
-from skin_host.fingertip.boards import StrainBoards
+from skin_host.fingertip.service import StrainBoards
 from skin_host.processing.core import Engine, Output
 
 log = logging.getLogger(__name__)

@@ -1,1 +1,281 @@
-"""`skin import`: turns files of the iCub software into a skin-host configuration."""
+"""`skin import`: read files of a kind, write a configuration that `skin check` accepts.
+
+Only values that differ from the defaults are written. (The available TOML writers do not keep each
+place on one line and cannot write comments.)
+"""
+
+import json
+import os
+import tempfile
+from collections.abc import Callable
+from itertools import groupby
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import msgspec
+from msgspec import Struct
+
+from skin_host.config import settings as configuration
+from skin_host.config.check import format_triangles
+from skin_host.config.settings import Board, Bus, Part, Patch, Settings
+from skin_host.errors import ConfigurationError
+from skin_host.files import write_atomic
+from skin_host.importing.positions import import_positions
+from skin_host.importing.report import Findings
+from skin_host.importing.skingui import import_places
+from skin_host.importing.skinmanager import import_manager
+from skin_host.importing.skinspec import BoardSpec, Device, read_device
+from skin_host.layout import build_layout
+
+Source = Literal["skinspec", "skingui", "positions", "skinmanager"]
+SOURCES: tuple[Source, ...] = get_args(Source)
+#: Boards of these types correct their values with a temperature pad: their triangles have ten pads.
+TEN_PAD_TYPES = (0, 3, 8)
+
+
+def configuration_text(settings: Settings, comment: str = "") -> str:
+    """Write `settings` so that `settings.load` reads the same ones; `comment` comes first."""
+    lines = [f"# {line}".rstrip() for line in comment.splitlines()]
+    lines.append(f"robot = {_value(settings.robot)}")
+    for section, tables in (
+        ("buses", settings.buses),
+        ("boards", settings.boards),
+        ("kinds", settings.kinds),
+        ("fingertips", settings.fingertips),
+    ):
+        for name, table in tables.items():
+            lines += _table(f"{section}.{name}", table, empty=True)
+    for name, part in settings.parts.items():
+        lines += _table(f"parts.{name}", part, without=("patches",))
+        for patch in part.patches:
+            lines += _patch(name, patch)
+    for section in ("calibration", "pressure", "relaxation", "touch", "drift"):
+        lines += _table(f"processing.{section}", getattr(settings.processing, section))
+    for section in ("mqtt", "receive", "service"):
+        lines += _table(section, getattr(settings, section))
+    return "\n".join(lines) + "\n"
+
+
+def _table(
+    head: str, table: Struct, *, empty: bool = False, without: tuple[str, ...] = ()
+) -> list[str]:
+    """Return a table with the values that differ from the defaults; empty if there are none."""
+    entries = [
+        f"{key} = {_value(value)}" for key, value in _changed(table).items() if key not in without
+    ]
+    return ["", f"[{head}]", *entries] if entries or empty else []
+
+
+def _patch(part: str, patch: Patch) -> list[str]:
+    lines = ["", f"[[parts.{part}.patches]]"]
+    for key, value in _changed(patch).items():
+        if key == "places":
+            places = [f"    {_inline(_changed(place))}," for place in patch.places]
+            lines += ["places = [", *places, "]"]
+        elif key == "cdc_offset":
+            lines.append(f"{key} = {value:#06x}")
+        else:
+            lines.append(f"{key} = {_value(value)}")
+    return lines
+
+
+def _changed(table: Struct) -> dict[str, Any]:
+    """Return the entries of a table that are required or differ from their defaults."""
+    changed = {}
+    for entry in msgspec.structs.fields(table):
+        value = getattr(table, entry.name)
+        default = entry.default
+        if entry.default_factory is not msgspec.NODEFAULT:
+            default = entry.default_factory()
+        if value is not None and (default is msgspec.NODEFAULT or value != default):
+            changed[entry.name] = value
+    return changed
+
+
+def _inline(entries: dict[str, Any]) -> str:
+    inner = ", ".join(f"{key} = {_value(value)}" for key, value in entries.items())
+    return f"{{ {inner} }}" if inner else "{}"
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, str):
+        # A JSON string is a valid TOML basic string, except for DEL.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, dict):
+        return _inline({_value(key): inner for key, inner in value.items()})
+    return f"[{', '.join(_value(inner) for inner in value)}]"
+
+
+def import_boards(files: list[Path], base: Settings | None, findings: Findings) -> Settings:
+    """Read skinSpec (or device) files; each gives a part, and a bus for each of its patches.
+
+    Args:
+        files: the XML files.
+        base: a configuration to add to, or None.
+        findings: receives the remarks.
+
+    Raises:
+        ConfigurationError: a file cannot be read or describes no board.
+    """
+    base = base or Settings(robot="", buses={}, boards={}, parts={})
+    buses, boards, parts = dict(base.buses), dict(base.boards), dict(base.parts)
+    robot = base.robot
+    for file in files:
+        device = read_device(file, findings)
+        robot = robot or _robot(device)
+        if not device.patches:
+            raise ConfigurationError(
+                f"{file}: no triangle of any board is on in it; import the device file that "
+                "includes it, which names the CAN addresses, or add sets of triangles"
+            )
+        if device.name in parts:
+            raise ConfigurationError(f'{file}: a part of this name exists: "{device.name}"')
+        patches = []
+        for number, specs in device.patches.items():
+            bus = device.name if len(device.patches) == 1 else f"{device.name}_{number}"
+            buses[bus] = Bus(channel=f"can{len(buses)}")
+            findings.assumed(
+                file, 0, f'patch {number} is the bus "{bus}" on channel {buses[bus].channel}'
+            )
+            for spec in specs:
+                name = f"{bus}_{spec.address}"
+                boards[name] = Board(
+                    bus=bus,
+                    address=spec.address,
+                    period_ms=spec.period_ms,
+                    skin_type=spec.skin_type,  # type: ignore[arg-type]  # read as one of them
+                    no_load=spec.no_load,
+                )
+                patches += _patches(name, spec)
+        parts[device.name] = Part(patches=patches)
+        kinds = sorted({patch.kind for patch in patches})
+        findings.assumed(
+            file,
+            0,
+            f"triangles are of the kind {' and '.join(kinds)}, by the type of their boards, and "
+            "lie side by side; `skin import skingui` brings kinds and places",
+        )
+    findings.assumed(files[0], 0, "boards are of the model mtb4")
+    return msgspec.structs.replace(
+        base, robot=robot or "robot", buses=buses, boards=boards, parts=parts
+    )
+
+
+def _robot(device: Device) -> str:
+    text = "".join(c if c.isascii() and c.isalnum() else "-" for c in device.robot.lower())
+    return text.strip("-")[:64]
+
+
+def _patches(board: str, spec: BoardSpec) -> list[Patch]:
+    """Return patches of consecutive triangles that have the same set-up."""
+    kind = "triangle_10pad" if spec.skin_type in TEN_PAD_TYPES else "triangle"
+    ordered = sorted(spec.triangles.items())
+    patches = []
+    for (shift, offset), group in groupby(ordered, key=lambda item: item[1]):
+        numbers = [number for number, _ in group]
+        patches.append(
+            Patch(
+                board=board,
+                triangles=format_triangles(numbers),
+                kind=kind,
+                shift=shift,
+                cdc_offset=offset,
+            )
+        )
+    return patches
+
+
+def import_files(
+    source: Source,
+    files: list[Path],
+    output: Path,
+    findings: Findings,
+    *,
+    config: Path | None = None,
+    part: str | None = None,
+) -> list[Path]:
+    """Turn files of the iCub software into the configuration `output`.
+
+    Args:
+        source: the kind of files.
+        files: at least one.
+        output: the configuration to write; the positions files of `robot.toml` go to the folder
+            `robot-positions` beside it.
+        findings: receives every remark, also those made before an error.
+        config: a configuration to add to; may be `output` itself. Its comments are lost.
+        part: the part that a positions file describes.
+
+    Returns:
+        The files written; nothing is written if anything is wrong.
+
+    Raises:
+        ConfigurationError: a file cannot be read, or the result is not a valid configuration.
+    """
+    folder = output.parent
+    base = None
+    if config is not None:
+        base = configuration.load(config)
+        # Paths of positions files are relative to the configuration's folder, which may be another
+        # one here.
+        base = _with_positions(base, lambda name: os.path.relpath(config.parent / name, folder))
+    written: dict[str, bytes] = {}
+    if source == "skinspec":
+        settings = import_boards(files, base, findings)
+    elif source == "skingui":
+        settings = import_places(files, base, findings)
+    elif source == "positions":
+        settings, written = import_positions(
+            files, base, part, f"{output.stem}-positions", findings
+        )
+    else:
+        settings = import_manager(files, base, findings)
+    names = ", ".join(file.name for file in files)
+    text = configuration_text(settings, f"Imported from {names} by `skin import {source}`.")
+    _check(text, written, output)
+    for name, data in written.items():
+        write_atomic(folder / name, data)
+    write_atomic(output, text.encode())
+    return [output, *(folder / name for name in written)]
+
+
+def _with_positions(settings: Settings, renamed: Callable[[str], str]) -> Settings:
+    """Return the same settings with renamed positions files."""
+
+    def changed(patch: Patch) -> Patch:
+        if patch.positions is None:
+            return patch
+        return msgspec.structs.replace(patch, positions=renamed(patch.positions))
+
+    parts = {
+        name: msgspec.structs.replace(part, patches=[changed(patch) for patch in part.patches])
+        for name, part in settings.parts.items()
+    }
+    return msgspec.structs.replace(settings, parts=parts)
+
+
+def _check(text: str, written: dict[str, bytes], output: Path) -> None:
+    """Read the new configuration back in a temporary folder before it is written.
+
+    Raises:
+        ConfigurationError: it is not a valid configuration.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        trial = Path(folder) / output.name
+        for name, data in {**written, output.name: text.encode()}.items():
+            write_atomic(trial.parent / name, data)
+
+        def where_it_is(name: str) -> str:
+            return name if name in written else str((output.parent / name).resolve())
+
+        try:
+            settings = _with_positions(configuration.load(trial), where_it_is)
+            build_layout(settings, trial.parent)
+        except ConfigurationError as error:
+            what = str(error).removeprefix(f"{trial}: ")
+            raise ConfigurationError(
+                f"{output}: the files do not give a valid configuration: {what}"
+            ) from None

@@ -13,7 +13,7 @@ from skin_host.bus.port import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import Settings, skin_hash
 from skin_host.errors import BusError, LogError
-from skin_host.fingertip.publishing import FingertipPublisher
+from skin_host.fingertip.service import FingertipPublisher
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import connect
 from skin_host.mqtt.contact import PartContact

@@ -18,7 +18,7 @@ from skin_host.config.settings import Bus, TouchSettings, changed
 from skin_host.daemon import metrics, service
 from skin_host.daemon.state import NodeState, Thresholds, load_state, save_state
 from skin_host.health import LINE_S, FaultLog
-from skin_host.importing.run import configuration_text
+from skin_host.importing import configuration_text
 from skin_host.recording.capture import FrameRecorder, candump_lines
 from tests.support.fault_bench import FaultBench
 from tests.support.live import living

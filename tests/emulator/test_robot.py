@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from smbus2 import i2c_msg
 
-from emulator.boards.mtb import triangle_set_ups
 from emulator.clock import SteppedClock
 from emulator.probes import scene as scenes
 from emulator.probes.scene import Place, Probe, Scene
 from emulator.robot import Robot
 from skin_host.bus.answers import Discovered, parse_answer
+from skin_host.bus.board import configuration
 from skin_host.bus.commands import (
     Discover,
     SetBoardConfig,
@@ -210,7 +210,7 @@ async def test_boards_whose_computer_was_busy_get_their_commands_one_after_the_o
         await clock.advance(0.01)
         # The first command 50 takes its zero before the chips have converted, the second after.
         board = layout.boards[0]
-        set_ups = triangle_set_ups(layout, 0)
+        _, *set_ups = configuration(board, [one for one in layout.triangles if one.board == 0])
         start = [SetTxMode(TxMode.START)]
         for message in [SetBoardConfig(0, 50, 240), *set_ups, *set_ups, *start]:
             can_id, data = command_frame(message, board.settings.address)

@@ -7,7 +7,7 @@ import pytest
 
 from skin_host.bus.wire import TAXELS, TRIANGLES
 from skin_host.evaluation.body_stream import Body
-from skin_host.evaluation.instruments import RoomClock, _room_of
+from skin_host.evaluation.measured_daemon import RoomClock, _room_of
 from skin_host.layout import build_layout
 from skin_host.processing import curves
 

@@ -18,10 +18,10 @@ from emulator.robot import Robot
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import changed, load
 from skin_host.daemon import metrics
-from skin_host.fingertip.boards import StrainBoards
 from skin_host.fingertip.engine import FingertipEngine
 from skin_host.fingertip.events import FingertipEvent
 from skin_host.fingertip.health import FingertipHealth, FingertipRecord
+from skin_host.fingertip.service import StrainBoards
 from skin_host.layout import build_layout
 from skin_host.mqtt import messages
 from skin_host.processing.calibration import Zero

@@ -13,8 +13,8 @@ from emulator.robot import Robot
 from skin_host.config import check
 from skin_host.config.settings import PlaceSettings, Settings, changed, load, parse_triangles
 from skin_host.errors import ConfigurationError
+from skin_host.importing import configuration_text, import_files
 from skin_host.importing.report import Findings
-from skin_host.importing.run import configuration_text, import_files
 from skin_host.layout import Layout, build_layout, builtin_kinds
 from skin_host.layout.geometry import lay
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from skin_host.config.settings import Bus, changed, load
+from skin_host.importing import configuration_text, import_files
 from skin_host.importing.report import Findings
-from skin_host.importing.run import configuration_text, import_files
 from skin_host.recording.mcap import read_messages_of
 from tests.support.broker import Mosquitto
 from tests.support.devtools import Page
