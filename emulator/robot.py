@@ -99,7 +99,8 @@ class Robot:
         for chip in np.flatnonzero(held.any(axis=1)).tolist():
             self.converters.hold_results(chip, held[chip])
         self._skin_due_ns = 0
-        self._felt_taxels = self._felt_chips = np.zeros(0, np.intp)
+        self._felt_taxels = np.zeros(0, np.intp)
+        self._gather(self._felt_taxels)
         chips = np.arange(len(layout.triangles))
         self.converters.set_capacitance_ff(chips, self.skin.capacitance_ff.reshape(-1, TAXELS))
         rng = np.random.default_rng([scene.seed, 3])
@@ -169,11 +170,10 @@ class Robot:
 
     def _look_ahead(self) -> None:
         """Find out when the next board is due; after anything that may have changed it."""
-        due_ns = [
-            due
-            for number, due in enumerate(board.due_ns for board in self._boards)
-            if due is not None and number not in self.hung
-        ]
+        self._due_ns = [board.due_ns for board in self._boards]
+        for number in self.hung:
+            self._due_ns[number] = None
+        due_ns = [due for due in self._due_ns if due is not None]
         self._boards_due_ns = _next_tick_ns(min(due_ns)) if due_ns else NEVER_NS
         self._tips_due_ns = self.fingertips.due_ns
 
@@ -187,24 +187,32 @@ class Robot:
         self._skin_due_ns = self.skin.due_ns
         if taxels is not self._felt_taxels:
             self._felt_taxels = taxels
-            self._felt_chips = np.unique(self.layout.triangle_of[taxels]).astype(np.intp)
+            chips = np.unique(self.layout.triangle_of[taxels]).astype(np.intp)
+            if not np.array_equal(chips, self._felt_chips):
+                self._gather(chips)
         if len(taxels):
-            self._pass_on(self._felt_chips)
+            self._pass_on()
 
-    def _pass_on(self, chips: Ints) -> None:
+    def _gather(self, chips: Ints) -> None:
+        """Get ready to set what the pads of chips measure."""
+        self._felt_chips = chips
+        self._held_ff = self.skin.held_ff.reshape(-1, TAXELS)[chips]
+        self._is_held = ~np.isnan(self._held_ff)
+
+    def _pass_on(self) -> None:
         """Set what the pads of chips measure."""
-        values = self.skin.capacitance_ff.reshape(-1, TAXELS)[chips]
-        held = self.skin.held_ff.reshape(-1, TAXELS)[chips]
-        self.converters.set_capacitance_ff(chips, np.where(np.isnan(held), values, held))
+        values = self.skin.capacitance_ff.reshape(-1, TAXELS)[self._felt_chips]
+        np.copyto(values, self._held_ff, where=self._is_held)
+        self.converters.set_capacitance_ff(self._felt_chips, values)
 
     def _sample(self) -> None:
         """Let every board that is due read its chips and send."""
         together: dict[object, list[int]] = {}
         for number in self._in_bus_order:
-            board = self._boards[number]
-            due_ns = board.due_ns
-            if due_ns is None or _next_tick_ns(due_ns) > self.t_ns or number in self.hung:
+            due_ns = self._due_ns[number]
+            if due_ns is None or _next_tick_ns(due_ns) > self.t_ns:
                 continue
+            board = self._boards[number]
             bus = self._bus_of[number]
             if board.advance(self.t_ns):
                 if board.next_ns is not None:
@@ -325,7 +333,11 @@ class Robot:
 
     def pass_on(self, taxels: slice) -> None:
         """Set what the chips of some taxels measure, at once."""
-        self._pass_on(np.unique(self.layout.triangle_of[taxels]).astype(np.intp))
+        self._gather(np.unique(self.layout.triangle_of[taxels]).astype(np.intp))
+        self._pass_on()
+        # What is held now may be felt too.
+        self._felt_taxels = np.zeros(0, np.intp)
+        self._gather(self._felt_taxels)
 
     def work_out_now(self) -> None:
         """Something changed that the mechanics must take up at once."""

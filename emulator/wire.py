@@ -5,6 +5,7 @@ drops its whole stack and reports that.
 """
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,19 +83,23 @@ class Wire:
 
     def _pass(self, t_ns: int) -> FrameBatch:
         waiting = self._waiting
-        if (waiting.t_ns == waiting.t_ns[0]).all():
-            sent, self._waiting = self._transmit(waiting, int(waiting.t_ns[0]), t_ns)
-            return sent
+        if not waiting.rising:
+            waiting = _rows(waiting, np.argsort(waiting.t_ns, kind="stable"))
+        times_ns = waiting.t_ns
+        turns = np.flatnonzero(times_ns[1:] != times_ns[:-1]) + 1
         done: list[FrameBatch] = []
-        later = _rows(waiting, waiting.t_ns > t_ns)
-        backlog = FrameBatch.of([])
-        ready_times = np.unique(waiting.t_ns[waiting.t_ns <= t_ns]).tolist()
-        for ready_ns, next_ns in zip(ready_times, [*ready_times[1:], t_ns], strict=True):
-            backlog = self._admit(backlog, _rows(waiting, waiting.t_ns == ready_ns))
+        backlog, first = FrameBatch.of([]), 0
+        for start, stop in pairwise([0, *turns.tolist(), len(waiting)]):
+            ready_ns = int(times_ns[start])
+            if ready_ns > t_ns:
+                break
+            next_ns = min(t_ns, int(times_ns[stop])) if stop < len(waiting) else t_ns
+            backlog = self._admit(backlog, _rows(waiting, slice(start, stop)))
             sent, backlog = self._transmit(backlog, ready_ns, next_ns)
             done.append(sent)
+            first = stop
         # What waits still was ready before; it keeps its place in line.
-        self._waiting = join([backlog, later])
+        self._waiting = join([backlog, _rows(waiting, slice(first, None))])
         return join(done) if done else FrameBatch.of([])
 
     def _spoil(self, sent: FrameBatch) -> FrameBatch:

@@ -180,6 +180,9 @@ class Mtb(ABC):
 
 def join(batches: Sequence[FrameBatch]) -> FrameBatch:
     """Batches one after the other as one."""
+    batches = [batch for batch in batches if len(batch)] or batches[:1]
+    if len(batches) == 1:
+        return batches[0]
     return FrameBatch(
         np.concatenate([batch.id for batch in batches]),
         np.concatenate([batch.dlc for batch in batches]),

@@ -225,6 +225,7 @@ class FoamLayer:
         self._footprint = Footprint.empty()
         self._drive = Drive.by_force([])
         self._a = self._b = self._unit = np.zeros(0)
+        self._is_moved = False
         #: Strains of the last step, and of the two before it.
         self._strain = np.zeros(0)
         self._strains_before = self._strain, self._strain
@@ -279,8 +280,12 @@ class FoamLayer:
         p is the mean pressure under the contact. It is convex in x, so the steps overshoot at
         most once and then come down to the root.
         """
-        contact, weight, n_contacts = self._footprint.contact, self._footprint.weight, len(self._a)
-        a, b, law = self._a, self._b, self._law
+        contact, weight, n_contacts = (
+            self._footprint.contact,
+            self._footprint.weight,
+            len(self._unit),
+        )
+        law = self._law
         d = np.maximum(drive.value / self._unit, 0.0)
         if len(self._between):
             bare = np.flatnonzero(~self._bears & ~drive.is_depth)
@@ -296,7 +301,11 @@ class FoamLayer:
             bearing = np.where(over > 0, weight, 0.0)
             mean = np.bincount(contact, bearing * over, n_contacts)
             mean_slope = np.bincount(contact, bearing * slope, n_contacts)
-            newton = (a * strain + b * mean - d) / np.maximum(a + b * mean_slope, 1e-9)
+            gap, gap_slope = mean - d, np.maximum(mean_slope, 1e-9)
+            if self._is_moved:
+                gap = self._a * strain + self._b * mean - d
+                gap_slope = np.maximum(self._a + self._b * mean_slope, 1e-9)
+            newton = gap / gap_slope
             # Half way to the pole at most, so that no step jumps over it.
             nearest = 0.5 * (strain + POLE_STRAIN)
             last, strain = strain, np.minimum(np.maximum(strain - newton, 0.0), nearest)
@@ -381,6 +390,7 @@ class FoamLayer:
     def _set_drive(self, drive: Drive) -> None:
         """What `_press` has to solve, but for the present value of the drive."""
         forced = ~drive.is_depth & self._bears
+        self._is_moved = not forced.all()
         softness = drive.compliance_mm_per_n * self._bears_n_per_kpa / self._thickness_mm
         self._a = np.where(forced, 0.0, 1.0)
         self._b = np.where(forced, 1.0, np.where(self._bears, softness, 0.0))

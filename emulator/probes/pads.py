@@ -290,15 +290,20 @@ class Pads:
             grounded: whether each contact's object is grounded, one value or [c]. It only
                 matters where the conductive cover is off.
         """
+        rise_ff = self.row_rise_ff(felt, footprint, grounded)
+        return np.asarray(np.bincount(felt.taxel, rise_ff, len(self)), np.float64)
+
+    def row_rise_ff(self, felt: Felt, footprint: Footprint, grounded: ArrayLike = False) -> Floats:
+        """As `rise_ff`, what each row of `felt` adds to its pad, float64[k]."""
         under = felt.covered * self.c0_ff[felt.taxel]
-        rise = under * felt.strain / (1 - felt.strain)
+        rise: Floats = under * felt.strain / (1 - felt.strain)
         if not self._is_covered:
             is_grounded = np.zeros(len(felt.taxel), bool)
             contacts = np.broadcast_to(grounded, len(footprint.area_mm2))
             is_grounded[: len(footprint.taxel)] = contacts[footprint.contact]
             bare = np.where(is_grounded, under / (1 - felt.strain), 0.0)
             rise = np.where(self.cover[felt.taxel], rise, bare)
-        return np.asarray(np.bincount(felt.taxel, rise, len(self)), np.float64)
+        return rise
 
 
 def draw_resting_ff(n: int, rng: np.random.Generator) -> Floats:
@@ -320,6 +325,9 @@ class Jumps:
     Args:
         at_kpa: float64[n], where each pad jumps; infinite for one that does not.
         by_ff: float64[n], how far.
+
+    Attributes:
+        can: bool[n], whether a pad jumps at any pressure.
     """
 
     #: Share of the pressure where a pad jumped at which it comes back.
@@ -329,7 +337,7 @@ class Jumps:
         self._at_kpa = at_kpa
         self._by_ff = by_ff
         self._jumped = np.zeros(len(at_kpa), bool)
-        self.any = bool(np.isfinite(at_kpa).any())
+        self.can = np.isfinite(at_kpa)
 
     @classmethod
     def drawn(cls, n: int, per_triangle: int, rng: np.random.Generator) -> "Jumps":

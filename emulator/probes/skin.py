@@ -104,7 +104,9 @@ class Skin:
         self._times_s = [t_s for t_s, _ in scene.temperature.keyframes_c]
         self._degrees_c = [c for _, c in scene.temperature.keyframes_c]
         self._shift_c = 0.0
-        self._none = self._touched = self._felt = np.zeros(0, np.intp)
+        self._none = self._touched = self._felt = self._jumping = np.zeros(0, np.intp)
+        self._is_left = False
+        self._set_untouched()
         self._all = np.arange(n)
         self._covered = np.zeros(n)
         self.capacitance_ff = self.resting_ff.copy()
@@ -289,6 +291,7 @@ class Skin:
             return False
         self.capacitance_ff += self._ff_per_c * (shift_c - self._shift_c)
         self._shift_c = shift_c
+        self._set_untouched()
         return True
 
     def _press(self, moment: Moment, dt_s: float) -> Ints:
@@ -299,21 +302,40 @@ class Skin:
             self._place(moment, same=same)
         drive = Drive(moment.drive, self._by_depth_now, self._compliance_now)
         felt = self._foam.step(self._footprint, drive, dt_s)
-        rise_ff = self._pads.rise_ff(felt, self._footprint, self._grounded[number])
-        if felt.taxel is not self._felt and not np.array_equal(felt.taxel, self._felt):
-            self._touched = np.union1d(felt.taxel, self._felt)
-            self._felt = felt.taxel
-        elif len(self._touched) > len(self._felt):
-            self._touched = np.unique(self._felt)
+        if felt.taxel is not self._felt or self._is_left:
+            self._touch(felt.taxel)
         touched = self._touched
-        self._idle = len(felt.taxel) == 0
-        drifted_ff = self._ff_per_c[touched] * self._shift_c
-        rise_ff = rise_ff[touched]
-        if self._jumps.any:
-            pressure_kpa = self._foam.pressure_kpa[touched] * self._covered[touched]
-            rise_ff += self._jumps.step_ff(touched, pressure_kpa)
-        self.capacitance_ff[touched] = self.resting_ff[touched] + rise_ff + drifted_ff
+        rise_ff = self._pads.row_rise_ff(felt, self._footprint, self._grounded[number])
+        if touched is not felt.taxel:
+            of_pad_ff = np.bincount(felt.taxel, rise_ff, self._layout.n_taxels)
+            rise_ff = of_pad_ff[touched].astype(np.float64, copy=False)
+        if len(self._jumping):
+            pads = touched[self._jumping]
+            pressure_kpa = self._foam.pressure_kpa[pads] * self._covered[pads]
+            rise_ff[self._jumping] += self._jumps.step_ff(pads, pressure_kpa)
+        self.capacitance_ff[touched] = self._untouched_ff + rise_ff
         return touched
+
+    def _touch(self, felt: Ints) -> None:
+        """Take over which pads are felt; those that were felt until now change once more."""
+        before, self._felt = self._felt, felt
+        self._idle = len(felt) == 0
+        touched = np.unique(felt)
+        is_twice = len(touched) < len(felt)
+        left = np.setdiff1d(before, touched)
+        self._is_left = len(left) > 0
+        if self._is_left:
+            touched = np.concatenate([touched, left])
+        elif not is_twice:
+            touched = felt
+        self._touched = touched
+        self._jumping = np.flatnonzero(self._jumps.can[self._touched])
+        self._set_untouched()
+
+    def _set_untouched(self) -> None:
+        """What the touched pads would measure untouched."""
+        pads = self._touched
+        self._untouched_ff = self.resting_ff[pads] + self._ff_per_c[pads] * self._shift_c
 
     def _place(self, moment: Moment, *, same: bool) -> None:
         """Find out what the probes cover, when some came, went or slid."""
