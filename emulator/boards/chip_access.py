@@ -98,6 +98,12 @@ def _set_up_messages(stages: StageMap, cdc_offset: int, power_control: int) -> l
     ]
 
 
+def _places(slots: Iterable[int], n_lines: int) -> list[tuple[int, int]]:
+    """Line and address of each slot; a board of four lines has none at the last four."""
+    places = [divmod(slot, CHIPS_PER_LINE) for slot in slots]
+    return [(line, ADDRESSES[index]) for line, index in places if line < n_lines]
+
+
 class I2cChips:
     """Chips behind smbus2 buses, one per data line: emulated ones, or /dev/i2c-N.
 
@@ -119,13 +125,10 @@ class I2cChips:
     ) -> None:
         """Write the set-up burst by burst."""
         messages = _set_up_messages(stages, cdc_offset, power_control)
-        for slot in slots:
-            line, index = divmod(slot, CHIPS_PER_LINE)
-            if line >= len(self._lines):
-                continue
+        for line, address in _places(slots, len(self._lines)):
             for message in messages:
                 try:
-                    self._lines[line].i2c_rdwr(i2c_msg.write(ADDRESSES[index], message))
+                    self._lines[line].i2c_rdwr(i2c_msg.write(address, message))
                 except OSError:
                     break
 
@@ -162,13 +165,10 @@ class BangedChips:
     ) -> None:
         """Write the set-up burst by burst, a line at a time."""
         messages = _set_up_messages(stages, cdc_offset, power_control)
-        for slot in slots:
-            line, index = divmod(slot, CHIPS_PER_LINE)
-            if line >= len(self._wire.lines):
-                continue
+        for line, address in _places(slots, len(self._wire.lines)):
             master = BitMaster(self._wire, 1 << line)
             for message in messages:
-                _send(master, ADDRESSES[index], message)
+                _send(master, address, message)
                 master.stop()
 
     def read(self, without: int = 0) -> Words:

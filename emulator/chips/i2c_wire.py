@@ -338,11 +338,6 @@ class I2cWire:
         return faulty
 
     @property
-    def scl(self) -> bool:
-        """Level of the clock: low if the master or a chip holds it low."""
-        return self._clock
-
-    @property
     def sda(self) -> int:
         """Levels of the data lines; while the clock is high, those that were sampled."""
         levels = 0

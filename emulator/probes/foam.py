@@ -299,13 +299,11 @@ class FoamLayer:
             value, slope = law.elastic_kpa_and_slope(strain[contact])
             over = value - imprint
             bearing = np.where(over > 0, weight, 0.0)
-            mean = np.bincount(contact, bearing * over, n_contacts)
-            mean_slope = np.bincount(contact, bearing * slope, n_contacts)
-            gap, gap_slope = mean - d, np.maximum(mean_slope, 1e-9)
+            mean = np.asarray(np.bincount(contact, bearing * over, n_contacts), np.float64)
+            rise = np.asarray(np.bincount(contact, bearing * slope, n_contacts), np.float64)
             if self._is_moved:
-                gap = self._a * strain + self._b * mean - d
-                gap_slope = np.maximum(self._a + self._b * mean_slope, 1e-9)
-            newton = gap / gap_slope
+                mean, rise = self._a * strain + self._b * mean, self._a + self._b * rise
+            newton = (mean - d) / np.maximum(rise, 1e-9)
             # Half way to the pole at most, so that no step jumps over it.
             nearest = 0.5 * (strain + POLE_STRAIN)
             last, strain = strain, np.minimum(np.maximum(strain - newton, 0.0), nearest)
