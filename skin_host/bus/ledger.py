@@ -79,6 +79,7 @@ class BoardLedger:
         self._enabled = [board.enabled for _, board in boards]
 
         self.received_ns = np.zeros(n, np.int64)
+        self._none_silent_until_ns = -1
         self.last: list[Sweep | None] = [None] * n
         self.sweeps = np.zeros(n, np.int64)
         self.present = np.zeros((n, TRIANGLES), np.bool_)
@@ -144,6 +145,15 @@ class BoardLedger:
     def complete(self, row: int) -> bool:
         """Whether the last sweep had every enabled triangle."""
         return self._complete[row]
+
+    @property
+    def any_silent(self) -> bool:
+        """Whether any board has timed out."""
+        if self.now_ns <= self._none_silent_until_ns:
+            return False
+        # Boards that send meanwhile only move this further away.
+        self._none_silent_until_ns = int((self.received_ns + self._silent_after_ns).min())
+        return self.now_ns > self._none_silent_until_ns
 
     @property
     def silent(self) -> Mask:

@@ -133,7 +133,10 @@ class Intake:
                 state.pending = True
             del state.waits[board]
             state.last_ns = max(state.last_ns, t_ns)
-            if not state.waits or all(map(self._ledger.is_silent, state.waits.values())):
+            if not state.waits or (
+                self._ledger.any_silent
+                and all(map(self._ledger.is_silent, state.waits.values()))
+            ):
                 samples.append(self._sample(state))
         return samples
 
@@ -152,7 +155,7 @@ class Intake:
                 continue
             if state.reported_ns >= 0 and ledger.now_ns - state.reported_ns < SILENCE_REPEAT_NS:
                 continue
-            if not all(map(ledger.is_silent, state.rows.values())):
+            if not (ledger.any_silent and all(map(ledger.is_silent, state.rows.values()))):
                 continue
             # The first sample of silence has the time at which the wait ended, because late frames
             # may still be newer.

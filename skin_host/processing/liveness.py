@@ -141,6 +141,8 @@ class Liveness:
         # Before the calibration it is not known how much noise is too much.
         jump = np.maximum(NOISY_UNITS, NOISY_SIGMAS * noise_units)
         self._jump = jump if calibrated else np.full(shape, np.inf)
+        #: Steps are whole units.
+        self._jump_units = np.minimum(np.floor(self._jump), 256.0).astype(np.int16)
         self._spike = np.maximum(SPIKE_UNITS, SPIKE_SIGMAS * noise_units)
         constant = ~np.any(noise_units > 0.0, axis=1)
 
@@ -150,7 +152,7 @@ class Liveness:
         self._jumping = np.zeros(shape)
         self._any_jumping = False
         self._surprise = np.zeros(k)
-        self._changes = np.zeros(shape, np.int64)
+        self._changes = np.zeros(shape, np.int16)
         self._alive = np.zeros(k, np.int64)
         self._samples = np.zeros(k, np.int64)
         self._to_show = np.where(constant, PROBATION_CHANGES, 0)
@@ -190,20 +192,27 @@ class Liveness:
                 present.
         """
         compared = present & self._present
-        changed = (raw != self._raw) & compared[:, None]
-        self._note_jumps(raw, changed, compared)
-        self._note_triangles(raw, changed, compared, erring, touched)
+        #: Usually every triangle came, now and before.
+        whole = b"\0" not in compared.tobytes()
+        changed = raw != self._raw
+        if not whole:
+            changed &= compared[:, None]
+        self._note_jumps(raw, changed, compared, whole)
+        calm = None if touched is None else self._calm(touched)
+        self._note_triangles(raw, changed, compared, erring, touched, calm)
         self._pads.step(raw, changed, compared, self.unproven, touched, came)
-        np.copyto(self._raw, raw, where=present[:, None])
+        if whole:
+            self._raw[:] = raw
+        else:
+            np.copyto(self._raw, raw, where=present[:, None])
         if came is None:
-            self._present = present.copy()
+            self._present[:] = present
         else:
             np.copyto(self._present, present, where=np.repeat(came, len(present) // len(came)))
-        if touched is None:
+        if calm is None:
             self._samples += compared
             self._changes += changed
         else:
-            calm = self._calm(touched)
             self._samples += compared & calm
             self._changes += changed & calm[:, None]
         if int(self._samples.max()) >= RATE_SAMPLES:
@@ -248,9 +257,10 @@ class Liveness:
         compared: Mask,
         erring: Mask,
         touched: Mask | None,
+        calm: Mask | None,
     ) -> None:
-        alive = changed.any(axis=1)
-        self._alive += alive if touched is None else alive & self._calm(touched)
+        alive = np.logical_or.reduce(changed, axis=1)
+        self._alive += alive if calm is None else alive & calm
         all_alive = alive.tobytes() == compared.tobytes()
         if all_alive and not self._any_to_show and not any_of(erring):
             self._surprise[compared] = 0.0
@@ -277,14 +287,21 @@ class Liveness:
         self.frozen = (too_long | self.frozen) & self.unproven & ~erring
         self.silenced = (self.silenced | erring) & self.unproven
 
-    def _note_jumps(self, raw: NDArray[np.uint8], changed: Mask, compared: Mask) -> None:
+    def _note_jumps(
+        self, raw: NDArray[np.uint8], changed: Mask, compared: Mask, whole: bool
+    ) -> None:
         """A step up followed by a step down is noise; a touch goes in one direction at a time."""
-        step = np.where(changed, np.subtract(raw, self._raw, dtype=np.int16), np.int16(0))
-        far = np.abs(step) > self._jump
+        step = np.subtract(raw, self._raw, dtype=np.int16)
+        if not whole:
+            step *= changed
+        far = np.abs(step) > self._jump_units
         if not self._any_jumping and not any_of(far):
-            np.copyto(self._step, step, where=compared[:, None])
+            if whole:
+                self._step = step
+            else:
+                np.copyto(self._step, step, where=compared[:, None])
             return
-        jump = far & (np.abs(self._step) > self._jump) & ((step ^ self._step) < 0)
+        jump = far & (np.abs(self._step) > self._jump_units) & ((step ^ self._step) < 0)
         size = np.minimum(np.abs(step), np.abs(self._step))
         spike = jump & (size > self._spike)
         alone = np.count_nonzero(spike & (self._jumping < LATELY_MEAN), axis=1) == 1

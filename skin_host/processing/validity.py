@@ -147,7 +147,9 @@ class Validity:
         """Judge which chips live if every board that has not timed out has sent since."""
         n = len(self._waiting)
         if self._n_waiting == n or (
-            self._n_waiting and (self._waiting | self._ledger.silent).all()
+            self._n_waiting
+            and self._ledger.any_silent
+            and (self._waiting | self._ledger.silent).all()
         ):
             self.judge()
 
