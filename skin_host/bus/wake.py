@@ -75,7 +75,7 @@ class Plan:
             [look_ns[board] for board in boards if board in look_ns] for boards in self._missing()
         ]
         # With the last but one, what came before it is worked off and does not delay the last.
-        sample_ns = min((sorted(ends)[-2:][0] for ends in ends_ns if ends), default=None)
+        sample_ns = min((max(ends) for ends in ends_ns if ends), default=None)
         if sample_ns is None:
             return now_ns + self._poll_ns
         if len(look_ns) < len(self._periods_ns):
