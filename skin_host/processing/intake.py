@@ -134,8 +134,7 @@ class Intake:
             del state.waits[board]
             state.last_ns = max(state.last_ns, t_ns)
             if not state.waits or (
-                self._ledger.any_silent
-                and all(map(self._ledger.is_silent, state.waits.values()))
+                self._ledger.any_silent and all(map(self._ledger.is_silent, state.waits.values()))
             ):
                 samples.append(self._sample(state))
         return samples

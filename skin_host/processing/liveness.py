@@ -35,6 +35,7 @@ from skin_host.processing.stuck import (
     TOUCHED_PACE,
     Encoding,
     Repeats,
+    Felt,
     Rows,
     StuckPads,
     inside,
@@ -151,6 +152,7 @@ class Liveness:
         self._step = np.zeros(shape, np.int16)
         self._jumping = np.zeros(shape)
         self._any_jumping = False
+        self._felt: Felt | None = None
         self._surprise = np.zeros(k)
         self._changes = np.zeros(shape, np.int16)
         self._alive = np.zeros(k, np.int64)
@@ -198,9 +200,12 @@ class Liveness:
         if not whole:
             changed &= compared[:, None]
         self._note_jumps(raw, changed, compared, whole)
-        calm = None if touched is None else self._calm(touched)
-        self._note_triangles(raw, changed, compared, erring, touched, calm)
-        self._pads.step(raw, changed, compared, self.unproven, touched, came)
+        felt = None if touched is None else self._what_is_felt(touched)
+        self._note_triangles(raw, changed, compared, erring, felt)
+        within = inside(raw)
+        if not whole:
+            within &= compared[:, None]
+        self._pads.step(raw, changed, within, self.unproven, felt, came)
         if whole:
             self._raw[:] = raw
         else:
@@ -209,13 +214,13 @@ class Liveness:
             self._present[:] = present
         else:
             np.copyto(self._present, present, where=np.repeat(came, len(present) // len(came)))
-        if calm is None:
+        if felt is None:
             self._samples += compared
             self._changes += changed
         else:
-            self._samples += compared & calm
-            self._changes += changed & calm[:, None]
-        if int(self._samples.max()) >= RATE_SAMPLES:
+            self._samples += compared & felt.calm
+            self._changes += changed & felt.calm_pads
+        if int(np.maximum.reduce(self._samples)) >= RATE_SAMPLES:
             self._learn()
         self._doubt()
 
@@ -241,10 +246,12 @@ class Liveness:
         self._pads.any_stuck = any_of(self._pads.stuck)
         self._doubt()
 
-    def _calm(self, touched: Mask) -> Mask:
-        """Return triangles bool[k] of boards on which nothing is touched."""
-        felt = touched.reshape(self._boards, -1).any(axis=1)
-        return np.repeat(~felt, len(touched) // self._boards)
+    def _what_is_felt(self, touched: Mask) -> Felt:
+        """Return the consequences of which pads are touched; mostly those of the last sweep."""
+        key = touched.tobytes()
+        if self._felt is None or self._felt.key != key:
+            self._felt = Felt.of(touched, key, self._boards)
+        return self._felt
 
     def _doubt(self) -> None:
         doubts = self._any_to_show or self._pads.any_stuck or any_of(self.noisy)
@@ -256,11 +263,10 @@ class Liveness:
         changed: Mask,
         compared: Mask,
         erring: Mask,
-        touched: Mask | None,
-        calm: Mask | None,
+        felt: Felt | None,
     ) -> None:
         alive = np.logical_or.reduce(changed, axis=1)
-        self._alive += alive if calm is None else alive & calm
+        self._alive += alive if felt is None else alive & felt.calm
         all_alive = alive.tobytes() == compared.tobytes()
         if all_alive and not self._any_to_show and not any_of(erring):
             self._surprise[compared] = 0.0
@@ -271,11 +277,8 @@ class Liveness:
             # A pad at an end of the scale cannot change, even if it works.
             most = (self._pad_expected * movable).sum(axis=1)
             expected = np.where(movable.any(axis=1), np.minimum(expected, most), 0.0)
-        if touched is not None:
-            # A chip that died can look touched itself; only a touch on other triangles counts.
-            felt = np.count_nonzero(touched, axis=1).reshape(self._boards, -1)
-            elsewhere = (felt.sum(axis=1, keepdims=True) > felt).ravel()
-            expected = np.where(elsewhere, expected / TOUCHED_PACE, expected)
+        if felt is not None:
+            expected = np.where(felt.elsewhere, expected / TOUCHED_PACE, expected)
         self._surprise += np.where(compared, expected, 0.0)
         self._surprise[alive] = 0.0
         self._to_show -= alive & (self._to_show > 0)

@@ -184,6 +184,36 @@ LONGEST_RUN = 1e6
 NEWTON_STEPS = 8
 
 
+class Felt(NamedTuple):
+    """Consequences of which pads are touched.
+
+    Attributes:
+        key: the touched pads, as bytes.
+        calm: bool[k], triangles of boards on which nothing is touched.
+        elsewhere: bool[k], triangles of boards on which another triangle is touched.
+        calm_pads: bool[k, 1], the same as `calm`.
+        pace: int[k, 12], how many repeats of a pad count as one.
+    """
+
+    key: bytes
+    calm: Mask
+    elsewhere: Mask
+    calm_pads: Mask
+    pace: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, touched: Mask, key: bytes, boards: int) -> "Felt":
+        of_triangles = np.count_nonzero(touched, axis=1).reshape(boards, -1)
+        of_boards = of_triangles.sum(axis=1, keepdims=True)
+        triangles = of_triangles.shape[1]
+        calm = np.repeat(of_boards == 0, triangles)
+        # A touch that only the pad itself feels does not count: the pad may be stuck there.
+        pace = np.where(np.repeat(of_boards, triangles)[:, None] > touched, TOUCHED_PACE, 1)
+        # A chip that died can look touched itself; only a touch on other triangles counts.
+        elsewhere = (of_boards > of_triangles).ravel()
+        return cls(key, calm, elsewhere, calm[:, None], pace)
+
+
 class StuckPads:
     """Watches the pads of the k triangles of some boards, equally many of each.
 
@@ -228,9 +258,9 @@ class StuckPads:
         self,
         raw: NDArray[np.uint8],
         changed: Mask,
-        compared: Mask,
+        within: Mask,
         unproven: Mask,
-        touched: Mask | None,
+        felt: Felt | None = None,
         came: Mask | None = None,
     ) -> None:
         """Take one sweep of some boards.
@@ -238,30 +268,26 @@ class StuckPads:
         Args:
             raw: uint8[k, 12].
             changed: bool[k, 12], bytes that differ from those before.
-            compared: bool[k], triangles that were received now and before.
+            within: bool[k, 12], bytes of triangles that were received now and before, see `inside`.
             unproven: bool[k], triangles that are not valid as a whole.
-            touched: bool[k, 12], recently touched pads, if there are any.
+            felt: which pads are touched, if any is.
             came: bool[boards], boards whose sweep this is, all by default.
         """
-        within = inside(raw) & compared[:, None]
         moved, told = self._repeats.step(raw, changed, within)
         run = self._run
         # A run counts when it ends: a run without an end may not be chance.
         ended = moved & (run >= self._begun)
         more: Floats | Mask = told
-        if touched is not None:
-            # A touch that only the pad itself feels does not count: the pad may be stuck there.
-            felt = touched.reshape(self._boards, -1).sum(axis=1)
-            of_triangles = np.repeat(felt, len(touched) // self._boards)[:, None]
-            ended &= of_triangles == 0
-            more = told / np.where(of_triangles > touched, TOUCHED_PACE, 1)
+        if felt is not None:
+            ended &= felt.calm_pads
+            more = told / felt.pace
         if any_of(ended):
             np.add(self._new_seen, run - (self._begun - 1), out=self._new_seen, where=ended)
             self._new_moved += ended
         run += more
         np.copyto(run, 0.0, where=moved)
         self._samples += 1 if came is None else came
-        if int(self._samples.max()) >= STEP_SAMPLES:
+        if int(np.maximum.reduce(self._samples)) >= STEP_SAMPLES:
             self._learn(unproven)
         too_long = run > self.longest
         if not self.any_stuck and not any_of(too_long):

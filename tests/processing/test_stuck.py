@@ -10,12 +10,11 @@ from hypothesis import strategies as st
 from emulator.boards.arithmetic import transmit_16, transmit_32
 from skin_host.bus.compensation import GAIN, GAIN_V2, NO_GAIN, THERMAL_TAXEL
 from skin_host.processing import stuck
-from skin_host.processing.stuck import Encoding, Repeats, StuckPads
+from skin_host.processing.stuck import Encoding, Felt, Repeats, StuckPads, inside
 
 K = 8
 SHAPE = (K, 12)
 PERIOD_S = 0.05
-HERE = np.ones(K, bool)
 NO = np.zeros(K, bool)
 NO_LOAD = 240
 
@@ -32,7 +31,8 @@ class Watched:
 
     def show(self, raw: np.ndarray, touched: np.ndarray | None = None) -> None:
         before = self.pads.stuck
-        self.pads.step(raw, raw != self.raw, HERE, NO, touched)
+        felt = None if touched is None else Felt.of(touched, touched.tobytes(), 1)
+        self.pads.step(raw, raw != self.raw, inside(raw), NO, felt)
         self.raw = raw
         self.accusations += np.count_nonzero(self.pads.stuck & ~before)
 
