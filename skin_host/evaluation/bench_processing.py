@@ -1,23 +1,24 @@
-"""`skin bench processing`: bytes to kPa, and every relaxation model, against a copy of memory."""
+"""`skin bench processing`: bytes to kPa, every relaxation model, and frames to events."""
 
 from typing import Any
 
-from skin_host.evaluation import speed
+from skin_host.evaluation import frames_to_events, speed
 from skin_host.evaluation.machine import machine
 
 Row = dict[str, Any]
 
 
 def run(*, quick: bool = False) -> dict[str, Any]:
-    """Time the models alone and the whole pipeline.
+    """Time the models alone, the pipeline, and everything from frames to events.
 
     Returns:
         `machine`, and rows: `models` and `pipeline`, each with its ratio to a copy of as many
-        numbers in memory, timed in the same run.
+        numbers in memory, timed in the same run; and `frames_to_events`.
     """
     models = speed.models(0.02 if quick else 0.2)
     pipeline = speed.pipeline(0.1 if quick else 1.0)
-    return {"machine": machine()} | with_ratios(models, pipeline)
+    whole = frames_to_events.measure(5.0 if quick else 20.0)
+    return {"machine": machine()} | with_ratios(models, pipeline) | {"frames_to_events": whole}
 
 
 def with_ratios(models: list[Row], pipeline: list[Row]) -> dict[str, list[Row]]:
@@ -51,6 +52,12 @@ def describe(document: dict[str, Any]) -> str:
         f"{'wanted' if row['pressures_wanted'] else 'not':>10} {row['ns_per_taxel_step']:>14.2f} "
         f"{row['ns_per_taxel_step'] * row['taxels'] * 1e-3:>9.1f} {row['ratio_to_copy']:>13.1f}"
         for row in document["pipeline"]
+    ]
+    lines += ["", "frames to events: taxels        touched  us/sweep  reads  judging chips"]
+    lines += [
+        f"{row['taxels']:>24,} {row['touched']:>14} {row['us_per_sweep']:>9.0f} "
+        f"{row['feed_us']:>6.0f} {row['judge_us']:>14.0f}"
+        for row in document["frames_to_events"]
     ]
     return "\n".join(lines)
 
