@@ -3,8 +3,9 @@
 A wake-up costs as much as reading dozens of frames, so the daemon wakes up only by its own plan. A
 board sends its sweep once a period: after one sweep it is known when the last frame of the next is
 due, and the ports are read right then. Of boards whose sweeps make one sample together (those of a
-part) the last two are planned for, because nothing comes of the others before. While a board has
-not sent yet, or not in time, the ports are read at fixed intervals.
+part) the last is planned for, because nothing comes of the others before. While a board has not
+sent yet, or not in time, the ports are read at fixed intervals; after some time without it at
+longer ones.
 """
 
 import asyncio
@@ -27,6 +28,8 @@ SLIP_NS = 50_000
 #: With a plan for every board, the ports are read at least this often: once between two sweeps of
 #: a board at 20 Hz.
 LONGEST_NS = 26_000_000
+#: A board that has not been heard of for this long is searched for no oftener than that.
+SEARCH_NS = 2_000_000_000
 #: At this rate of samples one is always due: then reads are one polling interval apart, and
 #: proportionally with fewer samples, so that wake-ups never cost more than the frames.
 BUSY_HZ = 1000.0
@@ -51,6 +54,8 @@ class Plan:
         self._missing = missing or (lambda: ((board,) for board in periods_ns))
         self._due_ns: dict[int, int] = {}
         self._look_ns: dict[int, int] = {}
+        #: Since when boards have been without a plan; None before the first call of `next_ns`.
+        self._lost_ns: dict[int, int | None] = dict.fromkeys(periods_ns)
 
     def sweep_ended(self, board: int, t_ns: int) -> None:
         """Note the time of a sweep's last frame."""
@@ -60,6 +65,7 @@ class Plan:
             t_ns -= late_ns - SLIP_NS
         self._due_ns[board] = t_ns + period_ns
         self._look_ns[board] = t_ns + period_ns + GUARD_NS
+        self._lost_ns.pop(board, None)
 
     def next_ns(self, now_ns: int) -> int:
         """Return when to read next, after all sweeps that ended by now were noted."""
@@ -71,18 +77,26 @@ class Plan:
                     look_ns[board] = now_ns + max(RETRY_NS, late_ns)
                 else:
                     del look_ns[board]
+                    self._lost_ns[board] = now_ns
         ends_ns = [
             [look_ns[board] for board in boards if board in look_ns] for boards in self._missing()
         ]
-        # With the last but one, what came before it is worked off and does not delay the last.
         sample_ns = min((max(ends) for ends in ends_ns if ends), default=None)
         if sample_ns is None:
-            return now_ns + self._poll_ns
-        if len(look_ns) < len(self._periods_ns):
-            return min(now_ns + self._poll_ns, sample_ns)
+            return now_ns + self._search_ns(now_ns)
+        if self._lost_ns:
+            return min(now_ns + self._search_ns(now_ns), sample_ns)
         # Looks between are spread evenly: none comes just before that for a sample.
         looks = -(-(sample_ns - now_ns) // max(LONGEST_NS, self._poll_ns))
         return now_ns + (sample_ns - now_ns) // looks
+
+    def _search_ns(self, now_ns: int) -> int:
+        """Return the interval of reads while some board is not predicted."""
+        for board, since_ns in self._lost_ns.items():
+            if since_ns is None:
+                self._lost_ns[board] = now_ns
+        newest_ns = max((ns for ns in self._lost_ns.values() if ns is not None), default=now_ns)
+        return self._poll_ns if now_ns - newest_ns < SEARCH_NS else max(LONGEST_NS, self._poll_ns)
 
 
 class WakeUp:

@@ -5,7 +5,16 @@ import time
 
 import pytest
 
-from skin_host.bus.wake import GIVE_UP_NS, GUARD_NS, LONGEST_NS, RETRY_NS, SLIP_NS, Plan, WakeUp
+from skin_host.bus.wake import (
+    GIVE_UP_NS,
+    GUARD_NS,
+    LONGEST_NS,
+    RETRY_NS,
+    SEARCH_NS,
+    SLIP_NS,
+    Plan,
+    WakeUp,
+)
 from skin_host.config.settings import Receive
 
 MS = 1_000_000
@@ -36,7 +45,7 @@ def test_between_sweeps_it_sleeps_long_only_if_every_board_is_known():
     assert plan.next_ns(once_between) == T0 + PERIOD + GUARD_NS
 
 
-def test_boards_of_one_sample_are_read_with_the_last_but_one_and_the_last():
+def test_boards_of_one_sample_are_read_with_the_last():
     missing = [[0, 1, 2], [3]]
     plan = Plan(dict.fromkeys(range(4), PERIOD), POLL, lambda: missing)
     for board, at_ms in ((0, 0), (3, 5), (1, 10), (2, 20)):
@@ -46,7 +55,7 @@ def test_boards_of_one_sample_are_read_with_the_last_but_one_and_the_last():
     plan.sweep_ended(0, again)
     plan.sweep_ended(3, again + 5 * MS)
     missing[0].remove(0)
-    assert plan.next_ns(again + 6 * MS) == again + 10 * MS + GUARD_NS
+    assert plan.next_ns(again + 6 * MS) == again + 20 * MS + GUARD_NS
     plan.sweep_ended(1, again + 10 * MS)
     missing[0].remove(1)
     assert plan.next_ns(again + 11 * MS) == again + 20 * MS + GUARD_NS
@@ -72,6 +81,18 @@ def test_a_late_sweep_is_looked_for_again_ever_more_seldom_then_no_more():
     assert waits == sorted(waits)
     assert len(waits) < 8
     assert plan.next_ns(now) == now + POLL
+
+
+def test_a_board_that_stays_away_is_looked_for_less_often_until_it_sends():
+    plan = Plan({0: PERIOD, 1: PERIOD}, POLL)
+    plan.sweep_ended(1, T0)
+    assert plan.next_ns(T0) == T0 + POLL
+    later = T0 + SEARCH_NS
+    plan.sweep_ended(1, later)
+    assert plan.next_ns(later) == later + LONGEST_NS
+    plan.sweep_ended(0, later + MS)
+    back = later + MS + SEARCH_NS
+    assert plan.next_ns(back) <= back + POLL
 
 
 def test_one_late_sweep_does_not_delay_the_next():
