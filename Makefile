@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip --quiet --quiet --disable-pip-version-check --no-inp
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo docs test test-system simulate install uninstall lint format clean
+.PHONY: help demo docs test coverage test-system simulate install uninstall lint format clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z.-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -17,6 +17,9 @@ demo: .venv/demo.stamp  ## emulator, daemon, broker and page together; DURATION=
 
 test: lint  ## all that needs no root and no hardware
 	@tools/timed "pytest" $(BIN)/python -m pytest --numprocesses=3 --dist=loadfile
+
+coverage: .venv/dev.stamp .venv/coverage.stamp  ## branches of the core that the tests run: 95 % at least
+	@$(BIN)/python -m pytest --quiet --numprocesses=3 --dist=loadfile --cov --cov-report=term
 
 # Real time on a shared computer: a test that fails is run once more, and the summary names it.
 AGAIN := --reruns=1 -rR

@@ -20,6 +20,7 @@ from skin_host.clock import SYSTEM, Clock, SteppedClock
 from skin_host.config.settings import Bus, Receive
 from skin_host.errors import BusError, ConfigurationError
 from skin_host.evaluation.stand_in import StandInBus, pair, register
+from tests.support.waiting import PATIENCE_S
 
 SMALL = Receive(buffer_bytes=65536)
 
@@ -37,7 +38,7 @@ def port_on(
 def read_all(port: Port, expected: int) -> tuple[int, int]:
     """Frames and losses of all reads until both make up what was sent."""
     frames = dropped = 0
-    deadline = time.monotonic() + 5.0
+    deadline = time.monotonic() + PATIENCE_S
     while frames + dropped < expected and time.monotonic() < deadline:
         batch = port.read()
         frames += len(batch)
@@ -198,7 +199,7 @@ def test_a_socket_that_fails_is_replaced():
     assert port.state is LinkState.GONE
     assert port.fileno() is None
     with StandInBus(f"{address}-0") as back:
-        deadline = time.monotonic() + 10.0
+        deadline = time.monotonic() + PATIENCE_S
         while port.state is LinkState.GONE and time.monotonic() < deadline:
             port.read()
             time.sleep(0.01)
@@ -311,7 +312,7 @@ def test_an_adapter_that_is_absent_at_the_start_is_used_once_it_is_there():
     assert len(port.read()) == 0
     assert port.state is LinkState.GONE
     taken.shutdown()
-    deadline = time.monotonic() + 10.0
+    deadline = time.monotonic() + PATIENCE_S
     while port.state is not LinkState.UP and time.monotonic() < deadline:
         port.read()
     theirs.socket.send(can_frame(0x410, b"\x40"))

@@ -10,6 +10,7 @@ from skin_host.bus.adapters import CAPACITY, AdapterPort, nanoseconds
 from skin_host.bus.opening import open_bus, open_port
 from skin_host.bus.port import LinkState, Port
 from skin_host.config.settings import Bus, Receive
+from tests.support.waiting import PATIENCE_S
 
 _numbers = itertools.count()
 
@@ -115,7 +116,7 @@ class Unplugged(can.BusABC):
 
 
 def read_until(port: Port, state: LinkState) -> None:
-    deadline = time.monotonic() + 10.0
+    deadline = time.monotonic() + PATIENCE_S
     while port.state is not state and time.monotonic() < deadline:
         port.read()
         time.sleep(0.01)

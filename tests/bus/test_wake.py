@@ -16,6 +16,7 @@ from skin_host.bus.wake import (
     WakeUp,
 )
 from skin_host.config.settings import Receive
+from tests.support.waiting import PATIENCE_S
 
 MS = 1_000_000
 PERIOD = 50 * MS
@@ -141,7 +142,7 @@ async def test_work_is_called_again_and_again():
             enough.set()
 
     running = asyncio.create_task(WakeUp(Receive(poll_ms=1.0), {}).run(work))
-    async with asyncio.timeout(5.0):
+    async with asyncio.timeout(PATIENCE_S):
         await enough.wait()
     running.cancel()
     with pytest.raises(asyncio.CancelledError):

@@ -13,6 +13,7 @@ from skin_host.cli import main, watch
 from skin_host.config.settings import skin_hash
 from skin_host.processing.calibration import Calibrator
 from tests.support.broker import free_port
+from tests.support.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 DEMO = ROOT / "config/demo.toml"
@@ -26,7 +27,7 @@ def skin(*arguments: str, **environment: str) -> "subprocess.CompletedProcess[st
         text=True,
         cwd=ROOT,
         env=os.environ | environment,
-        timeout=60,
+        timeout=PATIENCE_S,
     )
 
 

@@ -18,9 +18,9 @@ from skin_host.layout import build_layout
 from skin_host.mqtt.info import encode_info, node_info
 from tests.support import programs
 from tests.support.broker import Mosquitto
+from tests.support.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
-PATIENCE_S = 30.0
 #: As a shell that has just been started without anybody's files.
 START = {"bash": ["--norc", "--noprofile", "-i"], "zsh": ["-f", "-i"]}
 PREPARE = {"bash": "", "zsh": "autoload -U compinit && compinit -u -D; "}

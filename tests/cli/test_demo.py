@@ -14,6 +14,7 @@ from skin_host import demo
 from skin_host.errors import SkinError
 from skin_host.viewer.server import Viewer
 from tests.support.broker import free_port
+from tests.support.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 
@@ -39,7 +40,7 @@ def test_the_demo_tells_touches_and_ends_with_a_summary_of_them(tmp_path):
         if line.split()[1:2] == ["end"]:
             break
     demo.send_signal(signal.SIGINT)
-    out, err = demo.communicate(timeout=60)
+    out, err = demo.communicate(timeout=PATIENCE_S)
     assert demo.returncode == 0
     assert "Traceback" not in err
     # While the first calibration is being taken, that there is none is no news.
@@ -58,7 +59,7 @@ def test_the_demo_tells_touches_and_ends_with_a_summary_of_them(tmp_path):
 
 def test_the_demo_of_any_configuration_ends_by_itself(tmp_path):
     hand = str(ROOT / "config/icub_hand.toml")
-    out, err = start(tmp_path, hand, "--duration", "1").communicate(timeout=60)
+    out, err = start(tmp_path, hand, "--duration", "1").communicate(timeout=PATIENCE_S)
     assert "skin/icub/+/touch" in out
     assert json.loads(out.splitlines()[-1])["touches_begun"] == 0
     assert "Traceback" not in err

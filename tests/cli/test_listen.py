@@ -14,6 +14,7 @@ from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.events import TouchEvent
 from tests.support.broker import Mosquitto
+from tests.support.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / "config" / "fingertips.toml"
@@ -49,7 +50,7 @@ async def listened(broker: Mosquitto, *options: str) -> list[str]:
         layout = build_layout(load(CONFIG), CONFIG.parent)
         publisher.put_info(node_info(layout, "main", version="1", configuration="x"))
         # Events are not retained: they are told again until the command listens.
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(PATIENCE_S):
             while not said.done():
                 publisher.put_touch(BEGUN)
                 for event in (SLIP, SLIP_END, OVER):

@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 from hatchling.builders.wheel import WheelBuilder
 
+from tests.support.waiting import PATIENCE_S
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -38,7 +40,7 @@ def run(site: Path, program: str) -> str:
         capture_output=True,
         text=True,
         cwd=site,
-        timeout=60,
+        timeout=PATIENCE_S,
     ).stdout
 
 

@@ -23,7 +23,7 @@ from tests.support.broker import Mosquitto, free_port
 from tests.support.fault_bench import FaultBench
 from tests.support.live import CONFIG, living
 from tests.support.stepped import stepped
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 STATE = {"schema": "skin.state/1", "disabled": ["left_hand"]}
 NEWER: list[dict[str, Any]] = [
@@ -148,7 +148,7 @@ async def test_a_metrics_port_in_use_is_waited_for(
         writer.close()
         return found.startswith(b"HTTP/1.0 200")
 
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(PATIENCE_S):
         while not await answers():  # noqa: ASYNC110  # the port tells nobody
             await asyncio.sleep(0.05)
     serving.cancel()

@@ -18,7 +18,7 @@ from tests.support.live import living
 from tests.support.waiting import until
 
 #: Nothing waits for so long but a test that fails.
-FOREVER_S = 20.0
+FOREVER_S = 120.0
 
 
 class Gate:

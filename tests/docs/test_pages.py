@@ -25,10 +25,10 @@ from skin_host.processing.pipeline import PressureFrame
 from tests.support import programs
 from tests.support.broker import Mosquitto, free_port
 from tests.support.pages import PAGES, ROOT, Block, Command, blocks, commands
+from tests.support.waiting import PATIENCE_S
 from tests.support.world import SAMPLES, World
 
 WHILE_S = 0.3
-PATIENCE_S = 30.0
 SIMULATED_S = 5.0
 FOLLOWED = [
     page

@@ -23,11 +23,11 @@ from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
 from tests.support import ros
 from tests.support.broker import Mosquitto
+from tests.support.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
 CONFIG = ROOT / "config" / "demo.toml"
-PATIENCE_S = 30.0
 BEGIN = TouchEvent(
     "begin", 7, 3, 10**18 + 5, "left_hand", [0, 1], [0.1, 0, 0], [0, 0, 1.0], 40.0, 31, 20.0, 2.0
 )

@@ -7,6 +7,7 @@ import pytest
 from aiomqtt import Client, MqttError
 
 from tests.support.broker import Mosquitto
+from tests.support.waiting import PATIENCE_S
 
 
 async def _echo(broker: Mosquitto, payload: str, timeout_s: float = 20.0) -> bytes:
@@ -41,7 +42,7 @@ async def test_a_frozen_broker_answers_nobody_until_it_goes_on(mosquitto: Mosqui
         with pytest.raises(TimeoutError):
             client.recv(1)
         mosquitto.resume()
-        client.settimeout(20.0)
+        client.settimeout(PATIENCE_S)
         assert client.recv(1) == b"\x20"  # CONNACK
 
 

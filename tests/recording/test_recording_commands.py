@@ -19,13 +19,13 @@ from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
 from skin_host.recording.mcap import read_messages_of
 from tests.support.broker import Mosquitto
+from tests.support.waiting import PATIENCE_S
 from tests.support.world import World
 
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / "config" / "icub_hand.toml"
 GRASP = ROOT.parent / "shared" / "data" / "icub_grasp.log"
 needs_grasp = pytest.mark.skipif(not GRASP.exists(), reason=f"{GRASP} is not here")
-PATIENCE_S = 30.0
 
 
 @pytest.fixture(scope="module")

@@ -15,9 +15,9 @@ from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Bus, changed, load
 from skin_host.daemon.daemon import Daemon
 from skin_host.layout import build_layout
+from tests.support.waiting import PATIENCE_S
 
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
-PATIENCE_S = 30.0
 
 
 class Live:

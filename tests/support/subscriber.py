@@ -8,6 +8,8 @@ from typing import Any
 
 import paho.mqtt.client as mqtt
 
+from tests.support.waiting import PATIENCE_S
+
 
 class Subscriber:
     """Collects everything below a topic, in the order of arrival."""
@@ -27,7 +29,7 @@ class Subscriber:
         self._client.on_subscribe = lambda *_: self._subscribed.set()
         self._client.connect(host, port)
         self._client.loop_start()
-        assert self._subscribed.wait(20)
+        assert self._subscribed.wait(PATIENCE_S)
 
     def _take(self, _client: Any, _data: Any, message: mqtt.MQTTMessage) -> None:
         if message.topic == self._marker:
@@ -43,7 +45,7 @@ class Subscriber:
         """
         self._caught_up.clear()
         self._client.publish(self._marker, b"", qos=1)
-        assert self._caught_up.wait(20), "the broker did not send our own message back"
+        assert self._caught_up.wait(PATIENCE_S), "the broker did not send our own message back"
 
     def payloads(self, ending: str) -> list[bytes]:
         """Payloads so far of the topics that end so."""
@@ -61,7 +63,7 @@ class Subscriber:
 
     def wait_for(self, n: int) -> dict[str, bytes]:
         """Wait until so many topics have been heard of; return the last payload of each."""
-        deadline_s = time.monotonic() + 20
+        deadline_s = time.monotonic() + PATIENCE_S
         while True:
             with self._lock:
                 heard = dict(self._messages)

@@ -29,10 +29,10 @@ from skin_host.recording.replay import calibrate_from_log, read_buses
 from tests.support.broker import Mosquitto
 from tests.support.live import living
 from tests.support.pages import ROOT
+from tests.support.waiting import PATIENCE_S
 
 SAMPLES = ROOT.parent / "shared" / "data"
 CONFIG = ROOT / "config" / "demo.toml"
-PATIENCE_S = 30.0
 _numbers = itertools.count()
 
 
