@@ -23,6 +23,7 @@ from emulator.boards.recording import load_recordings
 from emulator.chips.converters import Converters, fidelities
 from emulator.clock import Clock, RealClock
 from emulator.link import BoardLink
+from emulator.probes.contacts import ContactSource
 from emulator.probes.scene import Fault, Probe, Scene, check
 from emulator.probes.skin import NEVER_NS, Skin
 from emulator.state import StateError
@@ -56,6 +57,7 @@ class Robot:
         seed: replaces the scene's.
         recordings: logs by the board's name: these boards send what was recorded from a board
             of their address.
+        source: contacts that press besides the scene's probes, as of a simulation of bodies.
 
     Attributes:
         t_ns: time since it was switched on.
@@ -81,6 +83,7 @@ class Robot:
         fidelity: str | Mapping[str, str] = "signal",
         seed: int | None = None,
         recordings: Mapping[str, Path] | None = None,
+        source: ContactSource | None = None,
     ) -> None:
         scene = scene or Scene()
         if seed is not None:
@@ -89,7 +92,7 @@ class Robot:
         self.settings = settings
         self.layout = layout
         self.t_ns = 0
-        self.skin = Skin(layout, scene, settings.fingertips)
+        self.skin = Skin(layout, scene, settings.fingertips, source)
         self.fingertips = Fingertips(settings, layout, scene, self._skin_force_n)
         of_board = fidelities(layout, fidelity)
         self.converters = Converters(

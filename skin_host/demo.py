@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import can
 import numpy as np
+from msgspec import structs
 
 from skin_host.cli.common import load_skin
 from skin_host.cli.lines import event_line
@@ -49,6 +50,7 @@ async def run(
     page_port: int | None,
     config: Path | None = None,
     scene: Path | None = None,
+    mujoco: Path | None = None,
 ) -> int:
     """Run until `stop` or for `duration_s`; the last line on stdout is a JSON summary.
 
@@ -60,18 +62,21 @@ async def run(
         config: of the robot to show; the demo's own by default.
         scene: what happens to the skin; by default the demo's own, or on another robot a press
             on one part after the other.
+        mujoco: a model whose contacts press the skin; without `scene` nothing else happens then.
 
     Raises:
         SkinError: a broker, a bus or the emulator cannot be started.
     """
     settings, layout, happening = _prepared(config, scene)
+    if mujoco is not None and scene is None:
+        happening = structs.replace(happening, probe=[])
     if duration_s is not None:
         asyncio.get_running_loop().call_later(duration_s, stop.set)
     touches: Counter[str] = Counter()
     # The page and the listener log that they found the broker, which is not of interest here.
     logging.getLogger("skin_host.client").setLevel(logging.WARNING)
     with tempfile.TemporaryDirectory(prefix="skin-demo-") as state:
-        async with local_broker() as broker, _robot(settings, layout, happening):
+        async with local_broker() as broker, _robot(settings, layout, happening, mujoco):
             settings = changed(
                 settings,
                 {
@@ -223,11 +228,15 @@ def _explain(settings: Settings, broker: LocalBroker, page: str) -> None:
 
 
 @contextlib.asynccontextmanager
-async def _robot(settings: Settings, layout: Layout, scene: "Scene") -> AsyncIterator[None]:
+async def _robot(
+    settings: Settings, layout: Layout, scene: "Scene", mujoco: Path | None
+) -> AsyncIterator[None]:
     """Run the emulated robot on its buses, for as long as the block lasts."""
+    from emulator.probes.mujoco_model import MujocoModel
     from emulator.robot import Robot
 
-    robot = Robot(settings, layout, scene)
+    model = None if mujoco is None else MujocoModel(mujoco, layout)
+    robot = Robot(settings, layout, scene, source=model)
     with contextlib.ExitStack() as stack:
         buses = {
             name: stack.enter_context(can.Bus(interface=bus.interface, channel=bus.channel))

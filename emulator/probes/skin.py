@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from emulator.boards.arithmetic import TAXELS
 from emulator.chips.noise import SENT_UNIT_FF, PadNoise
 from emulator.probes.air import AirCourse, read_course
+from emulator.probes.contacts import ContactPads, Contacts, ContactSource, joined
 from emulator.probes.coverage import MOST_AT_ONCE, Coverage
 from emulator.probes.foam import INFINERGY_LOSS, Drive, Foam, FoamLayer, Footprint
 from emulator.probes.pads import (
@@ -68,9 +69,16 @@ class Skin:
         layout: of the skin.
         scene: what happens to it.
         bare: names of fingertips without skin; the probes on them are none of ours.
+        source: contacts that press besides the scene's probes.
     """
 
-    def __init__(self, layout: Layout, scene: Scene, bare: Collection[str] = ()) -> None:
+    def __init__(
+        self,
+        layout: Layout,
+        scene: Scene,
+        bare: Collection[str] = (),
+        source: ContactSource | None = None,
+    ) -> None:
         n = layout.n_taxels
         self._t_ns = 0
         rng = np.random.default_rng([scene.seed, 1])
@@ -112,6 +120,13 @@ class Skin:
         self.capacitance_ff = self.resting_ff.copy()
         self.held_ff = np.where(self._dead, self.resting_ff, np.nan)
         self._set_probes(scene.probe, bare)
+        self._source = source
+        self._contact_pads = ContactPads(layout)
+        #: What the source gave last, and when the footprint was last found; which of it is on
+        #: skin, and what that covers.
+        self._given = self._placed = Contacts.none()
+        self._on_skin = np.zeros(0, bool)
+        self._pressed = Footprint.empty()
         self._set_air(scene.air)
         self.temperature_step_c = 0.0
 
@@ -153,6 +168,8 @@ class Skin:
         self._came_true = 0
         self._by_depth_now = np.zeros(0, bool)
         self._compliance_now = np.zeros(0)
+        self._grounded_now = np.zeros(0, bool)
+        self._of_probes = self._footprint
         self._idle = True
         self._still_until_s = 0.0
         self._changed_ns = self._t_ns
@@ -202,7 +219,7 @@ class Skin:
     @property
     def due_ns(self) -> int:
         """When the mechanics has to be worked out again: a time of its own grid."""
-        if self._changed_ns == self._t_ns:
+        if self._changed_ns == self._t_ns or self._source is not None:
             return self._t_ns + MOVING_NS
         quiet = not len(self._active) and self._idle and self._t_ns * 1e-9 >= self._times_s[-1]
         due_ns = NEVER_NS if quiet else self._t_ns + self._holding_ns
@@ -232,7 +249,21 @@ class Skin:
 
     def contact_force_n(self) -> dict[int, float]:
         """Force (N) of each probe that is in contact now, by its number in `probes`."""
-        return dict(zip(self._active.tolist(), self._foam.force_n.tolist(), strict=True))
+        return dict(zip(self._active.tolist(), self._foam.force_n.tolist(), strict=False))
+
+    @property
+    def contacts(self) -> Contacts:
+        """The source's contacts that are on skin now."""
+        return self._given.take(self._on_skin)
+
+    @property
+    def contacts_beside(self) -> Contacts:
+        """The source's contacts that meet a part's body where it has no skin now."""
+        return self._given.take(~self._on_skin)
+
+    def source_force_n(self) -> Floats:
+        """Force (N) with which each of `contacts` presses the foam, float64[c]."""
+        return self._foam.force_n[len(self._active) :]
 
     def step(self, t_ns: int) -> Ints:
         """Go on to `t_ns`.
@@ -250,8 +281,9 @@ class Skin:
         self._still_until_s = self._script.still_until_s(t_s)
         if self._still_until_s <= t_s:
             self._changed_ns = t_ns
-        if len(moment.number) or not self._idle:
-            touched = self._press(moment, dt_s)
+        given = self._given if self._source is None else self._source.at(t_ns)
+        if len(moment.number) or len(given) or not self._idle:
+            touched = self._press(moment, given, dt_s)
         if self._air and self._blow(t_s, dt_s):
             touched = (
                 np.concatenate([touched, self._under_air]) if len(touched) else self._under_air
@@ -294,18 +326,24 @@ class Skin:
         self._set_untouched()
         return True
 
-    def _press(self, moment: Moment, dt_s: float) -> Ints:
+    def _press(self, moment: Moment, given: Contacts, dt_s: float) -> Ints:
         number = moment.number
         same = number is self._active or np.array_equal(number, self._active)
+        still = given.is_still(self._placed)
+        self._given = given
         slid = moment.offset_mm is not self._offset_mm
-        if not same or (slid and (moment.offset_mm != self._offset_mm).any()):
-            self._place(moment, same=same)
-        drive = Drive(moment.drive, self._by_depth_now, self._compliance_now)
+        slid = slid and bool((moment.offset_mm != self._offset_mm).any())
+        if slid or not (same and still):
+            self._place(moment, same=same, slid=slid, still=still)
+        value = moment.drive
+        if len(self._pressed.area_mm2):
+            value = np.append(value, given.force_n[self._on_skin])
+        drive = Drive(value, self._by_depth_now, self._compliance_now)
         felt = self._foam.step(self._footprint, drive, dt_s)
         if felt.taxel is not self._felt or self._is_left:
             self._touch(felt.taxel)
         touched = self._touched
-        rise_ff = self._pads.row_rise_ff(felt, self._footprint, self._grounded[number])
+        rise_ff = self._pads.row_rise_ff(felt, self._footprint, self._grounded_now)
         if touched is not felt.taxel:
             of_pad_ff = np.bincount(felt.taxel, rise_ff, self._layout.n_taxels)
             rise_ff = of_pad_ff[touched].astype(np.float64, copy=False)
@@ -337,14 +375,26 @@ class Skin:
         pads = self._touched
         self._untouched_ff = self.resting_ff[pads] + self._ff_per_c[pads] * self._shift_c
 
-    def _place(self, moment: Moment, *, same: bool) -> None:
-        """Find out what the probes cover, when some came, went or slid."""
-        self._active, self._offset_mm = moment.number, moment.offset_mm
+    def _place(self, moment: Moment, *, same: bool, slid: bool, still: bool) -> None:
+        """Find out what is covered, when something came, went or slid.
+
+        `same` are the probes, which `slid` or not; `still` are the source's contacts.
+        """
+        number = moment.number
+        self._active, self._offset_mm = number, moment.offset_mm
+        if not still:
+            self._placed = self._given
+            self._on_skin, self._pressed = self._contact_pads.place(self._given)
+        if not (same and still):
+            none = np.zeros(len(self._pressed.area_mm2))
+            self._by_depth_now = np.append(self._by_depth[number], none > 0)
+            self._compliance_now = np.append(self._compliance[number], none)
+            self._grounded_now = np.append(self._grounded[number], none > 0)
         if not same:
-            self._by_depth_now = self._by_depth[moment.number]
-            self._compliance_now = self._compliance[moment.number]
             self._foreseen.clear()
-        self._footprint = rows = self._foresee(moment)
+        if slid or not same:
+            self._of_probes = self._foresee(moment)
+        self._footprint = rows = joined(self._of_probes, self._pressed)
         bears = rows.covered
         if self._membrane_mm:
             bears = np.where(rows.weight > 0, rows.covered, 0.0)

@@ -24,6 +24,7 @@ from skin_host.errors import RequestError
 if TYPE_CHECKING:
     import can
 
+    from emulator.probes.mujoco_model import MujocoModel
     from emulator.robot import Robot
     from skin_host.config.settings import Settings
     from skin_host.layout import Layout
@@ -44,6 +45,7 @@ def add_commands(commands: Commands) -> None:
     )
     add_config(emulate)
     emulate.add_argument("--scene", type=Path, help="what happens to the skin (TOML)")
+    add_mujoco(emulate)
     emulate.add_argument(
         "--fidelity", choices=("signal", "chip"), default="signal", help="how deep the chips go"
     )
@@ -86,6 +88,7 @@ def add_commands(commands: Commands) -> None:
     )
     demo.add_argument("--scene", type=Path, help="what happens to the skin (TOML)")
     demo.add_argument("--duration", type=positive, metavar="S", help="end after this many seconds")
+    add_mujoco(demo)
     demo.add_argument(
         "--page-port",
         type=int,
@@ -94,6 +97,16 @@ def add_commands(commands: Commands) -> None:
     )
     add_log_level(demo)
     demo.set_defaults(run=_demo)
+
+
+def add_mujoco(parser: argparse.ArgumentParser) -> None:
+    """Add the option for a simulation of bodies."""
+    parser.add_argument(
+        "--mujoco",
+        type=Path,
+        metavar="MODEL",
+        help="a MuJoCo model whose contacts press the skin, see docs/mujoco.md",
+    )
 
 
 def _emulate(arguments: argparse.Namespace) -> int:
@@ -112,6 +125,9 @@ def _emulate(arguments: argparse.Namespace) -> int:
         raise RequestError(f'--board: no board "{arguments.board}"; there are: {known}')
     if (arguments.i2c or arguments.i2c_dev is not None) and arguments.board is None:
         raise RequestError("--i2c and --i2c-dev need --board NAME")
+    if arguments.mujoco is not None and (arguments.i2c or arguments.state is not None):
+        option = "--i2c" if arguments.i2c else "--state"
+        raise RequestError(f"--mujoco and {option}: wanted one of them")
     for name, bus in settings.buses.items():
         chosen = {
             "interface": arguments.interface or bus.interface,
@@ -158,17 +174,19 @@ def _on_emulated_chips(
 ) -> Work:
     from emulator.chips.cuse import CuseBus
     from emulator.clock import RealClock
+    from emulator.probes.mujoco_model import MujocoModel
     from emulator.probes.scene import load as load_scene
     from emulator.robot import Robot
 
     scene = None if arguments.scene is None else load_scene(arguments.scene)
+    model = None if arguments.mujoco is None else MujocoModel(arguments.mujoco, layout)
     fidelity: str | dict[str, str] = arguments.fidelity
     if arguments.i2c_dev is not None:
         fidelity = dict.fromkeys(settings.boards, arguments.fidelity) | {arguments.board: "chip"}
     if arguments.state is not None and arguments.state.exists():
         robot = Robot.read(arguments.state, settings, layout)
     else:
-        robot = Robot(settings, layout, scene, fidelity=fidelity, seed=arguments.seed)
+        robot = Robot(settings, layout, scene, fidelity=fidelity, seed=arguments.seed, source=model)
     if arguments.state is not None:
         opened.callback(robot.write, arguments.state)
     devices: list[CuseBus] = []
@@ -183,18 +201,23 @@ def _on_emulated_chips(
             loop.add_reader(device.fileno(), device.handle)
         # A file or /dev/null cannot be waited for; then there are no commands.
         with contextlib.suppress(PermissionError, ValueError, AttributeError):
-            loop.add_reader(sys.stdin.fileno(), take_command, robot, {})
+            loop.add_reader(sys.stdin.fileno(), take_command, robot, {}, model)
         await robot.run(buses, RealClock(arguments.speed))
 
     return work
 
 
-def take_command(robot: "Robot", mends: dict[str, Callable[[], None]]) -> None:
+def take_command(
+    robot: "Robot", mends: dict[str, Callable[[], None]], model: "MujocoModel | None" = None
+) -> None:
     """Read a line of stdin: a fault such as `chip_gone board=hand triangle=3`, or `mend` and it.
+
+    With a MuJoCo model also `ctrl ACTUATOR VALUE`, which sets what drives an actuator.
 
     Args:
         robot: to which it happens.
         mends: functions that end the given faults, by their lines.
+        model: of the bodies.
     """
     from emulator import faults
 
@@ -209,10 +232,25 @@ def take_command(robot: "Robot", mends: dict[str, Callable[[], None]]) -> None:
             if rest not in mends:
                 raise RequestError(f'"{rest}": no such fault is on; there are: {", ".join(mends)}')
             mends.pop(rest)()
+        elif verb == "ctrl":
+            _set_control(model, rest)
         elif text:
             mends[text] = robot.inject(faults.parse(text))
     except RequestError as error:
         print(f"skin emulate: {error}", file=sys.stderr, flush=True)
+
+
+def _set_control(model: "MujocoModel | None", text: str) -> None:
+    if model is None:
+        raise RequestError("ctrl: there is no model; wanted skin emulate CONFIG --mujoco MODEL")
+    name, _, number = text.partition(" ")
+    try:
+        value = float(number)
+    except ValueError:
+        raise RequestError(
+            f'ctrl {text}: "{number}" is no number; wanted ctrl NAME VALUE'
+        ) from None
+    model.set_control(name, value)
 
 
 async def _until_stopped(
@@ -241,7 +279,12 @@ def _demo(arguments: argparse.Namespace) -> int:
         stop = asyncio.Event()
         stop_on_signals(stop)
         return await demo.run(
-            arguments.duration, stop, arguments.page_port, arguments.config, arguments.scene
+            arguments.duration,
+            stop,
+            arguments.page_port,
+            arguments.config,
+            arguments.scene,
+            arguments.mujoco,
         )
 
     return asyncio.run(work())

@@ -5,8 +5,11 @@ busy, so other work on the machine does not count. The mechanics is timed separa
 taxel and for a thousand.
 """
 
+import importlib.util
+import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +54,7 @@ def run(*, quick: bool = False) -> list[Row]:
         )
     ]
     rows += _mechanics(share)
+    rows += _bodies(share)
     rows.append(_agreement(20.0 * share))
     return rows
 
@@ -168,6 +172,65 @@ def _mechanics(share: float) -> list[Row]:
     return rows
 
 
+def _bodies(share: float) -> list[Row]:
+    """A forearm of 288 taxels on which balls lie in a MuJoCo simulation, if that is installed."""
+    if importlib.util.find_spec("mujoco") is None:
+        return []
+    from emulator.probes.mujoco_model import MujocoModel
+
+    document = {
+        "robot": "bench",
+        **wired(2),
+        "parts": {
+            "forearm": {
+                "patches": [{"board": name, "triangles": "0-11"} for name in wired(2)["boards"]]
+            }
+        },
+    }
+    settings = msgspec.convert(document, Settings)
+    layout = build_layout(settings, Path())
+    rows: list[Row] = []
+    for balls in (0, 1, 20):
+        with tempfile.TemporaryDirectory(prefix="skin-bench-") as folder:
+            path = Path(folder, "model.xml")
+            path.write_text(_lying(layout, balls))
+            model = MujocoModel(path, layout)
+        robot = Robot(settings, layout, source=model)
+        robot.bring_up()
+        robot.step(0.5)
+        seconds = 5.0 * share
+        spent_s = _seconds(partial(robot.step, seconds), REPEATS)
+        row = {
+            "part": "bodies",
+            "taxels": layout.n_taxels,
+            "balls": balls,
+            "contacts": len(robot.skin.contacts),
+            "times_real": round(seconds / spent_s, 1),
+        }
+        rows.append(row)
+    return rows
+
+
+def _lying(layout: Layout, balls: int) -> str:
+    """A MuJoCo model of the first part of a robot, flat, with balls of 6 mm on it."""
+    part = layout.parts[0]
+    places_m = layout.position_m[part.start : part.stop, :2]
+    low_m, high_m = places_m.min(axis=0), places_m.max(axis=0)
+    middle_m, half_m = (low_m + high_m) / 2, (high_m - low_m) / 2 + 0.01
+    at_m = np.random.default_rng(1).uniform(low_m, high_m, (balls, 2))
+    lying = "".join(
+        f'<body pos="{x_m} {y_m} 0.0031"><joint type="slide" axis="0 0 1"/>'
+        '<geom size="0.003" mass="0.05" contype="2" conaffinity="1"/></body>'
+        for x_m, y_m in at_m
+    )
+    return (
+        '<mujoco><option timestep="0.002"/><worldbody><body>'
+        f'<geom type="box" size="{half_m[0]} {half_m[1]} 0.01" '
+        f'pos="{middle_m[0]} {middle_m[1]} -0.01"/><site name="{part.name}"/></body>'
+        f"{lying}</worldbody></mujoco>"
+    )
+
+
 def _agreement(seconds: float) -> Row:
     """The same scene and seed at both fidelities: how far the transmitted bytes differ."""
     settings, layout = robot_of(3, 11)
@@ -190,7 +253,7 @@ def _agreement(seconds: float) -> Row:
     }
 
 
-def _seconds(work: Callable[[], None], repeats: int) -> float:
+def _seconds(work: Callable[[], object], repeats: int) -> float:
     """The shortest processor time that `work` takes."""
     best = np.inf
     for _ in range(repeats):
@@ -222,6 +285,12 @@ def describe(rows: list[Row]) -> str:
         "of a thousand"
         for row in rows
         if row["part"] == "mechanics ratio"
+    ]
+    lines += [
+        f"MuJoCo: {row['balls']:2d} balls on a part of {row['taxels']} taxels, "
+        f"{row['contacts']} contacts  {row['times_real']:7.1f}"
+        for row in rows
+        if row["part"] == "bodies"
     ]
     lines += [
         f"Signal against chip: {row['bytes_compared']} bytes, "
