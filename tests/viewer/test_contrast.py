@@ -34,5 +34,6 @@ def contrast(one: str, other: str) -> float:
 )
 def test_marks_stand_out(theme: str, mark: str, least: float) -> None:
     colours = THEMES[theme]
-    assert contrast(colours[mark], colours["panel"]) >= least
+    for ground in ("panel", "body"):
+        assert contrast(colours[mark], colours[ground]) >= least
     assert contrast(colours["on-accent"], colours["accent"]) >= 4.5

@@ -45,7 +45,7 @@ export function paper() {
   if (!papers[name]) {
     const style = getComputedStyle(document.documentElement);
     const colour = (key) => style.getPropertyValue(key).trim();
-    papers[name] = { back: colour("--panel"), line: colour("--line"), rim: colour("--rim"), text: colour("--text"), dim: colour("--dim"), alarm: colour("--alarm"), warn: colour("--warn") };
+    papers[name] = { back: colour("--panel"), body: colour("--body"), line: colour("--line"), rim: colour("--rim"), text: colour("--text"), dim: colour("--dim"), alarm: colour("--alarm"), warn: colour("--warn") };
   }
   return papers[name];
 }

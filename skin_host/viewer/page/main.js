@@ -453,6 +453,7 @@ function frame(nowMs) {
     showScale(nowMs);
     map.draw(nowMs);
     document.body.dataset.drawMs = (performance.now() - began).toFixed(1);
+    $("flattened").hidden = !map.flattened && !map.body?.lost;
     showTip();
     showStatus(nowMs);
     showParts($("parts"), store, map.shown, nowMs, pick);
@@ -479,7 +480,10 @@ let moved = 0;
 $("map").addEventListener("pointerdown", (event) => {
   $("map").setPointerCapture(event.pointerId);
   pointers.set(event.pointerId, [event.offsetX, event.offsetY]);
-  if (pointers.size === 1) moved = 0;
+  if (pointers.size === 1) {
+    moved = 0;
+    map.grab(event.offsetX, event.offsetY);
+  }
 });
 $("map").addEventListener("pointermove", (event) => {
   const before = pointers.get(event.pointerId);
@@ -562,9 +566,17 @@ const keys = {
   "?": () => $("keys").showModal(),
 };
 
+/** Shift and an arrow turn the curved parts that are shown. */
+const TURNS = { ArrowLeft: [-12, 0], ArrowRight: [12, 0], ArrowUp: [0, -12], ArrowDown: [0, 12] };
+
 document.addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
   if (event.target.matches("select") || (event.key === "Enter" && event.target !== $("map"))) return;
+  if (event.shiftKey && TURNS[event.key]) {
+    map.turn(map.parts, ...TURNS[event.key]);
+    dirty = true;
+    return event.preventDefault();
+  }
   const digit = /^[1-9]$/.test(event.key) && store.parts[Number(event.key) - 1];
   const act = digit ? () => pick(digit.name) : keys[event.key];
   if (act) { event.preventDefault(); act(); }

@@ -1,4 +1,5 @@
 // The drawing of the skin: parts side by side, or one of them large.
+import { drawer } from "./body.js";
 import { paper, ramp, shareOf } from "./colours.js";
 
 const GAP_MM = 14;
@@ -14,14 +15,22 @@ class Pose {
     const n = part.n || 1;
     this.flat = part.normal.every((v) => v[2] > 0.999);
     this.centre = [0, 1, 2].map((k) => part.position.reduce((sum, p) => sum + p[k], 0) / n);
+    this.face(part);
+  }
+
+  /** Turn it so that most of it is seen. */
+  face(part) {
     this.axes = this.flat ? [[1, 0, 0], [0, 1, 0], [0, 0, 1]] : faceOn(part, this.centre);
     this.project(part);
   }
 
   turn(part, dx, dy) {
-    const [right, up, eye] = this.axes;
-    this.axes = [right, up, eye].map((axis) => rotated(rotated(axis, up, -dx), right, -dy));
-    // The eye moves, so the axes move as one.
+    const [right, up] = this.axes;
+    const [across, , eye] = this.axes.map((axis) => rotated(rotated(axis, up, -dx), right, -dy));
+    // The eye moves, so the axes move as one; they stay at right angles however often they do.
+    const towards = unit(eye);
+    const side = unit(across.map((x, k) => x - dot(across, towards) * towards[k]));
+    this.axes = [side, cross(towards, side), towards];
     this.project(part);
   }
 
@@ -96,6 +105,10 @@ export class SkinMap {
     this.top = 50;
     this.pointed = null; // [part, id] of the contact under the pointer
     this.selected = null; // and of the one that was clicked
+    this.body = null; // draws curved parts, once one is here
+    this.asked = false;
+    this.flattened = false; // whether curved parts have to do without it
+    this.grabbed = null; // the curved part that a drag turns
   }
 
   get parts() {
@@ -113,10 +126,22 @@ export class SkinMap {
       poses.set(part.name, pose);
     }
     this.poses = poses;
+    this.body?.relayout();
+    if (!this.asked && [...poses.values()].some((pose) => !pose.flat)) {
+      this.asked = true;
+      drawer(this.canvas).then((body) => { this.body = body; this.flattened = !body; });
+    }
     this.arrange();
   }
 
-  fit() { this.zoom = 1; this.pan = [0, 0]; }
+  /** Whether a part is drawn in space. */
+  solid(part) { return this.body !== null && !this.body.lost && !this.poses.get(part.name).flat; }
+
+  fit() {
+    this.zoom = 1;
+    this.pan = [0, 0];
+    for (const part of this.parts) this.poses.get(part.name)?.face(part);
+  }
 
   show(name) { this.shown = name; this.fit(); this.arrange(); }
 
@@ -214,15 +239,29 @@ export class SkinMap {
     this.pan[1] += my / this.scale - my / before;
   }
 
-  /** Move what is shown; a bent part that is shown alone turns instead. */
+  /** Take hold of what is at a point of the canvas: dragging turns a curved part. */
+  grab(sx, sy) {
+    const at = (this.placed ?? []).find(({ part, dx, dy }) => {
+      const { flat, box: [x0, y0, x1, y1] } = this.poses.get(part.name);
+      const [left, top] = this.toScreen([x0 + dx, y0 + dy]);
+      const [right, bottom] = this.toScreen([x1 + dx, y1 + dy]);
+      return !flat && sx > left && sx < right && sy > top && sy < bottom;
+    });
+    this.grabbed = at?.part.name ?? null;
+  }
+
+  /** Move what is shown, or turn the curved part that was grabbed. */
   drag(dx, dy, slide) {
-    const pose = this.shown && this.poses.get(this.shown);
-    if (pose && !pose.flat && !slide) {
-      pose.turn(this.store.part(this.shown), dx * 0.008, dy * 0.008);
-      this.arrange();
-    } else {
-      this.pan[0] += dx / this.scale;
-      this.pan[1] += dy / this.scale;
+    if (this.grabbed && !slide) return this.turn([this.store.part(this.grabbed)], dx, dy);
+    this.pan[0] += dx / this.scale;
+    this.pan[1] += dy / this.scale;
+  }
+
+  /** Turn curved parts as if their front was moved by so many px. */
+  turn(parts, dx, dy) {
+    for (const part of parts) {
+      const pose = part && this.poses.get(part.name);
+      if (pose && !pose.flat) pose.turn(part, dx * 0.008, dy * 0.008);
     }
   }
 
@@ -231,8 +270,11 @@ export class SkinMap {
     let best = null;
     for (const { part, dx, dy } of this.placed ?? []) {
       const pose = this.poses.get(part.name);
+      const hit = this.solid(part) && this.body.hit(part, sx, sy, this.canvas.clientWidth, this.canvas.clientHeight);
       for (let i = 0; i < part.n; i++) {
         if (pose.towards[i] < 0) continue;
+        // Where skin is in front, its taxel is meant and none behind it.
+        if (hit && Math.hypot(...part.position[i].map((x, k) => x - hit[k])) > 1.5 * part.radius[i] + 9 / this.scale) continue;
         const [x, y] = this.toScreen([pose.points[i][0] + dx, pose.points[i][1] + dy]);
         const away = Math.hypot(x - sx, y - sy);
         if (away < Math.max(9, part.radius[i] * this.scale * 1.2) && (!best || away < best.away)) best = { part: part.name, taxel: i, away };
@@ -246,7 +288,7 @@ export class SkinMap {
     for (const { part, dx, dy } of this.placed ?? []) {
       const pose = this.poses.get(part.name);
       for (const contact of part.contacts) {
-        const near = contact.taxels.some((i) => i < part.n
+        const near = contact.taxels.some((i) => i < part.n && pose.towards[i] >= 0
           && Math.hypot(...this.toScreen([pose.points[i][0] + dx, pose.points[i][1] + dy]).map((v, k) => v - [sx, sy][k])) < part.radius[i] * this.scale + 4);
         if (near) return { part: part.name, id: contact.id };
       }
@@ -268,6 +310,12 @@ export class SkinMap {
     const look = paper();
     ctx.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
     ctx.clearRect(0, 0, this.canvas.clientWidth, this.canvas.clientHeight);
+    const solid = (this.placed ?? []).filter(({ part }) => this.solid(part)).map(({ part, dx, dy }) => {
+      const [x, y] = this.toScreen([dx, dy]);
+      return { part, pose: this.poses.get(part.name), x, y };
+    });
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    this.body?.draw(solid, { width, height, ratio: this.ratio, scale: this.scale, raw: this.raw, top: this.top, nowMs });
     for (const at of this.placed ?? []) this.drawPart(ctx, look, at, nowMs);
     this.labels = [];
     for (const at of this.placed ?? []) this.drawContacts(ctx, look, at, nowMs);
@@ -278,10 +326,13 @@ export class SkinMap {
     const pose = this.poses.get(part.name);
     const scale = this.scale;
     const stale = part.stale(nowMs);
+    const solid = this.solid(part);
     ctx.lineWidth = 1;
     part.triangles.forEach((triangle, k) => {
       // Units of several triangles have one outline.
       if (k && sameOutline(part.triangles[k - 1], triangle) && !part.faults.size) return;
+      const faulty = part.faults.has(`${triangle.board}/${triangle.number}`);
+      if (solid && (!faulty || pose.facing[k] < 0)) return;
       ctx.beginPath();
       pose.outlines[k].forEach((p, i) => {
         const [x, y] = this.toScreen([p[0] + dx, p[1] + dy]);
@@ -289,7 +340,7 @@ export class SkinMap {
       });
       ctx.closePath();
       ctx.globalAlpha = pose.facing[k] < 0 ? 0.25 : 1;
-      if (part.faults.has(`${triangle.board}/${triangle.number}`)) {
+      if (faulty) {
         ctx.fillStyle = hatch(ctx, look.alarm);
         if (!sharesOutline(part, k)) ctx.fill();
         ctx.strokeStyle = look.alarm;
@@ -304,7 +355,7 @@ export class SkinMap {
     });
     ctx.setLineDash([]);
     ctx.globalAlpha = 1;
-    this.drawTaxels(ctx, look, part, pose, dx, dy, scale, stale);
+    if (!solid) this.drawTaxels(ctx, look, part, pose, dx, dy, scale, stale);
     const [lx, ly] = this.toScreen(label);
     ctx.font = FONT;
     ctx.textAlign = "center";
@@ -396,6 +447,8 @@ export class SkinMap {
       ctx.beginPath();
       hull.forEach(([x, y], i) => { if (i) ctx.lineTo(x, y); else ctx.moveTo(x, y); });
       ctx.closePath();
+      // Of a contact on the far side there is a faint outline, and its force.
+      ctx.globalAlpha = seen.some((i) => pose.towards[i] >= 0) ? 1 : 0.45;
       const marked = is(this.pointed, part, contact) || is(this.selected, part, contact);
       halo(ctx, look, marked ? 4 : 2, marked);
       let [cx, cy] = [0, 1].map((k) => hull.reduce((sum, p) => sum + p[k], 0) / hull.length);
@@ -408,6 +461,7 @@ export class SkinMap {
         halo(ctx, look, 2);
       }
       this.drawLabel(ctx, look, hull, [cx, cy], `#${contact.id}  ${contact.force_n.toFixed(contact.force_n < 10 ? 2 : 1)} N`);
+      ctx.globalAlpha = 1;
     }
   }
 
@@ -436,12 +490,14 @@ export class SkinMap {
       const at = this.find(part, taxel);
       if (!at) return;
       const r = this.store.part(part).radius[taxel] * this.scale + 2.5;
+      ctx.globalAlpha = this.poses.get(part).towards[taxel] < 0 ? 0.45 : 1;
       ctx.beginPath();
       ctx.arc(...at, r, 0, TAU);
       ctx.lineWidth = 3;
       ctx.strokeStyle = colour;
       ctx.stroke();
     });
+    ctx.globalAlpha = 1;
     const at = this.cursor && this.find(this.cursor.part, this.cursor.taxel);
     if (at) {
       ctx.beginPath();

@@ -17,11 +17,13 @@ from tests.support.viewing import LIVE, viewing
 
 SAMPLES = ROOT.parent / "shared" / "data"
 SCENE = ROOT / "config" / "scenes" / "demo.toml"
-#: How many pixels of the map are not of its background.
+#: How many pixels of the map, and of curved parts below it, are not of its background.
 DRAWN = """(() => {
     const map = document.getElementById("map");
     const copy = new OffscreenCanvas(map.width, map.height)
         .getContext("2d", { willReadFrequently: true });
+    const body = document.getElementById("body");
+    if (body) copy.drawImage(body, 0, 0);
     copy.drawImage(map, 0, 0);
     const data = copy.getImageData(0, 0, map.width, map.height).data;
     let drawn = 0;
@@ -100,10 +102,12 @@ def start(robot: Stack) -> None:
 
 
 @asynccontextmanager
-async def page(robot: Stack, profile: Path, width: int = 1280) -> AsyncIterator[Page]:
+async def page(
+    robot: Stack, profile: Path, width: int = 1280, *, watch: str = ""
+) -> AsyncIterator[Page]:
     """The page of the robot, which ends with it."""
     try:
-        async with viewing(robot.broker, "demo", profile, width) as opened:
+        async with viewing(robot.broker, "demo", profile, width, watch=watch) as opened:
             yield opened
     finally:
         robot.kill()
@@ -322,6 +326,81 @@ async def test_a_recording_is_begun_marked_and_ended_from_the_page(
         await seen.until(f"{RECORD} === 'record'")
     recorded = list(read_messages_of(tmp_path / "recordings" / name))
     assert any(message.topic == "skin/demo/left_hand/frame" for message in recorded)
+
+
+#: Where the chosen taxel is on the map, by the ring around it.
+POSE = """(() => {
+    const ring = [...window.rings].at(-1);
+    return ring && ring.map(Math.round).join();
+})()"""
+WATCH_RINGS = """
+    window.rings = [];
+    const arc = CanvasRenderingContext2D.prototype.arc;
+    CanvasRenderingContext2D.prototype.arc = function (x, y, ...all) {
+        if (this.canvas.id === "map") window.rings = [...window.rings.slice(-9), [x, y]];
+        arc.call(this, x, y, ...all);
+    };
+"""
+
+
+@pytest.mark.parametrize("by", ["mouse", "touch", "keyboard"])
+async def test_a_curved_part_turns_beside_others(robot: Stack, tmp_path: Path, by: str) -> None:
+    start(robot)
+    async with page(robot, tmp_path / "profile", watch=WATCH_RINGS) as seen:
+        await seen.call("Emulation.setTouchEmulationEnabled", enabled=by == "touch")
+        await seen.until(f"{LIVE} && document.getElementById('body') !== null")
+        # The cursor is on a taxel of the forearm, which is drawn beside the hand.
+        await seen.run('document.getElementById("map").focus()')
+        await seen.press(",")
+        await seen.until("/^left_forearm/.test(document.getElementById('tip').textContent)")
+        before = await seen.until(POSE)
+        left, top, width, height = await seen.box("#map")
+        places = [(left + share * width, top + 0.5 * height) for share in (0.7, 0.75, 0.8)]
+        if by == "touch":
+            await seen.touch(*places)
+        elif by == "mouse":
+            await seen.drag(*places)
+        else:
+            arrow = {"key": "ArrowRight", "modifiers": 8}
+            await seen.call("Input.dispatchKeyEvent", type="keyDown", **arrow)
+            await seen.call("Input.dispatchKeyEvent", type="keyUp", **arrow)
+        await seen.call("Input.dispatchMouseEvent", type="mouseMoved", x=1, y=1)
+        await seen.press("Escape")
+        await seen.press(",")
+        await seen.until("/^left_forearm/.test(document.getElementById('tip').textContent)")
+        await seen.until(f"{POSE} !== '{before}'")
+        # What fits again is as it was at first.
+        await seen.press("f")
+        await seen.until(f"{POSE} === '{before}'")
+
+
+async def test_skin_in_front_hides_what_is_behind_it(robot: Stack, tmp_path: Path) -> None:
+    start(robot)
+    async with page(robot, tmp_path / "profile") as seen:
+        await seen.until(f"{LIVE} && document.getElementById('body') !== null")
+        await seen.press("2")
+        # From behind, of the same skin, no taxel can be seen or chosen.
+        for _ in range(33):  # of 12 px, 0.008 rad each: half a turn
+            arrow = {"key": "ArrowUp", "modifiers": 8}
+            await seen.call("Input.dispatchKeyEvent", type="keyDown", **arrow)
+        await seen.until(f"{DRAWN} > 20_000")
+        left, top, width, height = await seen.box("#map")
+        for share in (0.3, 0.4, 0.5, 0.6, 0.7):
+            await seen.click(left + share * width, top + height / 2)
+        assert await seen.run('document.querySelectorAll("#chosen button").length') == 0
+
+
+async def test_without_three_js_curved_parts_are_drawn_flat_and_it_says_so(
+    robot: Stack, tmp_path: Path
+) -> None:
+    start(robot)
+    no_webgl = "HTMLCanvasElement.prototype.getContext = (get => function (kind, ...all) {"
+    no_webgl += "return /webgl/.test(kind) ? null : get.call(this, kind, ...all);"
+    no_webgl += "})(HTMLCanvasElement.prototype.getContext);"
+    async with page(robot, tmp_path / "profile", watch=no_webgl) as seen:
+        await seen.until(f"{LIVE} && !document.getElementById('flattened').hidden")
+        assert await seen.run('document.getElementById("body")') is None
+        assert await seen.run(DRAWN) > 20_000
 
 
 async def test_what_is_touched_is_44_pixels_large(robot: Stack, tmp_path: Path) -> None:
