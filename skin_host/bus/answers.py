@@ -1,9 +1,8 @@
 """Answers of boards to commands of class 2 and class 7; sources as in `commands`."""
 
-import struct
 from dataclasses import dataclass
 
-from skin_host.bus.commands import Analog, Management, Message
+from skin_host.bus.commands import Analog, Management, Message, message
 from skin_host.bus.wire import (
     BROADCAST_ADDRESS,
     HOST_ADDRESS,
@@ -12,13 +11,15 @@ from skin_host.bus.wire import (
     identifier,
 )
 
+#: Every answer of a board; longest first where two share a code, so that it is tried first.
+ANSWERS: list[type[Message]] = []
+TX_OVERFLOW_TYPE = 5
 
-@dataclass(frozen=True, slots=True)
+
+@message(0x1C, "7B", ANSWERS)
 class FirmwareVersion(Analog):
     """Answer to 1C."""
 
-    CODE = 0x1C
-    LAYOUT = struct.Struct("7B")
     board_type: int
     firmware_major: int
     firmware_minor: int
@@ -28,40 +29,32 @@ class FirmwareVersion(Analog):
     compatible: int
 
 
-@dataclass(frozen=True, slots=True)
+@message(0x00, "B", ANSWERS)
 class ResetAnswer(Management):
     """Answer of an MTB3 to 00, just before it resets."""
 
-    CODE = 0x00
-    LAYOUT = struct.Struct("B")
     ok: int = 1
 
 
-@dataclass(frozen=True, slots=True)
+@message(0x04, "B", ANSWERS)
 class PingAnswer(Management):
     """Answer to 04."""
 
-    CODE = 0x04
-    LAYOUT = struct.Struct("B")
     ok: int = 1
 
 
-@dataclass(frozen=True, slots=True)
+@message(0x0C, "B4s", ANSWERS)
 class AdditionalInfo(Management):
     """One of eight answers to 0C."""
 
-    CODE = 0x0C
-    LAYOUT = struct.Struct("B4s")
     index: int
     text: bytes
 
 
-@dataclass(frozen=True, slots=True)
+@message(0x0E, "7s", ANSWERS)
 class TimeOfLife(Management):
     """Answer to 0E: seven bytes of microseconds, little endian (byte order inferred)."""
 
-    CODE = 0x0E
-    LAYOUT = struct.Struct("7s")
     microseconds: bytes
 
     @property
@@ -70,24 +63,20 @@ class TimeOfLife(Management):
         return int.from_bytes(self.microseconds, "little") * 1e-6
 
 
-@dataclass(frozen=True, slots=True)
+@message(0xFF, "4B", ANSWERS)
 class Discovered(Management):
     """Answer of an application to FF."""
 
-    CODE = 0xFF
-    LAYOUT = struct.Struct("4B")
     board_type: int
     firmware_major: int
     firmware_minor: int
     firmware_build: int
 
 
-@dataclass(frozen=True, slots=True)
+@message(0xFF, "3B", ANSWERS)
 class DiscoveredBootloader(Management):
     """Answer of a bootloader to FF: the board runs no application."""
 
-    CODE = 0xFF
-    LAYOUT = struct.Struct("3B")
     board_type: int
     bootloader_major: int
     bootloader_minor: int
@@ -98,19 +87,6 @@ class TxOverflow:
     """Notification from an MTB3 that its transmit buffer overflowed: class 7, low nibble 5, DLC
     0.
     """
-
-
-#: Longest first where two answers share a code, so that the longer one is tried first.
-ANSWERS: tuple[type[Message], ...] = (
-    FirmwareVersion,
-    ResetAnswer,
-    PingAnswer,
-    AdditionalInfo,
-    TimeOfLife,
-    Discovered,
-    DiscoveredBootloader,
-)
-TX_OVERFLOW_TYPE = 5
 
 
 def answer_frame(answer: Message, address: int) -> tuple[int, bytes]:

@@ -1,15 +1,16 @@
 """Commands to the boards: class 2 (analog) and class 7 (management); see `answers` for the answers.
 
-Every message is a small record that knows its code and the layout of its payload, so one encoder
-and one parser serve all. Multi-byte numbers are little endian. Boards do not answer the skin
-configuration commands. Sources: the boards' protocol document TSD-ICUBUNIT (section 3),
-mtb3/can_interface.c and embot_prot_can_analog_polling.cpp.
+Every message is a small record that knows its code and the layout of its payload, so one encoder,
+one parser and one writer of DBC files serve all. Multi-byte numbers are little endian. Boards do
+not answer the skin configuration commands. Sources: the boards' protocol document TSD-ICUBUNIT
+(section 3), mtb3/can_interface.c and embot_prot_can_analog_polling.cpp.
 """
 
 import struct
+from collections.abc import Callable
 from dataclasses import astuple, dataclass
 from enum import IntEnum, IntFlag
-from typing import ClassVar, Self
+from typing import ClassVar, Self, TypeVar, dataclass_transform
 
 from skin_host.bus.wire import (
     HOST_ADDRESS,
@@ -35,6 +36,9 @@ class BoardType(IntEnum):
 
 
 SKIN_BOARD_TYPES = frozenset({BoardType.SKIN, BoardType.MTB4, BoardType.MTB4W, BoardType.MTB4C})
+
+
+M = TypeVar("M", bound="Message")
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +71,32 @@ class Message:
         return cls(*cls.LAYOUT.unpack_from(payload, 1))
 
 
+#: Every command to a board, in the order in which they are described below.
+COMMANDS: list[type[Message]] = []
+
+
+@dataclass_transform(frozen_default=True)
+def message(
+    code: int, layout: str = "", table: list[type[Message]] | None = None
+) -> Callable[[type[M]], type[M]]:
+    """Make a class a message: a frozen record of its fields.
+
+    Args:
+        code: the first byte of the payload.
+        layout: how the fields are packed behind it, as `struct` writes it.
+        table: lists the message.
+    """
+
+    def made(kind: type[M]) -> type[M]:
+        record = dataclass(frozen=True, slots=True)(kind)
+        record.CODE, record.LAYOUT = code, struct.Struct(layout)
+        if table is not None:
+            table.append(record)
+        return record
+
+    return made
+
+
 class Analog(Message):
     """A message of class 2."""
 
@@ -88,96 +118,76 @@ class TxMode(IntEnum):
     STOP = 1
 
 
-@dataclass(frozen=True, slots=True)
+@message(0x07, "B", COMMANDS)
 class SetTxMode(Analog):
     """07: start or stop the stream."""
 
-    CODE = 0x07
-    LAYOUT = struct.Struct("B")
     mode: int
 
 
-@dataclass(frozen=True, slots=True)
+@message(0x08, "B", COMMANDS)
 class SetTransmissionPeriod(Analog):
     """08: period of an analog stream in ms (force/torque boards; skin takes it from 4D)."""
 
-    CODE = 0x08
-    LAYOUT = struct.Struct("B")
     period_ms: int
 
 
-@dataclass(frozen=True, slots=True)
+@message(0x1C, "2B", COMMANDS)
 class GetFirmwareVersion(Analog):
     """1C: query the firmware version, with the CAN protocol version of the host."""
 
-    CODE = 0x1C
-    LAYOUT = struct.Struct("2B")
     protocol_major: int
     protocol_minor: int
 
 
-@dataclass(frozen=True, slots=True)
+@message(0x32, "B", COMMANDS)
 class SetBoardAddress(Analog):
     """32: a new address 1..14, stored at once, not answered."""
 
-    CODE = 0x32
-    LAYOUT = struct.Struct("B")
     address: int
 
 
-@dataclass(frozen=True, slots=True)
+@message(0x33, "", COMMANDS)
 class ImuGet(Analog):
     """33: query the inertial set-up (MTB4 family)."""
 
-    CODE = 0x33
 
-
-@dataclass(frozen=True, slots=True)
+@message(0x34, "<HBI", COMMANDS)
 class ImuSet(Analog):
     """34: which inertial sensors stream, a mask of 16 bits, then range and further settings."""
 
-    CODE = 0x34
-    LAYOUT = struct.Struct("<HBI")
     sensors: int
     fusion: int
     ranges: int
 
 
-@dataclass(frozen=True, slots=True)
+@message(0x35, "B", COMMANDS)
 class ImuTransmit(Analog):
     """35: inertial period in ms, 0 stops."""
 
-    CODE = 0x35
-    LAYOUT = struct.Struct("B")
     period_ms: int
 
 
-@dataclass(frozen=True, slots=True)
+@message(0x38, "", COMMANDS)
 class ThermometerGet(Analog):
     """38: query the set-up of the temperature sensors."""
 
-    CODE = 0x38
 
-
-@dataclass(frozen=True, slots=True)
+@message(0x39, "B", COMMANDS)
 class ThermometerSet(Analog):
     """39: which temperature sensors stream."""
 
-    CODE = 0x39
-    LAYOUT = struct.Struct("B")
     sensors: int
 
 
-@dataclass(frozen=True, slots=True)
+@message(0x3A, "B", COMMANDS)
 class ThermometerTransmit(Analog):
     """3A: period of the temperature sensors in seconds, 0 stops."""
 
-    CODE = 0x3A
-    LAYOUT = struct.Struct("B")
     period_s: int
 
 
-@dataclass(frozen=True, slots=True)
+@message(0x4C, "<3BHH", COMMANDS)
 class TactileSetup(Analog):
     """4C, obsolete: set up, calibrate and start in class 3 (MTB3); MTB4 ignores the fields.
 
@@ -186,8 +196,6 @@ class TactileSetup(Analog):
     counts 3.2 us and is used where `timer_flag` is 3.
     """
 
-    CODE = 0x4C
-    LAYOUT = struct.Struct("<3BHH")
     mode: int = 1
     decimation: int = 1
     timer_flag: int = 1
@@ -195,23 +203,19 @@ class TactileSetup(Analog):
     timer: int = 0
 
 
-@dataclass(frozen=True, slots=True)
+@message(0x4D, "3B", COMMANDS)
 class SetBoardConfig(Analog):
     """4D: skin type, period, untouched value. Side effect: all triangles are disabled."""
 
-    CODE = 0x4D
-    LAYOUT = struct.Struct("3B")
     skin_type: int
     period_ms: int
     no_load: int
 
 
-@dataclass(frozen=True, slots=True)
+@message(0x4E, "<4BHB", COMMANDS)
 class TactileSetup2(Analog):
     """4E, obsolete (MTB3): shifts, no-load, flags, enabled triangles; calibrates and starts."""
 
-    CODE = 0x4E
-    LAYOUT = struct.Struct("<4BHB")
     shift: int = 0x02
     shifts: int = 0x22
     no_load: int = 0xF0
@@ -220,12 +224,10 @@ class TactileSetup2(Analog):
     trailer: int = 0x0A
 
 
-@dataclass(frozen=True, slots=True)
+@message(0x4F, "2B", COMMANDS)
 class AccGyroSetup(Analog):
     """4F: inertial sensors of the board; period in ms, 0 stops."""
 
-    CODE = 0x4F
-    LAYOUT = struct.Struct("2B")
     sensors: int
     period_ms: int
 
@@ -236,12 +238,10 @@ class TriangleFlags(IntFlag):
     ENABLE = 1
 
 
-@dataclass(frozen=True, slots=True)
+@message(0x50, "<4BH", COMMANDS)
 class SetTriangleConfig(Analog):
     """50: set up triangles first..last. Triggers a new baseline of the whole board."""
 
-    CODE = 0x50
-    LAYOUT = struct.Struct("<4BH")
     first: int
     last: int
     shift: int = 2
@@ -249,85 +249,45 @@ class SetTriangleConfig(Analog):
     cdc_offset: int = 0x2200
 
 
-@dataclass(frozen=True, slots=True)
+@message(0x00, "", COMMANDS)
 class EnterBootloader(Management):
     """00: reset into the bootloader."""
 
-    CODE = 0x00
 
-
-@dataclass(frozen=True, slots=True)
+@message(0x04, "", COMMANDS)
 class Ping(Management):
     """04: check that a board is present (MTB3 application); ends the bootloader."""
 
-    CODE = 0x04
 
-
-@dataclass(frozen=True, slots=True)
+@message(0x0C, "", COMMANDS)
 class GetAdditionalInfo(Management):
     """0C: query the board's text of 32 characters."""
 
-    CODE = 0x0C
 
-
-@dataclass(frozen=True, slots=True)
+@message(0x0D, "B4s", COMMANDS)
 class SetAdditionalInfo(Management):
     """0D: four characters of the board's text, `index` 0..7."""
 
-    CODE = 0x0D
-    LAYOUT = struct.Struct("B4s")
     index: int
     text: bytes
 
 
-@dataclass(frozen=True, slots=True)
+@message(0x0E, "", COMMANDS)
 class GetTimeOfLife(Management):
     """0E: query how long the board has been up."""
 
-    CODE = 0x0E
 
-
-@dataclass(frozen=True, slots=True)
+@message(0x32, "<BH", COMMANDS)
 class SetCanAddress(Management):
     """32: a new address (FF picks one at random outside `forbidden`, a mask of addresses)."""
 
-    CODE = 0x32
-    LAYOUT = struct.Struct("<BH")
     address: int
     forbidden: int = 0
 
 
-@dataclass(frozen=True, slots=True)
+@message(0xFF, "", COMMANDS)
 class Discover(Management):
     """FF: query all boards. An MTB3 stops sending after any frame of this class."""
-
-    CODE = 0xFF
-
-
-COMMANDS: tuple[type[Message], ...] = (
-    SetTxMode,
-    SetTransmissionPeriod,
-    GetFirmwareVersion,
-    SetBoardAddress,
-    ImuGet,
-    ImuSet,
-    ImuTransmit,
-    ThermometerGet,
-    ThermometerSet,
-    ThermometerTransmit,
-    TactileSetup,
-    SetBoardConfig,
-    TactileSetup2,
-    AccGyroSetup,
-    SetTriangleConfig,
-    EnterBootloader,
-    Ping,
-    GetAdditionalInfo,
-    SetAdditionalInfo,
-    GetTimeOfLife,
-    SetCanAddress,
-    Discover,
-)
 
 
 def command_frame(command: Message, address: int) -> tuple[int, bytes]:

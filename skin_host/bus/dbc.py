@@ -116,8 +116,8 @@ def dbc_text(
     values: list[str] = []
     commands, answers = COMMANDS, ANSWERS
     if layout is None:  # a board of either sort may have the address
-        commands = (GetFullScale, *COMMANDS)
-        answers = (FullScale, *ANSWERS)
+        commands = [GetFullScale, *COMMANDS]
+        answers = [FullScale, *ANSWERS]
     for board in boards:
         for triangle, about in board.triangles:
             can_id = skin_id(board.address, triangle)

@@ -5,15 +5,13 @@ with three little-endian words around 0x8000. They have no sequence number and a
 arrival. Source: icub-main's CanBusFtSensor.cpp and iCubCanProto_analogSensorMessages.h.
 """
 
-import struct
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skin_host.bus.commands import Analog, SetTransmissionPeriod, SetTxMode, command_frame
+from skin_host.bus.commands import Analog, SetTransmissionPeriod, SetTxMode, command_frame, message
 from skin_host.bus.wire import HOST_ADDRESS, FrameBatch, MessageClass, identifier
 
 Floats = NDArray[np.float64]
@@ -46,21 +44,17 @@ class StrainMode(IntEnum):
     BOTH = 4
 
 
-@dataclass(frozen=True, slots=True)
+@message(0x18, "<B")
 class GetFullScale(Analog):
     """18: query the full scale of a channel: 0-2 force (N), 3-5 torque (N m)."""
 
-    CODE: ClassVar[int] = 0x18
-    LAYOUT: ClassVar[struct.Struct] = struct.Struct("<B")
     channel: int
 
 
-@dataclass(frozen=True, slots=True)
+@message(0x18, ">BH")
 class FullScale(Analog):
     """Answer to 18. The only number in this protocol with its high byte first."""
 
-    CODE: ClassVar[int] = 0x18
-    LAYOUT: ClassVar[struct.Struct] = struct.Struct(">BH")
     channel: int
     value: int
 

@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
-from skin_host.evaluation import plots, tables
+from skin_host.evaluation import tables
 from skin_host.evaluation.document import Section
 from skin_host.evaluation.document import write as write_document
+from skin_host.evaluation.pictures import draw_report
 from skin_host.evaluation.tables import Report
 
 PICTURES = "accuracy"
@@ -16,7 +17,7 @@ def write(report: Report, folder: Path) -> None:
     Raises:
         OSError: the folder cannot be written.
     """
-    pictures = {f"{PICTURES}/{name}": picture for name, picture in plots.draw(report).items()}
+    pictures = {f"{PICTURES}/{name}": picture for name, picture in draw_report(report).items()}
     title = "How accurate, how fast"
     sections = _sections(report)
     write_document(sections, title, report, folder, "report", pictures, markdown_name="accuracy")

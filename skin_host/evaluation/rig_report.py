@@ -23,7 +23,7 @@ from skin_host.demo import configuration
 from skin_host.evaluation.cup_grasp import Grasp
 from skin_host.evaluation.cup_grasp import run as grasp_cups
 from skin_host.evaluation.document import Section, Table, as_text, write
-from skin_host.evaluation.rig_plots import Corrected, Results, draw
+from skin_host.evaluation.pictures import Corrected, Results, draw_rig
 from skin_host.processing.fitting.hold import fit, merge
 from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.relaxation import make_model
@@ -56,7 +56,7 @@ def run(*, quick: bool = False, output: Path | None = None) -> list[Row]:
     results = measure(quick=quick)
     rows = facts(results)
     if output is not None:
-        pictures = draw(results)
+        pictures = draw_rig(results)
         sections = [Section("The facts", [], [_table(rows)])]
         sections += [Section(_FIGURES[name], [], picture=name) for name in pictures]
         document = {"facts": rows}

@@ -4,7 +4,7 @@ import pytest
 
 from skin_host.evaluation import rig_report
 from skin_host.evaluation.cup_grasp import PERIOD_S
-from skin_host.evaluation.rig_plots import Results
+from skin_host.evaluation.pictures import Results
 from skin_host.evaluation.rig_report import Row
 
 
