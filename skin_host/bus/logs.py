@@ -307,7 +307,7 @@ def _by_channel(
     batch: RecordBatch, channel: NDArray[np.uint16], names: list[str]
 ) -> Iterator[tuple[str, FrameBatch]]:
     """The frames of one window channel by channel, in the order in which channels came."""
-    codes = dict.fromkeys(channel.tolist())
+    codes = {0: None} if len(names) == 1 else dict.fromkeys(channel.tolist())
     if len(codes) == 1:
         yield names[next(iter(codes))], batch
         return

@@ -177,13 +177,18 @@ def encode_frame(
     Raises:
         SkinError: CBOR is wanted and cbor2 is not installed.
     """
-    scaled = frame.pressure_kpa.astype(np.float64) / SCALE_KPA
+    scaled = np.divide(frame.pressure_kpa, SCALE_KPA, dtype=np.float64)
+    np.rint(scaled, out=scaled)
     valid = frame.valid
-    finite = np.isfinite(scaled)
-    if not finite.all():
+    # False with any number that is not one.
+    if not (
+        np.minimum.reduce(scaled, initial=0.0) >= -_INT32
+        and np.maximum.reduce(scaled, initial=0.0) <= _INT32
+    ):
+        finite = np.isfinite(scaled)
         valid = valid & finite
-        scaled = np.where(finite, scaled, 0.0)
-    values = np.clip(np.rint(scaled), -_INT32, _INT32).astype(np.int32)
+        scaled = np.clip(np.where(finite, scaled, 0.0), -_INT32, _INT32)
+    values = scaled.astype(np.int32)
     fields = _FrameFields(
         FRAME_SCHEMA, frame.seq, frame.t_ns, "kPa", SCALE_KPA, None, encode_mask(valid)
     )
