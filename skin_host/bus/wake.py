@@ -3,9 +3,9 @@
 A wake-up costs as much as reading dozens of frames, so the daemon wakes up only by its own plan. A
 board sends its sweep once a period: after one sweep it is known when the last frame of the next is
 due, and the ports are read right then. Of boards whose sweeps make one sample together (those of a
-part) the last is planned for, because nothing comes of the others before. While a board has not
-sent yet, or not in time, the ports are read at fixed intervals; after some time without it at
-longer ones.
+part) the last two are planned for, because nothing comes of the others before. While a board has
+not sent yet, or not in time, the ports are read at fixed intervals; after some time without it
+at longer ones.
 """
 
 import asyncio
@@ -81,7 +81,8 @@ class Plan:
         ends_ns = [
             [look_ns[board] for board in boards if board in look_ns] for boards in self._missing()
         ]
-        sample_ns = min((max(ends) for ends in ends_ns if ends), default=None)
+        # With the last but one, what came before it is worked off and does not delay the last.
+        sample_ns = min((sorted(ends)[-2:][0] for ends in ends_ns if ends), default=None)
         if sample_ns is None:
             return now_ns + self._search_ns(now_ns)
         if self._lost_ns:

@@ -46,7 +46,7 @@ def test_between_sweeps_it_sleeps_long_only_if_every_board_is_known():
     assert plan.next_ns(once_between) == T0 + PERIOD + GUARD_NS
 
 
-def test_boards_of_one_sample_are_read_with_the_last():
+def test_boards_of_one_sample_are_read_with_the_last_but_one_and_the_last():
     missing = [[0, 1, 2], [3]]
     plan = Plan(dict.fromkeys(range(4), PERIOD), POLL, lambda: missing)
     for board, at_ms in ((0, 0), (3, 5), (1, 10), (2, 20)):
@@ -56,7 +56,7 @@ def test_boards_of_one_sample_are_read_with_the_last():
     plan.sweep_ended(0, again)
     plan.sweep_ended(3, again + 5 * MS)
     missing[0].remove(0)
-    assert plan.next_ns(again + 6 * MS) == again + 20 * MS + GUARD_NS
+    assert plan.next_ns(again + 6 * MS) == again + 10 * MS + GUARD_NS
     plan.sweep_ended(1, again + 10 * MS)
     missing[0].remove(1)
     assert plan.next_ns(again + 11 * MS) == again + 20 * MS + GUARD_NS
