@@ -140,8 +140,9 @@ class Link:
 
         def work() -> None:
             self.turn(self._clock.now_ns(), deliver, record)
-            # After the delivered results have been sent.
-            loop.call_soon(self._engine.judge)
+            if self._engine.has_deferred:
+                # After the delivered results have been sent.
+                loop.call_soon(self._engine.judge)
 
         await self._wake_up.run(work)
 

@@ -280,6 +280,11 @@ class Engine:
         """Of each part, the boards whose sweeps its next sample waits for."""
         return self._intake.missing()
 
+    @property
+    def has_deferred(self) -> bool:
+        """Whether `judge` has something to do."""
+        return self.validity.is_whole
+
     def judge(self) -> None:
         """Do deferred work between sweeps, so that the next one does not wait for it."""
         self.validity.judge_whole()

@@ -143,14 +143,18 @@ class Validity:
             here &= ~(self._unpressable[row] & many)
         return here
 
-    def judge_whole(self) -> None:
-        """Judge which chips live if every board that has not timed out has sent since."""
-        n = len(self._waiting)
-        if self._n_waiting == n or (
+    @property
+    def is_whole(self) -> bool:
+        """Whether every board that has not timed out has sent since the last judgement."""
+        return self._n_waiting == len(self._waiting) or bool(
             self._n_waiting
             and self._ledger.any_silent
             and (self._waiting | self._ledger.silent).all()
-        ):
+        )
+
+    def judge_whole(self) -> None:
+        """Judge which chips live if every board that has not timed out has sent since."""
+        if self.is_whole:
             self.judge()
 
     def judge(self) -> None:
