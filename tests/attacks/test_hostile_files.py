@@ -8,7 +8,7 @@ from skin_host.cli import main
 from skin_host.daemon import metrics
 from skin_host.errors import RequestError, SkinError
 from skin_host.mqtt.address import Broker
-from skin_host.recording.capture import MAX_RECORDINGS, Recorder
+from skin_host.recording.capture import MAX_RECORDINGS, FrameRecorder
 
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
 
@@ -53,7 +53,7 @@ def test_a_folder_takes_so_many_recordings_and_no_more(tmp_path: Path) -> None:
     for number in range(MAX_RECORDINGS):
         (tmp_path / f"{number}.log").touch()
     with pytest.raises(SkinError, match="holds 100 recordings already"):
-        Recorder(tmp_path / "one_more.log", 1.0, 1000)
+        FrameRecorder(tmp_path / "one_more.log", 1.0, 1000)
 
 
 def test_a_password_need_not_stand_in_the_url(
