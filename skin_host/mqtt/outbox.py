@@ -25,6 +25,9 @@ from skin_host.processing.pipeline import PressureFrame
 #: many. A frozen broker is noticed after 3 s.
 REPEAT_S = 10.0
 REPEATED = 1000
+#: While more events than this wait, a newer `move` takes the place of the one before it: what waits
+#: longer would tell of the past. The first ones, as many, may be on their way.
+BACKLOG = 100
 #: `move` events may fill half of the queue, because a begin or an end is more important.
 MOVE_SHARE = 0.5
 
@@ -39,6 +42,8 @@ class PublisherCounters:
         connections: how often the broker was reached.
         frames_skipped: a newer frame came before they could be sent, or there was no broker.
         touches_waiting: events in the queue now.
+        moves_replaced: `move` events that were replaced by a newer one of their contact before they
+            were sent, because many events waited; they leave no gap in `count`.
         touches_dropped: events that found the queue full, or were left at the end.
         refused: publications that the broker refused; `last_error` gives the reason.
         rejected: publications that were dropped because the broker ended the connection
@@ -56,6 +61,7 @@ class PublisherCounters:
     touches_sent: int = 0
     touches_waiting: int = 0
     touches_dropped: int = 0
+    moves_replaced: int = 0
     retained_sent: int = 0
     refused: int = 0
     rejected: int = 0
@@ -112,6 +118,8 @@ class Outbox:
         self._move_limit = int(event_limit * MOVE_SHARE)
         self._overflowing = False
         self._counts: dict[str, int] = {}
+        #: By topic and contact: its last event, if that is a move, and the event's number.
+        self._last_moves: dict[tuple[str, int], tuple[Event, int]] = {}
         #: Payloads that the broker did not take, by topic.
         self._given_up: dict[str, bytes] = {}
         self._frame_ns = int(1e9 / frame_hz) if frame_hz else 0
@@ -144,9 +152,40 @@ class Outbox:
     def put_touch(
         self, topic: str, touch: TouchEvent, properties: MessageProperties | None
     ) -> None:
-        """Take a touch event, or count it as lost; either way it is numbered."""
-        limit = self._move_limit if touch.event == "move" else self._event_limit
-        self._put_counted(topic, lambda n: encode_touch(touch, n), properties, limit)
+        """Take a touch event, or count it as lost; either way it is numbered.
+
+        While many events wait, a `move` takes the place and the number of the contact's last one.
+        """
+        contact = topic, touch.id
+        if touch.event != "move":
+            self._last_moves.pop(contact, None)
+            self._put_counted(
+                topic, lambda n: encode_touch(touch, n), properties, self._event_limit
+            )
+            return
+        if len(self.events) > BACKLOG and self._replace_move(contact, touch, properties):
+            return
+        event = self._put_counted(
+            topic, lambda n: encode_touch(touch, n), properties, self._move_limit
+        )
+        if event is not None:
+            self._last_moves[contact] = event, self._counts[topic]
+
+    def _replace_move(
+        self, contact: tuple[str, int], touch: TouchEvent, properties: MessageProperties | None
+    ) -> bool:
+        """Put a move in the place of the contact's last event, if that is a waiting move."""
+        last, count = self._last_moves.get(contact, (None, 0))
+        if last is None:
+            return False
+        for back, event in enumerate(islice(reversed(self.events), len(self.events) - BACKLOG)):
+            if event is last:
+                newer = last._replace(payload=encode_touch(touch, count), properties=properties)
+                self.events[-1 - back] = newer
+                self._last_moves[contact] = newer, count
+                self.counters.moves_replaced += 1
+                return True
+        return False
 
     def put_grasp(
         self, topic: str, event: SlipEvent | OverEvent, properties: MessageProperties | None
@@ -161,19 +200,21 @@ class Outbox:
         encode: Callable[[int], bytes],
         properties: MessageProperties | None,
         limit: int,
-    ) -> None:
+    ) -> Event | None:
         count = self._counts[topic] = self._counts.get(topic, 0) + 1
         if self.trials.withholds(topic):
             self.counters.touches_dropped += 1
             self.counters.rejected += 1
-            return
+            return None
         if len(self.events) < limit:
-            self.put_event(Event(topic, encode(count), properties, is_touch=True))
-            return
+            event = Event(topic, encode(count), properties, is_touch=True)
+            self.put_event(event)
+            return event
         self.counters.touches_dropped += 1
         if not self._overflowing:
             self._overflowing = True
             _log.warning("touch events are lost: %d wait for the broker already", limit)
+        return None
 
     def put_event(self, event: Event) -> None:
         """Take a message that must arrive."""

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import json
 
-from skin_host.mqtt.outbox import Outbox
+from skin_host.mqtt.outbox import BACKLOG, Outbox
 from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
 
@@ -17,8 +17,8 @@ def frame(part: str, seq: int, t_ns: int = 0) -> PressureFrame:
     )
 
 
-def touch(event: str, part: str = "palm") -> TouchEvent:
-    return TouchEvent(event, 1, 1, 1, part, [1], None, None, 1.0, 1.0, 1.0, 0.1)  # type: ignore[arg-type]
+def touch(event: str, part: str = "palm", contact: int = 1, t_ns: int = 1) -> TouchEvent:
+    return TouchEvent(event, contact, 1, t_ns, part, [1], None, None, 1.0, 1.0, 1.0, 0.1)  # type: ignore[arg-type]
 
 
 def connected(event_limit: int = 16, frame_hz: float = 0.0) -> Outbox:
@@ -61,6 +61,38 @@ def test_frames_are_thinned_to_the_rate_despite_jitter(
         passed += len(outbox.frames)
         outbox.frames.clear()
     assert abs(passed - 10 * rate_hz) <= 1
+
+
+def test_while_many_events_wait_a_contact_waits_with_its_newest_move_only() -> None:
+    outbox = connected(event_limit=10_000)
+    waiting_before = BACKLOG + 1
+    for contact in range(waiting_before):
+        outbox.put_touch("palm", touch("begin", contact=contact), None)
+    for t_ns in range(1000):
+        for contact in (1, 2):
+            outbox.put_touch("palm", touch("move", contact=contact, t_ns=t_ns), None)
+    for contact in (1, 2):
+        outbox.put_touch("palm", touch("end", contact=contact), None)
+    waiting = [json.decode(event.payload) for event in outbox.events]
+    assert [(one["event"], one["id"], one["t_ns"]) for one in waiting[waiting_before:]] == [
+        ("move", 1, 999),
+        ("move", 2, 999),
+        ("end", 1, 1),
+        ("end", 2, 1),
+    ]
+    assert [one["count"] for one in waiting] == list(range(1, len(waiting) + 1))
+    assert outbox.counters.moves_replaced == 2 * 999
+    assert outbox.counters.touches_dropped == 0
+
+
+def test_a_move_that_may_be_on_its_way_is_not_replaced() -> None:
+    outbox = connected(event_limit=10_000)
+    outbox.put_touch("palm", touch("move", contact=0), None)
+    for contact in range(1, BACKLOG + 1):
+        outbox.put_touch("palm", touch("begin", contact=contact), None)
+    outbox.put_touch("palm", touch("move", contact=0, t_ns=2), None)
+    first, last = outbox.events[0], outbox.events[-1]
+    assert [json.decode(one.payload)["t_ns"] for one in (first, last)] == [1, 2]
 
 
 @given(st.lists(st.tuples(st.sampled_from(["begin", "move", "end"]), st.sampled_from("ab"))))
