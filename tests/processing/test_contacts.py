@@ -256,3 +256,23 @@ def test_every_touched_taxel_is_in_one_contact_and_every_begin_has_its_end(frame
         assert sorted(said) == sorted(touched)
     ended = {event.id for event in skin.tracker.end_all(0, 0)}
     assert ended == set(alive)
+
+
+def test_a_press_of_the_whole_skin_keeps_the_name_of_the_larger_contact_that_it_covers():
+    skin = Skin()
+    larger = HERE | set(range(12, 24))
+    assert kinds(skin.show(larger, THERE)) == [("begin", 1), ("begin", 2)]
+    for _ in range(MERGED_NS // SWEEP_NS + 2):
+        events = skin.show(set(range(N)))
+        assert {event.id for event in events if event.event != "end"} <= {1, 2}
+        for event in events:
+            assert event.taxels == sorted(event.taxels)
+    assert kinds(skin.show()) == [("end", 1)]
+
+
+def test_a_press_of_the_whole_skin_is_one_contact_to_its_end():
+    skin = Skin()
+    (begun,) = skin.show(set(range(N)))
+    assert begun.taxels == list(range(N))
+    assert skin.show(set(range(N))) == []
+    assert kinds(skin.show()) == [("end", 1)]
