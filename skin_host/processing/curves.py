@@ -26,12 +26,18 @@ Taxels = slice | Mask
 
 #: Dense where foam is soft; the straight end covers a byte's whole range.
 KNOTS_UNITS: Floats = np.array([0.0, 0.75, 1.5, 3.0, 5.0, 7.5, *np.arange(10.0, 256.0, 3.0)])
+#: All knots are multiples of this, so one look-up finds the piece that an activation is in.
+GRID_UNITS = 0.25
+_PIECE_AT: NDArray[np.intp] = (
+    np.searchsorted(KNOTS_UNITS, np.arange(0.0, KNOTS_UNITS[-1], GRID_UNITS), side="right") - 1
+)
 #: A curve rises by at least this much per unit, so that it has an inverse.
 LEAST_SLOPE = 1e-3
 
 
-#: A table is computed again when its taxel's baseline has moved this far: a quarter of a kPa.
-STALE_UNITS = 1 / 32
+#: A table is computed again when its baseline has moved this far: a quarter of the error that
+#: bytes have from rounding.
+STALE_UNITS = 1 / 8
 CODES = np.arange(256.0)[:, np.newaxis]
 
 
@@ -116,9 +122,10 @@ class TableCurve:
     def __init__(self, table_kpa: Floats, beyond_units: Floats) -> None:
         self.table_kpa = table_kpa
         self.beyond_units = beyond_units
-        steps = np.diff(KNOTS_UNITS)
-        self.linear: Floats = (table_kpa[:, 1] - table_kpa[:, 0]) / steps[0]
-        self._last_slope: Floats = (table_kpa[:, -1] - table_kpa[:, -2]) / steps[-1]
+        #: Each piece between knots is level + slope x; the first and the last go on for ever.
+        self._slope: Floats = np.diff(table_kpa, axis=1) / np.diff(KNOTS_UNITS)
+        self._level: Floats = table_kpa[:, :-1] - self._slope * KNOTS_UNITS[:-1]
+        self.linear: Floats = self._slope[:, 0]
 
     def part(self, taxels: Taxels) -> "TableCurve":
         """Return the curves of some of the taxels."""
@@ -126,40 +133,25 @@ class TableCurve:
         chosen.table_kpa = self.table_kpa[taxels]
         chosen.beyond_units = self.beyond_units[taxels]
         chosen.linear = self.linear[taxels]
-        chosen._last_slope = self._last_slope[taxels]
+        chosen._slope = self._slope[taxels]
+        chosen._level = self._level[taxels]
         return chosen
 
     def kpa(self, units: ArrayLike) -> Floats:
         """Return the pressure [..., n] in kPa of activations [..., n] in units."""
         x = np.asarray(units, dtype=np.float64)
-        inside = np.clip(x, 0.0, KNOTS_UNITS[-1])
-        knot = np.searchsorted(KNOTS_UNITS[1:-1], inside, side="right")
+        quarters = np.clip(x / GRID_UNITS, 0.0, len(_PIECE_AT) - 1.0).astype(np.intp)
+        piece = _PIECE_AT[quarters]
         taxel = np.arange(len(self.linear))
-        low, high = self.table_kpa[taxel, knot], self.table_kpa[taxel, knot + 1]
-        share = (inside - KNOTS_UNITS[knot]) / (KNOTS_UNITS[knot + 1] - KNOTS_UNITS[knot])
-        result: Floats = (
-            low
-            + share * (high - low)
-            + np.minimum(x, 0.0) * self.linear
-            + np.maximum(x - KNOTS_UNITS[-1], 0.0) * self._last_slope
-        )
+        result: Floats = self._level[taxel, piece] + self._slope[taxel, piece] * x
         return result
 
     def units(self, kpa: ArrayLike) -> Floats:
         """Return the activation [..., n] in units for these pressures; inverse of kpa."""
         c = np.asarray(kpa, dtype=np.float64)
-        first, last = self.table_kpa[:, 0], self.table_kpa[:, -1]
-        inside = np.clip(c, first, last)
-        knot = np.sum(self.table_kpa[:, 1:-1] <= inside[..., np.newaxis], axis=-1)
+        piece = np.sum(self.table_kpa[:, 1:-1] <= c[..., np.newaxis], axis=-1)
         taxel = np.arange(len(self.linear))
-        low, high = self.table_kpa[taxel, knot], self.table_kpa[taxel, knot + 1]
-        share = (inside - low) / (high - low)
-        result: Floats = (
-            KNOTS_UNITS[knot]
-            + share * (KNOTS_UNITS[knot + 1] - KNOTS_UNITS[knot])
-            + np.minimum(c - first, 0.0) / self.linear
-            + np.maximum(c - last, 0.0) / self._last_slope
-        )
+        result: Floats = (c - self._level[taxel, piece]) / self._slope[taxel, piece]
         return result
 
 

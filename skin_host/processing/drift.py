@@ -65,14 +65,21 @@ SETTLE_S = 5.0
 RECOVERED_S = 1.0
 #: Slow changes are detected in means over this time, because a byte resolves them poorly.
 SMOOTHING_S = 10.0
+#: Such means differ by no more without a change: five times their noise on good pads.
+SMOOTH_TOLERANCE_UNITS = 0.25
 #: A load that suddenly falls below this share of its value is eased.
 EASED_SHARE = 0.8
 #: A contact has released when less than this share of its largest reading remains ...
 RELEASED_SHARE = 0.4
 #: ... and at most this much of it can be drift that was not followed.
 UNSEEN_UNITS = 3.5
-#: For so long that is found to be a load if the reading rises.
-REGRET_S = 60.0
+#: Where untouched taxels show the drift, that is no more than what the reading under the touch has
+#: risen by, and this share of the relaxation, by which the model of the foam may be wrong.
+MODEL_ERROR_SHARE = 0.25
+#: For so long that is found to be a load if the reading rises by more than this share of what free
+#: foam would have lost of it.
+REGRET_S = 180.0
+HELD_SHARE = 0.5
 #: For how long it counts that a load was eased when it is felt no more.
 EASED_S = 60.0
 #: A zero that is uncertain by more than the paper's resolution (5 kPa) is reported.
@@ -155,10 +162,13 @@ class BaselineTracker:
         self._free_s: Array = np.full(n, np.inf)
         self._lowest: Array = np.full(n, np.inf)
         #: Where a reading was taken for unseen drift when a touch was released: the baseline
-        #: before, for how long it may yet go back, and the reading, relaxation included.
+        #: before, for how long it may yet go back, the reading with and without relaxation, and by
+        #: how much the reading without it has risen since.
         self._before: Array = np.zeros(n)
         self._taken_s: Array = np.zeros(n)
         self._taken_level: Array = np.zeros(n)
+        self._taken_free: Array = np.zeros(n)
+        self._risen: Array = np.zeros(n)
         self._touches = _Touches(n)
 
     def step(
@@ -212,8 +222,11 @@ class BaselineTracker:
         level = self.baseline + units + relaxed_units
         still = (np.abs(level - self._last) < TOLERANCE_UNITS) & ~missing
         self._last = level
-        change += self._touches.step(units, touched, dt_s)
-        released = still & self._touches.released(units, touched)
+        change += self._touches.step(units, touched, dt_s, relaxed_units)
+        referenced = np.count_nonzero(free) >= REFERENCES
+        released = still & self._touches.released(
+            units, touched, relaxed_units if referenced else None
+        )
         change[released] = units[released]
         change += self._given_back(units, level, released, dt_s)
         back = still & self._back(level, dt_s)
@@ -323,16 +336,27 @@ class BaselineTracker:
     def _given_back(self, units: Array, level: Array, released: Mask, dt_s: float) -> Array | float:
         """Return the change [n] of baselines that took a load that had been eased for drift.
 
-        Foam that is free comes back: its reading falls, relaxation included (`level` [n]). Where
-        that stays and the corrected reading rises, the foam pushes back against a load.
+        Foam that is free comes back: its reading falls, relaxation included (`level` [n]), by what
+        the model of the foam expects. Where it falls by less than half of that, the corrected
+        reading rises: something still presses the foam.
         """
+        free = self.baseline + units
         self._before[released] = self.baseline[released]
         self._taken_level[released] = level[released]
+        self._taken_free[released] = free[released]
+        self._risen[released] = 0.0
         self._taken_s[released] = REGRET_S
         if not np.count_nonzero(self._taken_s > 0.0):
             return 0.0
-        load = (self._taken_s > 0.0) & (units > 2.0 * TOLERANCE_UNITS) & ~released
-        load &= level > self._taken_level - TOLERANCE_UNITS
+        since_s = REGRET_S - self._taken_s
+        settling = np.where(since_s < SETTLE_S, dt_s / (since_s + dt_s), 0.0)
+        self._taken_free += settling * (free - self._taken_free)
+        self._taken_level += settling * (level - self._taken_level)
+        share = -math.expm1(-dt_s / SMOOTHING_S)
+        self._risen += share * (free - self._taken_free - self._risen)
+        expected = (self._taken_level - self._taken_free) - (level - free)
+        load = (self._taken_s > 0.0) & (self._risen > TOLERANCE_UNITS) & ~released
+        load &= self._risen > HELD_SHARE * expected
         given = np.where(load, np.minimum(self._before - self.baseline, 0.0), 0.0)
         self._taken_s -= dt_s
         self._taken_s[load] = 0.0
@@ -412,12 +436,17 @@ class _Touches:
         #: The smoothed reading, and its lowest value while the load was steady.
         self._level: Array = np.zeros(n)
         self._lowest: Array = np.zeros(n)
+        #: The same with the relaxation, and by how much it has slowly risen under the touch.
+        self._reading: Array = np.zeros(n)
+        self._risen: Array = np.zeros(n)
         self._before: Mask = np.zeros(n, np.bool_)
         #: The highest level that a load was suddenly eased from.
         self._eased: Array = np.zeros(n)
         self._fading_s = 0.0
 
-    def step(self, units: Array, touched: Mask, dt_s: float) -> Array | float:
+    def step(
+        self, units: Array, touched: Mask, dt_s: float, relaxed_units: Array | float
+    ) -> Array | float:
         """Return the slow rise [n] that the baselines of touched taxels follow."""
         if np.count_nonzero(touched):
             self._fading_s = 10.0 * SETTLE_S
@@ -433,6 +462,12 @@ class _Touches:
         share = -math.expm1(-dt_s / SMOOTHING_S)
         distance = units - self._level
         changed = ~self._before | (np.abs(distance) > 2.0 * TOLERANCE_UNITS)
+        # While foam is held it loses pressure, not reading: drift shows even where that hides it.
+        moved = units + relaxed_units - self._reading
+        moved = np.where(changed, moved, share * moved)
+        self._reading += moved
+        moved[changed] = 0.0
+        self._risen = np.fmax(self._risen + moved, 0.0)
         # Foam that was pressed harder before pushes back more and more: that rise is a load.
         np.fmax(self._eased, self._level, out=self._eased, where=units < EASED_SHARE * self._level)
         self._eased *= np.where(self._before, 1.0, math.exp(-dt_s / EASED_S))
@@ -441,10 +476,12 @@ class _Touches:
         # So is a rise that is too fast for the baselines.
         changed |= self._level - self._lowest > 3.0 * TOLERANCE_UNITS
         self._lowest = np.where(changed, self._level, np.minimum(self._lowest, self._level))
-        rise = self._level - self._lowest - TOLERANCE_UNITS
+        rise = self._level - self._lowest - SMOOTH_TOLERANCE_UNITS
         rise = np.clip(rise, 0.0, SLOW_UNITS_PER_S * dt_s) * touched
         rise *= self._level > EASED_SHARE * self._eased
         self._level -= rise
+        self._reading -= rise
+        self._risen = np.fmax(self._risen - rise, 0.0)
         self.drifted += rise
         return rise
 
@@ -452,6 +489,7 @@ class _Touches:
         """Forget all but this share [n] of what is known."""
         self.touched_s *= kept
         self.drifted *= kept
+        self._risen *= kept
         self._peak *= kept
 
     @property
@@ -459,11 +497,18 @@ class _Touches:
         """Whether any touch is still remembered."""
         return self._fading_s > 0.0
 
-    def released(self, units: Array, touched: Mask) -> Mask:
+    def released(self, units: Array, touched: Mask, relaxed_units: Array | float | None) -> Mask:
         """Return which touched taxels [n] read no more than a released contact and drift can
         leave.
+
+        Args:
+            units, touched: of the last step.
+            relaxed_units: the relaxation [n]; None if no untouched taxel shows the drift.
         """
         unseen = np.minimum(SLOW_UNITS_PER_S * self.touched_s, UNSEEN_UNITS)
+        if relaxed_units is not None:
+            shown = self._risen + MODEL_ERROR_SHARE * relaxed_units + SMOOTH_TOLERANCE_UNITS
+            unseen = np.minimum(unseen, shown)
         return touched & (units < RELEASED_SHARE * self._peak) & (units < unseen)
 
 

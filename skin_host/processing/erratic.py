@@ -29,33 +29,43 @@ class Erratic:
     Attributes:
         pads: bool[m], the erratic pads; the array changes in place.
         any: whether there is one.
+        suspects: whether any pad has jumped of late.
     """
 
     def __init__(self, step_kpa: NDArray[np.float64]) -> None:
         m = len(step_kpa)
         self._step = step_kpa.astype(np.float32)
-        self._minus_step = -self._step
         self._score = np.zeros(m, np.float32)
         self._left_s = np.zeros(m)
         self.pads: Mask = np.zeros(m, np.bool_)
         self.any = False
+        self.suspects = False
 
     def look(self, rows: Floats) -> None:
         """Check some successive samples [k, m] in kPa."""
         if len(rows) < 3:
             return
-        changes = rows[1:] - rows[:-1]
-        both = (changes.max(axis=0) > self._step) & (changes.min(axis=0) < self._minus_step)
-        np.subtract(self._score, np.float32(RELIEF), out=self._score)
-        np.maximum(self._score, np.float32(0.0), out=self._score)
-        if both.any():
+        if self.suspects:
+            np.subtract(self._score, np.float32(RELIEF), out=self._score)
+            np.maximum(self._score, np.float32(0.0), out=self._score)
+        # Few pads move that far at all; only those are looked at step by step.
+        spread = rows.max(axis=0)
+        np.subtract(spread, rows.min(axis=0), out=spread)
+        moving = np.flatnonzero(spread > self._step)
+        if len(moving):
+            changes = np.diff(rows[:, moving], axis=0)
+            step = self._step[moving]
+            both = moving[(changes.max(axis=0) > step) & (changes.min(axis=0) < -step)]
             self._score[both] += np.float32(1.0 + RELIEF)
-            beyond = self._score > np.float32(LIMIT)
-            if beyond.any():
+            beyond = both[self._score[both] > LIMIT]
+            if len(beyond):
                 self._score[beyond] = LIMIT
                 self._left_s[beyond] = CALM_S
-                self.pads |= beyond
+                self.pads[beyond] = True
                 self.any = True
+        elif not self.suspects:
+            return
+        self.suspects = bool(self._score.any())
 
     def reset(self, taxels: Mask) -> None:
         """Forget the jumps of taxels [m], which have a new zero."""

@@ -18,6 +18,7 @@ from skin_host.config.settings import Processing
 from skin_host.layout import Layout, PadKind, PartLayout
 from skin_host.processing.calibration import Calibration
 from skin_host.processing.curves import (
+    KNOTS_UNITS,
     Curves,
     Parabolas,
     Reader,
@@ -369,15 +370,13 @@ class _PartPipeline:
         self._since_glance_s = 0.0
         cut_off = b"\xff" in self._last_raw.tobytes()
         beyond = self._beyond() if cut_off or not (idle and quiet) else self._nowhere
-        corrected = self._corrected_kpa(beyond, dt_s)
+        corrected, pressure = self._pressures(beyond, touched, dt_s)
         self._gather(touched, dt_s)
         if not quiet:
             repeated = None if idle else self._detector.repeated
             touched = self._residuals.step(touched, corrected, repeated)
-        pressure = np.fmax(corrected if own is None else own.reported_kpa, self._zeros)
         if valid is not self._always_valid:
-            missing = ~valid
-            pressure[missing] = 0.0
+            pressure = np.where(valid, pressure, self._zeros)
             touched = touched & valid
             beyond = beyond & valid
         return self._frame(t_ns, raw, valid, pressure, touched, beyond, True)
@@ -469,14 +468,17 @@ class _PartPipeline:
         np.logical_and(self._near, self._usable, out=self._near)
         return self._near.copy() if any_of(self._near) else self._nowhere
 
-    def _corrected_kpa(self, beyond: Mask, dt_s: float) -> Floats:
-        """Return the momentary pressure minus the relaxation, and store it for the means."""
+    def _pressures(self, beyond: Mask, touched: Mask, dt_s: float) -> tuple[Floats, Floats]:
+        """Return the momentary pressure minus the relaxation, and what is reported of it.
+
+        The first is stored for the means.
+        """
         row = self._row[self._laid]
         self._reader.kpa(self._last_raw, row)
         if self._own is not None:
-            self._own.step(row, dt_s, self._relaxation_kpa)
+            reported = self._own.step(row, dt_s, touched, self._relaxation_kpa)
             np.subtract(row, self._relaxation_kpa, out=row)
-            return row
+            return row, reported
         if beyond is not self._nowhere:
             row[beyond] = self._beyond_kpa(beyond)
         if self._every_sample and self._relaxation is not None:
@@ -484,7 +486,7 @@ class _PartPipeline:
             pressed = np.fmax(row, self._zeros, out=self._part_kpa)
             self._relaxation.step(pressed, dt_s, self._relaxation_kpa)
             np.subtract(row, self._relaxation_kpa, out=row)
-        return row
+        return row, np.fmax(row, self._zeros)
 
     def _beyond_kpa(self, beyond: Mask) -> NDArray[np.float64]:
         """Return the common curve beyond its calibrated range."""
@@ -508,8 +510,16 @@ class _PartPipeline:
     def _end_window(self) -> None:
         """Update the slow state from the means of the window."""
         self._fold()
-        units = self._units(np.divide(self._sum_kpa, self._samples, dtype=np.float64))
+        mean_kpa = np.divide(self._sum_kpa, self._samples, dtype=np.float64)
+        if self._own is not None:
+            self._own.end_window(self._elapsed_s, self._relaxation_kpa)
+        units = self._units(mean_kpa)
         relaxed_units = np.multiply(self._relaxation_kpa, self._units_per_kpa, dtype=np.float64)
+        pressed = self._was_touched & self._usable
+        if any_of(pressed):
+            momentary_kpa = mean_kpa[pressed] + self._relaxation_kpa[pressed]
+            momentary_units = self._curve.part(pressed).units(momentary_kpa)
+            relaxed_units[pressed] = momentary_units - units[pressed]
         if self._has_thermal:
             np.subtract(self._offset, self._last_raw, out=units, where=self._thermal)
         if self._relaxation is not None and not self._every_sample:
@@ -519,8 +529,6 @@ class _PartPipeline:
             np.add(momentary, self._relaxation_kpa, out=momentary)
             np.fmax(momentary, self._zeros, out=momentary)
             self._relaxation.step(momentary, self._elapsed_s, self._relaxation_kpa)
-        if self._own is not None:
-            self._own.erratic.pass_time(self._elapsed_s)
         before = self.drift.baseline.copy()
         ghosts = self.drift.step(
             units, self._was_touched, self._was_missing, self._elapsed_s, relaxed_units
@@ -545,9 +553,12 @@ class _PartPipeline:
         """Return mean activations [m] in units; the bend of the curve matters only far from
         zero.
         """
-        if isinstance(self._curve, TableCurve):
-            return np.where(self._usable, self._curve.units(kpa), 0.0)
         units = kpa * self._units_per_kpa
+        if isinstance(self._curve, TableCurve):
+            far = units > KNOTS_UNITS[1]
+            if any_of(far):
+                units[far] = self._curve.part(far).units(kpa[far])
+            return units
         far = np.abs(units) > STRAIGHT_UNITS
         if any_of(far):
             curve, c = self._curve.part(far), kpa[far]
@@ -558,9 +569,9 @@ class _PartPipeline:
         return units
 
     def _fold(self) -> None:
-        if self._own is not None:
-            self._own.erratic.look(self._rows[: self._laid])
         np.add.reduce(self._rows[: self._laid], axis=0, out=self._part_kpa)
+        if self._own is not None and self._laid:
+            self._own.fold(self._rows[: self._laid], self._part_kpa, self._relaxation_kpa)
         np.add(self._sum_kpa, self._part_kpa, out=self._sum_kpa)
         self._laid = 0
 
@@ -589,9 +600,11 @@ class _PartPipeline:
 class _OwnCurves:
     """Extra state of taxels with own curves: smoothing, memory, and detection of jumps.
 
+    Cost follows touch: touched taxels are smoothed and remembered in each sweep, the others from
+    the means of `ROWS` sweeps. Their reported pressures change as seldom.
+
     Attributes:
         erratic: which of them jump.
-        reported_kpa: float32[m], the smoothed pressure minus the relaxation; of the last step.
     """
 
     def __init__(self, curve: TableCurve, curves: Curves, mine: slice, smoothing_s: float) -> None:
@@ -602,14 +615,66 @@ class _OwnCurves:
         self._smoother = StepFilter(limit, smoothing_s, np.float32)
         self._memory = make_memory(m, curves.memory, np.float32)
         self.erratic = Erratic(np.where(own, step_kpa(curve, noise), np.inf))
-        self.reported_kpa = np.zeros(m, np.float32)
+        self._zeros = np.zeros(m, np.float32)
+        self._reported = self._zeros
+        self._touched: Mask | None = None
+        self._which = np.zeros(0, np.intp)
+        #: Which were touched since the last fold.
+        self._felt: Mask = np.zeros(m, np.bool_)
+        self._touching = False
+        self._folded_s = 0.0
 
-    def step(self, momentary: Floats, dt_s: float, relaxation_kpa: Floats) -> None:
-        """Take the momentary pressures [m]; write the relaxation [m]."""
-        smooth = self._smoother.step(momentary, dt_s)
+    def step(self, momentary: Floats, dt_s: float, touched: Mask, relaxation_kpa: Floats) -> Floats:
+        """Return the pressures [m] to report; update the relaxation [m] of touched taxels.
+
+        The result is not written to again.
+        """
+        self._folded_s += dt_s
+        if touched is not self._touched:
+            self._touched, self._which = touched, np.flatnonzero(touched)
+            self._felt |= touched
+            self._report(relaxation_kpa)
+        which = self._which
+        if not len(which):
+            return self._reported
+        self._touching = True
+        smooth = self._smoother.step_some(which, momentary, dt_s)
         if self._memory is not None:
-            self._memory.step(smooth, dt_s, relaxation_kpa)
-        np.subtract(smooth, relaxation_kpa, out=self.reported_kpa)
+            self._memory.step_some(which, smooth, relaxation_kpa)
+        reported = self._reported.copy()
+        pressure = smooth.take(which)
+        pressure -= relaxation_kpa.take(which)
+        reported[which] = np.maximum(pressure, self._zeros[0], out=pressure)
+        return reported
+
+    def fold(self, rows: Floats, sums: Floats, relaxation_kpa: Floats) -> None:
+        """Take the corrected pressures [k, m] of the last sweeps, and their sums [m]."""
+        if self._touching or self.erratic.suspects:
+            self.erratic.look(rows)
+        which = self._which
+        if 4 * len(which) <= len(self._own):
+            momentary = sums / np.float32(len(rows))
+            if self._touching:
+                # A mean over a press and its release is neither.
+                np.copyto(momentary, rows[-1], where=self._felt)
+            momentary += relaxation_kpa
+            known = self._smoother.smooth.take(which)
+            self._smoother.step(momentary, self._folded_s)[which] = known
+        if self._touching:
+            self._touching = bool(len(self._which))
+            self._felt.fill(False)
+            self._felt[self._which] = True
+        self._folded_s = 0.0
+        self._report(relaxation_kpa)
+
+    def end_window(self, elapsed_s: float, relaxation_kpa: Floats) -> None:
+        """Update the relaxation [m] of all taxels, in place, and forget jumps of long ago."""
+        if self._memory is not None:
+            self._memory.step(self._smoother.smooth, elapsed_s, relaxation_kpa)
+        self.erratic.pass_time(elapsed_s)
+
+    def _report(self, relaxation_kpa: Floats) -> None:
+        self._reported = np.fmax(self._smoother.smooth - relaxation_kpa, self._zeros)
 
     def hold_rises(
         self,
@@ -646,6 +711,7 @@ class _OwnCurves:
     def reset(self, taxels: Mask) -> None:
         """Forget the readings of taxels [m]."""
         self._smoother.reset(taxels)
+        self._reported = np.where(taxels, self._zeros, self._reported)
         self.erratic.reset(taxels)
         if self._memory is not None:
             self._memory.reset(taxels)

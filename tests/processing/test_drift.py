@@ -340,3 +340,25 @@ def test_thermal_pads_that_do_not_feel_the_drift_do_no_harm():
         units = np.where(thermal, rng.normal(0.0, 0.3, N), true - track.baseline)
         track.step(units, NOBODY, NOBODY, 1.0)
     assert np.abs(true - track.baseline[~thermal]).max() < 0.3
+
+
+def test_a_grip_that_is_eased_is_no_drift_where_untouched_taxels_show_none():
+    track = tracker()
+    held = np.arange(N) < 6
+    for _ in range(1500):
+        follow(track, 0.0, held, 25.0)
+    assert all(follow(track, 0.0, held, 3.0) is None for _ in range(60))
+    assert np.abs(track.baseline).max() < 0.1
+
+
+def test_drift_that_the_foams_relaxation_hides_under_a_touch_is_known_at_the_release():
+    track = tracker()
+    held = np.arange(N) < 6
+    for second in range(1500):
+        # The pressure falls as fast as the zero rises, so only the reading shows the drift.
+        drift = 0.002 * second
+        relaxed = np.where(held, drift, 0.0)
+        track.step(np.where(held, 25.0, 0.0) - track.baseline, held, NOBODY, 1.0, relaxed)
+    found = [follow(track, 0.0, held, 2.6) for _ in range(2)]
+    assert found[1] is not None
+    assert list(found[1]) == list(range(6))

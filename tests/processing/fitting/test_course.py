@@ -1,13 +1,17 @@
 """Curves, memory and verdicts from any course of known pressure."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from skin_host.errors import RequestError
+from skin_host.evaluation.rig import Rig
 from skin_host.processing.curves import (
     KNOTS_UNITS,
+    Curves,
     CurveVerdict,
     Memory,
     TableCurve,
@@ -20,6 +24,7 @@ from skin_host.processing.fitting.course import (
     median_of_moving,
     read_course,
 )
+from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.relaxation import PlayRelaxation
 from skin_host.processing.smoothing import StepFilter
 
@@ -187,3 +192,55 @@ def test_noise_is_smoothed_and_a_step_passes_but_for_the_noise():
     read = [smoother.step(np.array([v]), 0.02)[0] for v in 100.0 + 8.0 * rng.normal(size=500)]
     assert np.std(read[200:]) < 3.0
     assert smoother.step(np.array([200.0]), 0.02)[0] > 175.0
+
+
+def test_steps_of_some_taxels_give_the_same_as_steps_of_all():
+    rng = np.random.default_rng(3)
+    n, some = 40, np.array([2, 3, 5, 7, 30])
+    radius, weight = (5.0, 20.0, 60.0), (0.3, 0.2, 0.1)
+    models = [PlayRelaxation(n, radius_kpa=radius, weight=weight) for _ in range(2)]
+    filters = [StepFilter(np.full(n, 4.0), 0.5) for _ in range(2)]
+    relaxation = [np.zeros(n), np.zeros(n)]
+    kpa = np.zeros(n)
+    for _ in range(500):
+        kpa = kpa + rng.normal(0.0, 6.0, n)
+        models[0].step(filters[0].step(kpa, 0.02), 0.02, relaxation[0])
+        models[1].step_some(some, filters[1].step_some(some, kpa, 0.02), relaxation[1])
+        assert relaxation[1][some] == pytest.approx(relaxation[0][some])
+        assert filters[1].smooth[some] == pytest.approx(filters[0].smooth[some])
+    assert not np.delete(relaxation[1], some).any()
+
+
+@pytest.mark.parametrize("pressed", [6, 192])
+def test_pressures_by_own_curves_follow_a_press_at_once_and_end_with_it(pressed):
+    rig = Rig(1, 0.4, seed=5, hz=50.0)
+    n = rig.n
+    knots_kpa = PressureCurve(2.88).kpa(KNOTS_UNITS[:, np.newaxis])[:, 0]
+    curves = Curves(
+        kpa=np.tile(knots_kpa, (n, 1)),
+        beyond_units=np.full(n, 60.0),
+        noise_units=np.full(n, 0.4),
+        error_kpa=np.full(n, 1.0),
+        verdict=np.full(n, CurveVerdict.GOOD, np.uint8),
+        highest_kpa=150.0,
+        lag_s=0.0,
+        memory=Memory((5.0, 20.0), (0.2, 0.1)),
+    )
+    rig.pipeline.renew(
+        rig.settings.processing, replace(rig.calibration, curves=curves), np.zeros(n, np.bool_)
+    )
+    here = np.arange(n) < pressed
+    true_kpa = float(PressureCurve(2.88).kpa(np.array([20.0]))[0])
+    for _ in range(20):
+        rig.step(0.0)
+    for _ in range(3):
+        during = [rig.step(np.where(here, 20.0, 0.0)) for _ in range(50)]
+        after = [rig.step(0.0) for _ in range(50)]
+        # Two measurements decide; a filter's limit is what may be missing then.
+        assert all(frame.touched[here].all() for frame in during[4:])
+        assert np.abs(during[10].pressure_kpa[here] - true_kpa).max() < 6.0
+        for frame in (during[-1], during[10]):
+            assert frame.pressure_kpa[~here].max(initial=0.0) < 4.0
+        for frame in after[5:]:
+            assert not frame.touched.any()
+            assert frame.pressure_kpa.max() < 4.0
