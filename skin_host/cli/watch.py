@@ -18,6 +18,7 @@ from skin_host.cli.common import (
 
 #: `skin status` looks for the broker for this long; a reachable one answers at once.
 PATIENCE_S = 1.5
+PAGE_PORT = 8080
 
 
 def add_commands(commands: Commands) -> None:
@@ -45,10 +46,24 @@ def add_commands(commands: Commands) -> None:
     status.add_argument("--json", action="store_true", help="one JSON document")
     status.set_defaults(run=_status)
 
-    view = add_command(commands, "view", "serve the live page", "skin view --port 8080")
+    view = add_command(
+        commands,
+        "view",
+        "serve the live page, or Foxglove, or show it in Rerun",
+        "skin view --port 8080",
+    )
     add_broker(view)
+    viewers = view.add_mutually_exclusive_group()
+    viewers.add_argument(
+        "--foxglove", action="store_true", help="serve Foxglove instead (extra `foxglove`)"
+    )
+    viewers.add_argument(
+        "--rerun", action="store_true", help="serve Rerun's viewer instead (extra `rerun`)"
+    )
     view.add_argument("--host", default="127.0.0.1", help="address to listen on")
-    view.add_argument("--port", type=int, default=8080, help="port to listen on")
+    view.add_argument(
+        "--port", type=int, help="port to listen on (8080; Foxglove 8765, Rerun 9090)"
+    )
     view.add_argument("--read-only", action="store_true", help="pages calibrate and record nothing")
     view.add_argument(
         "--recordings",
@@ -156,8 +171,11 @@ def _status(arguments: argparse.Namespace) -> int:
 
 
 def _view(arguments: argparse.Namespace) -> int:
+    if arguments.foxglove or arguments.rerun:
+        return _view_elsewhere(arguments)
     from skin_host.viewer.server import Viewer
 
+    port = PAGE_PORT if arguments.port is None else arguments.port
     set_up_logging(arguments.verbose)
 
     async def work() -> None:
@@ -170,7 +188,28 @@ def _view(arguments: argparse.Namespace) -> int:
             recordings=arguments.recordings,
         )
         await viewer.run(
-            stop, arguments.host, arguments.port, lambda url: print(f"the page: {url}", flush=True)
+            stop, arguments.host, port, lambda url: print(f"the page: {url}", flush=True)
+        )
+
+    asyncio.run(work())
+    return 0
+
+
+def _view_elsewhere(arguments: argparse.Namespace) -> int:
+    from skin_host.recording.export import live
+
+    set_up_logging(arguments.verbose)
+
+    async def work() -> None:
+        stop = asyncio.Event()
+        stop_on_signals(stop)
+        serving = live.foxglove if arguments.foxglove else live.rerun
+        await live.run(
+            arguments.broker,
+            arguments.robot,
+            stop,
+            serving(arguments.host, arguments.port),
+            lambda url: print(f"open {url}", flush=True),
         )
 
     asyncio.run(work())

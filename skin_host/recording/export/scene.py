@@ -10,7 +10,7 @@ its frame.
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from heapq import merge
 from itertools import groupby
 from pathlib import Path
@@ -83,12 +83,71 @@ class Arrows(NamedTuple):
 Item = Points | Arrows | HealthLine
 
 
+class SkinScene:
+    """Items for a viewer, made from frames and touches as they come.
+
+    Args:
+        shapes: of the parts, by name.
+        top_kpa: pressure at the end of the colour scale; higher ones raise it.
+
+    Attributes:
+        origins_m: where the frame of each part lies in the robot's.
+        radius_m: of each part's taxels.
+    """
+
+    def __init__(self, shapes: dict[str, PartInfo], top_kpa: float = LEAST_TOP_KPA) -> None:
+        self._top_kpa = top_kpa
+        self._feels: dict[str, NDArray[np.bool_]] = {}
+        self._points: dict[str, NDArray[np.void]] = {}
+        self._arrows: dict[str, dict[int, Arrow]] = {}
+        self.origins_m = _side_by_side(shapes)
+        self.radius_m = {
+            name: float(np.mean(shape.radius_mm)) * 1e-3 for name, shape in shapes.items()
+        }
+        for name, shape in shapes.items():
+            feels = np.array([pad == "pressure" for pad in shape.pads], np.bool_)
+            points = np.zeros(int(feels.sum()), POINT)
+            places_m = np.array(shape.position_m, np.float64)[feels]
+            for axis, key in enumerate("xyz"):
+                points[key] = places_m[:, axis]
+            self._feels[name], self._points[name], self._arrows[name] = feels, points, {}
+
+    def points(self, part: str, t_ns: int, all_kpa: Floats) -> Points:
+        """A frame: pressures of all taxels [m], NaN where not valid."""
+        points, kpa = self._points[part].copy(), all_kpa[self._feels[part]]
+        self._top_kpa = max(self._top_kpa, float(np.nanmax(kpa, initial=0.0)))
+        points["valid"] = np.isfinite(kpa)
+        points["kpa"] = np.nan_to_num(kpa)
+        for key, values in zip(POINT.names[5:], self._colours(kpa).T, strict=True):  # type: ignore[index]
+            points[key] = values
+        return Points(part, t_ns, points)
+
+    def _colours(self, kpa: Floats) -> NDArray[np.uint8]:
+        """Red, green, blue, alpha uint8[n, 4]."""
+        share = np.sqrt(np.clip(np.nan_to_num(kpa) / self._top_kpa, 0.0, 1.0))
+        stops = np.linspace(0.0, 1.0, len(RAMP))
+        colours = np.full((len(kpa), 4), 255, np.uint8)
+        for channel in range(3):
+            colours[:, channel] = np.interp(share, stops, RAMP[:, channel]).round()
+        colours[~np.isfinite(kpa)] = INVALID_RGBA
+        return colours
+
+    def arrows(self, part: str, t_ns: int, touches: Iterable[TouchMessage]) -> Arrows:
+        """The contacts of a part after some of its events."""
+        there = self._arrows[part]
+        for touch in touches:
+            there.pop(touch.id, None)
+            arrow = _arrow(touch)
+            if arrow is not None:
+                there[touch.id] = arrow
+        return Arrows(part, t_ns, list(there.values()))
+
+
 class RecordedScene:
     """Items of a recording for a viewer, in the order of time.
 
     Attributes:
-        origins_m: where the frame of each part lies in the robot's.
-        top_kpa: pressure at the end of the colour scale.
+        scene: of its parts; its scale ends at the highest pressure of the recording.
 
     Raises:
         RequestError: the recording has no positions of its taxels.
@@ -106,8 +165,8 @@ class RecordedScene:
             (float(np.nanmax(part.pressure_kpa, initial=0.0)) for part in series.parts.values()),
             default=0.0,
         )
-        self.top_kpa = max(LEAST_TOP_KPA, peak_kpa)
-        self.origins_m = _side_by_side({name: series.shapes[name] for name in series.parts})
+        shapes = {name: series.shapes[name] for name in series.parts}
+        self.scene = SkinScene(shapes, max(LEAST_TOP_KPA, peak_kpa))
 
     @property
     def start_ns(self) -> int:
@@ -122,40 +181,14 @@ class RecordedScene:
         yield from merge(*courses, key=lambda item: item.t_ns)
 
     def _points(self, name: str) -> Iterator[Item]:
-        part, shape = self._series.parts[name], self._series.shapes[name]
-        feels = np.array([pad == "pressure" for pad in shape.pads], np.bool_)
-        points = np.zeros(int(feels.sum()), POINT)
-        places_m = np.array(shape.position_m, np.float64)[feels]
-        for axis, key in enumerate("xyz"):
-            points[key] = places_m[:, axis]
-        for t_ns, all_kpa in zip(part.t_ns.tolist(), part.pressure_kpa, strict=True):
-            kpa = all_kpa[feels]
-            points["valid"] = np.isfinite(kpa)
-            points["kpa"] = np.nan_to_num(kpa)
-            for key, values in zip(POINT.names[5:], self._colours(kpa).T, strict=True):  # type: ignore[index]
-                points[key] = values
-            yield Points(name, t_ns, points.copy())
-
-    def _colours(self, kpa: Floats) -> NDArray[np.uint8]:
-        """Red, green, blue, alpha uint8[n, 4]."""
-        share = np.sqrt(np.clip(np.nan_to_num(kpa) / self.top_kpa, 0.0, 1.0))
-        stops = np.linspace(0.0, 1.0, len(RAMP))
-        colours = np.full((len(kpa), 4), 255, np.uint8)
-        for channel in range(3):
-            colours[:, channel] = np.interp(share, stops, RAMP[:, channel]).round()
-        colours[~np.isfinite(kpa)] = INVALID_RGBA
-        return colours
+        part = self._series.parts[name]
+        for t_ns, kpa in zip(part.t_ns.tolist(), part.pressure_kpa, strict=True):
+            yield self.scene.points(name, t_ns, kpa)
 
     def _arrows(self, name: str) -> Iterator[Item]:
-        there: dict[int, Arrow] = {}
         mine = (touch for touch in self._series.touches if touch.part == name)
         for t_ns, touches in groupby(mine, key=lambda touch: touch.t_ns):
-            for touch in touches:
-                there.pop(touch.id, None)
-                arrow = _arrow(touch)
-                if arrow is not None:
-                    there[touch.id] = arrow
-            yield Arrows(name, t_ns, list(there.values()))
+            yield self.scene.arrows(name, t_ns, touches)
 
 
 def _arrow(touch: TouchMessage) -> Arrow | None:
@@ -237,15 +270,9 @@ class _Foxglove:
         self._channels: dict[str, int] = {}
 
     def write(self, scene: RecordedScene) -> None:
-        self._add("/tf", scene.start_ns, _transforms(scene))
+        self._add("/tf", scene.start_ns, transforms(scene.scene, scene.start_ns))
         for item in scene.items():
-            match item:
-                case Points(part, t_ns, _):
-                    self._add(f"/{part}/points", t_ns, _cloud(item))
-                case Arrows(part, t_ns, _):
-                    self._add(f"/{part}/contacts", t_ns, _update(item))
-                case HealthLine():
-                    self._add("/health", item.t_ns, _log(item))
+            self._add(*foxglove_message(item))
 
     def _add(self, topic: str, t_ns: int, message: Any) -> None:
         from mcap_protobuf.schema import register_schema
@@ -264,14 +291,26 @@ class _Foxglove:
         )
 
 
-def _transforms(scene: RecordedScene) -> Any:
+def foxglove_message(item: Item) -> tuple[str, int, Any]:
+    """Topic, time (ns) and message in Foxglove's Protobuf schemas."""
+    match item:
+        case Points(part, t_ns, _):
+            return f"/{part}/points", t_ns, _cloud(item)
+        case Arrows(part, t_ns, _):
+            return f"/{part}/contacts", t_ns, _update(item)
+        case _:
+            return "/health", item.t_ns, _log(item)
+
+
+def transforms(scene: SkinScene, t_ns: int) -> Any:
+    """Foxglove's message about where the parts' frames lie."""
     from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
     from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 
     message = FrameTransforms()
     for part, (x, y, z) in scene.origins_m.items():
         one = FrameTransform(parent_frame_id=ROOT, child_frame_id=part)
-        one.timestamp.FromNanoseconds(scene.start_ns)
+        one.timestamp.FromNanoseconds(t_ns)
         one.translation.x, one.translation.y, one.translation.z = x, y, z
         one.rotation.w = 1.0
         message.transforms.append(one)
@@ -365,37 +404,52 @@ def write_rerun(series: Series, output: Path) -> None:
     with _new(output) as growing:
         stream = rr.RecordingStream("skin-host")
         stream.save(growing)
+        shown = RerunStream(stream, scene.scene)
+        for item in scene.items():
+            shown.show(item)
+        stream.flush()
+        stream.disconnect()
+
+
+class RerunStream:
+    """Logs items to a recording stream of Rerun, which goes to a file or to a viewer."""
+
+    def __init__(self, stream: Any, scene: SkinScene) -> None:
+        self._rr = rr = required("rerun", "views in Rerun", "rerun")
+        self._stream = stream
+        self._scene = scene
         stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for part, origin_m in scene.origins_m.items():
             stream.log(f"{ROOT}/{part}", rr.Transform3D(translation=origin_m), static=True)
-        for item in scene.items():
-            stream.set_time("time", timestamp=np.datetime64(item.t_ns, "ns"))
-            where = f"{ROOT}/{item.part}"
-            match item:
-                case Points(part, _, points):
-                    places_m = np.stack([points[axis] for axis in "xyz"], axis=1)
-                    colours = np.stack([points[key] for key in POINT.names[5:]], axis=1)  # type: ignore[index]
-                    radius_m = float(np.mean(series.shapes[part].radius_mm)) * 1e-3
-                    cloud = rr.Points3D(places_m, colors=colours, radii=radius_m)
-                    stream.log(f"{where}/taxels", cloud)
-                    stream.log(f"kpa/{part}", rr.Scalars(float(points["kpa"].max(initial=0.0))))
-                case Arrows(part, _, arrows):
-                    forces_n = np.array([one.force_n for one in arrows]).reshape(-1, 3)
-                    starts_m = np.array([one.at_m for one in arrows]).reshape(-1, 3)
-                    shown = rr.Arrows3D(
-                        origins=starts_m - forces_n * ARROW_M_PER_N,
-                        vectors=forces_n * ARROW_M_PER_N,
-                        colors=[ARROW_RGBA] * len(arrows),
-                        labels=[f"#{one.id} {np.linalg.norm(one.force_n):.2f} N" for one in arrows],
-                    )
-                    stream.log(f"{where}/contacts", shown)
-                    total_n = float(np.linalg.norm(forces_n, axis=1).sum())
-                    stream.log(f"force_n/{part}", rr.Scalars(total_n))
-                case HealthLine():
-                    level = "INFO" if item.state == "ok" else "WARN"
-                    stream.log("health", rr.TextLog(item.text, level=level))
-        stream.flush()
-        stream.disconnect()
+
+    def show(self, item: Item) -> None:
+        """Log one item."""
+        rr, stream = self._rr, self._stream
+        stream.set_time("time", timestamp=np.datetime64(item.t_ns, "ns"))
+        where = f"{ROOT}/{item.part}"
+        match item:
+            case Points(part, _, points):
+                places_m = np.stack([points[axis] for axis in "xyz"], axis=1)
+                colours = np.stack([points[key] for key in POINT.names[5:]], axis=1)  # type: ignore[index]
+                radius_m = self._scene.radius_m[part]
+                cloud = rr.Points3D(places_m, colors=colours, radii=radius_m)
+                stream.log(f"{where}/taxels", cloud)
+                stream.log(f"kpa/{part}", rr.Scalars(float(points["kpa"].max(initial=0.0))))
+            case Arrows(part, _, arrows):
+                forces_n = np.array([one.force_n for one in arrows]).reshape(-1, 3)
+                starts_m = np.array([one.at_m for one in arrows]).reshape(-1, 3)
+                shown = rr.Arrows3D(
+                    origins=starts_m - forces_n * ARROW_M_PER_N,
+                    vectors=forces_n * ARROW_M_PER_N,
+                    colors=[ARROW_RGBA] * len(arrows),
+                    labels=[f"#{one.id} {np.linalg.norm(one.force_n):.2f} N" for one in arrows],
+                )
+                stream.log(f"{where}/contacts", shown)
+                total_n = float(np.linalg.norm(forces_n, axis=1).sum())
+                stream.log(f"force_n/{part}", rr.Scalars(total_n))
+            case HealthLine():
+                level = "INFO" if item.state == "ok" else "WARN"
+                stream.log("health", rr.TextLog(item.text, level=level))
 
 
 @contextlib.contextmanager

@@ -1,5 +1,6 @@
 """What was recorded, as arrays over time: read from messages, or computed from CAN frames."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -143,7 +144,7 @@ def read_messages(recording: Path) -> Series:
             elif kind == "touch":
                 touches.append(decode_touch(said.payload))
             elif kind == "health":
-                line = _health_line(name, said.t_ns, decode_health(said.payload))
+                line = health_line(name, said.t_ns, decode_health(said.payload))
                 before = latest.get(name)
                 if before is None or (before.state, before.text) != (line.state, line.text):
                     latest[name] = line
@@ -158,7 +159,8 @@ def read_messages(recording: Path) -> Series:
     return Series(found, touches, shapes, health)
 
 
-def _health_line(part: str, t_ns: int, record: dict[str, Any]) -> HealthLine:
+def health_line(part: str, t_ns: int, record: Mapping[str, Any]) -> HealthLine:
+    """A record of health as a line."""
     state, sentences = str(record.get("state", "?")), record.get("sentences") or []
     return HealthLine(part, t_ns, state, "; ".join([f"{part}: {state}", *map(str, sentences)]))
 

@@ -1,0 +1,229 @@
+"""Live servers for the viewers of robotics: Foxglove's WebSocket, and Rerun's own viewer.
+
+They are subscribers like the page, and show the items of `scene`.
+"""
+
+import asyncio
+import contextlib
+import os
+import secrets
+import socket
+import sys
+from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from skin_host.client import SkinClient
+from skin_host.clock import SYSTEM, Clock
+from skin_host.errors import SkinError
+from skin_host.extras import required
+from skin_host.mqtt.info import PartInfo
+from skin_host.recording.export.scene import (
+    Item,
+    RerunStream,
+    SkinScene,
+    foxglove_message,
+    transforms,
+)
+from skin_host.recording.export.series import health_line
+
+FOXGLOVE_PORT = 8765
+RERUN_PORT = 9090
+#: The transforms are sent again this often, for viewers that came later.
+TRANSFORMS_S = 1.0
+#: Rerun's server answers within this time.
+STARTING_S = 30.0
+
+#: Takes the scene when it is known, and returns what shows an item.
+Show = Callable[[SkinScene], Callable[[Item], None]]
+#: A viewer's server while it runs: its URL, and how it shows.
+Serving = AbstractAsyncContextManager[tuple[str, Show]]
+
+
+async def run(
+    broker: str,
+    robot: str | None,
+    stop: asyncio.Event,
+    serving: Serving,
+    tell: Callable[[str], None],
+    clock: Clock = SYSTEM,
+) -> None:
+    """Show a robot's skin in a viewer until `stop`.
+
+    Args:
+        broker, robot: whose skin, as `SkinClient` takes them.
+        stop: set it to end.
+        serving: `foxglove` or `rerun`.
+        tell: receives the viewer's URL.
+        clock: gives the time of a record of health.
+
+    Raises:
+        SkinError: no broker, no robot, a port that is taken, or a package that is not installed.
+    """
+    async with SkinClient(broker, robot=robot) as skin:
+        nodes = await skin.info()
+        shapes = {name: part for node in nodes.values() for name, part in node.parts.items()}
+        async with serving as (url, begin):
+            scene = SkinScene(shapes)
+            show = begin(scene)
+            tell(url)
+            tasks = [
+                asyncio.create_task(_follow(skin, shapes, scene, show, clock)),
+                asyncio.create_task(stop.wait()),
+            ]
+            done, rest = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in rest:
+                task.cancel()
+            await asyncio.gather(*rest, return_exceptions=True)
+            for task in done:
+                task.result()
+
+
+async def _follow(
+    skin: SkinClient,
+    shapes: dict[str, PartInfo],
+    scene: SkinScene,
+    show: Callable[[Item], None],
+    clock: Clock,
+) -> None:
+    """Show what comes, until cancelled."""
+
+    async def frames() -> None:
+        async for frame in skin.frames():
+            if frame.part in shapes and len(frame.valid) == len(shapes[frame.part].pads):
+                kpa = np.where(frame.valid, frame.pressure_kpa, np.nan)
+                show(scene.points(frame.part, frame.t_ns, kpa))
+
+    async def touches() -> None:
+        async for touch in skin.touches():
+            if touch.part in shapes:
+                show(scene.arrows(touch.part, touch.t_ns, [touch]))
+
+    async def health() -> None:
+        latest: dict[str, str] = {}
+        async for said in skin.health():
+            line = health_line(said.part, clock.now_ns(), said.record)
+            if latest.get(said.part) != line.text:
+                latest[said.part] = line.text
+                show(line)
+
+    async with asyncio.TaskGroup() as group:
+        for follow in (frames, touches, health):
+            group.create_task(follow())
+
+
+@asynccontextmanager
+async def foxglove(host: str, port: int | None) -> AsyncIterator[tuple[str, Show]]:
+    """Serve Foxglove's WebSocket, which its app opens; port 0 is any free one.
+
+    Raises:
+        SkinError: the port is taken, or the extra `foxglove` is not installed.
+    """
+    sdk = required("foxglove", "views in Foxglove", "foxglove")
+    required("foxglove_schemas_protobuf", "views in Foxglove", "foxglove")
+    context = sdk.Context()
+    wanted = FOXGLOVE_PORT if port is None else port
+    try:
+        server = sdk.start_server(name="skin-host", host=host, port=wanted, context=context)
+    except (RuntimeError, OSError) as error:
+        raise SkinError(f"{host}:{wanted}: {error}; choose another port with --port") from None
+    try:
+        yield f"ws://{host}:{server.port} in Foxglove", lambda scene: _Foxglove(sdk, context, scene)
+    finally:
+        server.stop()
+
+
+class _Foxglove:
+    """Sends items on channels of a context; a channel is made when its first message comes."""
+
+    def __init__(self, sdk: Any, context: Any, scene: SkinScene) -> None:
+        self._sdk = sdk
+        self._context = context
+        self._scene = scene
+        self._channels: dict[str, Any] = {}
+        self._sent_ns = 0
+
+    def __call__(self, item: Item) -> None:
+        if abs(item.t_ns - self._sent_ns) > TRANSFORMS_S * 1e9:
+            self._sent_ns = item.t_ns
+            self._send("/tf", item.t_ns, transforms(self._scene, item.t_ns))
+        self._send(*foxglove_message(item))
+
+    def _send(self, topic: str, t_ns: int, message: Any) -> None:
+        from mcap_protobuf.schema import build_file_descriptor_set
+
+        if topic not in self._channels:
+            kind = type(message)
+            schema = self._sdk.Schema(
+                name=kind.DESCRIPTOR.full_name,
+                encoding="protobuf",
+                data=build_file_descriptor_set(kind).SerializeToString(),
+            )
+            self._channels[topic] = self._sdk.Channel(
+                topic, schema=schema, message_encoding="protobuf", context=self._context
+            )
+        self._channels[topic].log(message.SerializeToString(), log_time=t_ns)
+
+
+@asynccontextmanager
+async def rerun(host: str, port: int | None) -> AsyncIterator[tuple[str, Show]]:
+    """Serve Rerun's viewer to browsers.
+
+    Its command line serves, bound to `host`, as the functions of its SDK that serve bind to all
+    addresses; its analytics are off.
+
+    Raises:
+        SkinError: its server does not start, or the extra `rerun` is not installed.
+    """
+    rr = required("rerun", "views in Rerun", "rerun")
+    page, feed = RERUN_PORT if port is None else port or _free_port(host), _free_port(host)
+    url = f"rerun+http://{host}:{feed}/proxy"
+    program = await asyncio.create_subprocess_exec(
+        *(str(Path(sys.executable).with_name("rerun")), "--serve-web", "--bind", host),
+        *("--port", str(feed), "--web-viewer-port", str(page), "--hide-welcome-screen"),
+        env=os.environ | {"RERUN_ANALYTICS": "0", "DO_NOT_TRACK": "1"},
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.DEVNULL,
+        stderr=asyncio.subprocess.DEVNULL,
+    )
+    stream = rr.RecordingStream("skin-host", recording_id=secrets.token_hex(8))
+    try:
+        await _answers(program, host, (feed, page))
+        stream.connect_grpc(url)
+        yield f"http://{host}:{page}/?url={url}", lambda scene: RerunStream(stream, scene).show
+    finally:
+        stream.disconnect()
+        with contextlib.suppress(ProcessLookupError):
+            program.terminate()
+        await program.wait()
+
+
+async def _answers(program: asyncio.subprocess.Process, host: str, ports: tuple[int, ...]) -> None:
+    try:
+        async with asyncio.timeout(STARTING_S):
+            for port in ports:
+                while True:
+                    if program.returncode is not None:
+                        raise SkinError(
+                            f"{host}:{port}: rerun ended with {program.returncode}; "
+                            "choose another port with --port"
+                        )
+                    try:
+                        _, writer = await asyncio.open_connection(host, port)
+                    except OSError:
+                        await asyncio.sleep(0.1)
+                        continue
+                    writer.close()
+                    break
+    except TimeoutError:
+        raise SkinError(f"{host}:{port}: rerun does not answer; wanted its viewer there") from None
+
+
+def _free_port(host: str) -> int:
+    with socket.socket() as probe:
+        probe.bind((host, 0))
+        port: int = probe.getsockname()[1]
+        return port

@@ -1,0 +1,129 @@
+"""The live servers of Foxglove and Rerun, seen by a client of each."""
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from websockets.asyncio.client import connect
+from websockets.typing import Subprotocol
+
+from skin_host.config.settings import Mqtt, load
+from skin_host.layout import build_layout
+from skin_host.mqtt.info import node_info
+from skin_host.mqtt.publisher import Publisher
+from skin_host.processing.events import TouchEvent
+from skin_host.processing.pipeline import PressureFrame
+from skin_host.recording.export import live
+from tests.support.broker import Mosquitto
+
+CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
+PATIENCE_S = 60.0
+TOUCH = TouchEvent(
+    "begin", 7, 3, 10**18 + 5, "left_hand", [0, 1], [0.1, 0, 0], [0, 0, 1.0], 40.0, 31, 20.0, 2.0
+)
+
+
+@asynccontextmanager
+async def shown(broker: Mosquitto, serving: live.Serving) -> AsyncIterator[str]:
+    """A viewer of a robot that sends a frame and a touch again and again; its URL."""
+    layout = build_layout(load(CONFIG), CONFIG.parent)
+    n = layout.part("left_hand").n_taxels
+    valid, none = np.arange(n) != 5, np.zeros(n, np.bool_)
+    kpa = np.where(valid, np.float32(12.5), np.float32(0.0))
+    url: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+    stop = asyncio.Event()
+
+    async def publish(publisher: Publisher) -> None:
+        seq = 0
+        while True:
+            seq += 1
+            t_ns, raw = 10**18 + seq * 50_000_000, np.zeros(n, np.uint8)
+            frame = PressureFrame("left_hand", seq, t_ns, raw, kpa, none, valid, none)
+            publisher.put_frame(frame)
+            publisher.put_touch(TOUCH)
+            await asyncio.sleep(0.1)
+
+    async with Publisher(Mqtt(host=broker.host, port=broker.port), "demo", "main") as publisher:
+        publisher.put_info(node_info(layout, "main", version="1", configuration="x"))
+        where = f"mqtt://{broker.host}:{broker.port}"
+        tasks = [
+            asyncio.create_task(publish(publisher)),
+            asyncio.create_task(live.run(where, "demo", stop, serving, url.set_result)),
+        ]
+        async with asyncio.timeout(PATIENCE_S):
+            await asyncio.wait([url, tasks[1]], return_when=asyncio.FIRST_COMPLETED)
+            if tasks[1].done():
+                await tasks[1]
+            yield await url
+            stop.set()
+            await tasks[1]
+        tasks[0].cancel()
+        with suppress(asyncio.CancelledError):
+            await tasks[0]
+
+
+async def test_foxglove_s_client_receives_points_contacts_and_transforms(
+    mosquitto: Mosquitto,
+) -> None:
+    pytest.importorskip("foxglove")
+    from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+    from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+
+    kinds: dict[str, Any] = {
+        "/tf": FrameTransforms,
+        "/left_hand/points": PointCloud,
+        "/left_hand/contacts": SceneUpdate,
+    }
+    seen: dict[str, Any] = {}
+    async with shown(mosquitto, live.foxglove("127.0.0.1", 0)) as url:
+        protocols = [Subprotocol("foxglove.sdk.v1")]
+        async with connect(url.split()[0], subprotocols=protocols, max_size=None) as socket:
+            topics: dict[int, str] = {}
+            while set(seen) != set(kinds):
+                said = await socket.recv()
+                if isinstance(said, str):
+                    for channel in json.loads(said).get("channels", []):
+                        assert channel["encoding"] == "protobuf"
+                        topics[channel["id"]] = channel["topic"]
+                        subscribed = {"id": channel["id"], "channelId": channel["id"]}
+                        await socket.send(
+                            json.dumps({"op": "subscribe", "subscriptions": [subscribed]})
+                        )
+                elif said[0] == 1:
+                    topic = topics[int.from_bytes(said[1:5], "little")]
+                    if topic in kinds:
+                        seen[topic] = kinds[topic].FromString(said[13:])
+    cloud = seen["/left_hand/points"]
+    assert [field.name for field in cloud.fields][:5] == ["x", "y", "z", "kpa", "valid"]
+    assert len(cloud.data) % cloud.point_stride == 0
+    (entity,) = seen["/left_hand/contacts"].entities
+    assert len(entity.arrows) == 1
+    names = {one.child_frame_id for one in seen["/tf"].transforms}
+    assert names == {"left_hand", "left_forearm"}
+
+
+async def test_rerun_s_viewer_is_served_on_loopback_alone(mosquitto: Mosquitto) -> None:
+    pytest.importorskip("rerun")
+    async with shown(mosquitto, live.rerun("127.0.0.1", 0)) as url:
+        page, _, feed = url.partition("?url=")
+        host, _, port = page.removeprefix("http://").rstrip("/").partition(":")
+        assert feed.startswith("rerun+http://127.0.0.1:")
+        reader, writer = await asyncio.open_connection(host, int(port))
+        writer.write(b"GET / HTTP/1.0\r\nHost: localhost\r\n\r\n")
+        assert b"200" in await reader.readline()
+        writer.close()
+        listening = [
+            line.split()[1]
+            for line in Path("/proc/net/tcp").read_text().splitlines()[1:]  # noqa: ASYNC240
+            if line.split()[3] == "0A"
+        ]
+        ports = (int(port), int(feed.split(":")[2].partition("/")[0]))
+        for wanted in ports:
+            assert f"0100007F:{wanted:04X}" in listening
+            assert f"00000000:{wanted:04X}" not in listening
