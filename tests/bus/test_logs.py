@@ -148,6 +148,17 @@ def test_what_comes_before_damage_is_handed_on(tmp_path):
     assert frames == 2  # the third waited for the end of its window
 
 
+def test_frames_of_can_fd_are_passed_over(tmp_path):
+    lines = ["(1.0) can0 4E0#40", "(1.001) can0 4E1##1" + "00" * 12, "(1.002) can0 4E2#41"]
+    (batch,) = read(candump(tmp_path / "fd.log", lines))
+    assert batch.id.tolist() == [0x4E0, 0x4E2]
+
+
+def test_a_time_that_no_clock_shows_ends_a_recording(tmp_path):
+    far = candump(tmp_path / "far.log", ["(1.0) can0 4E0#40", "(99999999999999.0) can0 4E0#40"])
+    assert "damaged after frame 1: a time of 1e+14 s" in message_of(far)
+
+
 def test_cut_files_are_told(tmp_path):
     text = "".join(f"({10 + i}.0) can0 4E0#40\n" for i in range(5000)).encode()
     cut = tmp_path / "cut.log.gz"

@@ -8,6 +8,8 @@ import pytest
 
 from emulator.probes.scene import Fault, Place, Probe
 from skin_host.bus.commands import (
+    Message,
+    SetBoardConfig,
     SetTriangleConfig,
     SetTxMode,
     TxMode,
@@ -222,3 +224,33 @@ async def test_while_the_daemon_is_behind_no_board_is_set_up(
         port.read, port.capacity = usual  # type: ignore[method-assign]
         await live.wait(lambda: record.configurations == 2)
         bus.shutdown()
+
+
+@stepped
+async def test_a_board_that_somebody_else_sets_up_otherwise_gets_its_own_set_up_back(
+    clock: SteppedClock,
+    can_bus_settings: Bus,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """One at another period, one without a triangle."""
+    async with living(can_bus_settings, tmp_path, clock=clock) as live:
+        await live.until_well(but=LATELY)
+        records = live.daemon.link.boards["can0"].records
+        period, triangle = records[14], records[13]
+        bus = can.Bus(interface=can_bus_settings.interface, channel=can_bus_settings.channel)
+
+        def command(address: int, *commands: Message) -> None:
+            for identifier, data in (command_frame(one, address) for one in commands):
+                bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+
+        command(14, SetBoardConfig(0, 100, 240), SetTriangleConfig(0, 15), SetTxMode(TxMode.START))
+        command(13, SetTriangleConfig(2, 2, flags=0))
+        await live.wait(lambda: period.configurations == triangle.configurations == 2)
+        bus.shutdown()
+        here = "bus can0: board"
+        assert f"{here} hand sends every 100 ms, not 50 ms: setting it up" in caplog.text
+        assert f"{here} {triangle.layout.name} does not send all of its triangles" in caplog.text
+        lost = live.daemon.engine.ledger.lost_set_ups
+        assert lost[period.row] == lost[triangle.row] == 1
+        assert records[12].configurations == 1
