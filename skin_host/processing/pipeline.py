@@ -201,7 +201,11 @@ class _Rules:
         curves = calibration.curves
         curve = common if curves is None else with_own(common, curves)
         above = calibration.percentile - calibration.baseline
-        found = levels(above, calibration.spread, settings.touch)
+        spread = calibration.spread
+        if curves is not None:
+            # Some seconds at rest show less noise than a whole recording under pressure.
+            spread = np.where(curves.own, np.fmax(spread, curves.noise_units), spread)
+        found = levels(above, spread, settings.touch)
         return cls(settings, usable, curve, curves, found)
 
     def part(self, mine: slice) -> "_Rules":

@@ -211,24 +211,47 @@ def test_steps_of_some_taxels_give_the_same_as_steps_of_all():
     assert not np.delete(relaxation[1], some).any()
 
 
-@pytest.mark.parametrize("pressed", [6, 192])
-def test_pressures_by_own_curves_follow_a_press_at_once_and_end_with_it(pressed):
-    rig = Rig(1, 0.4, seed=5, hz=50.0)
+def use_own_curves(rig, noise_units):
+    """Give all pads equation (1) as their own curve, and a foam with plays."""
     n = rig.n
-    knots_kpa = PressureCurve(2.88).kpa(KNOTS_UNITS[:, np.newaxis])[:, 0]
     curves = Curves(
-        kpa=np.tile(knots_kpa, (n, 1)),
+        kpa=np.tile(PressureCurve(2.88).kpa(KNOTS_UNITS[:, np.newaxis])[:, 0], (n, 1)),
         beyond_units=np.full(n, 60.0),
-        noise_units=np.full(n, 0.4),
+        noise_units=np.full(n, noise_units),
         error_kpa=np.full(n, 1.0),
         verdict=np.full(n, CurveVerdict.GOOD, np.uint8),
         highest_kpa=150.0,
         lag_s=0.0,
         memory=Memory((5.0, 20.0), (0.2, 0.1)),
     )
-    rig.pipeline.renew(
-        rig.settings.processing, replace(rig.calibration, curves=curves), np.zeros(n, np.bool_)
-    )
+    calibration = replace(rig.calibration, curves=curves)
+    rig.pipeline.renew(rig.settings.processing, calibration, np.zeros(n, np.bool_))
+
+
+def test_pads_that_were_noisy_under_pressure_do_not_flicker_though_they_rest_calmly():
+    begins = []
+    here = np.arange(192) < 48
+    for noise_units in (0.4, 2.0):
+        rig = Rig(1, 0.4, seed=6, hz=25.0)
+        use_own_curves(rig, noise_units)
+        rng = np.random.default_rng(7)
+        touched = np.array(
+            [
+                rig.step(np.where(here, rng.normal(3.0, 1.5, rig.n), 0.0)).touched[here]
+                for _ in range(1000)
+            ]
+        )
+        assert touched[-500:].mean() > 0.8
+        begins.append(np.count_nonzero(touched[1:] & ~touched[:-1]) / 48)
+    assert begins[0] > 2.0
+    assert begins[1] < 1.1
+
+
+@pytest.mark.parametrize("pressed", [6, 192])
+def test_pressures_by_own_curves_follow_a_press_at_once_and_end_with_it(pressed):
+    rig = Rig(1, 0.4, seed=5, hz=50.0)
+    n = rig.n
+    use_own_curves(rig, 0.4)
     here = np.arange(n) < pressed
     true_kpa = float(PressureCurve(2.88).kpa(np.array([20.0]))[0])
     for _ in range(20):
