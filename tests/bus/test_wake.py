@@ -1,7 +1,6 @@
 """When the ports are read: right after each sweep, seldom otherwise, never in a tight loop."""
 
 import asyncio
-import time
 
 import pytest
 
@@ -15,7 +14,9 @@ from skin_host.bus.wake import (
     Plan,
     WakeUp,
 )
+from skin_host.clock import SteppedClock
 from skin_host.config.settings import Receive
+from tests.support.stepped import stepped
 from tests.support.waiting import PATIENCE_S
 
 MS = 1_000_000
@@ -149,7 +150,8 @@ async def test_work_is_called_again_and_again():
         await running
 
 
-async def test_an_idle_reader_does_not_spin():
+@stepped
+async def test_an_idle_reader_does_not_spin(clock: SteppedClock):
     calls = 0
 
     def work() -> None:
@@ -157,31 +159,28 @@ async def test_an_idle_reader_does_not_spin():
         calls += 1
 
     receive = Receive(poll_ms=20.0)
-    running = asyncio.create_task(WakeUp(receive, {}).run(work))
-    began_s = time.monotonic()
-    await asyncio.sleep(0.2)
-    elapsed_s = time.monotonic() - began_s
+    running = asyncio.create_task(WakeUp(receive, {}, clock).run(work))
+    await clock.sleep(0.2)
     running.cancel()
-    assert 1 <= calls <= 2 + elapsed_s / 0.02
+    assert 1 <= calls <= 2 + 0.2 / 0.02
 
 
-async def test_when_a_sweep_is_always_due_looks_begin_a_poll_apart():
+@stepped
+async def test_when_a_sweep_is_always_due_looks_begin_a_poll_apart(clock: SteppedClock):
     boards = dict.fromkeys(range(14), 10 * MS)
-    wake_up = WakeUp(Receive(poll_ms=20.0), boards)
+    wake_up = WakeUp(Receive(poll_ms=20.0), boards, clock)
     calls = 0
 
     def work() -> None:
         nonlocal calls
         calls += 1
         for board in boards:
-            wake_up.sweep_ended(board, time.time_ns() - 10 * MS + board * MS // 14)
+            wake_up.sweep_ended(board, clock.now_ns() - 10 * MS + board * MS // 14)
 
     running = asyncio.create_task(wake_up.run(work))
-    began_s = time.monotonic()
-    await asyncio.sleep(0.2)
-    elapsed_s = time.monotonic() - began_s
+    await clock.sleep(0.2)
     running.cancel()
-    assert 1 <= calls <= 2 + elapsed_s / 0.02
+    assert 1 <= calls <= 2 + 0.2 / 0.02
 
 
 async def test_an_error_in_the_work_ends_the_run_with_it():
