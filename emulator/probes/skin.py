@@ -332,7 +332,7 @@ class Skin:
         still = given.is_still(self._placed)
         self._given = given
         slid = moment.offset_mm is not self._offset_mm
-        slid = slid and bool((moment.offset_mm != self._offset_mm).any())
+        slid = same and slid and bool((moment.offset_mm != self._offset_mm).any())
         if slid or not (same and still):
             self._place(moment, same=same, slid=slid, still=still)
         value = moment.drive

@@ -185,6 +185,22 @@ def test_an_object_of_the_scene_presses_beside_the_simulation_s(tmp_path: Path) 
     assert lying.kpa("left_forearm").max() == 0
 
 
+def test_probes_that_come_while_others_slide_are_found() -> None:
+    def sliding(taxel: int, start_s: float) -> Probe:
+        return Probe(
+            part="left_forearm",
+            at=Place(taxel=taxel),
+            force_n=[(0, 1.0), (2, 1.0)],
+            slide_mm=[(0, 0, 0), (2, 20, 0)],
+            start_s=start_s,
+        )
+
+    skin = Skin(LAYOUT, Scene(probe=[sliding(20, 0.0), sliding(60, 0.1)]))
+    for t_ns in range(MOVING_NS, 300_000_000, MOVING_NS):
+        skin.step(t_ns)
+    assert set(skin.contact_force_n()) == {0, 1}
+
+
 def test_what_meets_the_body_beside_its_skin_presses_no_taxel(tmp_path: Path) -> None:
     lying = Lying(balls(tmp_path, [(115.0, 80.0)]))
     lying.model.set_control("push0", -1.0)
