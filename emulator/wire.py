@@ -43,7 +43,10 @@ class Wire:
         self._bit_ns = 1e9 / bitrate
         self._stack_size = stack_size
         self._rng = rng
+        #: Frames that their boards have made, `t_ns` when; and those that they have handed over to
+        #: the bus, `t_ns` when their transmission ends unless more urgent ones come.
         self._waiting = FrameBatch.of([])
+        self._under_way = FrameBatch.of([])
         self._free_ns = 0
         self._babble_every_ns = 0
         self._babbled_ns = 0
@@ -67,13 +70,16 @@ class Wire:
         """The frames whose transmission has ended by `t_ns`, stamped with that moment."""
         if self._babble_every_ns:
             self._add_babble(t_ns)
-        if not len(self._waiting):
-            return self._waiting
         if self.off:
-            self.lost += len(self._waiting)
-            self._waiting = FrameBatch.of([])
-            return self._waiting
-        sent = self._pass(t_ns)
+            self.lost += len(self._waiting) + len(self._under_way)
+            self._waiting = self._under_way = FrameBatch.of([])
+        if len(self._waiting):
+            self._hand_over(t_ns)
+        n = int(np.searchsorted(self._under_way.t_ns, t_ns, side="right"))
+        sent, self._under_way = _split(self._under_way, n)
+        if not n:
+            return sent
+        self._free_ns = int(sent.t_ns[-1])
         return self._spoil(sent) if self.loss_share or self.error_share else sent
 
     def _add_babble(self, t_ns: int) -> None:
@@ -81,26 +87,21 @@ class Wire:
         self._babbled_ns += len(times_ns) * self._babble_every_ns
         self.put(FrameBatch.of([(0, bytes(8), int(time_ns)) for time_ns in times_ns]))
 
-    def _pass(self, t_ns: int) -> FrameBatch:
+    def _hand_over(self, t_ns: int) -> None:
+        """Take what is ready by `t_ns` to the bus, one moment after the other."""
         waiting = self._waiting
         if not waiting.rising:
             waiting = _rows(waiting, np.argsort(waiting.t_ns, kind="stable"))
         times_ns = waiting.t_ns
         turns = np.flatnonzero(times_ns[1:] != times_ns[:-1]) + 1
-        done: list[FrameBatch] = []
-        backlog, first = FrameBatch.of([]), 0
+        taken = 0
         for start, stop in pairwise([0, *turns.tolist(), len(waiting)]):
             ready_ns = int(times_ns[start])
             if ready_ns > t_ns:
                 break
-            next_ns = min(t_ns, int(times_ns[stop])) if stop < len(waiting) else t_ns
-            backlog = self._admit(backlog, _rows(waiting, slice(start, stop)))
-            sent, backlog = self._transmit(backlog, ready_ns, next_ns)
-            done.append(sent)
-            first = stop
-        # What waits still was ready before; it keeps its place in line.
-        self._waiting = join([backlog, _rows(waiting, slice(first, None))])
-        return join(done) if done else FrameBatch.of([])
+            self._arbitrate(_rows(waiting, slice(start, stop)), ready_ns)
+            taken = stop
+        _, self._waiting = _split(waiting, taken)
 
     def _spoil(self, sent: FrameBatch) -> FrameBatch:
         n = len(sent)
@@ -130,24 +131,25 @@ class Wire:
                 group = _rows(group, ~np.isin(np.arange(len(group)), over))
         return join([_rows(backlog, keep), FrameBatch.of(notices), group])
 
-    def _transmit(
-        self, backlog: FrameBatch, ready_ns: int, until_ns: int
-    ) -> tuple[FrameBatch, FrameBatch]:
+    def _arbitrate(self, group: FrameBatch, ready_ns: int) -> None:
+        """Find out when these frames, and those that they delay, are transmitted."""
+        n = int(np.searchsorted(self._under_way.t_ns, ready_ns, side="right"))
+        ended, backlog = _split(self._under_way, n)
+        free_ns = int(ended.t_ns[-1]) if n else self._free_ns
+        group = self._admit(backlog, group)
         # Class and sender decide the arbitration; a sender's own frames stay in its order.
-        priority = backlog.id >> 4
+        priority = group.id >> 4
         if (priority[1:] < priority[:-1]).any():
-            backlog = _rows(backlog, np.argsort(priority, kind="stable"))
-        bits = OVERHEAD_BITS + STUFF_BITS + 8 * backlog.dlc.astype(np.int64)
-        start_ns = max(self._free_ns, ready_ns)
-        end_ns = start_ns + np.round(np.cumsum(bits) * self._bit_ns).astype(np.int64)
-        n = int(np.searchsorted(end_ns, until_ns, side="right"))
-        if n:
-            self._free_ns = int(end_ns[n - 1])
-        sent = _rows(backlog, slice(n))
-        sent.t_ns = end_ns[:n]
-        rest = _rows(backlog, slice(n, None))
-        rest.t_ns = np.full(len(rest), ready_ns, np.int64)
-        return sent, rest
+            group = _rows(group, np.argsort(priority, kind="stable"))
+        bits = OVERHEAD_BITS + STUFF_BITS + 8 * group.dlc.astype(np.int64)
+        passed_ns = np.round(np.cumsum(bits) * self._bit_ns).astype(np.int64)
+        group.t_ns = max(free_ns, ready_ns) + passed_ns
+        self._under_way = join([ended, group])
+
+
+def _split(batch: FrameBatch, n: int) -> tuple[FrameBatch, FrameBatch]:
+    """The first `n` frames, and the others."""
+    return _rows(batch, slice(n)), _rows(batch, slice(n, None))
 
 
 def _rows(batch: FrameBatch, rows: NDArray[np.generic] | slice) -> FrameBatch:

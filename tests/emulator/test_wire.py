@@ -1,0 +1,59 @@
+"""Frames on their way over one bus."""
+
+import numpy as np
+import pytest
+
+from emulator.wire import Wire
+from skin_host.bus.wire import FrameBatch
+
+MS = 1_000_000
+
+
+def burst(address: int, n: int, ready_ns: int) -> FrameBatch:
+    return FrameBatch.of(
+        [(0x400 | address << 4 | i % 16, bytes([i] * 8), ready_ns) for i in range(n)]
+    )
+
+
+def wire_of(bitrate: int = 1_000_000) -> Wire:
+    return Wire(bitrate, lambda address: 20 if address % 2 else None, np.random.default_rng(1))
+
+
+def test_frames_that_become_ready_later_wait() -> None:
+    wire = wire_of()
+    wire.put(burst(1, 2, 10 * MS))
+    wire.put(burst(2, 2, 20 * MS))
+    assert len(wire.until(5 * MS)) == 0
+    assert len(wire.until(15 * MS)) == 2
+    assert len(wire.until(25 * MS)) == 2
+
+
+def test_an_urgent_frame_overtakes_those_that_wait() -> None:
+    wire = wire_of()
+    wire.put(burst(4, 10, 0))
+    wire.put(burst(2, 1, MS // 2))
+    senders = (wire.until(10 * MS).id >> 4 & 0xF).tolist()
+    # 116 us a frame: four have passed by then.
+    assert senders == [4] * 4 + [2] + [4] * 6
+
+
+@pytest.mark.parametrize("bitrate", [125_000, 500_000, 1_000_000])
+def test_how_often_one_looks_changes_no_frame(bitrate: int) -> None:
+    """Also where boards send more than the bus can carry."""
+    sent = []
+    for every_ms in (1, 2, 5, 50):
+        wire = wire_of(bitrate)
+        batches = []
+        for t_ms in range(400):
+            if t_ms % 7 == 0:
+                wire.put(burst(1 + t_ms % 5, 30, t_ms * MS))
+            if (t_ms + 1) % every_ms == 0:
+                batches.append(wire.until((t_ms + 1) * MS))
+        frames = [
+            (int(can_id), data.tobytes(), int(t_ns))
+            for batch in batches
+            for can_id, data, t_ns in zip(batch.id, batch.data, batch.t_ns, strict=True)
+        ]
+        sent.append((frames, wire.lost))
+    assert all(one == sent[0] for one in sent)
+    assert (sent[0][1] > 0) == (bitrate == 125_000)
