@@ -73,6 +73,7 @@ class SignalSkin:
         self._began_ns = np.zeros((n, reg.N_STAGES), np.int64)
         #: Chips whose inputs have changed, when, and to what, since they were last worked out.
         self._changed = np.zeros(0, np.intp)
+        self._is_changed = np.zeros(n, np.bool_)
         self._changes: list[tuple[int, Floats]] = []
 
     def set_capacitance_ff(self, chips: Ints, values: Floats) -> None:
@@ -88,6 +89,7 @@ class SignalSkin:
                 self._update_ideal(chips)
                 return
             self._changed = chips
+            self._is_changed[chips] = True
         self._changes.append((self.t_ns, values.copy()))
 
     def _work_out(self) -> None:
@@ -101,6 +103,7 @@ class SignalSkin:
             self._capacitance_ff[chips, :TAXELS] = values[-1]
             self._ideal[chips] = ideals[-1]
             self._changes = []
+        self._is_changed[self._changed] = False
         self._changed = np.zeros(0, np.intp)
 
     def set_input_noise_ff(self, chips: Ints, values: Floats) -> None:
@@ -217,7 +220,9 @@ class SignalSkin:
 
     def _settle(self, chips: Ints) -> None:
         """Store the results of the conversions that have ended, with their noise."""
-        self._work_out()
+        # What has changed at other chips can wait, for more of it.
+        if self._is_changed[chips].any():
+            self._work_out()
         self._take(chips)
         fresh = self._unseen[chips].any(axis=1)
         if not fresh.any():
