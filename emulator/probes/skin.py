@@ -166,6 +166,7 @@ class Skin:
         #: next one last.
         self._foreseen: list[tuple[Floats, Footprint]] = []
         self._came_true = 0
+        self._is_alone = True
         self._by_depth_now = np.zeros(0, bool)
         self._compliance_now = np.zeros(0)
         self._grounded_now = np.zeros(0, bool)
@@ -329,12 +330,10 @@ class Skin:
     def _press(self, moment: Moment, given: Contacts, dt_s: float) -> Ints:
         number = moment.number
         same = number is self._active or np.array_equal(number, self._active)
-        still = given.is_still(self._placed)
+        still = given is self._placed or given.is_still(self._placed)
         self._given = given
-        slid = moment.offset_mm is not self._offset_mm
-        slid = same and slid and bool((moment.offset_mm != self._offset_mm).any())
-        if slid or not (same and still):
-            self._place(moment, same=same, slid=slid, still=still)
+        if not (same and still and moment.offset_mm is self._offset_mm):
+            self._place(moment, same=same, still=still)
         value = moment.drive
         if len(self._pressed.area_mm2):
             value = np.append(value, given.force_n[self._on_skin])
@@ -375,13 +374,17 @@ class Skin:
         pads = self._touched
         self._untouched_ff = self.resting_ff[pads] + self._ff_per_c[pads] * self._shift_c
 
-    def _place(self, moment: Moment, *, same: bool, slid: bool, still: bool) -> None:
+    def _place(self, moment: Moment, *, same: bool, still: bool) -> None:
         """Find out what is covered, when something came, went or slid.
 
-        `same` are the probes, which `slid` or not; `still` are the source's contacts.
+        `same` are the probes; `still` are the source's contacts.
         """
         number = moment.number
+        of_probes = self._cover(moment, same=same)
         self._active, self._offset_mm = number, moment.offset_mm
+        if still and of_probes is self._of_probes:
+            return
+        self._of_probes = of_probes
         if not still:
             self._placed = self._given
             self._on_skin, self._pressed = self._contact_pads.place(self._given)
@@ -390,25 +393,26 @@ class Skin:
             self._by_depth_now = np.append(self._by_depth[number], none > 0)
             self._compliance_now = np.append(self._compliance[number], none)
             self._grounded_now = np.append(self._grounded[number], none > 0)
-        if not same:
-            self._foreseen.clear()
-        if slid or not same:
-            self._of_probes = self._foresee(moment)
-        self._footprint = rows = joined(self._of_probes, self._pressed)
+        before, self._footprint = self._footprint, joined(of_probes, self._pressed)
+        rows = self._footprint
         bears = rows.covered
         if self._membrane_mm:
             bears = np.where(rows.weight > 0, rows.covered, 0.0)
+        if rows.taxel is not before.taxel:
+            self._is_alone = len(np.unique(rows.taxel)) == len(rows.taxel)
+        elif self._is_alone:
+            self._covered[rows.taxel] = bears
+            return
         n = self._layout.n_taxels
         self._covered = np.bincount(rows.taxel, bears, n).astype(np.float64, copy=False)
 
-    def _foresee(self, moment: Moment) -> Footprint:
-        """What probes cover now; with it, if it is new, what they will cover in the next steps."""
-        if self._foreseen:
-            offset_mm, footprint = self._foreseen.pop()
-            if (offset_mm == moment.offset_mm).all():
-                self._came_true += 1
-                return footprint
-            self._foreseen.clear()
+    def _cover(self, moment: Moment, *, same: bool) -> Footprint:
+        """What the probes cover, the `same` as in the last step; as it was foreseen, if it was."""
+        if same and self._foreseen and (self._foreseen[-1][0] == moment.offset_mm).all():
+            self._came_true += 1
+            return self._foreseen.pop()[1]
+        if same and (moment.offset_mm == self._offset_mm).all():
+            return self._of_probes
         # Twice as far ahead as what was foreseen came true.
         steps = min(2 * self._came_true, MOST_FORESEEN, MOST_AT_ONCE // max(1, len(moment.number)))
         self._came_true = 1
