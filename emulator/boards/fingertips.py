@@ -30,7 +30,8 @@ from skin_host.bus.wire import (
     MessageClass,
     identifier,
 )
-from skin_host.config.settings import Fingertip, Settings
+from skin_host.config.fingertips import Fingertip
+from skin_host.config.settings import Settings
 from skin_host.errors import ConfigurationError
 from skin_host.layout import Layout
 

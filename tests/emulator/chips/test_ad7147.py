@@ -1,9 +1,12 @@
+import importlib
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from emulator.chips.ad7147 import AD7147
+from emulator.chips.i2c import EmulatedSMBus
 
 RESULTS = 0x00B
 STATUS = 0x008
@@ -337,3 +340,8 @@ class TestNoise:
         chip.set_input_noise_ff(np.full(12, 10.0))
         chip.advance(1.0)
         assert len(set(get(chip, RESULTS, 12))) == 1
+
+
+def test_programs_find_chip_and_bus_under_their_short_names() -> None:
+    assert importlib.import_module("emulator.ad7147").AD7147 is AD7147
+    assert importlib.import_module("emulator.i2c").EmulatedSMBus is EmulatedSMBus
