@@ -1,5 +1,7 @@
 """What a user sees who asks for the wrong thing: one clear line and the right status."""
 
+import contextlib
+import io
 import os
 import re
 import subprocess
@@ -19,7 +21,20 @@ ROOT = Path(__file__).parents[2]
 DEMO = ROOT / "config/demo.toml"
 
 
+def asked(*arguments: str) -> "subprocess.CompletedProcess[str]":
+    """What a command that starts nothing says, without a process of its own."""
+    said, complained = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(complained):
+        try:
+            status = main(arguments)
+        except SystemExit as ended:
+            assert isinstance(ended.code, int)
+            status = ended.code
+    return subprocess.CompletedProcess(arguments, status, said.getvalue(), complained.getvalue())
+
+
 def skin(*arguments: str, **environment: str) -> "subprocess.CompletedProcess[str]":
+    """The same of a whole program."""
     return subprocess.run(
         [sys.executable, "-m", "skin_host", *arguments],
         check=False,
@@ -62,7 +77,7 @@ def changed(tmp_path: Path, old: str, new: str) -> str:
 )
 def test_a_wrong_configuration_is_named_by_file_and_key(tmp_path, old, new, path, seen):
     config = changed(tmp_path, old, new)
-    refused(skin("check", config), 2, config, path, seen)
+    refused(asked("check", config), 2, config, path, seen)
 
 
 @pytest.mark.parametrize("config", sorted((ROOT / "config").glob("*.toml")), ids=lambda at: at.stem)
@@ -92,7 +107,7 @@ def test_an_unreadable_log_is_refused_and_leaves_no_output(tmp_path, name, conte
     if content is not None:
         log.write_bytes(content)
     output = tmp_path / "out.jsonl"
-    result = skin("replay", str(log), "--config", str(DEMO), "--output", str(output))
+    result = asked("replay", str(log), "--config", str(DEMO), "--output", str(output))
     refused(result, 2, str(log))
     assert not output.exists()
     assert {path.name for path in tmp_path.iterdir()} <= {name}
@@ -101,7 +116,7 @@ def test_an_unreadable_log_is_refused_and_leaves_no_output(tmp_path, name, conte
 def test_a_log_of_another_robot_is_refused(tmp_path):
     log = tmp_path / "other.log"
     log.write_text("(1700000000.000000) can0 410#40F0F0F0F0F0F0F0\n")
-    refused(skin("replay", str(log), "--config", str(DEMO)), 2, "no sweep of this skin")
+    refused(asked("replay", str(log), "--config", str(DEMO)), 2, "no sweep of this skin")
 
 
 def test_a_calibration_of_another_configuration_is_refused(tmp_path):
@@ -109,7 +124,7 @@ def test_a_calibration_of_another_configuration_is_refused(tmp_path):
     log = tmp_path / "x.log"
     log.write_text("(1700000000.000000) can0 4E0#40F0F0F0F0F0F0F0\n")
     calibration.write_text("{}")
-    result = skin("replay", str(log), "--config", str(DEMO), "--calibration", str(calibration))
+    result = asked("replay", str(log), "--config", str(DEMO), "--calibration", str(calibration))
     refused(result, 2, str(calibration), "skin calibrate")
 
 
@@ -158,7 +173,11 @@ def test_a_calibration_of_touched_skin_is_a_warning(options, status, tmp_path, m
 
 @pytest.mark.parametrize("arguments", [[], ["fly"], ["replay"], ["run"], ["emulate", "nope.toml"]])
 def test_a_wrong_command_is_one_line_and_status_2(arguments):
-    refused(skin(*arguments), 2)
+    refused(asked(*arguments), 2)
+
+
+def test_the_program_ends_with_the_status_of_its_command():
+    refused(skin("check", "nope.toml"), 2, "nope.toml")
 
 
 def help_of(capsys: pytest.CaptureFixture[str], *command: str) -> str:
