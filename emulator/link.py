@@ -15,6 +15,7 @@ from smbus2 import SMBus
 
 from emulator.boards.mtb import I2cChips, make_board
 from emulator.clock import Clock, RealClock
+from skin_host.bus.pair import PairBus
 from skin_host.bus.wire import FrameBatch, MessageClass
 
 log = logging.getLogger(__name__)
@@ -78,6 +79,11 @@ class BoardLink:
             batch: the frames.
             host_ns: when they are sent, int64[n], in the host's time of day.
         """
+        if isinstance(self._bus, PairBus):
+            lost = self._bus.send_batch(batch, host_ns)
+            self.lost += lost
+            self.sent += len(batch) - lost
+            return
         messages = self._waiting + [
             can.Message(
                 timestamp=t_ns * 1e-9,

@@ -4,6 +4,9 @@ import asyncio
 import contextlib
 import json
 import logging
+import multiprocessing
+import signal
+import socket
 import sys
 import tempfile
 from collections import Counter
@@ -16,6 +19,7 @@ import can
 import numpy as np
 from msgspec import structs
 
+from skin_host.bus.pair import PAIR, PairBus, pair
 from skin_host.cli.common import load_skin
 from skin_host.cli.lines import event_line
 from skin_host.client import SkinClient
@@ -27,6 +31,8 @@ from skin_host.mqtt.broker import LocalBroker, local_broker
 from skin_host.viewer.server import Viewer
 
 if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
+
     from emulator.probes.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -76,10 +82,14 @@ async def run(
     # The page and the listener log that they found the broker, which is not of interest here.
     logging.getLogger("skin_host.client").setLevel(logging.WARNING)
     with tempfile.TemporaryDirectory(prefix="skin-demo-") as state:
-        async with local_broker() as broker, _robot(settings, layout, happening, mujoco):
+        async with (
+            local_broker() as broker,
+            _robot(settings, layout, happening, mujoco, stop) as buses,
+        ):
             settings = changed(
                 settings,
                 {
+                    "buses": buses,
                     "service.state_directory": state,
                     "service.metrics_port": 0,
                     "processing.calibration.seconds": CALIBRATION_S,
@@ -214,8 +224,8 @@ def _is_up(interface: str) -> bool:
 
 def _explain(settings: Settings, broker: LocalBroker, page: str) -> None:
     bus = next(iter(settings.buses.values()))
-    if bus.interface == "virtual":
-        print("Emulator and daemon share python-can's virtual bus: no CAN interface is needed.")
+    if bus.interface == PAIR:
+        print("Emulator and daemon are joined by sockets: no CAN interface is needed.")
     else:
         print(f"Emulator and daemon meet on {bus.channel}.")
     print(f"Broker: {broker.kind} on {broker.host}:{broker.port}. To listen to it:")
@@ -229,27 +239,94 @@ def _explain(settings: Settings, broker: LocalBroker, page: str) -> None:
 
 @contextlib.asynccontextmanager
 async def _robot(
-    settings: Settings, layout: Layout, scene: "Scene", mujoco: Path | None
-) -> AsyncIterator[None]:
-    """Run the emulated robot on its buses, for as long as the block lasts."""
+    settings: Settings,
+    layout: Layout,
+    scene: "Scene",
+    mujoco: Path | None,
+    stop: asyncio.Event,
+) -> AsyncIterator[dict[str, Bus]]:
+    """Run the emulated robot in a process of its own, for as long as the block lasts.
+
+    A daemon that is busy must not hold up its robot. Yields the daemon's buses; `stop` is set if
+    the robot ends by itself.
+    """
+    buses, ends = dict(settings.buses), {}
+    for name, bus in settings.buses.items():
+        if bus.interface == "virtual":
+            ours, ends[name] = pair()
+            channel = str(ours.detach())
+            buses[name] = Bus(interface=PAIR, channel=channel, bitrate=bus.bitrate)
+    spawn = multiprocessing.get_context("spawn")
+    ready, told = spawn.Pipe(duplex=False)
+    process = spawn.Process(
+        target=_live, args=(settings, layout, scene, mujoco, ends, told), daemon=True
+    )
+    process.start()
+    told.close()
+    for end in ends.values():
+        end.close()
+    loop = asyncio.get_running_loop()
+    try:
+        try:
+            fault = await asyncio.to_thread(ready.recv)
+        except EOFError:
+            fault = SkinError("the emulator failed as it started; its error stands above")
+        if fault is not None:
+            raise fault
+        loop.add_reader(process.sentinel, stop.set)
+        yield buses
+    finally:
+        loop.remove_reader(process.sentinel)
+        failed = process.exitcode
+        process.terminate()
+        await asyncio.to_thread(process.join)
+        ready.close()
+    if failed:
+        raise SkinError("the emulator failed; its error stands above")
+
+
+def _live(
+    settings: Settings,
+    layout: Layout,
+    scene: "Scene",
+    mujoco: Path | None,
+    ends: dict[str, socket.socket],
+    told: "Connection",
+) -> None:
+    """Be the robot, in its own process, until the parent ends."""
     from emulator.probes.mujoco_model import MujocoModel
     from emulator.robot import Robot
 
-    model = None if mujoco is None else MujocoModel(mujoco, layout)
-    robot = Robot(settings, layout, scene, source=model)
-    with contextlib.ExitStack() as stack:
-        buses = {
-            name: stack.enter_context(can.Bus(interface=bus.interface, channel=bus.channel))
-            for name, bus in settings.buses.items()
-        }
+    # Ctrl-C is for the parent, which ends this process last.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        model = None if mujoco is None else MujocoModel(mujoco, layout)
+        robot = Robot(settings, layout, scene, source=model)
+        buses: dict[str, can.BusABC] = {name: PairBus(end) for name, end in ends.items()}
+        for name, bus in settings.buses.items():
+            if name not in buses:
+                buses[name] = can.Bus(interface=bus.interface, channel=bus.channel)
+    except SkinError as error:
+        told.send(error)
+        return
+    told.send(None)
+
+    async def live() -> None:
         living = asyncio.create_task(robot.run(buses))
-        try:
-            yield
-        finally:
-            living.cancel()
-            (result,) = await asyncio.gather(living, return_exceptions=True)
-            if isinstance(result, Exception):
-                raise SkinError(f"the emulator failed: {result}") from result
+        parent = multiprocessing.parent_process()
+        assert parent is not None
+        asyncio.get_running_loop().add_reader(parent.sentinel, living.cancel)
+        with contextlib.suppress(asyncio.CancelledError):
+            await living
+
+    try:
+        asyncio.run(live())
+    except SkinError as error:
+        print(f"skin demo: {error}", file=sys.stderr)
+        sys.exit(1)
+    finally:
+        for open_bus in buses.values():
+            open_bus.shutdown()
 
 
 async def _heard(touches: "Counter[str]", sent: int) -> None:

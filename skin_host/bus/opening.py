@@ -6,6 +6,7 @@ import can
 from can.interfaces.socketcan import SocketcanBus
 
 from skin_host.bus import adapters, socketcan
+from skin_host.bus.pair import PAIR, PairPort
 from skin_host.bus.port import Port
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Bus, Receive
@@ -32,6 +33,8 @@ def open_port(
         BusError: the interface is absent, down, not CAN, not permitted, or not supported, and
             `wait` is not set.
     """
+    if bus.interface == PAIR:
+        return PairPort(name, bus, clock)
     opened: can.BusABC | None
     try:
         opened = open_bus(name, bus)

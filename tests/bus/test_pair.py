@@ -1,0 +1,79 @@
+"""A bus between two processes: what one end sends the other receives, in whole batches."""
+
+import numpy as np
+import pytest
+
+from skin_host.bus.opening import open_port
+from skin_host.bus.pair import MOST_FRAMES, PAIR, PairBus, pair
+from skin_host.bus.port import LinkState, Port
+from skin_host.bus.wire import FrameBatch
+from skin_host.config.settings import Bus, Receive
+from skin_host.errors import BusError
+
+
+def batch(n: int) -> FrameBatch:
+    frames = [(0x300 + i % 16, bytes([i % 256, 1, 2]), 10**18 + i) for i in range(n)]
+    return FrameBatch.of(frames)
+
+
+def opened() -> tuple[PairBus, Port]:
+    ours, theirs = pair()
+    port = open_port("can0", Bus(interface=PAIR, channel=str(ours.detach())), Receive())
+    return PairBus(theirs), port
+
+
+def test_batches_arrive_in_order_with_their_times() -> None:
+    far, port = opened()
+    sent = batch(MOST_FRAMES + 7)
+    assert far.send_batch(sent, sent.t_ns + 5) == 0
+    read = port.read()
+    assert len(read) == len(sent)
+    np.testing.assert_array_equal(read.id, sent.id)
+    np.testing.assert_array_equal(read.data, sent.data)
+    np.testing.assert_array_equal(read.dlc, sent.dlc)
+    np.testing.assert_array_equal(read.t_ns, sent.t_ns + 5)
+    assert port.counters.frames == len(sent)
+    assert len(port.read()) == 0
+    port.close()
+    far.shutdown()
+
+
+async def test_commands_go_the_other_way() -> None:
+    far, port = opened()
+    await port.send([(0x20E, b"\x32\x01"), (0x20D, b"\x4d")], gap_s=0)
+    seen = [far.recv(0), far.recv(0)]
+    assert [(one.arbitration_id, bytes(one.data)) for one in seen if one] == [
+        (0x20E, b"\x32\x01"),
+        (0x20D, b"\x4d"),
+    ]
+    assert far.recv(0) is None
+    port.close()
+    far.shutdown()
+
+
+def test_what_the_other_side_never_reads_is_lost_and_counted() -> None:
+    far, port = opened()
+    sent = batch(MOST_FRAMES)
+    lost = sum(far.send_batch(sent, sent.t_ns) for _ in range(60))
+    assert lost > 0
+    read = 0
+    while n := len(port.read()):
+        read += n
+        # What waits goes on with the next batch.
+        far.send_batch(batch(0), np.zeros(0, np.int64))
+    assert read + lost == 60 * MOST_FRAMES
+    port.close()
+    far.shutdown()
+
+
+def test_an_end_that_was_closed_is_gone() -> None:
+    far, port = opened()
+    far.shutdown()
+    assert len(port.read()) == 0
+    assert port.state is LinkState.GONE
+    port.close()
+
+
+def test_a_channel_that_is_no_socket_is_refused() -> None:
+    with pytest.raises(BusError, match="wanted the number of a socket"):
+        open_port("can0", Bus(interface=PAIR, channel="can0"), Receive())
