@@ -156,12 +156,16 @@ class SteppedClock(Clock):
     Args:
         epoch_ns: the time of day at which it begins.
         seed: of the random numbers: the same seed gives the same ones.
+
+    Attributes:
+        threads_take_s: how long what runs beside the event loop takes.
     """
 
     def __init__(self, epoch_ns: int = EPOCH_NS, seed: int = 0) -> None:
         self._random = random.Random(seed)
         self._epoch_ns = epoch_ns
         self._t_ns = 0
+        self.threads_take_s = 0.0
 
     def now_ns(self) -> int:
         return self._epoch_ns + self._t_ns
@@ -182,7 +186,7 @@ class SteppedClock(Clock):
 
     async def in_thread(self, function: Callable[[Unpack[Ts]], T], *args: *Ts) -> T:
         """Run the function directly, without a thread."""
-        await asyncio.sleep(0)
+        await asyncio.sleep(self.threads_take_s)
         return function(*args)
 
     def executor(self, name: str) -> Executor:

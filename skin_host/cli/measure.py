@@ -153,7 +153,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
                 progress.close()
                 print(_line(result), flush=True)
                 if result.broken:
-                    print(_story(result, config), flush=True)
+                    print(_story(result, arguments, config), flush=True)
     finally:
         progress.close()
         logging.disable(logging.NOTSET)
@@ -175,14 +175,15 @@ def _line(result: "RunResult") -> str:
     )
 
 
-def _story(result: "RunResult", config: Path) -> str:
+def _story(result: "RunResult", arguments: argparse.Namespace, config: Path) -> str:
     """Return the events before a broken promise, and the command that repeats it."""
+    command = f"skin simulate {config} --seed {result.seed} --hours {arguments.hours:g}"
     again = max(0.0, result.simulated_s - 1.0)
     return "\n".join(
         [
             *(f"  {line}" for line in result.last),
             f"  broken at {result.simulated_s:.3f} s: {result.broken}",
-            f"  with logs: skin simulate {config} --seed {result.seed} --until {again:.1f}",
+            f"  with logs: {command} --until {again:.1f}",
         ]
     )
 

@@ -13,16 +13,19 @@ from numpy.typing import NDArray
 
 from emulator.boards.board import join
 from skin_host.bus.port import ERROR_FLAG, LinkState, Port
-from skin_host.bus.wire import FrameBatch
+from skin_host.bus.wire import FrameBatch, MessageClass
 from skin_host.clock import Clock
 from skin_host.config.settings import Bus
 from skin_host.errors import BusError
+from skin_host.evaluation.simulate.sent import Sent
 from skin_host.evaluation.simulate.trace import Trace
 
 #: Frames that wait to be read; more are dropped and counted, as a socket does.
 BUFFER_FRAMES = 4000
 #: Most frames of one read.
 CAPACITY = 1024
+#: A second board at an address sends this long after the first.
+TWIN_NS = 20_000_000
 _NOTHING = FrameBatch.of([])
 
 
@@ -37,10 +40,19 @@ class Mischief:
     damaged: float = 0.0
     #: How late the late ones come.
     late_ns: int = 3_000_000
+    #: A second board sends at this address.
+    twin: int | None = None
 
     def any(self) -> bool:
         """Whether anything happens to any frame."""
         return bool(self.lost or self.late or self.doubled or self.swapped or self.damaged)
+
+    def second_board(self, batch: FrameBatch) -> FrameBatch:
+        """Return what a second board at the address sends after these frames."""
+        mine = (batch.id >> 8 == MessageClass.SKIN_STREAM) & (batch.id >> 4 & 0xF == self.twin)
+        other = _rows(batch, mine)
+        other.t_ns = other.t_ns + TWIN_NS
+        return other
 
 
 @dataclass(slots=True)
@@ -78,7 +90,9 @@ class Cable:
     Attributes:
         mischief: what happens to frames.
         state: of the interface, as the port is to find it.
+        damaged_ns: when a frame was last damaged.
         fate: what became of the frames since the port was opened.
+        sent: what passed over the bus.
     """
 
     def __init__(
@@ -95,6 +109,8 @@ class Cable:
         self.mischief = Mischief()
         self.state = LinkState.UP
         self.fate = Fate()
+        self.sent = Sent()
+        self.damaged_ns = -(1 << 62)
         self.move = move
         self._clock = clock
         self._command = command
@@ -105,6 +121,7 @@ class Cable:
         self._waiting: list[FrameBatch] = []
         self._n_waiting = 0
         self._late: list[tuple[int, FrameBatch]] = []
+        self._twin: list[FrameBatch] = []
         #: When a frame of each standard identifier was last read (ns, stepped time).
         self.read_ns = np.full(0x800, -(1 << 62), np.int64)
 
@@ -114,6 +131,7 @@ class Cable:
         self._port = port
         self._forget()
         self.fate = Fate()
+        self.sent.forget()
 
     def close(self, port: "SimulatedPort") -> None:
         """Frames are not kept any more, if they were kept for this port."""
@@ -136,12 +154,16 @@ class Cable:
 
     def arrive(self, batch: FrameBatch) -> None:
         """Frames that passed over the bus, stamped with the robot's time."""
+        if self.mischief.twin is not None or self._twin:
+            batch = self._with_twin(batch)
         n = len(batch)
         fate = self.fate
         fate.sent += n
         if self._port is None or self.state in (LinkState.GONE, LinkState.DOWN):
             fate.unheard += n
             return
+        if n:
+            self.sent.note(batch)
         if self._late:
             due = [one for at_ns, one in self._late if at_ns <= self._clock.monotonic_ns()]
             if due:
@@ -163,6 +185,25 @@ class Cable:
         self._n_waiting += len(batch)
         self._waiting.append(batch)
 
+    def sleep_through(self, batch: FrameBatch) -> None:
+        """Frames that passed while this computer was suspended."""
+        self.fate.sent += len(batch)
+        self.fate.unheard += len(batch)
+
+    def _with_twin(self, batch: FrameBatch) -> FrameBatch:
+        """Add what a second board at one address sends, in the order of time."""
+        if self.mischief.twin is not None and len(batch):
+            self._twin.append(self.mischief.second_board(batch))
+        waiting = [one for one in self._twin if len(one)]
+        self._twin = []
+        if not waiting:
+            return batch
+        other = join(waiting)
+        due = other.t_ns <= self._clock.monotonic_ns()
+        self._twin = [_rows(other, ~due)]
+        batch = join([batch, _rows(other, due)])
+        return _rows(batch, np.argsort(batch.t_ns, kind="stable"))
+
     def _spoil(self, batch: FrameBatch) -> FrameBatch:
         what, rng, fate = self.mischief, self._rng, self.fate
         n = len(batch)
@@ -171,6 +212,8 @@ class Cable:
             bits = rng.integers(0, 64, len(wrong))
             batch.data[wrong, bits // 8] ^= (1 << bits % 8).astype(np.uint8)
             fate.damaged += len(wrong)
+            if len(wrong):
+                self.damaged_ns = self._clock.monotonic_ns()
         if what.swapped:
             order = np.arange(n)
             for row in np.flatnonzero(rng.random(max(n - 1, 0)) < what.swapped).tolist():

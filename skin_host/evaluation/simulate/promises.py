@@ -6,6 +6,7 @@ ends the run.
 """
 
 import asyncio
+import gc
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -14,6 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.evaluation.simulate.accusations import Accusations
 from skin_host.evaluation.simulate.troubles import Trouble
 from skin_host.evaluation.simulate.world import Life, World
 from skin_host.layout import PadKind
@@ -24,19 +26,25 @@ NS = 1_000_000_000
 #: Truth is sampled this often, and so many samples are looked back on.
 SAMPLE_S = 0.25
 SAMPLES = 8
+#: Sweeps of a board that may be under way, or be cut off, at the two ends of a life.
+SLACK = 3
 #: What comes of a board is valid for no longer than so many of its periods after its last frame.
 STALE_PERIODS = 8
 #: Pads that press at least so much and read less than that are felt wrong, and the reverse.
 PRESSED_KPA, FELT_KPA = 25.0, 2.0
 UNTOUCHED_KPA = 25.0
-#: A fault may be reported this long after it ended: past events are reported for a minute.
-ACCUSED_NS = 75 * NS
-#: Codes that need no cause: pads differ, and long touches are reported.
-ALWAYS = {"taxel_decides_late", "taxel_held", "part_not_calibrated", "taxel_drifting"}
 #: A pad is pressed at all; and so long after it began, a touch may not be decided yet.
 TOUCHING_KPA = 0.2
 DECIDED_NS = NS // 2
 MOST_TASKS = 100
+#: So many objects may live more than after the first calm: histories that are bounded.
+MORE_OBJECTS = 60_000
+#: A sweep reaches the end of the core within so many of its periods, and this.
+FRESH_PERIODS, FRESH_NS = 3, 80_000_000
+#: What is retained is at the broker so long after it changed, or a connection began.
+RETAINED_NS = 2 * NS
+#: The broker keeps no `OFF` of a part without a valid taxel for longer.
+UNKNOWN_NS = NS
 
 Mask = NDArray[np.bool_]
 
@@ -52,23 +60,24 @@ class Promises:
 
     Attributes:
         broken: what was broken first, or None.
-        named: kinds of trouble that health had to name, and did.
+        touches: events so far.
+        accusations: what health reports against the troubles.
     """
 
     def __init__(self, world: World) -> None:
         self._world = world
         self.broken: str | None = None
         self.stopped = asyncio.Event()
-        self.named: set[str] = set()
         self.touches = 0
+        self.accusations = Accusations(world)
         layout = world.layout
         self._parts = {part.name: part for part in layout.parts}
         self._open: dict[str, set[int]] = {}
         self._last_id: dict[str, int] = {}
         self._seq: dict[str, int] = {}
-        self._codes: dict[str, set[str]] = {}
-        self._troubles: list[tuple[Trouble, int, int | None]] = []
-        self._spoiled_ns = -(1 << 62)
+        #: Taxels whose values may be wrong: now, and until when.
+        self._spoiling: list[Trouble] = []
+        self._spoiled_until_ns = np.full(layout.n_taxels, -(1 << 62), np.int64)
         self._exempt = np.zeros(layout.n_taxels, np.bool_)
         #: When each taxel began to be pressed, when its board was last received, and since when
         #: what presses it may be in its zero.
@@ -96,6 +105,31 @@ class Promises:
                 buses[taxels] = own.bus
         for bus in world.cables:
             self._bus_of[bus] = np.flatnonzero(buses == bus)
+        #: Frames in the sweeps of each bus, in this life of the daemon.
+        self._swept: dict[str, int] = {}
+        self._bus_of_board = [board.settings.bus for board in layout.boards]
+        #: Retained topics as the daemon puts them, and when.
+        self._said: dict[str, tuple[bytes, int]] = {}
+        self._connected_ns: int | None = None
+        self._connection = 0
+        self._blank_since: dict[str, int] = {}
+        self._clock_set_ns = -(1 << 62)
+        self._objects: int | None = None
+        #: Of each part its triangles: address, number, first taxel, index of the bus.
+        self._triangles = {
+            part.name: [
+                (
+                    layout.boards[one.board].settings.bus,
+                    layout.boards[one.board].settings.address,
+                    one.number,
+                    int(layout.boards[one.board].taxel_index[one.number].min()),
+                    layout.boards[one.board].settings.period_ms * 1_000_000,
+                )
+                for one in layout.triangles
+                if layout.parts[one.part].name == part.name
+            ]
+            for part in layout.parts
+        }
         #: Of each count of touches that subscribers got, in this life of the daemon.
         self._counts: dict[str, dict[int, bytes]] = {}
         self._put: dict[str, int] = {}
@@ -116,30 +150,44 @@ class Promises:
     def begin(self, trouble: Trouble) -> None:
         """A trouble begins."""
         now_ns = self._now_ns()
-        over = None if trouble.lasts_s[1] else now_ns
-        self._troubles = [
-            one
-            for one in self._troubles
-            if one[0].lingers or one[2] is None or now_ns - one[2] < ACCUSED_NS
-        ]
-        self._troubles.append((trouble, now_ns, over))
+        self.accusations.begin(trouble)
         for triangle in trouble.blind:
             self._blind_since.setdefault(triangle, now_ns)
+        if trouble.spoils is not None:
+            self._spoiling.append(trouble)
+            if not trouble.lasts_s[1]:
+                self._recover(trouble)
+        if trouble.name == "clock_set":
+            self._clock_set_ns = now_ns
 
     def end(self, trouble: Trouble) -> None:
         """A trouble ends."""
-        now_ns = self._now_ns()
-        self._troubles = [
-            (one, began, now_ns if one is trouble else over) for one, began, over in self._troubles
-        ]
+        self.accusations.end(trouble)
         for triangle in trouble.blind:
             self._blind_since.pop(triangle, None)
-        if trouble.spoils:
-            self._spoiled_ns = now_ns
+        if trouble in self._spoiling:
+            self._recover(trouble)
+
+    def _recover(self, trouble: Trouble) -> None:
+        self._spoiling.remove(trouble)
+        assert trouble.spoils is not None
+        until_ns = self._now_ns() + int(trouble.recovers_s * NS)
+        wrong = self._spoiled_until_ns
+        wrong[trouble.spoils] = np.maximum(wrong[trouble.spoils], until_ns)
+
+    def _spoiled(self) -> Mask:
+        """Return the taxels bool[n] whose values may be wrong now."""
+        spoiled: Mask = self._spoiled_until_ns > self._now_ns()
+        for trouble in self._spoiling:
+            assert trouble.spoils is not None
+            spoiled |= trouble.spoils
+        return spoiled
 
     def calibrated_at_rest(self) -> None:
         """A calibration of the whole untouched skin was taken."""
         self._exempt[:] = False
+        self._spoiled_until_ns[:] = self._now_ns()
+        self.accusations.repaired()
 
     def watch(self, life: Life) -> None:
         """Look at what a daemon puts out from its start on."""
@@ -149,6 +197,15 @@ class Promises:
         self._counts.clear()
         self._put.clear()
         self._frames.clear()
+        self.accusations.restarted()
+        self._swept = dict.fromkeys(self._world.cables, 0)
+        self._said = {}
+        self._blank_since.clear()
+        self._connected_ns = None
+        outbox: Any = life.daemon.publisher._outbox
+        outbox.put_state = _after(life, self._retain, outbox.put_state)
+        health: Any = life.daemon.health
+        health.note = _after(life, self._output, health.note)
         publisher: Any = life.daemon.publisher
         for name, look in (
             ("put_touch", self._touch),
@@ -211,25 +268,53 @@ class Promises:
             taxels = taxels[(taxels >= part.start) & (taxels < part.stop)] - part.start
             if frame.valid[taxels].any():
                 self.break_(f"{name}: triangle {board}/{triangle} is valid, and has no chip")
+        if frame.valid.any():
+            self._blank_since.pop(name, None)
+        else:
+            self._blank_since.setdefault(name, self._now_ns())
+        self._trace_back(frame, part.start)
+
+    def _trace_back(self, frame: PressureFrame, start: int) -> None:
+        """What is valid was sent so, lately, in one sweep, by a chip that answers."""
+        world = self._world
+        valid, raw = frame.valid.tobytes(), frame.raw.tobytes()
+        clock_was_set = self._now_ns() - self._clock_set_ns < 5 * NS
+        for bus, address, number, first, period_ns in self._triangles[frame.part]:
+            at = first - start
+            if b"\1" not in valid[at : at + 12]:
+                continue
+            cable = world.cables[bus]
+            if cable.mischief.damaged or self._now_ns() - cable.damaged_ns < 2 * NS:
+                continue
+            found = "no sweep of it"
+            for answered, t_ns in cable.sent.find(address, number, raw[at : at + 12]):
+                age_ns = frame.t_ns - (world.clock.now_ns() - world.clock.monotonic_ns()) - t_ns
+                if not answered:
+                    found = "a chip that did not answer"
+                elif age_ns > FRESH_PERIODS * period_ns + FRESH_NS and not clock_was_set:
+                    found = f"a sweep {age_ns / NS:.2f} s before it"
+                else:
+                    break
+            else:
+                self.break_(
+                    f"{frame.part}: triangle {address}/{number} of frame {frame.seq} is valid, and "
+                    f"its bytes are of {found}"
+                )
+                return
+
+    def _output(self, output: Any) -> None:
+        for sweep in output.sweeps:
+            self._swept[self._bus_of_board[sweep.board]] += 2 * sweep.present.bit_count()
+
+    def _retain(self, topic: str, payload: bytes) -> None:
+        before = self._said.get(topic)
+        if before is None or before[0] != payload:
+            self._said[topic] = payload, self._now_ns()
 
     def _health(self, part: str, record: Any) -> None:
-        codes = {fault["code"] for fault in record["faults"]}
-        if codes == self._codes.get(part):
-            return
-        self._codes[part] = codes
-        now_ns = self._now_ns()
-        allowed = set(ALWAYS)
-        for trouble, _, over in self._troubles:
-            if over is None or now_ns - over < ACCUSED_NS or trouble.lingers:
-                allowed |= trouble.may
-        wrong = codes - allowed
-        if wrong:
-            says = [
-                text
-                for fault, text in zip(record["faults"], record["sentences"], strict=True)
-                if fault["code"] in wrong
-            ]
-            self.break_(f"{part}: accused without a cause: {'; '.join(says)}")
+        wrong = self.accusations.note(part, record)
+        if wrong is not None:
+            self.break_(wrong)
 
     # ------------------------------------------------------------------ subscribers
 
@@ -294,6 +379,7 @@ class Promises:
             assembled = daemon.engine.assemblers[name].counters.frames
             if assembled != counters.frames:
                 self.break_(f"bus {name}: {assembled} of {counters.frames} frames were taken")
+            self._account_frames(name, daemon.engine.assemblers[name])
         known = daemon.publisher.counters
         waiting = sum(
             1
@@ -311,6 +397,44 @@ class Promises:
         got = sum(len(seen) for seen in self._counts.values())
         if not life.dead and got < known.touches_sent:
             self.break_(f"{known.touches_sent} events were acknowledged, {got} arrived")
+
+    def _account_frames(self, bus: str, assembler: Any) -> None:
+        """Each frame is in a sweep, waits to be, or is counted; each sweep came or is counted."""
+        counters = assembler.counters
+        states = assembler._states.values()
+        waiting = sum(
+            (state.awaited & ~state.missing).bit_count() for state in states if state.missing
+        )
+        told = (
+            counters.other
+            + counters.force_torque
+            + counters.wrong_header
+            + counters.short
+            + counters.unknown_board
+            + counters.unknown_triangle
+            + counters.late
+            + counters.doubled
+            + counters.halves
+        )
+        if counters.frames != told + self._swept[bus] + waiting:
+            self.break_(
+                f"bus {bus}: {counters.frames} frames came; {self._swept[bus]} are in sweeps, "
+                f"{waiting} wait, {told} are counted otherwise"
+            )
+        bursts = self._world.cables[bus].sent.bursts
+        known = {board.settings.address for board in self._world.layout.boards}
+        sent = sum(count - SLACK for address, count in bursts.items() if address in known)
+        came = counters.sweeps + counters.missed
+        if sent > came:
+            self.break_(f"bus {bus}: {sent} sweeps were sent; {came} came or are counted as missed")
+
+    def grown(self) -> None:
+        """At the end of a calm: what lives does not become more and more."""
+        count = len(gc.get_objects())
+        if self._objects is None:
+            self._objects = count
+        elif count > self._objects + MORE_OBJECTS:
+            self.break_(f"{count} objects live, {self._objects} did after the first calm")
 
     # ------------------------------------------------------------------ truth
 
@@ -340,16 +464,14 @@ class Promises:
         life = world.life
         if life is not None and life.daemon.engine.calibrating:
             # Touched taxels are calibrated anyway, with that verdict.
-            self._exempt |= truth > TOUCHING_KPA
+            self._exempt |= (truth > TOUCHING_KPA) | self._spoiled()
         if life is not None:
             self._exempt_zeroed(life, truth)
             if life.daemon.engine.calibration is not None:
                 self._note_calibration(life.daemon.engine.calibration.id)
         if life is None or life.dead or len(self._truth) < SAMPLES:
             return
-        spoiled = now_ns - self._spoiled_ns < 60 * NS or any(
-            over is None and trouble.spoils for trouble, _, over in self._troubles
-        )
+        spoiled = self._spoiled()
         lately = np.array([values for _, values in list(self._truth)[-4:]])
         longer = np.array([values for _, values in self._truth])
         least, most = lately.min(axis=0), longer.max(axis=0)
@@ -360,9 +482,7 @@ class Promises:
             wall_ns = world.clock.now_ns()
             if abs(wall_ns - frame.t_ns) > NS // 2 or not frame.computed:
                 continue
-            fit = frame.valid & pads[mine] & ~self._exempt[mine]
-            if spoiled:
-                continue
+            fit = frame.valid & pads[mine] & ~self._exempt[mine] & ~spoiled[mine]
             missed = fit & (least[mine] > PRESSED_KPA) & (frame.pressure_kpa < FELT_KPA)
             if missed.any():
                 taxel = int(np.flatnonzero(missed)[0])
@@ -377,13 +497,16 @@ class Promises:
                     f"{name}: taxel {taxel} is valid and reads {frame.pressure_kpa[taxel]:.1f} kPa "
                     "while nothing presses it"
                 )
-        self._named()
+        unnamed = self.accusations.unnamed()
+        if unnamed is not None:
+            self.break_(unnamed)
         if len(asyncio.all_tasks()) > MOST_TASKS:
             self.break_(f"{len(asyncio.all_tasks())} tasks run")
 
     def _exempt_zeroed(self, life: Life, truth: NDArray[np.float64]) -> None:
         """What its board did not feel before it took a zero is in that zero: nobody can know."""
         now_ns = self._now_ns()
+        spoiled = self._spoiled()
         pressed = truth > TOUCHING_KPA
         self._pressed_ns[pressed & ~self._pressed] = now_ns
         self._pressed = pressed
@@ -403,6 +526,8 @@ class Promises:
             self._exempt[taxels] |= pressed[taxels] & (
                 self._pressed_ns[taxels] > self._unfelt_ns[taxels]
             )
+            if not rezero.settled(0):
+                self._exempt[taxels] |= spoiled[taxels]
         whole = slice(0, layout.n_taxels)
         self._felt_ns = self._heard_ns(whole)
 
@@ -411,13 +536,25 @@ class Promises:
         world = self._world
         life = world.life
         if life is None or life.dead or not life.daemon.publisher.counters.connected:
+            self._connected_ns = None
             return
-        if len(self._truth) < SAMPLES or world.broker.frozen:
+        if world.broker.frozen:
+            self._connected_ns = None
             return
-        if self._now_ns() - self._spoiled_ns < 60 * NS:
+        now_ns = self._now_ns()
+        connections = life.daemon.publisher.counters.connections
+        if self._connected_ns is None or self._connection != connections:
+            self._connection, self._connected_ns = connections, now_ns
+        self._retained(now_ns)
+        for name, since_ns in self._blank_since.items():
+            topic = life.daemon.publisher.topics.part("contact", name)
+            long = now_ns - max(since_ns, self._connected_ns) > UNKNOWN_NS
+            if long and world.broker.retained.get(topic) == b"OFF":
+                self.break_(f"{name}: the broker keeps OFF, and no taxel is valid")
+        if len(self._truth) < SAMPLES:
             return
         lately = np.array([values for _, values in list(self._truth)[-6:]])
-        pads = (world.layout.pad_kind == PadKind.PRESSURE) & ~self._exempt
+        pads = (world.layout.pad_kind == PadKind.PRESSURE) & ~self._exempt & ~self._spoiled()
         pressed = (lately.min(axis=0) > PRESSED_KPA) & pads
         for name, part in self._parts.items():
             topic = life.daemon.publisher.topics.part("contact", name)
@@ -428,32 +565,16 @@ class Promises:
             elif self._now_ns() - self._wrong_since_ns.setdefault(name, self._now_ns()) > NS // 2:
                 self.break_(f"{name}: the broker keeps OFF, and it has been pressed for 2 s")
 
-    def _named(self) -> None:
-        """Health reports the required codes of lasting troubles."""
-        now_ns = self._now_ns()
-        said = set().union(*self._codes.values()) if self._codes else set()
-        for trouble, began_ns, over in self._troubles:
-            if trouble.must is None or over is not None:
+    def _retained(self, now_ns: int) -> None:
+        """The broker keeps what the daemon wants it to keep."""
+        assert self._connected_ns is not None
+        for topic, (payload, put_ns) in self._said.items():
+            if now_ns - max(put_ns, self._connected_ns) < RETAINED_NS:
                 continue
-            if trouble.must in said:
-                self.named.add(trouble.name)
-            elif now_ns - began_ns > trouble.within_s * NS and self._is_plain(trouble, began_ns):
-                self.break_(
-                    f"{trouble.about}: health lacks {trouble.must} after {trouble.within_s:g} s"
-                )
-
-    def _is_plain(self, trouble: Trouble, began_ns: int) -> bool:
-        """Whether nothing else can hide a trouble: no other, and a daemon that works."""
-        life = self._world.life
-        if life is None or life.dead or began_ns - life.began_ns < 15 * NS:
-            return False
-        engine = life.daemon.engine
-        if engine.calibration is None or engine.calibrating or engine.disabled:
-            return False
-        return not any(
-            one is not trouble and (over is None or began_ns - over < 10 * NS)
-            for one, _, over in self._troubles
-        )
+            kept = self._world.broker.retained.get(topic)
+            if kept != payload:
+                self.break_(f"{topic}: the broker keeps {kept!r:.60}, put was {payload!r:.60}")
+                return
 
     def _now_ns(self) -> int:
         return self._world.clock.monotonic_ns()

@@ -12,23 +12,33 @@ from typing import Any
 
 import msgspec
 
-from emulator.probes.scene import Scene
+from emulator.probes.scene import Fault, Scene, Temperature
 from skin_host.config.settings import Settings
 from skin_host.errors import ConfigurationError
+from skin_host.evaluation.simulate.accusations import NOISE, QUIET_NS, STARTED_NS
 from skin_host.evaluation.simulate.disk import PowerCut
 from skin_host.evaluation.simulate.promises import SAMPLE_S, Promises
 from skin_host.evaluation.simulate.troubles import ACTS, KINDS, WIRING, Trouble, act
-from skin_host.evaluation.simulate.world import Life, World
+from skin_host.evaluation.simulate.world import Life, Spot, World
 from skin_host.layout import Layout
 
-#: How long a storm lasts, and how long the calm after it may take to be well.
+#: How long a storm lasts, how long the calm after it may take to be well, and after what time an
+#: operator calibrates again.
 STORM_S = 40.0
-CALM_S = 45.0
+CALM_S = 60.0
+AGAIN_S = 8.0
 #: Mean times between troubles, presses, requests and ends of the daemon in a storm.
 TROUBLE_S = 3.0
 PRESS_S = 2.5
 REQUEST_S = 6.0
-DEATH_S = 60.0
+DEATH_S = 25.0
+#: A trouble without a bound lasts no longer alone.
+LONGEST_DRILL_S = 20.0
+#: Presses: short ones, and long ones in which an operator does something that a press spoils.
+SHORT_S, LONG_S = (0.2, 5.0), (7.0, 11.0)
+LONG_SHARE = 0.3
+#: The temperature moves by at most so much in this time.
+WANDER_S, MOST_WANDER_C = 600.0, 1.0
 #: Troubles at one time.
 MOST_TROUBLES = 3
 #: Faults that a calm may keep: they report what happened within the last minute, or real pads.
@@ -94,7 +104,7 @@ def simulate(
         before = os.environ.get("STATE_DIRECTORY")
         os.environ["STATE_DIRECTORY"] = state
         try:
-            scene = Scene(quiet=True)
+            scene = _scene(seed, seconds)
             world = World(settings, layout, config, seed, scene)
             with world.clock.runner() as runner:
                 run = _Run(world, Path(state), seed, seconds, until_s)
@@ -107,6 +117,16 @@ def simulate(
     result = run.result
     result.cpu_s = time.process_time() - began_s
     return result
+
+
+def _scene(seed: int, seconds: float) -> Scene:
+    """Noise as recorded on real skin or of the best skin, and a temperature that wanders."""
+    chance = random.Random(f"{seed} scene")
+    degrees_c = [24.0]
+    while len(degrees_c) * WANDER_S < seconds + 2 * STORM_S:
+        degrees_c.append(degrees_c[-1] + chance.uniform(-MOST_WANDER_C, MOST_WANDER_C))
+    keyframes = [(WANDER_S * number, at_c) for number, at_c in enumerate(degrees_c)]
+    return Scene(quiet=chance.random() < 0.5, temperature=Temperature(keyframes_c=keyframes))
 
 
 class _Run:
@@ -122,6 +142,7 @@ class _Run:
         self._troubles: list[Trouble] = []
         self._injected: Counter[str] = Counter()
         self._requests = 0
+        self._drills: list[str] = []
 
     async def live(self) -> None:
         """Storm and calm, until the time is over or a promise is broken."""
@@ -147,7 +168,7 @@ class _Run:
         result.broken = self._promises.broken
         result.last = list(world.trace.last)
         result.troubles = dict(sorted(self._injected.items()))
-        result.named = sorted(self._promises.named)
+        result.named = sorted(self._promises.accusations.named)
         result.touches = self._promises.touches
 
     def _unexpected(self, _: object, context: dict[str, Any]) -> None:
@@ -172,7 +193,8 @@ class _Run:
         while world.clock.monotonic_s() < self._seconds:
             await self._storm()
             await self._calm()
-        await self._stop()
+            await self._drill()
+        await self._end_in_a_press()
 
     # ------------------------------------------------------------------ the daemon's lives
 
@@ -239,7 +261,7 @@ class _Run:
             group.create_task(work(left_s))
 
     async def _trouble(self, left_s: float) -> None:
-        world, chance = self.world, self._chance
+        chance = self._chance
         if len(self._troubles) >= MOST_TROUBLES:
             return
         name = chance.choice(list(KINDS))
@@ -247,19 +269,29 @@ class _Run:
             return
         if name in WIRING and any(trouble.name in WIRING for trouble in self._troubles):
             return
+        trouble = self._inject(name)
+        if trouble is None or not trouble.lasts_s[1]:
+            return
+        await self._last(trouble, min(left_s, chance.uniform(*trouble.lasts_s)))
+
+    def _inject(self, name: str) -> Trouble | None:
+        """Begin a trouble; None if another one has unplugged the chip that was drawn."""
+        world = self.world
         try:
-            trouble = KINDS[name](world, chance)
+            trouble = KINDS[name](world, self._chance)
         except ConfigurationError:
-            return  # another trouble has unplugged the chip that was drawn
+            return None
         world.note(f"trouble: {trouble.about}")
         self._injected[name] += 1
         self._promises.begin(trouble)
-        least_s, most_s = trouble.lasts_s
-        if not most_s:
-            return
+        return trouble
+
+    async def _last(self, trouble: Trouble, seconds: float) -> None:
+        """Let a trouble last, then end it."""
+        world = self.world
         self._troubles.append(trouble)
         try:
-            await world.clock.sleep(min(left_s, chance.uniform(least_s, most_s)))
+            await world.clock.sleep(seconds)
         finally:
             trouble.end()
             self._troubles.remove(trouble)
@@ -270,8 +302,28 @@ class _Run:
         spots = [spot for spot in self.world.spots if not spot.pressed]
         if spots:
             spot = self._chance.choice(spots)
+            long = self._chance.random() < LONG_SHARE
+            seconds = self._chance.uniform(*(LONG_S if long else SHORT_S))
+            if long:
+                self.world.clock.call_later(self._chance.uniform(1.0, 2.0), self._meddle, spot)
             # A tap of one sweep cannot be distinguished from a byte that was off for one sweep.
-            await spot.press(max(0.2, min(left_s, self._chance.uniform(0.2, 5.0))))
+            await spot.press(max(SHORT_S[0], min(left_s, seconds)))
+
+    def _meddle(self, spot: Spot) -> None:
+        """An operator does something to what is pressed."""
+        layout = self.world.layout
+        part = next(part for part in layout.parts if part.name == spot.part)
+        board = layout.triangles[int(layout.triangle_of[part.start + spot.taxel])].board
+        name, payload = self._chance.choice(
+            [
+                ("configure", f'{{"board": "{layout.boards[board].name}"}}'),
+                ("configure", "{}"),
+                ("disable", f'{{"part": "{spot.part}"}}'),
+                ("reload", "{}"),
+                ("calibrate", "{}"),
+            ]
+        )
+        self._ask(name, payload)
 
     async def _request(self, _: float) -> None:
         """An operator does something, at a moment that may be a bad one."""
@@ -335,6 +387,36 @@ class _Run:
         await world.clock.sleep(min(left_s, chance.uniform(0.1, 5.0)))
         self._start()
 
+    # ------------------------------------------------------------------ drill
+
+    async def _drill(self) -> None:
+        """One trouble alone, until health names it. All kinds take their turns."""
+        world = self.world
+        if not self._drills:
+            self._drills = list(KINDS)
+            self._chance.shuffle(self._drills)
+        if world.life is None or world.clock.monotonic_s() > self._seconds:
+            return
+        quiet_s = max(QUIET_NS, STARTED_NS) / 1e9
+        await world.clock.sleep(quiet_s)
+        trouble = self._inject(self._drills.pop())
+        if trouble is None:
+            return
+        if trouble.writes:
+            self._ask("thresholds", '{"reset": true}')
+        if trouble.lasts_s[1]:
+            await self._last(trouble, min(trouble.within_s, LONGEST_DRILL_S) + 0.5)
+        else:
+            await world.clock.sleep(trouble.within_s + 0.5)
+
+    async def _end_in_a_press(self) -> None:
+        """The daemon is asked to end while something touches; every touch ends before it does."""
+        spot = self._chance.choice(self.world.spots)
+        pressing = asyncio.create_task(spot.press(3.0), name="last press")
+        await self.world.clock.sleep(2.0)
+        await self._stop()
+        await pressing
+
     # ------------------------------------------------------------------ calm
 
     async def _calm(self) -> None:
@@ -343,28 +425,43 @@ class _Run:
         world.note("calm")
         began_s = world.clock.monotonic_s()
         await world.clock.sleep(8.0)
-        repaired = False
+        repaired_s: float | None = None
         while not self._is_well():
-            if world.clock.monotonic_s() - began_s > CALM_S:
+            now_s = world.clock.monotonic_s()
+            if now_s - began_s > CALM_S:
                 self._promises.break_(
                     f"not well after {CALM_S:g} s of calm: {self._state_of_all()}"
                 )
                 return
-            if not repaired and self._is_reachable():
-                repaired = True
-                world.note("the operator sets everything up and calibrates")
-                for part in world.layout.parts:
-                    self._ask("enable", f'{{"part": "{part.name}"}}')
-                self._ask("thresholds", '{"reset": true}')
-                self._ask("configure", "{}")
-                await world.clock.sleep(6.0)
-                self._ask("calibrate", "{}")
-                await world.clock.sleep(7.0)
-                self._promises.calibrated_at_rest()
+            due = repaired_s is None or now_s - repaired_s > AGAIN_S
+            if due and self._is_reachable():
+                await self._repair(first=repaired_s is None)
+                repaired_s = world.clock.monotonic_s()
             await world.clock.sleep(0.5)
         world.note("well")
         if world.life is not None:
             self._promises.account(world.life)
+            self._promises.grown()
+
+    async def _repair(self, *, first: bool) -> None:
+        """The operator does what the sentences of health ask for."""
+        world = self.world
+        if first:
+            world.note("the operator sets everything up")
+            for part in world.layout.parts:
+                self._ask("enable", f'{{"part": "{part.name}"}}')
+            self._ask("thresholds", '{"reset": true}')
+            for board in sorted(world.unpowered):
+                self._promises.begin(act("power"))
+                world.robot.inject(Fault(name="board_reset", board=board))
+            world.unpowered.clear()
+            self._ask("configure", "{}")
+            await world.clock.sleep(6.0)
+        # Foam that was pressed for long relaxes for a while: then one calibration is not enough.
+        world.note("the operator calibrates")
+        self._ask("calibrate", "{}")
+        await world.clock.sleep(7.0)
+        self._promises.calibrated_at_rest()
 
     def _is_reachable(self) -> bool:
         life = self.world.life
@@ -388,16 +485,16 @@ class _Run:
                 state = retained.get(topics.part("contact", part.name))
                 found.append(f"{part.name}: contact {state!r}")
             for fault, where in self._faults(retained.get(topics.part("health", part.name))):
-                if fault not in LATE_FAULTS:
+                if fault not in LATE_FAULTS and not (world.real_noise and fault in NOISE):
                     found.append(f"{part.name}: {fault} {where}")
         return found
 
-    @staticmethod
-    def _faults(payload: bytes | None) -> list[tuple[str, str]]:
+    def _faults(self, payload: bytes | None) -> list[tuple[str, str]]:
         if payload is None:
             return [("no health", "")]
         record = msgspec.json.decode(payload)
         found = [(fault["code"], fault["where"]) for fault in record["faults"]]
-        if record["state"] not in ("ok", "warning"):
+        refused = self.world.real_noise and any(code in NOISE for code, _ in found)
+        if record["state"] not in ("ok", "warning") and not refused:
             found.append((record["state"], f"{record['valid_taxels']} of {record['taxels']}"))
         return found

@@ -7,6 +7,9 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
+
 from emulator import faults
 from emulator.probes.scene import Fault
 from skin_host.bus.port import LinkState
@@ -15,6 +18,7 @@ from skin_host.evaluation.simulate.disk import FULL, READ_ONLY
 from skin_host.evaluation.simulate.world import World
 
 Triangle = tuple[str, int]
+Mask = NDArray[np.bool_]
 
 _TAXELS = {
     "taxel_out_of_range",
@@ -50,10 +54,31 @@ _SET_UP = {
 }
 _TIMING = {"board_jitter", "board_period", "bus_loses_frames"}
 _CHIPS = _TAXELS | _TRIANGLES
+#: Verdicts of a calibration that was taken meanwhile.
+_CALIBRATED = {"taxel_refused", "taxel_saturates", "taxel_drifting", "taxel_at_limit"}
+_DAMAGED = {"bus_bit_errors", "bus_stranger", "bus_babbling"}
 #: They change which chip answers where: what ends one would undo another.
-WIRING = {"chip_gone", "shorted_finger", "wrong_address", "swapped_lines"}
+WIRING = {
+    "chip_gone",
+    "shorted_finger",
+    "wrong_address",
+    "swapped_lines",
+    "shared_address",
+    "no_acknowledge",
+    "data_held_low",
+    "clock_stretched",
+    "bit_flipped",
+    "slow_rise",
+    "brown_out",
+}
 _BUS = _TIMING | _SET_UP | _CHIPS | {"bus_silent", "board_overflows"}
 _SWAPPED = _CHIPS | _SET_UP | {"part_temperature"}
+#: Until a calibration at rest.
+FOR_EVER_S = 1e6
+#: A broker ends the connection of a client that it has not heard for longer.
+KEEP_ALIVE_S = 10.0
+#: While it lasts, the chip that it names does not measure.
+SILENCING = {"chip_gone"}
 _BROKER = {"broker_away", "touches_dropped", "broker_refuses", "node_name_taken", "broker_rejects"}
 
 
@@ -65,11 +90,15 @@ class Trouble:
         name: its kind.
         about: the same with its target, for people.
         end: ends it.
-        may: codes that health may report because of it.
-        must: a code that health must report, once it has lasted for `within_s`.
+        may: codes that health may report because of it, at `places`.
+        must: codes of which health must report one, once it has lasted for `within_s`; what
+            happens at once must be reported within that time.
+        places: names of buses, boards and parts; None is everywhere.
         blind: triangles that do not measure meanwhile.
-        spoils: values may be wrong meanwhile, without anybody being able to know.
+        spoils: bool[n], taxels whose values may be wrong meanwhile, without anybody being able to
+            know, and for `recovers_s` afterwards.
         lingers: what it did lasts until it is put right.
+        writes: it shows only when something is written.
         lasts_s: shortest and longest; no time at all for what happens at once.
     """
 
@@ -77,12 +106,21 @@ class Trouble:
     about: str
     end: Callable[[], object]
     may: set[str] = field(default_factory=set)
-    must: str | None = None
+    must: frozenset[str] = frozenset()
     within_s: float = 3.0
+    places: frozenset[str] | None = None
     blind: frozenset[Triangle] = frozenset()
-    spoils: bool = False
+    spoils: Mask | None = None
+    recovers_s: float = 3.0
     lingers: bool = False
+    writes: bool = False
     lasts_s: tuple[float, float] = (0.2, 15.0)
+
+    def accuses(self, code: str, where: str) -> bool:
+        """Whether health may report this because of it."""
+        if code not in self.may:
+            return False
+        return self.places is None or where.partition("/")[0] in self.places
 
 
 Begin = Callable[[World, random.Random], Trouble]
@@ -97,41 +135,74 @@ def _triangle(world: World, chance: random.Random) -> Triangle:
     return board.name, chance.choice(board.triangles)
 
 
+def places_of(world: World, *, board: str = "", bus: str = "") -> frozenset[str]:
+    """Return a board, or all of a bus, with what depends on it: names that health may blame."""
+    layout = world.layout
+    boards = [
+        (number, one)
+        for number, one in enumerate(layout.boards)
+        if one.name == board or one.settings.bus == bus
+    ]
+    numbers = {number for number, _ in boards}
+    parts = {part.name for part in layout.parts if numbers & set(part.boards)}
+    buses = {one.settings.bus for _, one in boards}
+    return frozenset({one.name for _, one in boards} | parts | buses | ({bus} - {""}))
+
+
+def taxels_of(world: World, *, board: str = "", bus: str = "") -> Mask:
+    """Return the taxels bool[n] of a board, or of all of a bus."""
+    found = np.zeros(world.layout.n_taxels, np.bool_)
+    for one in world.layout.boards:
+        if one.name == board or one.settings.bus == bus:
+            found[one.taxel_index[one.taxel_index >= 0]] = True
+    return found
+
+
 def _emulated(
     name: str,
     may: set[str],
-    must: str | None,
+    must: set[str],
     within_s: float = 3.0,
     *,
     spoils: bool = False,
+    recovers_s: float = 3.0,
     values: tuple[float, float] | None = None,
+    sure: float = 0.0,
+    lingers: bool = False,
     lasts_s: tuple[float, float] = (0.2, 15.0),
 ) -> Begin:
-    """A fault of the emulator's catalogue, with targets and value drawn."""
+    """A fault of the emulator's catalogue, with targets and value drawn.
+
+    Args:
+        name: of it.
+        may, must, within_s, spoils, recovers_s, lingers, lasts_s: see `Trouble`.
+        values: least and most of its value.
+        sure: from this value on, it must be reported.
+    """
 
     def begin(world: World, chance: random.Random) -> Trouble:
         kind = faults.KINDS[name]
         targets: dict[str, object] = {}
         blind: frozenset[Triangle] = frozenset()
         board, triangle = _triangle(world, chance)
+        bus = chance.choice(list(world.robot.wires))
         if "board" in kind.needs:
             targets["board"] = board
         if "triangle" in kind.needs:
             targets["triangle"] = triangle
-            blind = frozenset({(board, triangle)})
+            if name in SILENCING:
+                blind = frozenset({(board, triangle)})
         if "taxel" in kind.needs:
             targets["taxel"] = chance.randrange(12)
-            blind = frozenset()
         if "bus" in kind.needs:
-            targets["bus"] = chance.choice(list(world.robot.wires))
-        if values is not None:
-            targets["value"] = round(chance.uniform(*values), 4)
-        if name == "wrong_address":
-            targets["value"] = float((triangle % 4 + chance.randrange(1, 4)) % 4)
+            targets["bus"] = bus
+        value = None if values is None else round(chance.uniform(*values), 4)
+        if name in ("wrong_address", "shared_address"):
+            value = float((triangle % 4 + chance.randrange(1, 4)) % 4)
         if name == "swapped_lines":
-            targets["value"] = float((triangle // 4 + chance.randrange(1, 4)) % 4)
-        if name in ("shorted_finger", "swapped_lines", "wrong_address"):
-            blind = frozenset()
+            value = float((triangle // 4 + chance.randrange(1, 4)) % 4)
+        if value is not None:
+            targets["value"] = value
         world.move()
         mend = world.robot.inject(Fault(name=name, **targets))  # type: ignore[arg-type]
 
@@ -139,14 +210,53 @@ def _emulated(
             world.move()
             mend()
 
+        spoiled: Mask | None = None
+        if spoils and "board" in targets:
+            spoiled = taxels_of(world, board=board)
+            if "taxel" in targets:
+                number = next(one for one in world.layout.boards if one.name == board)
+                spoiled = np.zeros_like(spoiled)
+                spoiled[number.taxel_index[triangle, int(str(targets["taxel"]))]] = True
+        elif spoils:
+            spoiled = (
+                taxels_of(world, bus=bus)
+                if "bus" in targets
+                else np.ones(world.layout.n_taxels, np.bool_)
+            )
+        if name == "brown_out":
+            world.unpowered.add(board)
+        places = None
+        if "board" in targets:
+            places = places_of(world, board=board)
+        elif "bus" in targets:
+            places = places_of(world, bus=bus)
         about = " ".join([name, *(f"{key}={value}" for key, value in targets.items())])
-        return Trouble(name, about, end, may, must, within_s, blind, spoils, lasts_s=lasts_s)
+        return Trouble(
+            name,
+            about,
+            end,
+            may,
+            frozenset(must) if value is None or abs(value) >= sure else frozenset(),
+            within_s,
+            places,
+            blind,
+            spoiled,
+            recovers_s,
+            lingers,
+            lasts_s=lasts_s,
+        )
 
     return begin
 
 
 def _frames(
-    name: str, may: set[str], most: float, *, must: str | None = None, spoils: bool = False
+    name: str,
+    may: set[str],
+    most: float,
+    *,
+    must: str | None = None,
+    sure: float = 0.0,
+    spoils: bool = False,
 ) -> Begin:
     """Something that happens to frames between the bus and the daemon."""
 
@@ -160,11 +270,40 @@ def _frames(
             world.move()
             setattr(cable.mischief, name, getattr(Mischief(), name))
 
-        said = must if share > 0.02 else None
-        about = f"frames_{name} bus={cable.name} share={share}"
-        return Trouble(f"frames_{name}", about, end, may, said, 4.0, spoils=spoils)
+        return Trouble(
+            f"frames_{name}",
+            f"frames_{name} bus={cable.name} share={share}",
+            end,
+            may,
+            frozenset({must}) if must is not None and share >= sure else frozenset(),
+            8.0,
+            places_of(world, bus=cable.name),
+            spoils=taxels_of(world, bus=cable.name) if spoils else None,
+        )
 
     return begin
+
+
+def _address_twice(world: World, chance: random.Random) -> Trouble:
+    """A second board of the same address sends the same bus full of its own sweeps."""
+    board = chance.choice(world.layout.boards)
+    cable = world.cables[board.settings.bus]
+    world.move()
+    cable.mischief.twin = board.settings.address
+
+    def end() -> None:
+        world.move()
+        cable.mischief.twin = None
+
+    return Trouble(
+        "address_twice",
+        f"address_twice board={board.name}",
+        end,
+        _TIMING | _SET_UP | {"board_twice", "taxel_unproven"},
+        frozenset({"board_twice"}),
+        5.0,
+        places_of(world, board=board.name),
+    )
 
 
 def _interface(name: str, state: LinkState, must: str) -> Begin:
@@ -172,17 +311,41 @@ def _interface(name: str, state: LinkState, must: str) -> Begin:
         cable = world.cables[chance.choice(list(world.cables))]
         cable.set_state(state)
         about = f"{name} bus={cable.name}"
-        may = _BUS | {must, "bus_gone", "bus_down", "bus_off", "bus_errors", "host_stalls"}
-        return Trouble(name, about, lambda: cable.set_state(LinkState.UP), may, must)
+        may = _BUS | {must}
+        places = places_of(world, bus=cable.name)
+        return Trouble(
+            name,
+            about,
+            lambda: cable.set_state(LinkState.UP),
+            may,
+            frozenset({must}),
+            3.0,
+            places,
+        )
 
     return begin
+
+
+_STALLED = _BUS | _BROKER | {"host_stalls", "bus_drops"}
 
 
 def _stall(world: World, chance: random.Random) -> Trouble:
     seconds = chance.choice((0.05, 0.2, 0.5, 1.5, 4.0)) * chance.uniform(0.8, 1.2)
     world.clock.advance(seconds)
-    may = _BUS | _BROKER | {"host_stalls", "bus_drops"}
-    return Trouble("stall", f"stall {seconds:.2f} s", _nothing, may, lasts_s=(0.0, 0.0))
+    must = frozenset({"host_stalls"} if seconds > 0.7 else ())
+    about = f"stall {seconds:.2f} s"
+    return Trouble("stall", about, _nothing, _STALLED, must, 1.0, lasts_s=(0.0, 0.0))
+
+
+def _suspended(world: World, chance: random.Random) -> Trouble:
+    """The computer sleeps: its adapters hear nothing, its monotonic time stops, brokers go on."""
+    seconds = round(chance.uniform(2.0, 20.0), 1)
+    world.suspend(seconds)
+    if seconds > KEEP_ALIVE_S:
+        world.broker.disconnect_all(accusing=False)
+    about = f"suspended {seconds:g} s"
+    must = frozenset({"host_stalls"})
+    return Trouble("suspended", about, _nothing, _STALLED, must, 1.0, lasts_s=(0.0, 0.0))
 
 
 def _set_clock(world: World, chance: random.Random) -> Trouble:
@@ -190,7 +353,14 @@ def _set_clock(world: World, chance: random.Random) -> Trouble:
     world.move()
     world.clock.set(jump_s)
     may = _BUS | {"host_stalls"}
-    return Trouble("clock_set", f"clock set by {jump_s:+g} s", _nothing, may, lasts_s=(0.0, 0.0))
+    # Time set by more than a minute is recognised as that and blamed on nothing.
+    must = frozenset({"host_stalls"} if 1.0 < jump_s < 60.0 else ())
+    about = f"clock set by {jump_s:+g} s"
+    return Trouble("clock_set", about, _nothing, may, must, 1.0, lasts_s=(0.0, 0.0))
+
+
+_AWAY = frozenset({"broker_away"})
+_BROKER_PLACES = frozenset({"broker"})
 
 
 def _broker_absent(world: World, chance: random.Random) -> Trouble:
@@ -201,7 +371,7 @@ def _broker_absent(world: World, chance: random.Random) -> Trouble:
         world.broker.absent = False
 
     about = f"broker_absent forgets={forget}"
-    return Trouble("broker_absent", about, end, _BROKER, "broker_away", 1.0)
+    return Trouble("broker_absent", about, end, _BROKER, _AWAY, 1.0, _BROKER_PLACES)
 
 
 def _broker_frozen(world: World, _: random.Random) -> Trouble:
@@ -210,7 +380,7 @@ def _broker_frozen(world: World, _: random.Random) -> Trouble:
     def end() -> None:
         world.broker.set_frozen(frozen=False)
 
-    return Trouble("broker_frozen", "broker_frozen", end, _BROKER, "broker_away", 6.0)
+    return Trouble("broker_frozen", "broker_frozen", end, _BROKER, _AWAY, 6.0, _BROKER_PLACES)
 
 
 def _broker_refuses(world: World, _: random.Random) -> Trouble:
@@ -220,14 +390,21 @@ def _broker_refuses(world: World, _: random.Random) -> Trouble:
     def end() -> None:
         world.broker.refuses = False
 
-    return Trouble("broker_refuses", "broker_refuses", end, _BROKER, "broker_away", 1.0)
+    return Trouble("broker_refuses", "broker_refuses", end, _BROKER, _AWAY, 1.0, _BROKER_PLACES)
 
 
 def _broker_disconnects(world: World, chance: random.Random) -> Trouble:
     accusing = chance.random() < 0.3
     world.broker.disconnect_all(accusing=accusing)
     about = f"broker_disconnects accusing={accusing}"
-    return Trouble("broker_disconnects", about, _nothing, _BROKER, lasts_s=(0.0, 0.0))
+    return Trouble(
+        "broker_disconnects",
+        about,
+        _nothing,
+        _BROKER,
+        places=_BROKER_PLACES,
+        lasts_s=(0.0, 0.0),
+    )
 
 
 def _broker_doubles(world: World, _: random.Random) -> Trouble:
@@ -246,9 +423,23 @@ def _disk(name: str, code: int) -> Begin:
         def end() -> None:
             world.disk_refuses = None
 
-        return Trouble(name, name, end, {"state_not_kept"}, lingers=True)
+        must = frozenset({"state_not_kept"})
+        places = frozenset({"state", "calibration"})
+        return Trouble(
+            name, name, end, set(must), must, 4.0, places=places, lingers=True, writes=True
+        )
 
     return begin
+
+
+def _disk_slow(world: World, chance: random.Random) -> Trouble:
+    """Each file takes long; everything else goes on meanwhile."""
+    world.clock.threads_take_s = round(chance.uniform(0.1, 3.0), 2)
+
+    def end() -> None:
+        world.clock.threads_take_s = 0.0
+
+    return Trouble("disk_slow", f"disk_slow {world.clock.threads_take_s:g} s", end)
 
 
 def act(name: str) -> Trouble:
@@ -256,69 +447,121 @@ def act(name: str) -> Trouble:
     return Trouble(name, name, _nothing, ACTS[name], lasts_s=(0.0, 0.0))
 
 
+#: A board that is zeroed: its pads are not valid until its new zero is known.
+_ZEROED = {"board_rezeroed", "board_in_doubt", "taxel_unproven"}
 #: What health may report after these acts, which are not faults.
 ACTS: dict[str, set[str]] = {
-    "start": _SET_UP | _TAXELS | {"broker_away", "bus_silent", "triangle_out_of_range"},
-    "calibrate": {"taxel_pressed", "taxel_refused", "taxel_saturates", "state_not_kept"},
-    "configure": _SET_UP | _TAXELS | {"bus_silent", "triangle_out_of_range"},
+    # What the broker and the boards do not know yet; a board that just stopped must be queried.
+    "start": _ZEROED
+    | {"broker_away", "bus_silent", "board_absent", "board_silent", "board_lost_set_up"}
+    | {"triangle_missing", "bus_loses_frames"},
+    "calibrate": _CALIBRATED | {"taxel_pressed"},
+    "configure": _ZEROED | {"bus_silent", "board_silent", "triangle_missing", "bus_loses_frames"},
     "disable": {"part_disabled"},
+    "power": _SET_UP | _CHIPS | _TIMING | {"bus_silent"},
     "enable": set(),
     "thresholds": set(),
-    "reload": _SET_UP | _TAXELS | {"bus_silent", "triangle_out_of_range"},
+    "reload": _ZEROED | {"bus_silent", "board_silent", "triangle_missing", "bus_loses_frames"},
 }
 
+_LINE = {"line_shorted", "triangle_no_ack", "triangle_not_connected"}
+_ELSEWHERE = {"triangle_not_connected", "triangle_out_of_range", "taxel_out_of_range"}
+
 KINDS: dict[str, Begin] = {
-    "chip_gone": _emulated("chip_gone", _CHIPS | _SET_UP, "triangle_not_connected", 2.0),
-    "stuck_taxel": _emulated("stuck_taxel", _CHIPS, None),
-    "noisy_taxel": _emulated("noisy_taxel", _CHIPS, None, spoils=True),
-    "shorted_finger": _emulated("shorted_finger", _CHIPS | _SET_UP, None),
-    "wrong_address": _emulated("wrong_address", _SWAPPED, None, spoils=True),
-    "swapped_lines": _emulated("swapped_lines", _SWAPPED, None, spoils=True),
-    "board_reset": _emulated(
-        "board_reset", _SET_UP | _CHIPS | _TIMING | {"bus_silent"}, None, lasts_s=(0.0, 0.0)
-    ),
-    "board_silent": _emulated(
-        "board_silent", _SET_UP | _CHIPS | _TIMING | {"bus_silent"}, "board_silent", 2.0
-    ),
-    "late_period": _emulated(
-        "late_period", _TIMING | _SET_UP | _CHIPS, "board_period", 4.0, values=(3.0, 40.0)
-    ),
-    "jittered_period": _emulated(
-        "jittered_period", _TIMING | _SET_UP | _CHIPS, None, values=(2.0, 8.0)
-    ),
-    "frame_loss": _emulated("frame_loss", _BUS, "bus_loses_frames", 5.0, values=(0.01, 0.3)),
-    "bit_errors": _emulated(
-        "bit_errors",
-        _BUS | {"bus_bit_errors", "bus_stranger", "bus_babbling"},
-        None,
-        values=(0.0005, 0.05),
+    "chip_gone": _emulated("chip_gone", _CHIPS | _SET_UP, {"triangle_not_connected"}, 1.0),
+    "stuck_taxel": _emulated("stuck_taxel", {"taxel_stuck", "taxel_unproven"}, {"taxel_stuck"}, 20),
+    "noisy_taxel": _emulated(
+        "noisy_taxel",
+        {"taxel_noisy", "taxel_unproven", "bus_bit_errors", *_CALIBRATED},
+        {"taxel_noisy"},
+        4.0,
         spoils=True,
     ),
-    "bus_off": _emulated("bus_off", _BUS, "bus_silent", 2.0),
+    "shorted_finger": _emulated("shorted_finger", _CHIPS | _SET_UP, _LINE, 1.0),
+    "wrong_address": _emulated("wrong_address", _SWAPPED, _ELSEWHERE, 1.0, spoils=True),
+    "swapped_lines": _emulated(
+        "swapped_lines", _SWAPPED, _ELSEWHERE | _LINE | {"lines_swapped"}, 1.0, spoils=True
+    ),
+    "shared_address": _emulated("shared_address", _SWAPPED, _ELSEWHERE, 1.0, spoils=True),
+    "no_acknowledge": _emulated("no_acknowledge", _CHIPS | _SET_UP, _LINE, 1.0),
+    "data_held_low": _emulated("data_held_low", _CHIPS | _SET_UP, _LINE, 1.0, spoils=True),
+    "clock_stretched": _emulated("clock_stretched", _SWAPPED, _ELSEWHERE | _LINE, 1.0, spoils=True),
+    "bit_flipped": _emulated("bit_flipped", _SWAPPED | {"bus_bit_errors"}, set(), spoils=True),
+    "slow_rise": _emulated("slow_rise", _SWAPPED | {"bus_bit_errors"}, set(), spoils=True),
+    "brown_out": _emulated(
+        "brown_out",
+        _SWAPPED,
+        _ELSEWHERE | _LINE,
+        1.0,
+        spoils=True,
+        recovers_s=FOR_EVER_S,
+        lingers=True,
+        lasts_s=(0.0, 0.0),
+    ),
+    "board_reset": _emulated(
+        "board_reset",
+        _SET_UP | _CHIPS | _TIMING | {"bus_silent"},
+        {"board_silent", "board_reset", "bus_silent"},
+        2.0,
+        lasts_s=(0.0, 0.0),
+    ),
+    "board_silent": _emulated(
+        "board_silent",
+        _SET_UP | _CHIPS | _TIMING | {"bus_silent"},
+        {"board_silent", "bus_silent"},
+        2.0,
+    ),
+    "late_period": _emulated(
+        "late_period", _TIMING | _SET_UP | _CHIPS, {"board_period"}, 4.0, values=(3.0, 40.0)
+    ),
+    "jittered_period": _emulated(
+        "jittered_period",
+        _TIMING | _SET_UP | _CHIPS,
+        {"board_jitter", "board_period"},
+        4.0,
+        values=(2.0, 8.0),
+        sure=6.0,
+    ),
+    "frame_loss": _emulated("frame_loss", _BUS, {"bus_loses_frames"}, 5.0, values=(0.01, 0.3)),
+    "bit_errors": _emulated(
+        "bit_errors",
+        _BUS | _DAMAGED,
+        {"bus_bit_errors"},
+        8.0,
+        values=(0.0005, 0.05),
+        sure=0.02,
+        spoils=True,
+    ),
+    "bus_off": _emulated("bus_off", _BUS, {"bus_silent"}, 2.0),
     "babbling_node": _emulated(
         "babbling_node",
         _BUS | {"bus_babbling", "bus_drops"},
-        "bus_babbling",
+        {"bus_babbling"},
         2.0,
         lasts_s=(0.5, 3.0),  # thousands of frames a second cost what minutes of others do
     ),
     "temperature_step": _emulated(
         "temperature_step",
         {"part_temperature", "bus_bit_errors"} | _TAXELS,
-        None,
+        {"part_temperature"},
+        3.0,
         values=(-4.0, 4.0),
+        sure=3.5,
         spoils=True,
+        recovers_s=60.0,
     ),
-    "frames_lost": _frames("lost", _BUS, 0.5, must="bus_loses_frames"),
+    "frames_lost": _frames("lost", _BUS, 0.5, must="bus_loses_frames", sure=0.02),
     "frames_late": _frames("late", _BUS, 0.2),
     "frames_doubled": _frames("doubled", _BUS, 0.2),
     "frames_swapped": _frames("swapped", _BUS, 0.5),
     "frames_damaged": _frames(
-        "damaged", _BUS | {"bus_bit_errors", "bus_stranger", "bus_babbling"}, 0.05, spoils=True
+        "damaged", _BUS | _DAMAGED, 0.05, must="bus_bit_errors", sure=0.02, spoils=True
     ),
+    "address_twice": _address_twice,
     "adapter_gone": _interface("adapter_gone", LinkState.GONE, "bus_gone"),
     "link_down": _interface("link_down", LinkState.DOWN, "bus_down"),
     "stall": _stall,
+    "suspended": _suspended,
     "clock_set": _set_clock,
     "broker_absent": _broker_absent,
     "broker_frozen": _broker_frozen,
@@ -327,4 +570,5 @@ KINDS: dict[str, Begin] = {
     "broker_doubles": _broker_doubles,
     "disk_full": _disk("disk_full", FULL),
     "disk_read_only": _disk("disk_read_only", READ_ONLY),
+    "disk_slow": _disk_slow,
 }

@@ -124,17 +124,32 @@ class World:
             for number, (name, wire) in enumerate(self.robot.wires.items())
         }
         self.life: Life | None = None
+        self.real_noise = not scene.quiet
+        #: Boards of which a chip lost its set-up: they need their power switched off and on.
+        self.unpowered: set[str] = set()
+        #: By how much the robot's time is ahead of the computer's, which was suspended.
+        self.slept_ns = 0
         self.spots = [Spot(self, self.chance) for _ in range(SPOTS)]
         self.power_failed = asyncio.Event()
         self._disk_refuses: int | None = None
 
     def move(self) -> None:
         """Bring the robot to the present; what its boards sent waits on the buses."""
-        passed_ns = self.clock.monotonic_ns() - self.robot.t_ns
+        passed_ns = self.clock.monotonic_ns() + self.slept_ns - self.robot.t_ns
         if passed_ns <= 0:
             return
         for name, batch in self.robot.step(passed_ns / NS).items():
+            if self.slept_ns and len(batch):
+                batch.t_ns = batch.t_ns - self.slept_ns
             self.cables[name].arrive(batch)
+
+    def suspend(self, seconds: float) -> None:
+        """The computer sleeps and wakes up: its monotonic time has not moved, all else has."""
+        self.move()
+        for name, batch in self.robot.step(seconds).items():
+            self.cables[name].sleep_through(batch)
+        self.slept_ns = self.robot.t_ns - self.clock.monotonic_ns()
+        self.clock.set(seconds)
 
     @property
     def disk_refuses(self) -> int | None:
