@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from skin_host import __version__
 from skin_host.bus.opening import open_port
@@ -16,7 +18,15 @@ from skin_host.daemon import metrics, service
 from skin_host.daemon.calibrate import calibration_path, collect
 from skin_host.daemon.control import Control
 from skin_host.daemon.link import Link, OpenPort
-from skin_host.daemon.state import NodeState, Thresholds, load_state, save_state
+from skin_host.daemon.state import (
+    NodeState,
+    Thresholds,
+    Zeros,
+    load_state,
+    load_zeros,
+    save_state,
+    save_zeros,
+)
 from skin_host.errors import ConfigurationError, RequestError, SkinError
 from skin_host.fingertip.health import FingertipRecord
 from skin_host.fingertip.service import FingertipPublisher
@@ -40,6 +50,8 @@ HEALTH_S = 1.0
 _UNTIL_CALIBRATED = {"part_not_calibrated", "fingertip_not_calibrated"}
 #: The time of day was set if it differs by more than this from the monotonic time.
 JUMP_NS = 50_000_000
+#: The end waits so long for a file that is being written.
+KEEPING_S = 2.0
 #: Readiness is reported after the first sweeps, or after this time without them.
 PATIENCE_S = 3.0
 
@@ -63,7 +75,8 @@ class Daemon:
     Attributes:
         settings, layout: in use, with the changes that operators made.
         thresholds: these changes.
-        unkept: what could not be written to the state directory (`calibration`, `state`), and why.
+        unkept: what could not be written to the state directory (`calibration`, `state`, `zeros`),
+            and why.
 
     Raises:
         ConfigurationError: no part belongs to this node, or python-can does not know the kind
@@ -89,7 +102,7 @@ class Daemon:
         self.layout = layout
         self._node = node
         self._configuration = configuration
-        state = load_state(self._state_path())
+        state = load_state(self._path("state"))
         self._configured = settings
         self.thresholds = state.thresholds
         self.settings = settings = state.thresholds.over_settings(settings)
@@ -98,6 +111,11 @@ class Daemon:
             i for i in self.engine.parts if layout.parts[i].name in state.disabled
         }
         self.engine.touch_only = _touch_only(settings, layout, self.engine.parts)
+        self._zeros = load_zeros(self._path("zeros"))
+        doubted = np.zeros(layout.n_taxels, np.bool_)
+        if calibration is not None and calibration.id == self._zeros.calibration:
+            doubted = _taxels(layout, self._zeros)
+            self.engine.doubt(doubted)
         self.health = Health(self.engine)
         self.control = Control(self)
         self.publisher = Publisher(
@@ -112,8 +130,10 @@ class Daemon:
         self.publisher.put_info(self._info())
         self._contacts = {i: PartContact(layout, i) for i in self.engine.parts}
         for i in self.engine.parts:
+            part = layout.parts[i]
+            self._contacts[i].doubt(doubted[part.start : part.stop])
             # The state that the broker retained from an earlier start is no longer known.
-            self.publisher.put_contact(layout.parts[i].name, "UNKNOWN")
+            self.publisher.put_contact(part.name, "UNKNOWN")
         self.fingertips = FingertipPublisher(self.engine.fingertips, self.publisher)
         self.link = Link(self.engine, wait=True, open_port=open_port, clock=clock)
         self.unkept: dict[str, str] = {}
@@ -122,6 +142,7 @@ class Daemon:
         self._fed_s = 0.0
         self._status_s = 0.0
         self._fault_log = FaultLog()
+        self._keeping: asyncio.Task[None] | None = None
         self._clock_ahead_ns = self._clock_against_ns()
 
     async def run(self, stop: asyncio.Event, *, calibrate: bool = False) -> None:
@@ -155,6 +176,9 @@ class Daemon:
             for task in [*tasks, stopping]:
                 task.cancel()
             await asyncio.gather(*tasks, stopping, return_exceptions=True)
+            if self._keeping is not None:
+                await asyncio.wait([self._keeping], timeout=KEEPING_S)
+            await self._keep_zeros(touched=True)
             for part in self.engine.parts:
                 self._end_contacts(part)
             self.fingertips.end(self.clock.now_ns())
@@ -250,7 +274,7 @@ class Daemon:
         Raises:
             OSError: it cannot be written.
         """
-        path = self._state_path()
+        path = self._path("state")
         try:
             save_state(path, state)
         except OSError as error:
@@ -374,6 +398,8 @@ class Daemon:
             self._fault_log.note(told, now_s)
             if now_s - self._status_s >= HEALTH_S:
                 self._status_s = now_s
+                if self._keeping is None or self._keeping.done():
+                    self._keeping = asyncio.create_task(self._keep_zeros(), name="keep zeros")
                 service.notify("STATUS=" + self._status(len(told)))
 
     def _pulse(self) -> tuple[object, ...]:
@@ -384,6 +410,32 @@ class Daemon:
             (output.connected, output.last_error, output.touches_dropped, output.refused),
             (tuple(output.withheld), output.name_taken, tuple(self.unkept)),
         )
+
+    async def _keep_zeros(self, *, touched: bool = False) -> None:
+        """Write which zeros are not known, or with `touched` will not be, if that has changed."""
+        engine, found = self.engine, self.engine.calibration
+        if found is None:
+            return
+        unknown: dict[str, list[int]] = {}
+        at_risk = engine.zero_at_risk(touched)
+        if at_risk.any():
+            for part in map(self.layout.parts.__getitem__, engine.parts):
+                mine = np.flatnonzero(at_risk[part.start : part.stop]).tolist()
+                if mine:
+                    unknown[part.name] = mine
+        zeros = Zeros(calibration=found.id, unknown=unknown)
+        if zeros == self._zeros or not (unknown or self._zeros.unknown):
+            return
+        path = self._path("zeros")
+        try:
+            await self.clock.in_thread(save_zeros, path, zeros)
+        except OSError as error:
+            if "zeros" not in self.unkept:
+                log.error("zeros not kept: %s: %s", path, error.strerror)
+            self.unkept["zeros"] = f"{path}: {error.strerror}"
+            return
+        self.unkept.pop("zeros", None)
+        self._zeros = zeros
 
     def _record_of(self, part: int) -> Record:
         link = self.link
@@ -414,9 +466,20 @@ class Daemon:
             fingertips=self.settings.fingertips,
         )
 
-    def _state_path(self) -> Path:
+    def _path(self, what: str) -> Path:
+        """Return a file of this node's state."""
         directory = service.state_directory(self.settings.service.state_directory)
-        return directory / f"{self.settings.robot}-{self._node}.state.json"
+        return directory / f"{self.settings.robot}-{self._node}.{what}.json"
+
+
+def _taxels(layout: Layout, zeros: Zeros) -> NDArray[np.bool_]:
+    """Return as bool[n] the taxels that are named, as far as this skin has them."""
+    found = np.zeros(layout.n_taxels, np.bool_)
+    for part in layout.parts:
+        for taxel in zeros.unknown.get(part.name, ()):
+            if 0 <= taxel < part.n_taxels:
+                found[part.start + taxel] = True
+    return found
 
 
 def _touch_only(settings: Settings, layout: Layout, parts: list[int]) -> set[int]:

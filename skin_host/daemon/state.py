@@ -1,6 +1,7 @@
-"""State that a node keeps over a restart, besides its calibration: changes by operators.
+"""State that a node keeps over a restart, besides its calibration: changes by operators, and
+taxels whose zero will not be known.
 
-It is a file of the state directory, written completely or not at all. A damaged one is set aside
+Each is a file of the state directory, written completely or not at all. A damaged one is set aside
 and reported, so that the service can always start.
 """
 
@@ -19,6 +20,7 @@ from skin_host.files import read_document, set_aside, write_atomic
 log = logging.getLogger(__name__)
 
 SCHEMA = "skin.state/1"
+ZEROS_SCHEMA = "skin.zeros/1"
 
 
 class Thresholds(Struct, forbid_unknown_fields=True, omit_defaults=True):
@@ -77,3 +79,44 @@ def save_state(path: Path, state: NodeState) -> None:
         OSError: it cannot be written; the old one is unchanged.
     """
     write_atomic(path, msgspec.json.format(msgspec.json.encode(state), indent=1) + b"\n")
+
+
+class Zeros(Struct, forbid_unknown_fields=True):
+    """Taxels whose zero is not known, or will not be after the next start.
+
+    A start sets the boards up, and their set-up takes what touches them into the zero. So taxels
+    that were touched when the daemon ended are not valid after it, until they are calibrated.
+
+    Attributes:
+        calibration: id of the calibration in use; a later one has measured their zero.
+        unknown: numbers of taxels by part.
+    """
+
+    schema: str = ZEROS_SCHEMA
+    calibration: str = ""
+    unknown: dict[Name, list[int]] = {}
+
+
+def load_zeros(path: Path) -> Zeros:
+    """Read which zeros are not known; see `load_state`.
+
+    Raises:
+        NewerFileError: a newer version has written it.
+    """
+    if not os.access(path, os.F_OK):
+        return Zeros()
+    try:
+        return read_document(path, Zeros, ZEROS_SCHEMA, "zeros", ValueError)
+    except ValueError as error:
+        log.error("%s: damaged (%s); calibrate when nothing touches the skin", path, error)
+        set_aside(path)
+        return Zeros()
+
+
+def save_zeros(path: Path, zeros: Zeros) -> None:
+    """Store which zeros are not known.
+
+    Raises:
+        OSError: it cannot be written; the old one is unchanged.
+    """
+    write_atomic(path, msgspec.json.encode(zeros) + b"\n")

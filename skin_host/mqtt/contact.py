@@ -12,14 +12,18 @@ from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
 
 _NEVER_NS = -(1 << 62)
+#: A place that was not valid counts as untouched from this many frames on: so many votes, and one
+#: more, decide whether something touches it (`processing.touch`).
+SURE_FRAMES = 4
 
 
 class PartContact:
     """The contact state of one part.
 
     ON: a taxel is touched. OFF: none is, and every triangle has a valid taxel, and where a contact
-    was lost all taxels are valid again. UNKNOWN: all other cases. A triangle may miss frames for
-    `LOST_NS`, as a contact may; a part without any valid taxel is UNKNOWN at once.
+    was lost all taxels are valid again, in each case for `SURE_FRAMES`. UNKNOWN: all other cases. A
+    triangle may miss frames for `LOST_NS`, as a contact may; a part without any valid taxel is
+    UNKNOWN at once.
 
     Args:
         layout: the skin.
@@ -40,7 +44,10 @@ class PartContact:
         self._pads = np.concatenate(pads)
         self._starts = np.cumsum([0, *(len(one) for one in pads[:-1])])
         self._felt_ns = np.full(len(pads), _NEVER_NS, np.int64)
-        self._lost = np.zeros(here.n_taxels, np.bool_)
+        #: Valid frames that are still wanted of the taxels where a contact was lost, and of each
+        #: triangle.
+        self._lost = np.zeros(here.n_taxels, np.uint8)
+        self._unsure = np.full(len(pads), SURE_FRAMES, np.uint8)
         self._present: set[int] = set()
         self._last_ns = 0
         #: By how much the clock was set forward since the last frame.
@@ -52,7 +59,7 @@ class PartContact:
             if event.event == "end":
                 self._present.discard(event.id)
                 if event.reason == "lost":
-                    self._lost[event.taxels] = True
+                    self._lost[event.taxels] = SURE_FRAMES
             else:
                 self._present.add(event.id)
         if frame.t_ns - self._last_ns > self._jump_ns > 0:
@@ -63,15 +70,16 @@ class PartContact:
         np.minimum(self._felt_ns, frame.t_ns, out=self._felt_ns)  # the clock may be set back
         feels = np.logical_or.reduceat(frame.valid[self._pads], self._starts)
         self._felt_ns[feels] = frame.t_ns
-        self._lost &= ~frame.valid
+        self._unsure[frame.t_ns - self._felt_ns >= LOST_NS] = SURE_FRAMES
+        self._unsure -= feels & (self._unsure > 0)
+        self._lost -= frame.valid & (self._lost > 0)
         if frame.touched.any():
             return "ON"
         if not feels.any():
             return "UNKNOWN"
         if self._present:  # frames of the touched place were lost, for less than `LOST_NS`
             return "ON"
-        blind = frame.t_ns - self._felt_ns >= LOST_NS
-        return "UNKNOWN" if blind.any() or self._lost.any() else "OFF"
+        return "UNKNOWN" if self._unsure.any() or self._lost.any() else "OFF"
 
     def follow_clock(self, jump_ns: int) -> None:
         """The clock by which frames have their times was set: no time has passed by that.
@@ -80,8 +88,13 @@ class PartContact:
         """
         self._jump_ns = max(0, self._jump_ns + jump_ns)
 
+    def doubt(self, taxels: NDArray[np.bool_]) -> None:
+        """Something may touch these taxels [m], as it did when an earlier daemon ended."""
+        self._lost[taxels] = SURE_FRAMES
+
     def stop(self, events: Iterable[TouchEvent]) -> ContactState:
         """End the contacts, because no data of the part will come for a while."""
         self._present.difference_update(event.id for event in events)
         self._felt_ns[:] = _NEVER_NS
+        self._unsure[:] = SURE_FRAMES
         return "UNKNOWN"

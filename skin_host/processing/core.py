@@ -338,6 +338,25 @@ class Engine:
         self.validity.veto[self.ledger.row[board]] = np.ones((TRIANGLES, PADS), np.bool_)
         return int(np.count_nonzero(touched))
 
+    def doubt(self, taxels: Mask) -> None:
+        """The zero of these taxels, bool[n], is not known from before: see `rezero`."""
+        for board in self.boards:
+            mine = self._taxels_of(board)
+            doubted = taxels[mine] & (mine >= 0)
+            if doubted.any():
+                self.rezero(board)
+                if board in self._rezeros:
+                    self._rezeros[board].doubted |= doubted.ravel()
+
+    def zero_at_risk(self, touched: bool) -> Mask:
+        """Return taxels bool[n] whose zero is not known; with `touched`, also those which are
+        touched: after another zero, theirs would not be.
+        """
+        found = self._touched.copy() if touched else np.zeros_like(self._touched)
+        for board, rezero in self._rezeros.items():
+            found[self._taxels_of(board).ravel()[rezero.doubted]] = True
+        return found
+
     def in_doubt(self, board: int) -> NDArray[np.bool_]:
         """Return taxels bool[16, 12] of a board whose zero is unknown."""
         rezero = self._rezeros.get(board)

@@ -8,7 +8,7 @@ import pytest
 from emulator.probes.scene import Place, Probe, Scene
 from skin_host.config.settings import load
 from skin_host.layout import PadKind, build_layout
-from skin_host.mqtt.contact import PartContact
+from skin_host.mqtt.contact import SURE_FRAMES, PartContact
 from skin_host.processing.contacts import LOST_NS
 from skin_host.processing.core import Output
 from skin_host.processing.events import TouchEvent
@@ -38,16 +38,47 @@ def begin(taxels: list[int]) -> TouchEvent:
     return TouchEvent("begin", 1, 1, 1, "left_forearm", taxels, None, None, 1.0, 1.0, 1.0, 1.0)
 
 
-def test_a_part_that_feels_is_on_or_off() -> None:
+def watched(t_ns: int = 0) -> PartContact:
+    """A part that has been felt for long enough by then."""
     contact = PartContact(LAYOUT, PART)
-    assert contact.step(frame(0), []) == "OFF"
+    states = [contact.step(frame(t_ns - 50 * MS * left), []) for left in range(SURE_FRAMES)[::-1]]
+    assert states == ["UNKNOWN"] * (SURE_FRAMES - 1) + ["OFF"]
+    return contact
+
+
+def test_a_part_that_feels_is_on_or_off() -> None:
+    contact = watched()
     assert contact.step(frame(1, [3]), [begin([3])]) == "ON"
     assert contact.step(frame(2), [begin([3]).ended(2, 2)]) == "OFF"
 
 
-def test_without_a_valid_taxel_it_is_unknown_at_once() -> None:
+def test_a_triangle_that_comes_back_is_not_off_before_its_touch_can_be_decided() -> None:
+    contact = watched()
+    dead = slice(0, 12)
+    assert contact.step(frame(2000 * MS, blind=dead), []) == "UNKNOWN"
+    for sweep in range(SURE_FRAMES - 1):
+        assert contact.step(frame((2050 + 50 * sweep) * MS), []) == "UNKNOWN"
+    assert contact.step(frame(2200 * MS, [3]), [begin([3])]) == "ON"
+
+
+def test_a_board_that_sends_once_in_two_seconds_is_felt() -> None:
     contact = PartContact(LAYOUT, PART)
-    assert contact.step(frame(0), []) == "OFF"
+    states = [contact.step(frame(2000 * MS * sweep), []) for sweep in range(SURE_FRAMES)]
+    assert states[-1] == "OFF"
+
+
+def test_where_an_earlier_daemon_felt_something_it_is_not_off_until_that_is_valid() -> None:
+    contact = watched()
+    taxels = np.zeros(N, np.bool_)
+    taxels[3] = True
+    contact.doubt(taxels)
+    assert contact.step(frame(50 * MS, blind=slice(3, 4)), []) == "UNKNOWN"
+    states = [contact.step(frame((100 + 50 * sweep) * MS), []) for sweep in range(SURE_FRAMES)]
+    assert states == ["UNKNOWN"] * (SURE_FRAMES - 1) + ["OFF"]
+
+
+def test_without_a_valid_taxel_it_is_unknown_at_once() -> None:
+    contact = watched()
     assert contact.step(frame(50 * MS, blind=slice(0, N)), []) == "UNKNOWN"
     assert contact.step(frame(100 * MS), []) == "OFF"
 
@@ -59,9 +90,8 @@ def test_a_triangle_that_was_never_felt_makes_it_unknown() -> None:
 
 
 def test_a_clock_that_is_set_forward_makes_nothing_unfelt() -> None:
-    contact = PartContact(LAYOUT, PART)
+    contact = watched()
     hour_ns = 3600 * 1000 * MS
-    assert contact.step(frame(0), []) == "OFF"
     contact.follow_clock(hour_ns)
     assert contact.step(frame(50 * MS), []) == "OFF"  # from before
     assert contact.step(frame(hour_ns + 100 * MS, blind=slice(0, 12)), []) == "OFF"
@@ -70,8 +100,7 @@ def test_a_clock_that_is_set_forward_makes_nothing_unfelt() -> None:
 
 
 def test_frames_that_are_lost_for_a_moment_change_nothing() -> None:
-    contact = PartContact(LAYOUT, PART)
-    contact.step(frame(0), [])
+    contact = watched()
     states = [
         contact.step(frame(t_ns, blind=slice(0, 12)), [])
         for t_ns in range(50 * MS, LOST_NS + 50 * MS, 50 * MS)
@@ -80,36 +109,38 @@ def test_frames_that_are_lost_for_a_moment_change_nothing() -> None:
 
 
 def test_a_contact_whose_frames_are_lost_stays_on_until_it_is_lost_itself() -> None:
-    contact = PartContact(LAYOUT, PART)
+    contact = watched()
     contact.step(frame(0, [3]), [begin([3])])
     assert contact.step(frame(50 * MS, blind=slice(0, 12)), []) == "ON"
     lost = begin([3]).ended(2, 600 * MS, "lost")
     assert contact.step(frame(600 * MS, blind=slice(0, 12)), [lost]) == "UNKNOWN"
-    assert contact.step(frame(650 * MS), []) == "OFF"
+    states = [contact.step(frame((650 + 50 * sweep) * MS), []) for sweep in range(SURE_FRAMES)]
+    assert states == ["UNKNOWN"] * (SURE_FRAMES - 1) + ["OFF"]
 
 
 def test_where_a_contact_was_lost_the_same_taxels_must_come_back() -> None:
-    contact = PartContact(LAYOUT, PART)
+    contact = watched()
     contact.step(frame(0, [3]), [begin([3])])
     only = slice(3, 4)
     lost = begin([3]).ended(2, 1, "lost")
     assert contact.step(frame(600 * MS, blind=only), [lost]) == "UNKNOWN"
     assert contact.step(frame(9000 * MS, blind=only), []) == "UNKNOWN"
-    assert contact.step(frame(9050 * MS), []) == "OFF"
+    states = [contact.step(frame((9050 + 50 * sweep) * MS), []) for sweep in range(SURE_FRAMES)]
+    assert states == ["UNKNOWN"] * (SURE_FRAMES - 1) + ["OFF"]
 
 
 def test_a_clock_that_is_set_back_hides_no_dead_triangle() -> None:
-    contact = PartContact(LAYOUT, PART)
-    contact.step(frame(10**15), [])
+    contact = watched(10**15)
     contact.step(frame(0, blind=slice(0, 12)), [])
     assert contact.step(frame(LOST_NS, blind=slice(0, 12)), []) == "UNKNOWN"
 
 
 def test_a_part_that_was_stopped_must_be_felt_again() -> None:
-    contact = PartContact(LAYOUT, PART)
+    contact = watched()
     contact.step(frame(0, [3]), [begin([3])])
     assert contact.stop([begin([3]).ended(1, 1, "stopped")]) == "UNKNOWN"
-    assert contact.step(frame(1), []) == "OFF"
+    states = [contact.step(frame(1 + sweep), []) for sweep in range(SURE_FRAMES)]
+    assert states == ["UNKNOWN"] * (SURE_FRAMES - 1) + ["OFF"]
 
 
 HERE = {"board": "forearm_outer", "triangle": 3}

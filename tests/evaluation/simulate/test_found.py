@@ -54,3 +54,49 @@ def test_a_daemon_that_died_in_a_touch_does_not_call_it_untouched_when_it_is_bac
 
     with world.clock.runner() as runner:
         assert runner.run(live()) == b"UNKNOWN"
+
+
+async def press_through(world: World, *, whole: bool) -> tuple[Life, str]:
+    """Press, end the daemon meanwhile, start it again; return the new one, and the part pressed."""
+    life = start(world)
+    await world.clock.sleep(8.0)
+    spot = world.spots[0]
+    pressing = asyncio.create_task(spot.press(12.0), name="press")
+    await world.clock.sleep(2.0)
+    if whole:
+        await world.end()
+    else:
+        life.kill()
+    await world.clock.sleep(0.5)
+    life = start(world)
+    await world.clock.sleep(5.0)
+    assert not pressing.done()
+    return life, spot.part
+
+
+def test_a_daemon_that_was_asked_to_end_in_a_touch_does_not_zero_it_away(world: World) -> None:
+    """The boards stop with it, and take what still presses into the zero of their next set-up."""
+
+    async def live() -> None:
+        life, part = await press_through(world, whole=True)
+        topic = life.daemon.publisher.topics.part("contact", part)
+        assert world.broker.retained[topic] == b"UNKNOWN"
+        record = life.daemon.records()[part]
+        assert "board_in_doubt" in {fault["code"] for fault in record["faults"]}
+        # It stays so over a third start, and until the skin is calibrated at rest.
+        await world.clock.sleep(8.0)
+        life.kill()
+        life = start(world)
+        await world.clock.sleep(5.0)
+        assert sum(life.daemon.engine.in_doubt(i).sum() for i in life.daemon.engine.boards)
+        await life.daemon.calibrate(2.0)
+        await world.clock.sleep(3.0)
+        assert world.broker.retained[topic] == b"OFF"
+        await world.end()
+        life = start(world)
+        await world.clock.sleep(5.0)
+        assert world.broker.retained[topic] == b"OFF"
+        life.kill()
+
+    with world.clock.runner() as runner:
+        runner.run(live())
