@@ -105,7 +105,7 @@ def diagnose(record: Record, lost_lately: Collection[str] = ()) -> list[Fault]:
         )
     faults += _output(record.get("output"), lost_lately)
     for what, why in record.get("unkept", {}).items():
-        sentence = f"the {what} is in use but not kept: {why}; it is lost at a restart"
+        sentence = f"{what} in use but not kept: {why}; lost at a restart"
         faults.append(Fault("state_not_kept", what, sentence))
     return faults
 

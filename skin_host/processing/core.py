@@ -422,6 +422,9 @@ class Engine:
             self._pipeline.set_zero(taxels[fitted], found[fitted])
         elif rezero.settled(sweep.t_ns):
             self.validity.veto[row] = self.in_doubt(sweep.board)
+            return
+        # What jumps while a board is set up was not damaged on its way.
+        self.validity.liveness.note_gap(row)
 
     def _process(self, samples: list[PartSample]) -> list[Step]:
         steps = []

@@ -395,7 +395,7 @@ class _Run:
         if not self._drills:
             self._drills = list(KINDS)
             self._chance.shuffle(self._drills)
-        if world.life is None or world.clock.monotonic_s() > self._seconds:
+        if world.life is None:
             return
         quiet_s = max(QUIET_NS, STARTED_NS) / 1e9
         await world.clock.sleep(quiet_s)

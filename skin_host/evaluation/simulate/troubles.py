@@ -424,7 +424,7 @@ def _disk(name: str, code: int) -> Begin:
             world.disk_refuses = None
 
         must = frozenset({"state_not_kept"})
-        places = frozenset({"state", "calibration"})
+        places = frozenset({"state", "calibration", "zeros"})
         return Trouble(
             name, name, end, set(must), must, 4.0, places=places, lingers=True, writes=True
         )

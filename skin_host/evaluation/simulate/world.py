@@ -68,6 +68,8 @@ class Life(Living):
         watch(self)
         with on_disk(self.disk):
             self.task = asyncio.create_task(self.daemon.run(self.stop), name="daemon")
+        # One that was killed fails where it would write; nobody asks why.
+        self.task.add_done_callback(lambda task: task.cancelled() or task.exception())
 
     def _open_port(
         self, name: str, bus: Bus, receive: Receive, *, wait: bool = False, clock: Clock = SYSTEM

@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -168,44 +169,61 @@ from pathlib import Path
 from skin_host.cli.common import load_skin
 from skin_host.evaluation.simulate.run import simulate
 logging.disable(logging.CRITICAL)
-config, first, seeds, seconds = Path(sys.argv[1]), *map(int, sys.argv[2:5])
+config, seed, seconds = Path(sys.argv[1]), *map(int, sys.argv[2:4])
 settings, layout = load_skin(config)
-for seed in range(first, first + seeds):
-    try:
-        broken = simulate(settings, layout, config, seed, seconds).broken
-    except Exception as error:
-        broken = f"{type(error).__name__}: {error}"
-    print(seed, broken or "", flush=True)
+try:
+    print(simulate(settings, layout, config, seed, seconds).broken or "")
+except Exception as error:
+    print(f"{type(error).__name__}: {error}")
 """
 
 
 def plant(mutant: Mutant, folder: Path) -> None:
     """Write a daemon with the fault to a folder."""
-    shutil.copytree(ROOT / "skin_host", folder / "skin_host")
-    shutil.copytree(ROOT / "emulator", folder / "emulator")
-    shutil.copytree(ROOT / "config", folder / "config")
+    for package in ("skin_host", "emulator", "config"):
+        shutil.copytree(ROOT / package, folder / package)
     path = folder / "skin_host" / mutant.file
     source = path.read_text()
     assert source.count(mutant.line) == 1, f"{mutant.name}: not once in {mutant.file}"
     path.write_text(source.replace(mutant.line, mutant.planted))
 
 
-def find(mutant: Mutant, seeds: list[int], seconds: int) -> tuple[int, str] | None:
-    """The place in `seeds` of the first that finds a mutant, from 1, and what it broke."""
+def outcome(folder: Path, seed: int, seconds: int) -> str:
+    """Return what a seed breaks in the daemon of a folder; nothing is an empty text."""
+    ran = subprocess.run(
+        [sys.executable, "-c", _RUN, str(SMALL), str(seed), str(seconds)],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if ran.returncode:
+        return (ran.stderr.strip().splitlines() or ["it ended"])[-1]
+    return ran.stdout.strip()
+
+
+def find(
+    mutant: Mutant, seeds: Iterable[int], seconds: int, plain: dict[int, str]
+) -> tuple[int, str] | None:
+    """Return the first seed that finds a mutant, and what it broke.
+
+    Args:
+        mutant: to be planted.
+        seeds: tried in this order.
+        seconds: simulated time of each.
+        plain: what seeds break in the daemon as it is, as far as that is known; these do not count.
+    """
     with tempfile.TemporaryDirectory() as name:
         plant(mutant, Path(name))
-        for number, seed in enumerate(seeds, 1):
-            said = subprocess.run(
-                [sys.executable, "-c", _RUN, str(SMALL), str(seed), "1", str(seconds)],
-                cwd=name,
-                capture_output=True,
-                text=True,
-                check=False,
-            )
-            last = (said.stdout.strip() or said.stderr.strip()).splitlines()[-1:]
-            outcome = last[0].partition(" ")[2] if last else "it ended"
-            if outcome:
-                return number, outcome
+        for seed in seeds:
+            broken = outcome(Path(name), seed, seconds)
+            if not broken:
+                continue
+            if seed not in plain:
+                plain[seed] = outcome(ROOT, seed, seconds)
+            if not plain[seed]:
+                return seed, broken
+            print(f"seed {seed} does not count: {plain[seed]}", flush=True)
     return None
 
 
@@ -217,28 +235,14 @@ def main() -> int:
     parser.add_argument("--only", nargs="*", default=[])
     arguments = parser.parse_args()
     chosen = [m for m in MUTANTS if not arguments.only or any(w in m.name for w in arguments.only)]
-    asked = [
-        sys.executable,
-        "-c",
-        _RUN,
-        str(SMALL),
-        *map(str, (arguments.first, arguments.seeds, arguments.seconds)),
-    ]
-    seeds = []
-    with subprocess.Popen(asked, cwd=ROOT, stdout=subprocess.PIPE, text=True) as plain:
-        assert plain.stdout is not None
-        for line in plain.stdout:
-            seed, _, broken = line.strip().partition(" ")
-            if broken:
-                print(f"seed {seed} is left out: {broken}", flush=True)
-            else:
-                seeds.append(int(seed))
+    seeds = range(arguments.first, arguments.first + arguments.seeds)
+    plain: dict[int, str] = {}
     found = 0
     for mutant in chosen:
-        outcome = find(mutant, seeds, arguments.seconds)
-        found += outcome is not None
-        said = "not found" if outcome is None else f"seed {outcome[0]}: {outcome[1][:110]}"
-        print(f"{mutant.name}: {said}", flush=True)
+        known = find(mutant, seeds, arguments.seconds, plain)
+        found += known is not None
+        text = "not found" if known is None else f"{known[0]} | {known[1][:110]}"
+        print(f"| {mutant.name} | {text} |", flush=True)
     print(f"{found} of {len(chosen)} found within {len(seeds)} seeds")
     return 0
 

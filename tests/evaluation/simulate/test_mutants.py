@@ -14,4 +14,4 @@ def test_a_planted_fault_has_its_place(mutant: Mutant) -> None:
 @pytest.mark.parametrize("name", ["every event has the same count"])
 def test_a_planted_fault_is_found(name: str) -> None:
     (mutant,) = (mutant for mutant in MUTANTS if mutant.name == name)
-    assert find(mutant, [5], 30) is not None
+    assert find(mutant, [5], 30, {5: ""}) is not None
