@@ -122,11 +122,13 @@ def simulate(
 def _scene(seed: int, seconds: float) -> Scene:
     """Noise as recorded on real skin or of the best skin, and a temperature that wanders."""
     chance = random.Random(f"{seed} scene")
+    quiet = chance.random() < 0.5
+    # A longer run has the same beginning.
     degrees_c = [24.0]
-    while len(degrees_c) * WANDER_S < seconds + 2 * STORM_S:
+    while (len(degrees_c) - 2) * WANDER_S < seconds:
         degrees_c.append(degrees_c[-1] + chance.uniform(-MOST_WANDER_C, MOST_WANDER_C))
     keyframes = [(WANDER_S * number, at_c) for number, at_c in enumerate(degrees_c)]
-    return Scene(quiet=chance.random() < 0.5, temperature=Temperature(keyframes_c=keyframes))
+    return Scene(quiet=quiet, temperature=Temperature(keyframes_c=keyframes))
 
 
 class _Run:
