@@ -157,6 +157,8 @@ class _Run:
         await asyncio.wait(
             [living, stopped], timeout=self._until_s, return_when=asyncio.FIRST_COMPLETED
         )
+        # What ends now ends in any order.
+        self.result.events, self.result.digest = world.trace.count, world.trace.digest()
         for task in (living, looking, stopped):
             task.cancel()
         outcome, *_ = await asyncio.gather(living, looking, stopped, return_exceptions=True)
@@ -166,7 +168,6 @@ class _Run:
             world.life.kill()
         result = self.result
         result.simulated_s = world.clock.monotonic_s()
-        result.events, result.digest = world.trace.count, world.trace.digest()
         result.broken = self._promises.broken
         result.last = list(world.trace.last)
         result.troubles = dict(sorted(self._injected.items()))
