@@ -98,14 +98,15 @@ class Model {
       const normal = new three.Vector3(...part.normal[i]);
       return { at: new three.Vector3(...p).addScaledVector(normal, ABOVE_MM), turn: new three.Quaternion().setFromUnitVectors(up, normal) };
     });
-    const disc = new three.CircleGeometry(1, 24);
-    this.discs = this.marks(disc, part.n, 1);
-    this.rims = this.marks(new three.RingGeometry(1, 1.09, 24), part.n, 1);
-    this.crosses = this.marks(cross(three), part.n, 1.01);
-    this.squares = this.marks(new three.RingGeometry(0.55, 0.7, 4, 1, Math.PI / 4), part.n, 1);
-    this.rings = this.marks(new three.RingGeometry(1.15, 1.4, 24), part.n, 1);
-    this.group.add(this.skin, this.edges, this.discs, this.rims, this.crosses, this.squares, this.rings);
-    this.shown = new Map();
+    this.discs = this.marks(new three.CircleGeometry(1, 18), part.n);
+    this.rims = this.marks(new three.RingGeometry(1, 1.09, 18), part.n);
+    this.crosses = this.marks(cross(three), part.n);
+    this.squares = this.marks(new three.RingGeometry(0.55, 0.7, 4, 1, Math.PI / 4), part.n);
+    this.rings = this.marks(new three.RingGeometry(1.15, 1.4, 18), part.n);
+    this.kinds = [this.discs, this.rims, this.crosses, this.squares, this.rings];
+    this.group.add(this.skin, this.edges, ...this.kinds);
+    this.states = new Float32Array(part.n).fill(-1); // marks of each taxel and their size
+    this.discOf = []; // which taxel each disc is
     scene.add(this.group);
   }
 
@@ -116,11 +117,11 @@ class Model {
     return made;
   }
 
-  /** Copies of a mark, one a taxel; those that face away are not drawn. */
+  /** Copies of a mark for up to n taxels; those that face away are not drawn. */
   marks(geometry, n) {
     const made = new this.three.InstancedMesh(geometry, new this.three.MeshBasicMaterial(), Math.max(1, n));
     made.frustumCulled = false;
-    made.count = n;
+    made.count = 0;
     return made;
   }
 
@@ -140,32 +141,34 @@ class Model {
     this.edges.material.color.set(look.rim);
     for (const [mesh, colour] of [[this.rims, look.rim], [this.crosses, look.dim], [this.squares, look.dim], [this.rings, look.alarm]]) mesh.material.color.set(colour);
     const stale = part.stale(nowMs);
+    let changed = false;
     for (let i = 0; i < part.n; i++) {
       const thermal = part.thermal[i] && !raw;
       const known = !stale && !thermal && (raw ? part.raw !== null : part.valid(i));
-      const size = part.radius[i] * (part.thermal[i] && raw ? 0.6 : 1);
-      if (known) {
-        const value = raw ? part.noLoad[i] - part.raw[i] : part.pressure[i];
-        this.discs.setColorAt(i, colours[Math.round(255 * shareOf(value, top))]);
-      }
-      const crossed = !stale && !thermal && (raw ? part.raw === null || (!part.valid(i) && !part.thermal[i]) : !part.valid(i));
+      const crossed = !stale && !thermal && !(known && (part.valid(i) || part.thermal[i]));
       const ringed = known && !raw && part.beyond(i);
-      this.show(i, size, known * 1 + (known || (stale && !thermal)) * 2 + crossed * 4 + thermal * 8 + ringed * 16);
+      const bits = known * 1 + (known || (stale && !thermal)) * 2 + crossed * 4 + thermal * 8 + ringed * 16;
+      const state = bits + (part.thermal[i] && raw ? 32 : 0);
+      if (this.states[i] !== state) { this.states[i] = state; changed = true; }
     }
+    if (changed) this.arrange(part);
+    this.discOf.forEach((i, k) => {
+      const value = raw ? part.noLoad[i] - part.raw[i] : part.pressure[i];
+      this.discs.setColorAt(k, colours[Math.round(255 * shareOf(value, top))]);
+    });
     if (this.discs.instanceColor) this.discs.instanceColor.needsUpdate = true;
   }
 
-  /** Which marks a taxel has now: bits of disc, rim, cross, square, ring. */
-  show(i, size, bits) {
-    const key = bits + 32 * size;
-    if (this.shown.get(i) === key) return;
-    this.shown.set(i, key);
+  /** Put each mark on the taxels that have it now: only those cost time. */
+  arrange(part) {
     const { Matrix4, Vector3 } = this.three;
-    const { at, turn } = this.places[i];
-    [this.discs, this.rims, this.crosses, this.squares, this.rings].forEach((mesh, k) => {
-      const share = bits & (1 << k) ? size : 0;
-      mesh.setMatrixAt(i, new Matrix4().compose(at, turn, new Vector3(share, share, share)));
-      mesh.instanceMatrix.needsUpdate = true;
+    this.discOf = [];
+    for (const mesh of this.kinds) { mesh.count = 0; mesh.instanceMatrix.needsUpdate = true; }
+    this.places.forEach(({ at, turn }, i) => {
+      const size = part.radius[i] * (this.states[i] & 32 ? 0.6 : 1);
+      const matrix = new Matrix4().compose(at, turn, new Vector3(size, size, size));
+      if (this.states[i] & 1) this.discOf.push(i);
+      this.kinds.forEach((mesh, k) => { if (this.states[i] & (1 << k)) mesh.setMatrixAt(mesh.count++, matrix); });
     });
   }
 
