@@ -18,7 +18,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -148,43 +148,50 @@ class FrameBatch:
 
 
 class RecordBatch(FrameBatch):
-    """A batch that is cut into others: its frames are laid out for walking through once."""
+    """A batch that is cut into others: its frames are laid out for walking through once, and each
+    array is made when it is first read.
+    """
 
     __slots__ = ("_octets", "_rising")
 
     def __init__(
-        self,
-        identifier: NDArray[np.uint32],
-        dlc: Bytes,
-        data: Bytes,
-        t_ns: NDArray[np.int64],
-        octets: Bytes | None = None,
-        rising: bool | None = None,
+        self, identifier: NDArray[np.uint32], dlc: Bytes, data: Bytes, t_ns: NDArray[np.int64]
     ) -> None:
         super().__init__(identifier, dlc, data, t_ns)
-        self._octets = _octets_of(identifier, dlc, data, t_ns) if octets is None else octets
-        self._rising = _rising(t_ns) if rising is None else rising
+        self._octets = _octets_of(identifier, dlc, data, t_ns)
+        self._rising = _rising(t_ns)
+
+    @classmethod
+    def _laid_out(cls, octets: Bytes, rising: bool | None) -> "RecordBatch":
+        batch = cls.__new__(cls)
+        batch.dropped = 0
+        batch._octets = octets
+        batch._rising = _rising(batch.t_ns) if rising is None else rising
+        return batch
+
+    def __getattr__(self, name: str) -> NDArray[Any]:
+        """Called once for each array, while its slot is empty."""
+        if name not in {"id", "dlc", "data", "t_ns"}:
+            raise AttributeError(name)
+        records = self._octets.view(_RECORD_ARRAY).reshape(-1)
+        array: NDArray[Any]
+        if name == "t_ns":
+            array = records["seconds"] * NS_PER_S + records["nanoseconds"]
+        else:
+            array = records[name]
+        setattr(self, name, array)
+        return array
+
+    def __len__(self) -> int:
+        return len(self._octets)
 
     def __getitem__(self, rows: "slice | NDArray[np.intp]") -> "RecordBatch":
         """Some of the frames, in their order."""
-        return RecordBatch(
-            self.id[rows],
-            self.dlc[rows],
-            self.data[rows],
-            self.t_ns[rows],
-            self._octets[rows],
-            self._rising or None,
-        )
+        return self._laid_out(self._octets[rows], self._rising or None)
 
     def joined(self, other: "RecordBatch") -> "RecordBatch":
         """These frames and then the other ones."""
-        return RecordBatch(
-            np.concatenate((self.id, other.id)),
-            np.concatenate((self.dlc, other.dlc)),
-            np.concatenate((self.data, other.data)),
-            np.concatenate((self.t_ns, other.t_ns)),
-            np.concatenate((self._octets, other._octets)),
-        )
+        return self._laid_out(np.concatenate((self._octets, other._octets)), None)
 
     @property
     def rising(self) -> bool:

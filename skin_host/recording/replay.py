@@ -50,7 +50,7 @@ _encoder = msgspec.json.Encoder()
 def frame_line(frame: PressureFrame) -> bytes:
     """Write a frame as a line: arrays of all taxels, kPa with three decimals."""
     # Adding 0 turns a rounded -0.0 into 0.0.
-    pressure = np.round(frame.pressure_kpa.astype(np.float64), KPA_DECIMALS) + 0.0
+    pressure = frame.pressure_kpa.astype(np.float64).round(KPA_DECIMALS) + 0.0
     return _line(
         "frame",
         {
