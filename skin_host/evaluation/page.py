@@ -200,7 +200,10 @@ def _sections(report: Report) -> list[Section]:
             [
                 (
                     "kPa RMS with 0.4 units of noise, whole units and a baseline between two "
-                    "codes. The error of `perfect` is the limit of the 8-bit reading."
+                    "codes. The error of `perfect` is the limit of the 8-bit reading. In "
+                    "`multistep` a grip is eased to 4 kPa for five minutes: that is below the "
+                    "threshold of touch, the baseline follows it, and most of what the default "
+                    "adds there is this."
                 ),
             ],
             [tables.errors(report, 0.4, measure="rms_kpa")],
