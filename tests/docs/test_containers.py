@@ -2,7 +2,12 @@
 
 import re
 import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
+import pytest
 import yaml
 
 from skin_host.cli import build_parser
@@ -20,6 +25,13 @@ def test_what_is_copied_into_the_image_is_there_and_enough_for_a_wheel() -> None
     }
     assert all((ROOT / name).exists() for name in copied)
     assert {"skin_host", "emulator", "config", "pyproject.toml", "README.md", "LICENSE"} <= copied
+
+
+def test_the_linter_finds_nothing() -> None:
+    hadolint = shutil.which("hadolint", path=str(Path(sys.executable).parent))
+    if hadolint is None:
+        pytest.skip("hadolint is not installed (extra `dev`, on x86-64)")
+    subprocess.run([hadolint, FOLDER / "Containerfile"], check=True)
 
 
 def test_the_commands_of_the_services_are_ours() -> None:
