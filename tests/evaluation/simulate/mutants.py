@@ -83,7 +83,7 @@ MUTANTS = [
     Mutant(
         "frames are not counted",
         "bus/assembler.py",
-        "        self.counters.frames += len(batch)\n",
+        "        self.counters.frames += n\n",
         "",
     ),
     Mutant(
@@ -127,9 +127,8 @@ MUTANTS = [
     Mutant(
         "what did not come stays as it was",
         "processing/intake.py",
-        "                state.present[feed.target] = False\n"
-        "                state.received[feed.target] = False\n            feed.fresh",
-        "                pass\n            feed.fresh",
+        "            raw[lost] = 0\n            present[lost] = received[lost] = False\n",
+        "            pass\n",
     ),
     Mutant(
         "touches go on when the daemon ends",
