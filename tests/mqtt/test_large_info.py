@@ -51,7 +51,7 @@ async def test_pieces_that_are_needed_no_longer_are_cleared(
     mosquitto: Mosquitto, tmp_path: Path
 ) -> None:
     info = info_of("demo.toml")
-    narrow = limited(mosquitto, tmp_path / "narrow", 24_000)
+    narrow = limited(mosquitto, tmp_path / "narrow", one_part(info))
     narrow.start()
     try:
         async with listening(narrow) as seen, Publisher(settings(narrow), "robot") as publisher:
@@ -92,6 +92,13 @@ async def test_a_part_that_fits_into_no_packet_is_named_and_the_others_are_known
         narrow.kill()
 
 
+def one_part(info: NodeInfo) -> int:
+    """So many bytes that each part fits into a packet alone, and two do not."""
+    sizes = sorted(len(encode_info(one)) for one in single_parts(info).values())
+    assert sizes[0] > 2000
+    return sizes[-1] + 1000
+
+
 def single_parts(info: NodeInfo) -> dict[str, NodeInfo]:
     return {
         name: NodeInfo(robot="r", node="main", version="1", configuration="x", parts={name: part})
@@ -101,7 +108,7 @@ def single_parts(info: NodeInfo) -> dict[str, NodeInfo]:
 
 async def test_pieces_of_another_configuration_are_not_put_together(mosquitto: Mosquitto) -> None:
     info = info_of("demo.toml")
-    pieces = encode_pieces(info, 24_000)
+    pieces = encode_pieces(info, one_part(info))
     assert len(pieces) == 2
     async with listening(mosquitto) as seen, Publisher(settings(mosquitto), "robot") as publisher:
         publisher._outbox.put_state("skin/robot/nodes/main/info", pieces[0])

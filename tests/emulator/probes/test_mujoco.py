@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -18,8 +19,19 @@ from skin_host.processing.core import Engine
 mujoco = pytest.importorskip("mujoco")
 
 CONFIG = Path(__file__).parents[3] / "config"
-#: Flat parts.
-LAYOUT = build_layout(load(CONFIG / "icub_2011_arm.toml"), CONFIG)
+
+
+def flat_layout() -> Layout:
+    """An arm whose forearm is not wound around it: a model's plane is its foam."""
+    settings = load(CONFIG / "icub_2011_arm.toml")
+    forearm = settings.parts["left_forearm"]
+    patches = [msgspec.structs.replace(patch, places=[]) for patch in forearm.patches]
+    flat = msgspec.structs.replace(forearm, patches=patches)
+    parts = settings.parts | {"left_forearm": flat}
+    return build_layout(msgspec.structs.replace(settings, parts=parts), CONFIG)
+
+
+LAYOUT = flat_layout()
 FOREARM = """
   <body name="forearm" pos="0.3 0.2 0.1" euler="20 -30 70">
     <geom type="box" size=".07 .05 .01" pos=".048 .036 -.01"/>
