@@ -100,7 +100,7 @@ class FleetPlan:
 PHASES = ("quiet", "one killed", "it is back", "another frozen", "it goes on")
 
 
-class Sent(NamedTuple):
+class RobotSent(NamedTuple):
     """What a robot has sent: number of events, number of dropped ones, and its contact states."""
 
     events: int
@@ -179,7 +179,7 @@ async def _conduct(brokers: Brokers, plan: FleetPlan, pipes: list[Pipe]) -> dict
         )
     for pipe in pipes:
         pipe.send("end")
-    told: dict[str, Sent] = {}
+    told: dict[str, RobotSent] = {}
     for pipe in pipes:
         told |= await asyncio.to_thread(pipe.recv)
     await ear.settled({name: said.events for name, said in told.items()})
@@ -315,7 +315,7 @@ class _Receiver:
             "worst_ms": round(float(np.max(delays_ms)), 1),
         }
 
-    def judge(self, told: dict[str, Sent]) -> dict[str, Any]:
+    def judge(self, told: dict[str, RobotSent]) -> dict[str, Any]:
         """Compare with what the robots sent."""
         lost = twice = disordered = wrong = offline = events = 0
         unknown_s = 0.0
@@ -410,7 +410,7 @@ async def _be(pipe: Pipe, names: list[str], settings: Mqtt, plan: FleetPlan) -> 
     told = {}
     for name, publisher in publishers.items():
         known = publisher.counters
-        told[name] = Sent(
+        told[name] = RobotSent(
             publisher._outbox.counted(publisher.topics.part("touch", PART)),
             known.touches_dropped,
             known.touches_waiting,

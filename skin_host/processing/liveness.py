@@ -34,10 +34,10 @@ from skin_host.processing.stuck import (
     MOST_RATE,
     TOUCHED_PACE,
     Encoding,
-    Felt,
     Repeats,
     Rows,
     StuckPads,
+    TouchedPads,
     inside,
     longest_run,
 )
@@ -152,7 +152,7 @@ class Liveness:
         self._step = np.zeros(shape, np.int16)
         self._jumping = np.zeros(shape)
         self._any_jumping = False
-        self._felt: Felt | None = None
+        self._felt: TouchedPads | None = None
         self._surprise = np.zeros(k)
         self._changes = np.zeros(shape, np.int16)
         self._alive = np.zeros(k, np.int64)
@@ -246,11 +246,11 @@ class Liveness:
         self._pads.any_stuck = any_of(self._pads.stuck)
         self._doubt()
 
-    def _what_is_felt(self, touched: Mask) -> Felt:
+    def _what_is_felt(self, touched: Mask) -> TouchedPads:
         """Return the consequences of which pads are touched; mostly those of the last sweep."""
         key = touched.tobytes()
         if self._felt is None or self._felt.key != key:
-            self._felt = Felt.of(touched, key, self._boards)
+            self._felt = TouchedPads.of(touched, key, self._boards)
         return self._felt
 
     def _doubt(self) -> None:
@@ -263,7 +263,7 @@ class Liveness:
         changed: Mask,
         compared: Mask,
         erring: Mask,
-        felt: Felt | None,
+        felt: TouchedPads | None,
     ) -> None:
         alive = np.logical_or.reduce(changed, axis=1)
         self._alive += alive if felt is None else alive & felt.calm

@@ -184,7 +184,7 @@ LONGEST_RUN = 1e6
 NEWTON_STEPS = 8
 
 
-class Felt(NamedTuple):
+class TouchedPads(NamedTuple):
     """Consequences of which pads are touched.
 
     Attributes:
@@ -202,7 +202,7 @@ class Felt(NamedTuple):
     pace: NDArray[np.int64]
 
     @classmethod
-    def of(cls, touched: Mask, key: bytes, boards: int) -> "Felt":
+    def of(cls, touched: Mask, key: bytes, boards: int) -> "TouchedPads":
         of_triangles = np.count_nonzero(touched, axis=1).reshape(boards, -1)
         of_boards = of_triangles.sum(axis=1, keepdims=True)
         triangles = of_triangles.shape[1]
@@ -260,7 +260,7 @@ class StuckPads:
         changed: Mask,
         within: Mask,
         unproven: Mask,
-        felt: Felt | None = None,
+        felt: TouchedPads | None = None,
         came: Mask | None = None,
     ) -> None:
         """Take one sweep of some boards.

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from emulator.boards.arithmetic import transmit_16, transmit_32
 from skin_host.bus.compensation import GAIN, GAIN_V2, NO_GAIN, THERMAL_TAXEL
 from skin_host.processing import stuck
-from skin_host.processing.stuck import Encoding, Felt, Repeats, StuckPads, inside
+from skin_host.processing.stuck import Encoding, Repeats, StuckPads, TouchedPads, inside
 
 K = 8
 SHAPE = (K, 12)
@@ -31,7 +31,7 @@ class Watched:
 
     def show(self, raw: np.ndarray, touched: np.ndarray | None = None) -> None:
         before = self.pads.stuck
-        felt = None if touched is None else Felt.of(touched, touched.tobytes(), 1)
+        felt = None if touched is None else TouchedPads.of(touched, touched.tobytes(), 1)
         self.pads.step(raw, raw != self.raw, inside(raw), NO, felt)
         self.raw = raw
         self.accusations += np.count_nonzero(self.pads.stuck & ~before)
