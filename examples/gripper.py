@@ -45,11 +45,11 @@ def main(url: str = "mqtt://localhost", config: str = str(CONFIG)) -> None:
 
     def on_contact(contact: Contact) -> None:
         finger = contact.part.removesuffix("_finger")
-        if contact.touched and not contact.why:
-            touched[finger].set()
         closing = not (contact.touched or touched[finger].is_set())
         gripper.move(finger, CLOSING_M_S if closing else 0.0)
         print(finger, "closes" if closing else f"stops: {contact.why or 'touched'}", flush=True)
+        if contact.touched and not contact.why:
+            touched[finger].set()
 
     try:
         with SkinCallbacks(url, robot="gripper", patience_s=60) as skin:
