@@ -46,6 +46,8 @@ async def test_the_gripper_closes_until_both_fingers_are_touched(
             while "it holds" not in told:
                 told.append((await example.stdout.readline()).decode().strip())
                 assert told[-1]
+    except TimeoutError:
+        pytest.fail(f"after {PATIENCE_S:g} s it has said only {told}")
     finally:
         assert example.stdin is not None
         example.stdin.close()
