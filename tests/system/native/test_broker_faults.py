@@ -98,14 +98,15 @@ async def test_every_touch_arrives_or_its_loss_is_told(mosquitto: Mosquitto, see
                 publisher.put_touch(
                     TouchEvent("end", 999_999, 0, 10**18, part, [], None, None, 1, 1, 1, 0.1)
                 )
-            per_part = load.touches // len(PARTS) + 1
-            await until(lambda: all(seen[p] + told[p] == per_part for p in PARTS))
+            # A move that a newer one replaced while many waited is neither sent nor a loss.
+            sent = load.touches + len(PARTS) - publisher.counters.moves_replaced
+            await until(lambda: sum(seen.values()) + sum(told.values()) == sent)
             await until(lambda: publisher.counters.touches_waiting == 0)
             counters = publisher.counters
         counting.cancel()
     assert load.sweeps == SECONDS * RATE_HZ
     assert counters.touches_dropped == 0
-    assert counters.touches_sent == load.touches + len(PARTS)
+    assert counters.touches_sent == sent
     # Every frame was sent or is counted as skipped; one may have been lost with each link.
     frames = load.sweeps * len(PARTS)
     in_flight = frames - counters.frames_sent - counters.frames_skipped
