@@ -157,18 +157,13 @@ class Outbox:
         While many events wait, a `move` takes the place and the number of the contact's last one.
         """
         contact = topic, touch.id
-        if touch.event != "move":
-            self._last_moves.pop(contact, None)
-            self._put_counted(
-                topic, lambda n: encode_touch(touch, n), properties, self._event_limit
-            )
+        moves = touch.event == "move"
+        if moves and len(self.events) > BACKLOG and self._replace_move(contact, touch, properties):
             return
-        if len(self.events) > BACKLOG and self._replace_move(contact, touch, properties):
-            return
-        event = self._put_counted(
-            topic, lambda n: encode_touch(touch, n), properties, self._move_limit
-        )
-        if event is not None:
+        self._last_moves.pop(contact, None)
+        limit = self._move_limit if moves else self._event_limit
+        event = self._put_counted(topic, lambda n: encode_touch(touch, n), properties, limit)
+        if moves and event is not None:
             self._last_moves[contact] = event, self._counts[topic]
 
     def _replace_move(
@@ -259,6 +254,8 @@ class Outbox:
         self.passed_on.clear()
         self.counters.touches_sent -= len(again)
         self.events.extendleft(reversed(again))
+        # Subscribers may know the numbers of these and of what was in flight behind them.
+        self._last_moves.clear()
         self.events_put.set()
         return len(again)
 

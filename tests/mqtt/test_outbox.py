@@ -95,6 +95,20 @@ def test_a_move_that_may_be_on_its_way_is_not_replaced() -> None:
     assert [json.decode(one.payload)["t_ns"] for one in (first, last)] == [1, 2]
 
 
+def test_a_move_behind_repeated_events_keeps_what_its_number_stood_for() -> None:
+    outbox = connected(event_limit=10_000)
+    for contact in range(1, BACKLOG + 2):
+        outbox.put_touch("palm", touch("begin", contact=contact), None)
+    for _ in range(BACKLOG + 1):
+        outbox.event_sent()
+    outbox.put_touch("palm", touch("move", t_ns=2), None)  # may be in flight as the broker dies
+    assert outbox.repeat_events() == BACKLOG + 1
+    outbox.put_touch("palm", touch("move", t_ns=3), None)
+    waiting = [json.decode(event.payload) for event in outbox.events]
+    assert [one["t_ns"] for one in waiting[-2:]] == [2, 3]
+    assert outbox.counters.moves_replaced == 0
+
+
 @given(st.lists(st.tuples(st.sampled_from(["begin", "move", "end"]), st.sampled_from("ab"))))
 def test_every_event_waits_or_is_counted_and_leaves_a_gap(events: list[tuple[str, str]]) -> None:
     outbox = connected()
