@@ -1,5 +1,7 @@
 """The whole daemon lives by the clock that it is given: robot, buses and host in one event loop."""
 
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +11,7 @@ from skin_host.config.settings import Bus
 from skin_host.health import Record
 from skin_host.mqtt.messages import ContactState
 from skin_host.processing.events import TouchEvent
-from tests.support.live import living
+from tests.support.live import Live, living
 from tests.support.stepped import stepped
 
 PRESS = Probe(
@@ -21,6 +23,17 @@ PRESS = Probe(
     repeat_s=2.0,
 )
 LATELY = frozenset({"board_rezeroed"})
+
+
+@asynccontextmanager
+async def well(
+    clock: SteppedClock, state: Path, channel: str, *probes: Probe
+) -> AsyncIterator[Live]:
+    """A daemon and its robot, from when nothing is wrong with them."""
+    bus, scene = Bus(interface="virtual", channel=channel), Scene(quiet=True, probe=[*probes])
+    async with living(bus, state, scene=scene, clock=clock) as live:
+        await live.until_well(but=LATELY)
+        yield live
 
 
 async def lived(clock: SteppedClock, state: Path, channel: str) -> list[object]:
@@ -59,13 +72,7 @@ def test_the_life_of_a_daemon_is_the_same_every_time(tmp_path: Path) -> None:
 async def test_a_process_that_stood_still_takes_no_board_for_silent(
     clock: SteppedClock, tmp_path: Path
 ) -> None:
-    async with living(
-        Bus(interface="virtual", channel="stepped-c"),
-        tmp_path,
-        scene=Scene(quiet=True),
-        clock=clock,
-    ) as live:
-        await live.until_well(but=LATELY)
+    async with well(clock, tmp_path, "stepped-c") as live:
         ledger = live.daemon.engine.ledger
         clock.advance(3.0)
         await clock.sleep(0.5)
@@ -74,13 +81,7 @@ async def test_a_process_that_stood_still_takes_no_board_for_silent(
 
 @stepped
 async def test_a_clock_that_is_set_costs_no_board(clock: SteppedClock, tmp_path: Path) -> None:
-    async with living(
-        Bus(interface="virtual", channel="stepped-d"),
-        tmp_path,
-        scene=Scene(quiet=True),
-        clock=clock,
-    ) as live:
-        await live.until_well(but=LATELY)
+    async with well(clock, tmp_path, "stepped-d") as live:
         ledger = live.daemon.engine.ledger
         for jump_s in (3600.0, -7200.0):
             clock.set(jump_s)
@@ -98,13 +99,7 @@ async def test_a_clock_that_is_set_changes_no_contact(clock: SteppedClock, tmp_p
         pressure_kpa=[(0, 0), (0.1, 60), (1000, 60)],
         start_s=4.0,
     )
-    async with living(
-        Bus(interface="virtual", channel="stepped-e"),
-        tmp_path,
-        scene=Scene(quiet=True, probe=[lasting]),
-        clock=clock,
-    ) as live:
-        await live.until_well(but=LATELY)
+    async with well(clock, tmp_path, "stepped-e", lasting) as live:
         await clock.sleep(4.0)
         publisher = live.daemon.publisher
         put_contact, put_touch = publisher.put_contact, publisher.put_touch
@@ -130,13 +125,7 @@ async def test_a_clock_that_is_set_changes_no_contact(clock: SteppedClock, tmp_p
 async def test_health_that_does_not_change_is_worked_out_once_a_second(
     clock: SteppedClock, tmp_path: Path
 ) -> None:
-    async with living(
-        Bus(interface="virtual", channel="stepped-h"),
-        tmp_path,
-        scene=Scene(quiet=True),
-        clock=clock,
-    ) as live:
-        await live.until_well(but=LATELY)
+    async with well(clock, tmp_path, "stepped-h") as live:
         health = live.daemon.health
         record = health.record
         recorded: list[int] = []

@@ -92,7 +92,6 @@ class Promises:
         self._periods_ns = np.zeros(layout.n_taxels, np.int64)
         self._ids = np.zeros(layout.n_taxels, np.int64)
         self._bus_of: dict[str, NDArray[np.intp]] = {}
-        self._triangle_of = layout.triangle_of
         self._blind_since: dict[tuple[str, int], int] = {}
         buses = np.empty(layout.n_taxels, object)
         for board in layout.boards:
