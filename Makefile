@@ -15,14 +15,14 @@ help:  ## this list
 demo: .venv/demo.stamp  ## emulator, daemon, broker and page together; DURATION=15 ends by itself
 	@exec $(BIN)/skin demo $(if $(DURATION),--duration $(DURATION))
 
+# Real time on a shared computer: a test that fails is run once more, and the summary names it.
+AGAIN := --reruns=1 -rR
+
 test: lint  ## all that needs no root and no hardware
-	@tools/timed "pytest" $(BIN)/python -m pytest --numprocesses=3 --dist=loadfile
+	@tools/timed "pytest" $(BIN)/python -m pytest --numprocesses=3 --dist=loadfile $(AGAIN)
 
 coverage: .venv/dev.stamp .venv/coverage.stamp  ## branches of the core that the tests run: 95 % at least
 	@$(BIN)/python -m pytest --quiet --numprocesses=3 --dist=loadfile --cov --cov-report=term
-
-# Real time on a shared computer: a test that fails is run once more, and the summary names it.
-AGAIN := --reruns=1 -rR
 
 test-system: .venv/dev.stamp .venv/fuzz.stamp  ## real CAN, I2C, systemd, broker and browser; root, if packages are missing
 	@tools/timed "packages" tools/lane/packages

@@ -11,10 +11,10 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from skin_host.errors import BrokerError
 
@@ -108,10 +108,26 @@ async def embedded_broker() -> AsyncIterator[LocalBroker]:
             "apt install mosquitto, or pip install amqtt"
         ) from None
 
+    class Steady(dict[str, Any]):
+        """Iterates over what it held at the start: amqtt waits within its loops over these
+        dictionaries while other clients subscribe, and would drop the client or the message.
+        """
+
+        def __iter__(self) -> Iterator[str]:
+            return iter(list(super().__iter__()))
+
+        def items(self) -> Any:
+            return list(super().items())
+
     class TidyBroker(Broker):  # type: ignore[misc]
         """Ends a connection silently where amqtt lets asyncio report a cancelled task as a
         failure.
         """
+
+        def __init__(self, config: BrokerConfig) -> None:
+            super().__init__(config)
+            self._subscriptions = Steady()
+            self._retained_messages = Steady()
 
         async def stream_connected(
             self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, listener_name: str

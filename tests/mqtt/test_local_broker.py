@@ -105,3 +105,29 @@ def test_a_connection_that_is_left_when_the_program_ends_is_no_failure() -> None
     with socket.socket() as client:
         asyncio.run(leave())
     assert told == []
+
+
+async def test_clients_that_come_while_others_subscribe_are_served() -> None:
+    pytest.importorskip("amqtt")
+    told: list[dict[str, Any]] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: told.append(context))
+
+    async def come(broker: local.LocalBroker, name: str) -> str:
+        async with aiomqtt.Client(broker.host, broker.port) as client:
+            for level in range(int(name[-1])):
+                await client.subscribe(f"{name}/{level}", qos=1)
+            await client.subscribe("kept/#", qos=1)
+            async with asyncio.timeout(20):
+                message = await anext(client.messages)
+        return message.topic.value
+
+    seen: set[str] = set()
+    async with local.embedded_broker() as broker:
+        async with aiomqtt.Client(broker.host, broker.port) as first:
+            await first.publish("kept/1", "here", qos=1, retain=True)
+            await first.subscribe("kept/#", qos=1)
+            for round_ in range(4):
+                names = [f"client_{round_}_{n}" for n in range(8)]
+                seen |= set(await asyncio.gather(*(come(broker, name) for name in names)))
+    assert seen == {"kept/1"}
+    assert told == []
