@@ -10,7 +10,7 @@ from typing import Protocol
 from skin_host.bus.boards import Boards
 from skin_host.bus.opening import open_port
 from skin_host.bus.port import Port
-from skin_host.bus.wake import WakeUp
+from skin_host.bus.wake import LONGEST_NS, WakeUp
 from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Bus, Receive
@@ -22,6 +22,11 @@ log = logging.getLogger(__name__)
 
 #: Waiting sweeps and samples are checked this often.
 EXPIRE_NS = 20_000_000
+#: A turn that comes later than planned by this was held up by other work on this computer.
+HELD_UP_NS = 25_000_000
+#: What brings the frames may have been held up by the same work. For this long after such a turn
+#: no sweep is closed, so that what is on its way is not counted as lost.
+PATIENCE_NS = 100_000_000
 #: A bus that does not take the set-up of its boards is tried again after this.
 RETRY_S = 2.0
 STOP_S = 1.0
@@ -92,6 +97,9 @@ class Link:
             sum(1e9 / period_ns for period_ns in fastest_ns),
         )
         self._expired_ns = 0
+        self._turned_ns = self.read_ns
+        self._held_up_ns = max(LONGEST_NS, int(settings.receive.poll_ms * 1e6)) + HELD_UP_NS
+        self._held_up_at_ns: int | None = None
         try:
             for bus in engine.assemblers:
                 port = open_port(bus, settings.buses[bus], settings.receive, wait=wait, clock=clock)
@@ -174,11 +182,25 @@ class Link:
             return
         self.read_ns = now_ns
         self._engine.ledger.look(now_ns)
-        if not 0 <= now_ns - self._expired_ns < EXPIRE_NS:
+        if not self._is_patient(now_ns) and not 0 <= now_ns - self._expired_ns < EXPIRE_NS:
             self._expired_ns = now_ns
             output = self._engine.expire(now_ns)
             self._note(output)
             deliver(output)
+
+    def _is_patient(self, now_ns: int) -> bool:
+        """Whether this turn, or one shortly before it, was held up.
+
+        Between two such times what has waited too long is closed once, so that a computer that is
+        held up all the time closes it too.
+        """
+        held_up = now_ns - self._turned_ns > self._held_up_ns
+        self._turned_ns = now_ns
+        if self._held_up_at_ns is None:
+            self._held_up_at_ns = now_ns if held_up else None
+        elif not 0 <= now_ns - self._held_up_at_ns < PATIENCE_NS:
+            self._held_up_at_ns = None
+        return self._held_up_at_ns is not None
 
     def _note(self, output: Output) -> None:
         """Note that the next sweep of a board is one period later."""

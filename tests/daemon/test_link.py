@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from skin_host.bus import wire
+from skin_host.bus.assembler import AssemblerCounters
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import Board, Bus, Part, Patch, Settings
 from skin_host.daemon.link import Link
@@ -17,6 +18,9 @@ MS = 1_000_000
 PERIOD = 50 * MS
 T0 = 1_700_000_000_000_000_000
 TRIANGLES = 4
+#: Identifier, payload, time.
+Frame = tuple[int, bytes, int]
+ALL = np.arange(2 * TRIANGLES)
 
 
 class Reader:
@@ -41,19 +45,35 @@ class Reader:
     def turn(self) -> None:
         self.link.turn(self.now_ns, self.outputs.append)
 
-    def period(self, keep: np.ndarray) -> None:
-        """The board sends the frames with these numbers; then a period passes."""
-        port = self.link.ports["can0"]
-        assert isinstance(port, StillPort)
+    def frames(self) -> list[Frame]:
+        """Of a sweep that the board begins to send now."""
         values = self.rng.integers(200, 250, (TRIANGLES, 12), np.uint8)
         ids, data = wire.encode_sweep(
             1, np.arange(TRIANGLES), values, np.zeros(TRIANGLES, np.uint16)
         )
-        sent = [(int(ids[i]), data[i].tobytes(), self.now_ns + 100 * int(i)) for i in keep]
-        port.waiting.append(FrameBatch.of(sent))
-        for _ in range(50):
+        times = self.now_ns + 100_000 * np.arange(2 * TRIANGLES)
+        return [(int(ids[i]), data[i].tobytes(), int(times[i])) for i in range(2 * TRIANGLES)]
+
+    def arrive(self, frames: list[Frame]) -> None:
+        port = self.link.ports["can0"]
+        assert isinstance(port, StillPort)
+        port.waiting.append(FrameBatch.of(frames))
+
+    def wait(self, ms: int) -> None:
+        """Time passes in which the link takes its turns."""
+        for _ in range(ms):
             self.turn()
             self.now_ns += MS
+
+    def period(self, keep: np.ndarray) -> None:
+        """The board sends the frames with these numbers; then a period passes."""
+        frames = self.frames()
+        self.arrive([frames[i] for i in keep])
+        self.wait(50)
+
+    @property
+    def counters(self) -> AssemblerCounters:
+        return self.engine.assemblers["can0"].counters
 
 
 @pytest.fixture
@@ -68,3 +88,30 @@ def test_sweeps_that_time_closes_reach_the_supervision_of_their_board(reader: Re
     sweeps = [sweep for output in reader.outputs for sweep in output.sweeps]
     assert len(sweeps) == 200
     assert reader.engine.ledger.sweeps.tolist() == [200]
+
+
+@pytest.mark.parametrize("pause_ms", [75, 150, 300])
+def test_half_a_sweep_is_not_lost_when_the_computer_paused(reader: Reader, pause_ms: int) -> None:
+    reader.period(ALL)
+    frames = reader.frames()
+    reader.arrive(frames[:3])
+    reader.now_ns += pause_ms * MS
+    reader.wait(10)
+    # What brings the frames was held up as well, and went on a little later.
+    reader.arrive(frames[3:])
+    reader.wait(50)
+    reader.period(ALL)
+    assert reader.counters.sweeps == 3
+    assert (reader.counters.halves, reader.counters.incomplete, reader.counters.late) == (0, 0, 0)
+
+
+def test_half_a_sweep_is_closed_in_time_on_a_computer_that_pauses_again_and_again(
+    reader: Reader,
+) -> None:
+    reader.period(ALL)
+    reader.arrive(reader.frames()[:3])
+    began_ns = reader.now_ns
+    while reader.counters.incomplete == 0:
+        reader.turn()
+        reader.now_ns += 80 * MS
+    assert reader.now_ns - began_ns <= 400 * MS
