@@ -1,11 +1,15 @@
 """What the ROS 2 node sends, serialised and read back without ROS.
 
-rclpy, launch and colcon are on no package index: the node itself was not run.
+rclpy, launch and colcon are on no package index: the node itself was not run. Cyclone DDS is, which
+ROS 2 sends messages with.
 """
 
 import ast
 import importlib.util
+import json
 import re
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +19,7 @@ import pytest
 
 from skin_host.client import Contact, Frame, Health, PartInfo, Touch
 from skin_host.mqtt.info import TriangleInfo
+from tests.support.cdr import typestore
 
 ROS2 = Path(__file__).parents[2] / "ros2"
 NODE = (ROS2 / "skin_host_ros/skin_host_ros/node.py").read_text()
@@ -39,13 +44,7 @@ def as_array(code: str, values: Sequence[Any]) -> Any:
 
 @pytest.fixture(scope="module")
 def store() -> Any:
-    """The types of ROS 2 and of this project; hundreds of them, read only here."""
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    types = get_typestore(Stores.ROS2_HUMBLE)
-    for path in sorted((ROS2 / "skin_host_msgs/msg").glob("*.msg")):
-        types.register(get_types_from_msg(path.read_text(), f"skin_host_msgs/msg/{path.stem}"))
-    return types
+    return typestore()
 
 
 @pytest.fixture(scope="module")
@@ -156,6 +155,47 @@ def test_they_can_be_kept_in_a_bag(store: Any, made: Any, tmp_path: Path) -> Non
         seen = {c.topic: store.deserialize_cdr(data, c.msgtype) for c, _, data in bag.messages()}
     assert seen["/arm/taxels"].seq == 7
     assert seen["/arm/points"].width == 3
+
+
+def test_other_processes_receive_the_same_bytes_over_dds(
+    store: Any, made: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Under the names that ROS 2 gives topics and types, as rmw_cyclonedds_cpp would send them."""
+    pytest.importorskip("cyclonedds", reason="no wheel of cyclonedds for this Python or machine")
+    from cyclonedds.domain import DomainParticipant
+
+    from tests.support import dds
+
+    sick: Any = {"state": "degraded", "sentences": ["taxel 3: stuck"], "rate_hz": 20.0}
+    sent = {
+        message.__msgtype__: bytes(store.serialize_cdr(message, message.__msgtype__))
+        for message in (
+            made.taxels(FRAME),
+            made.layout("arm", SHAPE, T_NS),
+            made.cloud(FRAME, SHAPE),
+            made.contacts(Contact("arm", "ON"), [TOUCH], T_NS),
+            made.wrench("arm", [TOUCH], T_NS),
+            made.diagnostics({"arm": Health("arm", sick)}, T_NS),
+        )
+    }
+    monkeypatch.setenv("CYCLONEDDS_URI", dds.loopback(str(tmp_path)))
+    participant = DomainParticipant()
+    writers = [dds.publish(participant, name, cdr) for name, cdr in sent.items()]
+    process = subprocess.run(
+        [sys.executable, "-m", "tests.support.dds", *sent],
+        cwd=ROS2.parent,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert len(writers) == len(sent)  # they live until here
+    received = json.loads(process.stdout or "{}")
+    assert set(received) == set(sent), process.stderr
+    assert {name: bytes.fromhex(one["cdr"]) for name, one in received.items()} == sent
+    assert received["sensor_msgs/msg/PointCloud2"]["topic"] == "rt/arm/pointcloud2"
+    assert received["skin_host_msgs/msg/ContactArray"]["type"] == (
+        "skin_host_msgs::msg::dds_::ContactArray_"
+    )
 
 
 def test_the_packages_hold_together() -> None:
