@@ -1,4 +1,4 @@
-"""Commands around recordings: record, export, plot, dbc; and replay onto a bus or a broker."""
+"""Commands around recordings: record, export, plot, dbc, urdf; and replay onto CAN or a broker."""
 
 import argparse
 import asyncio
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from skin_host.cli.common import (
     Commands,
     add_command,
+    add_config,
     load_skin,
     positive,
     print_json,
@@ -84,6 +85,16 @@ def add_commands(commands: Commands) -> None:
     dbc.add_argument("--bus", help="which bus of CONFIG")
     dbc.add_argument("--output", type=Path, help="file to write; else standard output")
     dbc.set_defaults(run=_dbc)
+
+    urdf = add_command(
+        commands,
+        "urdf",
+        "write the taxels' places as tags for a robot's description (URDF)",
+        "skin urdf config/icub.toml --output skin.urdf",
+    )
+    add_config(urdf)
+    urdf.add_argument("--output", type=Path, help="file to write; else standard output")
+    urdf.set_defaults(run=_urdf)
 
 
 def add_onto(parser: argparse.ArgumentParser) -> None:
@@ -274,18 +285,30 @@ def _plot(arguments: argparse.Namespace) -> int:
 
 def _dbc(arguments: argparse.Namespace) -> int:
     from skin_host.bus.dbc import dbc_text
-    from skin_host.files import write_atomic
 
     if arguments.config is None:
         text = dbc_text(bus=arguments.bus)
     else:
         settings, layout = load_skin(arguments.config)
         text = dbc_text(layout, arguments.bus, settings.fingertips)
-    if arguments.output is None:
+    return _write(text, arguments.output)
+
+
+def _urdf(arguments: argparse.Namespace) -> int:
+    from skin_host.layout.urdf import urdf_text
+
+    _, layout = load_skin(arguments.config)
+    return _write(urdf_text(layout), arguments.output)
+
+
+def _write(text: str, output: Path | None) -> int:
+    from skin_host.files import write_atomic
+
+    if output is None:
         print(text, end="")
     else:
-        write_atomic(arguments.output, text.encode())
-        print(arguments.output)
+        write_atomic(output, text.encode())
+        print(output)
     return 0
 
 
