@@ -33,6 +33,7 @@ Floats = NDArray[np.float64]
 
 #: At most this many bits may be left out, for the words that a byte stands for to fit into 64 bits.
 MOST_SHIFT = 4
+_ALL_WORDS = np.uint64(2**64 - 1)
 
 
 class Encoding(NamedTuple):
@@ -76,11 +77,17 @@ class Repeats:
         self._pattern = np.concatenate([pattern for _, pattern in tables])
         # At an end of its scale the temperature pad does not show what was subtracted.
         scale = np.arange(256)
-        self._tells = np.tile((scale > 0) & (scale < 255), len(kinds))[:, None]
+        self._tells = np.tile((scale > 0) & (scale < 255), len(kinds))
         self._kind = np.array([256 * kinds.index(one) for one in encodings])
-        self._shift = np.array([one.shift for one in encodings], np.int64)[:, None]
-        self._base = np.zeros(self._gain.shape, np.int64)
-        self._possible = np.zeros(self._gain.shape, np.uint64)
+        shape = self._gain.shape
+        cells = np.array([1 << one.shift for one in encodings], np.int64)
+        self._cells = np.repeat(cells, shape[1]).reshape(shape)
+        self._base = np.zeros(shape, np.int64)
+        self._possible = np.zeros(shape, np.uint64)
+        # Work arrays. In a step of two thousand pads, arrays of one shape that are written in place
+        # cost a third of masks and broadcasts.
+        self._lowered, self._up, self._left = (np.empty(shape, np.int64) for _ in range(3))
+        self._words, self._shifted = (np.empty(shape, np.uint64) for _ in range(2))
 
     @property
     def shifted(self) -> Mask:
@@ -123,17 +130,33 @@ class Repeats:
         if not self._compensated:
             return changed, within
         row = self._kind + raw[:, THERMAL_TAXEL]
-        told = within & self._tells[row]
-        base = self._lowest[row] - (raw << self._shift)
-        words = self._pattern[row]
-        up = np.minimum(np.maximum(base - self._base, -63), 63)
-        shifted = words << np.maximum(up, 0).view(np.uint64)
-        shifted >>= np.maximum(-up, 0).view(np.uint64)
-        np.bitwise_and(self._possible, shifted, out=self._possible, where=told)
-        moved: Mask = (self._possible == 0) & told
-        np.copyto(self._base, base, where=moved)
-        np.copyto(self._possible, words, where=moved)
+        tells = self._tells.take(row)
+        told = within if tells.all() else within & tells[:, None]
+        base, up, left = self._lowered, self._up, self._left
+        words, shifted, possible = self._words, self._shifted, self._possible
+        self._lowest.take(row, 0, base, "clip")
+        self._pattern.take(row, 0, words, "clip")
+        np.copyto(up, raw)
+        np.multiply(up, self._cells, out=up)
+        np.subtract(base, up, out=base)
+        np.subtract(base, self._base, out=up)
+        # Words are moved up or down by so many bits; numpy moves all of them out by 64 and more.
+        np.maximum(up, 0, out=left)
+        np.left_shift(words, left.view(np.uint64), out=shifted)
+        np.subtract(left, up, out=left)
+        np.right_shift(shifted, left.view(np.uint64), out=shifted)
+        untold = ~told
+        some_untold = any_of(untold)
+        if some_untold:
+            np.putmask(shifted, untold, _ALL_WORDS)
+        np.bitwise_and(possible, shifted, out=possible)
+        moved: Mask = np.equal(possible, 0)
+        if some_untold:
+            moved &= told
+        np.putmask(self._base, moved, base)
+        np.putmask(possible, moved, words)
         if len(self._plain):
+            told = told.copy()
             moved[self._plain] = changed[self._plain]
             told[self._plain] = within[self._plain]
         return moved, told
@@ -192,14 +215,14 @@ class TouchedPads(NamedTuple):
         calm: bool[k], triangles of boards on which nothing is touched.
         elsewhere: bool[k], triangles of boards on which another triangle is touched.
         calm_pads: bool[k, 1], the same as `calm`.
-        pace: int[k, 12], how many repeats of a pad count as one.
+        weight: float64[k, 12], what a repeat of a pad counts.
     """
 
     key: bytes
     calm: Mask
     elsewhere: Mask
     calm_pads: Mask
-    pace: NDArray[np.int64]
+    weight: Floats
 
     @classmethod
     def of(cls, touched: Mask, key: bytes, boards: int) -> "TouchedPads":
@@ -208,10 +231,11 @@ class TouchedPads(NamedTuple):
         triangles = of_triangles.shape[1]
         calm = np.repeat(of_boards == 0, triangles)
         # A touch that only the pad itself feels does not count: the pad may be stuck there.
-        pace = np.where(np.repeat(of_boards, triangles)[:, None] > touched, TOUCHED_PACE, 1)
+        slow = np.repeat(of_boards, triangles)[:, None] > touched
+        weight = np.where(slow, 1.0 / TOUCHED_PACE, 1.0)
         # A chip that died can look touched itself; only a touch on other triangles counts.
         elsewhere = (of_boards > of_triangles).ravel()
-        return cls(key, calm, elsewhere, calm[:, None], pace)
+        return cls(key, calm, elsewhere, calm[:, None], weight)
 
 
 class StuckPads:
@@ -237,7 +261,8 @@ class StuckPads:
         share, period_s = share[:, None], period_s[:, None]
         self._repeats = repeats
         self._boards = boards
-        self._begun = np.ceil(BEGUN / share)
+        self._begun = np.broadcast_to(np.ceil(BEGUN / share), shape).copy()
+        self._before = self._begun - 1
         self._forget = np.minimum(1.0, STEP_SAMPLES * period_s / MEMORY_S)
         resting = share * rate_in_run(repeats.own_noise(noise_units))
         most = np.where(repeats.shifted, MOST_RATE, RESTING_MARGIN * resting)
@@ -247,7 +272,7 @@ class StuckPads:
         self._run = np.zeros(shape)
         self._to_show = np.zeros(shape, np.int64)
         self._new_seen = np.zeros(shape)
-        self._new_moved = np.zeros(shape, np.int64)
+        self._new_moved = np.zeros(shape, np.int16)
         self._samples = np.zeros(boards, np.int64)
         self.stuck: Mask = np.zeros(shape, np.bool_)
         self.any_stuck = False
@@ -276,16 +301,22 @@ class StuckPads:
         moved, told = self._repeats.step(raw, changed, within)
         run = self._run
         # A run counts when it ends: a run without an end may not be chance.
-        ended = moved & (run >= self._begun)
-        more: Floats | Mask = told
+        ended = run >= self._begun
+        ended &= moved
         if felt is not None:
             ended &= felt.calm_pads
-            more = told / felt.pace
         if any_of(ended):
-            np.add(self._new_seen, run - (self._begun - 1), out=self._new_seen, where=ended)
+            gained = run - self._before
+            gained *= ended
+            self._new_seen += gained
             self._new_moved += ended
-        run += more
-        np.copyto(run, 0.0, where=moved)
+        if felt is not None:
+            run += told * felt.weight
+        elif b"\0" in told.tobytes():
+            run += told.astype(np.float64)
+        else:
+            run += 1.0
+        np.putmask(run, moved, 0.0)
         self._samples += 1 if came is None else came
         if int(np.maximum.reduce(self._samples)) >= STEP_SAMPLES:
             self._learn(unproven)
