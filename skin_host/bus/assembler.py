@@ -6,9 +6,9 @@ the age of the sweep's first frame starts a new one. A sweep is returned as soon
 triangle is complete. A triangle that has been missing for a while is no longer awaited, so that it
 causes no delay, until it sends again.
 
-A board usually sends its frames in the same order. Once that order is known, a run of frames in it
-is recognised by one comparison of bytes and copied as a whole; all other frames are taken one by
-one, with the same result.
+A board usually sends its frames in the same order. Once that order is known, a sweep or a run of
+frames in it is recognised by one comparison of bytes and copied as a whole; all other frames are
+taken one by one, with the same result.
 """
 
 from collections import Counter
@@ -217,6 +217,8 @@ class Assembler:
         # For identifier << 8 | header byte of each frame that a configured triangle may send: the
         # board, the place among its values, and the bit in its masks.
         self._slots: dict[int, tuple[_BoardState, int, int]] = {}
+        #: By the head of the frame with which they usually begin a sweep: boards of known order.
+        self._first: dict[bytes, _BoardState] = {}
         for index, board in boards:
             period_ns = board.settings.period_ms * 1_000_000
             wanted = 0
@@ -251,6 +253,13 @@ class Assembler:
         rising = batch.rising
         at = 0
         while at < n:
+            if rising:
+                known = self._first.get(heads[at * HEAD_BYTES : (at + 1) * HEAD_BYTES])
+                if known is not None:
+                    taken = self._take_sweep(known, records, heads, at, sweeps)
+                    if taken:
+                        at += taken
+                        continue
             left = records.form.iter_unpack(records.octets[at:].data)
             for seconds, nanoseconds, identifier, dlc, header, payload in left:
                 at += 1
@@ -371,6 +380,49 @@ class Assembler:
         elif state.awaited == state.wanted:
             state.came = []
 
+    def _take_sweep(
+        self, state: _BoardState, records: Records, heads: bytes, at: int, sweeps: list[Sweep]
+    ) -> int:
+        """Take a whole sweep that begins at `at` in the board's order; return its frames' number.
+
+        It is taken if the sweep before was whole, too, and no frame would need a closer look alone.
+        """
+        order = state.order
+        if (
+            order is None
+            or state.missing
+            or state.sent != state.awaited
+            or order.missing[0] != state.awaited
+            or not heads.startswith(order.heads, at * HEAD_BYTES)
+        ):
+            return 0
+        n = len(order.places)
+        size, unpack_from = records.form.size, records.form.unpack_from
+        frames = records.octets.data
+        seconds, nanoseconds, *_ = unpack_from(frames, at * size)
+        first_ns = seconds * NS_PER_S + nanoseconds
+        seconds, nanoseconds, _, _, _, payload = unpack_from(frames, (at + n - 1) * size)
+        last_ns = seconds * NS_PER_S + nanoseconds
+        if (
+            last_ns - first_ns > min(state.pause_ns, state.close_ns)
+            or 0 < 2 * (first_ns - state.sent_first_ns) < state.period_ns
+            or state.last_place == order.places[0]
+        ):
+            return 0
+        data = records.octets[at : at + n, records.head + HEAD_BYTES : size]
+        if order.rows is None and n == 2 * TRIANGLES:
+            values = data.copy()
+        else:
+            values = np.zeros((2 * TRIANGLES, _PAYLOAD), np.uint8)
+            values[slice(n) if order.rows is None else order.rows] = data
+        state.values[order.places[-1]] = payload
+        state.last_place = order.places[-1]
+        state.first_ns = first_ns
+        state.last_ns = last_ns
+        state.stray = 0
+        self._close(state, sweeps, values)
+        return n
+
     def _take_run(
         self, state: _BoardState, records: Records, heads: bytes, at: int, sweeps: list[Sweep]
     ) -> int:
@@ -490,8 +542,7 @@ class Assembler:
         state.sent_last_ns = state.last_ns
         state.missing = 0
 
-    @staticmethod
-    def _learn_order(state: _BoardState, came: list[tuple[bytes, int, int]]) -> None:
+    def _learn_order(self, state: _BoardState, came: list[tuple[bytes, int, int]]) -> None:
         """Note the order of a complete sweep, if its frames are of full length."""
         state.came = None
         heads, places, missing = zip(*came, strict=True)
@@ -500,6 +551,7 @@ class Assembler:
             return
         rows = None if places == tuple(range(len(places))) else np.array(places, np.intp)
         state.order = _Order(b"".join(heads), list(places), rows, [*missing, 0])
+        self._first[heads[0]] = state
 
     @staticmethod
     def _note_absent(state: _BoardState, present: int) -> None:
