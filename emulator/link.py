@@ -69,6 +69,8 @@ class BoardLink:
                 return
             data_frame = not (message.is_remote_frame or message.is_error_frame or message.is_fd)
             standard = data_frame and not message.is_extended_id
+            # By multicast anybody may send numbers of other types.
+            standard = standard and isinstance(message.arbitration_id, int)
             if standard and message.arbitration_id >> 4 in _COMMANDS:
                 yield message.arbitration_id, bytes(message.data)
 

@@ -15,6 +15,7 @@ from tests.support.broker import Mosquitto
 from tests.support.fault_bench import FaultBench
 from tests.support.stack import configuration, stack, subscriber  # noqa: F401  (fixtures for all)
 from tests.support.vcan import Vcan
+from tests.support.watchdog import watchdog  # noqa: F401  (fixture for all)
 
 _numbers = itertools.count()
 

@@ -22,6 +22,8 @@ CAPACITY = 1024
 #: A time stamp farther from now than this is an uptime or a counter, not a time of day.
 _PLAUSIBLE_S = 3600.0
 MULTICAST = "udp_multicast"
+#: Stands for a frame that the adapter's library could not read.
+_UNREADABLE = can.Message()
 #: Options of Linux sockets (in.h, in6.h) that Python does not name.
 IP_MULTICAST_ALL = 49
 IPV6_MULTICAST_ALL = 29
@@ -39,9 +41,9 @@ def identifier(message: can.Message) -> int:
     """Return a message's identifier with SocketCAN's flags."""
     return (
         message.arbitration_id
-        | message.is_extended_id * EXTENDED_FLAG
-        | message.is_remote_frame * REMOTE_FLAG
-        | message.is_error_frame * ERROR_FLAG
+        | bool(message.is_extended_id) * EXTENDED_FLAG
+        | bool(message.is_remote_frame) * REMOTE_FLAG
+        | bool(message.is_error_frame) * ERROR_FLAG
     )
 
 
@@ -74,12 +76,11 @@ class AdapterPort(Port):
         else:
             try:
                 for _ in range(CAPACITY):
-                    message = self._bus.recv(0)
+                    message = self._receive(self._bus)
                     if message is None:
                         break
-                    if self._wanted(message):
-                        self._put(n, message)
-                        errors |= message.is_error_frame
+                    if self._put(n, message):
+                        errors |= bool(message.is_error_frame)
                         n += 1
             except (can.CanError, OSError) as error:
                 self._note_failure(error)
@@ -87,6 +88,8 @@ class AdapterPort(Port):
         batch = FrameBatch(self._id[:n], self._dlc[:n], self._data[:n], self._t_ns[:n])
         if errors:
             self._note_errors(batch)
+        elif n and self.state is LinkState.BUS_OFF:
+            self._enter(LinkState.UP)  # it receives
         if self.state is not self._logged_state:
             self._log_state()
         return batch
@@ -96,6 +99,17 @@ class AdapterPort(Port):
         if self._opener is not None:
             self._opener.close()
             self._opener = None
+
+    def _receive(self, bus: can.BusABC) -> can.Message | None:
+        """Return the next frame, `_UNREADABLE` in place of a damaged one, or None."""
+        try:
+            return bus.recv(0)
+        except can.CanOperationError as error:
+            # Everybody in the network may send datagrams. What is in them says nothing about the
+            # socket, whose own failures are caused by an OSError.
+            if self._settings.interface != MULTICAST or isinstance(error.__cause__, OSError):
+                raise
+            return _UNREADABLE
 
     def _wanted(self, message: can.Message) -> bool:
         # python-can's own filters are not used: with a filter, `recv(0)` returns None for a frame
@@ -108,15 +122,24 @@ class AdapterPort(Port):
             or (not message.is_extended_id and message.arbitration_id >> 8 in SKIN_CLASSES)
         )
 
-    def _put(self, row: int, message: can.Message) -> None:
-        self._id[row] = identifier(message)
-        self._dlc[row] = message.dlc
-        self._data[row, : len(message.data)] = message.data
+    def _put(self, row: int, message: can.Message) -> bool:
+        """Write a frame into a row of the batch; return whether it is wanted and readable."""
+        try:
+            if message is _UNREADABLE or not self._wanted(message):
+                self.counters.damaged += message is _UNREADABLE
+                return False
+            self._id[row] = identifier(message)
+            self._dlc[row] = message.dlc
+            self._data[row, : len(message.data)] = message.data
+        except (TypeError, ValueError, OverflowError):  # numbers of other types, out of range
+            self.counters.damaged += 1
+            return False
         now_s = self._clock.now_ns() * 1e-9
         stamp_s = message.timestamp
-        if abs(stamp_s - now_s) > _PLAUSIBLE_S:
+        if not abs(stamp_s - now_s) <= _PLAUSIBLE_S:
             stamp_s = now_s
         self._t_ns[row] = nanoseconds(stamp_s)
+        return True
 
     def _note_failure(self, error: Exception) -> None:
         try:

@@ -76,12 +76,14 @@ class PortCounters:
     Attributes:
         frames: frames read, error frames included.
         dropped: frames lost because the socket's buffer was full (counted by the kernel).
+        damaged: frames that could not be read, and are left out.
         controller_overflows: how often the controller lost frames; it does not report how many.
         buffer_bytes: size of the socket's buffer that was granted, 0 without a socket.
     """
 
     frames: int = 0
     dropped: int = 0
+    damaged: int = 0
     controller_overflows: int = 0
     error_frames: int = 0
     bus_offs: int = 0

@@ -164,7 +164,7 @@ def _bus(bus: BusHealth) -> Iterator[Fault]:
         yield Fault(
             "bus_bit_errors",
             name,
-            f"bus {name}: damaged frames ({recent['wrong']} with a wrong header, "
+            f"bus {name}: damaged frames ({recent['wrong']} with a wrong header or unreadable, "
             f"{recent['spikes']} single bytes off); suspect a gateway or an adapter",
         )
     if recent["error_frames"] and state == "up":

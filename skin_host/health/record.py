@@ -12,8 +12,8 @@ class LastSecond(TypedDict):
     """What a bus has gained in about the last second.
 
     `load` and `other_load` are shares of the bus: of all frames, and of the frames of other
-    devices. The others are counts; `wrong` are frames with a wrong header or too few bytes,
-    `spikes` single bytes that were off for one sweep.
+    devices. The others are counts; `wrong` are frames with a wrong header, too few bytes, or
+    unreadable; `spikes` single bytes that were off for one sweep.
     """
 
     frames_hz: int

@@ -173,11 +173,12 @@ class Watch:
 
     def _totals(self, bus: str, port: Port | None) -> dict[str, int]:
         counters = self._engine.assemblers[bus].counters
+        damaged = 0 if port is None else port.counters.damaged
         return {
             "frames": counters.frames,
             "sweeps": counters.sweeps,
             "other": counters.other,
-            "wrong": counters.wrong_header + counters.short,
+            "wrong": counters.wrong_header + counters.short + damaged,
             "halves": counters.halves,
             "missed": counters.missed,
             "unknown": counters.unknown_board + counters.unknown_triangle,

@@ -5,18 +5,13 @@ answers as before, and few lines in the log, none of them a traceback or of some
 """
 
 import json
-import os
 import socket
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
-from itertools import pairwise
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import paho.mqtt.client as mqtt
-import pytest
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
@@ -24,49 +19,13 @@ from tests.support.broker import Mosquitto
 from tests.support.stack import Stack, wait_for
 from tests.support.subscriber import Subscriber
 from tests.support.waiting import PATIENCE_S
+from tests.support.watchdog import Watchdog, computed_s, memory_kb
 
 NODE = "skin/demo/nodes/main"
 GROWTH_KB = 20_000
 #: Of the daemon's own computing: a busy machine only makes it wait.
 GAP_S = 0.4
 LOG_BYTES = 20_000
-
-
-class Watchdog:
-    """What systemd would see: when the daemon says that it works, in its own computing time."""
-
-    def __init__(self, path: Path) -> None:
-        self.pid: int | None = None
-        self.fed_s: list[float] = []
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self._socket.bind(str(path))
-        self._thread = threading.Thread(target=self._listen, daemon=True)
-        self._thread.start()
-
-    def _listen(self) -> None:
-        # `shutdown` ends the wait with an empty datagram.
-        while said := self._socket.recv(4096):
-            if b"WATCHDOG=1" in said:
-                self.fed_s.append(computed_s(self.pid))
-
-    def close(self) -> None:
-        """Stop listening."""
-        self._socket.shutdown(socket.SHUT_RDWR)
-        self._thread.join()
-        self._socket.close()
-
-    def longest_gap_s(self, since_s: float) -> float:
-        now_s = computed_s(self.pid)
-        times_s = [since_s, *(at_s for at_s in self.fed_s if at_s >= since_s), now_s]
-        return max(b - a for a, b in pairwise(times_s))
-
-
-def computed_s(pid: int | None) -> float:
-    """Processor time of a process so far, 0 before it is known."""
-    if pid is None:
-        return 0.0
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 class Attacker:
@@ -157,22 +116,6 @@ ATTACKS: list[Callable[[Attacker], None]] = [
     poisoned,
     deaf,
 ]
-
-
-@pytest.fixture
-def watchdog(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Watchdog]:
-    path = tmp_path / "notify"
-    made = Watchdog(path)
-    monkeypatch.setenv("NOTIFY_SOCKET", str(path))
-    monkeypatch.setenv("WATCHDOG_USEC", "400000")
-    yield made
-    made.close()
-
-
-def memory_kb(pid: int) -> int:
-    status = Path(f"/proc/{pid}/status").read_text()
-    (line,) = [line for line in status.splitlines() if line.startswith("VmRSS")]
-    return int(line.split()[1])
 
 
 def test_whoever_is_on_the_network_stops_nothing(

@@ -96,6 +96,24 @@ def test_time_stamps_that_count_from_power_on_are_replaced_by_the_time(virtual):
     assert all(abs(int(t) - now_ns) < 10**9 for t in port.read().t_ns)
 
 
+def test_a_time_stamp_that_is_no_number_is_replaced_by_the_time(virtual):
+    port, _ = virtual
+    sender = can.Bus(interface="virtual", channel=port.channel, preserve_timestamps=True)
+    sender.send(message(0x410, timestamp=float("nan")))
+    sender.shutdown()
+    assert abs(int(port.read().t_ns[0]) - time.time_ns()) < 10**9
+
+
+def test_a_bus_that_receives_is_not_off(virtual):
+    port, other = virtual
+    other.send(message(0x040, bytes(8), is_error_frame=True))
+    port.read()
+    assert port.state is LinkState.BUS_OFF
+    other.send(message(0x410))
+    port.read()
+    assert port.state is LinkState.UP
+
+
 def test_microseconds_survive_pythons_floats():
     for microseconds in range(0, 1_000_000, 997):
         text = f"1700000000.{microseconds:06d}"
