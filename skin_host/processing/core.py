@@ -31,6 +31,9 @@ from skin_host.processing.validity import Validity
 #: A calibration takes at least this many samples of each part, even if its boards are slow: the
 #: 95th percentile of fewer would be the largest.
 FEWEST_SAMPLES = 20
+#: A longer interval between two samples of a calibration does not count for its time: nothing was
+#: received, or the clock was set.
+LONGEST_INTERVAL_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,8 +83,10 @@ class Output(NamedTuple):
 class _CalibrationRun:
     calibrator: Calibrator
     duration_ns: int
-    since_ns: int | None = None
-    last_ns: int = 0
+    #: Time of the newest sample; None before the first.
+    last_ns: int | None = None
+    #: The sum of the intervals between samples: a clock that is set adds nothing.
+    passed_ns: int = 0
     #: By part, for the parts that have sent any.
     samples: dict[int, int] = field(default_factory=dict)
 
@@ -248,9 +253,9 @@ class Engine:
     def calibration_progress(self) -> float:
         """Share of the wanted time, and of the fewest samples, that has been collected, 0 to 1."""
         run = self._run
-        if run is None or run.since_ns is None:
+        if run is None or run.last_ns is None:
             return 0.0
-        time_share = (run.last_ns - run.since_ns) / run.duration_ns
+        time_share = run.passed_ns / run.duration_ns
         return min(1.0, time_share, min(run.samples.values()) / FEWEST_SAMPLES)
 
     def end_calibration(self, time: str) -> Calibration:
@@ -466,11 +471,14 @@ class Engine:
     def _collect(run: _CalibrationRun, sample: PartSample) -> None:
         if not sample.received.any():
             return
-        if run.since_ns is None:
-            run.since_ns = sample.t_ns
+        interval_ns = 0 if run.last_ns is None else sample.t_ns - run.last_ns
+        if 0 < interval_ns <= LONGEST_INTERVAL_NS:
+            run.passed_ns += interval_ns
+        # Samples of several parts come in any order, by much less.
+        if run.last_ns is None or interval_ns > 0 or interval_ns < -LONGEST_INTERVAL_NS:
+            run.last_ns = sample.t_ns
         samples = run.samples.setdefault(sample.part, 0)
-        in_time = 0 <= sample.t_ns - run.since_ns <= run.duration_ns
+        in_time = run.passed_ns <= run.duration_ns
         if in_time or samples < FEWEST_SAMPLES:
             run.calibrator.add(sample.part, sample.raw, sample.received, sample.t_ns)
             run.samples[sample.part] += 1
-        run.last_ns = max(run.last_ns, sample.t_ns)

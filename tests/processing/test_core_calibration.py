@@ -1,34 +1,60 @@
 """How long a calibration looks: its time, and enough samples however slow the boards are."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from skin_host.bus.wire import FrameBatch, encode_sweep
 from skin_host.config.settings import load
 from skin_host.layout import build_layout
+from skin_host.processing.calibration import Verdict
 from skin_host.processing.core import FEWEST_SAMPLES, Engine
 from tests.support.stack import ROOT
 
 CONFIG = ROOT / "config" / "demo.toml"
 
 
-@pytest.mark.parametrize(("period_s", "sweeps"), [(0.05, 41), (1.0, FEWEST_SAMPLES)])
-def test_two_seconds_are_enough_for_quick_boards_only(period_s: float, sweeps: int) -> None:
-    settings = load(CONFIG)
-    layout = build_layout(settings, CONFIG.parent)
-    hand = layout.boards[0]
-    engine = Engine(settings, layout, [layout.parts.index(layout.part("left_hand"))])
-    engine.begin_calibration(2.0)
+def sweeps_taken(engine: Engine, time_s: Callable[[int], float]) -> int:
+    """How many sweeps a calibration takes, of which number `i` comes at `time_s(i)`."""
+    hand = engine.layout.boards[0]
     triangles = np.array(hand.triangles)
     rng = np.random.default_rng(1)
     status = np.zeros(len(triangles), np.uint16)
+    engine.begin_calibration(2.0)
     sent = 0
     while engine.calibration_progress() < 1.0:
         values = rng.integers(238, 242, (len(triangles), 12)).astype(np.uint8)
         ids, data = encode_sweep(hand.settings.address, triangles, values, status)
-        t_ns = round(1e9 * (1.0 + sent * period_s))
+        t_ns = round(1e9 * time_s(sent))
         frames = [(int(i), bytes(d), t_ns) for i, d in zip(ids, data, strict=True)]
         engine.feed(hand.settings.bus, FrameBatch.of(frames))
         sent += 1
         assert sent < 100
-    assert sent == sweeps
+    return sent
+
+
+@pytest.fixture
+def engine() -> Engine:
+    settings = load(CONFIG)
+    layout = build_layout(settings, CONFIG.parent)
+    return Engine(settings, layout, [layout.parts.index(layout.part("left_hand"))])
+
+
+@pytest.mark.parametrize(("period_s", "sweeps"), [(0.05, 41), (1.0, FEWEST_SAMPLES)])
+def test_two_seconds_are_enough_for_quick_boards_only(
+    engine: Engine, period_s: float, sweeps: int
+) -> None:
+    assert sweeps_taken(engine, lambda number: 1.0 + number * period_s) == sweeps
+
+
+@pytest.mark.parametrize("step_s", [3600.0, 1.5, -1.5, -3600.0])
+def test_a_clock_that_is_set_shortens_no_calibration(engine: Engine, step_s: float) -> None:
+    def time_s(number: int) -> float:
+        return 10_000.0 + number * 0.05 + step_s * (number >= 10)
+
+    # One interval more, of which nobody knows how long it was.
+    assert sweeps_taken(engine, time_s) == 42
+    verdict = engine.end_calibration("2026-01-01T00:00:00+00:00").verdict
+    mine = engine.taxels_of([0])
+    assert (verdict[mine] != Verdict.TOO_FEW).all()
