@@ -93,7 +93,7 @@ def unfit(
     if length > limit:
         return Unfit(f"a message of {length} bytes; wanted at most {limit}", mid, True)
     topic = packet[2:name_end]
-    if any(byte in topic for byte in b"+#\0") or not _is_text(topic):
+    if not topic or any(byte in topic for byte in b"+#\0") or not _is_text(topic):
         return Unfit("a message with an invalid topic", mid, True)
     if v5:
         why = _properties(packet, name_end + (2 if has_mid else 0))

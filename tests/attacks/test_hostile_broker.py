@@ -75,3 +75,40 @@ async def test_a_hostile_broker_is_left_and_tried_again_with_few_words(
     errors = [r for r in caplog.records if r.exc_info is not None]
     assert errors == []
     assert len([r for r in caplog.records if r.levelno >= logging.WARNING]) < 40
+
+
+@pytest.mark.parametrize("qos", [0, 1])
+async def test_a_message_without_a_topic_or_with_a_number_for_it_is_left_out(
+    qos: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    mid = b"\0\1" * qos
+    # No property; a topic alias of 0, of 1, of 65535, none of which was ever allowed.
+    properties = [b"\0", b"\3\x23\0\0", b"\3\x23\0\1", b"\3\x23\xff\xff"]
+    bodies = [b"\0\0" + mid + one + b"{}" for one in properties] * 100
+    connections = answered = 0
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        nonlocal connections, answered
+        connections += 1
+        try:
+            await reader.readuntil(b"MQTT")
+            writer.write(CONNACK_5)
+            for body in bodies:
+                writer.write(bytes([0x30 | qos << 1, len(body)]) + body)
+            await writer.drain()
+            await reader.readuntil(b"online")
+            answered += 1
+            await reader.read()
+        except (OSError, asyncio.IncompleteReadError):
+            pass
+        finally:
+            writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    port = server.sockets[0].getsockname()[1]
+    async with Publisher(Mqtt(host="127.0.0.1", port=port), "robot", drain_s=0.0):
+        await until(lambda: connections > 1 or answered)
+        assert (connections, answered) == (1, 1)
+    server.close()
+    said = [r for r in caplog.records if "an invalid topic was not read" in r.getMessage()]
+    assert len(said) == 1

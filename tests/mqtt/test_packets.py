@@ -61,7 +61,7 @@ def test_a_message_with_too_many_properties_is_acknowledged_and_not_decoded(
     assert found.mid == 0x1234
 
 
-@pytest.mark.parametrize("topic", [b"\xff\xfe", b"a/+", b"a/#", b"a\0b"])
+@pytest.mark.parametrize("topic", [b"", b"\xff\xfe", b"a/+", b"a/#", b"a\0b"])
 def test_a_message_whose_topic_is_none_is_not_decoded(topic: bytes) -> None:
     assert why(publish(b"", topic)) == "a message with an invalid topic"
 
