@@ -14,6 +14,7 @@ from skin_host.mqtt.info import PartInfo, TriangleInfo
 from skin_host.mqtt.messages import TouchMessage
 from skin_host.recording.export import HealthLine, PartSeries, Series, export
 from skin_host.recording.export.scene import ARROW_M_PER_N, POINT, RecordedScene
+from tests.support.rerun import chunks
 
 N, TAXELS = 5, 12
 START_NS = 1_700_000_000_000_000_000
@@ -115,15 +116,6 @@ def test_an_arrow_turns_to_where_a_force_points() -> None:
         x, y, z, w = _turned_from_x(np.array(wanted))
         turned = [1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)]
         np.testing.assert_allclose(turned, np.array(wanted) / np.linalg.norm(wanted), atol=1e-9)
-
-
-def chunks(reader: Any) -> dict[str, set[str]]:
-    """The columns of each entity that a reader of Rerun finds."""
-    found: dict[str, set[str]] = {}
-    for chunk in reader.stream():
-        names = chunk.to_record_batch().schema.names
-        found.setdefault(chunk.entity_path, set()).update(names)
-    return found
 
 
 def test_rerun_reads_what_was_exported(series: Series, tmp_path: Path) -> None:

@@ -2,6 +2,10 @@
 
 import asyncio
 import json
+import os
+import signal
+import sys
+import warnings
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
@@ -19,7 +23,9 @@ from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.recording.export import live
-from tests.support.broker import Mosquitto
+from tests.support.broker import Mosquitto, free_port
+from tests.support.rerun import chunks
+from tests.support.waiting import until
 
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
 PATIENCE_S = 60.0
@@ -108,7 +114,15 @@ async def test_foxglove_s_client_receives_points_contacts_and_transforms(
     assert names == {"left_hand", "left_forearm"}
 
 
-async def test_rerun_s_viewer_is_served_on_loopback_alone(mosquitto: Mosquitto) -> None:
+def listening() -> set[str]:
+    """Addresses on which programs of this machine listen, as the kernel writes them."""
+    lines = Path("/proc/net/tcp").read_text().splitlines()[1:]
+    return {line.split()[1] for line in lines if line.split()[3] == "0A"}
+
+
+async def test_rerun_s_viewer_is_served_on_loopback_alone_and_ends_with_us(
+    mosquitto: Mosquitto,
+) -> None:
     pytest.importorskip("rerun")
     async with shown(mosquitto, live.rerun("127.0.0.1", 0)) as url:
         page, _, feed = url.partition("?url=")
@@ -118,12 +132,36 @@ async def test_rerun_s_viewer_is_served_on_loopback_alone(mosquitto: Mosquitto) 
         writer.write(b"GET / HTTP/1.0\r\nHost: localhost\r\n\r\n")
         assert b"200" in await reader.readline()
         writer.close()
-        listening = [
-            line.split()[1]
-            for line in Path("/proc/net/tcp").read_text().splitlines()[1:]  # noqa: ASYNC240
-            if line.split()[3] == "0A"
-        ]
         ports = (int(port), int(feed.split(":")[2].partition("/")[0]))
-        for wanted in ports:
-            assert f"0100007F:{wanted:04X}" in listening
-            assert f"00000000:{wanted:04X}" not in listening
+        ours = {f"0100007F:{wanted:04X}" for wanted in ports}
+        assert ours <= listening()
+        assert not {f"00000000:{wanted:04X}" for wanted in ports} & listening()
+    await until(lambda: not ours & listening())
+
+
+async def test_rerun_s_own_client_receives_points_contacts_and_transforms(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    pytest.importorskip("rerun")
+    from rerun.chunk import RrdReader
+
+    received = tmp_path / "received.rrd"
+    async with shown(mosquitto, live.rerun("127.0.0.1", 0)) as url:
+        client = await asyncio.create_subprocess_exec(
+            *(Path(sys.executable).with_name("rerun"), url.partition("?url=")[2]),
+            *("--save", received, "--bind", "127.0.0.1", "--port", str(free_port())),
+            env=os.environ | {"RERUN_ANALYTICS": "0"},
+            stderr=asyncio.subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        # Some tens of frames and touches: the first ones come with it.
+        await until(lambda: received.exists() and received.stat().st_size > 200_000)
+        os.killpg(client.pid, signal.SIGINT)
+        await client.wait()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a file that was ended by a signal has no index
+        seen = chunks(RrdReader(received))
+    assert {"time", "Points3D:positions", "Points3D:colors"} <= seen["/robot/left_hand/taxels"]
+    assert {"Arrows3D:vectors", "Arrows3D:labels"} <= seen["/robot/left_hand/contacts"]
+    assert "Transform3D:translation" in seen["/robot/left_forearm"]
+    assert "Scalars:scalars" in seen["/kpa/left_hand"]

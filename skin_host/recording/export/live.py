@@ -7,6 +7,7 @@ import asyncio
 import contextlib
 import os
 import secrets
+import signal
 import socket
 import sys
 from collections.abc import AsyncIterator, Callable
@@ -173,7 +174,7 @@ async def rerun(host: str, port: int | None) -> AsyncIterator[tuple[str, Show]]:
     """Serve Rerun's viewer to browsers.
 
     Its command line serves, bound to `host`, as the functions of its SDK that serve bind to all
-    addresses; its analytics are off.
+    addresses. Its analytics are off; those of the viewer in the browser cannot be turned off.
 
     Raises:
         SkinError: its server does not start, or the extra `rerun` is not installed.
@@ -188,6 +189,8 @@ async def rerun(host: str, port: int | None) -> AsyncIterator[tuple[str, Show]]:
         stdin=asyncio.subprocess.DEVNULL,
         stdout=asyncio.subprocess.DEVNULL,
         stderr=asyncio.subprocess.DEVNULL,
+        # Its script waits for the program proper and does not end it: signals go to both.
+        start_new_session=True,
     )
     stream = rr.RecordingStream("skin-host", recording_id=secrets.token_hex(8))
     try:
@@ -197,7 +200,7 @@ async def rerun(host: str, port: int | None) -> AsyncIterator[tuple[str, Show]]:
     finally:
         stream.disconnect()
         with contextlib.suppress(ProcessLookupError):
-            program.terminate()
+            os.killpg(program.pid, signal.SIGTERM)
         await program.wait()
 
 
