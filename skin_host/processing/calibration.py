@@ -47,12 +47,15 @@ JOINED = 4
 STEADY_UNITS = 1.5
 STEADY_ERRORS = 5.0
 #: ... most of the variance is that of joined blocks (for white noise a sixteenth, for conversions
-#: sent three times a sixth), ...
+#: sent three times a sixth), and so many standard deviations more than such noise gives by chance,
+#: ...
 BETWEEN_SHARE = 0.5
+SURE_DEVIATIONS = 6.0
 #: ... and they rise and fall once, or together with another taxel of the triangle.
 PRESS_SWITCHES = 2
 SHARED_CORRELATION = 0.8
-#: A taxel that rests this much nearer to pressure than its triangle and its part was pressed.
+#: A taxel that rests this much nearer to pressure than its triangle and its part was pressed, if
+#: its noise does not explain it.
 PRESSED_UNITS = 8.0
 #: Noise below this is rounding, from which the duration of noise cannot be measured.
 ROUNDING_VARIANCE = 0.1
@@ -213,7 +216,7 @@ class Calibrator:
         lasting = self._lasting(variance, received / some)
 
         course = self._course
-        touched = self._touched(variance)
+        touched = self._touched(variance, received / some)
         steady_noise = course.error * np.sqrt(course.length * samples / np.maximum(received, 1))
         # The lowest activation is the best estimate of the untouched one.
         baseline = np.where(touched, no_load - course.highest, baseline)
@@ -230,7 +233,7 @@ class Calibrator:
         verdict = np.full(len(samples), Verdict.OK, dtype=np.uint8)
         verdict[decides > NOISY_MARGINS * margin] = Verdict.NOISY
         verdict[cut_off] = Verdict.SATURATES
-        verdict[touched | self._pressed(baseline, samples > 0)] = Verdict.TOUCHED
+        verdict[touched | self._pressed(baseline, counts)] = Verdict.TOUCHED
         verdict[decides > USELESS_MARGINS * margin] = Verdict.TOO_NOISY
         verdict[ends > SATURATED_SHARE * samples] = Verdict.OUT_OF_RANGE
         verdict[(counts[:, 0] == samples) | (counts[:, 255] == samples)] = Verdict.STUCK
@@ -281,15 +284,23 @@ class Calibrator:
                 lasting[mine] = np.maximum(lasting[mine], common)
         return lasting
 
-    def _touched(self, variance: Floats) -> Mask:
+    def _touched(self, variance: Floats, repeats: Floats) -> Mask:
         """Return the taxels [n] that were touched for a part of the time.
 
         Not those that jump between levels: such noise has no course, or one that goes up and down
         more often than a press does and that no other pad shares.
+
+        Args:
+            variance: float64[n], of a measurement.
+            repeats: float64[n], samples a measurement.
         """
         course = self._course
         moved = course.highest - course.lowest > STEADY_UNITS + STEADY_ERRORS * course.error
-        moved &= course.joined_variance > BETWEEN_SHARE * variance
+        # Few blocks of few measurements differ by chance.
+        blocks = course.number // JOINED
+        chance = 1.0 + SURE_DEVIATIONS * np.sqrt(2.0 / np.maximum(blocks - 1, 1))
+        noise_share = repeats / (course.length * JOINED) * chance
+        moved &= course.joined_variance > np.maximum(BETWEEN_SHARE, noise_share) * variance
         pressed = moved & (course.switches <= PRESS_SWITCHES)
         unclear = moved & ~pressed
         for taxel in np.flatnonzero(unclear):
@@ -303,21 +314,31 @@ class Calibrator:
                 pressed[taxel] |= shared > SHARED_CORRELATION
         return pressed
 
-    def _pressed(self, baseline: Floats, known: Mask) -> Mask:
+    def _pressed(self, baseline: Floats, counts: NDArray[np.int64]) -> Mask:
         """Return the taxels [n] that were pressed all the time: they rest far from all other
         pads.
+
+        A board's zero is one reading of each pad, noise included. A noisy pad may thus rest as far
+        from the others as its own readings lie apart; only what is farther away was pressed.
+
+        Args:
+            baseline: float64[n], mean activations.
+            counts: int64[n, 256], how often each byte was measured.
         """
         layout = self._layout
+        seen = counts > 0
+        known = seen.any(axis=1) & (layout.pad_kind == PadKind.PRESSURE)
+        apart = 255 - np.argmax(seen[:, ::-1], axis=1) - np.argmax(seen, axis=1)
+        limit = np.maximum(PRESSED_UNITS, apart)
         found = np.zeros(len(baseline), np.bool_)
-        known = known & (layout.pad_kind == PadKind.PRESSURE)
         for triangle in np.unique(layout.triangle_of[known]):
             mine = known & (layout.triangle_of == triangle)
-            found[mine] = baseline[mine] - np.median(baseline[mine]) > PRESSED_UNITS
+            found[mine] = baseline[mine] - np.median(baseline[mine]) > limit[mine]
         for part in layout.parts:
             span = slice(part.start, part.stop)
             if known[span].any():
                 usual = np.median(baseline[span][known[span]])
-                found[span] &= baseline[span] - usual > PRESSED_UNITS
+                found[span] &= baseline[span] - usual > limit[span]
         return found
 
 

@@ -75,8 +75,9 @@ CALM_MEAN = 0.1
 NOISE_MEMORY_SAMPLES = 8
 #: A pad has jumped lately while that mean is above this: for some 25 samples.
 LATELY_MEAN = 0.01
-#: A spike is one sweep off by more than this many units, and this multiple of the noise. A spike
-#: of a pad that has jumped lately is a fault of the pad, not of the bus.
+#: A spike is one sweep off by more than this many units, and this multiple of the noise, and back
+#: where it was but for the noise: a press after a release ends elsewhere. A spike of a pad that has
+#: jumped lately is a fault of the pad, not of the bus.
 SPIKE_UNITS = 7.0
 SPIKE_SIGMAS = 8.0
 
@@ -306,7 +307,7 @@ class Liveness:
             return
         jump = far & (np.abs(self._step) > self._jump_units) & ((step ^ self._step) < 0)
         size = np.minimum(np.abs(step), np.abs(self._step))
-        spike = jump & (size > self._spike)
+        spike = jump & (size > self._spike) & (np.abs(step + self._step) <= self._jump_units)
         alone = np.count_nonzero(spike & (self._jumping < LATELY_MEAN), axis=1) == 1
         self.spikes += np.count_nonzero(alone.reshape(self._boards, -1), axis=1)
         np.copyto(self._step, step, where=compared[:, None])

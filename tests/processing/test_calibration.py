@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 
+from emulator.chips.noise import SampledNoise
 from skin_host.config.settings import Processing
 from skin_host.errors import CalibrationError
 from skin_host.evaluation.rig import flat_skin
@@ -181,6 +182,30 @@ def test_a_pad_that_rests_far_from_all_others_was_pressed_all_the_time():
     assert np.flatnonzero(found.verdict).tolist() == [7]
     assert found.verdict[7] == Verdict.TOUCHED
     assert found.usable[7]
+
+
+@pytest.mark.parametrize("seconds", [1.0, 2.0, 5.0])
+@pytest.mark.parametrize("period_s", [0.01, 0.02, 0.05])
+def test_noise_of_real_skin_is_no_press_however_the_zero_caught_it(seconds, period_s):
+    """A board's zero is one reading of each pad: a noisy pad may rest far from all others."""
+    for seed in range(3):
+        noise = SampledNoise(N // 12, seed)
+        zero = noise.at(0)
+        calibrator = Calibrator(LAYOUT)
+        for t_ns in range(10**9, round((1.0 + seconds) * 1e9), round(period_s * 1e9)):
+            raw = np.clip(np.rint(240.0 + noise.at(t_ns) - zero), 0, 255).astype(np.uint8)
+            calibrator.add(0, raw, PRESENT, t_ns)
+        found = calibrator.finish("abc", TIME)
+        rest = found.baseline - np.median(found.baseline)
+        assert not (found.verdict == Verdict.TOUCHED).any(), rest[found.verdict == Verdict.TOUCHED]
+        # It can tell: pads that are pressed all the time are still named.
+    assert rest.max() > calibration.PRESSED_UNITS
+
+
+def test_a_noisy_pad_that_was_pressed_all_the_time_is_named():
+    conversions = telegraph(np.random.default_rng(20), CONVERSIONS, 0.5, 1)
+    conversions[:, 7] -= 60.0
+    assert calibrated_as_sent(conversions, 0.04).verdict[7] == Verdict.TOUCHED
 
 
 def test_noise_beyond_use_has_no_vote():

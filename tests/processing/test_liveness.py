@@ -175,3 +175,15 @@ def test_a_press_before_a_gap_and_its_end_after_it_are_no_spike(gap: bool) -> No
             liveness.note_gap(0)
         liveness.step(raw, HERE, NO)
     assert liveness.spikes.sum() == (0 if gap else 1)
+
+
+def test_a_press_right_after_a_release_is_no_damaged_byte() -> None:
+    """Up and down within two sweeps, but not back to where it was."""
+    rng = np.random.default_rng(4)
+    centre = np.full((K, 12), 240.3)
+    liveness = calibrated(rng, 0.4, centre)
+    for below in (90, 90, 0, 12, 20):
+        raw = noisy_bytes(rng, 0.4, centre)
+        raw[1, 4] -= below
+        liveness.step(raw, HERE, NO)
+    assert liveness.spikes.sum() == 0
