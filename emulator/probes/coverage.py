@@ -1,8 +1,9 @@
 """Computes which pads the probes of a scene cover, for all probes and some steps at once.
 
 The pads within reach of a probe are found once and kept while it slides by less than
-`MARGIN_MM`. Where probes go in the next steps is mostly known, so that these steps are computed
-together; what then remains to be done in each of them costs hardly more than in a press.
+`MARGIN_MM`. Where probes go in the next steps is mostly known: straight on. So the steps between
+which each pad is covered are found together, and in each of them it only remains to look up how
+much of each pad a probe at this distance covers.
 """
 
 from collections.abc import Sequence
@@ -32,6 +33,10 @@ REACH_MM = 15.0
 MARGIN_MM = 3.0
 #: So many pads times steps are computed at once: more would not stay in the processor's cache.
 MOST_AT_ONCE = 1 << 13
+#: Probes that slide less than this in a step are taken to slide so much.
+LEAST_STEP_MM = 1e-9
+#: How far the shares that sliding discs cover may be from the exact ones.
+WORST_SHARE = 1e-5
 #: A pad of which less than this share is covered counts as not covered.
 LEAST_SHARE = 1e-6
 
@@ -73,7 +78,9 @@ class Coverage:
         self._place_mm = np.zeros((2, 0))
         self._taxel = self._contact = self._rows = np.zeros(0, np.intp)
         self._reach_mm = self._pad_radius_mm = self._pad_mm2 = np.zeros(0)
-        self._pads = self._taxel, self._contact, self._reach_mm
+        self._curves = LensCurves()
+        #: Of each of them, what `LensCurves.find` returns: filled when probes slide.
+        self._course = np.zeros((0, 0))
 
     def add(self, probe: Probe) -> None:
         """One more probe.
@@ -95,79 +102,138 @@ class Coverage:
 
     def footprint(self, numbers: Ints, offset_mm: Floats) -> Footprint:
         """What some probes [c] cover that have slid by `offset_mm` [c, 2] from their places."""
-        return self.footprints(numbers, offset_mm[None])[0]
+        self._find(numbers, offset_mm, np.zeros_like(offset_mm), 1)
+        if self._membrane_mm:
+            return self._with_membrane(offset_mm)
+        x_mm, y_mm = self._place_mm - offset_mm.T[:, self._contact]
+        # As `np.hypot`, which guards against numbers that no length has, at five times the cost.
+        distance_mm = np.sqrt(x_mm * x_mm + y_mm * y_mm)
+        rows = np.flatnonzero(distance_mm < self._reach_mm)
+        contact, radius_mm = self._contact[rows], self._pad_radius_mm[rows]
+        area_mm2 = lens_area_mm2(distance_mm[rows], radius_mm, self._edge_mm[contact])
+        rectangle = np.flatnonzero(self._is_rectangle[contact])
+        if len(rectangle):
+            along_mm = np.column_stack([x_mm, y_mm])[rows[rectangle]]
+            area_mm2[rectangle] = self._rectangle_mm2(rows[rectangle], along_mm)
+        covered = area_mm2 / self._pad_mm2[rows]
+        hit = covered > LEAST_SHARE
+        return self._footprints(rows[hit], covered[None, hit])[0]
 
-    def footprints(self, numbers: Ints, path_mm: Floats) -> list[Footprint]:
-        """What some probes [c] cover along their path [k, c, 2], offsets from their places.
+    def footprints(
+        self, numbers: Ints, offset_mm: Floats, step_mm: Floats, steps: int
+    ) -> list[Footprint]:
+        """What some probes [c] cover as they slide straight on.
+
+        What discs cover is right to `WORST_SHARE` of each pad.
+
+        Args:
+            numbers: of the probes.
+            offset_mm: [c, 2], how far they have slid from their places.
+            step_mm: [c, 2], how far each slides in a step.
+            steps: how many are wanted, the present one among them.
 
         Returns:
-            The footprints of the first steps of the path, which is straight: one at least.
+            The footprints of the first steps: one at least.
         """
-        path_mm = path_mm[: self._find(numbers, path_mm)]
+        steps = self._find(numbers, offset_mm, step_mm, steps)
         if self._membrane_mm:
-            return [self._with_membrane(path_mm[0])]
-        near = self._on_the_way(path_mm)
-        path_mm = path_mm[: max(1, MOST_AT_ONCE // max(1, len(near)))]
-        contact = self._contact[near]
-        along_mm = np.stack(
-            [self._place_mm[axis, near] - path_mm[:, :, axis][:, contact] for axis in (0, 1)]
-        )
-        area_mm2 = self._area_mm2(near, along_mm)
-        covered = area_mm2 / self._pad_mm2[near]
-        hit = covered > LEAST_SHARE
-        turns = np.flatnonzero((hit[1:] != hit[:-1]).any(axis=1)) + 1
+            return [self._with_membrane(offset_mm)]
+        rows, course, enter, leave, by_rectangle = self._on_the_way(offset_mm, step_mm, steps)
+        is_turn = np.zeros(steps + 1, bool)
+        is_turn[[0, -1]] = is_turn[enter] = is_turn[leave] = True
         found: list[Footprint] = []
-        for start, stop in pairwise([0, *turns.tolist(), len(hit)]):
-            columns = np.flatnonzero(hit[start])
-            rows = near[columns]
-            # The same pads as before are the same object, see `Footprint`.
-            if not np.array_equal(rows, self._rows):
-                self._rows = rows
-                self._pads = self._taxel[rows], self._contact[rows], np.ones(len(rows))
-            taxel, contact, ones = self._pads
-            weight = _shares(area_mm2[start:stop, columns], contact)
-            found += [
-                Footprint(taxel, contact, of_pad, ones, share, self._contact_mm2, self._no_edge)
-                for of_pad, share in zip(covered[start:stop, columns], weight, strict=True)
-            ]
+        for start, stop in pairwise(np.flatnonzero(is_turn).tolist()):
+            on = np.flatnonzero((enter <= start) & (leave >= stop))
+            covered = self._curves.shares(course[:, on], start, stop)
+            if len(by_rectangle):
+                flat = np.flatnonzero(self._is_rectangle[self._contact[rows[on]]])
+                covered[:, flat] = by_rectangle[start:stop, on[flat]]
+            found += self._footprints(rows[on], covered)
         return found
 
-    def _on_the_way(self, path_mm: Floats) -> Ints:
-        """Which of the pads near the probes their paths [k, c, 2] reach, and a few more."""
-        ends_mm = path_mm[[0, -1]]
-        middle_mm, half_mm = ends_mm.mean(axis=0), np.abs(ends_mm[1] - ends_mm[0]) / 2
-        distance_mm = _length_mm(*(self._place_mm - middle_mm.T[:, self._contact]))
-        away_mm = _length_mm(*half_mm.T)[self._contact]
-        return np.flatnonzero(distance_mm < self._reach_mm + away_mm)
+    def _footprints(self, rows: Ints, covered: Floats) -> list[Footprint]:
+        """Of some steps in which the same pads `rows` are covered, by so much [k, rows]."""
+        # The same pads as before are the same object, see `Footprint`.
+        if not np.array_equal(rows, self._rows):
+            self._rows = rows
+            self._pads = self._taxel[rows], self._contact[rows], np.ones(len(rows))
+            contact = self._pads[1]
+            is_first = np.append(True, contact[1:] != contact[:-1])[: len(contact)]
+            self._firsts, self._group = np.flatnonzero(is_first), np.cumsum(is_first) - 1
+        taxel, contact, ones = self._pads
+        size, no_edge = self._contact_mm2, self._no_edge
+        if len(self._firsts) == len(rows):
+            # Each contact is borne by one pad.
+            return [
+                Footprint(taxel, contact, of_pad, ones, ones, size, no_edge) for of_pad in covered
+            ]
+        weight = covered * self._pad_mm2[rows]
+        weight /= np.add.reduceat(weight, self._firsts, axis=1).take(self._group, axis=1)
+        return [
+            Footprint(taxel, contact, of_pad, ones, share, size, no_edge)
+            for of_pad, share in zip(covered, weight, strict=True)
+        ]
 
-    def _area_mm2(self, rows: Ints, along_mm: Floats) -> Floats:
-        """Area common to pads and probes, [k, rows], by where they are, x and y [2, k, rows]."""
+    def _on_the_way(
+        self, offset_mm: Floats, step_mm: Floats, steps: int
+    ) -> tuple[Ints, Floats, Ints, Ints, Floats]:
+        """Which of the pads near the probes are covered in some of the next steps.
+
+        Returns:
+            Their rows [m]; their courses [_COURSE, m]; the first step [m] in which each is
+            covered, and that after the last; and by how much rectangles cover them, [steps, m],
+            empty if there are no rectangles.
+        """
+        if not len(self._course):
+            flat = self._is_rectangle[self._contact]
+            self._course = self._curves.find(self._pad_radius_mm, self._edge_mm[self._contact])
+            reach_mm = np.where(flat, self._reach_mm, self._course[_REACH])
+            # Rectangles follow no curve: theirs are held at one node, and not used.
+            self._course[_SCALE:, flat] = 0.0
+            self._reach_mm2 = reach_mm * reach_mm
+        x_mm, y_mm = self._place_mm - offset_mm.T[:, self._contact]
+        step_x_mm, step_y_mm = step_mm.T[:, self._contact]
+        # The squared distance is that of now, and i times this, and i^2 times that.
+        now = x_mm * x_mm + y_mm * y_mm
+        towards = -2.0 * (x_mm * step_x_mm + y_mm * step_y_mm)
+        fast = np.maximum(step_x_mm * step_x_mm + step_y_mm * step_y_mm, LEAST_STEP_MM**2)
+        nearest = -0.5 * towards / fast
+        half = np.sqrt(np.maximum(nearest * nearest - (now - self._reach_mm2) / fast, 0.0))
+        enter = np.maximum(np.ceil(nearest - half), 0.0)
+        leave = np.minimum(np.floor(nearest + half) + 1.0, steps)
+        rows = np.flatnonzero((half > 0) & (enter < leave))
+        course = self._course[:, rows]
+        course[:_REACH] = now[rows], towards[rows], fast[rows]
+        course[:_REACH] *= course[_SCALE] ** 2
+        enter, leave = enter[rows].astype(np.intp), leave[rows].astype(np.intp)
+        by_rectangle = np.zeros((0, 0))
+        flat = np.flatnonzero(self._is_rectangle[self._contact[rows]])
+        if len(flat):
+            of_flat = rows[flat]
+            by_rectangle = np.zeros((steps, len(rows)))
+            for step in range(steps):
+                along_mm = np.column_stack([x_mm - step * step_x_mm, y_mm - step * step_y_mm])
+                area_mm2 = self._rectangle_mm2(of_flat, along_mm[of_flat])
+                by_rectangle[step, flat] = area_mm2 / self._pad_mm2[of_flat]
+            # Both are convex: there is no second time.
+            hit = by_rectangle[:, flat] > LEAST_SHARE
+            enter[flat] = np.where(hit.any(axis=0), hit.argmax(axis=0), steps)
+            leave[flat] = steps - hit[::-1].argmax(axis=0)
+        return rows, course, enter, leave, by_rectangle
+
+    def _rectangle_mm2(self, rows: Ints, along_mm: Floats) -> Floats:
+        """Area common to pads and rectangles, by where the pads are in the probes' axes [k, 2]."""
         contact = self._contact[rows]
-        radius_mm = self._pad_radius_mm[rows]
-        distance_mm = _length_mm(*along_mm)
-        rectangle = self._is_rectangle[contact]
-        if not rectangle.any():
-            return lens_area_mm2(distance_mm, radius_mm, self._edge_mm[contact])
-        area_mm2 = np.empty(distance_mm.shape)
-        disc = ~rectangle
-        area_mm2[:, disc] = lens_area_mm2(
-            distance_mm[:, disc], radius_mm[disc], self._edge_mm[contact[disc]]
+        return rectangle_area_mm2(
+            along_mm, self._pad_radius_mm[rows], self._size_mm[contact], self._turn[contact]
         )
-        contact, radius_mm = contact[rectangle], radius_mm[rectangle]
-        for step, of_step_mm in enumerate(np.moveaxis(along_mm[:, :, rectangle], 0, 2)):
-            area_mm2[step, rectangle] = rectangle_area_mm2(
-                of_step_mm, radius_mm, self._size_mm[contact], self._turn[contact]
-            )
-        return area_mm2
 
-    def _find(self, numbers: Ints, path_mm: Floats) -> int:
+    def _find(self, numbers: Ints, offset_mm: Floats, step_mm: Floats, steps: int) -> int:
         """Gather the pads near these probes where they are not known; for how many steps."""
-        ends_mm = path_mm[[0, -1]]
-        longest_mm = float(np.abs(ends_mm[1] - ends_mm[0]).max(initial=0.0))
-        steps = len(path_mm)
-        if longest_mm >= MARGIN_MM / 2:
-            steps = max(1, int(steps * MARGIN_MM / 2 / longest_mm))
-            ends_mm = path_mm[[0, steps - 1]]
+        longest_mm = float(np.abs(step_mm).max(initial=0.0))
+        if longest_mm * (steps - 1) >= MARGIN_MM / 2:
+            steps = max(1, int(MARGIN_MM / 2 / longest_mm))
+        ends_mm = np.stack([offset_mm, offset_mm + (steps - 1) * step_mm])
         same = self._gathered and np.array_equal(numbers, self._numbers)
         if same and np.abs(ends_mm - self._found_mm).max(initial=0.0) < MARGIN_MM / 2:
             return steps
@@ -193,7 +259,7 @@ class Coverage:
         return _Near(offset_mm.copy(), taxels[near], place_mm[near])
 
     def _gather(self, numbers: Ints, found: Sequence[_Near], *, same: bool) -> None:
-        self._rows = np.full(1, -1, np.intp)
+        self._rows, self._course = np.full(1, -1, np.intp), np.zeros((0, 0))
         shapes = [self._shapes[number] for number in numbers]
         none = np.zeros((0, 2))
         self._found_mm = np.array([near.offset_mm for near in found]).reshape(-1, 2)
@@ -244,17 +310,79 @@ class Coverage:
         )
 
 
-def _length_mm(x_mm: Floats, y_mm: Floats) -> Floats:
-    """As `np.hypot`, which guards against numbers that no length has, at five times the cost."""
-    length_mm: Floats = np.sqrt(x_mm * x_mm + y_mm * y_mm)
-    return length_mm
+#: Numbers of a course: three of the squared distance by step; at which distance the pad is
+#: covered first, nodes of the curve per mm, at which node it begins, and from which scaled
+#: distance; the latter are what `LensCurves.find` finds.
+_COURSE = 7
+_REACH, _SCALE, _FIRST, _BEGIN = range(3, _COURSE)
 
 
-def _shares(area_mm2: Floats, contact: Ints) -> Floats:
-    """Share of each pad in what its contact covers, [k, m]; the pads of a contact together."""
-    is_first = np.append(True, contact[1:] != contact[:-1])[: len(contact)]
-    if is_first.all():
-        return np.ones(area_mm2.shape)
-    sums_mm2 = np.add.reduceat(area_mm2, np.flatnonzero(is_first), axis=1)
-    shares: Floats = area_mm2 / sums_mm2[:, np.cumsum(is_first) - 1]
-    return shares
+class LensCurves:
+    """The shares of pads that discs cover, by their distance: a curve for each pair of radii.
+
+    Straight lines join nodes of the exact curve, so near each other that it is met to
+    `WORST_SHARE`. Nothing else in sliding has to compute a root of an angle.
+    """
+
+    #: Nodes of the coarsest curve and of the finest.
+    NODES = 1 << 8, 1 << 16
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[float, float], tuple[float, ...]] = {}
+        #: Of the line from each node on: its value at node 0, and its slope per node.
+        self._value = self._slope = np.zeros(0)
+
+    def find(self, pad_mm: Floats, disc_mm: Floats) -> Floats:
+        """The curves of pads and discs by their radii [m]: courses [_COURSE, m] to be filled."""
+        pairs, of_row = np.unique(np.stack([pad_mm, disc_mm]), axis=1, return_inverse=True)
+        known = [self._curve(*pair) for pair in pairs.T.tolist()]
+        course = np.zeros((_COURSE, len(pad_mm)))
+        course[_REACH:] = np.array(known).reshape(-1, _COURSE - _REACH).T[:, of_row]
+        return course
+
+    def shares(self, course: Floats, start: int, stop: int) -> Floats:
+        """The shares that are covered from step `start` to before `stop`, [steps, m]."""
+        squares, first, begin = course[:_REACH], course[_FIRST], course[_BEGIN] ** 2
+        shares = np.empty((stop - start, course.shape[1]))
+        at_once = max(1, MOST_AT_ONCE // max(1, course.shape[1]))
+        for low in range(start, stop, at_once):
+            high = min(low + at_once, stop)
+            step = np.arange(low, high)
+            place = np.stack([np.ones(high - low), step, step * step], axis=1) @ squares
+            np.maximum(place, begin, out=place)
+            np.sqrt(place, out=place)
+            place += first
+            node = place.astype(np.intp)
+            place *= self._slope.take(node)
+            np.add(place, self._value.take(node), out=shares[low - start : high - start])
+        return shares
+
+    def _curve(self, pad_mm: float, disc_mm: float) -> tuple[float, ...]:
+        """Where the curve of a pair of radii is, in the order of a course."""
+        pair = pad_mm, disc_mm
+        if pair not in self._known:
+            self._known[pair] = self._add(pad_mm, disc_mm)
+        return self._known[pair]
+
+    def _add(self, pad_mm: float, disc_mm: float) -> tuple[float, ...]:
+        inside_mm, beside_mm = abs(pad_mm - disc_mm), pad_mm + disc_mm
+        nodes, most = self.NODES
+        while True:
+            # Every second one is a node, the others prove the lines half way between them.
+            distance_mm = np.linspace(inside_mm, beside_mm, 2 * nodes + 1)
+            exact = lens_area_mm2(distance_mm, pad_mm, disc_mm) / (np.pi * pad_mm**2)
+            share = exact[::2]
+            between = (share[1:] + share[:-1]) / 2
+            if np.abs(between - exact[1::2]).max() < WORST_SHARE / 2 or nodes == most:
+                break
+            nodes *= 2
+        reach_mm = float(np.interp(LEAST_SHARE, share[::-1], distance_mm[::-2]))
+        # Rounding may carry a distance out of the curve: it is level before and after.
+        share = np.concatenate([share[:1], share, share[-1:]])
+        slope = np.append(np.diff(share), 0.0)
+        node = len(self._value) + np.arange(len(slope))
+        self._value = np.append(self._value, share - node * slope)
+        self._slope = np.append(self._slope, slope)
+        scale = nodes / (beside_mm - inside_mm)
+        begin = inside_mm * scale
+        return reach_mm, scale, float(node[1]) - begin, begin

@@ -118,7 +118,8 @@ class Foam:
         return value, slope
 
 
-@dataclass(frozen=True, slots=True)
+# Not frozen: sliding probes need one at each step, and a frozen one takes three times as long.
+@dataclass(slots=True)
 class Footprint:
     """Which pads c contacts cover: m rows, one for each pad (or zone of a pad) of a contact.
 

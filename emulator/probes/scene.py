@@ -218,19 +218,48 @@ def _check_times(where: str, times_s: list[float]) -> None:
         raise ConfigurationError(f"{where}: times run backwards")
 
 
+@dataclass(frozen=True, slots=True)
+class Slide:
+    """How the c probes in contact slide: each straight on, until the next keyframe of any.
+
+    Attributes:
+        begin_s: float64[c], when the line of each probe began.
+        begin_mm: float64[2, c], how far it had slid from its place then.
+        mm_per_s: float64[2, c].
+        moves: whether any of them slides.
+    """
+
+    begin_s: Floats
+    begin_mm: Floats
+    mm_per_s: Floats
+    moves: bool
+
+    def offset_mm(self, t_s: float) -> Floats:
+        """How far each probe has slid from its place at `t_s`, [c, 2]."""
+        offset_mm: Floats = (self.begin_mm + self.mm_per_s * (t_s - self.begin_s)).T
+        return offset_mm
+
+
 @dataclass(slots=True)
 class Moment:
     """What presses at one time: arrays over the c probes in contact.
 
     Attributes:
+        t_s: the time.
         number: intp[c], the probes.
         drive: float64[c], force (N) or depth (mm).
-        offset_mm: float64[c, 2], how far each has slid from its place.
+        slide: how they slide; the same object from keyframe to keyframe.
     """
 
+    t_s: float
     number: NDArray[np.intp]
     drive: Floats
-    offset_mm: Floats
+    slide: Slide
+
+    @property
+    def offset_mm(self) -> Floats:
+        """How far each has slid from its place, [c, 2]."""
+        return self.slide.offset_mm(self.t_s)
 
 
 class Script:
@@ -260,10 +289,7 @@ class Script:
         self._gather()
 
     def at(self, t_s: float) -> Moment:
-        """What presses at `t_s`, which is not before that of the last call.
-
-        Of probes that do not slide, the offsets are the same object as at the last call.
-        """
+        """What presses at `t_s`, which is not before that of the last call."""
         if self._ends and self._ends[0][0] <= t_s:
             while self._ends[0][0] <= t_s:
                 number = self._ends[0][1]
@@ -271,18 +297,8 @@ class Script:
                 self._lines[number], self._touches[number], end_s = course.at(t_s)
                 heapreplace(self._ends, (end_s, number))
             self._gather()
-        since_s = t_s - self._begin_s
-        drive = np.maximum(self._drive + self._drive_rate * since_s, 0.0)
-        offset_mm = (
-            (self._offset_mm + self._offset_rate * since_s).T if self._slides else self._at_mm
-        )
-        return Moment(self._number, drive, offset_mm)
-
-    def path_mm(self, times_s: Floats) -> Floats:
-        """Where the probes that press at the last `at` are, [k, c, 2], if no keyframe comes."""
-        since_s = times_s[:, None] - self._begin_s
-        path_mm: Floats = self._offset_mm + self._offset_rate * since_s[:, None]
-        return np.moveaxis(path_mm, 1, 2)
+        drive = self._drive + self._drive_rate * (t_s - self._slide.begin_s)
+        return Moment(t_s, self._number, np.maximum(drive, 0.0), self._slide)
 
     def still_until_s(self, t_s: float) -> float:
         """After `at(t_s)`: when something may change next; `t_s` itself if it does now."""
@@ -294,11 +310,9 @@ class Script:
         """Collect the lines of the probes that touch."""
         self._number = np.flatnonzero(self._touches)
         lines = self._lines[self._number].T.copy()
-        self._begin_s, self._drive, self._drive_rate = lines[0], lines[1], lines[4]
-        self._offset_mm, self._offset_rate = lines[2:4], lines[5:7]
-        self._slides = bool(self._offset_rate.any())
-        self._moves = self._slides or bool(self._drive_rate.any())
-        self._at_mm = self._offset_mm.T
+        self._drive, self._drive_rate = lines[1], lines[4]
+        self._slide = Slide(lines[0], lines[2:4], lines[5:7], bool(lines[5:7].any()))
+        self._moves = self._slide.moves or bool(self._drive_rate.any())
 
 
 #: Numbers of a line: when it began (s); drive, x and y (mm) there; their rates (1/s).

@@ -14,7 +14,7 @@ from emulator.boards.arithmetic import TAXELS
 from emulator.chips.noise import SENT_UNIT_FF, PadNoise
 from emulator.probes.air import AirCourse, read_course
 from emulator.probes.contacts import ContactPads, Contacts, ContactSource, joined
-from emulator.probes.coverage import MOST_AT_ONCE, Coverage
+from emulator.probes.coverage import Coverage
 from emulator.probes.foam import INFINERGY_LOSS, Drive, Foam, FoamLayer, Footprint
 from emulator.probes.pads import (
     Jumps,
@@ -116,7 +116,6 @@ class Skin:
         self._is_left = False
         self._set_untouched()
         self._all = np.arange(n)
-        self._covered = np.zeros(n)
         self.capacitance_ff = self.resting_ff.copy()
         self.held_ff = np.where(self._dead, self.resting_ff, np.nan)
         self._set_probes(scene.probe, bare)
@@ -159,14 +158,15 @@ class Skin:
             except ConfigurationError as error:
                 raise ConfigurationError(f"probe[{number}].{error}") from None
         self._gather()
+        moment = self._script.at(0.0)
         self._active = np.zeros(0, np.intp)
-        self._offset_mm = np.zeros((0, 2))
+        #: How probes slid when they were placed last, and when that was.
+        self._slide, self._placed_s = moment.slide, 0.0
         self._footprint = Footprint.empty()
-        #: Footprints of the next steps of sliding probes, with the offsets that they are for; the
-        #: next one last.
-        self._foreseen: list[tuple[Floats, Footprint]] = []
+        #: Footprints of the next steps of sliding probes, the next one last, and its time.
+        self._foreseen: list[Footprint] = []
+        self._foreseen_ns = 0
         self._came_true = 0
-        self._is_alone = True
         self._by_depth_now = np.zeros(0, bool)
         self._compliance_now = np.zeros(0)
         self._grounded_now = np.zeros(0, bool)
@@ -246,7 +246,7 @@ class Skin:
 
     def true_pressure_kpa(self) -> Floats:
         """True pressure of each pad, float64[n]: mean over the pad's whole area (kPa)."""
-        return self._foam.pressure_kpa * self._covered + self._air_kpa
+        return self._foam.pressure_kpa * self._covered() + self._air_kpa
 
     def contact_force_n(self) -> dict[int, float]:
         """Force (N) of each probe that is in contact now, by its number in `probes`."""
@@ -332,7 +332,8 @@ class Skin:
         same = number is self._active or np.array_equal(number, self._active)
         still = given is self._placed or given.is_still(self._placed)
         self._given = given
-        if not (same and still and moment.offset_mm is self._offset_mm):
+        slide = moment.slide
+        if slide.moves or slide is not self._slide or not (same and still):
             self._place(moment, same=same, still=still)
         value = moment.drive
         if len(self._pressed.area_mm2):
@@ -343,23 +344,28 @@ class Skin:
             self._touch(felt.taxel)
         touched = self._touched
         rise_ff = self._pads.row_rise_ff(felt, self._footprint, self._grounded_now)
-        if touched is not felt.taxel:
+        is_alone = touched is felt.taxel
+        if not is_alone:
             of_pad_ff = np.bincount(felt.taxel, rise_ff, self._layout.n_taxels)
             rise_ff = of_pad_ff[touched].astype(np.float64, copy=False)
         if len(self._jumping):
             pads = touched[self._jumping]
-            pressure_kpa = self._foam.pressure_kpa[pads] * self._covered[pads]
+            # Foam that nothing presses any more is under no pressure, however it was covered.
+            simple = is_alone and not self._membrane_mm
+            covered = felt.covered[self._jumping] if simple else self._covered()[pads]
+            pressure_kpa = self._foam.pressure_kpa[pads] * covered
             rise_ff[self._jumping] += self._jumps.step_ff(pads, pressure_kpa)
         self.capacitance_ff[touched] = self._untouched_ff + rise_ff
         return touched
 
     def _touch(self, felt: Ints) -> None:
         """Take over which pads are felt; those that were felt until now change once more."""
-        before, self._felt = self._felt, felt
         self._idle = len(felt) == 0
-        touched = np.unique(felt)
+        was_felt, is_felt = np.zeros((2, self._layout.n_taxels), bool)
+        was_felt[self._felt] = is_felt[felt] = True
+        self._felt = felt
+        touched, left = np.flatnonzero(is_felt), np.flatnonzero(was_felt & ~is_felt)
         is_twice = len(touched) < len(felt)
-        left = np.setdiff1d(before, touched)
         self._is_left = len(left) > 0
         if self._is_left:
             touched = np.concatenate([touched, left])
@@ -381,7 +387,7 @@ class Skin:
         """
         number = moment.number
         of_probes = self._cover(moment, same=same)
-        self._active, self._offset_mm = number, moment.offset_mm
+        self._active, self._slide, self._placed_s = number, moment.slide, moment.t_s
         if still and of_probes is self._of_probes:
             return
         self._of_probes = of_probes
@@ -393,34 +399,34 @@ class Skin:
             self._by_depth_now = np.append(self._by_depth[number], none > 0)
             self._compliance_now = np.append(self._compliance[number], none)
             self._grounded_now = np.append(self._grounded[number], none > 0)
-        before, self._footprint = self._footprint, joined(of_probes, self._pressed)
+        self._footprint = joined(of_probes, self._pressed)
+
+    def _covered(self) -> Floats:
+        """Which share of each pad bears a contact, float64[n]."""
         rows = self._footprint
-        bears = rows.covered
-        if self._membrane_mm:
-            bears = np.where(rows.weight > 0, rows.covered, 0.0)
-        if rows.taxel is not before.taxel:
-            self._is_alone = len(np.unique(rows.taxel)) == len(rows.taxel)
-        elif self._is_alone:
-            self._covered[rows.taxel] = bears
-            return
-        n = self._layout.n_taxels
-        self._covered = np.bincount(rows.taxel, bears, n).astype(np.float64, copy=False)
+        bears = np.where(rows.weight > 0, rows.covered, 0.0) if self._membrane_mm else rows.covered
+        return np.bincount(rows.taxel, bears, self._layout.n_taxels).astype(np.float64, copy=False)
 
     def _cover(self, moment: Moment, *, same: bool) -> Footprint:
         """What the probes cover, the `same` as in the last step; as it was foreseen, if it was."""
-        if same and self._foreseen and (self._foreseen[-1][0] == moment.offset_mm).all():
+        slide = moment.slide
+        if self._foreseen and slide is self._slide and self._t_ns == self._foreseen_ns:
             self._came_true += 1
-            return self._foreseen.pop()[1]
-        if same and (moment.offset_mm == self._offset_mm).all():
+            self._foreseen_ns += MOVING_NS
+            return self._foreseen.pop()
+        offset_mm = moment.offset_mm
+        if same and np.array_equal(offset_mm, self._slide.offset_mm(self._placed_s)):
             return self._of_probes
+        if not slide.moves:
+            return self._coverage.footprint(moment.number, offset_mm)
         # Twice as far ahead as what was foreseen came true.
-        steps = min(2 * self._came_true, MOST_FORESEEN, MOST_AT_ONCE // max(1, len(moment.number)))
+        steps = max(1, min(2 * self._came_true, MOST_FORESEEN))
         self._came_true = 1
-        times_s = (self._t_ns + MOVING_NS * np.arange(1, steps)).astype(np.float64) * 1e-9
-        path_mm = np.concatenate([moment.offset_mm[None], self._script.path_mm(times_s)])
-        footprints = self._coverage.footprints(moment.number, path_mm)
-        self._foreseen = list(zip(path_mm[1:], footprints[1:], strict=False))[::-1]
-        return footprints[0]
+        step_mm = slide.mm_per_s.T * (MOVING_NS * 1e-9)
+        now, *self._foreseen = self._coverage.footprints(moment.number, offset_mm, step_mm, steps)
+        self._foreseen.reverse()
+        self._foreseen_ns = self._t_ns + MOVING_NS
+        return now
 
 
 def _truth(scene: Scene, n: int, rng: np.random.Generator | None) -> FoamTruth:

@@ -1,11 +1,13 @@
 """Probes that slide: what is found for all at once is what each pad's own geometry says."""
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
-from emulator.probes.coverage import Coverage
-from emulator.probes.pads import Disc, Pads, Rectangle
+from emulator.probes.coverage import WORST_SHARE, Coverage, LensCurves
+from emulator.probes.foam import Footprint
+from emulator.probes.pads import Disc, Pads, Rectangle, lens_area_mm2
 from emulator.probes.scene import Place, Probe
 from skin_host.evaluation.rig import flat_skin
 
@@ -82,16 +84,47 @@ def test_a_path_covers_at_each_step_what_its_places_cover(
         at_once.add(probe)
         one_by_one.add(probe)
     numbers = np.arange(len(drawn))
-    share = np.linspace(0.5, 1.0, len(drawn))[:, None]
-    path_mm = start_mm + np.arange(steps)[:, None, None] * share * step_mm
-    found = at_once.footprints(numbers, path_mm)
+    begin_mm = np.tile(start_mm, (len(drawn), 1))
+    # The first of several probes stays where it is.
+    own_step_mm = np.linspace(0.0, 1.0, len(drawn) + 1)[-len(drawn) :, None] * step_mm
+    own_step_mm[0] *= len(drawn) == 1
+    found = at_once.footprints(numbers, begin_mm, own_step_mm, steps)
     assert 1 <= len(found) <= steps
-    for footprint, offset_mm in zip(found, path_mm, strict=False):
-        alone = one_by_one.footprint(numbers, offset_mm)
-        assert footprint.taxel.tolist() == alone.taxel.tolist()
-        assert footprint.contact.tolist() == alone.contact.tolist()
-        np.testing.assert_allclose(footprint.covered, alone.covered, rtol=1e-9)
-        np.testing.assert_allclose(footprint.weight, alone.weight, rtol=1e-9)
-        sums = np.bincount(footprint.contact, footprint.weight, len(drawn))
-        under = np.bincount(footprint.contact, minlength=len(drawn)) > 0
-        np.testing.assert_allclose(sums[under], 1.0)
+    for number, footprint in enumerate(found):
+        alone = one_by_one.footprint(numbers, begin_mm + number * own_step_mm)
+        covered = dense(footprint, len(drawn))
+        np.testing.assert_allclose(covered, dense(alone, len(drawn)), atol=2 * WORST_SHARE)
+        bears = covered * LAYOUT.radius_mm**2
+        borne = bears.sum(axis=1)[footprint.contact]
+        weight = bears[footprint.contact, footprint.taxel] / borne
+        np.testing.assert_allclose(footprint.weight, weight, rtol=1e-9)
+
+
+def dense(footprint: Footprint, contacts: int) -> NDArray[np.float64]:
+    """How much of each pad each contact covers, [contacts, pads]."""
+    covered = np.zeros((contacts, LAYOUT.n_taxels))
+    covered[footprint.contact, footprint.taxel] = footprint.covered
+    return covered
+
+
+@given(
+    st.lists(st.tuples(st.floats(0.5, 5), st.floats(0.2, 40)), min_size=1, max_size=4),
+    st.floats(0, 1),
+)
+@example([(2.1, 2.1)], 1e-3)
+@example([(2.1, 2.1005)], 1e-3)
+def test_a_curve_meets_the_exact_share_at_every_distance(
+    radii_mm: list[tuple[float, float]], from_share: float
+) -> None:
+    pad_mm, disc_mm = np.array(radii_mm).T
+    curves = LensCurves()
+    course = curves.find(pad_mm, disc_mm)
+    steps = 300
+    # Straight away from the middle, until the disc has left the pad.
+    begin_mm = from_share * (pad_mm + disc_mm)
+    step_mm = (pad_mm + disc_mm - begin_mm) / steps
+    course[:3] = begin_mm**2, 2 * begin_mm * step_mm, step_mm**2
+    course[:3] *= course[4] ** 2
+    distance_mm = begin_mm + np.arange(steps)[:, None] * step_mm
+    exact = lens_area_mm2(distance_mm, pad_mm, disc_mm) / (np.pi * pad_mm**2)
+    np.testing.assert_allclose(curves.shares(course, 0, steps), exact, atol=WORST_SHARE)
