@@ -47,7 +47,6 @@ ROOMS = {
     "skin_host.daemon.link": "bus",
     "skin_host.clock": "bus",
     "skin_host.processing.intake": "intake",
-    "skin_host.processing.validity": "liveness",
     "skin_host.processing.liveness": "liveness",
     "skin_host.processing.stuck": "liveness",
     "skin_host.processing.contacts": "contacts",

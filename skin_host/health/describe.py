@@ -23,8 +23,8 @@ from skin_host.health.watch import Watch
 from skin_host.layout import TAXELS_PER_TRIANGLE, PadKind
 from skin_host.processing.calibration import Verdict
 from skin_host.processing.core import Engine
+from skin_host.processing.intake import FAR_PADS, lifted
 from skin_host.processing.masks import Mask
-from skin_host.processing.validity import FAR_PADS, lifted
 
 #: An event of a board stays in the record for this long.
 LATELY_NS = 60_000_000_000
@@ -130,7 +130,7 @@ class Describer:
             and ledger.complete(row)
             and not ledger.is_silent(row)
             and not ledger.flagged[row]
-            and not self._of_board(self._engine.validity.liveness.unproven, row).any()
+            and not self._of_board(self._engine.intake.liveness.unproven, row).any()
         )
 
     @staticmethod
@@ -153,7 +153,7 @@ class Describer:
             return "not connected"
         if error & StatusError.NO_ACK:
             return "no ack"
-        liveness = self._engine.validity.liveness
+        liveness = self._engine.intake.liveness
         triangle = TRIANGLES * row + number
         if liveness.frozen[triangle]:
             return "silenced" if liveness.silenced[triangle] else "frozen"
@@ -174,7 +174,7 @@ class Describer:
         for index in layout.boards:
             taxels = self._layout.boards[index].taxel_index
             mine = (taxels >= layout.start) & (taxels < layout.stop)
-            ledger, liveness = self._engine.ledger, self._engine.validity.liveness
+            ledger, liveness = self._engine.ledger, self._engine.intake.liveness
             row = ledger.row[index]
             masks = {
                 "stuck": self._of_board(liveness.stuck, row),

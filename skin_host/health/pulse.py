@@ -43,7 +43,7 @@ def pulse(
 
 
 def _boards(engine: Engine) -> tuple[object, ...]:
-    ledger, liveness = engine.ledger, engine.validity.liveness
+    ledger, liveness = engine.ledger, engine.intake.liveness
     events = (ledger.resets, ledger.lost_set_ups, ledger.tx_overflows, ledger.rezeros)
     found: tuple[object, ...] = (
         ledger.silent.tobytes(),

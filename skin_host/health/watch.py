@@ -182,7 +182,7 @@ class Watch:
             "halves": counters.halves,
             "missed": counters.missed,
             "unknown": counters.unknown_board + counters.unknown_triangle,
-            "spikes": int(self._engine.validity.liveness.spikes[self._rows[bus]].sum()),
+            "spikes": int(self._engine.intake.liveness.spikes[self._rows[bus]].sum()),
             "dropped": 0 if port is None else port.counters.dropped,
             "error_frames": 0 if port is None else port.counters.error_frames,
         }

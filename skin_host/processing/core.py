@@ -26,7 +26,6 @@ from skin_host.processing.masks import Mask
 from skin_host.processing.pipeline import Pipeline, PressureFrame
 from skin_host.processing.pressure import PressureCurve, vertex
 from skin_host.processing.rezero import Rezero
-from skin_host.processing.validity import Validity
 
 #: A calibration takes at least this many samples of each part, even if its boards are slow: the
 #: 95th percentile of fewer would be the largest.
@@ -106,7 +105,7 @@ class Engine:
         boards: indices of the boards of these parts.
         assemblers: of each bus, by its name.
         ledger: of these boards.
-        validity: which of their taxels are valid.
+        intake: joins their sweeps into samples of parts; knows which of their taxels are valid.
         disabled: parts without output.
         touch_only: parts whose pressures are not subscribed while nothing touches them.
         fingertips: those of these parts' nodes, if there are any.
@@ -152,13 +151,14 @@ class Engine:
             [(i, layout.boards[i]) for i in self.boards], receive.silent_periods, receive.poll_ms
         )
         curve = settings.processing.pressure
-        self.validity = Validity(
+        self.intake = Intake(
             layout,
+            parts,
             self.boards,
             self.ledger,
+            receive.silent_periods,
             float(vertex(curve.a_kpa_per_ff2, curve.b_kpa_per_ff)),
         )
-        self._intake = Intake(layout, parts, self.ledger, receive.silent_periods)
         self._rezeros: dict[int, Rezero] = {}
         self._unanswered: dict[int, Mask] = {}
         self._touched = np.zeros(layout.n_taxels, np.bool_)
@@ -174,8 +174,7 @@ class Engine:
         """Take over everything but settings and layout, which may differ only in values."""
         self.assemblers = after.assemblers
         self.ledger = after.ledger
-        self.validity.go_on(after.validity)
-        self._intake = after._intake
+        self.intake.go_on(after.intake)
         self.fingertips = after.fingertips
         if self.fingertips is not None:
             self.fingertips.renew(self.settings)
@@ -211,7 +210,7 @@ class Engine:
         """
         self.calibration = calibration
         boards = self.boards if boards is None else boards
-        self.validity.use(calibration.noise, np.isin(self.boards, boards))
+        self.intake.use(calibration.noise, np.isin(self.boards, boards))
         for board in boards:
             self._rezeros.pop(board, None)
         if self.fingertips is not None and boards == self.boards:
@@ -283,16 +282,16 @@ class Engine:
 
     def missing(self) -> list[dict[int, int]]:
         """Of each part, the boards whose sweeps its next sample waits for."""
-        return self._intake.missing()
+        return self.intake.missing()
 
     @property
     def has_deferred(self) -> bool:
         """Whether `judge` has something to do."""
-        return self.validity.is_whole
+        return self.intake.is_whole
 
     def judge(self) -> None:
         """Do deferred work between sweeps, so that the next one does not wait for it."""
-        self.validity.judge_whole()
+        self.intake.judge_whole()
 
     def expire(self, now_ns: int) -> Output:
         """Return what has waited too long, on the clock of the frames' time stamps.
@@ -307,14 +306,14 @@ class Engine:
         if self.fingertips is not None:
             grasps += self.fingertips.expire(now_ns)
         samples = self._take(sweeps)
-        samples += self._intake.expire(now_ns)
+        samples += self.intake.expire(now_ns)
         return Output(sweeps, self._process(samples) if samples else [], [], grasps, [])
 
     def flush(self) -> Output:
         """Return everything that waits, at the end of a recording."""
         sweeps = [sweep for assembler in self.assemblers.values() for sweep in assembler.flush()]
         grasps, self._ended = self._ended, []
-        steps = self._process(self._take(sweeps) + self._intake.flush())
+        steps = self._process(self._take(sweeps) + self.intake.flush())
         return Output(sweeps, steps, [], grasps, [])
 
     def rezero(self, board: int, believed: bool = True) -> int:
@@ -340,7 +339,7 @@ class Engine:
             touched |= before.doubted.reshape(TRIANGLES, PADS)
         no_load = np.full(taxels.size, float(self.layout.boards[board].settings.no_load))
         self._rezeros[board] = Rezero(touched.ravel(), no_load)
-        self.validity.veto[self.ledger.row[board]] = np.ones((TRIANGLES, PADS), np.bool_)
+        self.intake.veto[self.ledger.row[board]] = np.ones((TRIANGLES, PADS), np.bool_)
         return int(np.count_nonzero(touched))
 
     def doubt(self, taxels: Mask) -> None:
@@ -396,8 +395,7 @@ class Engine:
                 rezero = self._rezeros.get(sweep.board)
                 if rezero is not None:
                     self._find_zero(sweep, row, rezero)
-            valid, received = self.validity.take(row, sweep.raw)
-            samples += self._intake.take(sweep, valid, received)
+            samples += self.intake.take(sweep, row)
         return samples
 
     def _note_unanswered(self, sweep: Sweep, row: int) -> None:
@@ -426,10 +424,10 @@ class Engine:
             found = rezero.finish(baseline, self.calibration.noise[taxels])
             self._pipeline.set_zero(taxels[fitted], found[fitted])
         elif rezero.settled(sweep.t_ns):
-            self.validity.veto[row] = self.in_doubt(sweep.board)
+            self.intake.veto[row] = self.in_doubt(sweep.board)
             return
         # What jumps while a board is set up was not damaged on its way.
-        self.validity.liveness.note_gap(row)
+        self.intake.liveness.note_gap(row)
 
     def _process(self, samples: list[PartSample]) -> list[Step]:
         steps = []
@@ -455,7 +453,7 @@ class Engine:
         """Pass the touched pads to the liveness decision, but only when they change."""
         part = self.layout.parts[index]
         touched = self._touched[part.start : part.stop]
-        if np.array_equal(touched, frame.touched):
+        if touched.tobytes() == frame.touched.tobytes():
             return
         touched[:] = frame.touched
         for board in part.boards:
@@ -463,9 +461,9 @@ class Engine:
             pads = self._touched[taxels] & (taxels >= 0)
             row = self.ledger.row[board]
             if pads.any():
-                self.validity.touched[row] = pads
+                self.intake.touched[row] = pads
             else:
-                self.validity.touched.pop(row, None)
+                self.intake.touched.pop(row, None)
 
     @staticmethod
     def _collect(run: _CalibrationRun, sample: PartSample) -> None:

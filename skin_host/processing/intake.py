@@ -1,8 +1,15 @@
-"""Joins sweeps of boards into samples of parts.
+"""Joins sweeps of boards into samples of parts, and decides which of their taxels are valid.
 
 Several boards, each with its own clock, may belong to one part. A sample of the part is ready when
 every living board has sent a sweep, or when one sends its second: no board waits for a dead one.
 Values that were not received, or are not valid, are not present.
+
+A value is valid when its triangle was received, its chip answers (status words), it is not at a
+rail that pressing cannot reach, its chip lives (`liveness`), and the zero of its board is known.
+
+Deciding whether a chip lives takes more computing time than everything else of a sample, and does
+not depend on one sweep. So a sweep affects that decision only from the next sweep on. It is made
+for all boards at once: when every board that sends has sent, or before one sends again.
 """
 
 from dataclasses import dataclass
@@ -11,13 +18,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.bus.assembler import Sweep
+from skin_host.bus.compensation import thermal_gains
 from skin_host.bus.ledger import BoardLedger
 from skin_host.bus.wire import TAXELS, TRIANGLES
 from skin_host.layout import Layout
+from skin_host.processing.liveness import PADS, Liveness
 from skin_host.processing.masks import Mask
+from skin_host.processing.stuck import Encoding, Repeats
 
 #: A silent part reports its silence at once and then once a second.
 SILENCE_REPEAT_NS = 1_000_000_000
+#: This many pads far below zero pressure are not an accident.
+LIFTED_PADS = 2
+#: One such pad is enough while this many pads are far out of range. This many far pads are enough
+#: alone where "far" is more than this multiple of the capacitance at which the pressure curve ends.
+FAR_PADS = 7
+FAR_SHARE = 1.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +67,7 @@ class _PartState:
         stamped_ns: time of the last sample that was returned.
         silence_ns: time of the first sample of silence after the last sweep.
         reported_ns: when silence was reported last, on the ledger's clock; -1 if it was not.
+        present, received: of its last sample, None once those of a board have changed.
     """
 
     index: int
@@ -64,65 +81,112 @@ class _PartState:
     stamped_ns: int = 0
     reported_ns: int = -1
     pending: bool = False
+    present: Mask | None = None
+    received: Mask | None = None
 
 
 class Intake:
-    """Joins sweeps into samples of parts.
+    """Takes the sweeps of a node's boards.
 
     Args:
         layout: the skin.
         parts: indices of the parts that this daemon reads.
-        ledger: knows which boards have timed out.
+        boards: indices of their boards, in the order of the ledger.
+        ledger: of these boards.
         silent_periods: after this many of its periods without a sweep, a part is silent.
+        full_ff: capacitance at which the curve of pressure ends, of a pad of sensitivity 1.
+
+    Attributes:
+        liveness: of all triangles, those of one board after those of another.
+        veto: bool[16, 12] by row of the board: taxels that are invalid for a reason that the
+            bytes do not show.
+        touched: bool[16, 12] by row of the board: pads that are touched, where any is.
     """
 
     def __init__(
-        self, layout: Layout, parts: list[int], ledger: BoardLedger, silent_periods: float
+        self,
+        layout: Layout,
+        parts: list[int],
+        boards: list[int],
+        ledger: BoardLedger,
+        silent_periods: float,
+        full_ff: float = np.inf,
     ) -> None:
+        self._layout = layout
+        self._boards = boards
         self._ledger = ledger
-        self._states: list[_PartState] = []
-        self._of_board: dict[int, list[_PartState]] = {}
-        # The last sweep of each board, by its row in the ledger.
-        shape = (len(ledger.row), TRIANGLES * TAXELS)
+        self._unpressable = np.array([unpressable(layout, board, full_ff) for board in boards])
+        self.veto: dict[int, Mask] = {}
+        self.touched: dict[int, Mask] = {}
+        n = len(boards)
+        # The last sweep of each board, by its row.
+        shape = (n, TRIANGLES * TAXELS)
         self._raw = np.zeros(shape, np.uint8)
         self._present = np.zeros(shape, np.bool_)
         self._received = np.zeros(shape, np.bool_)
-        for index in parts:
-            part = layout.parts[index]
-            source = np.zeros(part.n_taxels, np.intp)
-            rows = {board: ledger.row[board] for board in part.boards}
-            for board, row in rows.items():
-                flat = layout.boards[board].taxel_index.ravel()
-                mine = np.flatnonzero((flat >= part.start) & (flat < part.stop))
-                source[flat[mine] - part.start] = row * flat.size + mine
-            period_ms = max(layout.boards[board].settings.period_ms for board in part.boards)
-            state = _PartState(
-                index,
-                rows,
-                rows.copy(),
-                source,
-                period_ms * 1_000_000,
-                int(silent_periods * period_ms * 1_000_000),
-            )
-            self._states.append(state)
-            for board in part.boards:
-                self._of_board.setdefault(board, []).append(state)
+        #: The masks that were copied there.
+        self._masks: list[tuple[Mask, Mask] | None] = [None] * n
+        #: By row: of a sweep without status words, what was received and is in doubt, as bytes, and
+        #: the masks made of that.
+        self._usual: list[tuple[bytes, tuple[Mask, Mask]] | None] = [None] * n
+        # What is not judged yet.
+        self._waiting = np.zeros(n, np.bool_)
+        self._n_waiting = 0
+        self._here = np.zeros((n, TRIANGLES), np.bool_)
+        self._erring = np.zeros((n, TRIANGLES), np.bool_)
+        self._felt: dict[int, Mask] = {}
+        self.liveness = self._new_liveness(None)
+        self._states = [self._new_state(part, silent_periods) for part in parts]
+        self._of_board: dict[int, list[_PartState]] = {board: [] for board in boards}
+        for state in self._states:
+            for board in state.rows:
+                self._of_board[board].append(state)
 
-    def take(self, sweep: Sweep, valid: Mask, received: Mask) -> list[PartSample]:
-        """Take a sweep that the ledger has noted; return the samples that it completes.
+    def use(self, noise: NDArray[np.float64] | None, boards: Mask) -> None:
+        """Use a calibrated noise.
+
+        Args:
+            noise: float64[n] over the skin in units, or None without a calibration.
+            boards: bool[b], the calibrated ones; the others continue unchanged.
+        """
+        self.judge()
+        before, self.liveness = self.liveness, self._new_liveness(noise)
+        self.liveness.keep(before, ~boards)
+        for row in np.flatnonzero(boards).tolist():
+            self.veto.pop(row, None)
+
+    def go_on(self, before: "Intake") -> None:
+        """Take over the state of a predecessor for the same boards."""
+        before.judge()
+        self._ledger = before._ledger
+        self.liveness = before.liveness
+        self.veto = before.veto
+        self.touched = before.touched
+        self._raw = before._raw
+        self._present, self._received = before._present, before._received
+        self._masks, self._usual = before._masks, before._usual
+        self._states, self._of_board = before._states, before._of_board
+
+    def take(self, sweep: Sweep, row: int) -> list[PartSample]:
+        """Take a sweep that the ledger has just noted; return the samples that it completes.
 
         Args:
             sweep: of one board.
-            valid, received: bool[192], see `PartSample`.
+            row: of the board.
         """
+        if self._waiting[row]:
+            self.judge()
+        masks = self._valid(row, sweep.raw)
         board, t_ns = sweep.board, sweep.t_ns
         states = self._of_board[board]
-        row = self._ledger.row[board]
         # Samples that the board's second sweep completes, before it replaces the first.
         completed = [self._sample(state) if board not in state.waits else None for state in states]
-        self._raw[row] = sweep.raw.ravel()
-        self._present[row] = valid
-        self._received[row] = received
+        self._raw[row] = sweep.raw.reshape(-1)
+        if masks is not self._masks[row]:
+            self._masks[row] = masks
+            self._present[row], self._received[row] = masks
+            for state in states:
+                state.present = None
         samples: list[PartSample] = []
         for state, sample in zip(states, completed, strict=True):
             if sample is not None:
@@ -171,14 +235,152 @@ class Intake:
         """Return all samples in progress, at the end of a recording."""
         return [self._sample(state) for state in self._states if state.pending]
 
+    def _valid(self, row: int, raw: NDArray[np.uint8]) -> tuple[Mask, Mask]:
+        """Return which taxels of a noted sweep are valid, and which would be without `veto`.
+
+        Args:
+            row: of the board.
+            raw: uint8[16, 12].
+        """
+        ledger = self._ledger
+        last = ledger.last[row]
+        if last is not None and last.missed:
+            self.liveness.note_gap(row)
+        doubted = self.liveness.doubted
+        if doubted is not None:
+            doubted = doubted[TRIANGLES * row : TRIANGLES * (row + 1)]
+        if ledger.flagged[row]:
+            here = self.here(row, raw)
+            self._erring[row] = ledger.error[row]
+            received = np.repeat(here[:, None], PADS, axis=1)
+            received &= ~ledger.far[row]
+            if doubted is not None:
+                received &= ~doubted
+            masks = received.ravel(), received.ravel()
+        else:
+            # Most sweeps have nothing but the triangles of the one before.
+            here = ledger.present[row]
+            key = here.tobytes() if doubted is None else here.tobytes() + doubted.tobytes()
+            usual = self._usual[row]
+            if usual is None or usual[0] != key:
+                received = np.repeat(here, PADS)
+                if doubted is not None:
+                    received &= ~doubted.ravel()
+                received.flags.writeable = False
+                self._usual[row] = usual = key, (received, received)
+            masks = usual[1]
+        self._waiting[row] = True
+        self._n_waiting += 1
+        self._here[row] = here
+        if row in self.touched:
+            self._felt[row] = self.touched[row]
+        veto = self.veto.get(row)
+        return masks if veto is None else (masks[1] & ~veto.ravel(), masks[1])
+
+    def here(self, row: int, raw: NDArray[np.uint8]) -> Mask:
+        """Return triangles bool[16] that were received, answer, and are in their range, by the
+        ledger.
+        """
+        ledger = self._ledger
+        here: Mask = ledger.present[row]
+        if ledger.flagged[row]:
+            far = ledger.far[row]
+            here = here & (ledger.error[row] == 0) & ~lifted(raw, far)
+            many = np.count_nonzero(far, axis=1) >= FAR_PADS
+            here &= ~(self._unpressable[row] & many)
+        return here
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether every board that has not timed out has sent since the last judgement."""
+        return self._n_waiting == len(self._waiting) or bool(
+            self._n_waiting
+            and self._ledger.any_silent
+            and (self._waiting | self._ledger.silent).all()
+        )
+
+    def judge_whole(self) -> None:
+        """Judge which chips live if every board that has not timed out has sent since."""
+        if self.is_whole:
+            self.judge()
+
+    def judge(self) -> None:
+        """Judge which chips live by the sweeps since the last judgement."""
+        if not self._n_waiting:
+            return
+        waiting = self._waiting
+        felt: Mask | None = None
+        if self._felt:
+            felt = np.zeros((TRIANGLES * len(waiting), PADS), np.bool_)
+            for row, pads in self._felt.items():
+                felt[TRIANGLES * row : TRIANGLES * (row + 1)] = pads
+        self.liveness.step(
+            self._raw.reshape(-1, PADS),
+            self._here.ravel(),
+            self._erring.ravel(),
+            felt,
+            None if self._n_waiting == len(waiting) else waiting.copy(),
+        )
+        self._felt.clear()
+        self._here[:] = False
+        self._erring[:] = False
+        waiting[:] = False
+        self._n_waiting = 0
+
+    def _new_liveness(self, noise: NDArray[np.float64] | None) -> Liveness:
+        encodings = []
+        of_pads = None if noise is None else np.zeros((len(self._boards), TRIANGLES, PADS))
+        for row, board in enumerate(self._boards):
+            layout = self._layout.boards[board]
+            if noise is not None and of_pads is not None:
+                taxels = layout.taxel_index
+                of_pads[row] = np.where(taxels >= 0, noise[taxels], 0.0)
+            settings = layout.settings
+            shifts = dict.fromkeys(range(TRIANGLES), 0)
+            mine = (triangle for triangle in self._layout.triangles if triangle.board == board)
+            shifts |= {triangle.number: triangle.shift for triangle in mine}
+            encodings += [
+                Encoding(
+                    thermal_gains(settings.skin_type, number)[0],
+                    shifts[number],
+                    settings.no_load,
+                    settings.model == "mtb3",
+                )
+                for number in range(TRIANGLES)
+            ]
+        periods_s = [self._layout.boards[board].settings.period_ms * 1e-3 for board in self._boards]
+        return Liveness(
+            len(encodings),
+            None if of_pads is None else of_pads.reshape(-1, PADS),
+            np.array(periods_s),
+            Repeats(encodings),
+            len(self._boards),
+        )
+
+    def _new_state(self, index: int, silent_periods: float) -> _PartState:
+        layout = self._layout
+        part = layout.parts[index]
+        source = np.zeros(part.n_taxels, np.intp)
+        rows = {board: self._ledger.row[board] for board in part.boards}
+        for board, row in rows.items():
+            flat = layout.boards[board].taxel_index.ravel()
+            mine = np.flatnonzero((flat >= part.start) & (flat < part.stop))
+            source[flat[mine] - part.start] = row * flat.size + mine
+        period_ns = 1_000_000 * max(layout.boards[board].settings.period_ms for board in rows)
+        silence_ns = int(silent_periods * period_ns)
+        return _PartState(index, rows, rows.copy(), source, period_ns, silence_ns)
+
     def _sample(self, state: _PartState) -> PartSample:
         """Return a part's sample in progress, and begin the next."""
         source = state.source
-        raw = self._raw.ravel()[source]
-        present = self._present.ravel()[source]
-        received = self._received.ravel()[source]
+        raw = self._raw.take(source)
+        present, received = state.present, state.received
+        if present is None or received is None:
+            present, received = self._present.take(source), self._received.take(source)
+            state.present, state.received = present, received
         if state.waits:
             lost = np.isin(source // self._raw.shape[1], list(state.waits.values()))
+            present, received = present.copy(), received.copy()
             raw[lost] = 0
             present[lost] = received[lost] = False
         if 0 <= state.stamped_ns - state.last_ns < 4 * state.period_ns:
@@ -190,3 +392,30 @@ class Intake:
         state.pending = False
         state.reported_ns = -1
         return PartSample(state.index, raw, present, received, state.last_ns)
+
+
+def unpressable(layout: Layout, board: int, full_ff: float) -> Mask:
+    """Return triangles bool[16] of a board that pressing cannot bring far out of their range.
+
+    A pad is far out at twice the capacitance of all its units (reference of the wire, 4.3).
+    """
+    taxels = layout.boards[board].taxel_index[:, 0]
+    far_ff = 2.0 * layout.no_load[taxels] * layout.unit_ff[taxels]
+    found: Mask = far_ff > FAR_SHARE * full_ff * layout.sensitivity[taxels]
+    return found
+
+
+def lifted(raw: NDArray[np.uint8], far: Mask) -> Mask:
+    """Return triangles bool[k] whose pads read far below zero pressure: those of another chip.
+
+    Pressing cannot do it. Plugs of data lines that were swapped, or a chip at another one's
+    address, put the pads of one triangle on the baselines of another.
+
+    Args:
+        raw: uint8[k, 12].
+        far: bool[k, 12], pads that their status words mark as far out of range.
+    """
+    below = np.count_nonzero(far & (raw == 255), axis=-1)
+    torn = (below > 0) & (np.count_nonzero(far, axis=-1) >= FAR_PADS)
+    found: Mask = (below >= LIFTED_PADS) | torn
+    return found

@@ -91,13 +91,13 @@ def test_a_new_core_goes_on_where_the_old_one_stood(bench: FaultBench) -> None:
     assert before.pipeline is not None
     before.pipeline.baseline[:20] += 1.5
     baseline = before.pipeline.baseline.copy()
-    known = before.ledger, before.calibration, before.validity.liveness
+    known = before.ledger, before.calibration, before.intake.liveness
     sweeps = before.ledger.sweeps.copy()
     bench.reload({"processing.touch.margin_units": 3.0, "processing.touch.move_hz": 5.0})
     after = bench.engine
     assert after is not before and after.pipeline is not None
     np.testing.assert_array_equal(after.pipeline.baseline, baseline)
-    assert (after.ledger, after.calibration, after.validity.liveness) == known
+    assert (after.ledger, after.calibration, after.intake.liveness) == known
     bench.run(0.5)
     assert (after.ledger.sweeps - sweeps >= 9).all()
     assert set(bench.told) <= told

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from skin_host.bus.assembler import Sweep
 from skin_host.cli.common import load_skin
 from skin_host.processing.core import Engine
-from skin_host.processing.intake import PartSample
-from skin_host.processing.validity import unpressable
+from skin_host.processing.intake import PartSample, unpressable
 
 MS = 1_000_000
 PERIOD = 50 * MS
@@ -26,7 +25,7 @@ def skin():
 
 
 class Joined:
-    """Ledger, validity and intake of an engine, as its sweeps pass through them."""
+    """Ledger and intake of an engine, as its sweeps pass through them."""
 
     def __init__(self) -> None:
         configuration, layout = skin()
@@ -37,14 +36,14 @@ class Joined:
 
     def expire(self, now_ns: int) -> list[PartSample]:
         self.engine.ledger.look(now_ns)
-        return self.engine._intake.expire(now_ns)
+        return self.engine.intake.expire(now_ns)
 
 
 def intake():
     """Of the forearm, both of whose boards have been heard of."""
     parts = Joined()
     parts.feed([sweep(OUTER, 1), sweep(INNER, 2), sweep(OUTER, 3)])
-    parts.engine._intake.flush()
+    parts.engine.intake.flush()
     return parts
 
 
@@ -119,10 +118,10 @@ def test_what_sweeps_say_of_a_chips_life_holds_from_the_next_one_on():
         one.raw[:] = rng.normal(240.0, 1.0, one.raw.shape).round()
         one.raw[3] = 200  # a triangle that repeats itself for ever
         samples = [parts.feed([one]) + parts.expire((turn + 1) * PERIOD) for parts in (lazy, eager)]
-        eager.engine.validity.judge()
+        eager.engine.intake.judge()
         for mine, its in zip(*samples, strict=True):
             assert (mine.present == its.present).all()
-        dead = eager.engine.validity.liveness.frozen[3]
+        dead = eager.engine.intake.liveness.frozen[3]
         believed = [sample.present[3 * 12 : 4 * 12].any() for sample in samples[1]]
         if frozen_at is None and dead:
             frozen_at = turn

@@ -114,13 +114,13 @@ MUTANTS = [
     ),
     Mutant(
         "taxels that a new zero made unknown stay valid",
-        "processing/validity.py",
-        "valid = received if veto is None else received & ~veto",
-        "valid = received",
+        "processing/intake.py",
+        "return masks if veto is None else (masks[1] & ~veto.ravel(), masks[1])",
+        "return masks",
     ),
     Mutant(
         "a chip that does not answer is believed",
-        "processing/validity.py",
+        "processing/intake.py",
         "here = here & (ledger.error[row] == 0) & ~lifted(raw, far)",
         "here = here & ~lifted(raw, far)",
     ),
