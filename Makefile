@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip --quiet --quiet --disable-pip-version-check --no-inp
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo docs test coverage test-system simulate install uninstall lint format clean
+.PHONY: help demo docs test coverage mutation test-system simulate install uninstall lint format clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z.-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -23,6 +23,9 @@ test: lint  ## all that needs no root and no hardware
 
 coverage: .venv/dev.stamp .venv/coverage.stamp  ## branches of the core that the tests run: 95 % at least
 	@$(BIN)/python -m pytest --quiet --numprocesses=3 --dist=loadfile --cov --cov-report=term
+
+mutation: .venv/dev.stamp .venv/mutation.stamp  ## small changes of the core that its tests must notice; FILES=... PLACES=40
+	@$(BIN)/python -m tests.support.mutation --places $(or $(PLACES),40) $(FILES)
 
 test-system: .venv/dev.stamp .venv/fuzz.stamp  ## real CAN, I2C, systemd, broker and browser; root, if packages are missing
 	@tools/timed "packages" tools/lane/packages
@@ -68,6 +71,7 @@ clean:  ## the virtual environment, the lane's machine and caches
 # The stamps are newer than what they depend on once it is installed, the page's libraries too.
 .venv/dev.stamp: EXTRAS := [dev]
 .venv/fuzz.stamp: EXTRAS := [fuzz]
+.venv/mutation.stamp: EXTRAS := [mutation]
 .venv/docs.stamp: EXTRAS := [docs]
 .venv/%.stamp: pyproject.toml hatch_build.py skin_host/viewer/npm/package-lock.json | .venv/bin/python
 	@echo "installing skin-host$(EXTRAS) into .venv"

@@ -21,6 +21,14 @@ _numbers = itertools.count()
 
 # A slow machine is no failure.
 hypothesis.settings.register_profile("project", deadline=None)
+# support/mutation.py: the same few examples in every run, and none is made smaller.
+hypothesis.settings.register_profile(
+    "mutation",
+    deadline=None,
+    derandomize=True,
+    max_examples=30,
+    phases=[hypothesis.Phase.explicit, hypothesis.Phase.generate],
+)
 hypothesis.settings.load_profile("project")
 
 

@@ -439,9 +439,7 @@ class Assembler:
         if state.missing != order.missing[done] or not heads.startswith(
             order.heads[begin:end], at * HEAD_BYTES
         ):
-            state.stray += 1
-            if state.stray == _MOST_STRAY_SWEEPS:
-                state.order, state.stray, state.learn_after = None, 0, _LEARN_AFTER_SWEEPS
+            self._note_stray(state)
             return 0
         if n < _SHORTEST_RUN:
             return 0
@@ -474,6 +472,13 @@ class Assembler:
         else:
             self._close(state, sweeps, whole)
         return n
+
+    @staticmethod
+    def _note_stray(state: _BoardState) -> None:
+        """A sweep did not come in the known order."""
+        state.stray += 1
+        if state.stray == _MOST_STRAY_SWEEPS:
+            state.order, state.stray, state.learn_after = None, 0, _LEARN_AFTER_SWEEPS
 
     def _belongs(self, state: _BoardState, bit: int, t_ns: int, sweeps: list[Sweep]) -> bool:
         """Handle a frame that is not the next one of a sweep in progress.
@@ -521,7 +526,10 @@ class Assembler:
         if values is None:
             values = np.frombuffer(bytearray().join(state.values), np.uint8)
         triangles = values.reshape(TRIANGLES, 2 * _PAYLOAD)
-        state.expected = -1
+        if state.expected >= 0:
+            # The second frame of the known order came first, or not at all.
+            self._note_stray(state)
+            state.expected = -1
         if got != state.wanted:
             counters.incomplete += state.missing != 0
             counters.halves += (got ^ present * _BOTH).bit_count()

@@ -1,5 +1,6 @@
 """Frames to sweeps: pairing, completeness, and an account of everything that went wrong."""
 
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -245,3 +246,232 @@ def test_frames_in_the_usual_order_are_taken_together_with_the_same_result(data)
     assert together.crowded == alone.crowded
     for mine, its in zip(found, expected, strict=True):
         assert all(map(np.array_equal, mine, its))
+
+
+def identifier(message_class: wire.MessageClass, address: int, triangle: int = 0) -> int:
+    return message_class << 8 | address << 4 | triangle
+
+
+STREAM, LEGACY = wire.MessageClass.SKIN_STREAM, wire.MessageClass.ANALOG_STREAM
+BATTERY = wire.MessageClass.BATTERY_STREAM
+
+
+@pytest.mark.parametrize(
+    ("can_id", "length", "header", "counted"),
+    [
+        (identifier(STREAM, 1), 7, wire.HEADER_A, "short"),
+        (identifier(STREAM, 1), 5, wire.HEADER_B, "short"),
+        (identifier(STREAM, 1), 8, 0x80, "wrong_header"),
+        (identifier(STREAM, 1, 4), 8, wire.HEADER_A, "unknown_triangle"),
+        (identifier(STREAM, 2, 3), 6, wire.HEADER_B, "unknown_board"),
+        (identifier(LEGACY, 1, 9), 8, wire.HEADER_A, "unknown_triangle"),
+        (identifier(LEGACY, 9), 8, wire.HEADER_B, "unknown_board"),
+        (identifier(BATTERY, 9), 8, wire.HEADER_B, "unknown_board"),
+        # Other sensors share these classes.
+        (identifier(LEGACY, 1), 7, wire.HEADER_A, "other"),
+        (identifier(LEGACY, 1), 6, wire.HEADER_B, "other"),
+        (identifier(LEGACY, 1), 8, 0x80, "other"),
+        (identifier(BATTERY, 1), 8, wire.HEADER_A, "other"),
+        (identifier(STREAM, 1), 0, 0, "other"),
+        (0x800 | identifier(STREAM, 1), 8, wire.HEADER_A, "other"),
+        (0x3A5, 8, wire.HEADER_A, "force_torque"),
+        (0x7FF, 8, wire.HEADER_A, "other"),
+    ],
+)
+def test_a_frame_that_is_of_no_sweep_is_counted_by_its_reason_and_once(
+    can_id: int, length: int, header: int, counted: str
+) -> None:
+    assembler = make()
+    assembler._force_torque = frozenset({0x3A5})
+    data = bytes([header, *range(1, 8)])[:length]
+    assert assembler.feed(FrameBatch.of([(can_id, data, PERIOD)])).sweeps == []
+    assert assembler.flush() == []
+    known = {name: getattr(assembler.counters, name) for name in assembler.counters.__slots__}
+    assert {name: n for name, n in known.items() if n} == {"frames": 1, counted: 1}
+
+
+def test_frames_of_every_class_in_which_a_board_may_send_make_its_sweep() -> None:
+    raw = values(3)
+    sent = frames(raw, PERIOD)
+    classes = [LEGACY, LEGACY, STREAM, BATTERY, STREAM, STREAM]
+    sent = [(of << 8 | one & 0xFF, *rest) for of, (one, *rest) in zip(classes, sent, strict=True)]
+    (sweep,) = feed(make("0-2"), sent)
+    np.testing.assert_array_equal(sweep.raw[:3], raw)
+
+
+def test_answers_are_handed_on_with_the_bytes_that_they_have() -> None:
+    sent = [
+        (identifier(wire.MessageClass.ANALOG_COMMAND, 1), b"\x1c\x02\x03", PERIOD),
+        (identifier(wire.MessageClass.MANAGEMENT, 1), bytes(range(8)), PERIOD),
+        (identifier(wire.MessageClass.MANAGEMENT, 1), b"", PERIOD),
+        (identifier(wire.MessageClass.MOTOR_STREAM, 1), b"\x01", PERIOD),
+        (identifier(wire.MessageClass.INERTIAL_STREAM, 1), b"\x01", PERIOD),
+    ]
+    assembler = make()
+    assert assembler.feed(FrameBatch.of(sent)).answers == [(one, data) for one, data, _ in sent[:3]]
+    assert assembler.counters.other == 5
+
+
+def test_the_most_frequent_motor_frame_is_named_when_these_are_most_of_what_comes() -> None:
+    def after(motors: list[int], others: int) -> int | None:
+        assembler = make()
+        sent = [(one, b"\x01", PERIOD) for one in motors]
+        feed(assembler, sent + frames(values(4), PERIOD)[:others])
+        return assembler.stranger_id
+
+    assert after([0x0A5, 0x123, 0x123], others=2) == 0x123
+    assert after([0x0A5, 0x123], others=2) is None
+    assert after([0x1FF], others=0) == 0x1FF
+    assert after([0x200], others=0) is None
+
+
+def test_the_frames_of_a_slow_burst_are_one_sweep_until_it_is_too_old() -> None:
+    """No pause is longer than half of a period, and the last frame is 0.9 periods old."""
+    raw = values(2)
+
+    def cut(*times_ms: float) -> list[int]:
+        sent = frames(raw, 0)
+        times = [PERIOD + round(t_ms * MS) for t_ms in times_ms]
+        late = [(*one[:2], t_ns) for one, t_ns in zip(sent, times, strict=True)]
+        assembler = make("0-1")
+        alone = [sweep.present for frame in late for sweep in feed(assembler, [frame])]
+        assert assembler.counters.doubled == 0
+        return alone + [sweep.present for sweep in assembler.flush()]
+
+    assert cut(0, 15, 30, 45) == [0b11]
+    assert cut(0, 25, 30, 45) == [0b11]
+    assert cut(0, 1, 26.001, 27) == [0b01, 0b10]
+    assert cut(0, 20, 40, 45.001) == [0b01]
+    # Stamps that step back a little end no sweep.
+    assert cut(3, 2, 1, 0) == [0b11]
+
+
+def test_a_sweep_expires_once_it_is_older_than_its_share_of_a_period() -> None:
+    assembler = make()
+    feed(assembler, frames(values(4), PERIOD)[:-1])
+    assert assembler.expire(PERIOD + 45 * MS) == []
+    (sweep,) = assembler.expire(PERIOD + 45 * MS + 1)
+    assert sweep.present == 0b0111
+    assert assembler.expire(10 * PERIOD) == []
+
+
+def test_two_boards_at_one_address_crowd_it_and_one_that_is_early_does_not() -> None:
+    def crowded(apart_ms: float) -> int:
+        assembler = make("0")
+        for start in (PERIOD, PERIOD + round(apart_ms * MS)):
+            feed(assembler, frames(values(1, start), start))
+        assert assembler.counters.sweeps == 2
+        return assembler.crowded[0]
+
+    assert [crowded(apart_ms) for apart_ms in (1.0, 24.0, 25.0, 40.0)] == [1, 1, 0, 0]
+
+
+def test_a_slot_that_repeats_its_bytes_a_period_later_was_sent_again() -> None:
+    """A board of which one frame comes, always the same: each is a sweep of its own."""
+
+    def counted(apart_ns: int) -> tuple[int, int]:
+        assembler = make("0-1")
+        first = frames(values(2), PERIOD)[0]
+        feed(assembler, [first])
+        feed(assembler, [(*first[:2], PERIOD + apart_ns)])
+        assembler.flush()
+        return assembler.counters.doubled, assembler.counters.halves
+
+    assert counted(0) == counted(25 * MS) == (1, 1)
+    assert counted(25 * MS + 1) == counted(PERIOD) == counted(-1) == (0, 2)
+
+
+def test_a_doubled_last_frame_is_told_from_the_next_sweeps_first() -> None:
+    """With one triangle of one frame missing, the last slot of a sweep is the next one's first."""
+
+    def counted(apart_ns: int) -> int:
+        assembler = make("0")
+        (first, second) = frames(values(1), PERIOD)
+        feed(assembler, [first, second, (*second[:2], first[2] + apart_ns)])
+        return assembler.counters.doubled
+
+    assert counted(25 * MS) == 1
+    assert counted(25 * MS + 1) == 0
+
+
+@pytest.mark.parametrize(("apart", "missed"), [(0.6, 0), (1.4, 0), (1.6, 1), (2.4, 1), (10.0, 9)])
+def test_periods_without_a_frame_are_rounded(apart: float, missed: int) -> None:
+    assembler = make()
+    feed(assembler, frames(values(4), PERIOD))
+    (sweep,) = feed(assembler, frames(values(4, 1), PERIOD + round(apart * PERIOD)))
+    assert sweep.missed == assembler.counters.missed == missed
+
+
+def test_what_is_no_longer_awaited_makes_no_sweep_incomplete_and_comes_late_within_a_pause() -> (
+    None
+):
+    assembler = make("0-1")
+    for period in range(1, PATIENCE_SWEEPS + 3):
+        feed(assembler, frames(values(1, period), period * PERIOD))
+        assembler.expire((period + 1) * PERIOD)
+    assert assembler.counters.incomplete == PATIENCE_SWEEPS
+    assert assembler.counters.halves == 0
+    start = 10 * PERIOD
+    feed(assembler, frames(values(1), start))
+    *_, first, second = frames(values(2), start)
+    feed(assembler, [(*first[:2], start + 25 * MS)])
+    assert assembler.counters.late == 1
+    # From then on it is awaited; what comes after a pause begins a sweep.
+    feed(assembler, [(*second[:2], start + 25 * MS + 1)])
+    assert assembler.counters.late == 1
+    sweeps = assembler.counters.sweeps
+    assembler.flush()
+    assert assembler.counters.sweeps == sweeps + 1
+
+
+def test_a_triangle_is_awaited_until_it_was_missing_so_often_in_a_row() -> None:
+    assembler = make("0-1")
+    for period in range(1, 20):
+        came = 2 if period % PATIENCE_SWEEPS == 0 else 1
+        sweeps = feed(assembler, frames(values(came, period), period * PERIOD))
+        assert len(sweeps) == came - 1
+        assembler.expire((period + 1) * PERIOD - 1)
+
+
+def test_a_board_that_only_sends_halves_is_awaited_in_whole_again() -> None:
+    assembler = make("0-1")
+    for period in range(1, 12):
+        feed(assembler, frames(values(2, period), period * PERIOD)[::2])
+        assert assembler.expire((period + 1) * PERIOD) == []
+    assert assembler.counters.halves == 2 * assembler.counters.sweeps == 22
+    (sweep,) = feed(assembler, frames(values(2), 12 * PERIOD))
+    assert sweep.present == 0b11
+
+
+def test_once_a_boards_order_is_known_its_frames_are_taken_as_a_whole(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An order that changes for good is learnt again, after a while."""
+    taken: list[int] = []
+
+    def watched(take: Callable[..., int]) -> Callable[..., int]:
+        def note(*args: object) -> int:
+            n = take(*args)
+            taken.extend([n] if n else [])
+            return n
+
+        return note
+
+    for name in ("_take_sweep", "_take_run"):
+        monkeypatch.setattr(Assembler, name, watched(getattr(Assembler, name)))
+    assembler = make()
+
+    def run(periods: range, order: list[int]) -> list[int]:
+        taken.clear()
+        for period in periods:
+            swept = frames(values(4, period), period * PERIOD)
+            times = [t_ns for _, _, t_ns in swept]
+            mixed = [(*swept[i][:2], t_ns) for i, t_ns in zip(order, times, strict=True)]
+            assert len(feed(assembler, mixed)) == 1
+        return taken.copy()
+
+    assert run(range(1, 11), list(range(8))) == [8] * 8  # the second sweep shows the order
+    for first, order in ((11, [7, 6, 5, 4, 3, 2, 1, 0]), (111, [1, 0, 3, 2, 7, 6, 5, 4])):
+        # Four sweeps that differ, a pause of 64, and one that shows the order.
+        assert run(range(first, first + 69), order) == []
+        assert run(range(first + 69, first + 79), order) == [8] * 10

@@ -1,0 +1,213 @@
+"""Mutation testing of the core: small changes of the code that the tests of its room must notice.
+
+    python -m tests.support.mutation [--places 40] [--seed 1] [FILE ...]
+
+cosmic-ray makes the changes; the tests run in a copy of the tree. `mutation.toml` has the files
+of the core with their tests, and the changes that are equivalent: nothing that the code promises
+depends on them. The seed draws so many places of each file, and one change of each place.
+"""
+
+import argparse
+import ast
+import contextlib
+import difflib
+import os
+import resource
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+import hypothesis.extra.numpy  # noqa: F401  (loaded once, not by each run of the tests)
+import msgspec
+import numpy as np  # noqa: F401
+import pytest
+from cosmic_ray.commands import init
+from cosmic_ray.mutating import mutate_code
+from cosmic_ray.plugins import get_operator
+from cosmic_ray.work_db import WorkDB, use_db
+
+ROOT = Path(__file__).parents[2]
+TABLE = Path(__file__).with_suffix(".toml")
+COPIED = ("skin_host", "emulator", "tests", "config")
+#: Failing examples are not made smaller, and every run draws the same ones.
+OPTIONS = [
+    "-x",
+    "-q",
+    "-n",
+    "0",
+    "-p",
+    "no:cacheprovider",
+    "--assert=plain",
+    "--hypothesis-profile=mutation",
+]
+#: Tests that take so much more CPU time than without a change hang.
+SLOWER, SLOWER_S = 3.0, 10.0
+#: They make the same of what is only ever compared with None.
+SAME = ("ReplaceComparisonOperator_Is_Eq", "ReplaceComparisonOperator_IsNot_NotEq")
+
+
+class Core(msgspec.Struct, forbid_unknown_fields=True):
+    """A file of the core, and the files of tests that have to notice its changes."""
+
+    file: str
+    tests: list[str]
+
+
+class Equivalent(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+    """A change that no test can notice: a line, what it becomes, and why that is the same."""
+
+    file: str
+    line: str
+    becomes: str
+    reason: str
+
+
+class Table(msgspec.Struct, forbid_unknown_fields=True):
+    """See the module."""
+
+    core: list[Core]
+    equivalent: list[Equivalent]
+
+
+def read_table() -> Table:
+    return msgspec.toml.decode(TABLE.read_bytes(), type=Table)
+
+
+@contextlib.contextmanager
+def copied_tree() -> Iterator[Path]:
+    """A copy of what tests need, for as long as it is used."""
+    with tempfile.TemporaryDirectory(prefix="skin-mutation-") as name:
+        folder = Path(name)
+        for entry in ROOT.iterdir():
+            if entry.name in COPIED:
+                shutil.copytree(entry, folder / entry.name)
+            elif not entry.name.startswith("."):
+                (folder / entry.name).symlink_to(entry)
+        with contextlib.chdir(folder):
+            yield folder
+
+
+def drawn(source: str, items: list[Any], places: int, seed: int) -> list[Any]:
+    """Return one change for each of so many places; a change elsewhere in the file changes few."""
+    lines = source.splitlines()
+    typed = [
+        (node.lineno, node.col_offset, node.end_lineno, node.end_col_offset)
+        for node in _annotations(ast.parse(source))
+    ]
+
+    def order(item: Any) -> bytes:
+        (change,) = item.mutations
+        row, column = change.start_pos
+        text = f"{seed} {lines[row - 1]} {column} {change.operator_name} {change.occurrence}"
+        return blake2b(text.encode()).digest()
+
+    found: dict[tuple[int, int], Any] = {}
+    for item in sorted(items, key=order):
+        (change,) = item.mutations
+        row, column = change.start_pos
+        is_type = any((a, b) <= (row, column) < (c, d) for a, b, c, d in typed)
+        if not is_type and not change.operator_name.endswith(SAME):
+            found.setdefault(change.start_pos, item)
+    return list(found.values())[:places]
+
+
+def _annotations(tree: ast.Module) -> Iterator[Any]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.AnnAssign | ast.arg) and node.annotation is not None:
+            yield node.annotation
+        elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.returns is not None:
+            yield node.returns
+
+
+def changed(source: str, becomes: str) -> tuple[str, str]:
+    """Return the line that was changed, and what it became."""
+    lines = list(difflib.ndiff(source.splitlines(), becomes.splitlines()))
+    before = [line[2:].strip() for line in lines if line.startswith("- ")]
+    after = [line[2:].strip() for line in lines if line.startswith("+ ")]
+    return " ".join(before), " ".join(after)
+
+
+def passes(tests: list[str], limit_s: float | None = None) -> bool:
+    """Whether tests pass, in a child of this process: what they import is compiled, most is loaded.
+
+    Args:
+        tests: files.
+        limit_s: CPU time that they may take.
+    """
+    child = os.fork()
+    if not child:
+        sys.dont_write_bytecode = True  # two changes within a second look alike to its cache
+        silence = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(silence, 1)
+        os.dup2(silence, 2)
+        if limit_s is not None:
+            resource.setrlimit(resource.RLIMIT_CPU, (int(limit_s) + 1,) * 2)
+        os._exit(pytest.main([*OPTIONS, *tests]))
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+def children_s() -> float:
+    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+
+
+def score(core: Core, equivalents: dict[tuple[str, str, str], str], places: int, seed: int) -> None:
+    """Run a file's changes, and print those that nobody noticed."""
+    path = Path(core.file)
+    source = path.read_text()
+    before_s = children_s()
+    if not passes(core.tests):
+        sys.exit(f"{core.file}: its tests fail without a change: pytest {' '.join(core.tests)}")
+    limit_s = SLOWER * (children_s() - before_s) + SLOWER_S
+    with use_db(":memory:", WorkDB.Mode.create) as work:
+        init([path], work, {})
+        items = list(work.work_items)
+    killed = lived = same = 0
+    for item in drawn(source, items, places, seed):
+        (change,) = item.mutations
+        becomes = mutate_code(source, get_operator(change.operator_name)(), change.occurrence)
+        assert becomes is not None
+        line = changed(source, becomes)
+        if (core.file, *line) in equivalents:
+            same += 1
+            continue
+        path.write_text(becomes)
+        if passes(core.tests, limit_s):
+            lived += 1
+            print(
+                f"  {core.file}:{change.start_pos[0]}\n    - {line[0]}\n    + {line[1]}", flush=True
+            )
+        else:
+            killed += 1
+    path.write_text(source)
+    share = 100 * killed / max(killed + lived, 1)
+    print(
+        f"{core.file}: {killed} of {killed + lived} noticed ({share:.0f} %); {same} equivalent; "
+        f"{len(items)} possible",
+        flush=True,
+    )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--places", type=int, default=40, help="of each file (default 40)")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("files", nargs="*", metavar="FILE", help="of the core (default: all)")
+    arguments = parser.parse_args()
+    table = read_table()
+    unknown = set(arguments.files) - {core.file for core in table.core}
+    if unknown:
+        parser.error(f"not in {TABLE.name}: {', '.join(sorted(unknown))}")
+    equivalents = {(one.file, one.line, one.becomes): one.reason for one in table.equivalent}
+    with copied_tree():
+        for core in table.core:
+            if not arguments.files or core.file in arguments.files:
+                score(core, equivalents, arguments.places, arguments.seed)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
