@@ -8,6 +8,8 @@ import pytest
 
 from tests.support.machine import ROOT, Machine
 
+pytestmark = pytest.mark.timeout(900)
+
 FOLDER = "/etc/systemd/network"
 #: A serial adapter's other end: it takes every command of the kernel's slcan.
 ADAPTER = """

@@ -2,8 +2,22 @@
 
 import time
 
+import pytest
+
+from tests.support import machine as machines
 from tests.support.machine import Done, Machine, now
 from tests.support.service import CONFIGURATION, DROP_INS, PIP, UNIT, Service
+
+pytestmark = pytest.mark.timeout(900)
+
+
+def test_an_answer_that_nobody_waited_for_is_not_taken_for_the_next(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch, pytest.raises(AssertionError, match="no answer"):
+        patch.setattr(machines, "GRACE_S", -10.0)
+        machine.run("sleep 2; echo late", timeout_s=10.0)
+    assert machine.do("echo next") == "next"
 
 
 def test_installing_brings_everything_and_asks_for_nothing_but_a_configuration(
