@@ -259,8 +259,9 @@ def _sections(report: Report) -> list[Section]:
                     f"{report['unwatched']['skipped_sweeps']} were skipped, "
                     f"{report['unwatched']['touches_that_differ']} touch decisions differed, and "
                     f"pressures by {report['unwatched']['worst_difference_kpa']:.2f} kPa at most. "
-                    "Second table: pads with their own curves, smoothing and the foam's plays "
-                    "included, and pads with equation (1) and the default model."
+                    "Second table: pads with equation (1) and the default model; pads with "
+                    "equation (1), a filter of noise and the foam's plays in each sweep; and the "
+                    "same with own curves. The third against the second is the cost of the curves."
                 ),
             ],
             [tables.pipeline(report), tables.own_curves(report)],

@@ -6,6 +6,7 @@ each pad, its expected error, and the memory of the foam (see `PlayRelaxation`).
 converts the bytes of a part to momentary pressures: by a parabola or a table per taxel.
 """
 
+import sys
 from copy import copy
 from dataclasses import dataclass, field
 from enum import IntEnum
@@ -113,14 +114,18 @@ class TableCurve:
 
     Has the same interface as `PressureCurve`.
 
-    Attributes:
+    Args:
         table_kpa: float64[n, k], rising.
+        beyond_units: float64[n], activation up to which the curve was measured.
+
+    Attributes:
         linear: float64[n], kPa per unit at zero activation; it continues below zero.
         beyond_units: float64[n], activation up to which the curve was measured.
     """
 
     def __init__(self, table_kpa: Floats, beyond_units: Floats) -> None:
-        self.table_kpa = table_kpa
+        self._table_kpa = table_kpa
+        self._row = np.arange(len(table_kpa))
         self.beyond_units = beyond_units
         #: Each piece between knots is level + slope x; the first and the last go on for ever.
         self._slope: Floats = np.diff(table_kpa, axis=1) / np.diff(KNOTS_UNITS)
@@ -128,13 +133,11 @@ class TableCurve:
         self.linear: Floats = self._slope[:, 0]
 
     def part(self, taxels: Taxels) -> "TableCurve":
-        """Return the curves of some of the taxels."""
+        """Return the curves of some of the taxels; they share the tables of all."""
         chosen = copy(self)
-        chosen.table_kpa = self.table_kpa[taxels]
+        chosen._row = self._row[taxels]
         chosen.beyond_units = self.beyond_units[taxels]
         chosen.linear = self.linear[taxels]
-        chosen._slope = self._slope[taxels]
-        chosen._level = self._level[taxels]
         return chosen
 
     def kpa(self, units: ArrayLike) -> Floats:
@@ -142,16 +145,15 @@ class TableCurve:
         x = np.asarray(units, dtype=np.float64)
         quarters = np.clip(x / GRID_UNITS, 0.0, len(_PIECE_AT) - 1.0).astype(np.intp)
         piece = _PIECE_AT[quarters]
-        taxel = np.arange(len(self.linear))
-        result: Floats = self._level[taxel, piece] + self._slope[taxel, piece] * x
+        result: Floats = self._level[self._row, piece] + self._slope[self._row, piece] * x
         return result
 
     def units(self, kpa: ArrayLike) -> Floats:
         """Return the activation [..., n] in units for these pressures; inverse of kpa."""
         c = np.asarray(kpa, dtype=np.float64)
-        piece = np.sum(self.table_kpa[:, 1:-1] <= c[..., np.newaxis], axis=-1)
-        taxel = np.arange(len(self.linear))
-        result: Floats = (c - self._level[taxel, piece]) / self._slope[taxel, piece]
+        knots_kpa = self._table_kpa[self._row, 1:-1]
+        piece = np.sum(knots_kpa <= c[..., np.newaxis], axis=-1)
+        result: Floats = (c - self._level[self._row, piece]) / self._slope[self._row, piece]
         return result
 
 
@@ -174,9 +176,14 @@ def common_curve(
     )
 
 
-def with_own(common: PressureCurve, curves: Curves) -> TableCurve:
+Curve = PressureCurve | TableCurve
+
+
+def with_own(common: PressureCurve, curves: Curves) -> Curve:
     """Return own curves where taxels have one, the common one elsewhere."""
     own = curves.own
+    if not own.any():
+        return common
     table = np.where(own[:, np.newaxis], curves.kpa, common.kpa(KNOTS_UNITS[:, np.newaxis]).T)
     return TableCurve(rising(table), np.where(own, curves.beyond_units, common.beyond_units))
 
@@ -242,8 +249,11 @@ class Tables:
         self._offset = np.full(m, np.inf, np.float32)
         self._table = np.zeros((m, 256), np.float32)
         self._flat = self._table.reshape(-1)
-        self._row = np.arange(0, 256 * m, 256)
-        self._index = np.empty(m, np.intp)
+        #: Where each taxel's row begins, plus its byte: rows are as long as a byte has values, so
+        #: the lowest byte of this sum is the taxel's.
+        self._index = np.arange(0, 256 * m, 256, dtype=np.intp)
+        lowest = 0 if sys.byteorder == "little" else self._index.itemsize - 1
+        self._lowest = self._index.view(np.uint8)[lowest :: self._index.itemsize]
         self._lowered: Floats32 | None = None
 
     def renew(self, offset: Floats32) -> None:
@@ -258,7 +268,7 @@ class Tables:
         self._lowered = relaxation_kpa.copy()
 
     def kpa(self, raw: Bytes, out: Floats32) -> None:
-        np.add(self._row, raw, out=self._index)
+        self._lowest[...] = raw
         self._flat.take(self._index, out=out, mode="clip")
         if self._lowered is not None:
             np.subtract(out, self._lowered, out=out)

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.processing.curves import TableCurve
+from skin_host.processing.curves import Curve
 from skin_host.processing.masks import Mask
 
 Floats = NDArray[np.float32]
@@ -81,7 +81,7 @@ class Erratic:
             self.any = bool(self.pads.any())
 
 
-def step_kpa(curve: TableCurve, noise_units: NDArray[np.float64]) -> NDArray[np.float64]:
+def step_kpa(curve: Curve, noise_units: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the step [m] from sample to sample that a pad's noise does not reach."""
     end = np.where(np.isfinite(curve.beyond_units), np.maximum(curve.beyond_units, 1.0), 1.0)
     step: NDArray[np.float64] = (

@@ -19,6 +19,7 @@ from skin_host.layout import Layout, PadKind, PartLayout
 from skin_host.processing.calibration import Calibration
 from skin_host.processing.curves import (
     KNOTS_UNITS,
+    Curve,
     Curves,
     Parabolas,
     Reader,
@@ -31,8 +32,7 @@ from skin_host.processing.drift import BaselineTracker
 from skin_host.processing.erratic import Erratic, step_kpa
 from skin_host.processing.fitting.course import limit_kpa, make_memory
 from skin_host.processing.masks import Mask, any_of
-from skin_host.processing.pressure import PressureCurve
-from skin_host.processing.relaxation import OWN_MEANS, make_model, parameters_of
+from skin_host.processing.relaxation import OWN_MEANS, PlayRelaxation, make_model, parameters_of
 from skin_host.processing.relaxation import Relaxation as Model
 from skin_host.processing.smoothing import StepFilter
 from skin_host.processing.touch import Levels, Residuals, TouchDetector, levels
@@ -190,7 +190,7 @@ class _Rules:
 
     settings: Processing
     usable: Mask
-    curve: PressureCurve | TableCurve
+    curve: Curve
     curves: Curves | None
     levels: Levels
 
@@ -331,7 +331,7 @@ class _PartPipeline:
         self._own: _OwnCurves | None = None
         self._every_sample = False
         self._window_s = WINDOW_S
-        if rules.curves is not None and isinstance(rules.curve, TableCurve):
+        if rules.curves is not None:
             smoothing_s = rules.settings.pressure.smoothing_s
             self._own = _OwnCurves(rules.curve, rules.curves, self._mine, smoothing_s)
             return
@@ -480,6 +480,8 @@ class _PartPipeline:
         row = self._row[self._laid]
         self._reader.kpa(self._last_raw, row)
         if self._own is not None:
+            if beyond is not self._nowhere and not isinstance(self._curve, TableCurve):
+                row[beyond] = self._curve.part(beyond).kpa(self._activations(beyond))
             reported = self._own.step(row, dt_s, touched, self._relaxation_kpa)
             np.subtract(row, self._relaxation_kpa, out=row)
             return row, reported
@@ -494,9 +496,13 @@ class _PartPipeline:
 
     def _beyond_kpa(self, beyond: Mask) -> NDArray[np.float64]:
         """Return the common curve beyond its calibrated range."""
-        units = self._offset[beyond] - self._last_raw[beyond]
-        kpa = self._curve.part(beyond).kpa(units)
+        kpa = self._curve.part(beyond).kpa(self._activations(beyond))
         return kpa if self._every_sample else kpa - self._relaxation_kpa[beyond]
+
+    def _activations(self, taxels: Mask) -> Floats:
+        """Return the activations of some taxels, in units."""
+        activations: Floats = self._offset[taxels] - self._last_raw[taxels]
+        return activations
 
     def _gather(self, touched: Mask, dt_s: float) -> None:
         """Add the sample to the window's means; at its end update the slow state."""
@@ -611,7 +617,7 @@ class _OwnCurves:
         erratic: which of them jump.
     """
 
-    def __init__(self, curve: TableCurve, curves: Curves, mine: slice, smoothing_s: float) -> None:
+    def __init__(self, curve: Curve, curves: Curves, mine: slice, smoothing_s: float) -> None:
         own, noise = curves.own[mine], curves.noise_units[mine]
         m = len(own)
         self._own = own
@@ -622,7 +628,9 @@ class _OwnCurves:
         self._zeros = np.zeros(m, np.float32)
         self._reported = self._zeros
         self._touched: Mask | None = None
-        self._which = np.zeros(0, np.intp)
+        #: The touched taxels, with a filter and a memory of their own as long as they are touched.
+        self._felt_memory: PlayRelaxation | None = None
+        self._set_apart(np.zeros(0, np.intp))
         #: Which were touched since the last fold.
         self._felt: Mask = np.zeros(m, np.bool_)
         self._touching = False
@@ -635,36 +643,52 @@ class _OwnCurves:
         """
         self._folded_s += dt_s
         if touched is not self._touched:
-            self._touched, self._which = touched, np.flatnonzero(touched)
+            self._touched = touched
             self._felt |= touched
+            self._take_back()
+            self._set_apart(np.flatnonzero(touched))
             self._report(relaxation_kpa)
         which = self._which
         if not len(which):
             return self._reported
         self._touching = True
-        smooth = self._smoother.step_some(which, momentary, dt_s)
-        if self._memory is not None:
-            self._memory.step_some(which, smooth, relaxation_kpa)
+        smooth = self._felt_smoother.step(momentary.take(which), dt_s)
+        if self._felt_memory is not None:
+            self._felt_memory.step(smooth, dt_s, self._relaxed)
+            relaxation_kpa[which] = self._relaxed
+        pressure = smooth - self._relaxed
+        np.maximum(pressure, self._zeros[: len(which)], out=pressure)
         reported = self._reported.copy()
-        pressure = smooth.take(which)
-        pressure -= relaxation_kpa.take(which)
-        reported[which] = np.maximum(pressure, self._zeros[0], out=pressure)
+        reported[which] = pressure
         return reported
+
+    def _set_apart(self, which: NDArray[np.intp]) -> None:
+        """Step these taxels apart from the others, in steps that cost as much as they are."""
+        self._which = which
+        self._relaxed = np.zeros(len(which), np.float32)
+        self._felt_smoother = self._smoother.part(which)
+        if self._memory is not None:
+            self._felt_memory = self._memory.part(which)
+
+    def _take_back(self) -> None:
+        """Bring the state of all taxels up to date."""
+        if len(self._which):
+            self._smoother.take_back(self._which, self._felt_smoother)
+            if self._memory is not None and self._felt_memory is not None:
+                self._memory.take_back(self._which, self._felt_memory)
 
     def fold(self, rows: Floats, sums: Floats, relaxation_kpa: Floats) -> None:
         """Take the corrected pressures [k, m] of the last sweeps, and their sums [m]."""
         if self._touching or self.erratic.suspects:
             self.erratic.look(rows)
-        which = self._which
-        if 4 * len(which) <= len(self._own):
-            momentary = sums / np.float32(len(rows))
-            if self._touching:
-                # A mean over a press and its release is neither.
-                np.copyto(momentary, rows[-1], where=self._felt)
-            momentary += relaxation_kpa
-            known = self._smoother.smooth.take(which)
-            self._smoother.step(momentary, self._folded_s)[which] = known
+        momentary = sums / np.float32(len(rows))
         if self._touching:
+            # A mean over a press and its release is neither.
+            np.copyto(momentary, rows[-1], where=self._felt)
+        momentary += relaxation_kpa
+        self._smoother.step(momentary, self._folded_s)
+        if self._touching:
+            self._smoother.take_back(self._which, self._felt_smoother)
             self._touching = bool(len(self._which))
             self._felt.fill(False)
             self._felt[self._which] = True
@@ -674,6 +698,8 @@ class _OwnCurves:
     def end_window(self, elapsed_s: float, relaxation_kpa: Floats) -> None:
         """Update the relaxation [m] of all taxels, in place, and forget jumps of long ago."""
         if self._memory is not None:
+            # Plays do not move under a reading that they had: those apart stay as they are.
+            self._take_back()
             self._memory.step(self._smoother.smooth, elapsed_s, relaxation_kpa)
         self.erratic.pass_time(elapsed_s)
 
@@ -714,11 +740,13 @@ class _OwnCurves:
 
     def reset(self, taxels: Mask) -> None:
         """Forget the readings of taxels [m]."""
+        self._take_back()
         self._smoother.reset(taxels)
         self._reported = np.where(taxels, self._zeros, self._reported)
         self.erratic.reset(taxels)
         if self._memory is not None:
             self._memory.reset(taxels)
+        self._set_apart(self._which)
 
     def without_rails(self, raw: NDArray[np.uint8], present: Mask, offset: Floats) -> Mask:
         """Leave out bytes at the ends of the range: 0, and 255 far from rest, are not readings."""

@@ -51,18 +51,15 @@ class StepFilter:
         np.multiply(smooth, kept, out=smooth)
         return np.subtract(kpa, smooth, out=smooth)
 
-    def step_some(self, taxels: NDArray[np.intp], kpa: Array, dt_s: float) -> Array:
-        """Step some taxels, int[k], only; as `step`, with the pressures of all."""
-        if 4 * len(taxels) > len(self.smooth):
-            return self.step(kpa, dt_s)
-        now, limit = kpa.take(taxels), self._limit.take(taxels)
-        late = now - self.smooth.take(taxels)
-        np.minimum(late, limit, out=late)
-        np.maximum(late, np.negative(limit, out=limit), out=late)
-        late *= self._share_kept(dt_s)
-        now -= late
-        self.smooth[taxels] = now
-        return self.smooth
+    def part(self, taxels: NDArray[np.intp]) -> "StepFilter":
+        """Return a filter of some taxels, int[k], that continues from their present state."""
+        part = StepFilter(self._limit[taxels], self._time_s, self._limit.dtype)
+        part.smooth[...] = self.smooth[taxels]
+        return part
+
+    def take_back(self, taxels: NDArray[np.intp], part: "StepFilter") -> None:
+        """Adopt the state of some taxels, int[k], from a filter of them."""
+        self.smooth[taxels] = part.smooth
 
     def _share_kept(self, dt_s: float) -> Any:
         if dt_s != self._dt_s:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from skin_host.errors import RequestError
 from skin_host.processing.curves import (
     KNOTS_UNITS,
+    Curve,
     Curves,
     CurveVerdict,
     Memory,
@@ -173,7 +174,7 @@ def read_course(
     return np.maximum(result, 0.0, out=result)
 
 
-def limit_kpa(curve: TableCurve, noise_units: Floats) -> Floats:
+def limit_kpa(curve: Curve, noise_units: Floats) -> Floats:
     """Return the effect of noise [n] in the middle of the measured range, for `StepFilter`."""
     end = np.where(np.isfinite(curve.beyond_units), curve.beyond_units, 1.0)
     end = np.maximum(end, 1.0)

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from skin_host.processing.relaxation.base import Array, FiniteInput, Parameters, as_modes
+from skin_host.processing.relaxation.base import Array, FiniteInput, Parameters, as_modes, mix
 
 
 class PlayRelaxation:
@@ -54,32 +54,24 @@ class PlayRelaxation:
         np.minimum(self._plays, far, out=self._plays)
         np.maximum(near, self._floor, out=near)
         np.subtract(self._plays, near, out=far)
-        np.multiply(far, self._weight, out=far)
-        return np.add.reduce(far, axis=0, out=out)
+        return mix(self._weight, far, out)
 
-    def step_some(self, taxels: NDArray[np.intp], pressure_kpa: Array, out: Array) -> None:
-        """Step some taxels only, in steps that cost as much as there are taxels in them.
+    def part(self, taxels: NDArray[np.intp]) -> "PlayRelaxation":
+        """Return a model of some taxels, int[k], that continues from their present state."""
+        radius, weight = (
+            values if values.shape[1] == 1 else values[:, taxels]
+            for values in (self._radius, self._weight)
+        )
+        k, dtype = len(taxels), self._plays.dtype
+        part = PlayRelaxation(k, radius_kpa=radius, weight=weight, dtype=dtype)
+        part._plays[...] = self._plays[:, taxels]
+        part._input.last[...] = self._input.last[taxels]
+        return part
 
-        Args:
-            taxels: int[k], which.
-            pressure_kpa: momentary pressures of all taxels [n]; finite.
-            out: [n], the relaxation in kPa; that of the others is left as it is.
-        """
-        if 4 * len(taxels) > self.n:
-            self.step(pressure_kpa, 0.0, out)
-            return
-        radius = self._radius if self._radius.shape[1] == 1 else self._radius[:, taxels]
-        weight = self._weight if self._weight.shape[1] == 1 else self._weight[:, taxels]
-        zero = self._floor[0, 0]
-        reading = np.maximum(pressure_kpa.take(taxels), zero)
-        near = reading - radius
-        plays = self._plays.take(taxels, axis=1)
-        np.maximum(plays, near, out=plays)
-        np.minimum(plays, reading + radius, out=plays)
-        self._plays[:, taxels] = plays
-        plays -= np.maximum(near, zero, out=near)
-        plays *= weight
-        out[taxels] = np.add.reduce(plays, axis=0)
+    def take_back(self, taxels: NDArray[np.intp], part: "PlayRelaxation") -> None:
+        """Adopt the state of some taxels, int[k], from a model of them."""
+        self._plays[:, taxels] = part._plays
+        self._input.last[taxels] = part._input.last
 
     def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
         """Forget the history of all taxels, or of those in `mask` [n]."""

@@ -194,24 +194,29 @@ def test_noise_is_smoothed_and_a_step_passes_but_for_the_noise():
     assert smoother.step(np.array([200.0]), 0.02)[0] > 175.0
 
 
-def test_steps_of_some_taxels_give_the_same_as_steps_of_all():
+def test_taxels_that_are_stepped_apart_and_taken_back_are_as_if_they_had_not_been():
     rng = np.random.default_rng(3)
-    n, some = 40, np.array([2, 3, 5, 7, 30])
+    n = 40
     radius, weight = (5.0, 20.0, 60.0), (0.3, 0.2, 0.1)
     models = [PlayRelaxation(n, radius_kpa=radius, weight=weight) for _ in range(2)]
     filters = [StepFilter(np.full(n, 4.0), 0.5) for _ in range(2)]
-    relaxation = [np.zeros(n), np.zeros(n)]
     kpa = np.zeros(n)
-    for _ in range(500):
-        kpa = kpa + rng.normal(0.0, 6.0, n)
-        models[0].step(filters[0].step(kpa, 0.02), 0.02, relaxation[0])
-        models[1].step_some(some, filters[1].step_some(some, kpa, 0.02), relaxation[1])
-        assert relaxation[1][some] == pytest.approx(relaxation[0][some])
-        assert filters[1].smooth[some] == pytest.approx(filters[0].smooth[some])
-    assert not np.delete(relaxation[1], some).any()
+    for some in (np.array([2, 3, 5, 7, 30]), np.array([], np.intp), np.array([3, 39])):
+        others = np.delete(np.arange(n), some)
+        apart = [(filters[1].part(them), models[1].part(them)) for them in (some, others)]
+        for _ in range(200):
+            kpa = kpa + rng.normal(0.0, 6.0, n)
+            wanted = models[0].step(filters[0].step(kpa, 0.02), 0.02)
+            for them, (smoother, memory) in zip((some, others), apart, strict=True):
+                relaxation = memory.step(smoother.step(kpa[them], 0.02), 0.02)
+                assert relaxation == pytest.approx(wanted[them])
+        for them, (smoother, memory) in zip((some, others), apart, strict=True):
+            filters[1].take_back(them, smoother)
+            models[1].take_back(them, memory)
+        assert filters[1].smooth == pytest.approx(filters[0].smooth)
 
 
-def use_own_curves(rig, noise_units):
+def use_own_curves(rig, noise_units, verdict=CurveVerdict.GOOD):
     """Give all pads equation (1) as their own curve, and a foam with plays."""
     n = rig.n
     curves = Curves(
@@ -219,7 +224,7 @@ def use_own_curves(rig, noise_units):
         beyond_units=np.full(n, 60.0),
         noise_units=np.full(n, noise_units),
         error_kpa=np.full(n, 1.0),
-        verdict=np.full(n, CurveVerdict.GOOD, np.uint8),
+        verdict=np.full(n, verdict, np.uint8),
         highest_kpa=150.0,
         lag_s=0.0,
         memory=Memory((5.0, 20.0), (0.2, 0.1)),
@@ -267,3 +272,13 @@ def test_pressures_by_own_curves_follow_a_press_at_once_and_end_with_it(pressed)
         for frame in after[5:]:
             assert not frame.touched.any()
             assert frame.pressure_kpa.max() < 4.0
+
+
+def test_pads_of_a_foam_with_memory_but_without_own_curves_read_equation_1_and_beyond_its_range():
+    rig = Rig(1, 0.0, seed=5, hz=50.0)
+    use_own_curves(rig, 0.0, CurveVerdict.UNKNOWN)
+    for units in (20.0, 60.0, 100.0):
+        frames = [rig.step(units) for _ in range(30)]
+        expected_kpa = float(PressureCurve(2.88).kpa(np.array([units]))[0])
+        assert np.median(frames[-1].pressure_kpa) == pytest.approx(expected_kpa, rel=0.05)
+    assert frames[-1].beyond_range.all()
