@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from emulator.probes.scene import Scene
 from emulator.robot import Robot
+from skin_host.cli import main
 from skin_host.config import check
 from skin_host.config.settings import PlaceSettings, Settings, changed, load, parse_triangles
 from skin_host.errors import ConfigurationError
@@ -375,3 +376,19 @@ def test_what_is_written_is_what_was_meant_to_be_read() -> None:
     text = configuration_text(settings)
     assert "period_ms" not in text  # the default
     assert parse_triangles(settings.parts["left_upper_arm"].patches[0].triangles) == list(range(9))
+
+
+@needs_samples
+def test_the_shipped_icub_has_its_forearm_where_its_positions_file_has_it(tmp_path: Path) -> None:
+    shipped = ROOT / "config" / "icub.toml"
+    output = tmp_path / "icub.toml"
+    arguments = ["--part", "left_forearm", "--config", str(shipped), "--output", str(output)]
+    assert main(["import", "positions", str(POSITIONS), *arguments]) == 0
+    ours, theirs = (build_layout(load(path), path.parent) for path in (shipped, output))
+    part = ours.part("left_forearm")
+    mine = np.arange(part.start, part.stop)[ours.pad_kind[part.start : part.stop] == 0]
+    apart_m = np.linalg.norm(ours.position_m[mine] - theirs.position_m[mine], axis=1)
+    assert np.median(apart_m) < 1e-3
+    assert apart_m.max() < 3e-3
+    # Both look outwards.
+    assert np.sum(ours.normal[mine] * theirs.normal[mine], axis=1).min() > 0
