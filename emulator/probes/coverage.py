@@ -1,13 +1,11 @@
 """Computes which pads the probes of a scene cover, for all probes and some steps at once.
 
-The pads within reach of a probe are found once and kept while it slides by less than
-`MARGIN_MM`. Where probes go in the next steps is mostly known: straight on. So the steps between
-which each pad is covered are found together, and in each of them it only remains to look up how
-much of each pad a probe at this distance covers.
+The pads near a probe's way are found once and kept until it leaves it by `MARGIN_MM`. Where
+probes go in the next steps is mostly known: straight on. So the steps between which each pad is
+covered are found together, and in each of them it only remains to look up how much of each pad a
+probe at this distance covers.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -29,8 +27,8 @@ from skin_host.layout import Layout
 #: A probe reaches only pads that face it, and not through the body.
 FACING = 0.3
 REACH_MM = 15.0
-#: How far a probe slides before what is within its reach is found again.
-MARGIN_MM = 3.0
+#: How far a probe slides at least before what is within its reach is found again.
+MARGIN_MM = 1.5
 #: So many pads times steps are computed at once: more would not stay in the processor's cache.
 MOST_AT_ONCE = 1 << 13
 #: Probes that slide less than this in a step are taken to slide so much.
@@ -42,15 +40,6 @@ LEAST_SHARE = 1e-6
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
-
-
-@dataclass(frozen=True, slots=True)
-class _Near:
-    """The pads near a probe's place: k of them, along its own axes, and where it was then."""
-
-    offset_mm: Floats
-    taxel: Ints
-    place_mm: Floats
 
 
 class Coverage:
@@ -69,18 +58,29 @@ class Coverage:
         self._thickness_mm = thickness_mm
         self._membrane_mm = membrane_mm
         self._shapes: list[Shape] = []
-        #: Point (mm), axes along the skin [2, 3] and pads that face it, of each probe.
-        self._places: list[tuple[Floats, Floats, Ints]] = []
-        self._near: dict[int, _Near] = {}
+        #: Of each probe: the pads that face it, and where they are along its axes, [2, k].
+        self._facing: list[Ints] = []
+        self._facing_mm: list[Floats] = []
         self._numbers: Ints = np.zeros(0, np.intp)
         self._gathered = False
-        #: What is gathered about the pads near all probes: x and y, pad, probe, reach and size.
+        #: Of the pads that the probes `_numbers` face: x and y, pad, probe and reach.
+        self._all_mm = np.zeros((2, 0))
+        self._all_taxel = self._all_contact = np.zeros(0, np.intp)
+        self._all_reach_mm = np.zeros(0)
+        #: Of those that are near, as far as is known from where and within what margin.
+        self._found_mm, self._margin_mm = np.zeros((0, 2)), 0.0
         self._place_mm = np.zeros((2, 0))
         self._taxel = self._contact = self._rows = np.zeros(0, np.intp)
         self._reach_mm = self._pad_radius_mm = self._pad_mm2 = np.zeros(0)
+        self._pads = self._taxel, self._contact, self._reach_mm
+        #: Radii that pads have, and which of them each has.
+        self._radii_mm, self._of_radius = np.unique(self._radius_mm, return_inverse=True)
         self._curves = LensCurves()
-        #: Of each of them, what `LensCurves.find` returns: filled when probes slide.
+        #: Courses of the probes' curves, [_COURSE, probes, radii], and of the pads that are near,
+        #: with their reach: filled when probes slide.
+        self._of_probes = np.zeros((0, 0, 0))
         self._course = np.zeros((0, 0))
+        self._curve_reach_mm = np.zeros(0)
 
     def add(self, probe: Probe) -> None:
         """One more probe.
@@ -94,7 +94,8 @@ class Coverage:
         height_mm = (self._position_mm[of_part] - point_m * 1e3) @ normal
         facing = (self._layout.normal[of_part] @ normal > FACING) & (np.abs(height_mm) < REACH_MM)
         taxels = np.flatnonzero(facing) + part.start
-        self._places.append((point_m * 1e3, tangents(normal), taxels))
+        self._facing.append(taxels)
+        self._facing_mm.append(tangents(normal) @ (self._position_mm[taxels] - point_m * 1e3).T)
         if probe.size_mm is None:
             self._shapes.append(Disc(0.0, 0.0, probe.diameter_mm))
         else:
@@ -133,9 +134,9 @@ class Coverage:
             steps: how many are wanted, the present one among them.
 
         Returns:
-            The footprints of the first steps: one at least.
+            Their footprints; of a skin with a membrane, that of the present one alone.
         """
-        steps = self._find(numbers, offset_mm, step_mm, steps)
+        self._find(numbers, offset_mm, step_mm, steps)
         if self._membrane_mm:
             return [self._with_membrane(offset_mm)]
         rows, course, enter, leave, by_rectangle = self._on_the_way(offset_mm, step_mm, steps)
@@ -185,35 +186,44 @@ class Coverage:
             empty if there are no rectangles.
         """
         if not len(self._course):
+            if not len(self._of_probes):
+                self._of_probes = self._curves.courses(self._edge_mm, self._radii_mm)
             flat = self._is_rectangle[self._contact]
-            self._course = self._curves.find(self._pad_radius_mm, self._edge_mm[self._contact])
-            reach_mm = np.where(flat, self._reach_mm, self._course[_REACH])
+            self._course = self._of_probes[:, self._contact, self._of_radius[self._taxel]]
+            self._curve_reach_mm = np.where(flat, self._reach_mm, self._course[_REACH])
             # Rectangles follow no curve: theirs are held at one node, and not used.
             self._course[_SCALE:, flat] = 0.0
-            self._reach_mm2 = reach_mm * reach_mm
         x_mm, y_mm = self._place_mm - offset_mm.T[:, self._contact]
-        step_x_mm, step_y_mm = step_mm.T[:, self._contact]
-        # The squared distance is that of now, and i times this, and i^2 times that.
         now = x_mm * x_mm + y_mm * y_mm
+        # Most pads are beyond what the fastest probe reaches.
+        fastest_mm = np.sqrt(np.square(step_mm).sum(axis=1).max(initial=0.0))
+        far_mm = self._curve_reach_mm + (steps - 1) * fastest_mm
+        rows = np.flatnonzero(now < far_mm * far_mm)
+        now, x_mm, y_mm = now[rows], x_mm[rows], y_mm[rows]
+        step_x_mm, step_y_mm = step_mm.T[:, self._contact[rows]]
+        # The squared distance is that of now, and i times this, and i^2 times that.
         towards = -2.0 * (x_mm * step_x_mm + y_mm * step_y_mm)
         fast = np.maximum(step_x_mm * step_x_mm + step_y_mm * step_y_mm, LEAST_STEP_MM**2)
         nearest = -0.5 * towards / fast
-        half = np.sqrt(np.maximum(nearest * nearest - (now - self._reach_mm2) / fast, 0.0))
-        enter = np.maximum(np.ceil(nearest - half), 0.0)
-        leave = np.minimum(np.floor(nearest + half) + 1.0, steps)
-        rows = np.flatnonzero((half > 0) & (enter < leave))
+        reach_mm2 = self._curve_reach_mm[rows] ** 2
+        half = np.sqrt(np.maximum(nearest * nearest - (now - reach_mm2) / fast, 0.0))
+        first = np.maximum(np.ceil(nearest - half), 0.0)
+        last = np.minimum(np.floor(nearest + half) + 1.0, steps)
+        met = np.flatnonzero((half > 0) & (first < last))
+        rows = rows[met]
         course = self._course[:, rows]
-        course[:_REACH] = now[rows], towards[rows], fast[rows]
+        course[:_REACH] = np.stack([now, towards, fast])[:, met]
         course[:_REACH] *= course[_SCALE] ** 2
-        enter, leave = enter[rows].astype(np.intp), leave[rows].astype(np.intp)
+        enter, leave = first[met].astype(np.intp), last[met].astype(np.intp)
         by_rectangle = np.zeros((0, 0))
         flat = np.flatnonzero(self._is_rectangle[self._contact[rows]])
         if len(flat):
             of_flat = rows[flat]
             by_rectangle = np.zeros((steps, len(rows)))
+            begin_mm = np.column_stack([x_mm, y_mm])[met[flat]]
+            ahead_mm = np.column_stack([step_x_mm, step_y_mm])[met[flat]]
             for step in range(steps):
-                along_mm = np.column_stack([x_mm - step * step_x_mm, y_mm - step * step_y_mm])
-                area_mm2 = self._rectangle_mm2(of_flat, along_mm[of_flat])
+                area_mm2 = self._rectangle_mm2(of_flat, begin_mm - step * ahead_mm)
                 by_rectangle[step, flat] = area_mm2 / self._pad_mm2[of_flat]
             # Both are convex: there is no second time.
             hit = by_rectangle[:, flat] > LEAST_SHARE
@@ -228,52 +238,41 @@ class Coverage:
             along_mm, self._pad_radius_mm[rows], self._size_mm[contact], self._turn[contact]
         )
 
-    def _find(self, numbers: Ints, offset_mm: Floats, step_mm: Floats, steps: int) -> int:
-        """Gather the pads near these probes where they are not known; for how many steps."""
-        longest_mm = float(np.abs(step_mm).max(initial=0.0))
-        if longest_mm * (steps - 1) >= MARGIN_MM / 2:
-            steps = max(1, int(MARGIN_MM / 2 / longest_mm))
-        ends_mm = np.stack([offset_mm, offset_mm + (steps - 1) * step_mm])
-        same = self._gathered and np.array_equal(numbers, self._numbers)
-        if same and np.abs(ends_mm - self._found_mm).max(initial=0.0) < MARGIN_MM / 2:
-            return steps
-        found = []
-        for number, own_mm in zip(numbers.tolist(), np.moveaxis(ends_mm, 1, 0), strict=True):
-            near = self._near.get(number)
-            # Those that are half way to their margin are looked for with those beyond it.
-            if near is None or np.abs(own_mm - near.offset_mm).max() >= MARGIN_MM / 4:
-                near = self._near[number] = self._look(number, own_mm[0])
-            found.append(near)
-        self._gather(numbers, found, same=same)
-        return steps
-
-    def _look(self, number: int, offset_mm: Floats) -> _Near:
-        point_mm, along, taxels = self._places[number]
-        place_mm = (self._position_mm[taxels] - point_mm) @ along.T
-        shape = self._shapes[number]
+    def _find(self, numbers: Ints, offset_mm: Floats, step_mm: Floats, steps: int) -> None:
+        """Gather the pads near the way of these probes, where they are not known."""
+        end_mm = offset_mm + (steps - 1) * step_mm
+        if not (self._gathered and np.array_equal(numbers, self._numbers)):
+            self._set_contacts(numbers)
+        elif (
+            np.abs(offset_mm - self._found_mm).max(initial=0.0) <= self._margin_mm
+            and np.abs(end_mm - self._found_mm).max(initial=0.0) <= self._margin_mm
+        ):
+            return
+        self._found_mm = offset_mm.copy()
+        self._margin_mm = MARGIN_MM + float(np.abs(end_mm - offset_mm).max(initial=0.0))
+        x_mm, y_mm = self._all_mm - offset_mm.T[:, self._all_contact]
         # sqrt(2) covers what max-norm margins leave at the corners.
-        reach_mm = shape.reach_mm + np.sqrt(2.0) * MARGIN_MM / 2
-        reach_mm += ZONES[-1] * self._membrane_mm
-        apart_mm = place_mm - offset_mm
-        near = np.hypot(apart_mm[:, 0], apart_mm[:, 1]) < reach_mm + self._radius_mm[taxels]
-        return _Near(offset_mm.copy(), taxels[near], place_mm[near])
-
-    def _gather(self, numbers: Ints, found: Sequence[_Near], *, same: bool) -> None:
-        self._rows, self._course = np.full(1, -1, np.intp), np.zeros((0, 0))
-        shapes = [self._shapes[number] for number in numbers]
-        none = np.zeros((0, 2))
-        self._found_mm = np.array([near.offset_mm for near in found]).reshape(-1, 2)
-        self._place_mm = np.concatenate([none, *(near.place_mm for near in found)]).T.copy()
-        self._taxel = np.concatenate([np.zeros(0, np.intp), *(near.taxel for near in found)])
-        self._contact = np.repeat(np.arange(len(found)), [len(near.taxel) for near in found])
+        reach_mm = self._all_reach_mm + np.sqrt(2.0) * self._margin_mm
+        near = np.flatnonzero(x_mm * x_mm + y_mm * y_mm < reach_mm * reach_mm)
+        self._place_mm = self._all_mm[:, near]
+        self._taxel, self._contact = self._all_taxel[near], self._all_contact[near]
         self._pad_radius_mm = self._radius_mm[self._taxel]
         self._pad_mm2 = np.pi * self._pad_radius_mm**2
-        if not same:
-            self._set_contacts(numbers, shapes)
-        reach_mm = np.array([shape.reach_mm for shape in shapes])
-        self._reach_mm = reach_mm[self._contact] + self._pad_radius_mm
+        self._reach_mm = self._shape_reach_mm[self._contact] + self._pad_radius_mm
+        self._rows, self._course = np.full(1, -1, np.intp), np.zeros((0, 0))
 
-    def _set_contacts(self, numbers: Ints, shapes: Sequence[Shape]) -> None:
+    def _set_contacts(self, numbers: Ints) -> None:
+        """Gather the pads that these probes face, and what their shapes are."""
+        shapes = [self._shapes[number] for number in numbers]
+        facing = [self._facing[number] for number in numbers]
+        self._all_taxel = np.concatenate([np.zeros(0, np.intp), *facing])
+        self._all_contact = np.repeat(np.arange(len(facing)), [len(pads) for pads in facing])
+        places_mm = [self._facing_mm[number] for number in numbers]
+        self._all_mm = np.concatenate([np.zeros((2, 0)), *places_mm], axis=1)
+        self._shape_reach_mm = np.array([shape.reach_mm for shape in shapes])
+        self._all_reach_mm = self._shape_reach_mm[self._all_contact]
+        self._all_reach_mm += self._radius_mm[self._all_taxel] + ZONES[-1] * self._membrane_mm
+        self._of_probes = np.zeros((0, 0, 0))
         self._numbers, self._gathered = numbers.copy(), True
         self._contact_mm2 = np.array([shape.area_mm2 for shape in shapes])
         self._no_edge = np.ones(len(shapes))
@@ -289,16 +288,19 @@ class Coverage:
     def _with_membrane(self, offset_mm: Floats) -> Footprint:
         """What a drawn-down surface adds is found contact by contact."""
         singles = []
-        for number, offset in zip(self._numbers.tolist(), offset_mm, strict=True):
-            near = self._near[number]
+        starts = np.searchsorted(self._contact, np.arange(len(self._numbers) + 1)).tolist()
+        for number, offset, near in zip(
+            self._numbers.tolist(), offset_mm, map(slice, starts, starts[1:]), strict=False
+        ):
+            taxel = self._taxel[near]
             pads = Pads(
-                near.place_mm - offset,
-                self._radius_mm[near.taxel],
-                self._thickness_mm[near.taxel],
+                self._place_mm[:, near].T - offset,
+                self._radius_mm[taxel],
+                self._thickness_mm[taxel],
                 membrane_mm=self._membrane_mm,
             )
             one = pads.footprint([self._shapes[number]])
-            singles.append((near.taxel[one.taxel], one))
+            singles.append((taxel[one.taxel], one))
         rows = [len(taxel) for taxel, _ in singles]
         return Footprint(
             np.concatenate([np.zeros(0, np.intp), *(taxel for taxel, _ in singles)]),
@@ -312,7 +314,7 @@ class Coverage:
 
 #: Numbers of a course: three of the squared distance by step; at which distance the pad is
 #: covered first, nodes of the curve per mm, at which node it begins, and from which scaled
-#: distance; the latter are what `LensCurves.find` finds.
+#: distance; the last four are what `LensCurves.courses` fills in.
 _COURSE = 7
 _REACH, _SCALE, _FIRST, _BEGIN = range(3, _COURSE)
 
@@ -332,29 +334,34 @@ class LensCurves:
         #: Of the line from each node on: its value at node 0, and its slope per node.
         self._value = self._slope = np.zeros(0)
 
-    def find(self, pad_mm: Floats, disc_mm: Floats) -> Floats:
-        """The curves of pads and discs by their radii [m]: courses [_COURSE, m] to be filled."""
-        pairs, of_row = np.unique(np.stack([pad_mm, disc_mm]), axis=1, return_inverse=True)
-        known = [self._curve(*pair) for pair in pairs.T.tolist()]
-        course = np.zeros((_COURSE, len(pad_mm)))
-        course[_REACH:] = np.array(known).reshape(-1, _COURSE - _REACH).T[:, of_row]
-        return course
+    def courses(self, disc_mm: Floats, pad_mm: Floats) -> Floats:
+        """The curves of discs [c] on pads [r], by radius: courses [_COURSE, c, r] to be filled."""
+        courses = np.zeros((_COURSE, len(disc_mm), len(pad_mm)))
+        for number, disc in enumerate(disc_mm.tolist()):
+            for kind, pad in enumerate(pad_mm.tolist()):
+                courses[_REACH:, number, kind] = self._curve(pad, disc)
+        return courses
 
     def shares(self, course: Floats, start: int, stop: int) -> Floats:
         """The shares that are covered from step `start` to before `stop`, [steps, m]."""
         squares, first, begin = course[:_REACH], course[_FIRST], course[_BEGIN] ** 2
-        shares = np.empty((stop - start, course.shape[1]))
+        step = np.arange(start, stop, dtype=np.float64)
+        powers = np.stack([np.ones_like(step), step, step * step], axis=1)
+        shares = np.empty((len(step), course.shape[1]))
         at_once = max(1, MOST_AT_ONCE // max(1, course.shape[1]))
-        for low in range(start, stop, at_once):
-            high = min(low + at_once, stop)
-            step = np.arange(low, high)
-            place = np.stack([np.ones(high - low), step, step * step], axis=1) @ squares
+        nodes = np.empty((min(at_once, len(step)), course.shape[1]), np.intp)
+        lines = np.empty(nodes.shape)
+        for low in range(0, len(step), at_once):
+            place = shares[low : low + at_once]
+            node, line = nodes[: len(place)], lines[: len(place)]
+            np.matmul(powers[low : low + at_once], squares, out=place)
             np.maximum(place, begin, out=place)
             np.sqrt(place, out=place)
             place += first
-            node = place.astype(np.intp)
-            place *= self._slope.take(node)
-            np.add(place, self._value.take(node), out=shares[low - start : high - start])
+            np.copyto(node, place, casting="unsafe")
+            # No node is beyond the last, "clip" only spares numpy a copy.
+            place *= self._slope.take(node, out=line, mode="clip")
+            place += self._value.take(node, out=line, mode="clip")
         return shares
 
     def _curve(self, pad_mm: float, disc_mm: float) -> tuple[float, ...]:

@@ -302,8 +302,11 @@ class Script:
 
     def still_until_s(self, t_s: float) -> float:
         """After `at(t_s)`: when something may change next; `t_s` itself if it does now."""
-        if self._moves:
-            return t_s
+        return t_s if self._moves else self.next_keyframe_s
+
+    @property
+    def next_keyframe_s(self) -> float:
+        """After `at`: when the line of any probe ends next."""
         return self._ends[0][0] if self._ends else np.inf
 
     def _gather(self) -> None:

@@ -42,8 +42,9 @@ STEP_C = 0.01
 MOVING_NS = 5_000_000
 #: While probes are held, foam recovers or the temperature moves, this is enough, after a time.
 HOLDING_NS = 50_000_000
-#: So many steps of sliding probes are foreseen at most.
-MOST_FORESEEN = 64
+#: So many steps of sliding probes are foreseen at most, and so many places of probes.
+MOST_FORESEEN = 128
+MOST_PLACES = 1 << 17
 #: Air changes slowly enough for this.
 AIR_NS = 20_000_000
 SETTLING_SHARE = 10
@@ -419,8 +420,10 @@ class Skin:
             return self._of_probes
         if not slide.moves:
             return self._coverage.footprint(moment.number, offset_mm)
-        # Twice as far ahead as what was foreseen came true.
-        steps = max(1, min(2 * self._came_true, MOST_FORESEEN))
+        # Twice as far ahead as what was foreseen came true, and not beyond the next keyframe.
+        until_end = (self._script.next_keyframe_s - moment.t_s) / (MOVING_NS * 1e-9)
+        ahead = min(2 * self._came_true, MOST_FORESEEN, MOST_PLACES // len(moment.number))
+        steps = max(1, int(min(ahead, np.ceil(until_end))))
         self._came_true = 1
         step_mm = slide.mm_per_s.T * (MOVING_NS * 1e-9)
         now, *self._foreseen = self._coverage.footprints(moment.number, offset_mm, step_mm, steps)
