@@ -161,7 +161,9 @@ class Daemon:
 
     async def _work(self, stop: asyncio.Event, calibrate: bool) -> None:
         tasks = [
-            asyncio.create_task(self.link.read(self._deliver, self._record), name="read"),
+            asyncio.create_task(
+                self.link.read(self._deliver, self._record, self.publisher.together), name="read"
+            ),
             asyncio.create_task(self._start(calibrate), name="start"),
             asyncio.create_task(self._housekeep(), name="housekeeping"),
         ]

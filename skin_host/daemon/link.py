@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from itertools import chain
 from typing import Protocol
 
@@ -137,20 +138,21 @@ class Link:
         self,
         deliver: Callable[[Output], None],
         record: Callable[[str, FrameBatch], None] = lambda *_: None,
+        together: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext,
     ) -> None:
         """Read all buses for ever; pass the results to `deliver`.
 
         Args:
             deliver: called after each batch, and several times a second.
             record: called with each received batch.
+            together: block of code in which each turn delivers; at its end the results leave.
         """
-        loop = asyncio.get_running_loop()
 
         def work() -> None:
-            self.turn(self._clock.now_ns(), deliver, record)
+            with together():
+                self.turn(self._clock.now_ns(), deliver, record)
             if self._engine.has_deferred:
-                # After the delivered results have been sent.
-                loop.call_soon(self._engine.judge)
+                self._engine.judge()
 
         await self._wake_up.run(work)
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from skin_host.bus.boards import Boards
 from skin_host.bus.port import Port
 from skin_host.processing.core import Engine, Output, Step
+from skin_host.processing.masks import any_of
 
 #: Rates are means over about this time.
 RATE_S = 2.0
@@ -41,7 +42,7 @@ class PartWatch:
     def note(self, step: Step) -> None:
         """Take in a processed sample."""
         frame = step.frame
-        if frame.valid.any():
+        if any_of(frame.valid):
             self.last_ns = frame.t_ns
             self.frames += 1
             self.rate_frames += 1

@@ -9,6 +9,7 @@ from skin_host.layout import Layout, PadKind
 from skin_host.mqtt.messages import ContactState
 from skin_host.processing.contacts import LOST_NS
 from skin_host.processing.events import TouchEvent
+from skin_host.processing.masks import all_of, any_of
 from skin_host.processing.pipeline import PressureFrame
 
 _NEVER_NS = -(1 << 62)
@@ -48,6 +49,12 @@ class PartContact:
         #: triangle.
         self._lost = np.zeros(here.n_taxels, np.uint8)
         self._unsure = np.full(len(pads), SURE_FRAMES, np.uint8)
+        #: Whether any of these is wanted.
+        self._is_unsure = True
+        #: The valid taxels of the last frame, and the triangles that have any.
+        self._valid: NDArray[np.bool_] | None = None
+        self._feels = np.zeros(len(pads), np.bool_)
+        self._all_feel = False
         self._present: set[int] = set()
         self._last_ns = 0
         #: By how much the clock was set forward since the last frame.
@@ -60,6 +67,7 @@ class PartContact:
                 self._present.discard(event.id)
                 if event.reason == "lost":
                     self._lost[event.taxels] = SURE_FRAMES
+                    self._is_unsure = True
             else:
                 self._present.add(event.id)
         if frame.t_ns - self._last_ns > self._jump_ns > 0:
@@ -67,19 +75,27 @@ class PartContact:
             self._felt_ns[felt] += self._jump_ns
             self._jump_ns = 0
         self._last_ns = frame.t_ns
+        if frame.valid is not self._valid:
+            self._valid = frame.valid
+            self._feels = np.logical_or.reduceat(frame.valid[self._pads], self._starts)
+            self._all_feel = all_of(self._feels)
+        if self._all_feel and not self._is_unsure:
+            self._felt_ns.fill(frame.t_ns)
+            return "ON" if self._present or any_of(frame.touched) else "OFF"
+        feels = self._feels
         np.minimum(self._felt_ns, frame.t_ns, out=self._felt_ns)  # the clock may be set back
-        feels = np.logical_or.reduceat(frame.valid[self._pads], self._starts)
         self._felt_ns[feels] = frame.t_ns
         self._unsure[frame.t_ns - self._felt_ns >= LOST_NS] = SURE_FRAMES
         self._unsure -= feels & (self._unsure > 0)
         self._lost -= frame.valid & (self._lost > 0)
-        if frame.touched.any():
+        self._is_unsure = any_of(self._unsure > 0) or any_of(self._lost > 0)
+        if any_of(frame.touched):
             return "ON"
-        if not feels.any():
+        if not any_of(feels):
             return "UNKNOWN"
         if self._present:  # frames of the touched place were lost, for less than `LOST_NS`
             return "ON"
-        return "UNKNOWN" if self._unsure.any() or self._lost.any() else "OFF"
+        return "UNKNOWN" if self._is_unsure else "OFF"
 
     def follow_clock(self, jump_ns: int) -> None:
         """The clock by which frames have their times was set: no time has passed by that.
@@ -91,10 +107,12 @@ class PartContact:
     def doubt(self, taxels: NDArray[np.bool_]) -> None:
         """Something may touch these taxels [m], as it did when an earlier daemon ended."""
         self._lost[taxels] = SURE_FRAMES
+        self._is_unsure = True
 
     def stop(self, events: Iterable[TouchEvent]) -> ContactState:
         """End the contacts, because no data of the part will come for a while."""
         self._present.difference_update(event.id for event in events)
         self._felt_ns[:] = _NEVER_NS
         self._unsure[:] = SURE_FRAMES
+        self._is_unsure = True
         return "UNKNOWN"

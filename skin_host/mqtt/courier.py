@@ -9,9 +9,10 @@ next: if one of them is the reason, it is found, dropped after `trials.TRIES`, c
 """
 
 import asyncio
+import contextlib
 import logging
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import islice
 from typing import Literal, NamedTuple
 
@@ -286,6 +287,18 @@ class Courier:
         self._outbox.counters.frames_sent += 1
         await within(TIMEOUT_S, done)
 
+    @contextlib.contextmanager
+    def together(self) -> Iterator[None]:
+        """Write at the end of this block what is put in it, without another turn of the loop."""
+        if self._is_writing_due:
+            yield
+            return
+        self._is_writing_due = True
+        try:
+            yield
+        finally:
+            self._write_frames()
+
     def _note_frame(self) -> None:
         """Write frames when everything of this turn of the loop has been put."""
         self._suspect_came.set()
@@ -297,13 +310,13 @@ class Courier:
         """Write the frames of the outbox, touches first, as far as the socket takes them."""
         self._is_writing_due = False
         connection, outbox = self._frames_to, self._outbox
-        if connection is None or not outbox.frames:
+        if connection is None:
             return
         try:
             self._fill_window(connection)
         except MqttError:
             return  # the reader of the connection finds it lost
-        if not connection.is_clear():
+        if not outbox.frames or not connection.is_clear():
             return
         frames, packets = [], []
         for _ in range(min(FRAME_WINDOW, len(outbox.frames))):

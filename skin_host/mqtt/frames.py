@@ -12,6 +12,7 @@ arrays. Source: RFC 8949, section 3; RFC 8746, section 2.
 """
 
 import re
+from functools import lru_cache
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import msgspec
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from skin_host.errors import SkinError
 from skin_host.mqtt.payload import MAX_TAXELS, Count, Int64, MessageError, check_size, decode
+from skin_host.processing.masks import Mask, any_of
 
 FRAME_SCHEMA: Final = "skin.frame/1"
 #: One unit of the values of a frame.
@@ -88,7 +90,6 @@ if TYPE_CHECKING:
     from skin_host.processing.pipeline import PressureFrame
 
 
-Mask = NDArray[np.bool_]
 HexMask = Annotated[str, Meta(max_length=MAX_TAXELS // 4)]
 
 
@@ -145,6 +146,13 @@ _decoder = msgspec.json.Decoder(_JsonFrame)
 
 def encode_mask(mask: Mask) -> str:
     """Write a mask [m] as hexadecimal digits; see the head of this module."""
+    return _hex_of(mask.tobytes())
+
+
+@lru_cache(maxsize=256)
+def _hex_of(bits: bytes) -> str:
+    """A mask, given as its bytes; most masks are those of the part's last frame."""
+    mask = np.frombuffer(bits, np.bool_)
     number = int.from_bytes(np.packbits(mask, bitorder="little").tobytes(), "little")
     return f"{number:0{(len(mask) + 3) // 4}x}" if len(mask) else ""
 
@@ -192,7 +200,7 @@ def encode_frame(
     fields = _FrameFields(
         FRAME_SCHEMA, frame.seq, frame.t_ns, "kPa", SCALE_KPA, None, encode_mask(valid)
     )
-    if frame.beyond_range.any():
+    if any_of(frame.beyond_range):
         fields.beyond_range = encode_mask(frame.beyond_range)
     if raw:
         fields.raw = frame.raw.tobytes()

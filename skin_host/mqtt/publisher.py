@@ -7,7 +7,7 @@ arrive are sent again. Frames are encoded only while there is a connection.
 import asyncio
 import logging
 from collections.abc import Callable
-from contextlib import AbstractAsyncContextManager
+from contextlib import AbstractAsyncContextManager, AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -192,6 +192,10 @@ class Publisher:
         for number in range(len(pieces) + 1, self._pieces + 1):
             self._outbox.put_state(self.topics.info(self._node, number), b"")
         self._pieces = max(self._pieces, len(pieces))
+
+    def together(self) -> AbstractContextManager[None]:
+        """Write at the end of a block what is put in it: touches first, then frames."""
+        return self._courier.together()
 
     def put_frame(self, frame: PressureFrame) -> None:
         """Send a frame, unless a newer one of its part comes first. It must not change any more."""

@@ -14,12 +14,12 @@ from skin_host.layout import Layout, PadKind
 from skin_host.processing.events import Reason, TouchEvent
 from skin_host.processing.localization import Localizer, make_localizer, separate
 from skin_host.processing.localization_centroid import GEOMETRY_PITCHES
+from skin_host.processing.masks import Mask, all_of, any_of
 from skin_host.processing.patches import Patches
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.processing.pressure import PressureCurve
 
 Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 #: Smallest change for another `move` event.
 MOVED_M = 0.2e-3
@@ -97,7 +97,7 @@ class ContactTracker:
 
     def step(self, frame: PressureFrame) -> list[TouchEvent]:
         """Return the events since the last frame: ends first, then moves and begins."""
-        if not self._contacts and not np.count_nonzero(frame.touched):
+        if not self._contacts and not any_of(frame.touched):
             return []
         found = self._grouping(frame)
         known = set(found.names)
@@ -116,7 +116,7 @@ class ContactTracker:
     def _grouping(self, frame: PressureFrame) -> "_Grouping":
         """Return the contacts of this frame, or those of the last frame if nothing has changed."""
         seen = frame.touched.tobytes()
-        if seen == self._seen and np.all(frame.valid[self._known.order]):
+        if seen == self._seen and all_of(frame.valid.take(self._known.order)):
             return self._known
         touched = self._touched(frame)
         groups = self._patches.find(touched)
@@ -131,7 +131,7 @@ class ContactTracker:
         self._known = _Grouping.of(self._identify(groups, home), groups, home, self._area_mm2)
         # Whether contacts are kept together or apart, or are split by pressure, can change with any
         # frame.
-        decided = as_before and self._places is None and np.all(frame.valid[self._known.order])
+        decided = as_before and self._places is None and all_of(frame.valid[self._known.order])
         self._seen = seen if decided else None
         return self._known
 
@@ -140,7 +140,7 @@ class ContactTracker:
 
         A lost frame is not the end of a touch.
         """
-        if frame.valid.all():
+        if all_of(frame.valid):
             return np.flatnonzero(frame.touched)
         touched = frame.touched.copy()
         for contact in self._contacts.values():

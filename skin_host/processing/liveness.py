@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.bus.compensation import NO_GAIN
-from skin_host.processing.masks import Mask, any_of
+from skin_host.processing.masks import Mask, all_of, any_of
 from skin_host.processing.stuck import (
     MOST_RATE,
     TOUCHED_PACE,
@@ -274,7 +274,7 @@ class Liveness:
             return
         expected = self._expected
         movable = inside(raw)
-        if not movable.all():
+        if not all_of(movable):
             # A pad at an end of the scale cannot change, even if it works.
             most = (self._pad_expected * movable).sum(axis=1)
             expected = np.where(movable.any(axis=1), np.minimum(expected, most), 0.0)
@@ -306,6 +306,9 @@ class Liveness:
                 np.copyto(self._step, step, where=compared[:, None])
             return
         jump = far & (np.abs(self._step) > self._jump_units) & ((step ^ self._step) < 0)
+        if not self._any_jumping and not any_of(jump):
+            np.copyto(self._step, step, where=compared[:, None])
+            return
         size = np.minimum(np.abs(step), np.abs(self._step))
         spike = jump & (size > self._spike) & (np.abs(step + self._step) <= self._jump_units)
         alone = np.count_nonzero(spike & (self._jumping < LATELY_MEAN), axis=1) == 1

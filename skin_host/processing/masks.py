@@ -11,3 +11,8 @@ def any_of(flags: Mask) -> bool:
     entries.
     """
     return flags.tobytes().find(1) >= 0
+
+
+def all_of(flags: Mask) -> bool:
+    """Return whether every one is set, as fast."""
+    return b"\0" not in flags.tobytes()

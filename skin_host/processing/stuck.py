@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.bus.compensation import NO_GAIN, THERMAL_TAXEL, drift_of
-from skin_host.processing.masks import Mask, any_of
+from skin_host.processing.masks import Mask, all_of, any_of
 
 Floats = NDArray[np.float64]
 
@@ -131,7 +131,7 @@ class Repeats:
             return changed, within
         row = self._kind + raw[:, THERMAL_TAXEL]
         tells = self._tells.take(row)
-        told = within if tells.all() else within & tells[:, None]
+        told = within if all_of(tells) else within & tells[:, None]
         base, up, left = self._lowered, self._up, self._left
         words, shifted, possible = self._words, self._shifted, self._possible
         self._lowest.take(row, 0, base, "clip")
@@ -145,13 +145,12 @@ class Repeats:
         np.left_shift(words, left.view(np.uint64), out=shifted)
         np.subtract(left, up, out=left)
         np.right_shift(shifted, left.view(np.uint64), out=shifted)
-        untold = ~told
-        some_untold = any_of(untold)
-        if some_untold:
-            np.putmask(shifted, untold, _ALL_WORDS)
+        all_told = all_of(told)
+        if not all_told:
+            np.putmask(shifted, ~told, _ALL_WORDS)
         np.bitwise_and(possible, shifted, out=possible)
         moved: Mask = np.equal(possible, 0)
-        if some_untold:
+        if not all_told:
             moved &= told
         np.putmask(self._base, moved, base)
         np.putmask(possible, moved, words)
@@ -312,10 +311,10 @@ class StuckPads:
             self._new_moved += ended
         if felt is not None:
             run += told * felt.weight
-        elif b"\0" in told.tobytes():
-            run += told.astype(np.float64)
-        else:
+        elif all_of(told):
             run += 1.0
+        else:
+            run += told.astype(np.float64)
         np.putmask(run, moved, 0.0)
         self._samples += 1 if came is None else came
         if int(np.maximum.reduce(self._samples)) >= STEP_SAMPLES:
