@@ -5,6 +5,9 @@ PYTHON ?= $(firstword $(foreach p,python3 python3.14 python3.13 python3.12 pytho
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --quiet --quiet --disable-pip-version-check --no-input
 
+# Bytecode is kept: hundreds of processes of the tests would compile every module again.
+export PYTHONDONTWRITEBYTECODE :=
+
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help demo docs test coverage mutation test-system simulate install uninstall lint format clean
@@ -19,6 +22,7 @@ demo: .venv/demo.stamp  ## emulator, daemon, broker and page together; DURATION=
 AGAIN := --reruns=1 -rR
 
 test: lint  ## all that needs no root and no hardware
+	@$(BIN)/python -m compileall -q skin_host emulator
 	@tools/timed "pytest" $(BIN)/python -m pytest --numprocesses=3 --dist=loadfile $(AGAIN)
 
 coverage: .venv/dev.stamp .venv/coverage.stamp  ## branches of the core that the tests run: 95 % at least
