@@ -31,6 +31,7 @@ def add_commands(commands: Commands) -> None:
     bench.add_argument("name", choices=list(BENCHMARKS), metavar="NAME", help=about)
     bench.add_argument("--quick", action="store_true", help="shorter and less certain")
     bench.add_argument("--robots", type=int, metavar="N", help="of bench fleet; 1000 otherwise")
+    bench.add_argument("--full", action="store_true", help="bench fleet: 7 messages/s a robot")
     bench.add_argument("--json", action="store_true", help="one JSON document")
     bench.set_defaults(run=_bench)
 
@@ -83,11 +84,15 @@ def add_commands(commands: Commands) -> None:
 
 def _bench(arguments: argparse.Namespace) -> int:
     module = import_module(f"skin_host.evaluation.bench_{arguments.name}")
-    more = {}
+    more: dict[str, int] = {}
     if arguments.robots is not None:
         if arguments.name != "fleet" or arguments.robots < 1:
             raise RequestError("--robots is a number of 1 or more, of bench fleet")
-        more = {"robots": arguments.robots}
+        more["robots"] = arguments.robots
+    if arguments.full:
+        if arguments.name != "fleet":
+            raise RequestError("--full is of bench fleet")
+        more["full"] = True
     document = module.run(quick=arguments.quick, **more)
     if arguments.json:
         print_json(document)

@@ -2,9 +2,11 @@
 
 `skin bench fleet` needs mosquitto on the PATH; its three know nothing of each other. The robots are
 publishers as the daemon has them, with touches, contacts and health recorded from the demo's left
-hand. At each broker a subscriber receives all robots, and orders their messages by number as
-`SkinClient` does. What is counted: events that a broker acknowledged and that were not passed
-on, or twice, or out of order; and states that differ from all that the robot has sent within 5 s.
+hand; with `--full` nine of ten are `fleet_sockets.PlainRobot`, for more messages than publishers in
+Python can send on a computer that also has the brokers and the subscribers. At each broker a
+subscriber receives all robots, and orders their messages by number as `SkinClient` does. What is
+counted: events that a broker acknowledged and that were not passed on, or twice, or out of order;
+and states that differ from all that the robot has sent within 5 s.
 """
 
 import asyncio
@@ -37,6 +39,7 @@ from skin_host.client.presence import Presence
 from skin_host.client.session import HOLD_S
 from skin_host.config.settings import Mqtt
 from skin_host.errors import RequestError
+from skin_host.evaluation.fleet_sockets import Heard, PlainEar, PlainRobot
 from skin_host.evaluation.machine import machine
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import Connection, Message
@@ -54,6 +57,8 @@ STALE_S = 3.0
 ALLOWED_S = 5.0
 DRAIN_S = 30.0
 WORKERS = 2
+#: With `--full`, one robot in so many is a publisher as the daemon has it.
+PLAIN_SHARE = 10
 
 
 class Brokers(Protocol):
@@ -89,14 +94,18 @@ class FleetPlan:
         pace: of the recording; 1 is as fast as it was.
         health_s: between two records of a robot's health.
         phase_s: of each of: quiet, one killed, it is back, another frozen, it is back.
+        plain: whether most robots are plain ones.
     """
 
     robots: int = 1000
     pace: float = 0.15
     health_s: float = 2.0
     phase_s: float = 12.0
+    plain: bool = False
 
 
+#: 7 messages a second and robot: health of two parts, and touches.
+FULL = FleetPlan(pace=2.0, health_s=0.5, plain=True)
 PHASES = ("quiet", "one killed", "it is back", "another frozen", "it goes on")
 
 
@@ -110,9 +119,11 @@ class RobotSent(NamedTuple):
     contacts: list[tuple[float, str]]
 
 
-def run(*, quick: bool = False, robots: int | None = None) -> dict[str, Any]:
+def run(*, quick: bool = False, full: bool = False, robots: int | None = None) -> dict[str, Any]:
     """Measure with mosquittos and return the document."""
-    plan = FleetPlan(robots=60, pace=1.0, health_s=1.0, phase_s=6.0) if quick else FleetPlan()
+    plan = FULL if full else FleetPlan()
+    if quick:
+        plan = replace(plan, robots=60, pace=1.0, health_s=1.0, phase_s=6.0)
     if robots is not None:
         plan = replace(plan, robots=robots)
     with mosquittos() as brokers:
@@ -126,12 +137,16 @@ def measure(brokers: Brokers, plan: FleetPlan) -> dict[str, Any]:
     context = multiprocessing.get_context("spawn")
     pipes: list[Pipe] = []
     workers = []
-    for number in range(WORKERS):
+    everyone = [f"robot{i}" for i in range(plan.robots)]
+    shares = [(everyone[number::WORKERS], False) for number in range(WORKERS)]
+    if plan.plain:
+        publishers = everyone[::PLAIN_SHARE]
+        shares = [(publishers, False), (sorted(set(everyone) - set(publishers)), True)]
+    for names, plain in shares:
         mine, theirs = context.Pipe()
-        names = [f"robot{i}" for i in range(number, plan.robots, WORKERS)]
         keys = {"username": brokers.username, "brokers": brokers.addresses}
         worker = context.Process(
-            target=_work, args=(theirs, names, keys, brokers.password, plan), daemon=True
+            target=_work, args=(theirs, names, keys, brokers.password, plan, plain), daemon=True
         )
         worker.start()
         pipes.append(mine)
@@ -147,13 +162,16 @@ def measure(brokers: Brokers, plan: FleetPlan) -> dict[str, Any]:
 async def _conduct(brokers: Brokers, plan: FleetPlan, pipes: list[Pipe]) -> dict[str, Any]:
     logging.getLogger("skin_host.client").setLevel(logging.ERROR)
     ear = _Receiver(plan)
-    links = [
-        BrokerLink(i, _broker(address, brokers), f"ear-{os.getpid()}-{i}", ear)
-        for i, address in enumerate(brokers.addresses)
-    ]
+    links: list[_FullEar | _Ear] = []
+    for number, address in enumerate(brokers.addresses):
+        broker, name = _broker(address, brokers), f"ear-{os.getpid()}-{number}"
+        if plan.plain:
+            links.append(_Ear(number, broker, name, ear))
+        else:
+            links.append(_FullEar(number, broker, name, ear))
     tasks = [asyncio.create_task(link.run()) for link in links]
     tasks.append(asyncio.create_task(ear.watch()))
-    while not all(link.connection for link in links):  # noqa: ASYNC110
+    while not all(link.connected for link in links):  # noqa: ASYNC110
         await asyncio.sleep(0.05)
     for pipe in pipes:
         pipe.send("start")
@@ -191,6 +209,7 @@ async def _conduct(brokers: Brokers, plan: FleetPlan, pipes: list[Pipe]) -> dict
         "engine": brokers.name,
         "machine": machine(),
         "robots": plan.robots,
+        "publishers": len(range(0, plan.robots, PLAIN_SHARE)) if plan.plain else plan.robots,
         "pace": plan.pace,
         "phases": rows,
     } | verdict
@@ -218,6 +237,28 @@ class _Received:
             self.contacts.append((time.time(), contact.state))
 
 
+class _FullEar(BrokerLink):
+    """A link as the client has it."""
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a broker."""
+        return self.connection is not None
+
+
+class _Ear(PlainEar):
+    """One that costs little."""
+
+    def __init__(self, number: int, broker: Broker, name: str, receiver: "_Receiver") -> None:
+        super().__init__(
+            broker,
+            name,
+            receiver.wanted(),
+            lambda heard: receiver.hear(number, heard),
+            lambda: None if self.connected else receiver.lose(number),
+        )
+
+
 class _Receiver:
     """Receives all robots from all brokers; a `links.Hearer`."""
 
@@ -240,37 +281,47 @@ class _Receiver:
     def note(self, link: BrokerLink) -> None:
         """Links come and go."""
         if link.connection is None:
-            for robot in self._robots.values():
-                robot.presence.take_loss(link.number)
-                robot.note_contact()
+            self.lose(link.number)
+
+    def lose(self, number: int) -> None:
+        """The connection to a broker is lost."""
+        for robot in self._robots.values():
+            robot.presence.take_loss(number)
+            robot.note_contact()
 
     def take(self, link: BrokerLink, message: Message) -> None:
-        """Process a message."""
-        words = message.topic.value.split("/")
+        """Process a message of the client's library."""
+        if not isinstance(message.payload, bytes):
+            return
+        run, stamp = run_of(message.properties), stamp_of(message.properties)
+        topic = message.topic.value
+        self.hear(link.number, Heard(topic, message.payload, message.retain, run, stamp))
+
+    def hear(self, number: int, heard: Heard) -> None:
+        """Process a message from a broker."""
+        words = heard.topic.split("/")
         robot = self._robots.get(words[1])
-        if robot is None or not isinstance(message.payload, bytes):
+        if robot is None:
             return
         self._received += 1
         now_s = time.time()
         kind = words[-1]
         if kind == "touch":
-            touch = decode_touch(message.payload)
-            self._pass_on(
-                robot, robot.order.take(touch, run_of(message.properties), time.monotonic()), now_s
-            )
+            touch = decode_touch(heard.payload)
+            self._pass_on(robot, robot.order.take(touch, heard.run, time.monotonic()), now_s)
             return
-        newness = robot.newest.take(kind, words[2], stamp_of(message.properties))
+        newness = robot.newest.take(kind, words[2], heard.stamp)
         at_s = time.monotonic()
         if kind == "contact" and newness is not False:
-            state = decode_contact(message.payload)
+            state = decode_contact(heard.payload)
             again = newness is None
-            robot.presence.take_state(PART, state, at_s, link.number, again=again)
-        elif kind == "health" and newness and not message.retain:
+            robot.presence.take_state(PART, state, at_s, number, again=again)
+        elif kind == "health" and newness and not heard.retained:
             robot.presence.take_sign(PART, at_s)
         elif kind == "status" and newness:
-            online = message.payload == ONLINE
+            online = heard.payload == ONLINE
             robot.presence.take_node("main", online)
-            robot.status.append((now_s, message.payload.decode()))
+            robot.status.append((now_s, heard.payload.decode()))
         robot.note_contact()
 
     def _pass_on(self, robot: _Received, events: Sequence[Any], now_s: float) -> None:
@@ -372,7 +423,12 @@ def _wrong(said: list[tuple[float, str]], heard: list[tuple[float, str]]) -> boo
 
 
 def _work(
-    pipe: Pipe, names: list[str], keys: dict[str, Any], password: str | None, plan: FleetPlan
+    pipe: Pipe,
+    names: list[str],
+    keys: dict[str, Any],
+    password: str | None,
+    plan: FleetPlan,
+    plain: bool,
 ) -> None:
     """Run some of the robots in a separate process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -383,20 +439,54 @@ def _work(
             file = Path(folder) / "password"
             file.write_text(password)
             keys["password_file"] = str(file)
-        asyncio.run(_be(pipe, names, Mqtt(**keys), plan))
+        asyncio.run(_be(pipe, names, Mqtt(**keys), plan, plain))
 
 
-async def _be(pipe: Pipe, names: list[str], settings: Mqtt, plan: FleetPlan) -> None:
+class _FullRobot(Publisher):
+    """A publisher as the daemon has it."""
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a broker."""
+        return self.counters.connected
+
+    @property
+    def waiting(self) -> int:
+        """How many events and states are not acknowledged."""
+        return self.counters.touches_waiting + len(self._outbox.pending)
+
+    def sent(self, contacts: list[tuple[float, str]]) -> RobotSent:
+        """What it has sent."""
+        known = self.counters
+        count = self._outbox.counted(self.topics.part("touch", PART))
+        return RobotSent(
+            count, known.touches_dropped, known.touches_waiting, known.connections, contacts
+        )
+
+
+class _PlainRobot(PlainRobot):
+    """One that costs little."""
+
+    def sent(self, contacts: list[tuple[float, str]]) -> RobotSent:
+        """What it has sent."""
+        return RobotSent(self.count, 0, len(self.events), self.connections, contacts)
+
+
+async def _be(pipe: Pipe, names: list[str], settings: Mqtt, plan: FleetPlan, plain: bool) -> None:
     traffic = [json.loads(line) for line in TRAFFIC.read_text().splitlines()]
+    for item in traffic:
+        if item["kind"] == "touch":
+            item["said"] = _event(item["said"])
     stop = asyncio.Event()
-    publishers = {name: Publisher(settings, name) for name in names}
+    kind = _PlainRobot if plain else _FullRobot
+    robots: dict[str, _FullRobot | _PlainRobot] = {name: kind(settings, name) for name in names}
     contacts: dict[str, list[tuple[float, str]]] = {name: [] for name in names}
     tasks = []
-    for name, publisher in publishers.items():
-        await publisher.__aenter__()
-        tasks.append(asyncio.create_task(_play(publisher, contacts[name], traffic, plan, stop)))
+    for name, robot in robots.items():
+        await robot.__aenter__()
+        tasks.append(asyncio.create_task(_play(robot, contacts[name], traffic, plan, stop)))
         await asyncio.sleep(0.002)
-    while not all(one.counters.connected for one in publishers.values()):  # noqa: ASYNC110
+    while not all(one.connected for one in robots.values()):  # noqa: ASYNC110
         await asyncio.sleep(0.05)
     pipe.send("connected")
     await asyncio.to_thread(pipe.recv)
@@ -404,26 +494,17 @@ async def _be(pipe: Pipe, names: list[str], settings: Mqtt, plan: FleetPlan) -> 
     await asyncio.gather(*tasks)
     until_s = time.monotonic() + DRAIN_S
     while time.monotonic() < until_s and any(  # noqa: ASYNC110
-        one.counters.touches_waiting or one._outbox.pending for one in publishers.values()
+        one.waiting for one in robots.values()
     ):
         await asyncio.sleep(0.1)
-    told = {}
-    for name, publisher in publishers.items():
-        known = publisher.counters
-        told[name] = RobotSent(
-            publisher._outbox.counted(publisher.topics.part("touch", PART)),
-            known.touches_dropped,
-            known.touches_waiting,
-            known.connections,
-            contacts[name],
-        )
+    told = {name: robot.sent(contacts[name]) for name, robot in robots.items()}
     pipe.send(told)
     # The daemon's end would publish `offline`, which is not measured.
     await asyncio.sleep(3600)
 
 
 async def _play(
-    publisher: Publisher,
+    publisher: Publisher | PlainRobot,
     contacts: list[tuple[float, str]],
     traffic: list[dict[str, Any]],
     plan: FleetPlan,
@@ -452,7 +533,7 @@ async def _play(
             continue
         item = due.pop(0)
         if item["kind"] == "touch":
-            publisher.put_touch(_event(item["said"]))
+            publisher.put_touch(replace(item["said"], t_ns=time.time_ns()))
         else:
             publisher.put_contact(PART, item["said"])
             if not contacts or contacts[-1][1] != item["said"]:
@@ -462,14 +543,15 @@ async def _play(
 def _event(said: dict[str, Any]) -> TouchEvent:
     touch = decode_touch(msgspec.json.encode(said))
     keys = {key: getattr(touch, key) for key in TouchEvent.__dataclass_fields__}
-    return replace(TouchEvent(**keys), t_ns=time.time_ns())
+    return TouchEvent(**keys)
 
 
 def describe(document: dict[str, Any]) -> str:
     """The document as a table and sentences."""
     where = document["machine"]
     lines = [
-        f"{document['robots']} robots, {document['engine']}",
+        f"{document['robots']} robots, {document['publishers']} with the daemon's own publisher, "
+        + document["engine"],
         f"{where['cores']} cores, load {where['load']:g}",
         "phase            messages/s  events/s   p50 ms   p99 ms  worst ms  brokers, of a core",
     ]

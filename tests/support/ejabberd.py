@@ -165,12 +165,14 @@ def main() -> None:
     plan = bench_fleet.FleetPlan()
     parser.add_argument("--robots", type=int, default=plan.robots)
     parser.add_argument("--pace", type=float, default=plan.pace)
+    parser.add_argument("--health", type=float, default=plan.health_s, metavar="S")
     parser.add_argument("--phase", type=float, default=plan.phase_s, metavar="S")
+    parser.add_argument("--plain", action="store_true", help="as `skin bench fleet --full`")
     given = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # and end the nodes
+    plan = bench_fleet.FleetPlan(given.robots, given.pace, given.health, given.phase, given.plain)
     with ejabberds() as cluster:
-        document = bench_fleet.measure(
-            cluster, bench_fleet.FleetPlan(given.robots, given.pace, plan.health_s, given.phase)
-        )
+        document = bench_fleet.measure(cluster, plan)
     sys.stdout.write(bench_fleet.describe(document) + "\n")
 
 
