@@ -224,7 +224,8 @@ def _board(board: BoardHealth) -> Iterator[Fault]:
             "board_in_doubt",
             name,
             f"{here} was zeroed while it was touched (taxels: {board['in_doubt']}); those are "
-            f"not valid until calibrated: skin command calibrate --board {name}",
+            f"not valid until calibrated untouched: skin command configure --board {name}, then "
+            f"skin command calibrate --board {name}",
         )
     if events.get("tx_overflows"):
         yield Fault("board_overflows", name, f"{here} could not send all its frames: bus too full")

@@ -20,12 +20,12 @@ from skin_host.layout import Layout
 from skin_host.processing.calibration import Calibration, Calibrator, with_zeros
 from skin_host.processing.contacts import ContactTracker
 from skin_host.processing.events import TouchEvent
-from skin_host.processing.intake import Intake, PartSample
+from skin_host.processing.intake import Intake, PartSample, below_zero
 from skin_host.processing.liveness import PADS
 from skin_host.processing.masks import Mask
 from skin_host.processing.pipeline import Pipeline, PressureFrame
 from skin_host.processing.pressure import PressureCurve, vertex
-from skin_host.processing.rezero import Rezero
+from skin_host.processing.rezero import BELOW_SWEEPS, Rezero
 
 #: A calibration takes at least this many samples of each part, even if its boards are slow: the
 #: 95th percentile of fewer would be the largest.
@@ -161,6 +161,8 @@ class Engine:
         )
         self._rezeros: dict[int, Rezero] = {}
         self._unanswered: dict[int, Mask] = {}
+        #: For how many sweeps pads int64[16, 12] of a board have read far below zero, where any do.
+        self._below: dict[int, NDArray[np.int64]] = {}
         self._touched = np.zeros(layout.n_taxels, np.bool_)
         self._run: _CalibrationRun | None = None
         self._pipeline: Pipeline | None = None
@@ -182,6 +184,7 @@ class Engine:
         self.disabled = after.disabled
         self._rezeros = after._rezeros
         self._unanswered = after._unanswered
+        self._below = after._below
         self._touched = after._touched
         self._run = after._run
         for part, tracker in self._trackers.items():
@@ -363,15 +366,18 @@ class Engine:
 
     def in_doubt(self, board: int) -> NDArray[np.bool_]:
         """Return taxels bool[16, 12] of a board whose zero is unknown."""
-        rezero = self._rezeros.get(board)
-        if rezero is None:
-            return np.zeros((TRIANGLES, PADS), np.bool_)
-        return rezero.doubted.reshape(TRIANGLES, PADS)
+        found = np.zeros((TRIANGLES, PADS), np.bool_)
+        if board in self._rezeros:
+            found |= self._rezeros[board].doubted.reshape(TRIANGLES, PADS)
+        if board in self._below:
+            found |= self._below[board] > 0
+        return found
 
     def doubts(self) -> dict[int, int]:
         """Return how many taxels of each board that was zeroed have an unknown zero, by index."""
         return {
-            board: int(np.count_nonzero(rezero.doubted)) for board, rezero in self._rezeros.items()
+            board: int(np.count_nonzero(self.in_doubt(board)))
+            for board in sorted(self._rezeros.keys() | self._below.keys())
         }
 
     def end_part(self, part: int, t_ns: int) -> list[TouchEvent]:
@@ -391,6 +397,8 @@ class Engine:
             row = self.ledger.note(sweep)
             if self.ledger.flagged[row] or self._unanswered:
                 self._note_unanswered(sweep, row)
+            if self.ledger.flagged[row] or self._below:
+                self._note_below_zero(sweep, row)
             if self._rezeros:
                 rezero = self._rezeros.get(sweep.board)
                 if rezero is not None:
@@ -410,6 +418,22 @@ class Engine:
             self._unanswered.pop(sweep.board, None)
         if before is not None and (before & ~now & self.ledger.present[row]).any():
             self.rezero(sweep.board)
+
+    def _note_below_zero(self, sweep: Sweep, row: int) -> None:
+        """Detect pads whose zero was taken while something pressed that has lifted now."""
+        answered = (self.ledger.error[row] == 0) & self.ledger.present[row]
+        below = below_zero(sweep.raw, self.ledger.far[row] & answered[:, None])
+        if self.calibration is None or not below.any():
+            self._below.pop(sweep.board, None)
+            return
+        lasted = self._below.get(sweep.board, np.zeros(below.shape, np.int64))
+        self._below[sweep.board] = lasted = (lasted + 1) * below
+        sure = lasted >= BELOW_SWEEPS
+        if sure.any():
+            if sweep.board not in self._rezeros:
+                no_load = float(self.layout.boards[sweep.board].settings.no_load)
+                self._rezeros[sweep.board] = Rezero.over(np.full(sure.size, no_load), sweep.t_ns)
+            self._rezeros[sweep.board].doubted |= sure.ravel()
 
     def _find_zero(self, sweep: Sweep, row: int, rezero: Rezero) -> None:
         if self._pipeline is None or self.calibration is None:

@@ -405,6 +405,20 @@ def unpressable(layout: Layout, board: int, full_ff: float) -> Mask:
     return found
 
 
+def below_zero(raw: NDArray[np.uint8], far: Mask) -> Mask:
+    """Return pads bool[k, 12] that read far below zero pressure, and are not of another chip.
+
+    A pad does that after a release if its board was zeroed while it was pressed.
+
+    Args:
+        raw: uint8[k, 12].
+        far: bool[k, 12], pads that their status words mark as far out of range.
+    """
+    few = np.count_nonzero(far, axis=1) < FAR_PADS
+    found: Mask = far & (raw == 255) & few[:, None]
+    return found
+
+
 def lifted(raw: NDArray[np.uint8], far: Mask) -> Mask:
     """Return triangles bool[k] whose pads read far below zero pressure: those of another chip.
 

@@ -5,6 +5,9 @@ wire, section 4.2 and 4.5): it stores one snapshot of every pad, noise included.
 calibration is then off by some units, and whatever pressed at that moment has become the zero. So
 the host observes the taxels for a while and moves the baselines by their new readings. The zero of
 a taxel that was touched just before is unknown; it is in doubt until it is calibrated again.
+
+A press that nobody felt begin (the daemon was not running, the part was disabled) becomes the zero
+too. It shows when it lifts: the pad then reads far below zero, which nothing can press it to.
 """
 
 import numpy as np
@@ -17,6 +20,8 @@ LOOK_SWEEPS = 20
 SETTLE_NS = 1_100_000_000
 #: Fewer samples than this are not used.
 FEWEST = 10
+#: A pad that reads far below zero in so many sweeps in a row was pressed when it was zeroed.
+BELOW_SWEEPS = 5
 #: A zero that has moved by more than this was not that of an untouched pad.
 LARGEST_UNITS = 30.0
 #: Noise of this many standard deviations must fit between the mean and the end of the scale.
@@ -45,6 +50,13 @@ class Rezero:
         self._since_ns: int | None = None
         self._ended_ns: int | None = None
         self.doubted: Mask = touched.copy()
+
+    @classmethod
+    def over(cls, no_load: Floats, t_ns: int) -> "Rezero":
+        """Return one whose zero has long been in use, at a time: only doubts can still arise."""
+        rezero = cls(np.zeros(len(no_load), np.bool_), no_load)
+        rezero._since_ns = rezero._ended_ns = t_ns - SETTLE_NS
+        return rezero
 
     def step(self, raw: NDArray[np.uint8], present: Mask, t_ns: int) -> bool:
         """Take one sweep: bytes [n], and which were received. Returns True once, when it has

@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from emulator.probes.scene import Scene
@@ -96,6 +97,49 @@ def test_a_daemon_that_was_asked_to_end_in_a_touch_does_not_zero_it_away(world: 
         life = start(world)
         await world.clock.sleep(5.0)
         assert world.broker.retained[topic] == b"OFF"
+        life.kill()
+
+    with world.clock.runner() as runner:
+        runner.run(live())
+
+
+def test_what_pressed_as_the_daemon_started_is_in_doubt_when_it_lifts_and_no_broken_pad(
+    world: World,
+) -> None:
+    """Nobody felt it begin, so its board took it for zero; then it reads far below zero."""
+
+    async def live() -> None:
+        life = start(world)
+        await world.clock.sleep(8.0)
+        await world.end()
+        spot = world.spots[0]
+        pressing = asyncio.create_task(spot.press(6.0))
+        await world.clock.sleep(0.5)
+        life = start(world)
+        accused = set()
+        while not pressing.done():
+            await world.clock.sleep(0.5)
+        for _ in range(20):
+            await world.clock.sleep(0.1)
+            faults = life.daemon.records()[spot.part]["faults"]
+            accused |= {fault["code"] for fault in faults}
+        assert "board_in_doubt" in accused
+        assert not accused & {"taxel_out_of_range", "triangle_out_of_range", "taxel_unproven"}
+        # It is not believed when it is pressed as it was, nor after it is set up again.
+        doubted = np.flatnonzero(life.daemon.engine.zero_at_risk(touched=False))
+        assert len(doubted)
+        pressing = asyncio.create_task(spot.press(3.0))
+        await world.clock.sleep(2.0)
+        start_of_part = world.layout.part(spot.part).start
+        invalid = life.daemon.records()[spot.part]["invalid"]
+        assert set(doubted - start_of_part) <= set(invalid)
+        await pressing
+        await life.daemon.configure()
+        await life.daemon.calibrate(2.0)
+        await world.clock.sleep(3.0)
+        record = life.daemon.records()[spot.part]
+        assert record["invalid"] == []
+        assert "board_in_doubt" not in {fault["code"] for fault in record["faults"]}
         life.kill()
 
     with world.clock.runner() as runner:
