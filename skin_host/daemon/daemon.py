@@ -131,6 +131,8 @@ class Daemon:
         self._contacts = {i: PartContact(layout, i) for i in self.engine.parts}
         for i in self.engine.parts:
             part = layout.parts[i]
+            if calibration is not None:
+                self._contacts[i].use(calibration.usable[part.start : part.stop])
             self._contacts[i].doubt(doubted[part.start : part.stop])
             # The state that the broker retained from an earlier start is no longer known.
             self.publisher.put_contact(part.name, "UNKNOWN")
@@ -213,6 +215,9 @@ class Daemon:
                     calibrations.with_gains_of, found, path, self.layout
                 )
             self.engine.use(found, boards)
+            for index, contact in self._contacts.items():
+                part = self.layout.parts[index]
+                contact.use(found.usable[part.start : part.stop])
             try:
                 await self.clock.in_thread(calibrations.save, path, found, self.layout)
             except OSError as error:

@@ -22,9 +22,9 @@ class PartContact:
     """The contact state of one part.
 
     ON: a taxel is touched. OFF: none is, and every triangle has a valid taxel, and where a contact
-    was lost all taxels are valid again, in each case for `SURE_FRAMES`. UNKNOWN: all other cases. A
-    triangle may miss frames for `LOST_NS`, as a contact may; a part without any valid taxel is
-    UNKNOWN at once.
+    was lost all usable taxels are valid again, in each case for `SURE_FRAMES`. UNKNOWN: all other
+    cases. A triangle may miss frames for `LOST_NS`, as a contact may; a part without any valid
+    taxel is UNKNOWN at once.
 
     Args:
         layout: the skin.
@@ -48,6 +48,7 @@ class PartContact:
         #: Valid frames that are still wanted of the taxels where a contact was lost, and of each
         #: triangle.
         self._lost = np.zeros(here.n_taxels, np.uint8)
+        self._usable = np.ones(here.n_taxels, np.bool_)
         self._unsure = np.full(len(pads), SURE_FRAMES, np.uint8)
         #: Whether any of these is wanted.
         self._is_unsure = True
@@ -67,6 +68,7 @@ class PartContact:
                 self._present.discard(event.id)
                 if event.reason == "lost":
                     self._lost[event.taxels] = SURE_FRAMES
+                    self._lost[~self._usable] = 0
                     self._is_unsure = True
             else:
                 self._present.add(event.id)
@@ -106,8 +108,13 @@ class PartContact:
 
     def doubt(self, taxels: NDArray[np.bool_]) -> None:
         """Something may touch these taxels [m], as it did when an earlier daemon ended."""
-        self._lost[taxels] = SURE_FRAMES
+        self._lost[taxels & self._usable] = SURE_FRAMES
         self._is_unsure = True
+
+    def use(self, usable: NDArray[np.bool_]) -> None:
+        """A calibration has found which taxels [m] are usable: no other will be valid again."""
+        self._usable = usable
+        self._lost[~usable] = 0
 
     def stop(self, events: Iterable[TouchEvent]) -> ContactState:
         """End the contacts, because no data of the part will come for a while."""

@@ -52,6 +52,26 @@ def test_a_part_that_feels_is_on_or_off() -> None:
     assert contact.step(frame(2), [begin([3]).ended(2, 2)]) == "OFF"
 
 
+@pytest.mark.parametrize("refused_first", [False, True])
+def test_a_taxel_that_a_calibration_refuses_keeps_no_contact_unknown(refused_first: bool) -> None:
+    """It will not be valid again, so nothing can confirm there that the contact is over."""
+    contact = watched()
+    assert contact.step(frame(1, [3]), [begin([3, 4])]) == "ON"
+    usable = np.ones(N, np.bool_)
+    usable[3] = False
+    lost = [begin([3, 4]).ended(2, 2, "lost")]
+    no_three = slice(3, 4)
+    if refused_first:
+        contact.use(usable)
+    assert contact.step(frame(2, blind=no_three), lost) == "UNKNOWN"
+    states = [contact.step(frame(3 + sweep, blind=no_three), []) for sweep in range(5)]
+    if not refused_first:
+        assert states[-1] == "UNKNOWN"
+        contact.use(usable)
+        states = [contact.step(frame(9, blind=no_three), [])]
+    assert states[-1] == "OFF"
+
+
 def test_a_triangle_that_comes_back_is_not_off_before_its_touch_can_be_decided() -> None:
     contact = watched()
     dead = slice(0, 12)
