@@ -148,3 +148,108 @@ def test_status_words_stand_until_the_next_sweep() -> None:
     assert not known.flagged[HAND]
     assert not known.error.any()
     assert not known.far.any()
+
+
+def test_a_board_is_overdue_one_nanosecond_after_its_periods_and_not_before_it_could_send() -> None:
+    known = ledger()
+    known.look(T0)
+    known.note(sweep(HAND, T0))
+    limit_ns = int(SILENT_PERIODS * PERIOD)
+    for passed_ns in (*range(50 * MS, limit_ns + 1, 50 * MS), limit_ns + 1):
+        known.look(T0 + passed_ns)
+        assert known.is_silent(HAND) is (passed_ns > limit_ns)
+        assert known.silent[HAND] == known.is_silent(HAND)
+        assert known.any_silent is bool(known.silent.any())
+    assert not known.overdue(HAND, 1)
+    known.note(sweep(HAND, T0))
+    assert not known.is_silent(HAND)
+    assert known.received_ns[HAND] == known.now_ns
+    assert known.sweeps.tolist()[:2] == [2, 0]
+
+
+def test_a_pause_counts_for_no_more_than_the_limit_and_the_poll() -> None:
+    layout = build_layout(load(CONFIG), CONFIG.parent)
+    for poll_ms in (0.0, 40.0):
+        known = BoardLedger(list(enumerate(layout.boards)), SILENT_PERIODS, poll_ms)
+        known.look(T0)
+        assert known.now_ns == 0
+        known.look(T0 + 3_600_000_000_000)
+        assert known.now_ns == LONGEST_PAUSE_NS + poll_ms * MS
+
+
+def test_time_goes_by_the_reader_once_it_looks() -> None:
+    known = ledger()
+    known.note(sweep(HAND, T0))
+    known.note(sweep(HAND, T0 + 7 * MS))
+    assert known.now_ns == 7 * MS
+    known.look(T0 + 10 * MS)
+    known.note(sweep(HAND, T0 + 90 * MS))
+    assert known.now_ns == 10 * MS
+
+
+@pytest.mark.parametrize(("back_ns", "passed_ms"), [(999_999_999, 0), (1_000_000_000, 5)])
+def test_a_step_back_by_a_second_is_a_clock_that_was_set(back_ns: int, passed_ms: int) -> None:
+    known = ledger()
+    for t_ns in (T0, T0 - back_ns, T0 - back_ns + 5 * MS):
+        known.look(t_ns)
+    assert known.now_ns == passed_ms * MS
+
+
+def test_triangles_are_missing_from_the_fifth_sweep_on_and_until_they_come() -> None:
+    known, all_of = ledger(), enabled(HAND)
+    highest = 1 << all_of.bit_length() - 1
+    found = []
+    for turn in range(12):
+        present = all_of if turn in (0, 9) else all_of & ~highest
+        known.note(sweep(HAND, T0 + turn * PERIOD, present))
+        assert known.complete(HAND) is (turn in (0, 9))
+        found.append(known.missing(HAND))
+    assert found == [0] * 5 + [highest] * 4 + [0] * 3
+    # After a set-up so many sweeps are needed again, whatever was missing before.
+    for turn in range(12, 18):
+        known.note(sweep(HAND, T0 + turn * PERIOD, all_of & ~highest))
+    known.set_up(HAND)
+    for turn in range(5):
+        assert (known.missing(HAND), known.since_set_up(HAND)) == (0, turn)
+        known.note(sweep(HAND, T0 + (18 + turn) * PERIOD, all_of & ~highest))
+    assert known.missing(HAND) == highest
+
+
+def test_a_triangle_that_is_not_enabled_is_never_missing() -> None:
+    known = ledger()
+    lone = enabled(HAND) & -enabled(HAND)
+    known._enabled[HAND] = lone
+    for turn in range(10):
+        known.note(sweep(HAND, T0 + turn * PERIOD, lone))
+    assert known.complete(HAND)
+    assert known.missing(HAND) == 0
+
+
+def test_only_intervals_since_the_set_up_and_without_a_pause_count() -> None:
+    known = after([20.0] * 7)
+    assert known.intervals_ns(HAND).tolist() == [20 * MS] * 7
+    assert known.regular_period_ns(HAND) == 20 * MS
+    known.set_up(HAND)
+    assert known.regular_period_ns(HAND) is None
+    t_ns = T0 + 140 * MS
+    for interval_ns, kept in ((30 * MS, 0), (30 * MS, 1), (999_999_999, 2), (10**9, 0), (5, 1)):
+        t_ns += interval_ns
+        known.note(sweep(HAND, t_ns))
+        assert len(known.intervals_ns(HAND)) == kept
+    known.note(sweep(HAND, t_ns))  # two at one time are no interval
+    assert len(known.intervals_ns(HAND)) == 0
+
+
+def test_the_last_sixteen_intervals_are_kept() -> None:
+    known = after([40.0] * 16 + [20.0] * 15)
+    assert sorted(known.intervals_ns(HAND).tolist()) == [20 * MS] * 15 + [40 * MS]
+    assert len(after([20.0] * 40).intervals_ns(HAND)) == 16
+
+
+@pytest.mark.parametrize(("spread_ms", "regular"), [(4.5, True), (5.5, False)])
+def test_a_period_is_regular_within_a_tenth(spread_ms: float, regular: bool) -> None:
+    """All but the longest and shortest fifth of the intervals count."""
+    low, high = 50.0 - spread_ms / 2, 50.0 + spread_ms / 2
+    known = after([10.0] * 2 + [low] * 3 + [50.0] * 5 + [high] * 3 + [300.0] * 2)
+    found = known.regular_period_ns(HAND)
+    assert found == (50 * MS if regular else None)

@@ -362,3 +362,67 @@ def test_drift_that_the_foams_relaxation_hides_under_a_touch_is_known_at_the_rel
     found = [follow(track, 0.0, held, 2.6) for _ in range(2)]
     assert found[1] is not None
     assert list(found[1]) == list(range(6))
+
+
+@pytest.mark.parametrize("pad", [0, 23])
+def test_taxels_of_a_triangle_without_a_thermal_pad_are_followed_without_one(pad):
+    track = tracker(thermal=np.arange(N) == pad)
+    true = 0.0
+    for _ in range(200):
+        true += 0.01
+        follow(track, true)
+    others = np.arange(N) != pad
+    assert np.abs(true - track.baseline[others]).max() < 0.3
+
+
+@pytest.mark.parametrize(("free", "moved"), [(3, False), (4, True)])
+def test_four_untouched_taxels_stand_for_the_part_and_three_do_not(free, moved):
+    track = tracker()
+    touched = np.arange(N) >= free
+    for _ in range(20):
+        units = np.where(touched, 30.0, 0.01)
+        track.step(units, touched, NOBODY, 1.0)
+    assert bool(track.baseline[-1] > 0.1) is moved
+
+
+def test_a_part_moves_alike_when_four_fifths_of_its_taxels_do():
+    def moves(alike):
+        track = tracker()
+        units = np.where(np.arange(N) < alike, 0.3, 1.5)
+        track.step(units, NOBODY, NOBODY, 1.0)
+        return track.baseline[0]
+
+    assert moves(20) == pytest.approx(0.3)
+    assert moves(19) < 0.2
+
+
+def test_the_time_in_touch_is_reported_from_its_limit_on_and_fades_after_it():
+    track = tracker(frozen_report_s=30.0)
+    touched = np.arange(N) < 6
+    found = []
+    for _ in range(31):
+        follow(track, 0.0, touched, 20.0)
+        found.append(bool(track.frozen[0]))
+    assert found == [False] * 29 + [True] * 2
+    for _ in range(2):
+        follow(track, 0.0)
+    assert not track.frozen.any()
+
+
+def test_a_taxel_that_fell_alone_is_left_for_five_seconds_and_then_followed_at_once():
+    track = tracker()
+    baselines = []
+    for _ in range(6):
+        follow(track, np.where(np.arange(N) == 5, -8.0, 0.0))
+        baselines.append(track.baseline[5])
+    assert baselines[3] == pytest.approx(0.0, abs=0.1)
+    assert baselines[4:] == pytest.approx([-8.0, -8.0])
+
+
+def test_half_a_unit_of_a_taxel_alone_is_noise_to_the_papers_rule_and_a_step_each_way_is_not():
+    track = tracker("paper")
+    for _ in range(10):
+        units = np.zeros(N)
+        units[:3] = 0.45, 0.8, -0.8
+        track.step(units, NOBODY, NOBODY, 0.1)
+    assert track.baseline[:4] == pytest.approx(np.array([0.0, 0.1, -0.1, 0.0]), abs=1e-9)

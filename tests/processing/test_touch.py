@@ -266,3 +266,81 @@ def test_a_noisy_taxel_that_falls_needs_as_many_measurements_as_for_a_touch():
 def test_a_measurement_that_is_sent_again_ends_no_press():
     reported = reported_over([100] * 8 + [3] * 3, residuals_of(), dt_s=0.01)
     assert reported[-3:] == flags(1, 1, 1)
+
+
+def test_a_taxel_without_noise_has_the_thresholds_of_its_settings() -> None:
+    still = TouchSettings(margin_units=3.0, hysteresis_units=1.0, minimum_threshold_units=0.5)
+    found = levels(np.array([0.0, 0.5, 9.0]), np.zeros(3), still)
+    # Half a unit less than the margin, and as much more as the percentile of a byte may be.
+    assert found.enter == pytest.approx(np.array([2.0, 2.5, 2.5]))
+    assert found.leave == pytest.approx(found.enter)
+    assert found.span == pytest.approx(np.ones(3))
+    assert found.hold == pytest.approx(found.span)
+    assert found.fall == pytest.approx(np.zeros(3))
+    assert found.votes.tolist() == [2, 2, 2]
+    assert found.decides == pytest.approx(found.enter + found.span * 0.0369, abs=1e-3)
+
+
+def test_the_least_threshold_and_the_hysteresis_bound_each_other() -> None:
+    least = TouchSettings(margin_units=0.2, hysteresis_units=5.0, minimum_threshold_units=0.8)
+    found = levels(np.zeros(1), np.zeros(1), least)
+    assert (found.enter[0], found.span[0]) == pytest.approx((0.4, 0.8))
+
+
+@given(st.floats(0.0, 0.6), st.floats(0.01, 8.0), st.floats(1.01, 3.0))
+@settings(deadline=None)
+def test_more_noise_takes_more_evidence_and_never_less_pressure(above, spread, factor) -> None:
+    found = levels(np.full(2, above), spread * np.array([1.0, factor]), TouchSettings())
+    for name in ("enter", "span", "hold", "fall", "votes", "decides"):
+        quiet, noisy = getattr(found, name).tolist()
+        assert noisy >= quiet * 0.75 if name == "fall" else noisy >= quiet - 1e-9, name
+    assert (found.leave <= found.enter + 1e-9).all()
+    assert (found.leave >= found.enter / 2 - 1e-9).all()
+    assert (found.hold >= found.span).all()
+    assert (found.hold <= 1.5 * found.span + 1e-9).all()
+    wanted = np.clip(np.ceil(found.span / found.enter), 2, 14)
+    assert found.votes.tolist() == wanted.tolist()
+    assert found.fall == pytest.approx(4.0 * spread * np.array([1, factor]) * np.sqrt(2 / wanted))
+
+
+def test_what_a_press_has_left_falls_to_a_third_in_five_seconds() -> None:
+    """100 kPa leave 3: after five seconds 1.1 more than the threshold of 2 are needed."""
+    assert not reported_after_a_press(100, 3, rest_s=5.0)
+    assert reported_after_a_press(100, 4, rest_s=5.0)
+    assert not reported_after_a_press(100, 4, rest_s=1.0)
+
+
+def test_a_press_that_left_next_to_nothing_changes_no_threshold() -> None:
+    # A twentieth of the threshold of 2 is what 3.3 units leave.
+    residuals = residuals_of()
+    on, off = np.array([True]), np.array([False])
+    for touched, signal in ((on, 3.2), (off, 0.0), (on, 0.5)):
+        reported = residuals.step(touched, np.array([signal]))
+    assert reported[0]
+    residuals = residuals_of()
+    for touched, signal in ((on, 3.4), (off, 0.0), (on, 0.5)):
+        reported = residuals.step(touched, np.array([signal]))
+    assert not reported[0]
+
+
+def test_a_reset_forgets_the_press_of_its_taxel() -> None:
+    residuals = Residuals(2)
+    residuals.configure(np.full(2, 2.0), np.full(2, 6.0), np.array([2, 2]))
+    both, none = np.ones(2, bool), np.zeros(2, bool)
+    residuals.step(both, np.full(2, 100.0))
+    assert residuals.any
+    residuals.reset(np.array([True, False]))
+    assert residuals.step(none, np.zeros(2)).tolist() == [False, False]
+    assert not residuals.any
+    assert residuals.step(both.copy(), np.full(2, 4.0)).tolist() == [True, False]
+
+
+def test_what_is_felt_under_a_residual_is_the_mean_since_it_was_touched() -> None:
+    """A quarter of each new sample: 0.25 * 12 + 0.75 * 3 is more than 2 + 3, 0.25 * 8 is not."""
+    for second, wanted in ((12.0, True), (8.0, False)):
+        residuals = residuals_of()
+        on, off = np.array([True]), np.array([False])
+        residuals.step(on, np.array([100.0]))
+        residuals.step(off, np.array([0.0]))
+        assert not residuals.step(on.copy(), np.array([3.0]))[0]
+        assert residuals.step(on.copy(), np.array([second]))[0] == wanted
