@@ -610,8 +610,9 @@ class _PartPipeline:
 class _OwnCurves:
     """Extra state of taxels with own curves: smoothing, memory, and detection of jumps.
 
-    Cost follows touch: touched taxels are smoothed and remembered in each sweep, the others from
-    the means of `ROWS` sweeps. Their reported pressures change as seldom.
+    Cost follows touch: touched taxels, or all where more than a quarter is touched, are smoothed
+    and remembered in each sweep, the others from the means of `ROWS` sweeps. Their reported
+    pressures change as seldom.
 
     Attributes:
         erratic: which of them jump.
@@ -628,9 +629,10 @@ class _OwnCurves:
         self._zeros = np.zeros(m, np.float32)
         self._reported = self._zeros
         self._touched: Mask | None = None
-        #: The touched taxels, with a filter and a memory of their own as long as they are touched.
+        #: Taxels with a filter and a memory of their own: the touched ones, or all.
         self._felt_memory: PlayRelaxation | None = None
-        self._set_apart(np.zeros(0, np.intp))
+        self._all = np.arange(m)
+        self._set_apart(self._all[:0])
         #: Which were touched since the last fold.
         self._felt: Mask = np.zeros(m, np.bool_)
         self._touching = False
@@ -646,7 +648,9 @@ class _OwnCurves:
             self._touched = touched
             self._felt |= touched
             self._take_back()
-            self._set_apart(np.flatnonzero(touched))
+            which = np.flatnonzero(touched)
+            # Where much is touched, the rest is likely to feel something, too.
+            self._set_apart(which if 4 * len(which) <= len(touched) else self._all)
             self._report(relaxation_kpa)
         which = self._which
         if not len(which):
@@ -690,8 +694,8 @@ class _OwnCurves:
         if self._touching:
             self._smoother.take_back(self._which, self._felt_smoother)
             self._touching = bool(len(self._which))
-            self._felt.fill(False)
-            self._felt[self._which] = True
+            if self._touched is not None:
+                np.copyto(self._felt, self._touched)
         self._folded_s = 0.0
         self._report(relaxation_kpa)
 

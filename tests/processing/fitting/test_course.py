@@ -282,3 +282,19 @@ def test_pads_of_a_foam_with_memory_but_without_own_curves_read_equation_1_and_b
         expected_kpa = float(PressureCurve(2.88).kpa(np.array([units]))[0])
         assert np.median(frames[-1].pressure_kpa) == pytest.approx(expected_kpa, rel=0.05)
     assert frames[-1].beyond_range.all()
+
+
+def test_where_much_is_touched_the_untouched_pads_are_followed_in_each_sweep_too():
+    rig = Rig(1, 0.0, seed=5, hz=50.0)
+    use_own_curves(rig, 0.4)
+    pressed, one = np.arange(192) < 96, np.arange(192) == 150
+    for _ in range(50):
+        rig.step(np.where(pressed, 20.0, 0.0))
+    for _ in range(3):
+        rig.step(np.where(pressed, 20.0, 0.0))
+        # One measurement does not make a touch.
+        frame = rig.step(np.where(pressed, 20.0, np.where(one, 10.0, 0.0)))
+        assert not frame.touched[one]
+        assert frame.pressure_kpa[one] > 10.0
+        for _ in range(20):
+            rig.step(np.where(pressed, 20.0, 0.0))
