@@ -128,7 +128,7 @@ if TYPE_CHECKING:
 
 def _simulate(arguments: argparse.Namespace) -> int:
     from skin_host.demo import configuration
-    from skin_host.evaluation.simulate.run import simulate
+    from skin_host.evaluation.simulate.run import coverage, simulate
 
     if arguments.seeds < 1 or arguments.hours <= 0 or arguments.seed < 0:
         raise RequestError("wanted --seed of 0 or more, --seeds of 1 or more and --hours above 0")
@@ -167,6 +167,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
         print_json(_document(results))
     elif arguments.seeds > 1:
         print(f"{len(results) - len(broken)} of {len(results)} seeds kept every promise")
+        print(_covered(coverage(results)))
     return 1 if broken else 0
 
 
@@ -193,12 +194,26 @@ def _story(result: "RunResult", arguments: argparse.Namespace, config: Path) -> 
     )
 
 
+def _covered(kinds: dict[str, list[str]]) -> str:
+    """Return how much of the catalogue came, and was named."""
+    n_injected, n_named = len(kinds["injected"]), len(kinds["named"])
+    came = f"{n_injected} of {n_injected + len(kinds['never_injected'])} kinds of trouble came"
+    named = f"{n_named} of {n_named + len(kinds['never_named'])} that must be named were"
+    return "; ".join(
+        f"{what} (not {', '.join(kinds[missing])})" if kinds[missing] else what
+        for what, missing in ((came, "never_injected"), (named, "never_named"))
+    )
+
+
 def _document(results: "list[RunResult]") -> dict[str, Any]:
+    from skin_host.evaluation.simulate.run import coverage
+
     return {
         "seeds": len(results),
         "kept": sum(result.broken is None for result in results),
         "simulated_s": round(sum(result.simulated_s for result in results), 3),
         "cpu_s": round(sum(result.cpu_s for result in results), 3),
+        "coverage": coverage(results),
         "runs": [
             {
                 "seed": result.seed,

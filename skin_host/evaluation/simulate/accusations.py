@@ -58,9 +58,8 @@ SLOW = {
 }
 #: Codes that need no trouble: pads differ from the start, presses are long, and the skin drifts.
 ALWAYS = {"taxel_decides_late", "taxel_held", "part_not_calibrated", "taxel_drifting"}
-#: One pad in twenty of real skin is so noisy that a calibration refuses it, now and then one that
-#: jumps is taken for touched meanwhile.
-NOISE = {"taxel_refused", "taxel_noisy", "taxel_saturates", "taxel_pressed"}
+#: One pad in twenty of real skin is so noisy that a calibration refuses it.
+NOISE = {"taxel_refused", "taxel_noisy", "taxel_saturates"}
 #: A trouble is plain if nothing else happened for so long before it, nor a start for longer.
 QUIET_NS = 10 * NS
 STARTED_NS = 15 * NS
@@ -74,13 +73,15 @@ class Accusations:
 
     Attributes:
         codes: what health reports now, by part.
-        named: kinds of trouble that health had to name, and did.
+        required: kinds of trouble that health had to name if they lasted.
+        named: those of them that it named.
         troubles: those of now and lately: each with when it began, and ended.
     """
 
     def __init__(self, world: World) -> None:
         self._world = world
         self.codes: dict[str, set[str]] = {}
+        self.required: set[str] = set()
         self.named: set[str] = set()
         self.troubles: list[tuple[Trouble, int, int | None]] = []
         self._faults: dict[str, set[tuple[str, str]]] = {}
@@ -90,6 +91,8 @@ class Accusations:
     def begin(self, trouble: Trouble) -> None:
         """A trouble begins."""
         now_ns = self._world.clock.monotonic_ns()
+        if trouble.must:
+            self.required.add(trouble.name)
         self.troubles.append((trouble, now_ns, None if trouble.lasts_s[1] else now_ns))
 
     def end(self, trouble: Trouble) -> None:

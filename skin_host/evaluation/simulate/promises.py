@@ -36,6 +36,10 @@ UNTOUCHED_KPA = 25.0
 #: A pad is pressed at all; and so long after it began, a touch may not be decided yet.
 TOUCHING_KPA = 0.2
 DECIDED_NS = NS // 2
+#: Foam that was pressed still relaxes for so long.
+RELAXED_NS = 60 * NS
+#: A calibration at rest began no longer ago when it is noted.
+RESTING_NS = 8 * NS
 MOST_TASKS = 100
 #: So many objects may live more than after the first calm: histories that are bounded.
 MORE_OBJECTS = 60_000
@@ -85,6 +89,9 @@ class Promises:
         self._pressed_ns = np.zeros(layout.n_taxels, np.int64)
         self._felt_ns = np.zeros(layout.n_taxels, np.int64)
         self._unfelt_ns = np.zeros(layout.n_taxels, np.int64)
+        #: When each taxel was last pressed, and when a calibration may last have seen it pressed.
+        self._touched_ns = np.full(layout.n_taxels, -(1 << 62), np.int64)
+        self._calibrated_touched_ns = np.full(layout.n_taxels, -(1 << 62), np.int64)
         self._zeros: dict[int, object] = {}
         self._wrong_since_ns: dict[str, int] = {}
         self._truth: deque[tuple[int, NDArray[np.float64]]] = deque(maxlen=SAMPLES)
@@ -184,6 +191,8 @@ class Promises:
 
     def calibrated_at_rest(self) -> None:
         """A calibration of the whole untouched skin was taken."""
+        long_ago = self._calibrated_touched_ns < self._now_ns() - RESTING_NS
+        self._calibrated_touched_ns[long_ago] = -(1 << 62)
         self._exempt[:] = False
         self._spoiled_until_ns[:] = self._now_ns()
         self.accusations.repaired()
@@ -314,6 +323,10 @@ class Promises:
         wrong = self.accusations.note(part, record)
         if wrong is not None:
             self.break_(wrong)
+        touched = np.array(record["taxel_verdicts"].get("touched", []), np.intp)
+        false = touched[self._calibrated_touched_ns[touched + self._parts[part].start] < 0]
+        if len(false):
+            self.break_(f"{part}: taxels {false.tolist()} rested when they were calibrated")
 
     # ------------------------------------------------------------------ subscribers
 
@@ -461,9 +474,12 @@ class Promises:
         truth = world.robot.skin.true_pressure_kpa().copy()
         self._truth.append((now_ns, truth))
         life = world.life
+        self._touched_ns[truth > TOUCHING_KPA] = now_ns
         if life is not None and life.daemon.engine.calibrating:
             # Touched taxels are calibrated anyway, with that verdict.
             self._exempt |= (truth > TOUCHING_KPA) | self._spoiled()
+            relaxing = now_ns - self._touched_ns < RELAXED_NS
+            self._calibrated_touched_ns[self._exempt | relaxing] = now_ns
         if life is not None:
             self._exempt_zeroed(life, truth)
             if life.daemon.engine.calibration is not None:

@@ -6,6 +6,7 @@ import random
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -65,7 +66,8 @@ class RunResult:
         simulated_s, cpu_s: how long it lasted, simulated and in CPU time.
         events, digest: how many events there were, and the hash of them all.
         broken: the promise that was broken, or None; `last` are the events before.
-        troubles: how many of each kind were injected; `named` are those that health had to name.
+        troubles: how many of each kind were injected.
+        required, named: kinds that health had to name if they lasted, and those that it named.
         touches, deaths: events of touch, and ends of the daemon.
     """
 
@@ -77,6 +79,7 @@ class RunResult:
     broken: str | None = None
     last: list[str] = field(default_factory=list)
     troubles: dict[str, int] = field(default_factory=dict)
+    required: list[str] = field(default_factory=list)
     named: list[str] = field(default_factory=list)
     touches: int = 0
     deaths: int = 0
@@ -119,6 +122,26 @@ def simulate(
     return result
 
 
+def coverage(results: Iterable[RunResult]) -> dict[str, list[str]]:
+    """Return what came of the catalogue over some runs, as kinds of trouble.
+
+    Returns:
+        injected, never_injected: all kinds.
+        named, never_named: of the injected ones that health had to name. Those that do no harm, or
+            were too weak, it need not.
+    """
+    results = list(results)
+    injected = {kind for result in results for kind in result.troubles}
+    required = {kind for result in results for kind in result.required}
+    named = {kind for result in results for kind in result.named}
+    return {
+        "injected": sorted(injected),
+        "never_injected": sorted(KINDS.keys() - injected),
+        "named": sorted(named),
+        "never_named": sorted(required - named),
+    }
+
+
 def _scene(seed: int, seconds: float) -> Scene:
     """Noise as recorded on real skin or of the best skin, and a temperature that wanders."""
     chance = random.Random(f"{seed} scene")
@@ -144,7 +167,7 @@ class _Run:
         self._troubles: list[Trouble] = []
         self._injected: Counter[str] = Counter()
         self._requests = 0
-        self._drills: list[str] = []
+        self._drills = 0
 
     async def live(self) -> None:
         """Storm and calm, until the time is over or a promise is broken."""
@@ -171,6 +194,7 @@ class _Run:
         result.broken = self._promises.broken
         result.last = list(world.trace.last)
         result.troubles = dict(sorted(self._injected.items()))
+        result.required = sorted(self._promises.accusations.required)
         result.named = sorted(self._promises.accusations.named)
         result.touches = self._promises.touches
 
@@ -393,16 +417,16 @@ class _Run:
     # ------------------------------------------------------------------ drill
 
     async def _drill(self) -> None:
-        """One trouble alone, until health names it. All kinds take their turns."""
+        """One trouble alone, until health names it. All kinds take their turns, also over seeds."""
         world = self.world
-        if not self._drills:
-            self._drills = list(KINDS)
-            self._chance.shuffle(self._drills)
         if world.life is None:
             return
+        kinds = list(KINDS)
+        kind = kinds[(self.result.seed + self._drills) % len(kinds)]
+        self._drills += 1
         quiet_s = max(QUIET_NS, STARTED_NS) / 1e9
         await world.clock.sleep(quiet_s)
-        trouble = self._inject(self._drills.pop())
+        trouble = self._inject(kind)
         if trouble is None:
             return
         if trouble.writes:

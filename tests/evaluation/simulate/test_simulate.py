@@ -16,8 +16,9 @@ DEMO = configuration("demo.toml")
 SMALL = Path(__file__).with_name("small.toml")
 #: Simulated time of each fixed seed: one storm and its calm.
 SECONDS = 30.0
-#: Seeds that once broke a promise stay.
-FIXED = [(DEMO, 1), (SMALL, 5)]
+#: Seeds that once broke a promise stay: 5 touches without an end; 6 a contact that stayed unknown;
+#: 8, 9 and 11 presses that were zeroed away unfelt; 10 a press after a release.
+FIXED = [(DEMO, 1), *((SMALL, seed) for seed in (5, 6, 8, 9, 10, 11))]
 
 
 def run(seed: int, config: Path = DEMO, *, until_s: float | None = None) -> RunResult:
@@ -42,7 +43,10 @@ def test_the_same_seed_gives_the_same_events_in_another_process(tmp_path: Path) 
         capture_output=True,
         check=True,
     )
-    (other,) = json.loads(said.stdout)["runs"]
+    document = json.loads(said.stdout)
+    (other,) = document["runs"]
+    assert set(other["troubles"]) == set(document["coverage"]["injected"])
+    assert set(other["named"]) == set(document["coverage"]["named"])
     here = run(4, until_s=14.0)
     assert (other["hash"], other["events"]) == (here.digest, here.events)
     assert run(5, until_s=14.0).digest != here.digest
