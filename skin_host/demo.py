@@ -19,6 +19,7 @@ import can
 import numpy as np
 from msgspec import structs
 
+from skin_host import emulator_path
 from skin_host.bus.pair import PAIR, PairBus, pair
 from skin_host.cli.common import load_skin
 from skin_host.cli.lines import event_line
@@ -34,6 +35,9 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
     from emulator.probes.scene import Scene
+
+# The emulator's process begins here, not at the command line.
+emulator_path.provide()
 
 log = logging.getLogger(__name__)
 

@@ -1,5 +1,6 @@
 """What `pip install` puts on a machine that has no checkout of the project."""
 
+import json
 import re
 import shutil
 import subprocess
@@ -66,6 +67,15 @@ print(emulator.robot.__file__)
             run(site, "import skin_host.client, emulator")
     finally:
         shutil.rmtree(site / "emulator")
+
+
+def test_the_demo_runs_with_its_emulator_in_a_process_of_its_own(site):
+    program = (
+        "from skin_host.cli import main; main(['demo', '--duration', '1', '--page-port', '0'])"
+    )
+    summary = json.loads(run(site, program).splitlines()[-1])
+    assert summary["bus"] == "socketpair"
+    assert {"sweeps", "touches_begun"} <= set(summary)
 
 
 def test_a_subscriber_imports_nothing_of_the_daemon(site):
