@@ -11,8 +11,11 @@
     |- BrokerError            the MQTT broker: refused us, or sent an invalid answer
 
 A message is one line: what, where, the value seen, the value wanted, and the command that helps.
-The command line prints it and exits with `exit_status`.
+The command line prints it and exits with `exit_status`. `required` imports an extra, or raises.
 """
+
+import importlib
+from typing import Any
 
 
 class SkinError(Exception):
@@ -53,3 +56,24 @@ class BusError(SkinError):
 
 class BrokerError(SkinError):
     """The MQTT broker refused us, and waiting does not help."""
+
+
+def required(module: str, what: str, extra: str) -> Any:
+    """Import a module of an extra.
+
+    Args:
+        module: to import.
+        what: needs it, in the plural: "MCAP recordings".
+        extra: of the project that brings it.
+
+    Raises:
+        SkinError: it is not installed; the message gives the command that installs it.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        package = module.partition(".")[0]
+        raise SkinError(
+            f"{what} need the package {package}, which is not installed; "
+            f"mend it with: pip install 'skin-host[{extra}]'"
+        ) from None

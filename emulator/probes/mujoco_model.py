@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from emulator.probes.contacts import MOST_RADIUS_MM, Contacts
 from emulator.probes.foam import E0_KPA
-from skin_host.errors import ConfigurationError, RequestError, SkinError
-from skin_host.extras import required
+from skin_host.errors import ConfigurationError, RequestError, SkinError, required
 from skin_host.layout import Layout
 
 #: The mechanics takes up contacts this often; the simulation's steps cannot be longer.

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from skin_host.config.settings import Settings
 from skin_host.errors import RequestError
-from skin_host.evaluation import emulated, insole, page, tables
+from skin_host.evaluation import insole, page, tables
 from skin_host.evaluation.document import as_text, write
 from skin_host.evaluation.goals import goal
 from skin_host.evaluation.insole import InsoleRecording
@@ -143,7 +143,7 @@ def run(
         calibration = next((path for path in paths if path.stem == FITTED_FOAM), None)
         emulating = None
         if calibration is not None and with_emulation:
-            emulating = pool.submit(emulated.compare, calibration)
+            emulating = pool.submit(insole.compare, calibration)
         rows = [future.result() for future in measured]
         found = None if grasping is None else grasping.result()
         compared = [] if emulating is None else emulating.result()

@@ -18,8 +18,7 @@ import numpy as np
 from msgspec import Struct
 
 from skin_host.bus.wire import FrameBatch
-from skin_host.errors import LogError, SkinError
-from skin_host.extras import required
+from skin_host.errors import LogError, SkinError, required
 from skin_host.mqtt.frames import Frame, decode_frame, encode_frame
 from skin_host.mqtt.grasping import decode_over, decode_slip
 from skin_host.mqtt.messages import decode_touch

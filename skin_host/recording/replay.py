@@ -26,8 +26,7 @@ import numpy as np
 from skin_host.bus.logs import read_channels
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import Settings, load, skin_hash
-from skin_host.errors import ConfigurationError, LogError, RequestError, SkinError
-from skin_host.extras import required
+from skin_host.errors import ConfigurationError, LogError, RequestError, SkinError, required
 from skin_host.fingertip.events import FingertipEvent, SlipEvent
 from skin_host.fingertip.health import FingertipHealth
 from skin_host.health import Health

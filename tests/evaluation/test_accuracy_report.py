@@ -9,7 +9,6 @@ import pytest
 from skin_host.evaluation import (
     accuracy,
     bench_processing,
-    frames_to_events,
     page,
     report,
     speed,
@@ -207,7 +206,7 @@ def test_the_higher_the_press_the_sooner_it_is_told(small):
 
 def test_the_bench_compares_with_a_copy_in_the_same_run(small):
     document = bench_processing.with_ratios(small["speed"], small["pipeline"])
-    document["frames_to_events"] = frames_to_events.measure(0.2)
+    document["frames_to_events"] = bench_processing.frames_to_events(0.2)
     copies = report.select(document["models"], model="memory_copy")
     assert all(row["ratio_to_copy"] == 1.0 for row in copies)
     assert "times a copy" in bench_processing.describe(document)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from skin_host.cli import main
-from skin_host.errors import RequestError, SkinError
-from skin_host.extras import required
+from skin_host.errors import RequestError, SkinError, required
 from skin_host.mqtt.info import PartInfo, TriangleInfo
 from skin_host.mqtt.messages import TouchMessage
 from skin_host.recording.export import HealthLine, PartSeries, Series, export

@@ -19,8 +19,7 @@ import numpy as np
 
 from skin_host.client import SkinClient
 from skin_host.clock import SYSTEM, Clock
-from skin_host.errors import SkinError
-from skin_host.extras import required
+from skin_host.errors import SkinError, required
 from skin_host.mqtt.info import PartInfo
 from skin_host.recording.export.scene import (
     Item,

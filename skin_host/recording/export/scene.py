@@ -19,8 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.errors import RequestError, SkinError
-from skin_host.extras import required
+from skin_host.errors import RequestError, SkinError, required
 from skin_host.mqtt.info import PartInfo
 from skin_host.mqtt.messages import TouchMessage
 from skin_host.recording.export.series import HealthLine, Series

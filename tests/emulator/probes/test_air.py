@@ -10,7 +10,7 @@ from emulator.probes.scene import Air, Probe, Scene, load
 from emulator.robot import Robot
 from skin_host.config.settings import load as load_settings
 from skin_host.errors import ConfigurationError
-from skin_host.evaluation import emulated
+from skin_host.evaluation import insole
 from skin_host.layout import build_layout
 
 CONFIG = Path(__file__).parents[3] / "config" / "demo.toml"
@@ -143,7 +143,7 @@ def test_a_course_is_nothing_before_and_after_itself() -> None:
 
 @pytest.mark.skipif(not RECORDING.exists(), reason="the recordings are not here")
 def test_an_emulated_insole_sends_what_the_recorded_one_sent() -> None:
-    rows = {row["figure"]: row for row in emulated.compare(RECORDING, longest_s=25.0)}
+    rows = {row["figure"]: row for row in insole.compare(RECORDING, longest_s=25.0)}
 
     assert rows["course of the median pad: median difference"]["emulated"] < 1.0
     for share in (5, 50, 95):
