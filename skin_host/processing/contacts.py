@@ -85,7 +85,7 @@ class ContactTracker:
         self._contacts: dict[int, _Contact] = {}
         self._next_id = 1
         self._t_ns = 0
-        self._known = _Grouping.of([], [], _Homes({}, 0), self._area_mm2)
+        self._known = _Grouping.of([], [], _Homes({}, 0), self._area_mm2, self._position_m)
         self._seen: bytes | None = None
 
     def go_on(self, before: "ContactTracker") -> None:
@@ -128,7 +128,8 @@ class ContactTracker:
         if len(groups) == 1:
             home.note(groups[0], touched)
         groups = self._kept_whole(self._kept_apart(groups, home, frame.t_ns), home, frame)
-        self._known = _Grouping.of(self._identify(groups, home), groups, home, self._area_mm2)
+        names = self._identify(groups, home)
+        self._known = _Grouping.of(names, groups, home, self._area_mm2, self._position_m)
         # Whether contacts are kept together or apart, or are split by pressure, can change with any
         # frame.
         decided = as_before and self._places is None and all_of(frame.valid[self._known.order])
@@ -286,15 +287,17 @@ class ContactTracker:
         if not found.names:
             return []
         order, starts = found.order, found.starts
-        pressure = frame.pressure_kpa[order].astype(np.float64)
-        weight = pressure * self._area_mm2[order]
+        pressure = frame.pressure_kpa.take(order).astype(np.float64)
+        weight = pressure * found.pad_mm2
         total = np.add.reduceat(weight, starts)
-        moment = np.add.reduceat(weight[:, None] * self._position_m[order], starts)
+        moment = np.add.reduceat(weight[:, None] * found.position_m, starts)
         centroids = (moment / np.maximum(total, 1e-300)[:, None]).tolist()
         peaks = np.maximum.reduceat(pressure, starts).tolist()
-        valid = frame.valid[order]
-        heard = np.logical_or.reduceat(valid, starts).tolist()
-        all_heard = np.logical_and.reduceat(valid, starts).tolist()
+        heard = all_heard = [True] * len(starts)
+        valid = frame.valid.take(order)
+        if not all_of(valid):
+            heard = np.logical_or.reduceat(valid, starts).tolist()
+            all_heard = np.logical_and.reduceat(valid, starts).tolist()
         totals = total.tolist()
         elapsed_ns = min(max(frame.t_ns - self._t_ns, 0), FADES_NS)
         fading = math.exp(-elapsed_ns / FADES_NS)
@@ -445,6 +448,7 @@ class _Grouping:
         groups: the taxels of each.
         taxels: the same, in order.
         order, starts: intp, all taxels contact by contact, and the index of the first of each.
+        pad_mm2, position_m: of the taxels in this order: area, and position [.., 3].
         area_mm2: of each contact.
     """
 
@@ -453,18 +457,26 @@ class _Grouping:
     taxels: list[list[int]]
     order: NDArray[np.intp]
     starts: NDArray[np.intp]
+    pad_mm2: Floats
+    position_m: Floats
     area_mm2: list[float]
 
     @classmethod
     def of(
-        cls, names: list[int], groups: list[frozenset[int]], home: "_Homes", area_mm2: Floats
+        cls,
+        names: list[int],
+        groups: list[frozenset[int]],
+        home: "_Homes",
+        area_mm2: Floats,
+        position_m: Floats,
     ) -> "_Grouping":
         taxels = [home.sorted(group) for group in groups]
         order = home.order(groups)
         ends = list(accumulate(map(len, taxels)))
         starts = np.array([0, *ends[:-1]] if ends else [], np.intp)
-        areas = np.add.reduceat(area_mm2[order], starts).tolist() if ends else []
-        return cls(names, groups, taxels, order, starts, areas)
+        pads = area_mm2[order]
+        areas = np.add.reduceat(pads, starts).tolist() if ends else []
+        return cls(names, groups, taxels, order, starts, pads, position_m[order], areas)
 
     def span(self, number: int) -> slice:
         """Return the slice of `order` with the taxels of a contact."""

@@ -263,6 +263,8 @@ class Residuals:
         self._pressed = np.zeros(n, np.float32)
         self._felt = np.zeros(n, np.float32)
         self._fallen = np.zeros(n, np.int64)
+        #: Whether any reported taxel has fallen in its last measurement.
+        self._any_fallen = False
         self._reported: Mask = np.zeros(n, dtype=np.bool_)
         self._seen = self._reported
         self._which: NDArray[np.intp] = np.zeros(0, np.intp)
@@ -312,11 +314,17 @@ class Residuals:
     def _end_fallen(self, signal: Array, repeated: Mask | None) -> None:
         """End touches that have fallen from a firm press to its residual."""
         which = self._which
-        now, felt = signal[which], self._felt[which]
-        pressed = np.fmax(self._pressed[which], now)
+        now, felt = signal.take(which), self._felt.take(which)
+        pressed = np.fmax(self._pressed.take(which), now)
         self._pressed[which] = pressed
-        bar = self._on[which] + RESIDUAL_SHARE * pressed
-        fallen = (now < bar) & (felt >= bar + self._firmer[which])
+        bar = self._on.take(which) + RESIDUAL_SHARE * pressed
+        fallen = (now < bar) & (felt >= bar + self._firmer.take(which))
+        if not self._any_fallen and not any_of(fallen):
+            mean = felt + MEAN_SHARE * (now - felt)
+            if repeated is not None:
+                np.copyto(mean, felt, where=repeated.take(which))
+            self._felt[which] = mean
+            return
         counts = np.where(fallen, self._fallen[which] + 1, 0)
         # The earlier mean is kept while the fall is observed.
         felt = np.where(fallen, felt, felt + MEAN_SHARE * (now - felt))
@@ -325,6 +333,7 @@ class Residuals:
             counts = np.where(again, self._fallen[which], counts)
             felt = np.where(again, self._felt[which], felt)
         self._fallen[which] = counts
+        self._any_fallen = any_of(counts > 0)
         self._felt[which] = felt
         ended = which[counts >= self._votes[which]]
         if len(ended):
