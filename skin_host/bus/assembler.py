@@ -125,7 +125,7 @@ class AssemblerCounters:
     sweeps: int = 0
     #: Sweeps returned without a triangle that was awaited.
     incomplete: int = 0
-    #: Triangles of which only one frame arrived.
+    #: Triangles of which only one frame arrived before the board's next sweep.
     halves: int = 0
     #: Whole periods without a frame from a board that had been sending.
     missed: int = 0
@@ -158,6 +158,7 @@ class _BoardState:
         values: received bytes of each triangle, A and B in turn.
         order: in which it sends, once that is known.
         came: (head, place, missing before it) of the frames of a sweep from which it is learnt.
+        lone: halves of the last sweep of which the other has not come.
         done: frames of the sweep that came in this order; the next has the place `expected`, which
             is -1 while runs are not looked for.
         stray: sweeps in succession with frames in another order.
@@ -175,6 +176,7 @@ class _BoardState:
     last_ns: int = 0
     certain_until_ns: int = 0
     sent: int = 0
+    lone: int = 0
     sent_first_ns: int = -(1 << 62)
     sent_last_ns: int = 0
     last_place: int = -1
@@ -314,7 +316,10 @@ class Assembler:
 
     def flush(self) -> list[Sweep]:
         """Return all sweeps in progress, at the end of a recording."""
-        return self.expire(1 << 62)
+        sweeps = self.expire(1 << 62)
+        for state in self._states.values():
+            self._count_lone(state)
+        return sweeps
 
     def _add_slots(self, address: int, triangle: int, state: _BoardState) -> None:
         for half, header in enumerate((HEADER_A, HEADER_B)):
@@ -501,16 +506,25 @@ class Assembler:
                 state.missing |= both
         if not state.missing:
             if not bit & state.sent and t_ns - state.sent_first_ns <= state.pause_ns:
-                # The triangle was not awaited, so its sweep was returned without it.
+                # Its sweep was returned without it: the triangle was not awaited, or the frame was
+                # held up for longer than a sweep is waited for.
                 self.counters.late += 1
+                state.lone &= ~(bit << TRIANGLES | bit >> TRIANGLES)
                 return False
             if bit & state.sent and 0 < 2 * (t_ns - state.sent_first_ns) < state.period_ns:
                 self.crowded[state.index] += 1
+            if state.lone:
+                self._count_lone(state)
             state.missing = state.awaited
             state.first_ns = t_ns
             self._expect_order(state)
         state.certain_until_ns = min(t_ns + state.pause_ns, state.first_ns + state.close_ns)
         return True
+
+    def _count_lone(self, state: _BoardState) -> None:
+        """Count the lone frames of the last sweep: what was held up has come by now."""
+        self.counters.halves += state.lone.bit_count()
+        state.lone = 0
 
     def _close(self, state: _BoardState, sweeps: list[Sweep], values: Bytes | None = None) -> None:
         """End a sweep; `values` uint8[32 * 7] are given if they are not those of the state."""
@@ -532,7 +546,7 @@ class Assembler:
             state.expected = -1
         if got != state.wanted:
             counters.incomplete += state.missing != 0
-            counters.halves += (got ^ present * _BOTH).bit_count()
+            state.lone = got ^ present * _BOTH
             triangles[[not present >> triangle & 1 for triangle in range(TRIANGLES)]] = 0
             self._note_absent(state, present)
         else:

@@ -85,6 +85,27 @@ def test_a_lost_frame_costs_its_triangle_and_is_counted():
     assert sweep.present == 0b1101
     assert not sweep.raw[1].any()
     assert assembler.counters.incomplete == 1
+    feed(assembler, frames(values(4), t_ns=2 * PERIOD))
+    assert assembler.counters.halves == 1
+
+
+@pytest.mark.parametrize("cut", [1, 3, 6])
+def test_frames_that_were_held_up_until_their_sweep_was_closed_are_late_not_lost(cut: int) -> None:
+    order = [0, 2, 4, 6, 1, 3, 5, 7]  # all A, then all B
+    sent = [frames(values(4), PERIOD, spacing_ns=1000)[place] for place in order]
+    assembler = make()
+    feed(assembler, sent[:cut])
+    assembler.expire(2 * PERIOD)
+    assert feed(assembler, sent[cut:]) == []
+    feed(assembler, frames(values(4, 2), 2 * PERIOD))
+    counters = assembler.counters
+    assert (counters.incomplete, counters.late, counters.halves) == (1, 8 - cut, 0)
+
+
+def test_what_is_missing_from_the_last_sweep_of_a_recording_is_counted() -> None:
+    assembler = make()
+    feed(assembler, frames(values(4), PERIOD)[:-1])
+    assembler.flush()
     assert assembler.counters.halves == 1
 
 
@@ -438,8 +459,8 @@ def test_a_board_that_only_sends_halves_is_awaited_in_whole_again() -> None:
     for period in range(1, 12):
         feed(assembler, frames(values(2, period), period * PERIOD)[::2])
         assert assembler.expire((period + 1) * PERIOD) == []
-    assert assembler.counters.halves == 2 * assembler.counters.sweeps == 22
     (sweep,) = feed(assembler, frames(values(2), 12 * PERIOD))
+    assert assembler.counters.halves == 2 * (assembler.counters.sweeps - 1) == 22
     assert sweep.present == 0b11
 
 
