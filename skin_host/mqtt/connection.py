@@ -5,7 +5,7 @@ that never waits for a broker that does not answer, and a count of publications 
 took but refused (MQTT 5 reports that in the acknowledgement, aiomqtt does not).
 
 Frames (QoS 0) do not pass through paho: `Connection.write_now` writes packets that are encoded
-already, see `packets.publish_packet`, to paho's socket. Nothing is expected in answer to such a
+already, see `frames.publish_packet`, to paho's socket. Nothing is expected in answer to such a
 packet, so nothing of it has to be kept: no number, no future, no lock, no callback, which together
 cost paho and aiomqtt several times what the bytes do. Only the writing has to be shared, and
 paho's queue of packets does that: while it holds anything, no frame is written past it, and the

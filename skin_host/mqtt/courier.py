@@ -26,9 +26,8 @@ from skin_host.mqtt.connection import (
     PackedProperties,
     within,
 )
-from skin_host.mqtt.frames import encode_frame
+from skin_host.mqtt.frames import encode_frame, publish_head, publish_packet
 from skin_host.mqtt.outbox import Outbox
-from skin_host.mqtt.packets import publish_head, publish_packet
 from skin_host.mqtt.topics import Topics
 from skin_host.processing.pipeline import PressureFrame
 

@@ -1,9 +1,7 @@
-"""MQTT packets as bytes: limits that are checked before decoding, and encoding of frames. Pure.
+"""MQTT packets as bytes: limits that are checked before decoding. Pure.
 
 paho decodes properties in quadratic time: 80 kB of them take a second, 700 kB most of a minute.
 So packets that are too long or have too many properties are found here first, in bounded time.
-Frames are most of the published messages, and differ only in their payload: the head of a topic is
-encoded once, and a packet is put together from it.
 Source: MQTT 5.0, sections 1.5.5 (variable byte integer), 2.2.2 (properties) and 3.3 (PUBLISH);
 MQTT 3.1.1 has no properties.
 """
@@ -16,9 +14,6 @@ KEPT_BYTES = 70_000
 MAX_OTHER_BYTES = 8192
 MAX_PROPERTY_BYTES = 4096
 MAX_PROPERTIES = 32
-
-#: The largest variable byte integer: the maximum length after the fixed header.
-MOST_BYTES = 268_435_455
 
 _PUBLISH = 0x30
 #: Bytes of a property's value by its identifier; strings, binary data and pairs have a length.
@@ -37,38 +32,6 @@ class Unfit(NamedTuple):
     why: str
     mid: int = 0
     is_publish: bool = False
-
-
-def publish_head(topic: str, properties: bytes | None) -> bytes:
-    """Return the bytes between fixed header and payload of a PUBLISH with QoS 0.
-
-    Args:
-        topic: where to.
-        properties: packed, with their length; None for MQTT 3.1.1.
-    """
-    name = topic.encode()
-    return len(name).to_bytes(2, "big") + name + (properties or b"")
-
-
-def publish_packet(head: bytes, payload: bytes) -> bytes:
-    """A whole PUBLISH with QoS 0, not retained.
-
-    Args:
-        head: of `publish_head`.
-        payload: of the message.
-
-    Raises:
-        ValueError: it is longer than a packet can be.
-    """
-    left = len(head) + len(payload)
-    if left > MOST_BYTES:
-        raise ValueError(f"a packet of {left} bytes; wanted at most {MOST_BYTES}")
-    fixed = bytearray((_PUBLISH,))
-    while left > 0x7F:
-        fixed.append(left & 0x7F | 0x80)
-        left >>= 7
-    fixed.append(left)
-    return b"".join((fixed, head, payload))
 
 
 def unfit(

@@ -81,6 +81,12 @@ class Publisher:
         clock: for time and waiting.
         connect: makes the connections.
 
+    Attributes:
+        put_frame: sends a frame, unless a newer one of its part comes first. It must not change any
+            more.
+        together: at the end of this block, what was put in it is written: touches first, then
+            frames.
+
     Raises:
         ConfigurationError: a name cannot be part of a topic, or a named file cannot be used.
         SkinError: frames in CBOR are requested and cbor2 is not installed.
@@ -141,6 +147,8 @@ class Publisher:
             self._note_refusals,
             clock,
         )
+        self.put_frame: Callable[[PressureFrame], None] = self._outbox.put_frame
+        self.together: Callable[[], AbstractContextManager[None]] = self._courier.together
         self._number_messages()
 
     def _number_messages(self) -> None:
@@ -192,14 +200,6 @@ class Publisher:
         for number in range(len(pieces) + 1, self._pieces + 1):
             self._outbox.put_state(self.topics.info(self._node, number), b"")
         self._pieces = max(self._pieces, len(pieces))
-
-    def together(self) -> AbstractContextManager[None]:
-        """Write at the end of a block what is put in it: touches first, then frames."""
-        return self._courier.together()
-
-    def put_frame(self, frame: PressureFrame) -> None:
-        """Send a frame, unless a newer one of its part comes first. It must not change any more."""
-        self._outbox.put_frame(frame)
 
     def show_raw(self, seconds: float) -> None:
         """Send the boards' own bytes with the frames for this time; 0 ends it."""

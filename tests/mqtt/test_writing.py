@@ -16,7 +16,7 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import PackedProperties, connect, message_properties
-from skin_host.mqtt.packets import publish_head, publish_packet
+from skin_host.mqtt.frames import publish_head, publish_packet
 from tests.support.certificates import authority, certificate
 from tests.support.waiting import PATIENCE_S, until
 
