@@ -268,11 +268,11 @@ class FoamLayer:
         self.force_n = mean_kpa * self._bears_n_per_kpa
         if not len(self._recovering):
             return Felt(rows.taxel, strain, rows.covered)
-        left = self._recovering
+        left_strain, left_covered = self._left
         return Felt(
             self._felt_taxel,
-            np.concatenate([strain, self._imprint_strain[left]]),
-            np.concatenate([rows.covered, self._covered[left]]),
+            np.concatenate([strain, left_strain]),
+            np.concatenate([rows.covered, left_covered]),
         )
 
     def _press(self, drive: Drive, imprint: Floats) -> Floats:
@@ -363,6 +363,7 @@ class FoamLayer:
         n_contacts = len(rows.area_mm2)
         self._repeats = len(self._touched) < len(rows.taxel)
         self._felt_taxel = np.concatenate([rows.taxel, self._recovering])
+        self._set_left()
         self._law = self.foam.take(rows.taxel)
         self._bears = np.bincount(rows.contact, rows.weight, n_contacts) > 0
         # A probe between the pads has foam under it too: nominal, and purely elastic.
@@ -397,12 +398,20 @@ class FoamLayer:
 
     def _recover(self) -> None:
         """Bring recovering foam to the present."""
-        if len(self._recovering):
-            late_s = self._waited_s - self._ahead_s[self._recovering]
-            self._recovering = self._free(self._recovering, late_s)
-            self._felt_taxel = np.concatenate([self._footprint.taxel, self._recovering])
+        before = self._recovering
+        if len(before):
+            self._recovering = self._free(before, self._waited_s - self._ahead_s[before])
+            self._set_left()
+            # The same pads as before are the same object, which saves finding it out.
+            if len(self._recovering) < len(before):
+                self._felt_taxel = np.concatenate([self._footprint.taxel, self._recovering])
             self._ahead_s[self._recovering] = 0.0
         self._waited_s = 0.0
+
+    def _set_left(self) -> None:
+        """Strain and covered share of foam that still recovers; constant while it is left."""
+        left = self._recovering
+        self._left = self._imprint_strain[left], self._covered[left]
 
     def _free(self, taxels: Ints, dt_s: float | Floats) -> Ints:
         """Let untouched foam come back for `dt_s`; returns where a residual is left."""

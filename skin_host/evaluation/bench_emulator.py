@@ -32,7 +32,7 @@ MOTIONS = "pressing", "sliding"
 #: Steps of the mechanics in a period of the moving presses.
 PERIOD_STEPS = 200
 #: How often each motion's steps are timed; the shortest time counts.
-TURNS = 10
+TURNS = 30
 #: Instead of a number of touched pads: one on each triangle of a board, as a grasping hand.
 HAND = -1
 
