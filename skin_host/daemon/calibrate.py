@@ -22,6 +22,8 @@ log = logging.getLogger(__name__)
 
 #: If nothing was received for this long, a calibration ends with what it has.
 GRACE_S = 5.0
+#: A calibration in which a board is zeroed takes longer, so many times.
+MOST_FALLS = 3
 
 
 async def take_calibration(
@@ -92,15 +94,17 @@ async def collect(
     """
     engine().begin_calibration(seconds)
     grown_s = clock.monotonic_s()
-    share = 0.0
+    share, falls = 0.0, 0
     while share < 1.0 and clock.monotonic_s() - grown_s < GRACE_S:
         await clock.sleep(0.02)
         before, share = share, engine().calibration_progress()
-        if share > before:
+        falls += share < before
+        # A board that zeroes itself again and again takes it back every time.
+        if share > before and falls <= MOST_FALLS:
             grown_s = clock.monotonic_s()
         progress(share)
     found = engine().end_calibration(clock.today().isoformat(timespec="seconds"))
-    if share == 0.0:
+    if share == 0.0 and not falls:
         raise SkinError(
             "no calibration: no board sent a sweep; check with `skin scan` whether the boards are "
             "powered and answer"

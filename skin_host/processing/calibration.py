@@ -197,6 +197,12 @@ class Calibrator:
             new = present & ~self._conversions[part_index].step(raw.copy(), dt_s)
         self._counts[taxels[new], raw[new]] += 1
 
+    def forget(self, taxels: NDArray[np.intp]) -> None:
+        """Drop what was added of some taxels, whose board has another zero now."""
+        self._received[taxels] = 0
+        self._counts[taxels] = 0
+        self._course.forget(taxels)
+
     def finish(self, configuration: str, time: str) -> Calibration:
         """Return the calibration from the added sweeps, at `time` (ISO 8601, UTC)."""
         counts, received = self._counts, self._received
@@ -408,6 +414,13 @@ class _Course:
             self.means[joined, : MOST_BLOCKS // 2] = pairs
             self.number[joined] = MOST_BLOCKS // 2
             self.length[joined] *= 2
+
+    def forget(self, taxels: NDArray[np.intp]) -> None:
+        """Begin again with some taxels."""
+        self._sum[taxels] = 0.0
+        self._count[taxels] = 0
+        self.length[taxels] = BLOCK
+        self.number[taxels] = 0
 
     @property
     def _full(self) -> Mask:

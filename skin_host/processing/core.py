@@ -333,9 +333,15 @@ class Engine:
         Returns:
             How many taxels were touched.
         """
+        taxels = self._taxels_of(board)
+        if self._run is not None:
+            # A calibration of two zeros would be that of none.
+            self._run.calibrator.forget(taxels[taxels >= 0].astype(np.intp))
+            for part in self._run.samples:
+                if board in self.layout.parts[part].boards:
+                    self._run.samples[part] = 0
         if self.calibration is None:
             return 0
-        taxels = self._taxels_of(board)
         touched: NDArray[np.bool_] = self._touched[taxels] & (taxels >= 0) & believed
         before = self._rezeros.get(board)
         if before is not None:

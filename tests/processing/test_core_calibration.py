@@ -58,3 +58,30 @@ def test_a_clock_that_is_set_shortens_no_calibration(engine: Engine, step_s: flo
     verdict = engine.end_calibration("2026-01-01T00:00:00+00:00").verdict
     mine = engine.taxels_of([0])
     assert (verdict[mine] != Verdict.TOO_FEW).all()
+
+
+def test_a_board_that_is_zeroed_during_a_calibration_is_calibrated_with_its_new_zero(
+    engine: Engine,
+) -> None:
+    """Otherwise a press for the first half and a new zero for the second would look the same."""
+    hand = engine.layout.boards[0]
+    triangles = np.array(hand.triangles)
+    rng = np.random.default_rng(2)
+    status = np.zeros(len(triangles), np.uint16)
+    engine.begin_calibration(2.0)
+    number = 0
+    while engine.calibration_progress() < 1.0:
+        if number == 35:
+            engine.rezero(0)
+        shift = 20 if number < 35 else 0
+        values = rng.integers(238 - shift, 242 - shift, (len(triangles), 12)).astype(np.uint8)
+        ids, data = encode_sweep(hand.settings.address, triangles, values, status)
+        t_ns = round(1e9 * (1.0 + 0.05 * number))
+        frames = [(int(i), bytes(d), t_ns) for i, d in zip(ids, data, strict=True)]
+        engine.feed(hand.settings.bus, FrameBatch.of(frames))
+        number += 1
+    assert number >= 35 + FEWEST_SAMPLES
+    found = engine.end_calibration("2026-01-01T00:00:00+00:00")
+    mine = engine.taxels_of([0])
+    assert (found.verdict[mine] == Verdict.OK).all()
+    assert np.abs(found.baseline[mine] - (hand.settings.no_load - 239.5)).max() < 1.5

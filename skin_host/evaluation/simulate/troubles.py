@@ -484,7 +484,10 @@ KINDS: dict[str, Begin] = {
     ),
     "shared_address": _emulated("shared_address", _SWAPPED, _ELSEWHERE, 1.0, spoils=True),
     "no_acknowledge": _emulated("no_acknowledge", _CHIPS | _SET_UP, _LINE, 1.0),
-    "data_held_low": _emulated("data_held_low", _CHIPS | _SET_UP, _LINE, 1.0, spoils=True),
+    # It holds for one sweep, which may pass between two looks of health; what follows does not.
+    "data_held_low": _emulated(
+        "data_held_low", _CHIPS | _SET_UP, _LINE | {"triangle_silenced"}, 1.0, spoils=True
+    ),
     "clock_stretched": _emulated("clock_stretched", _SWAPPED, _ELSEWHERE | _LINE, 1.0, spoils=True),
     "bit_flipped": _emulated("bit_flipped", _SWAPPED | {"bus_bit_errors"}, set(), spoils=True),
     "slow_rise": _emulated("slow_rise", _SWAPPED | {"bus_bit_errors"}, set(), spoils=True),
