@@ -6,8 +6,8 @@ words report, how often it was reset.
 
 Silence is measured on a clock that only runs while the buses are read up to the present: it
 advances with the reader's calls of `look` (in a replay with the sweeps' time stamps), a pause
-counts for no more than a limit, and a clock that is set back or forward changes nothing. While
-nothing is read, or old frames are read, no board times out.
+counts for no more than a limit, or not at all if this computer was held up, and a clock that is set
+back or forward changes nothing. While nothing is read, or old frames are read, no board times out.
 """
 
 from collections.abc import Sequence
@@ -110,6 +110,11 @@ class BoardLedger:
         """Everything received up to `now_ns` has been read (clock of the time stamps)."""
         self._looked = True
         self._advance(now_ns)
+
+    def pass_over(self, now_ns: int) -> None:
+        """The time up to `now_ns` does not count: frames of it may still be on their way."""
+        self._looked = True
+        self._newest_ns = now_ns
 
     def note(self, sweep: Sweep) -> int:
         """Take in a sweep; return the row of its board."""

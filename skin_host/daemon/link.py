@@ -26,7 +26,7 @@ EXPIRE_NS = 20_000_000
 #: A turn that comes later than planned by this was held up by other work on this computer.
 HELD_UP_NS = 25_000_000
 #: What brings the frames may have been held up by the same work. For this long after such a turn
-#: no sweep is closed, so that what is on its way is not counted as lost.
+#: no sweep is closed and no board becomes silent, so that what is on its way is not missed.
 PATIENCE_NS = 100_000_000
 #: A bus that does not take the set-up of its boards is tried again after this.
 RETRY_S = 2.0
@@ -183,8 +183,11 @@ class Link:
         if not drained:
             return
         self.read_ns = now_ns
+        if self._is_patient(now_ns):
+            self._engine.ledger.pass_over(now_ns)
+            return
         self._engine.ledger.look(now_ns)
-        if not self._is_patient(now_ns) and not 0 <= now_ns - self._expired_ns < EXPIRE_NS:
+        if not 0 <= now_ns - self._expired_ns < EXPIRE_NS:
             self._expired_ns = now_ns
             output = self._engine.expire(now_ns)
             self._note(output)

@@ -115,3 +115,25 @@ def test_half_a_sweep_is_closed_in_time_on_a_computer_that_pauses_again_and_agai
         reader.turn()
         reader.now_ns += 80 * MS
     assert reader.now_ns - began_ns <= 400 * MS
+
+
+@pytest.mark.parametrize("pause_ms", [150, 600])
+def test_no_board_is_silent_because_what_brings_its_frames_was_held_up_too(
+    reader: Reader, pause_ms: int
+) -> None:
+    for _ in range(3):
+        reader.period(ALL)
+    reader.now_ns += pause_ms * MS
+    reader.wait(190)
+    assert not reader.engine.ledger.any_silent
+    reader.period(ALL)
+    assert not reader.engine.ledger.any_silent
+
+
+def test_a_silent_board_is_found_on_a_computer_that_pauses_again_and_again(reader: Reader) -> None:
+    reader.period(ALL)
+    began_ns = reader.now_ns
+    while not reader.engine.ledger.any_silent:
+        reader.turn()
+        reader.now_ns += 80 * MS
+    assert reader.now_ns - began_ns <= 1000 * MS
