@@ -56,6 +56,16 @@ def real_skin(document: Report) -> Section:
                 "whole file."
             ),
             *remarks_on_real(document),
+            (
+                "The second table shows what stands in the way of less: the same pressures, each "
+                "time with something known that no calibration knows. A recording is zeroed at "
+                "the pressure that is in the chamber then, which nobody knows, and pads of another "
+                "day read some percent more or less alike: that is the line of the whole skin. "
+                "What all pads read wrong together at a moment, foam's memory and temperature, is "
+                "the error in common; what remains without it is the pads' own. The best rising "
+                "curve of each pad, fitted to this very recording and its truth, is the limit of "
+                "any static curve after this memory."
+            ),
             "What others reach on these recordings, fitted on `left_calibration` like here"
             + (
                 '; then an emulated insole (`foam = "infinergy"`, drawn pads) under the pressure '
@@ -67,6 +77,7 @@ def real_skin(document: Report) -> Section:
         ],
         [
             tables.real(document),
+            tables.hindsight(document),
             tables.published(document),
             *([tables.emulated(document)] if document["emulated"] else []),
         ],
@@ -124,7 +135,13 @@ def _sections(report: Report) -> list[Section]:
         ),
         Section(
             "Goals",
-            ["Goals and measured values."],
+            [
+                (
+                    "Goals and measured values. What stands in the way where a goal is missed: on "
+                    "real skin, the second table above; on foam that differs from the fitted one, "
+                    "the columns `perfect model` and `best factor a pad` of the next section."
+                ),
+            ],
             [tables.goals(report)],
         ),
         Section(

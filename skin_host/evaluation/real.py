@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from skin_host.config.settings import Settings
 from skin_host.errors import RequestError
-from skin_host.evaluation import insole, page, tables
+from skin_host.evaluation import hindsight, insole, page, tables
 from skin_host.evaluation.document import as_text, write
 from skin_host.evaluation.goals import goal
 from skin_host.evaluation.insole import InsoleRecording
@@ -371,6 +371,8 @@ def pressure_errors(
             "lagged_median_rmse_kpa",
             "lagged_p95_rmse_kpa",
             "lagged_skin_rms_kpa",
+            "zero_kpa",
+            "hindsight",
         )
     )
     row["why_no_pressure"] = why_not
@@ -403,6 +405,12 @@ def pressure_errors(
     row |= dict(zip(names, errors(0), strict=True))
     row |= {f"lagged_{name}": value for name, value in zip(names, errors(lag), strict=True)}
     row["lag_s"] = lag * period_s
+    here = valid.any(axis=0)
+    row["hindsight"] = hindsight.errors(
+        kpa[known][:, here], valid[known][:, here], true_kpa(0)[known]
+    )
+    at_zero = np.searchsorted(recording.t_ns, recording.t_ns[0] + round(ZERO_S * 1e9))
+    row["zero_kpa"] = float(np.median(recording.pressure_kpa[:at_zero]))
     return row
 
 

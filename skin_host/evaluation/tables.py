@@ -50,6 +50,22 @@ def real(document: Report) -> Table:
     return head, rows
 
 
+def hindsight(document: Report) -> Table:
+    """What the best possible estimators reach that know something of the true pressure."""
+    rows = [
+        [
+            row["recording"],
+            _number(row["zero_kpa"], "{:.1f}"),
+            best["known"],
+            *(_number(best[name], "{:.1f}") for name in ERRORS_KPA),
+        ]
+        for row in document["real"]
+        for best in row["hindsight"] or ()
+    ]
+    head = ["recording", "kPa at its zero", "known beside the calibration"]
+    return [*head, "median kPa", "95 % kPa", "mean of the skin kPa"], rows
+
+
 def emulated(document: Report) -> Table:
     """Emulated pads beside recorded ones."""
     rows = [
