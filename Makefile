@@ -74,6 +74,7 @@ clean:  ## the virtual environment, the lane's machine and caches
 
 # The stamps are newer than what they depend on once it is installed, the page's libraries too.
 .venv/dev.stamp: EXTRAS := [dev]
+.venv/coverage.stamp: EXTRAS := [coverage]
 .venv/fuzz.stamp: EXTRAS := [fuzz]
 .venv/mutation.stamp: EXTRAS := [mutation]
 .venv/docs.stamp: EXTRAS := [docs]
