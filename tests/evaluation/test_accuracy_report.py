@@ -21,7 +21,7 @@ from skin_host.evaluation.machine import machine
 from skin_host.evaluation.rig import Rig
 from skin_host.processing.pipeline import Pipeline
 
-PLAN = HistoryPlan(0.01, 5.0)
+PLAN = HistoryPlan(0.01, 2.5)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def small():
         "detection": touching.detection_delays(boards=1),
         "drift": touching.drift_lags(0.1, "paper"),
         "holds": [
-            touching.long_hold("F", "short", 600.0, 0.0, 5.0, alone) for alone in (False, True)
+            touching.long_hold("F", "short", 600.0, 0.0, 2.5, alone) for alone in (False, True)
         ],
         "hard_cases": touching.negative(2.0),
         "localization": report._localization(20),
@@ -116,7 +116,7 @@ def test_the_models_are_run_by_the_pipeline_that_ships(monkeypatch):
         return original(self, *arguments, **named)
 
     monkeypatch.setattr(Pipeline, "step", step)
-    rows = accuracy.score("F", FITTED_FOAM, HistoryPlan(0.01, 5.0))
+    rows = accuracy.score("F", FITTED_FOAM, HistoryPlan(0.01, 1.0))
     assert len(set(map(id, stepped))) == len(accuracy.VARIANTS)
     models = {row["model"] for row in rows}
     assert models == {"perfect", "hindsight"} | {v.model for v in accuracy.VARIANTS}
