@@ -17,6 +17,7 @@ from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus, TouchSettings, changed
 from skin_host.daemon import metrics, service
 from skin_host.daemon.state import NodeState, Thresholds, load_state, save_state
+from skin_host.errors import RequestError
 from skin_host.health import LINE_S, FaultLog
 from skin_host.importing import configuration_text
 from skin_host.recording.capture import FrameRecorder, candump_lines
@@ -66,6 +67,20 @@ async def test_commands_work_and_say_so_where_nothing_can_be_written(
         with pytest.raises(Exception, match="no part"):
             await handle("disable", b'{"part":"tail"}')
         await live.until_well(but=frozenset({"state_not_kept"}))
+
+
+@stepped
+async def test_an_empty_request_changes_nothing(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    async with living(can_bus_settings, tmp_path, clock=clock) as live:
+        handle = live.daemon.control.handle
+        calibration = live.daemon.engine.calibration
+        for name in ("calibrate", "configure", "disable", "raw", "record", "reload"):
+            with pytest.raises(RequestError, match="an empty request is refused"):
+                await handle(name, b"")
+        assert live.daemon.engine.calibration is calibration
+        assert await handle("status", b"")
 
 
 @stepped
