@@ -16,13 +16,7 @@ from emulator.probes.air import AirCourse, read_course
 from emulator.probes.contacts import ContactPads, Contacts, ContactSource, joined
 from emulator.probes.coverage import Coverage
 from emulator.probes.foam import INFINERGY_LOSS, Drive, Foam, FoamLayer, Footprint
-from emulator.probes.pads import (
-    Jumps,
-    Pads,
-    draw_dead,
-    draw_noise_ff,
-    draw_resting_ff,
-)
+from emulator.probes.pads import Jumps, Pads, draw_dead, draw_noise_ff, draw_resting_ff
 from emulator.probes.scene import Air, Moment, Probe, Scene, Script
 from emulator.probes.viscoelastic import FoamTruth
 from skin_host.bus.compensation import GAIN, GAIN_V2
