@@ -1,7 +1,7 @@
 """Builds the health record of a part from what `watch` has noted."""
 
 from statistics import fmean, median
-from typing import cast
+from typing import Any, cast
 
 import msgspec
 import numpy as np
@@ -53,6 +53,8 @@ class Describer:
         self._engine = engine
         self._layout = engine.layout
         self._watch = watch
+        #: For each part the common shift at the last look.
+        self._common: dict[int, float] = {}
         #: For each part: the triangles that belong to it, by board.
         self._fitted: dict[int, dict[int, list[int]]] = {part: {} for part in engine.parts}
         for triangle in self._layout.triangles:
@@ -217,8 +219,11 @@ class Describer:
             warmth["thermal_units"] = round(float(np.median(shift)), 1)
         rests = watch.valid if watch.touched is None else watch.valid & ~watch.touched
         if np.count_nonzero(rests) >= FEWEST_RESTING:
-            shift = (units - pipeline.baseline[span])[rests]
-            warmth["common_units"] = round(float(np.median(shift)), 1)
+            shift = units - pipeline.baseline[span]
+            common = common_shift(shift, rests, self._layout.triangle_of[span])
+            # Noise that the pads of a triangle share passes from one sweep to the next.
+            before, self._common[part] = self._common.get(part, common), common
+            warmth["common_units"] = round(min(common, before, key=abs), 1)
         return warmth
 
     def _verdicts(self, part: int, pressure: NDArray[np.bool_]) -> dict[str, list[int]]:
@@ -314,6 +319,25 @@ class Describer:
         return record
 
 
+def common_shift(
+    shift: NDArray[np.float64], rests: NDArray[np.bool_], triangle_of: NDArray[np.integer[Any]]
+) -> float:
+    """Return how far the untouched taxels of a part have moved together: 0 if they have not.
+
+    Temperature moves all triangles. A press near them, or the end of one that a board took for its
+    zero, moves the pads around it.
+
+    Args:
+        shift: [m], from the baselines, in units.
+        rests: bool[m], untouched taxels; some are.
+        triangle_of: int[m].
+    """
+    common = float(np.median(shift[rests]))
+    own = [np.median(shift[rests & (triangle_of == one)]) for one in np.unique(triangle_of[rests])]
+    together = all(one * common > 0.0 and abs(one) >= abs(common) / 2 for one in own)
+    return common if together else 0.0
+
+
 def _period(intervals_ns: NDArray[np.int64], wanted_ms: int) -> tuple[float | None, float | None]:
     """Mean period and its scatter in ms, None until there are enough sweeps."""
     if len(intervals_ns) < FEWEST_INTERVALS:
@@ -321,8 +345,10 @@ def _period(intervals_ns: NDArray[np.int64], wanted_ms: int) -> tuple[float | No
     # For so few numbers lists are faster than arrays.
     intervals_ms = [interval_ns / 1e6 for interval_ns in intervals_ns.tolist()]
     usual = [interval_ms for interval_ms in intervals_ms if interval_ms < 1.6 * wanted_ms]
-    if len(usual) < FEWEST_INTERVALS:
+    if 2 * len(usual) < len(intervals_ms):
         usual = intervals_ms
+    elif len(usual) < FEWEST_INTERVALS:
+        return None, None
     # From the median deviation, because one late sweep among many is not jitter.
     middle = median(usual)
     jitter_ms = SIGMA * median([abs(interval_ms - middle) for interval_ms in usual])
