@@ -76,6 +76,12 @@ def test_a_reload_takes_a_new_threshold_without_a_restart(service: Service) -> N
     assert service.pid == before
 
 
+def test_a_reload_lasts_until_it_is_done_where_systemd_can_wait_for_it(service: Service) -> None:
+    version = int(service.machine.do("systemctl --version").split()[1])
+    kind = service.machine.do(f"systemctl show --property=Type --value {UNIT}")
+    assert kind == ("notify-reload" if version >= 253 else "notify")
+
+
 def test_a_reload_that_would_be_refused_fails_and_changes_nothing(service: Service) -> None:
     for wrong, says in (
         ("nonsense = ", "not TOML"),
