@@ -143,9 +143,12 @@ class TableCurve:
     def kpa(self, units: ArrayLike) -> Floats:
         """Return the pressure [..., n] in kPa of activations [..., n] in units."""
         x = np.asarray(units, dtype=np.float64)
-        quarters = np.clip(x / GRID_UNITS, 0.0, len(_PIECE_AT) - 1.0).astype(np.intp)
-        piece = _PIECE_AT[quarters]
-        result: Floats = self._level[self._row, piece] + self._slope[self._row, piece] * x
+        quarters = np.minimum(np.maximum(x / GRID_UNITS, 0.0), len(_PIECE_AT) - 1.0)
+        # Places in the whole table: two indices would cost several times as much.
+        piece = _PIECE_AT.take(quarters.astype(np.intp))
+        place = piece + self._row * self._slope.shape[1]
+        result: Floats = self._slope.take(place) * x
+        result += self._level.take(place)
         return result
 
     def units(self, kpa: ArrayLike) -> Floats:
