@@ -223,7 +223,8 @@ class Describer:
             common = common_shift(shift, rests, self._layout.triangle_of[span])
             # Noise that the pads of a triangle share passes from one sweep to the next.
             before, self._common[part] = self._common.get(part, common), common
-            warmth["common_units"] = round(min(common, before, key=abs), 1)
+            steady: float = min(common, before, key=abs)
+            warmth["common_units"] = round(steady, 1)
         return warmth
 
     def _verdicts(self, part: int, pressure: NDArray[np.bool_]) -> dict[str, list[int]]:
