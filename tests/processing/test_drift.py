@@ -426,3 +426,16 @@ def test_half_a_unit_of_a_taxel_alone_is_noise_to_the_papers_rule_and_a_step_eac
         units[:3] = 0.45, 0.8, -0.8
         track.step(units, NOBODY, NOBODY, 0.1)
     assert track.baseline[:4] == pytest.approx(np.array([0.0, 0.1, -0.1, 0.0]), abs=1e-9)
+
+
+def test_noise_after_a_release_gives_nothing_back_that_was_taken_for_drift():
+    track = tracker()
+    everything = ~NOBODY
+    for _ in range(600):
+        follow(track, 0.0, everything, press=35.0)
+    for _ in range(2):
+        follow(track, 0.0, everything, press=2.6)
+    assert track.baseline == pytest.approx(np.full(N, 2.6))
+    for second in range(60):
+        follow(track, 2.6 + (0.2 if second % 2 else -0.2))
+        assert track.baseline == pytest.approx(np.full(N, 2.6), abs=0.5)

@@ -200,6 +200,7 @@ def outcome(folder: Path, seed: int, seconds: int) -> str:
 def _simulate(folder: Path, seed: int, seconds: int) -> str:
     os.chdir(folder)
     sys.path.insert(0, str(folder))
+    assert "skin_host" not in sys.modules, "this process has the daemon as it is"
     logging.disable(logging.CRITICAL)
     try:
         from skin_host.cli.common import load_skin
