@@ -25,7 +25,7 @@ test: lint  ## all that needs no root and no hardware
 	@$(BIN)/python -m compileall -q skin_host emulator
 	@tools/timed "pytest" $(BIN)/python -m pytest --numprocesses=3 --dist=loadfile $(AGAIN)
 
-coverage: .venv/dev.stamp .venv/coverage.stamp  ## branches of the core that the tests run: 95 % at least
+coverage: .venv/dev.stamp .venv/coverage.stamp  ## statements and branches of the core that the tests run: together 95 % at least
 	@$(BIN)/python -m pytest --quiet --numprocesses=3 --dist=loadfile --cov --cov-report=term
 
 mutation: .venv/dev.stamp .venv/mutation.stamp  ## small changes of the core that its tests must notice; FILES=... PLACES=40
