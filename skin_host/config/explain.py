@@ -16,6 +16,8 @@ Table = type[Struct]
 Named = dict[str, Table]
 #: Longer values are shown by their beginning.
 LONGEST_VALUE = 40
+#: No setting is larger: so many seconds in nanoseconds still fit into 64 bits.
+LARGEST = 1e9
 
 
 def explain(document: Any, error: msgspec.ValidationError, root: Table, named: Named) -> str:
@@ -108,13 +110,17 @@ def _innermost(hint: Any) -> Any:
     return hint
 
 
-def not_finite(value: Any, where: str = "") -> Iterator[tuple[str, float]]:
-    """Yield where in a decoded file `nan` and `inf` are."""
+def out_of_bounds(value: Any, where: str = "") -> Iterator[tuple[str, str]]:
+    """Yield where in a decoded file `nan`, `inf` and numbers beyond `LARGEST` are, and what of
+    them is wrong.
+    """
     if isinstance(value, dict):
         for key, inner in value.items():
-            yield from not_finite(inner, f"{where}.{key}" if where else key)
+            yield from out_of_bounds(inner, f"{where}.{key}" if where else key)
     elif isinstance(value, list):
         for number, inner in enumerate(value):
-            yield from not_finite(inner, f"{where}[{number}]")
+            yield from out_of_bounds(inner, f"{where}[{number}]")
     elif isinstance(value, float) and not math.isfinite(value):
-        yield where, value
+        yield where, f"seen {value}, wanted a finite number"
+    elif isinstance(value, int | float) and abs(value) > LARGEST:
+        yield where, f"seen {value}, wanted a number between {-LARGEST:g} and {LARGEST:g}"

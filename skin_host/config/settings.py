@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 from msgspec import Meta, Struct, field
 
-from skin_host.config.explain import Named, explain, not_finite
+from skin_host.config.explain import Named, explain, out_of_bounds
 from skin_host.config.fields import Name, NotNegative, Positive
 from skin_host.config.fingertips import Fingertip as Fingertip  # noqa: PLC0414 (for others too)
 from skin_host.config.relaxation import RelaxationSettings, with_file, wrong_parameters
@@ -288,8 +288,8 @@ def read_toml(path: Path, table: type[T], named: Named) -> T:
         raise ConfigurationError(f"{path}: not TOML: {error}") from None
     except RecursionError:
         raise ConfigurationError(f"{path}: not a configuration: nested too deep") from None
-    for where, number in not_finite(msgspec.toml.decode(data)):
-        raise ConfigurationError(f"{path}: {where}: seen {number}, wanted a finite number")
+    for where, what in out_of_bounds(msgspec.toml.decode(data)):
+        raise ConfigurationError(f"{path}: {where}: {what}")
     return found
 
 

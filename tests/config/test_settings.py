@@ -53,6 +53,11 @@ TIP = 'fingertips.tip]\nbus = "can0"\naddress = 3\nshape = '
         ),
         ("x_mm = -25", "x_mm = nan", f"{PATCH}.places[0].x_mm: seen nan, wanted a finite number"),
         (
+            "x_mm = -25",
+            "x_mm = 1e308",
+            f"{PATCH}.places[0].x_mm: seen 1e+308, wanted a number between -1e+09 and 1e+09",
+        ),
+        (
             'bus = "can0"',
             'bus = "can9"',
             'boards.hand.bus: no bus "can9"; there are: can0',
