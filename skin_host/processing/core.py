@@ -25,7 +25,7 @@ from skin_host.processing.liveness import PADS
 from skin_host.processing.masks import Mask
 from skin_host.processing.pipeline import Pipeline, PressureFrame
 from skin_host.processing.pressure import PressureCurve, vertex
-from skin_host.processing.rezero import BELOW_SWEEPS, Rezero
+from skin_host.processing.rezero import BELOW_SWEEPS, JUMPS_NS, Rezero
 
 #: A calibration takes at least this many samples of each part, even if its boards are slow: the
 #: 95th percentile of fewer would be the largest.
@@ -163,6 +163,8 @@ class Engine:
         self._unanswered: dict[int, Mask] = {}
         #: For how many sweeps pads int64[16, 12] of a board have read far below zero, where any do.
         self._below: dict[int, NDArray[np.int64]] = {}
+        #: When a board's pad last came back from there by itself.
+        self._jumped_ns: dict[int, int] = {}
         self._touched = np.zeros(layout.n_taxels, np.bool_)
         self._run: _CalibrationRun | None = None
         self._pipeline: Pipeline | None = None
@@ -185,6 +187,7 @@ class Engine:
         self._rezeros = after._rezeros
         self._unanswered = after._unanswered
         self._below = after._below
+        self._jumped_ns = after._jumped_ns
         self._touched = after._touched
         self._run = after._run
         for part, tracker in self._trackers.items():
@@ -429,16 +432,21 @@ class Engine:
         """Detect pads whose zero was taken while something pressed that has lifted now."""
         answered = (self.ledger.error[row] == 0) & self.ledger.present[row]
         below = below_zero(sweep.raw, self.ledger.far[row] & answered[:, None])
-        if self.calibration is None or not below.any():
-            self._below.pop(sweep.board, None)
+        before = self._below.pop(sweep.board, np.zeros(below.shape, np.int64))
+        no_load = self.layout.boards[sweep.board].settings.no_load
+        back = (before > 0) & (before < BELOW_SWEEPS) & answered[:, None]
+        if (back & (sweep.raw < (no_load + 255) / 2)).any():
+            # What was pressed and lifts stays below zero; what a bad wire brings does not.
+            self._jumped_ns[sweep.board] = sweep.t_ns
+        jumps = 0 <= sweep.t_ns - self._jumped_ns.get(sweep.board, -JUMPS_NS) < JUMPS_NS
+        if self.calibration is None or jumps or not below.any():
             return
-        lasted = self._below.get(sweep.board, np.zeros(below.shape, np.int64))
-        self._below[sweep.board] = lasted = (lasted + 1) * below
+        self._below[sweep.board] = lasted = (before + 1) * below
         sure = lasted >= BELOW_SWEEPS
         if sure.any():
             if sweep.board not in self._rezeros:
-                no_load = float(self.layout.boards[sweep.board].settings.no_load)
-                self._rezeros[sweep.board] = Rezero.over(np.full(sure.size, no_load), sweep.t_ns)
+                zeros = np.full(sure.size, float(no_load))
+                self._rezeros[sweep.board] = Rezero.over(zeros, sweep.t_ns)
             self._rezeros[sweep.board].doubted |= sure.ravel()
 
     def _find_zero(self, sweep: Sweep, row: int, rezero: Rezero) -> None:

@@ -22,6 +22,8 @@ SETTLE_NS = 1_100_000_000
 FEWEST = 10
 #: A pad that reads far below zero in so many sweeps in a row was pressed when it was zeroed.
 BELOW_SWEEPS = 5
+#: One that comes back sooner jumps: for so long, none of its board is taken for a lifted press.
+JUMPS_NS = 2_000_000_000
 #: A zero that has moved by more than this was not that of an untouched pad.
 LARGEST_UNITS = 30.0
 #: Noise of this many standard deviations must fit between the mean and the end of the scale.

@@ -11,6 +11,7 @@ import pytest
 from emulator.faults import KINDS
 from skin_host.health.diagnosis import diagnose
 from tests.support.fault_bench import FaultBench
+from tests.support.fault_matrix import bench_of
 
 HERE = {"board": "forearm_outer", "triangle": 3}
 #: What happens -> what must be told, and which taxels of the forearm must not be believed.
@@ -65,6 +66,13 @@ def test_a_fault_is_named_in_time(
     assert code in told
     assert not bench.valid["left_forearm"][list(doubted)].any()
     assert not bench.touched["left_forearm"][list(doubted)].any()
+
+
+def test_readings_that_come_and_go_are_of_a_bad_wire_and_not_of_a_press_that_lifts() -> None:
+    bench = bench_of("mtb4", "chip", touched=False)
+    bench.inject("slow_rise", board="one", triangle=3)
+    bench.run(0.4)
+    assert "taxel_out_of_range" in {told for told, _ in bench.first_told}
 
 
 @pytest.mark.parametrize("value_ff", [None, 40.0])
