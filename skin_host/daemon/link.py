@@ -3,16 +3,18 @@
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from itertools import chain
+from itertools import chain, pairwise
 from typing import Protocol
+
+import numpy as np
 
 from skin_host.bus.boards import Boards
 from skin_host.bus.opening import open_port
 from skin_host.bus.port import Port
 from skin_host.bus.wake import LONGEST_NS, WakeUp
-from skin_host.bus.wire import FrameBatch
+from skin_host.bus.wire import FrameBatch, RecordBatch
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Bus, Receive
 from skin_host.errors import BusError, SkinError
@@ -23,6 +25,8 @@ log = logging.getLogger(__name__)
 
 #: Waiting sweeps and samples are checked this often.
 EXPIRE_NS = 20_000_000
+#: Frames that several buses sent within this time may be taken bus by bus.
+SLICE_NS = 10_000_000
 #: A turn that comes later than planned by this was held up by other work on this computer.
 HELD_UP_NS = 25_000_000
 #: What brings the frames may have been held up by the same work. For this long after such a turn
@@ -40,6 +44,26 @@ class OpenPort(Protocol):
         self, name: str, bus: Bus, receive: Receive, *, wait: bool = False, clock: Clock = SYSTEM
     ) -> Port:
         """See `bus.opening.open_port`."""
+
+
+def _by_time(batches: list[tuple[str, FrameBatch]]) -> Iterator[tuple[str, FrameBatch]]:
+    """Yield what was read of several buses in slices of time, the frames of a slice bus by bus.
+
+    After a pause of this computer each bus has several sweeps waiting. Taken bus by bus, the last
+    sweep of one would join the first of another to one frame of a part.
+    """
+    if len(batches) < 2 or all(batch.t_ns[-1] - batch.t_ns[0] < SLICE_NS for _, batch in batches):
+        yield from batches
+        return
+    slices: list[tuple[int, str, FrameBatch]] = []
+    for bus, batch in batches:
+        # The order of a bus's frames is kept, even where its clock was set back.
+        number = np.maximum.accumulate(batch.t_ns) // SLICE_NS
+        starts = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), len(batch)]
+        rows = RecordBatch(batch.id, batch.dlc, batch.data, batch.t_ns)
+        slices += [(int(number[begin]), bus, rows[begin:end]) for begin, end in pairwise(starts)]
+    for _, bus, part in sorted(slices, key=lambda one: one[0]):
+        yield bus, part
 
 
 class Link:
@@ -169,12 +193,15 @@ class Link:
             deliver, record: see `read`.
         """
         drained = True
+        batches: list[tuple[str, FrameBatch]] = []
         for bus, port in self.ports.items():
             batch = port.read()
             if not len(batch):
                 continue
             drained &= len(batch) < port.capacity
             record(bus, batch)
+            batches.append((bus, batch))
+        for bus, batch in _by_time(batches):
             output = self._engine.feed(bus, batch)
             if output.answers:
                 self._note_answers(bus, output.answers)

@@ -137,3 +137,31 @@ def test_a_silent_board_is_found_on_a_computer_that_pauses_again_and_again(reade
         reader.turn()
         reader.now_ns += 80 * MS
     assert reader.now_ns - began_ns <= 1000 * MS
+
+
+def test_what_waited_on_several_buses_is_taken_by_its_time_and_not_by_its_bus() -> None:
+    """Otherwise a frame of a part would join sweeps of different times."""
+    boards = {"b": Board(bus="can0", address=1), "c": Board(bus="can1", address=1)}
+    settings = Settings(
+        robot="r",
+        buses={"can0": Bus(), "can1": Bus()},
+        boards=boards,
+        parts={"p": Part(patches=[Patch(board=name, triangles="0-3") for name in boards])},
+    )
+    link = Link(Engine(settings, build_layout(settings, Path()), [0]), open_port=StillPort)
+    values = np.full((TRIANGLES, 12), 240, np.uint8)
+    ids, data = wire.encode_sweep(1, np.arange(TRIANGLES), values, np.zeros(TRIANGLES, np.uint16))
+    for number, port in enumerate(link.ports.values()):
+        assert isinstance(port, StillPort)
+        starts = [T0 + number * MS + period * PERIOD for period in range(8)]
+        frames = [
+            (int(ids[i]), data[i].tobytes(), start_ns + 100_000 * i)
+            for start_ns in starts
+            for i in ALL
+        ]
+        port.waiting.append(FrameBatch.of(frames))
+    outputs: list[Output] = []
+    link.turn(T0 + 8 * PERIOD, outputs.append)
+    sweeps = [(sweep.t_ns, sweep.board) for output in outputs for sweep in output.sweeps]
+    assert len(sweeps) == 16
+    assert sweeps == sorted(sweeps)
