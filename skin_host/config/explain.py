@@ -110,17 +110,20 @@ def _innermost(hint: Any) -> Any:
     return hint
 
 
-def out_of_bounds(value: Any, where: str = "") -> Iterator[tuple[str, str]]:
+def out_of_bounds(
+    value: Any, where: str = "", largest: float = LARGEST
+) -> Iterator[tuple[str, str]]:
     """Yield where in a decoded file `nan`, `inf` and numbers beyond `LARGEST` are, and what of
-    them is wrong.
+    them is wrong. The options of a CAN adapter may be of any size.
     """
     if isinstance(value, dict):
         for key, inner in value.items():
-            yield from out_of_bounds(inner, f"{where}.{key}" if where else key)
+            bound = math.inf if key == "options" else largest
+            yield from out_of_bounds(inner, f"{where}.{key}" if where else key, bound)
     elif isinstance(value, list):
         for number, inner in enumerate(value):
-            yield from out_of_bounds(inner, f"{where}[{number}]")
+            yield from out_of_bounds(inner, f"{where}[{number}]", largest)
     elif isinstance(value, float) and not math.isfinite(value):
         yield where, f"seen {value}, wanted a finite number"
-    elif isinstance(value, int | float) and abs(value) > LARGEST:
-        yield where, f"seen {value}, wanted a number between {-LARGEST:g} and {LARGEST:g}"
+    elif isinstance(value, int | float) and abs(value) > largest:
+        yield where, f"seen {value}, wanted a number between {-largest:g} and {largest:g}"

@@ -12,6 +12,7 @@ from emulator.probes.scene import Scene
 from emulator.robot import Robot
 from skin_host.cli import main
 from skin_host.config import check
+from skin_host.config.explain import LARGEST
 from skin_host.config.settings import PlaceSettings, Settings, changed, load, parse_triangles
 from skin_host.errors import ConfigurationError
 from skin_host.importing import configuration_text, import_files
@@ -349,7 +350,7 @@ def test_settings_survive_writing(tmp_path: Path, path: Path) -> None:
 
 @given(
     channel=st.text(st.characters(codec="utf-8"), max_size=20),
-    turn=st.floats(allow_nan=False, allow_infinity=False),
+    turn=st.floats(-LARGEST, LARGEST),
     option=st.one_of(st.booleans(), st.integers(-(2**62), 2**62), st.text(max_size=9)),
 )
 def test_any_values_survive_writing(
