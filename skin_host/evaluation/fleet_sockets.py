@@ -23,6 +23,7 @@ from skin_host.mqtt.courier import RETAINED_WINDOW, TOUCH_WINDOW
 from skin_host.mqtt.messages import ContactState, encode_contact, encode_health, encode_touch
 from skin_host.mqtt.order import RUN, STAMP, Numbers, Stamp, put_run
 from skin_host.mqtt.outbox import REPEAT_S, REPEATED
+from skin_host.mqtt.packets import pack_number, pack_text, unpack_number
 from skin_host.mqtt.payload import JSON_TYPE
 from skin_host.mqtt.topics import OFFLINE, ONLINE, Topics
 from skin_host.processing.events import TouchEvent
@@ -83,7 +84,7 @@ class PlainRobot(asyncio.Protocol):
 
     def put_touch(self, event: TouchEvent) -> None:
         """Send an event."""
-        self._touch_topic = self._touch_topic or _text(self._topics.part("touch", event.part))
+        self._touch_topic = self._touch_topic or pack_text(self._topics.part("touch", event.part))
         self.count += 1
         self.events.append(encode_touch(event, self.count))
         self._send()
@@ -191,7 +192,7 @@ class PlainRobot(asyncio.Protocol):
             mid, payload = self._next_mid(), self._retained[topic]
             self._states_out[mid] = topic, payload, now_s
             stamp = self._numbers.online if topic == self._status else self._numbers.state()
-            packets.append(_publish(_STATE, _text(topic), mid, _stamped(stamp), payload))
+            packets.append(_publish(_STATE, pack_text(topic), mid, _stamped(stamp), payload))
         if packets:
             self._transport.write(b"".join(packets))
 
@@ -227,12 +228,9 @@ class PlainRobot(asyncio.Protocol):
             self._lost.set_result(None)
 
     def data_received(self, data: bytes) -> None:
-        """Called by the loop with acknowledgements, which are all shorter than 128 bytes."""
-        data = self._received + data
-        at = 0
-        while at + 2 <= len(data) and at + 2 + data[at + 1] <= len(data):
-            kind, body = data[at], data[at + 2 : at + 2 + data[at + 1]]
-            at += 2 + len(body)
+        """Called by the loop with acknowledgements, and pieces of them."""
+        packets, self._received = _split(self._received + data)
+        for kind, body in packets:
             if kind == _PUBACK:
                 self._take_acknowledgement(int.from_bytes(body[:2], "big"))
             elif kind == _CONNACK and not self._accepted.done():
@@ -240,7 +238,6 @@ class PlainRobot(asyncio.Protocol):
                     self._accepted.set_result(None)
                 else:
                     self._accepted.set_exception(ConnectionRefusedError())
-        self._received = data[at:]
         self._send()
 
 
@@ -297,8 +294,8 @@ class PlainEar(asyncio.Protocol):
                     transport, _ = await loop.create_connection(
                         lambda: self, self._broker.host, self._broker.port
                     )
-                body = b"\0\1\0" + b"".join(_text(topic) + b"\1" for topic in self._topics)
-                subscribe = b"\x82" + _variable(len(body)) + body
+                body = b"\0\1\0" + b"".join(pack_text(topic) + b"\1" for topic in self._topics)
+                subscribe = b"\x82" + pack_number(len(body)) + body
                 transport.write(_connect(self._broker, self._identifier) + subscribe)
                 await self._lost
             except (OSError, TimeoutError):
@@ -322,20 +319,16 @@ class PlainEar(asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         """Called by the loop with packets, and pieces of packets."""
-        data = self._received + data
-        at = 0
+        packets, self._received = _split(self._received + data)
         acknowledgements = []
-        while (found := _packet(data, at)) is not None:
-            begin, end = found
-            if data[at] & 0xF0 == _PUBLISH:
-                mid = self._take_message(data[at], data[begin:end])
+        for first, body in packets:
+            if first & 0xF0 == _PUBLISH:
+                mid = self._take_message(first, body)
                 if mid:
                     acknowledgements.append(b"\x40\2" + mid)
-            elif data[at] == _SUBACK:
+            elif first == _SUBACK:
                 self.connected = True
                 self._note()
-            at = end
-        self._received = data[at:]
         if acknowledgements and self._transport is not None:
             self._transport.write(b"".join(acknowledgements))
 
@@ -355,21 +348,23 @@ class PlainEar(asyncio.Protocol):
         return mid
 
 
-def _packet(data: bytes, at: int) -> tuple[int, int] | None:
-    """Where the body of the packet at `at` begins and ends; None while some of it is missing."""
-    size = shift = 0
-    for number in range(at + 1, min(at + 5, len(data))):
-        size |= (data[number] & 0x7F) << shift
-        shift += 7
-        if data[number] < 0x80:
-            end = number + 1 + size
-            return (number + 1, end) if end <= len(data) else None
-    return None
+def _split(data: bytes) -> tuple[list[tuple[int, bytes]], bytes]:
+    """Return first byte and body of each whole packet in `data`, and what is left of it."""
+    packets = []
+    at = 0
+    while at + 1 < len(data):
+        size, begin = unpack_number(data, at + 1)
+        end = begin + size
+        if data[begin - 1] > 0x7F or end > len(data):
+            break
+        packets.append((data[at], data[begin:end]))
+        at = end
+    return packets, data[at:]
 
 
 def _user_value(properties: bytes, name: str) -> bytes:
     """The value of a user property of our own messages, empty if there is none."""
-    key = b"\x26" + _text(name)
+    key = b"\x26" + pack_text(name)
     at = properties.find(key)
     if at < 0:
         return b""
@@ -391,20 +386,20 @@ def _connect(
     last = b""
     if will is not None:
         topic, payload, stamp = will
-        last = _stamped(stamp) + _text(topic) + _text(payload.decode())
+        last = _stamped(stamp) + pack_text(topic) + pack_text(payload.decode())
     flags = _CLEAN | bool(last) * _WILL | bool(names) * _NAMED
     body = b"".join(
         (
-            _text("MQTT"),
+            pack_text("MQTT"),
             bytes((5, flags)),
             KEEPALIVE_S.to_bytes(2, "big"),
             b"\0",
-            _text(identifier),
+            pack_text(identifier),
             last,
-            *map(_text, names),
+            *map(pack_text, names),
         )
     )
-    return b"\x10" + _variable(len(body)) + body
+    return b"\x10" + pack_number(len(body)) + body
 
 
 _health: dict[int, bytes] = {}
@@ -418,31 +413,16 @@ def _encoded(record: Any) -> bytes:
     return payload
 
 
-def _variable(number: int) -> bytes:
-    """A variable byte integer."""
-    found = bytearray()
-    while number > 0x7F:
-        found.append(number & 0x7F | 0x80)
-        number >>= 7
-    found.append(number)
-    return bytes(found)
-
-
-def _text(text: str) -> bytes:
-    octets = text.encode()
-    return len(octets).to_bytes(2, "big") + octets
-
-
 def _publish(kind: bytes, topic: bytes, mid: int, properties: bytes, payload: bytes) -> bytes:
-    size = _variable(len(topic) + 2 + len(properties) + len(payload))
+    size = pack_number(len(topic) + 2 + len(properties) + len(payload))
     return b"".join((kind, size, topic, mid.to_bytes(2, "big"), properties, payload))
 
 
 def _user_property(stamp: Stamp) -> bytes:
-    return b"\x26" + _text(STAMP) + _text(f"{stamp.connection}.{stamp.message}")
+    return b"\x26" + pack_text(STAMP) + pack_text(f"{stamp.connection}.{stamp.message}")
 
 
 def _stamped(stamp: Stamp) -> bytes:
     """The properties of a state."""
     found = _user_property(stamp)
-    return _variable(len(found)) + found
+    return pack_number(len(found)) + found

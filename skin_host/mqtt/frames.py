@@ -13,7 +13,7 @@ ever. Our payloads need far less: maps with text for keys, lists, numbers, text,
 arrays. Source: RFC 8949, section 3; RFC 8746, section 2.
 
 Frames are most of the published messages, and differ only in their payload: the head of a topic's
-packet is encoded once. Source: MQTT 5.0, sections 1.5.5 (variable byte integer) and 3.3 (PUBLISH).
+packet is encoded once. Source: MQTT 5.0, section 3.3 (PUBLISH).
 """
 
 import re
@@ -26,6 +26,7 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from skin_host.errors import SkinError
+from skin_host.mqtt.packets import pack_number, pack_text
 from skin_host.mqtt.payload import MAX_TAXELS, Count, Int64, MessageError, check_size, decode
 from skin_host.processing.masks import Mask, any_of
 
@@ -38,7 +39,7 @@ _INT32 = 2**31 - 1
 #: The largest variable byte integer: the maximum length of a packet after its fixed header.
 _MOST_BYTES = 268_435_455
 #: The first byte of a PUBLISH with QoS 0, not retained.
-_PUBLISH = 0x30
+_PUBLISH = b"\x30"
 _HEX = re.compile("[0-9a-f]*")
 #: Limits of a valid payload: depth of nested values, and number of all values.
 MAX_DEPTH = 16
@@ -235,8 +236,7 @@ def publish_head(topic: str, properties: bytes | None) -> bytes:
         topic: where to.
         properties: packed, with their length; None for MQTT 3.1.1.
     """
-    name = topic.encode()
-    return len(name).to_bytes(2, "big") + name + (properties or b"")
+    return pack_text(topic) + (properties or b"")
 
 
 def publish_packet(head: bytes, payload: bytes) -> bytes:
@@ -252,12 +252,7 @@ def publish_packet(head: bytes, payload: bytes) -> bytes:
     left = len(head) + len(payload)
     if left > _MOST_BYTES:
         raise ValueError(f"a packet of {left} bytes; wanted at most {_MOST_BYTES}")
-    fixed = bytearray((_PUBLISH,))
-    while left > 0x7F:
-        fixed.append(left & 0x7F | 0x80)
-        left >>= 7
-    fixed.append(left)
-    return b"".join((fixed, head, payload))
+    return b"".join((_PUBLISH, pack_number(left), head, payload))
 
 
 def decode_frame(part: str, payload: bytes) -> Frame:

@@ -1,9 +1,10 @@
-"""MQTT packets as bytes: limits that are checked before decoding. Pure.
+"""MQTT packets as bytes: numbers and text in them, and limits that are checked before decoding.
+Pure.
 
 paho decodes properties in quadratic time: 80 kB of them take a second, 700 kB most of a minute.
 So packets that are too long or have too many properties are found here first, in bounded time.
-Source: MQTT 5.0, sections 1.5.5 (variable byte integer), 2.2.2 (properties) and 3.3 (PUBLISH);
-MQTT 3.1.1 has no properties.
+Source: MQTT 5.0, sections 1.5.4 (text), 1.5.5 (variable byte integer), 2.2.2 (properties) and 3.3
+(PUBLISH); MQTT 3.1.1 has no properties.
 """
 
 from typing import NamedTuple
@@ -67,7 +68,7 @@ def unfit(
 
 def _properties(packet: bytes | bytearray, at: int) -> str | None:
     """Why the properties that begin at `at` are not decoded."""
-    size, at = _variable(packet, at)
+    size, at = unpack_number(packet, at)
     if size > MAX_PROPERTY_BYTES:
         return f"a message with {size} bytes of properties; wanted at most {MAX_PROPERTY_BYTES}"
     end = at + size
@@ -77,7 +78,7 @@ def _properties(packet: bytes | bytearray, at: int) -> str | None:
         identifier = packet[at]
         at += 1
         if identifier == _SUBSCRIPTION:
-            _, at = _variable(packet, at)
+            _, at = unpack_number(packet, at)
         elif identifier in _FIXED:
             at += _FIXED[identifier]
         else:
@@ -88,8 +89,24 @@ def _properties(packet: bytes | bytearray, at: int) -> str | None:
     return f"a message with more than {MAX_PROPERTIES} properties"
 
 
-def _variable(packet: bytes | bytearray, at: int) -> tuple[int, int]:
-    """A variable byte integer, and where it ends."""
+def pack_number(number: int) -> bytes:
+    """Write a variable byte integer."""
+    found = bytearray()
+    while number > 0x7F:
+        found.append(number & 0x7F | 0x80)
+        number >>= 7
+    found.append(number)
+    return bytes(found)
+
+
+def pack_text(text: str) -> bytes:
+    """Write text with its length."""
+    octets = text.encode()
+    return len(octets).to_bytes(2, "big") + octets
+
+
+def unpack_number(packet: bytes | bytearray, at: int) -> tuple[int, int]:
+    """Return the variable byte integer at `at`, as far as it is there, and where it ends."""
     value = 0
     for shift in range(0, 28, 7):
         if at >= len(packet):

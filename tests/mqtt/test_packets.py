@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties, VariableByteIntegers
 
-from skin_host.mqtt.packets import MAX_PROPERTIES, unfit
+from skin_host.mqtt.packets import MAX_PROPERTIES, pack_number, unfit, unpack_number
 
 PUBLISH_1 = 0x32
 LIMIT = 80_000
@@ -74,3 +74,10 @@ def test_only_messages_may_be_long() -> None:
 @given(st.integers(0, 255), st.binary(max_size=300))
 def test_no_packet_makes_the_check_itself_fail(command: int, packet: bytes) -> None:
     unfit(command, packet, len(packet), LIMIT, v5=True)
+
+
+@given(st.integers(0, 268_435_455), st.binary(max_size=3))
+def test_numbers_are_written_and_read_as_paho_does(number: int, rest: bytes) -> None:
+    packed = pack_number(number)
+    assert packed == VariableByteIntegers.encode(number)  # type: ignore[no-untyped-call]
+    assert unpack_number(packed + rest, 0) == (number, len(packed))

@@ -17,6 +17,7 @@ from skin_host.clock import Clock
 from skin_host.evaluation.simulate.trace import Trace
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import TIMEOUT_S, Connection, Message, MqttError, Will
+from skin_host.mqtt.packets import unpack_number
 
 #: One way.
 LATENCY_S = 0.001
@@ -368,25 +369,14 @@ class Line:
 
 def _published(packet: bytes, *, v5: bool) -> tuple[str, bytes]:
     """Topic and payload of a PUBLISH packet with QoS 0."""
-    _, at = _variable(packet, 1)
+    _, at = unpack_number(packet, 1)
     name = at + 2
     at = name + int.from_bytes(packet[at:name], "big")
     topic = packet[name:at].decode()
     if v5:
-        length, at = _variable(packet, at)
+        length, at = unpack_number(packet, at)
         at += length
     return topic, packet[at:]
-
-
-def _variable(packet: bytes, at: int) -> tuple[int, int]:
-    """A number of variable length (MQTT 5.0, 1.5.5), and where it ends."""
-    number = shift = 0
-    while True:
-        byte = packet[at]
-        number |= (byte & 0x7F) << shift
-        at, shift = at + 1, shift + 7
-        if byte < 0x80:
-            return number, at
 
 
 def _as_received(properties: Any) -> Properties | None:
