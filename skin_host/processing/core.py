@@ -432,21 +432,22 @@ class Engine:
         """Detect pads whose zero was taken while something pressed that has lifted now."""
         answered = (self.ledger.error[row] == 0) & self.ledger.present[row]
         below = below_zero(sweep.raw, self.ledger.far[row] & answered[:, None])
-        before = self._below.pop(sweep.board, np.zeros(below.shape, np.int64))
-        no_load = self.layout.boards[sweep.board].settings.no_load
-        back = (before > 0) & (before < BELOW_SWEEPS) & answered[:, None]
-        if (back & (sweep.raw < (no_load + 255) / 2)).any():
-            # What was pressed and lifts stays below zero; what a bad wire brings does not.
-            self._jumped_ns[sweep.board] = sweep.t_ns
+        before = self._below.pop(sweep.board, None)
+        no_load = float(self.layout.boards[sweep.board].settings.no_load)
+        if before is not None:
+            back = (before > 0) & (before < BELOW_SWEEPS) & answered[:, None]
+            if (back & (sweep.raw < (no_load + 255) / 2)).any():
+                # What was pressed and lifts stays below zero; what a bad wire brings does not.
+                self._jumped_ns[sweep.board] = sweep.t_ns
         jumps = 0 <= sweep.t_ns - self._jumped_ns.get(sweep.board, -JUMPS_NS) < JUMPS_NS
         if self.calibration is None or jumps or not below.any():
             return
-        self._below[sweep.board] = lasted = (before + 1) * below
+        lasted = below.astype(np.int64) if before is None else (before + 1) * below
+        self._below[sweep.board] = lasted
         sure = lasted >= BELOW_SWEEPS
         if sure.any():
             if sweep.board not in self._rezeros:
-                zeros = np.full(sure.size, float(no_load))
-                self._rezeros[sweep.board] = Rezero.over(zeros, sweep.t_ns)
+                self._rezeros[sweep.board] = Rezero.over(np.full(sure.size, no_load), sweep.t_ns)
             self._rezeros[sweep.board].doubted |= sure.ravel()
 
     def _find_zero(self, sweep: Sweep, row: int, rezero: Rezero) -> None:
