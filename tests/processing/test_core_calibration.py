@@ -15,8 +15,15 @@ from tests.support.stack import ROOT
 CONFIG = ROOT / "config" / "demo.toml"
 
 
-def sweeps_taken(engine: Engine, time_s: Callable[[int], float]) -> int:
-    """How many sweeps a calibration takes, of which number `i` comes at `time_s(i)`."""
+def sweeps_taken(
+    engine: Engine,
+    time_s: Callable[[int], float],
+    shift: Callable[[int], int] = lambda _: 0,
+) -> int:
+    """How many sweeps a calibration takes, of which number `i` comes at `time_s(i)`.
+
+    Its readings are lower by `shift(i)`, which is called before it is sent.
+    """
     hand = engine.layout.boards[0]
     triangles = np.array(hand.triangles)
     rng = np.random.default_rng(1)
@@ -24,7 +31,8 @@ def sweeps_taken(engine: Engine, time_s: Callable[[int], float]) -> int:
     engine.begin_calibration(2.0)
     sent = 0
     while engine.calibration_progress() < 1.0:
-        values = rng.integers(238, 242, (len(triangles), 12)).astype(np.uint8)
+        readings = rng.integers(238, 242, (len(triangles), 12)) - shift(sent)
+        values = readings.astype(np.uint8)
         ids, data = encode_sweep(hand.settings.address, triangles, values, status)
         t_ns = round(1e9 * time_s(sent))
         frames = [(int(i), bytes(d), t_ns) for i, d in zip(ids, data, strict=True)]
@@ -64,24 +72,15 @@ def test_a_board_that_is_zeroed_during_a_calibration_is_calibrated_with_its_new_
     engine: Engine,
 ) -> None:
     """Otherwise a press for the first half and a new zero for the second would look the same."""
-    hand = engine.layout.boards[0]
-    triangles = np.array(hand.triangles)
-    rng = np.random.default_rng(2)
-    status = np.zeros(len(triangles), np.uint16)
-    engine.begin_calibration(2.0)
-    number = 0
-    while engine.calibration_progress() < 1.0:
+
+    def shift(number: int) -> int:
         if number == 35:
             engine.rezero(0)
-        shift = 20 if number < 35 else 0
-        values = rng.integers(238 - shift, 242 - shift, (len(triangles), 12)).astype(np.uint8)
-        ids, data = encode_sweep(hand.settings.address, triangles, values, status)
-        t_ns = round(1e9 * (1.0 + 0.05 * number))
-        frames = [(int(i), bytes(d), t_ns) for i, d in zip(ids, data, strict=True)]
-        engine.feed(hand.settings.bus, FrameBatch.of(frames))
-        number += 1
-    assert number >= 35 + FEWEST_SAMPLES
+        return 20 if number < 35 else 0
+
+    assert sweeps_taken(engine, lambda number: 1.0 + 0.05 * number, shift) >= 35 + FEWEST_SAMPLES
     found = engine.end_calibration("2026-01-01T00:00:00+00:00")
     mine = engine.taxels_of([0])
+    no_load = engine.layout.boards[0].settings.no_load
     assert (found.verdict[mine] == Verdict.OK).all()
-    assert np.abs(found.baseline[mine] - (hand.settings.no_load - 239.5)).max() < 1.5
+    assert np.abs(found.baseline[mine] - (no_load - 239.5)).max() < 1.5
