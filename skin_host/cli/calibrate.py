@@ -6,8 +6,9 @@ Recordings give the foam's relaxation and the pressure curve of each taxel.
 import argparse
 import asyncio
 import math
+from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict
 
 from skin_host.cli.common import (
     Commands,
@@ -27,6 +28,7 @@ from skin_host.errors import RequestError
 if TYPE_CHECKING:
     from skin_host.config.settings import Settings
     from skin_host.layout import Layout
+    from skin_host.processing.calibration import Calibration
     from skin_host.processing.curves import Curves
     from skin_host.processing.fitting.hold import Fit, HoldRecord
     from skin_host.recording import fitting
@@ -95,7 +97,6 @@ def _add_fits(calibrate: argparse.ArgumentParser) -> None:
 
 
 def _calibrate(arguments: argparse.Namespace) -> int:
-    from skin_host.cli import verdicts
     from skin_host.daemon.calibrate import calibration_path, take_calibration
     from skin_host.files import refuse_newer
     from skin_host.layout import parts_of
@@ -117,7 +118,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
         progress.close()
     found = calibrations.with_gains_of(found, path, layout)
     calibrations.save(path, found, layout)
-    triangles = verdicts.triangle_verdicts(found, layout, parts)
+    triangles = triangle_verdicts(found, layout, parts)
     tips = {
         name: name in found.zeros
         for name, tip in settings.fingertips.items()
@@ -135,11 +136,11 @@ def _calibrate(arguments: argparse.Namespace) -> int:
             }
         )
     else:
-        print(verdicts.table(triangles))
+        print(triangle_table(triangles))
         for name, zeroed in tips.items():
             print(f"{name}: " + ("zero taken" if zeroed else "its board sent nothing; no zero"))
         print(f"calibration {found.id} kept in {path}")
-    touched = verdicts.touched(triangles)
+    touched = touched_taxels(triangles)
     if touched:
         warn(
             f"the skin was touched while it was calibrated: {touched}; take away what touches it "
@@ -242,6 +243,7 @@ def _course(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from skin_host.daemon.calibrate import calibration_path
+    from skin_host.health.diagnosis import named
     from skin_host.processing import calibration as calibrations
     from skin_host.processing.curves import CurveVerdict
     from skin_host.recording import fitting
@@ -302,7 +304,7 @@ def _course(arguments: argparse.Namespace) -> int:
     for part, taxels in verdicts.items():
         for name, numbers in taxels.items():
             if name not in ("good", "unknown") and numbers:
-                print(f"{part}: {name}: taxels {ranges(numbers)}")
+                print(f"{part}: {name}: {named(numbers)}")
     print(f"calibration {found.id} kept in {path}")
     return 0
 
@@ -325,17 +327,6 @@ def curve_verdicts(curves: "Curves", layout: "Layout") -> dict[str, dict[str, li
         }
         for part in layout.parts
     }
-
-
-def ranges(numbers: list[int]) -> str:
-    """Rising numbers as text: 1-3, 7."""
-    pieces: list[list[int]] = []
-    for number in numbers:
-        if pieces and number == pieces[-1][1] + 1:
-            pieces[-1][1] = number
-        else:
-            pieces.append([number, number])
-    return ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in pieces)
 
 
 def _read_samples(
@@ -388,3 +379,86 @@ def _as_record(found: "Fit") -> dict[str, object]:
 
 def _number(value: float) -> float | None:
     return value if math.isfinite(value) else None
+
+
+class TriangleVerdict(TypedDict):
+    """One triangle of `pressure_taxels`: `verdict` is the worst; `taxels` are those not ok.
+
+    The taxels have their numbers within the part, grouped by their own verdicts.
+    """
+
+    part: str
+    board: str
+    triangle: int
+    pressure_taxels: int
+    verdict: str
+    taxels: dict[str, list[int]]
+
+
+def triangle_verdicts(
+    calibration: "Calibration", layout: "Layout", parts: list[int]
+) -> list[TriangleVerdict]:
+    """The verdicts of the triangles of some parts, in the order of the layout."""
+    from skin_host.layout import TAXELS_PER_TRIANGLE, PadKind
+    from skin_host.processing.calibration import Verdict
+
+    found: list[TriangleVerdict] = []
+    for triangle in layout.triangles:
+        if triangle.part not in parts:
+            continue
+        part = layout.parts[triangle.part]
+        by_verdict: dict[Verdict, list[int]] = {}
+        for taxel in range(triangle.first, triangle.first + TAXELS_PER_TRIANGLE):
+            if layout.pad_kind[taxel] == PadKind.PRESSURE:
+                verdict = Verdict(calibration.verdict[taxel])
+                by_verdict.setdefault(verdict, []).append(taxel - part.start)
+        found.append(
+            {
+                "part": part.name,
+                "board": layout.boards[triangle.board].name,
+                "triangle": triangle.number,
+                "pressure_taxels": sum(map(len, by_verdict.values())),
+                "verdict": max(by_verdict, default=Verdict.OK).name.lower(),
+                "taxels": {
+                    verdict.name.lower(): taxels
+                    for verdict, taxels in sorted(by_verdict.items())
+                    if verdict is not Verdict.OK
+                },
+            }
+        )
+    return found
+
+
+def triangle_table(verdicts: list[TriangleVerdict]) -> str:
+    """Return a line for each triangle that is not ok, and one for those of a board that are."""
+    from skin_host.config.check import columns, format_triangles
+
+    rows: list[list[str | int]] = []
+    for (part, board), triangles in groupby(verdicts, lambda one: (one["part"], one["board"])):
+        mine = list(triangles)
+        well = [one["triangle"] for one in mine if not one["taxels"]]
+        if well:
+            rows.append([part, board, format_triangles(well), "ok"])
+        rows += [[part, board, one["triangle"], _words(one)] for one in mine if one["taxels"]]
+    return columns(["part", "board", "triangles", "verdict"], rows)
+
+
+def touched_taxels(verdicts: list[TriangleVerdict]) -> str:
+    """Return which taxels were touched, by part: "taxels 3-5, 9 of left_hand"; empty if none
+    was.
+    """
+    from skin_host.health.diagnosis import named
+
+    by_part: dict[str, list[int]] = {}
+    for one in verdicts:
+        by_part.setdefault(one["part"], []).extend(one["taxels"].get("touched", []))
+    return "; ".join(f"{named(taxels)} of {part}" for part, taxels in by_part.items() if taxels)
+
+
+def _words(triangle: TriangleVerdict) -> str:
+    return "; ".join(
+        name.replace("_", " ")
+        if len(taxels) == triangle["pressure_taxels"]
+        else f"{len(taxels)} {name.replace('_', ' ')}: {', '.join(map(str, taxels))}"
+        for name, taxels in triangle["taxels"].items()
+    )

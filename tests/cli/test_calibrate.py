@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skin_host.cli import verdicts
+from skin_host.cli.calibrate import triangle_table, triangle_verdicts
 from skin_host.config.settings import load
 from skin_host.layout import build_layout
 from skin_host.processing.calibration import Calibration, Verdict
@@ -24,7 +24,7 @@ def calibration(**bad: list[int]) -> Calibration:
 
 
 def test_triangles_that_are_well_are_one_line_a_board() -> None:
-    said = verdicts.table(verdicts.triangle_verdicts(calibration(), LAYOUT, [0, 1]))
+    said = triangle_table(triangle_verdicts(calibration(), LAYOUT, [0, 1]))
     assert said.splitlines() == [
         "part          board          triangles  verdict",
         "left_hand     hand           0-4,8-11   ok",
@@ -35,8 +35,8 @@ def test_triangles_that_are_well_are_one_line_a_board() -> None:
 
 def test_a_triangle_with_bad_taxels_has_its_own_line_and_names_them() -> None:
     bad = calibration(noisy=[13, 14], stuck=[15], absent=list(range(24, 36)))
-    found = verdicts.triangle_verdicts(bad, LAYOUT, [0])
-    assert verdicts.table(found).splitlines()[1:] == [
+    found = triangle_verdicts(bad, LAYOUT, [0])
+    assert triangle_table(found).splitlines()[1:] == [
         "left_hand  hand   0,3-4,8-11  ok",
         "left_hand  hand   1           2 noisy: 13, 14; 1 stuck: 15",
         "left_hand  hand   2           absent",
@@ -48,6 +48,6 @@ def test_a_triangle_with_bad_taxels_has_its_own_line_and_names_them() -> None:
 @pytest.mark.parametrize("pad", [6, 10])
 def test_thermal_pads_have_no_verdict(pad: int) -> None:
     first = LAYOUT.part("left_forearm").start
-    (triangle, *_) = verdicts.triangle_verdicts(calibration(stuck=[first + pad]), LAYOUT, [1])
+    (triangle, *_) = triangle_verdicts(calibration(stuck=[first + pad]), LAYOUT, [1])
     assert triangle["pressure_taxels"] == 10
     assert triangle["verdict"] == "ok"
