@@ -1,4 +1,4 @@
-"""Discovers, sets up, starts, supervises and stops the boards of one bus.
+"""Discovers, sets up, starts, supervises and stops the boards of one bus; `scan` only lists them.
 
 A board that times out is queried for its type and its uptime: at once, then at growing intervals.
 If it was reset, it is set up again; if it was not, it is commanded to start, which does not change
@@ -20,7 +20,8 @@ Properties of the firmware decide the order (reference of the wire, sections 3 a
 import asyncio
 import logging
 from collections.abc import Callable, Coroutine, Iterable
-from typing import Protocol
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol
 
 from skin_host.bus.answers import (
     Discovered,
@@ -32,6 +33,7 @@ from skin_host.bus.answers import (
 from skin_host.bus.board import GAP_S, BoardRecord, configuration
 from skin_host.bus.commands import (
     SKIN_BOARD_TYPES,
+    BoardType,
     Discover,
     GetTimeOfLife,
     Message,
@@ -40,8 +42,10 @@ from skin_host.bus.commands import (
     command_frame,
 )
 from skin_host.bus.ledger import BoardLedger
-from skin_host.bus.wire import BROADCAST_ADDRESS
+from skin_host.bus.opening import open_port
+from skin_host.bus.wire import BROADCAST_ADDRESS, find_skin_frames
 from skin_host.clock import SYSTEM, Clock
+from skin_host.config.settings import Bus, Receive
 from skin_host.errors import BusError
 from skin_host.layout import BoardLayout, TriangleLayout
 
@@ -68,6 +72,8 @@ WRONG_S = 1.0
 WRONG_RETRY_S = (5.0, 10.0, 20.0, 60.0)
 #: A period that differs by more than this share is not the one that was set.
 WRONG_PERIOD = 0.25
+#: A scan listens for so long before it asks, and again after.
+SCAN_S = 0.5
 
 
 class Sender(Protocol):
@@ -376,3 +382,88 @@ class Boards:
             record.life_s = answer.seconds
         elif isinstance(answer, TxOverflow):
             self._ledger.tx_overflows[record.row] += 1
+
+
+@dataclass(slots=True)
+class FoundBoard:
+    """A board that answered or streams."""
+
+    address: int
+    board_type: str
+    firmware: str | None
+    in_bootloader: bool
+    triangles: list[int]
+
+    def as_record(self) -> dict[str, Any]:
+        """Return the board as a JSON record."""
+        return asdict(self)
+
+
+async def scan(bus: Bus) -> list[FoundBoard]:
+    """Broadcast a discovery and listen for answers and streams.
+
+    Raises:
+        BusError: the interface cannot be opened or does not take frames.
+    """
+    port = open_port("scan", bus, Receive())
+    found: dict[int, FoundBoard] = {}
+    triangles: dict[int, set[int]] = {}
+    try:
+        # Listen before asking: an MTB3 that streams stops sending when it is asked.
+        for asked in (False, True):
+            if asked:
+                await port.send([command_frame(Discover(), BROADCAST_ADDRESS)])
+            for _ in range(10):
+                await asyncio.sleep(SCAN_S / 10)
+                batch = port.read()
+                skin = find_skin_frames(batch)
+                for board, triangle in zip(
+                    skin.board.tolist(), skin.triangle.tolist(), strict=True
+                ):
+                    triangles.setdefault(board, set()).add(triangle)
+                for row in range(len(batch)):
+                    payload = batch.data[row, : int(batch.dlc[row])].tobytes()
+                    parsed = parse_answer(int(batch.id[row]), payload)
+                    if parsed is None:
+                        continue
+                    address, answer = parsed
+                    if isinstance(answer, Discovered):
+                        version = (
+                            f"{answer.firmware_major}.{answer.firmware_minor}."
+                            f"{answer.firmware_build}"
+                        )
+                        found[address] = FoundBoard(
+                            address, _type_name(answer.board_type), version, False, []
+                        )
+                    elif isinstance(answer, DiscoveredBootloader):
+                        found[address] = FoundBoard(
+                            address, _type_name(answer.board_type), None, True, []
+                        )
+    finally:
+        port.close()
+    for address, seen in triangles.items():
+        record = found.setdefault(address, FoundBoard(address, "unknown", None, False, []))
+        record.triangles = sorted(seen)
+    return [found[address] for address in sorted(found)]
+
+
+def scan_table(found: list[FoundBoard], channel: str) -> str:
+    """A table of what was found."""
+    if not found:
+        return (
+            f"{channel}: nobody answered. Are the boards powered, is the bitrate 1 Mbit/s, is the "
+            "bus terminated?"
+        )
+    lines = ["address  type      firmware  streaming triangles"]
+    for one in found:
+        firmware = "bootloader" if one.in_bootloader else one.firmware or "-"
+        streaming = ", ".join(map(str, one.triangles)) or "-"
+        lines.append(f"{one.address:>7}  {one.board_type:<8}  {firmware:<8}  {streaming}")
+    return "\n".join(lines)
+
+
+def _type_name(number: int) -> str:
+    try:
+        return BoardType(number).name.lower()
+    except ValueError:
+        return f"type {number}"

@@ -214,7 +214,7 @@ def _run_workers(arguments: argparse.Namespace, settings: "Settings") -> int:
 
 
 def _scan(arguments: argparse.Namespace) -> int:
-    from skin_host.bus.scan import describe, scan
+    from skin_host.bus.boards import scan, scan_table
     from skin_host.config.settings import Bus
 
     bus = Bus(interface=arguments.interface, channel=arguments.channel)
@@ -222,7 +222,7 @@ def _scan(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json({"boards": [one.as_record() for one in found]})
     else:
-        print(describe(found, arguments.channel))
+        print(scan_table(found, arguments.channel))
     return 0 if found else 1
 
 

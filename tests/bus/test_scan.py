@@ -6,8 +6,8 @@ import can
 import numpy as np
 
 from skin_host.bus.answers import Discovered, DiscoveredBootloader, answer_frame
+from skin_host.bus.boards import scan, scan_table
 from skin_host.bus.commands import BoardType, Discover, command_frame
-from skin_host.bus.scan import describe, scan
 from skin_host.bus.wire import BROADCAST_ADDRESS, encode_sweep
 from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus
@@ -62,7 +62,7 @@ async def test_boards_are_listed_by_address_with_what_they_run_and_send(
             (14, "mtb4", "1.2.3", []),
         ]
     ]
-    rows = describe(found, "can0").splitlines()
+    rows = scan_table(found, "can0").splitlines()
     assert [row.split() for row in rows[1:]] == [
         ["5", "unknown", "-", "0,", "3"],
         ["9", "skin", "bootloader", "-"],
@@ -77,4 +77,4 @@ async def test_on_an_empty_bus_the_scan_asks_for_power_and_termination(
 ) -> None:
     found = await scan(can_bus_settings)
     assert found == []
-    assert "powered" in describe(found, "can0")
+    assert "powered" in scan_table(found, "can0")
