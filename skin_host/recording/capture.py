@@ -4,7 +4,10 @@ Outside, both may go into one MCAP file; CAN frames alone also into the formats 
 (candump .log, Vector .asc and .blf, .trc, .csv), chosen by the file's suffix. In the daemon the
 receive path passes batches on and continues, and a thread writes them in candump's format. Frames
 that the disk does not take in time, or at all, are lost to the recording and counted, and have no
-other effect.
+other effect. The live page records messages, as long as somebody who looks at it wants.
+
+Where requests come from the network they name no files, and the folder, each recording and its
+marks are bounded.
 """
 
 import asyncio
@@ -15,9 +18,9 @@ import queue
 import secrets
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import can
 import numpy as np
@@ -45,6 +48,13 @@ MAX_RECORDINGS = 100
 PATIENCE_S = 1.0
 _FLAGS = ERROR_FLAG | EXTENDED_FLAG | REMOTE_FLAG
 _ID = 0x1FFFFFFF
+#: Bounds of what a page records.
+PAGE_MAX_S = 3600.0
+PAGE_MAX_BYTES = 1024**3
+MAX_MARKS = 1000
+#: A mark may be this much older than its request: somebody typed its text meanwhile.
+MAX_AGO_S = 600.0
+WATCH_S = 0.25
 
 _log = logging.getLogger(__name__)
 
@@ -298,3 +308,122 @@ class FrameRecorder:
         rest = memoryview(lines)
         while rest:
             rest = rest[self._file.write(rest) :]
+
+
+class PageRecording:
+    """The robot's messages, as pages start, mark and stop them: at most one recording at a time.
+
+    Args:
+        folder: the files go there; it is made when the first recording begins.
+        clock: by which the time ends.
+    """
+
+    def __init__(self, folder: Path, clock: Clock = SYSTEM) -> None:
+        self._folder = folder
+        self._clock = clock
+        self._path = folder
+        self._recorder: Recorder | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._stop = asyncio.Event()
+        self._began_s = 0.0
+        self._ended: str | None = None
+        self._marks = 0
+
+    @property
+    def state(self) -> dict[str, Any] | None:
+        """What pages show: the file, its seconds so far, its marks, and why it ended by itself."""
+        if self._recorder is not None:
+            seconds = int(self._clock.monotonic_s() - self._began_s)
+            return {"file": self._path.name, "seconds": seconds, "marks": self._marks}
+        if self._ended is not None:
+            return {"file": self._path.name, "ended": self._ended}
+        return None
+
+    def start(self, broker: Broker, base: str, robot: str) -> dict[str, Any]:
+        """Begin a recording.
+
+        Raises:
+            RequestError: one is in progress, or the folder is full.
+            SkinError: mcap is not installed, or the file cannot be made.
+        """
+        if self._recorder is not None:
+            raise RequestError(f"{self._path.name} is being recorded already; stop it")
+        if sum(1 for _ in self._folder.glob(f"*{SUFFIX}")) >= MAX_RECORDINGS:
+            raise RequestError(
+                f"{self._folder}: holds {MAX_RECORDINGS} recordings already; move some away"
+            )
+        self._path = self._folder / self._clock.today().strftime(f"%Y%m%dT%H%M%SZ{SUFFIX}")
+        if self._path.exists():
+            raise RequestError(f"{self._path.name}: is there already; try again")
+        self._recorder = Recorder(self._path)
+        self._began_s, self._marks, self._ended = self._clock.monotonic_s(), 0, None
+        self._stop = asyncio.Event()
+        capture = capture_broker(self._recorder, broker, base, robot, self._stop)
+        self._task = asyncio.create_task(self._run(capture), name="page's recording")
+        return {"file": str(self._path)}
+
+    def mark(self, text: str, ago_s: float) -> dict[str, Any]:
+        """Mark a moment of the recording in progress.
+
+        Raises:
+            RequestError: there is none, or it has too many marks.
+            SkinError: the disk is full or gone.
+        """
+        if self._recorder is None:
+            raise RequestError("nothing is being recorded")
+        if self._marks >= MAX_MARKS:
+            raise RequestError(f"{self._path.name} has {MAX_MARKS} marks already")
+        self._recorder.mark(self._clock.now_ns() - int(ago_s * 1e9), text)
+        self._marks += 1
+        return {"marks": self._marks}
+
+    async def stop(self) -> dict[str, Any]:
+        """End the recording in progress, and say what it holds.
+
+        Raises:
+            RequestError: there is none.
+            SkinError: the disk is full or gone.
+        """
+        recorder, task = self._recorder, self._task
+        if recorder is None or task is None:
+            raise RequestError("nothing is being recorded")
+        self._stop.set()
+        await asyncio.wait([task])
+        if self._ended is not None:
+            raise SkinError(self._ended)
+        return {
+            "file": str(self._path),
+            "messages": sum(recorder.messages.values()),
+            "marks": self._marks,
+            "gaps": recorder.gaps,
+        }
+
+    async def _run(self, capture: Awaitable[int]) -> None:
+        """Record until stopped, too long or too large, or the disk fails."""
+        recorder = self._recorder
+        assert recorder is not None
+        working = asyncio.ensure_future(capture)
+        try:
+            while not working.done():
+                if self._clock.monotonic_s() - self._began_s > PAGE_MAX_S:
+                    self._ended = (
+                        f"{self._path.name} has ended: it reached {PAGE_MAX_S / 60:.0f} min"
+                    )
+                elif recorder.size_bytes > PAGE_MAX_BYTES:
+                    self._ended = f"{self._path.name} has ended: it reached {PAGE_MAX_BYTES} bytes"
+                if self._ended is not None:
+                    self._stop.set()
+                await asyncio.wait([working], timeout=WATCH_S)
+            working.result()
+            recorder.close()
+        except SkinError as error:
+            self._ended = str(error)
+        finally:
+            working.cancel()
+            self._recorder = self._task = None
+            _log.info("recording %s ended", self._path)
+
+    async def close(self) -> None:
+        """End a recording in progress; the server stops."""
+        with contextlib.suppress(SkinError):
+            await self.stop()

@@ -24,8 +24,8 @@ from websockets.http11 import Request, Response
 from skin_host.client import SkinClient, Stream
 from skin_host.errors import BrokerError, RequestError, SkinError
 from skin_host.mqtt.address import Broker
+from skin_host.recording.capture import MAX_AGO_S, PageRecording
 from skin_host.viewer.picture import Cursor, Picture
-from skin_host.viewer.recording import MAX_AGO_S, PageRecording
 
 #: Pages get new messages this often; screens show no more.
 TICK_S = 0.04

@@ -24,8 +24,8 @@ from skin_host.mqtt.commands import Handler
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.pipeline import PressureFrame
+from skin_host.recording import capture
 from skin_host.recording.mcap import read_messages_of
-from skin_host.viewer import recording as viewer_recording
 from skin_host.viewer import server
 from skin_host.viewer.server import Viewer
 from tests.support.broker import Mosquitto, free_port
@@ -292,7 +292,7 @@ async def test_a_page_records_marks_and_stops(mosquitto: Mosquitto, tmp_path: Pa
 async def test_a_recording_that_becomes_too_long_ends_and_says_so(
     mosquitto: Mosquitto, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(viewer_recording, "MAX_S", 0.1)
+    monkeypatch.setattr(capture, "PAGE_MAX_S", 0.1)
     broker = f"mqtt://{mosquitto.host}:{mosquitto.port}"
     async with (
         node(mosquitto, skin()),
