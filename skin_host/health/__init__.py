@@ -8,11 +8,12 @@ finds the faults. The record is published as `<part>/health` and shown by `skin 
 import logging
 from typing import Any
 
+import numpy as np
+
 from skin_host.bus.boards import Boards
 from skin_host.bus.port import Port
-from skin_host.health.describe import Describer
+from skin_host.health.describe import ABSENT_SWEEPS, Describer
 from skin_host.health.diagnosis import Fault, diagnose
-from skin_host.health.pulse import pulse
 from skin_host.health.record import Record
 from skin_host.health.watch import Watch
 from skin_host.processing.core import Engine, Output
@@ -48,6 +49,8 @@ _PASSING = {
     "part_temperature",
     "taxel_noisy",
 }
+#: What a bus gains in a second through faults.
+_LOSSES = ("wrong", "halves", "spikes", "dropped", "error_frames")
 
 
 class Health:
@@ -87,8 +90,34 @@ class Health:
         self._watch.tick(now_ns, ports, boards)
 
     def pulse(self, ports: dict[str, Port], boards: dict[str, Boards]) -> tuple[object, ...]:
-        """Return a value that differs from the last one when a fault may have begun or ended."""
-        return (self._stalled_ns, *pulse(self._engine, self._watch, ports, boards))
+        """Return a value that differs from the last one when a fault may have begun or ended.
+
+        It is taken ten times a second; only when it differs, and once a second, are the records
+        made, which cost a hundred times as much. Measures that change slowly (temperature, periods,
+        baselines) are left to the records of each second.
+
+        Args:
+            ports, boards: by name of the bus.
+        """
+        engine, watch = self._engine, self._watch
+        return (
+            self._stalled_ns,
+            engine.calibration,
+            tuple(engine.disabled),
+            *_pulse_of_boards(engine),
+            *(
+                None if part.valid is None else part.valid.tobytes()
+                for part in watch.parts.values()
+            ),
+            *((bus.silent, *map(bus.gained.get, _LOSSES)) for bus in watch.buses.values()),
+            *(port.state for port in ports.values()),
+            *(dict(manager.strangers) for manager in boards.values()),
+            *(
+                (known.board_type, known.in_bootloader)
+                for manager in boards.values()
+                for known in manager.records.values()
+            ),
+        )
 
     def record(
         self,
@@ -171,6 +200,23 @@ class Health:
             if abs(now_ns - seen_ns) > (HOLD_NS if fault.code in _PASSING else 0):
                 del held[key]
         return [fault for fault, _ in held.values()]
+
+
+def _pulse_of_boards(engine: Engine) -> tuple[object, ...]:
+    ledger, liveness = engine.ledger, engine.intake.liveness
+    events = (ledger.resets, ledger.lost_set_ups, ledger.tx_overflows, ledger.rezeros)
+    found: tuple[object, ...] = (
+        ledger.silent.tobytes(),
+        (ledger.sweeps > 0).tobytes(),
+        np.minimum(ledger.absent, ABSENT_SWEEPS).tobytes(),
+        engine.doubts(),
+        *(counts.tobytes() for counts in events),
+    )
+    if any(ledger.flagged):
+        found += ledger.error.tobytes(), ledger.far.tobytes()
+    if liveness.doubted is not None:
+        found += liveness.doubted.tobytes(), liveness.frozen.tobytes()
+    return found
 
 
 class FaultLog:
