@@ -1,10 +1,12 @@
 """How much pressure the foam has lost: viscoelastic models behind one interface."""
 
-from skin_host.processing.relaxation.asymmetric import AsymmetricRelaxation
 from skin_host.processing.relaxation.base import Relaxation
-from skin_host.processing.relaxation.none import NoRelaxation
-from skin_host.processing.relaxation.plays import PlayRelaxation
-from skin_host.processing.relaxation.published import PublishedRelaxation
+from skin_host.processing.relaxation.models import (
+    AsymmetricRelaxation,
+    NoRelaxation,
+    PlayRelaxation,
+    PublishedRelaxation,
+)
 from skin_host.processing.relaxation.sets import (
     OWN_MEANS,
     STAND_INS,

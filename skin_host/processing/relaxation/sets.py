@@ -13,10 +13,12 @@ from numpy.typing import DTypeLike
 
 from skin_host.config.relaxation import MODELS
 from skin_host.config.relaxation import RelaxationSettings as Settings
-from skin_host.processing.relaxation.asymmetric import AsymmetricRelaxation
 from skin_host.processing.relaxation.base import Parameters, Relaxation
-from skin_host.processing.relaxation.none import NoRelaxation
-from skin_host.processing.relaxation.published import PublishedRelaxation
+from skin_host.processing.relaxation.models import (
+    AsymmetricRelaxation,
+    NoRelaxation,
+    PublishedRelaxation,
+)
 
 #: Evenly spaced modes, from a second to the longest that an hour's record can distinguish from a
 #: constant.
