@@ -11,6 +11,7 @@ back or forward changes nothing. While nothing is read, or old frames are read, 
 """
 
 from collections.abc import Sequence
+from statistics import median
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,14 +37,6 @@ MISSING_SWEEPS = 5
 UNEVEN = 0.1
 _BITS = np.arange(TRIANGLES)
 _NO_STATUS = bytes(2 * TRIANGLES)
-
-
-def _between(values: list[int], share: float) -> float:
-    """The value at a share of the way through sorted ones, interpolated."""
-    place = share * (len(values) - 1)
-    before = int(place)
-    after = min(before + 1, len(values) - 1)
-    return values[before] + (place - before) * (values[after] - values[before])
 
 
 class BoardLedger:
@@ -204,8 +197,9 @@ class BoardLedger:
         intervals = sorted(self.intervals_ns(row).tolist())
         if len(intervals) < INTERVALS // 2 - 1:
             return None
-        low_ns, usual_ns, high_ns = (_between(intervals, share) for share in (0.2, 0.5, 0.8))
-        return usual_ns if high_ns - low_ns < UNEVEN * usual_ns else None
+        fifth, usual_ns = len(intervals) // 5, float(median(intervals))
+        spread_ns = intervals[-1 - fifth] - intervals[fifth]
+        return usual_ns if spread_ns < UNEVEN * usual_ns else None
 
     def _note_interval(self, row: int, interval_ns: int) -> None:
         if not 0 < interval_ns < STALE_INTERVALS_NS:

@@ -83,7 +83,7 @@ class Erratic:
 
 def step_kpa(curve: Curve, noise_units: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the step [m] from sample to sample that a pad's noise does not reach."""
-    end = np.where(np.isfinite(curve.beyond_units), np.maximum(curve.beyond_units, 1.0), 1.0)
+    end = np.clip(curve.beyond_units, 1.0, 255.0)
     step: NDArray[np.float64] = (
         np.maximum(STEP_DEVIATIONS * noise_units, STEP_UNITS) * curve.kpa(end) / end
     )

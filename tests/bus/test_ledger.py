@@ -1,5 +1,6 @@
 """What is concluded from the sweeps of boards: silence, period, what is missing."""
 
+from functools import cache
 from itertools import accumulate
 
 import numpy as np
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 from skin_host.bus.assembler import Sweep
 from skin_host.bus.ledger import LONGEST_PAUSE_NS, BoardLedger
 from skin_host.config.settings import load
-from skin_host.layout import build_layout
+from skin_host.layout import BoardLayout, build_layout
 from tests.support.stack import ROOT
 
 CONFIG = ROOT / "config" / "demo.toml"
@@ -21,13 +22,17 @@ T0 = 1_700_000_000_000_000_000
 HAND, OUTER = 0, 1
 
 
-def ledger() -> BoardLedger:
-    layout = build_layout(load(CONFIG), CONFIG.parent)
-    return BoardLedger(list(enumerate(layout.boards)), SILENT_PERIODS)
+@cache
+def boards() -> list[tuple[int, BoardLayout]]:
+    return list(enumerate(build_layout(load(CONFIG), CONFIG.parent).boards))
+
+
+def ledger(poll_ms: float = 0.0) -> BoardLedger:
+    return BoardLedger(boards(), SILENT_PERIODS, poll_ms)
 
 
 def enabled(board: int) -> int:
-    return build_layout(load(CONFIG), CONFIG.parent).boards[board].enabled
+    return boards()[board][1].enabled
 
 
 def sweep(board: int, t_ns: int, present: int | None = None, status: int = 0) -> Sweep:
@@ -167,10 +172,22 @@ def test_a_board_is_overdue_one_nanosecond_after_its_periods_and_not_before_it_c
     assert known.sweeps.tolist()[:2] == [2, 0]
 
 
+@given(st.lists(st.tuples(st.sampled_from([HAND, OUTER, None]), st.integers(1, 90))))
+def test_any_board_is_silent_exactly_when_one_of_them_is(
+    turns: list[tuple[int | None, int]],
+) -> None:
+    known, now_ns = ledger(), T0
+    for board, passed_ms in turns:
+        now_ns += passed_ms * MS
+        known.look(now_ns)
+        if board is not None:
+            known.note(sweep(board, now_ns))
+        assert known.any_silent == bool(known.silent.any())
+
+
 def test_a_pause_counts_for_no_more_than_the_limit_and_the_poll() -> None:
-    layout = build_layout(load(CONFIG), CONFIG.parent)
     for poll_ms in (0.0, 40.0):
-        known = BoardLedger(list(enumerate(layout.boards)), SILENT_PERIODS, poll_ms)
+        known = ledger(poll_ms)
         known.look(T0)
         assert known.now_ns == 0
         known.look(T0 + 3_600_000_000_000)
