@@ -330,20 +330,41 @@ def _neighbours(
     position_m: Floats, normal: Floats, pitch_mm: Floats, parts: list[PartLayout]
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Which taxels of a part are near each other and on the same side of it."""
-    counts = []
-    found = []
+    firsts, seconds = [], []
     for part in parts:
         taxels = slice(part.start, part.stop)
-        apart = position_m[taxels, None, :] - position_m[None, taxels, :]
-        distance_m = np.sqrt(np.einsum("ijk,ijk->ij", apart, apart))
-        reach_mm = NEIGHBOUR_PITCHES * np.maximum(pitch_mm[taxels, None], pitch_mm[None, taxels])
-        near = distance_m * 1e3 <= reach_mm
-        near &= normal[taxels] @ normal[taxels].T > 0
-        np.fill_diagonal(near, val=False)
-        counts.append(near.sum(axis=1))
-        found.append(np.nonzero(near)[1] + part.start)
-    start = np.concatenate([[0], np.cumsum(np.concatenate(counts))])
-    return start.astype(np.int32), np.concatenate(found).astype(np.int32)
+        first, second = _pairs_along_an_axis(
+            position_m[taxels], NEIGHBOUR_PITCHES * pitch_mm[taxels].max() * 1e-3
+        )
+        firsts.append(first + part.start)
+        seconds.append(second + part.start)
+    first, second = np.concatenate(firsts), np.concatenate(seconds)
+    apart = position_m[first] - position_m[second]
+    reach_mm = NEIGHBOUR_PITCHES * np.maximum(pitch_mm[first], pitch_mm[second])
+    near = np.sqrt(np.einsum("ij,ij->i", apart, apart)) * 1e3 <= reach_mm
+    near &= np.einsum("ij,ij->i", normal[first], normal[second]) > 0
+    first, second = first[near], second[near]
+    taxel, neighbour = np.concatenate([first, second]), np.concatenate([second, first])
+    start = np.concatenate([[0], np.cumsum(np.bincount(taxel, minlength=len(position_m)))])
+    return start.astype(np.int32), neighbour[np.lexsort((neighbour, taxel))].astype(np.int32)
+
+
+def _pairs_along_an_axis(
+    position_m: Floats, reach_m: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Each pair of points once whose places on the axis of the greatest spread are in reach.
+
+    A large part has few such pairs beside the square of its taxels.
+    """
+    along_m = position_m[:, np.ptp(position_m, axis=0).argmax()]
+    order = np.argsort(along_m, kind="stable")
+    along_m = along_m[order]
+    number = np.arange(len(order))
+    # A little more than the reach: the exact distance decides.
+    after = np.searchsorted(along_m, along_m + reach_m * (1 + 1e-9), side="right") - number - 1
+    first = np.repeat(number, after)
+    second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(after) - after, after)
+    return order[first], order[second]
 
 
 def parts_of(layout: Layout, node: str) -> list[int]:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from skin_host.config.settings import PlaceSettings, Settings
 from skin_host.errors import ConfigurationError
 from skin_host.layout import Layout, PadKind, build_layout, builtin_kinds
-from skin_host.layout.geometry import fitted_outline, lay, tile
+from skin_host.layout.geometry import NEIGHBOUR_PITCHES, fitted_outline, lay, tile
 
 HERE = Path()
 angles_deg = st.floats(-360, 360)
@@ -144,10 +144,26 @@ def test_neighbours_reach_the_next_pads_of_a_triangle_and_no_further() -> None:
     assert 3 not in neighbours(layout, 3)
 
 
-def test_neighbours_are_mutual() -> None:
-    layout = build_layout(skin({"triangles": "0-15"}), HERE)
-    pairs = {(i, j) for i in range(layout.n_taxels) for j in neighbours(layout, i)}
-    assert pairs == {(j, i) for i, j in pairs}
+@given(st.lists(st.tuples(lengths_mm, lengths_mm, lengths_mm, directions), min_size=1, max_size=6))
+def test_neighbours_are_all_that_are_near_and_on_the_same_side(
+    places: list[tuple[float, float, float, tuple[float, float, float]]],
+) -> None:
+    settled = [
+        {"x_mm": x / 20, "y_mm": y / 20, "z_mm": z / 20, "normal": list(normal)}
+        for x, y, z, normal in places
+    ]
+    layout = build_layout(skin({"triangles": f"0-{len(places) - 1}", "places": settled}), HERE)
+    reach_m = NEIGHBOUR_PITCHES * builtin_kinds()["triangle"].pitch_mm * 1e-3
+    for taxel, (position_m, normal) in enumerate(
+        zip(layout.position_m, layout.normal, strict=True)
+    ):
+        apart_m = np.linalg.norm(layout.position_m - position_m, axis=1)
+        same_side = layout.normal @ normal
+        surely = (apart_m < reach_m - 1e-9) & (same_side > 1e-9)
+        perhaps = (apart_m < reach_m + 1e-9) & (same_side > -1e-9)
+        found = neighbours(layout, taxel)
+        assert set(np.flatnonzero(surely).tolist()) - {taxel} <= found
+        assert found <= set(np.flatnonzero(perhaps).tolist()) - {taxel}
 
 
 def test_neighbours_reach_across_the_edge_of_two_triangles() -> None:

@@ -297,7 +297,7 @@ async def test_a_subscriber_can_tell_that_events_were_lost(mosquitto: Mosquitto)
 
 async def test_stopping_sends_what_waits_and_says_offline(mosquitto: Mosquitto) -> None:
     async with listening(mosquitto) as seen:
-        async with Publisher(settings(mosquitto), "robot") as publisher:
+        async with Publisher(settings(mosquitto), "robot", drain_s=60) as publisher:
             await until(lambda: publisher.counters.connected)
             for number in range(200):
                 publisher.put_touch(touch(number))
