@@ -19,12 +19,11 @@ from skin_host import __version__, emulator_path
 from skin_host.cli import (
     calibrate,
     completion,
-    emulation,
     files,
-    measure,
     operate,
     recordings,
     watch,
+    without_robot,
 )
 from skin_host.daemon import service
 from skin_host.errors import SkinError
@@ -76,7 +75,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(
         title="commands", metavar="COMMAND", required=True, parser_class=_Parser
     )
-    for room in (operate, calibrate, watch, files, recordings, emulation, measure, completion):
+    for room in (operate, calibrate, watch, files, recordings, without_robot, completion):
         room.add_commands(commands)
     return parser
 
