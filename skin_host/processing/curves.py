@@ -23,22 +23,27 @@ from skin_host.processing.pressure import PressureCurve
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
-Taxels = slice | Mask
+Taxels = slice | Mask | NDArray[np.intp]
 
 #: Dense where foam is soft; the straight end covers a byte's whole range.
 KNOTS_UNITS: Floats = np.array([0.0, 0.75, 1.5, 3.0, 5.0, 7.5, *np.arange(10.0, 256.0, 3.0)])
 #: All knots are multiples of this, so one look-up finds the piece that an activation is in.
 GRID_UNITS = 0.25
-_PIECE_AT: NDArray[np.intp] = (
-    np.searchsorted(KNOTS_UNITS, np.arange(0.0, KNOTS_UNITS[-1], GRID_UNITS), side="right") - 1
+#: Piece 0 is below zero.
+_PIECE_AT: NDArray[np.intp] = np.searchsorted(
+    KNOTS_UNITS, np.arange(-GRID_UNITS, KNOTS_UNITS[-1], GRID_UNITS), side="right"
 )
 #: A curve rises by at least this much per unit, so that it has an inverse.
 LEAST_SLOPE = 1e-3
+#: Below zero a curve is as steep as up to this knot at least: noise may make its first piece flat,
+#: and a reading below zero would then be one of many units.
+STEEP_KNOT = 3
 
-
-#: A table is computed again when its baseline has moved this far: a quarter of the error that
-#: bytes have from rounding.
-STALE_UNITS = 1 / 8
+#: A table is computed again when its baseline has moved this far. Until then it is shifted by the
+#: slope at rest, which is exact for small pressures only; so less is allowed where a pad is
+#: touched.
+STALE_UNITS = 1 / 4
+STALE_TOUCHED_UNITS = 1 / 32
 CODES = np.arange(256.0)[:, np.newaxis]
 
 
@@ -110,43 +115,50 @@ class Curves:
 
 
 class TableCurve:
-    """Curves given at `KNOTS_UNITS`, straight between them and beyond the last.
+    """Curves given at `KNOTS_UNITS`, straight between them, beyond the last and below zero.
 
     Has the same interface as `PressureCurve`.
 
     Args:
-        table_kpa: float64[n, k], rising.
+        table_kpa: float64[n, k], rising from 0.
         beyond_units: float64[n], activation up to which the curve was measured.
 
     Attributes:
-        linear: float64[n], kPa per unit at zero activation; it continues below zero.
+        linear: float64[n], kPa per unit below zero.
+        straight_kpa: float64[n], pressure up to which the curve goes on like that.
         beyond_units: float64[n], activation up to which the curve was measured.
     """
 
     def __init__(self, table_kpa: Floats, beyond_units: Floats) -> None:
-        self._table_kpa = table_kpa
-        self._row = np.arange(len(table_kpa))
+        n, knots = table_kpa.shape
+        self._knot_kpa = table_kpa.reshape(-1)
+        #: Where each taxel's pieces begin: as many as knots, because one is below zero.
+        self._first = np.arange(n) * knots
         self.beyond_units = beyond_units
-        #: Each piece between knots is level + slope x; the first and the last go on for ever.
-        self._slope: Floats = np.diff(table_kpa, axis=1) / np.diff(KNOTS_UNITS)
-        self._level: Floats = table_kpa[:, :-1] - self._slope * KNOTS_UNITS[:-1]
-        self.linear: Floats = self._slope[:, 0]
+        rising = np.diff(table_kpa, axis=1) / np.diff(KNOTS_UNITS)
+        chord = table_kpa[:, STEEP_KNOT] / KNOTS_UNITS[STEEP_KNOT]
+        self.linear: Floats = np.maximum(rising[:, 0], chord)
+        self.straight_kpa: Floats = np.where(rising[:, 0] < self.linear, 0.0, table_kpa[:, 1])
+        #: Each piece is level + slope x; the first and the last go on for ever.
+        slope = np.column_stack([self.linear, rising])
+        level = np.column_stack([np.zeros(n), table_kpa[:, :-1] - rising * KNOTS_UNITS[:-1]])
+        self._slope, self._level = slope.reshape(-1), level.reshape(-1)
 
     def part(self, taxels: Taxels) -> "TableCurve":
         """Return the curves of some of the taxels; they share the tables of all."""
         chosen = copy(self)
-        chosen._row = self._row[taxels]
+        chosen._first = self._first[taxels]
         chosen.beyond_units = self.beyond_units[taxels]
         chosen.linear = self.linear[taxels]
+        chosen.straight_kpa = self.straight_kpa[taxels]
         return chosen
 
     def kpa(self, units: ArrayLike) -> Floats:
         """Return the pressure [..., n] in kPa of activations [..., n] in units."""
         x = np.asarray(units, dtype=np.float64)
-        quarters = np.minimum(np.maximum(x / GRID_UNITS, 0.0), len(_PIECE_AT) - 1.0)
+        quarters = np.minimum(np.maximum(x / GRID_UNITS + 1.0, 0.0), len(_PIECE_AT) - 1.0)
         # Places in the whole table: two indices would cost several times as much.
-        piece = _PIECE_AT.take(quarters.astype(np.intp))
-        place = piece + self._row * self._slope.shape[1]
+        place = _PIECE_AT.take(quarters.astype(np.intp)) + self._first
         result: Floats = self._slope.take(place) * x
         result += self._level.take(place)
         return result
@@ -154,9 +166,17 @@ class TableCurve:
     def units(self, kpa: ArrayLike) -> Floats:
         """Return the activation [..., n] in units for these pressures; inverse of kpa."""
         c = np.asarray(kpa, dtype=np.float64)
-        knots_kpa = self._table_kpa[self._row, 1:-1]
-        piece = np.sum(knots_kpa <= c[..., np.newaxis], axis=-1)
-        result: Floats = (c - self._level[self._row, piece]) / self._slope[self._row, piece]
+        # The piece is the number of knots, without the last, that are not above the pressure.
+        last = len(KNOTS_UNITS) - 1
+        knot = self._first - 1
+        piece = np.zeros(np.broadcast(c, knot).shape, np.intp)
+        step = 1 << (last.bit_length() - 1)
+        while step:
+            tried = np.minimum(piece + step, last)
+            piece = np.where(self._knot_kpa.take(tried + knot) <= c, tried, piece)
+            step >>= 1
+        place = piece + self._first
+        result: Floats = (c - self._level.take(place)) / self._slope.take(place)
         return result
 
 
@@ -194,8 +214,8 @@ def with_own(common: PressureCurve, curves: Curves) -> Curve:
 class Reader(Protocol):
     """Converts the bytes of m taxels into kPa."""
 
-    def renew(self, offset: Floats32) -> None:
-        """Set the bytes [m] of the untouched taxels, with fractions."""
+    def renew(self, offset: Floats32, touched: Mask) -> None:
+        """Set the bytes [m] of the untouched taxels, with fractions, and which are touched [m]."""
         ...
 
     def lower(self, relaxation_kpa: Floats32) -> None:
@@ -222,7 +242,7 @@ class Parabolas:
         self._level = np.empty_like(self._square)
         self._bytes = np.empty_like(self._square)
 
-    def renew(self, offset: Floats32) -> None:
+    def renew(self, offset: Floats32, touched: Mask) -> None:
         slope, level = self._slope, self._level
         np.multiply(self._square, offset, out=slope)
         np.add(slope, self._linear, out=level)
@@ -249,7 +269,9 @@ class Tables:
         m = len(believed)
         self._curve = curve
         self._believed = believed
-        self._offset = np.full(m, np.inf, np.float32)
+        #: The zero of each table, and what to add for the present one.
+        self._offset = np.full(m, -np.inf, np.float32)
+        self._shift = np.zeros(m, np.float32)
         self._table = np.zeros((m, 256), np.float32)
         self._flat = self._table.reshape(-1)
         #: Where each taxel's row begins, plus its byte: rows are as long as a byte has values, so
@@ -257,21 +279,21 @@ class Tables:
         self._index = np.arange(0, 256 * m, 256, dtype=np.intp)
         lowest = 0 if sys.byteorder == "little" else self._index.itemsize - 1
         self._lowest = self._index.view(np.uint8)[lowest :: self._index.itemsize]
-        self._lowered: Floats32 | None = None
 
-    def renew(self, offset: Floats32) -> None:
-        self._lowered = None
-        stale = (np.abs(offset - self._offset) > STALE_UNITS) & self._believed
-        if stale.any():
+    def renew(self, offset: Floats32, touched: Mask) -> None:
+        moved = np.subtract(offset, self._offset)
+        limit = np.where(touched, STALE_TOUCHED_UNITS, STALE_UNITS)
+        stale = np.flatnonzero((np.abs(moved) > limit) & self._believed)
+        if len(stale):
             self._offset[stale] = offset[stale]
-            kpa = self._curve.part(stale).kpa(self._offset[stale] - CODES)
-            self._table[stale] = kpa.T
+            self._table[stale] = self._curve.part(stale).kpa(offset[stale] - CODES).T
+            moved[stale] = 0.0
+        np.multiply(moved, self._curve.linear, out=self._shift, where=self._believed)
 
     def lower(self, relaxation_kpa: Floats32) -> None:
-        self._lowered = relaxation_kpa.copy()
+        np.subtract(self._shift, relaxation_kpa, out=self._shift)
 
     def kpa(self, raw: Bytes, out: Floats32) -> None:
         self._lowest[...] = raw
         self._flat.take(self._index, out=out, mode="clip")
-        if self._lowered is not None:
-            np.subtract(out, self._lowered, out=out)
+        np.add(out, self._shift, out=out)

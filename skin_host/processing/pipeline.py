@@ -18,7 +18,6 @@ from skin_host.config.settings import Processing
 from skin_host.layout import Layout, PadKind, PartLayout
 from skin_host.processing.calibration import Calibration
 from skin_host.processing.curves import (
-    KNOTS_UNITS,
     Curve,
     Curves,
     Parabolas,
@@ -247,6 +246,7 @@ class _PartPipeline:
         self._beyond_raw = np.empty(m, np.uint8)
         self._shifted = np.empty(m, np.uint8)
         self._near = np.empty(m, np.bool_)
+        self._was_touched = np.zeros(m, np.bool_)
 
         rules = rules.part(mine)
         self._set_model(rules)
@@ -270,7 +270,6 @@ class _PartPipeline:
         self._samples = 0
         self._skipped = 0
         self._elapsed_s = 0.0
-        self._was_touched = np.zeros(m, np.bool_)
         self._noted = self._nowhere
         self._was_missing = np.zeros(m, np.bool_)
         self._since_glance_s = 0.0
@@ -565,7 +564,7 @@ class _PartPipeline:
         """
         units = kpa * self._units_per_kpa
         if isinstance(self._curve, TableCurve):
-            far = units > KNOTS_UNITS[1]
+            far = kpa > self._curve.straight_kpa
             if any_of(far):
                 units[far] = self._curve.part(far).units(kpa[far])
             return units
@@ -591,7 +590,7 @@ class _PartPipeline:
         """
         offset = self._offset
         np.subtract(self._no_load, self.drift.baseline, out=offset, casting="same_kind")
-        self._reader.renew(offset)
+        self._reader.renew(offset, self._was_touched)
         if self._relaxation is not None and not self._every_sample:
             self._reader.lower(self._relaxation_kpa)
         # A press must exceed the relaxation of the foam.
