@@ -9,10 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.evaluation.papers.array import centroid, peak, smooth_peak, strip_array
 from skin_host.evaluation.papers.force_torque import calibrate
-from skin_host.evaluation.papers.fusion import FingertipFusion, calibrate_fusion
-from skin_host.evaluation.papers.planar import contact_angle
+from skin_host.evaluation.papers.fusion import (
+    FingertipFusion,
+    calibrate_fusion,
+    centroid,
+    contact_angle,
+    peak,
+    smooth_peak,
+    strip_array,
+)
 from skin_host.evaluation.papers.truth import (
     LoadPatch,
     PlanarGauges,

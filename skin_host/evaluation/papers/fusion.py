@@ -1,12 +1,19 @@
-"""Array and force/torque of one planar fingertip as one contact estimate.
+"""One planar fingertip with an array and force/torque (Son et al.): each alone, and both as one.
 
-Each makes up for the other (Son et al., section 5). The array is blind to inertia but is
+The array locates a contact in the three ways of its section 2.2, and a fourth; samples without a
+response give NaN. Force and torque locate it by one angle on a circle (section 3): the force is the
+object's on the fingertip with reversed sign, so it points outward, from the centre to the contact.
+Derivatives are the corrected ones: the paper's eq. 3.6 has a wrong sign in its second term, a wrong
+denominator under dm and a missing square under dr.
+
+Each makes up for the other (section 5). The array is blind to inertia but is
 pulled aside by shear: the force sensor measures the shear. The force sensor is fast but is
 hard to calibrate and answers every acceleration: the array shows its errors. Presses by
 hand calibrate both corrections; a Kalman filter over place, speed and the force sensor's
 remaining bias joins them in time.
 
-Places are in mm along the circumference, forces in N in the sign of `planar`.
+All work on many samples at once. Places are in mm along the circumference, forces in N, torque in
+N mm about the circle's centre.
 """
 
 from dataclasses import dataclass
@@ -15,8 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skin_host.errors import CalibrationError
-from skin_host.evaluation.papers.array import smooth_peak
-from skin_host.evaluation.papers.planar import contact_angle, position_sd_mm
+from skin_host.processing.localization_centroid import quadratic_peak
 
 Floats = NDArray[np.float64]
 
@@ -25,6 +31,152 @@ Floats = NDArray[np.float64]
 ALIKE_SAMPLES = 6.0
 #: Errors of the array, from strips and gains, do not average out over samples.
 ARRAY_SD_MM = 0.06
+#: Width of the window of `smooth_peak`, in pitches. Wide enough that a sum over places a
+#: pitch apart is as good as an integral, narrow enough to leave far elements out.
+WINDOW_PITCHES = 1.25
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayLayout:
+    """Crossed strips wrapped around a cylinder (Son et al., Fig. 1).
+
+    Attributes:
+        around_mm: float64[columns], places along the circumference, from the middle.
+        along_mm: float64[rows], places along the cylinder's axis, from the middle.
+        radius_mm: of the outer surface.
+        depth_mm: of the elements below it.
+    """
+
+    around_mm: Floats
+    along_mm: Floats
+    radius_mm: float
+    depth_mm: float
+
+
+def strip_array(
+    *,
+    strips: int = 8,
+    pitch_mm: float = 2.0,
+    radius_mm: float = 15.7,
+    depth_mm: float = 2.4,
+) -> ArrayLayout:
+    """The 8 x 8 array of Son et al.: 2 mm pitch under 2.4 mm of rubber, radius 15.7 mm."""
+    place: Floats = pitch_mm * (np.arange(strips, dtype=np.float64) - 0.5 * (strips - 1))
+    return ArrayLayout(place, place.copy(), radius_mm, depth_mm)
+
+
+def centroid(response: ArrayLike, around_mm: Floats, *, share: float = 0.0) -> Floats:
+    """Centroid over all elements of at least `share` of the greatest (eq. 2.2).
+
+    With share 0 it is the paper's simple centroid, with 0.5 its threshold centroid.
+    """
+    p = np.asarray(response, np.float64)
+    if share > 0.0:
+        p = np.where(p >= share * p.max(axis=(1, 2), keepdims=True), p, 0.0)
+    # Negative readings stay: cutting them off would turn noise into load all over the array.
+    columns = p.sum(axis=1)
+    total = columns.sum(axis=1)
+    total = np.where(total > 0.0, total, np.nan)
+    place: Floats = columns @ around_mm / total
+    return place
+
+
+def peak(response: ArrayLike, around_mm: Floats) -> Floats:
+    """Top of a parabola through the greatest element and its neighbours in its row.
+
+    At an edge of the array the greatest element itself is the answer.
+    """
+    p = np.asarray(response, np.float64)
+    n, _, columns = p.shape
+    row, column = np.divmod(p.reshape(n, -1).argmax(axis=1), columns)
+    inner = np.clip(column, 1, columns - 2)
+    sample = np.arange(n)
+    a, b, c = (p[sample, row, inner + side] for side in (-1, 0, 1))
+    offset = quadratic_peak(a, b, c, float(around_mm[1] - around_mm[0]))
+    place = around_mm[column] + np.where(inner == column, offset, 0.0)
+    return np.where(p.max(axis=(1, 2)) > 0.0, place, np.nan)
+
+
+def smooth_peak(response: ArrayLike, around_mm: Floats, *, steps: int = 8) -> Floats:
+    """Top of the profile after smoothing with a Gaussian window (mean shift).
+
+    Each step takes the centroid within a window about the last. It looks neither at one
+    element's noise, as `peak` does, nor at far elements, as `centroid` does, and has no
+    threshold for elements to jump across.
+    """
+    profile = np.maximum(np.asarray(response, np.float64), 0.0).sum(axis=1)
+    place: Floats = around_mm[profile.argmax(axis=1)]
+    width = WINDOW_PITCHES * float(around_mm[1] - around_mm[0])
+    for _ in range(steps):
+        off = around_mm - place[:, None]
+        weight = profile * np.exp(-0.5 * (off / width) ** 2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            # A bell under the window of its own width moves only half way: step twice.
+            place = place + 2.0 * (weight * off).sum(axis=1) / weight.sum(axis=1)
+    return place
+
+
+def contact_angle(fx: ArrayLike, fy: ArrayLike, m: ArrayLike, radius_mm: float) -> Floats:
+    """Angle of the contact, rad (eq. 3.5). NaN where |m| >= f r: no single contact.
+
+    m = fy x - fx y = f r sin(psi - theta), psi the direction of the force.
+    """
+    fx, fy, m = (np.asarray(values, np.float64) for values in (fx, fy, m))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        lever = m / (np.hypot(fx, fy) * radius_mm)
+        lever = np.where(np.abs(lever) < 1.0, lever, np.nan)
+    angle: Floats = np.arctan2(fy, fx) - np.arcsin(lever)
+    return angle
+
+
+@dataclass(frozen=True, slots=True)
+class AngleDerivatives:
+    """Derivatives of the contact angle: 1/N, 1/N, 1/(N mm), 1/mm."""
+
+    fx: Floats
+    fy: Floats
+    m: Floats
+    r: Floats
+
+
+def angle_derivatives(
+    fx: ArrayLike, fy: ArrayLike, m: ArrayLike, radius_mm: float
+) -> AngleDerivatives:
+    """Derivatives of `contact_angle` with respect to what goes into it."""
+    fx, fy, m = (np.asarray(values, np.float64) for values in (fx, fy, m))
+    f2 = fx**2 + fy**2
+    f = np.sqrt(f2)
+    g = np.sqrt(1.0 - (m / (f * radius_mm)) ** 2)
+    pull = m / (radius_mm * f2 * f * g)
+    return AngleDerivatives(
+        fx=-fy / f2 + fx * pull,
+        fy=fx / f2 + fy * pull,
+        m=-1.0 / (f * radius_mm * g),
+        r=m / (f * radius_mm**2 * g),
+    )
+
+
+def position_sd_mm(
+    fx: ArrayLike,
+    fy: ArrayLike,
+    m: ArrayLike,
+    radius_mm: float,
+    *,
+    force_sd_n: ArrayLike,
+    torque_sd_nmm: ArrayLike,
+    radius_sd_mm: float = 0.0,
+) -> Floats:
+    """Standard deviation of the contact along the circumference, mm (eq. 3.6 corrected).
+
+    Errors of fx, fy, m and r are taken as independent; fx and fy have the same one.
+    """
+    d = angle_derivatives(fx, fy, m, radius_mm)
+    force_sd, torque_sd = np.asarray(force_sd_n), np.asarray(torque_sd_nmm)
+    variance = (
+        (d.fx**2 + d.fy**2) * force_sd**2 + (d.m * torque_sd) ** 2 + (d.r * radius_sd_mm) ** 2
+    )
+    deviation: Floats = radius_mm * np.sqrt(variance)
+    return deviation
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from skin_host.evaluation.papers.array import centroid, peak, smooth_peak, strip_array
+from skin_host.evaluation.papers.fusion import centroid, peak, smooth_peak, strip_array
 from skin_host.evaluation.papers.truth import LoadPatch, StripArray, box_patch
 
 LAYOUT = strip_array()

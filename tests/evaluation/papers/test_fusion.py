@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from skin_host.errors import CalibrationError
-from skin_host.evaluation.papers.array import strip_array
 from skin_host.evaluation.papers.fingertip_trials import (
     RADIUS_MM,
     RATE_HZ,
@@ -13,8 +12,12 @@ from skin_host.evaluation.papers.fingertip_trials import (
     rms,
     task_errors,
 )
-from skin_host.evaluation.papers.fusion import calibrate_fusion, shear_ratio
-from skin_host.evaluation.papers.planar import contact_angle
+from skin_host.evaluation.papers.fusion import (
+    calibrate_fusion,
+    contact_angle,
+    shear_ratio,
+    strip_array,
+)
 from skin_host.evaluation.papers.truth import planar_load
 
 AROUND = strip_array().around_mm

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skin_host.evaluation.papers.planar import angle_derivatives, contact_angle, position_sd_mm
+from skin_host.evaluation.papers.fusion import angle_derivatives, contact_angle, position_sd_mm
 
 RADIUS = 15.7
 

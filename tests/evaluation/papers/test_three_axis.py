@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skin_host.errors import CalibrationError
-from skin_host.evaluation.papers.three_axis import (
+from skin_host.evaluation.papers.grasp_loops import (
     ThreeAxisSensor,
     dome,
     fit_bilinear,
