@@ -20,6 +20,7 @@ OVERHEAD_BITS = 47
 STUFF_BITS = 5
 #: Frames that a board can have waiting.
 QUEUE_FRAMES = 48
+_NOTHING = FrameBatch.of([])
 
 
 class Wire:
@@ -45,8 +46,7 @@ class Wire:
         self._rng = rng
         #: Frames that their boards have made, `t_ns` when; and those that they have handed over to
         #: the bus, `t_ns` when their transmission ends unless more urgent ones come.
-        self._waiting = FrameBatch.of([])
-        self._under_way = FrameBatch.of([])
+        self._waiting = self._under_way = _NOTHING
         self._free_ns = 0
         self._babble_every_ns = 0
         self._babbled_ns = 0
@@ -72,9 +72,11 @@ class Wire:
             self._add_babble(t_ns)
         if self.off:
             self.lost += len(self._waiting) + len(self._under_way)
-            self._waiting = self._under_way = FrameBatch.of([])
+            self._waiting = self._under_way = _NOTHING
         if len(self._waiting):
             self._hand_over(t_ns)
+        if not len(self._under_way):
+            return self._under_way
         n = int(np.searchsorted(self._under_way.t_ns, t_ns, side="right"))
         sent, self._under_way = _split(self._under_way, n)
         if not n:
@@ -93,6 +95,10 @@ class Wire:
         if not waiting.rising:
             waiting = _rows(waiting, np.argsort(waiting.t_ns, kind="stable"))
         times_ns = waiting.t_ns
+        if times_ns[0] == times_ns[-1] <= t_ns:
+            self._waiting = _NOTHING
+            self._arbitrate(waiting, int(times_ns[0]))
+            return
         turns = np.flatnonzero(times_ns[1:] != times_ns[:-1]) + 1
         taken = 0
         for start, stop in pairwise([0, *turns.tolist(), len(waiting)]):
@@ -133,8 +139,9 @@ class Wire:
 
     def _arbitrate(self, group: FrameBatch, ready_ns: int) -> None:
         """Find out when these frames, and those that they delay, are transmitted."""
-        n = int(np.searchsorted(self._under_way.t_ns, ready_ns, side="right"))
-        ended, backlog = _split(self._under_way, n)
+        under_way = self._under_way
+        n = int(np.searchsorted(under_way.t_ns, ready_ns, side="right")) if len(under_way) else 0
+        ended, backlog = _split(under_way, n)
         free_ns = int(ended.t_ns[-1]) if n else self._free_ns
         group = self._admit(backlog, group)
         # Class and sender decide the arbitration; a sender's own frames stay in its order.
@@ -149,6 +156,10 @@ class Wire:
 
 def _split(batch: FrameBatch, n: int) -> tuple[FrameBatch, FrameBatch]:
     """The first `n` frames, and the others."""
+    if n == len(batch):
+        return batch, _NOTHING
+    if not n:
+        return _NOTHING, batch
     return _rows(batch, slice(n)), _rows(batch, slice(n, None))
 
 

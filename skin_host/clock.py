@@ -228,7 +228,10 @@ class _Jumping(selectors.DefaultSelector):
         self._clock = clock
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        ready = super().select(0)
+        # The loop itself waits for one end of a pair of sockets, by which threads wake it. What
+        # they bring is taken at the loop's next turn anyway.
+        only_threads = len(self.get_map()) <= 1
+        ready = [] if only_threads and timeout is not None else super().select(0)
         if ready or timeout == 0:
             return ready
         if timeout is None:

@@ -23,7 +23,7 @@ from skin_host.bus.answers import (
 )
 from skin_host.bus.commands import BoardType, Message
 from skin_host.bus.compensation import thermal_gains
-from skin_host.bus.wire import TRIANGLES, FrameBatch, MessageClass, encode_sweep
+from skin_host.bus.wire import TRIANGLES, FrameBatch, MessageClass, encode_values
 
 NS_PER_MS = 1_000_000
 INFO_PARTS = 8
@@ -221,11 +221,15 @@ class Burst:
         self._no_load = np.array([board.no_load for _, board, _ in rows], np.int32)
         self._gain = np.array([gain for gain, _ in models], np.int32).reshape(-1, TAXELS)
         self._thermal = np.array([taxel for _, taxel in models], np.intp)
-        self._addresses = np.array([board.address for _, board, _ in rows], np.intp)
-        self._test_mode = np.array([board.sends_raw for _, board, _ in rows], bool)
+        addresses = np.array([board.address for _, board, _ in rows], np.intp)
+        test_mode = np.array([board.sends_raw for _, board, _ in rows], bool)
+        self._test_mode = test_mode if test_mode.any() else None
         classes = np.array([board.message_class for _, board, _ in rows], np.uint32)
-        self._header = np.repeat(classes << 8 | self._addresses.astype(np.uint32) << 4, 2)
+        header = classes << 8 | addresses.astype(np.uint32) << 4
         self._order = self._sending_order()
+        ids = np.repeat((header | self.triangle).astype(np.uint32), 2)
+        self._ids = ids if self._order is None else ids[self._order]
+        self._dlc = np.full(len(ids), 8, np.uint8)
 
     def _sending_order(self) -> NDArray[np.intp] | None:
         parts = []
@@ -242,19 +246,17 @@ class Burst:
         values, status = self._arithmetic(
             raw, self._base, self._shift, self._no_load, self._gain, self._thermal
         )
-        if self._test_mode.any():
+        if self._test_mode is not None:
             values[self._test_mode] = raw[self._test_mode] & 0xFF
             status[self._test_mode] = 0
-        ids, data = encode_sweep(0, self.triangle, values, status)
-        ids = (ids & 0xF | self._header).astype(np.uint32)
-        if (status & 1).any():
+        if status.any() and (status & 1).any():
             silent = np.bincount(self.board[(status & 1).astype(bool)], minlength=len(self.boards))
             for board, count in zip(self.boards, silent, strict=True):
                 board.count_no_ack(int(count))
+        data = encode_values(values, status)
         if self._order is not None:
-            ids, data = ids[self._order], data[self._order]
-        n = len(ids)
-        return FrameBatch(ids, np.full(n, 8, np.uint8), data, np.full(n, t_ns, np.int64))
+            data = data[self._order]
+        return FrameBatch(self._ids, self._dlc, data, np.full(len(data), t_ns, np.int64))
 
 
 def board_order(board: Mtb, n: int) -> NDArray[np.intp]:

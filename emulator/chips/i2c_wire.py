@@ -92,12 +92,13 @@ class DataLine:
         level: of the line, as all see it; low if anybody holds it low.
         seen: its level as it was sampled at the last rise of the clock.
         faulty: any fault is on.
+        asleep: nothing but the master or a fault can change anything: clocks pass it by.
     """
 
     def __init__(self, chips: Mapping[int, Chip], rng: np.random.Generator) -> None:
         self.chips = chips
         self.level = self.seen = True
-        self.faulty = False
+        self.faulty = self.asleep = False
         self._rng = rng
         self._master = self._own = self._sampled = True
         self._state = _State.IDLE
@@ -170,6 +171,7 @@ class DataLine:
         return bool(self._stretched_ns)
 
     def _note(self) -> None:
+        self.asleep = False
         self.faulty = bool(
             self._also
             or self._refused
@@ -186,6 +188,7 @@ class DataLine:
         """The master releases the line or holds it low, while the clock is at `clock`."""
         if level != self._master:
             self._master = level
+            self.asleep = False
             self._settle(clock=clock)
 
     def _settle(self, *, clock: bool) -> None:
@@ -215,6 +218,7 @@ class DataLine:
                 self._until_flip = int(self._rng.geometric(self._flip_share))
         self.seen = self._sampled = level
         if self._state is _State.IDLE:
+            self.asleep = level and not self.faulty
             return
         self._count += 1
         if self._state is _State.SENDING:
@@ -324,6 +328,7 @@ class I2cWire:
         self.lines = [DataLine(on_line, rng) for on_line in chips]
         self.t_ns = 0
         self._clock = self._released = True
+        self._levels = -1
         self._held_until_ns = 0
 
     @property
@@ -352,7 +357,7 @@ class I2cWire:
         if not level:
             if self._clock:
                 self._clock = False
-                held_ns = max([line.fall() for line in self.lines])
+                held_ns = max([line.fall() for line in self.lines if not line.asleep], default=0)
                 if held_ns:
                     self._held_until_ns = self.t_ns + held_ns
         elif not self._clock and self.t_ns >= self._held_until_ns:
@@ -360,9 +365,12 @@ class I2cWire:
 
     def set_sda(self, levels: int) -> None:
         """Release data lines (1) or hold them low (0)."""
-        clock = self._clock
-        for number, line in enumerate(self.lines):
-            line.drive(bool(levels >> number & 1), clock=clock)
+        changed = (levels ^ self._levels) & ((1 << len(self.lines)) - 1)
+        self._levels = levels
+        while changed:
+            number = changed.bit_length() - 1
+            changed ^= 1 << number
+            self.lines[number].drive(bool(levels >> number & 1), clock=self._clock)
 
     def wait(self, dt_ns: int) -> None:
         """Let time pass. A clock that a chip held rises when the chip releases it."""
@@ -379,7 +387,8 @@ class I2cWire:
     def _rise(self) -> None:
         self._clock = True
         for line in self.lines:
-            line.rise()
+            if not line.asleep:
+                line.rise()
 
 
 class BitMaster:
@@ -431,13 +440,15 @@ class BitMaster:
     def put(self, byte: int) -> int:
         """Send a byte on all lines; those that acknowledge it, as bits."""
         for bit in range(7, -1, -1):
-            self._clocked(high=bool(byte >> bit & 1))
+            self._rise(high=bool(byte >> bit & 1))
+            self._fall()
         return ~self._clocked(high=True) & self._lines
 
     def get(self, *, acknowledge: bool) -> list[int]:
         """Take a byte from each of the wire's lines."""
         samples = [self._clocked(high=True) for _ in range(8)]
-        self._clocked(high=not acknowledge)
+        self._rise(high=not acknowledge)
+        self._fall()
         values = []
         for number in range(len(self._wire.lines)):
             value = 0
@@ -454,14 +465,21 @@ class BitMaster:
 
     def _clocked(self, *, high: bool) -> int:
         """One clock; the levels that were sampled meanwhile."""
-        wire = self._wire
-        self._sda(high=high)
-        wire.wait(self._half_ns)
-        self._up()
-        levels = wire.sda
-        wire.wait(self._half_ns)
-        wire.set_scl(False)
+        self._rise(high=high)
+        levels = self._wire.sda
+        self._fall()
         return levels
+
+    def _rise(self, *, high: bool) -> None:
+        """The first half of a clock."""
+        self._sda(high=high)
+        self._wire.wait(self._half_ns)
+        self._up()
+
+    def _fall(self) -> None:
+        """The second half."""
+        self._wire.wait(self._half_ns)
+        self._wire.set_scl(False)
 
     def _up(self) -> None:
         self._wire.set_scl(True)

@@ -39,6 +39,8 @@ THERMAL_UNITS = (0.5, 0.9)
 #: Draws in the tables that all chips share.
 DRAWS = 1 << 18
 _STAGES = np.arange(TAXELS)
+#: For each number of stages that a pass has reached: which stages are of the one before.
+_PASS_OF = (np.arange(TAXELS + 1)[:, None] <= _STAGES).astype(np.intp)
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -134,11 +136,29 @@ class ChipNoise:
         else:
             mixed = _mixed((keys + began_ns).astype(np.uint64))
             normal_at, wave_at = _normal_at(mixed), _wave_at(mixed)
+        return self._drawn(chips, normal_at + _STAGES, wave_at + _STAGES)
+
+    def in_step(self, chips: Ints | slice, began_ns: int, before_ns: int, stages: int) -> Floats:
+        """The same for chips whose passes begin at the same times.
+
+        Args:
+            chips: which ones, intp[k].
+            began_ns, before_ns: when the pass began in which the first `stages` stages were
+                converted, and the one of the others.
+        """
+        keys = self._keys[chips][:, None]
+        mixed = _mixed((keys + np.array((began_ns, before_ns))).astype(np.uint64))
+        of_pass = _PASS_OF[stages]
+        return self._drawn(
+            chips, _normal_at(mixed)[:, of_pass] + _STAGES, _wave_at(mixed)[:, of_pass] + _STAGES
+        )
+
+    def _drawn(self, chips: Ints | slice, normal_at: Ints, wave_at: Ints) -> Floats:
         normals, waves = _tables()
-        noise: Floats = normals[normal_at + _STAGES]
+        noise: Floats = normals[normal_at]
         if self._has_wave:
             noise *= self._normal[chips]
-            noise += self._pads.wave[chips] * waves[wave_at + _STAGES]
+            noise += self._pads.wave[chips] * waves[wave_at]
         return noise
 
 

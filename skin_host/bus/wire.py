@@ -301,16 +301,21 @@ def encode_sweep(
     Returns:
         Identifiers uint32[2k] and data uint8[2k, 8], all of DLC 8.
     """
-    k = len(triangles)
     ids = np.repeat((MessageClass.SKIN_STREAM << 8 | board << 4 | triangles).astype(np.uint32), 2)
-    data = np.empty((k, 2, 8), np.uint8)
-    data[:, 0, 0] = HEADER_A
-    data[:, 0, 1:] = values[:, :VALUES_A]
-    data[:, 1, 0] = HEADER_B
-    data[:, 1, 1:6] = values[:, VALUES_A:]
-    data[:, 1, 6] = status >> 8
-    data[:, 1, 7] = status & 0xFF
-    return ids, data.reshape(2 * k, 8)
+    return ids, encode_values(values, status)
+
+
+def encode_values(values: Bytes, status: NDArray[np.uint16]) -> Bytes:
+    """Return the data uint8[2k, 8] alone of `encode_sweep`."""
+    k = len(values)
+    data = np.empty((k, 2 * 8), np.uint8)
+    data[:, 0] = HEADER_A
+    data[:, 1:8] = values[:, :VALUES_A]
+    data[:, 8] = HEADER_B
+    data[:, 9:14] = values[:, VALUES_A:]
+    # The high byte first, whatever the machine's order.
+    data[:, 14:] = status.astype(">u2").view(np.uint8).reshape(k, 2)
+    return data.reshape(2 * k, 8)
 
 
 def status_word(out_of_range: NDArray[np.bool_], error: NDArray[np.uint8]) -> NDArray[np.uint16]:
