@@ -4,7 +4,8 @@
 commands. Nothing here knows the time of day; only `run` communicates with the outside.
 """
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from heapq import heappop, heappush
 from pathlib import Path
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from emulator import faults, state
 from emulator.boards.arithmetic import TAXELS
+from emulator.boards.board import join
 from emulator.boards.bursts import Bursts
 from emulator.boards.fingertips import Fingertips
 from emulator.boards.mtb import Mtb, make_board, set_up
@@ -40,8 +42,11 @@ NS = 1_000_000_000
 TICK_NS = 1_000_000
 #: How often `run` looks at buses and boards.
 POLL_NS = 2_000_000
-#: A process that was stopped for longer skips the time instead of catching up.
-LONGEST_CATCH_UP_NS = 250_000_000
+#: Boards do not stall with a computer: a process that was held up catches up. One that was stopped
+#: for longer than this first leaves out whole periods of its boards.
+LONGEST_CATCH_UP_NS = 5_000_000_000
+#: Before time is left out, sweeps in progress get so long to end; a full bus is never idle.
+LONGEST_SWEEP_NS = 100_000_000
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -277,7 +282,8 @@ class Robot:
         """
         clock = clock or RealClock()
         links = {name: BoardLink(name, bus) for name, bus in buses.items()}
-        last_ns = clock.now_ns()
+        # The clock also counts the time before this and what is left out.
+        ahead_ns = clock.now_ns() - self.t_ns
         while True:
             commands = [
                 (name, can_id, data)
@@ -285,18 +291,33 @@ class Robot:
                 for can_id, data in link.received()
             ]
             now_ns = clock.now_ns()
-            passed_ns = min(now_ns - last_ns, LONGEST_CATCH_UP_NS)
-            last_ns = now_ns
-            # The clock also counts the time that was skipped.
-            behind_ns = now_ns - passed_ns - self.t_ns
+            if now_ns - ahead_ns - self.t_ns > LONGEST_CATCH_UP_NS:
+                _send(links, self._finish_sweeps(), clock, ahead_ns)
+                ahead_ns += self._to_leave_out_ns(now_ns - ahead_ns - self.t_ns)
+            passed_ns = now_ns - ahead_ns - self.t_ns
             # Commands came one after the other in this time: boards whose computer was busy
             # must not get them all at once, chips convert between them.
+            steps = []
             for command in [*commands, None]:
-                for name, batch in self.step(passed_ns / (len(commands) + 1) / NS).items():
-                    links[name].send(batch, clock.host_ns(batch.t_ns + behind_ns))
+                steps.append(self.step(passed_ns / (len(commands) + 1) / NS))
                 if command is not None:
                     self.receive(*command)
+            _send(links, steps, clock, ahead_ns)
             await clock.sleep_until_ns(now_ns + POLL_NS)
+
+    def _finish_sweeps(self) -> list[dict[str, FrameBatch]]:
+        """Live until all buses are idle."""
+        end_ns = self.t_ns + LONGEST_SWEEP_NS
+        steps = [self.step(0.0)]
+        while not all(wire.idle for wire in self.wires.values()) and self.t_ns < end_ns:
+            steps.append(self.step(TICK_NS / NS))
+        return steps
+
+    def _to_leave_out_ns(self, passed_ns: int) -> int:
+        """Whole periods of all boards, so that none changes its phase, if they are short enough."""
+        together_ns = math.lcm(*(board.period_ns or 1 for board in self._boards))
+        over_ns = max(0, passed_ns - LONGEST_CATCH_UP_NS)
+        return -(-over_ns // together_ns) * together_ns if together_ns < passed_ns else over_ns
 
     # ------------------------------------------------------------------ by hand
 
@@ -405,6 +426,21 @@ class Robot:
 
 def _next_tick_ns(t_ns: int) -> int:
     return -(-t_ns // TICK_NS) * TICK_NS
+
+
+def _send(
+    links: Mapping[str, BoardLink],
+    steps: Sequence[Mapping[str, FrameBatch]],
+    clock: Clock,
+    ahead_ns: int,
+) -> None:
+    """Send what the boards sent in some steps, of each bus at once.
+
+    A host that finds only the first frames of a sweep that is late takes the others for lost.
+    """
+    for name, link in links.items():
+        batch = join([step[name] for step in steps])
+        link.send(batch, clock.host_ns(batch.t_ns + ahead_ns))
 
 
 class LiveProbe:

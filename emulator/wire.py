@@ -66,6 +66,11 @@ class Wire:
         if len(batch):
             self._waiting = join([self._waiting, batch]) if len(self._waiting) else batch
 
+    @property
+    def idle(self) -> bool:
+        """Whether no frame waits or is under way."""
+        return not len(self._waiting) and not len(self._under_way)
+
     def until(self, t_ns: int) -> FrameBatch:
         """The frames whose transmission has ended by `t_ns`, stamped with that moment."""
         if self._babble_every_ns:

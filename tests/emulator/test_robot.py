@@ -246,6 +246,40 @@ async def test_a_busy_computer_delays_frames_but_not_their_time_stamps() -> None
     assert stamps_s[-1] <= clock.now_ns() * 1e-9
 
 
+@pytest.mark.parametrize("stalled_s", [0.3, 1.2, 7.33, 3600.01])
+async def test_boards_do_not_stall_with_their_computer(stalled_s: float) -> None:
+    settings, layout = load()
+    robot = Robot(settings, layout, Scene(noise=False))
+    robot.bring_up()
+    clock = SteppedClock()
+    with (
+        can.Bus(interface="virtual", channel="test-stall") as inside,
+        can.Bus(interface="virtual", channel="test-stall") as outside,
+    ):
+        life = asyncio.create_task(robot.run({"can0": inside}, clock))
+        for _ in range(30):
+            await clock.advance(0.01)
+        # The stall begins while a sweep is on its way, the test ends when none is.
+        while robot.wires["can0"].idle:
+            await clock.advance(0.001)
+        for late_s in (stalled_s, *[0.01] * 30):
+            await clock.advance(late_s)
+        while not robot.wires["can0"].idle:
+            await clock.advance(0.001)
+        life.cancel()
+        frames = list(iter(lambda: outside.recv(0), None))
+    for board in layout.boards:
+        mine = [one for one in frames if one.arbitration_id >> 4 & 0xF == board.settings.address]
+        stamps_s = np.array([one.timestamp for one in mine])
+        sweeps = np.split(stamps_s, np.flatnonzero(np.diff(stamps_s) > 0.02) + 1)
+        assert {len(sweep) for sweep in sweeps} == {2 * len(board.triangles)}
+        pauses_s = np.diff([sweep[0] for sweep in sweeps])
+        periods = np.round(pauses_s / 0.05)
+        assert pauses_s == pytest.approx(0.05 * periods, abs=0.002)
+        assert (np.flatnonzero(periods > 1).size > 0) == (stalled_s > 5.0)
+        assert clock.now_ns() * 1e-9 - stamps_s[-1] < 0.05
+
+
 def test_a_program_can_press_with_a_probe_of_its_own() -> None:
     settings, layout = load()
     robot = Robot(settings, layout, Scene(noise=False))
