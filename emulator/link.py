@@ -74,15 +74,18 @@ class BoardLink:
             if standard and message.arbitration_id >> 4 in _COMMANDS:
                 yield message.arbitration_id, bytes(message.data)
 
-    def send(self, batch: FrameBatch, host_ns: NDArray[np.int64]) -> None:
+    def send(
+        self, batch: FrameBatch, host_ns: NDArray[np.int64], until_ns: int | None = None
+    ) -> None:
         """Send frames in their order; frames that the controller does not take wait, or are lost.
 
         Args:
             batch: the frames.
             host_ns: when they are sent, int64[n], in the host's time of day.
+            until_ns: up to when all frames have now been sent, by the same clock.
         """
         if isinstance(self._bus, PairBus):
-            lost = self._bus.send_batch(batch, host_ns)
+            lost = self._bus.send_batch(batch, host_ns, until_ns)
             self.lost += lost
             self.sent += len(batch) - lost
             return

@@ -292,7 +292,7 @@ class Robot:
             ]
             now_ns = clock.now_ns()
             if now_ns - ahead_ns - self.t_ns > LONGEST_CATCH_UP_NS:
-                _send(links, self._finish_sweeps(), clock, ahead_ns)
+                self._send(links, self._finish_sweeps(), clock, ahead_ns)
                 ahead_ns += self._to_leave_out_ns(now_ns - ahead_ns - self.t_ns)
             passed_ns = now_ns - ahead_ns - self.t_ns
             # Commands came one after the other in this time: boards whose computer was busy
@@ -302,8 +302,24 @@ class Robot:
                 steps.append(self.step(passed_ns / (len(commands) + 1) / NS))
                 if command is not None:
                     self.receive(*command)
-            _send(links, steps, clock, ahead_ns)
+            self._send(links, steps, clock, ahead_ns)
             await clock.sleep_until_ns(now_ns + POLL_NS)
+
+    def _send(
+        self,
+        links: Mapping[str, BoardLink],
+        steps: Sequence[Mapping[str, FrameBatch]],
+        clock: Clock,
+        ahead_ns: int,
+    ) -> None:
+        """Send what the boards sent in some steps, of each bus at once.
+
+        A host that finds only the first frames of a sweep that is late takes the others for lost.
+        """
+        for name, link in links.items():
+            batch = join([step[name] for step in steps])
+            times_ns = clock.host_ns(np.append(batch.t_ns, self.t_ns) + ahead_ns)
+            link.send(batch, times_ns[:-1], int(times_ns[-1]))
 
     def _finish_sweeps(self) -> list[dict[str, FrameBatch]]:
         """Live until all buses are idle."""
@@ -426,21 +442,6 @@ class Robot:
 
 def _next_tick_ns(t_ns: int) -> int:
     return -(-t_ns // TICK_NS) * TICK_NS
-
-
-def _send(
-    links: Mapping[str, BoardLink],
-    steps: Sequence[Mapping[str, FrameBatch]],
-    clock: Clock,
-    ahead_ns: int,
-) -> None:
-    """Send what the boards sent in some steps, of each bus at once.
-
-    A host that finds only the first frames of a sweep that is late takes the others for lost.
-    """
-    for name, link in links.items():
-        batch = join([step[name] for step in steps])
-        link.send(batch, clock.host_ns(batch.t_ns + ahead_ns))
 
 
 class LiveProbe:

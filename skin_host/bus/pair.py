@@ -2,6 +2,10 @@
 
 The demo's emulator lives at one end, the daemon at the other; there is no CAN in the kernel. A
 message holds records of `FRAME`, so that neither side handles single frames.
+
+Boards on a real bus do not wait for a processor. The emulator does, so it marks up to when its
+boards have lived: only so far has the bus been read, and what its boards could not send yet is
+neither late nor lost.
 """
 
 import socket
@@ -22,6 +26,12 @@ from skin_host.errors import BusError
 PAIR = "socketpair"
 #: Time of day (ns), identifier, length, data.
 FRAME = np.dtype([("t_ns", "<i8"), ("id", "<u4"), ("dlc", "u1"), ("data", "u1", (8,))])
+#: Identifier of a record that is no frame: everything up to its time has been sent.
+MARK = 0xFFFF_FFFF
+#: Marks without frames come this often.
+MARK_EVERY_NS = 10_000_000
+#: An emulator that is farther behind than this counts as one that stands still.
+LONGEST_LAG_NS = 5_000_000_000
 #: Frames of one message, and of messages that wait for the other side.
 MOST_FRAMES = 1024
 MOST_WAITING = 20_000
@@ -45,6 +55,7 @@ class PairBus(can.BusABC):
         self._end = end
         self._read: deque[can.Message] = deque()
         self._waiting: deque[bytes] = deque()
+        self._marked_ns = 0
         self.gone = False
 
     def fileno(self) -> int:
@@ -63,11 +74,27 @@ class PairBus(can.BusABC):
             return None
         return np.frombuffer(data, FRAME)
 
-    def send_batch(self, batch: FrameBatch, host_ns: NDArray[np.int64]) -> int:
-        """Send frames with their times of day; how many were lost, as the other side is behind."""
-        records = np.zeros(len(batch), FRAME)
+    def send_batch(
+        self, batch: FrameBatch, host_ns: NDArray[np.int64], until_ns: int | None = None
+    ) -> int:
+        """Send frames.
+
+        Args:
+            batch: the frames.
+            host_ns: their times of day, int64[n].
+            until_ns: all frames up to this time of day have now been sent.
+
+        Returns:
+            How many frames were lost, because the other side is behind.
+        """
+        n = len(batch)
+        records = np.zeros(n, FRAME)
         records["t_ns"], records["id"] = host_ns, batch.id
         records["dlc"], records["data"] = batch.dlc, batch.data
+        if until_ns is not None and (n or abs(until_ns - self._marked_ns) >= MARK_EVERY_NS):
+            self._marked_ns = until_ns
+            mark = np.array([(until_ns, MARK, 0, 0)], FRAME)
+            records = np.concatenate([records, mark])
         for first in range(0, len(records), MOST_FRAMES):
             self._waiting.append(records[first : first + MOST_FRAMES].tobytes())
         self._flush()
@@ -119,6 +146,7 @@ def _message(record: Any) -> can.Message:
 class PairPort(Port):
     """The daemon's end: batches come as they were sent."""
 
+    #: Whole messages are read: one more may be added below it.
     capacity = 2 * MOST_FRAMES
 
     def __init__(self, name: str, settings: Bus, clock: Clock = SYSTEM) -> None:
@@ -129,15 +157,19 @@ class PairPort(Port):
                 f'bus "{name}": {PAIR} {settings.channel}: {error}; wanted the number of a socket'
             ) from None
         self._pair = PairBus(end)
+        self._marked_ns: int | None = None
         super().__init__(name, settings, self._pair, clock)
 
     def read(self) -> FrameBatch:
         messages = []
         n = 0
-        while n <= self.capacity - MOST_FRAMES:
+        while n < self.capacity:
             records = self._pair.receive()
             if records is None:
                 break
+            if records["id"][-1] == MARK:
+                self._marked_ns = int(records["t_ns"][-1])
+                records = records[:-1]
             messages.append(records)
             n += len(records)
         if self._pair.gone and self.state is LinkState.UP:
@@ -152,3 +184,8 @@ class PairPort(Port):
             records["data"].copy(),
             records["t_ns"].astype(np.int64),
         )
+
+    def read_until_ns(self, now_ns: int) -> int:
+        if self._marked_ns is None or self.state is not LinkState.UP:
+            return now_ns
+        return max(now_ns - LONGEST_LAG_NS, min(now_ns, self._marked_ns))

@@ -132,6 +132,12 @@ class Port(ABC):
         The arrays are reused: they are valid until the next read.
         """
 
+    def read_until_ns(self, now_ns: int) -> int:
+        """Return up to when everything sent has been read, by a `read` at `now_ns` that left
+        nothing.
+        """
+        return now_ns
+
     def fileno(self) -> int | None:
         """Return a descriptor that is readable when frames wait, or None; it changes on
         reopening.

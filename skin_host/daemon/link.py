@@ -209,14 +209,15 @@ class Link:
             deliver(output)
         if not drained:
             return
-        self.read_ns = now_ns
+        read_ns = min((port.read_until_ns(now_ns) for port in self.ports.values()), default=now_ns)
+        self.read_ns = read_ns
         if self._is_patient(now_ns):
-            self._engine.ledger.pass_over(now_ns)
+            self._engine.ledger.pass_over(read_ns)
             return
-        self._engine.ledger.look(now_ns)
-        if not 0 <= now_ns - self._expired_ns < EXPIRE_NS:
-            self._expired_ns = now_ns
-            output = self._engine.expire(now_ns)
+        self._engine.ledger.look(read_ns)
+        if not 0 <= read_ns - self._expired_ns < EXPIRE_NS:
+            self._expired_ns = read_ns
+            output = self._engine.expire(read_ns)
             self._note(output)
             deliver(output)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from skin_host.bus.opening import open_port
-from skin_host.bus.pair import MOST_FRAMES, PAIR, PairBus, pair
+from skin_host.bus.pair import LONGEST_LAG_NS, MOST_FRAMES, PAIR, PairBus, pair
 from skin_host.bus.port import LinkState, Port
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import Bus, Receive
@@ -62,6 +62,37 @@ def test_what_the_other_side_never_reads_is_lost_and_counted() -> None:
         # What waits goes on with the next batch.
         far.send_batch(batch(0), np.zeros(0, np.int64))
     assert read + lost == 60 * MOST_FRAMES
+    port.close()
+    far.shutdown()
+
+
+def test_the_bus_is_read_only_as_far_as_the_other_end_has_lived() -> None:
+    far, port = opened()
+    start_ns = 10**18
+    assert port.read_until_ns(start_ns) == start_ns
+    for lived_ns, n in ((0, 0), (2_000_000, 3), (30_000_000, 0), (500_000_000, MOST_FRAMES)):
+        sent = batch(n)
+        far.send_batch(sent, sent.t_ns, start_ns + lived_ns)
+        assert len(port.read()) == n
+        assert len(port.read()) == 0
+        assert port.read_until_ns(start_ns + 10**9) == start_ns + lived_ns
+        assert port.read_until_ns(start_ns + lived_ns - 1) == start_ns + lived_ns - 1
+    # It does not hold up time for ever.
+    assert port.read_until_ns(start_ns + 3600 * 10**9) == start_ns + 3600 * 10**9 - LONGEST_LAG_NS
+    far.shutdown()
+    port.read()
+    assert port.read_until_ns(start_ns + 10**9) == start_ns + 10**9
+    port.close()
+
+
+def test_a_read_that_left_something_is_at_its_capacity() -> None:
+    far, port = opened()
+    for _ in range(4):
+        sent = batch(700)
+        far.send_batch(sent, sent.t_ns, 10**18)
+    reads = [len(port.read()) for _ in range(3)]
+    assert reads == [2100, 700, 0]
+    assert reads[0] >= port.capacity > reads[1]
     port.close()
     far.shutdown()
 
