@@ -116,6 +116,7 @@ class Boards:
             board.settings.address: BoardRecord(i, ledger.row[i], board) for i, board in boards
         }
         self.strangers: dict[int, int] = {}
+        self._failed = False
         for record in self.records.values():
             mine = [triangle for triangle in triangles if triangle.board == record.index]
             record.commands = configuration(record.layout, mine)
@@ -129,6 +130,13 @@ class Boards:
         Raises:
             BusError: the bus does not take frames.
         """
+        try:
+            await self._bring_up(listen)
+        except BusError:
+            self._failed = True
+            raise
+
+    async def _bring_up(self, listen: bool) -> None:
         if listen:
             await self._listen()
         await self._port.send([command_frame(Discover(), BROADCAST_ADDRESS)])
@@ -210,6 +218,19 @@ class Boards:
         seen_ns = self._ledger.regular_period_ns(record.row)
         period_ns = record.layout.settings.period_ms * 1e6
         return seen_ns is not None and abs(seen_ns - period_ns) <= WRONG_PERIOD * period_ns
+
+    def awaits(self, address: int) -> bool:
+        """Whether a board has sent nothing yet because it has not had its time for that: it is
+        being discovered or set up.
+        """
+        record = self.records[address]
+        has_sent = bool(self._ledger.sweeps[record.row])
+        return not (has_sent or record.retries or self._failed)
+
+    @property
+    def awaits_all(self) -> bool:
+        """Whether the bus has boards, and none has had its time to send yet."""
+        return bool(self.records) and all(map(self.awaits, self.records))
 
     def supervise(self) -> None:
         """Supervise every board; actions run as separate tasks, so this does not wait for them.

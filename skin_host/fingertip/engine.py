@@ -41,6 +41,7 @@ class TipState:
         assembler: of its samples; None until the full scales are known.
         saturated_ns: when a sample was last saturated, 0 if never.
         silenced: how often the board has timed out.
+        awaited: the board is being set up and has not had the time to send yet.
     """
 
     name: str
@@ -54,6 +55,7 @@ class TipState:
     saturated_ns: int = 0
     silenced: int = 0
     alive: bool = False
+    awaited: bool = False
     zeroing: list[Floats] = field(default_factory=list)
 
     @property

@@ -86,7 +86,7 @@ class FingertipHealth:
         record: FingertipRecord = {
             "part": state.name,
             "kind": "fingertip",
-            "state": _STATES.get(faults[0].code, "degraded") if faults else "ok",
+            "state": _state(state, faults),
             "bus": table.bus,
             "address": table.address,
             "samples": 0 if counters is None else counters.samples,
@@ -115,7 +115,7 @@ class FingertipHealth:
         def fault(code: str, sentence: str) -> Fault:
             return Fault(f"fingertip_{code}", name, sentence)
 
-        if not state.frames:
+        if not state.frames and not state.awaited:
             yield fault("absent", f"{here} has not sent anything yet; check power and address")
         elif not state.alive and now_ns is not None:
             yield fault(
@@ -164,9 +164,14 @@ class FingertipHealth:
 
 
 _STATES = {
-    "fingertip_absent": "no data",
     "fingertip_silent": "silent",
     "fingertip_not_configured": "not configured",
     "fingertip_not_calibrated": "not calibrated",
     "fingertip_saturated": "saturated",
 }
+
+
+def _state(tip: TipState, faults: list[Fault]) -> str:
+    if not tip.frames:
+        return "no data"
+    return _STATES.get(faults[0].code, "degraded") if faults else "ok"

@@ -48,6 +48,8 @@ class StrainBoards:
         self._bus = bus
         self._port = port
         self._boards = [_Known(state) for state in tips]
+        for state in tips:
+            state.awaited = True
         self._clock = clock
         self._busy: asyncio.Task[None] | None = None
 
@@ -57,8 +59,13 @@ class StrainBoards:
         Raises:
             BusError: the bus does not take frames.
         """
-        for board in self._boards:
-            await self._set_up(board)
+        try:
+            for board in self._boards:
+                await self._set_up(board)
+        except BusError:
+            for board in self._boards:
+                board.state.awaited = False
+            raise
 
     def claim(self, strangers: dict[int, int]) -> None:
         """Remove our boards from the boards that answered discovery and are not skin boards."""
@@ -75,6 +82,7 @@ class StrainBoards:
                     board.retries = 0
             well = now_ns - board.heard_ns <= SILENT_NS and board.state.assembler is not None
             due = board.started and now_ns >= board.retry_at_ns
+            board.state.awaited &= not (due or board.frames)
             if due and not well and self._busy is None:
                 self._busy = asyncio.create_task(self._mend(board))
 

@@ -113,9 +113,9 @@ class Health:
             *(port.state for port in ports.values()),
             *(dict(manager.strangers) for manager in boards.values()),
             *(
-                (known.board_type, known.in_bootloader)
+                (known.board_type, known.in_bootloader, manager.awaits(address))
                 for manager in boards.values()
-                for known in manager.records.values()
+                for address, known in manager.records.items()
             ),
         )
 

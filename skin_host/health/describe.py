@@ -72,16 +72,17 @@ class Describer:
         buses = sorted({self._layout.boards[i].settings.bus for i in layout.boards})
         pipeline = self._engine.pipeline
         calibration = self._engine.calibration
+        valid = self._valid(part)
         record: Record = {
             "part": layout.name,
-            "state": self._state(part, pressure),
+            "state": self._state(part, pressure, valid),
             "frames": watch.frames,
             "rate_hz": round(watch.rate_hz, 2),
             "taxels": int(np.count_nonzero(pressure)),
-            "valid_taxels": 0 if watch.valid is None else int(np.count_nonzero(watch.valid)),
-            "invalid": _listed(None if watch.valid is None else pressure & ~watch.valid),
+            "valid_taxels": 0 if valid is None else int(np.count_nonzero(valid)),
+            "invalid": _listed(None if valid is None else pressure & ~valid),
             "beyond_range": _listed(watch.beyond),
-            "triangles": self._triangles(part),
+            "triangles": self._triangles(part, boards),
             "taxel_verdicts": self._verdicts(part, pressure),
             "decides_kpa": self._decides_kpa(part),
             "taxel_faults": self._taxel_faults(part, pressure),
@@ -98,23 +99,51 @@ class Describer:
             record["age_ms"] = _age_ms(now_ns, watch.last_ns or None)
         return record
 
-    def _state(self, part: int, pressure: NDArray[np.bool_]) -> str:
+    def _valid(self, part: int) -> Mask | None:
+        """Return the valid taxels of a part, bool[m], so that every other one has a known reason.
+
+        They are those of its last sample; those that were late for it, which is no fault until
+        their board times out; and those in whose chip or pad there has been no doubt since.
+        """
+        watch, ledger = self._watch.parts[part], self._engine.ledger
+        now = self._engine.intake.liveness.doubted
+        cleared = [
+            then if now is None else then & ~now
+            for then in watch.doubted
+            if then is not None and then is not now
+        ]
+        if watch.valid is None or (watch.late is None and not cleared):
+            return watch.valid
+        layout = self._layout.parts[part]
+        valid = watch.valid.copy()
+        for index in layout.boards:
+            taxels, row = self._layout.boards[index].taxel_index, ledger.row[index]
+            fitted = (taxels >= layout.start) & (taxels < layout.stop)
+            mine = taxels[fitted] - layout.start
+            # A chip that does not answer is not late.
+            if watch.late is not None and not ledger.flagged[row]:
+                valid[mine] |= watch.late[mine]
+            for pads in cleared:
+                valid[mine] |= self._of_board(pads, row)[fitted]
+        return valid
+
+    def _state(self, part: int, pressure: NDArray[np.bool_], valid: Mask | None) -> str:
         watch = self._watch.parts[part]
         if part in self._engine.disabled:
             return "disabled"
         if self._engine.calibration is None:
             return "not calibrated"
-        if not watch.frames or watch.valid is None:
+        if not watch.frames or valid is None:
             return "no data"
-        if not watch.valid.any():
+        if not valid.any():
             return "silent"
-        return "ok" if watch.valid[pressure].all() else "degraded"
+        return "ok" if valid[pressure].all() else "degraded"
 
-    def _triangles(self, part: int) -> list[TriangleHealth]:
+    def _triangles(self, part: int, boards: dict[str, Boards]) -> list[TriangleHealth]:
         """Return the triangles of a part that have a fault."""
         unwell: list[TriangleHealth] = []
         for board, numbers in self._fitted[part].items():
-            if self._all_well(board):
+            if self._all_well(board) or self._awaits(board, boards):
                 continue
             name = self._layout.boards[board].name
             for number in numbers:
@@ -134,6 +163,11 @@ class Describer:
             and not ledger.flagged[row]
             and not self._of_board(self._engine.intake.liveness.unproven, row).any()
         )
+
+    def _awaits(self, board: int, boards: dict[str, Boards]) -> bool:
+        """Whether a board has not had the time to send yet."""
+        settings = self._layout.boards[board].settings
+        return settings.bus in boards and boards[settings.bus].awaits(settings.address)
 
     @staticmethod
     def _of_board(of_triangles: Mask, row: int) -> Mask:
@@ -257,7 +291,7 @@ class Describer:
             "bus": board.settings.bus,
             "address": board.settings.address,
             "skin_type": board.settings.skin_type,
-            "alive": sweep is not None and not ledger.is_silent(row),
+            "alive": sweep is not None and not ledger.is_silent(row) and not self._is_new(index),
             "sweeps": int(ledger.sweeps[row]),
             "fitted": list(board.triangles),
             "triangles_present": 0 if sweep is None else _count(sweep.present, board.triangles),
@@ -277,6 +311,7 @@ class Describer:
                 "wrong_type": kind is not None and kind not in SKIN_BOARD_TYPES,
                 "firmware": known.firmware,
                 "in_bootloader": known.in_bootloader,
+                "awaited": manager.awaits(board.settings.address),
                 "configurations": known.configurations,
                 "silences": int(ledger.silences[row]),
                 "resets": int(ledger.resets[row]),
@@ -292,6 +327,20 @@ class Describer:
             }
             record["twice"] = watch.is_twice(now_ns)
         return record
+
+    def _is_new(self, index: int) -> bool:
+        """Whether a board that had timed out sends again, but no sample has its values yet."""
+        sweep = self._engine.ledger.last[self._engine.ledger.row[index]]
+        if sweep is None or self._engine.ledger.flagged[self._engine.ledger.row[index]]:
+            return False
+        for part, fitted in self._fitted.items():
+            watch = self._watch.parts[part]
+            if index in fitted and watch.lost is not None and sweep.t_ns > watch.sample_ns:
+                taxels = self._layout.boards[index].taxel_index[fitted[index], 0]
+                first = taxels - self._layout.parts[part].start
+                if (watch.lost[first // TAXELS_PER_TRIANGLE] >= watch.late_samples).all():
+                    return True
+        return False
 
     def _bus(
         self,
@@ -316,7 +365,8 @@ class Describer:
         watch = self._watch.buses[name]
         if watch.gained and now_ns is not None:
             record["last_second"] = _last_second(watch.gained, bus.bitrate)
-            record["silent"] = watch.silent
+            awaited = manager is not None and manager.awaits_all
+            record["silent"] = watch.silent and not awaited
         return record
 
 

@@ -89,7 +89,8 @@ def diagnose(record: Record, lost_lately: Collection[str] = ()) -> list[Fault]:
             continue
         found = list(_board(board))
         faults += found
-        if any(fault.code in {"board_silent", "board_absent"} for fault in found):
+        absent = any(fault.code in {"board_silent", "board_absent"} for fault in found)
+        if absent or board.get("awaited"):
             silent.add(board["name"])
     faults += _triangles(record, silent)
     faults += _taxels(record)
@@ -100,7 +101,7 @@ def diagnose(record: Record, lost_lately: Collection[str] = ()) -> list[Fault]:
                 "taxel_unproven",
                 record["part"],
                 f"{named(record['invalid'])} of {record['part']}: not valid: the pad failed when "
-                "calibrated under pressure, jumps, or has not yet shown that it works",
+                "calibrated under pressure, or jumps",
             )
         )
     faults += _output(record.get("output"), lost_lately)
@@ -187,7 +188,7 @@ def _board(board: BoardHealth) -> Iterator[Fault]:
     here = f"board {name} (address {board['address']})"
     if board.get("in_bootloader"):
         yield Fault("board_in_bootloader", name, f"{here} is in its bootloader: no firmware runs")
-    elif not board["alive"]:
+    elif not board["alive"] and not board.get("awaited"):
         if board["sweeps"]:
             yield Fault(
                 "board_silent",

@@ -62,9 +62,10 @@ class BoardHealth(TypedDict):
     """One board.
 
     `period_seen_ms` and `jitter_ms` come from the kernel's time stamps of its last sweeps;
-    `in_doubt` counts taxels whose zero is unknown; `lately` has the counters among `resets`,
-    `lost_set_ups`, `tx_overflows` and `rezeros` that rose within the last minute; `twice`: two
-    boards send at its address.
+    `in_doubt` counts taxels whose zero is unknown; `awaited`: since the start
+    it has not had the time to send; `lately` has the counters among `resets`, `lost_set_ups`,
+    `tx_overflows` and `rezeros` that rose within the last minute; `twice`: two boards send at its
+    address.
     """
 
     name: str
@@ -85,6 +86,7 @@ class BoardHealth(TypedDict):
     wrong_type: NotRequired[bool]
     firmware: NotRequired[tuple[int, int, int] | None]
     in_bootloader: NotRequired[bool]
+    awaited: NotRequired[bool]
     configurations: NotRequired[int]
     silences: NotRequired[int]
     resets: NotRequired[int]

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from skin_host.bus.boards import Boards
 from skin_host.bus.port import Port
+from skin_host.layout import TAXELS_PER_TRIANGLE
 from skin_host.processing.core import Engine, Output, Step
-from skin_host.processing.masks import any_of
+from skin_host.processing.masks import Mask, any_of
+from skin_host.processing.pipeline import PressureFrame
 
 #: Rates are means over about this time.
 RATE_S = 2.0
@@ -27,8 +29,18 @@ ALONE_NS = 50_000_000
 
 @dataclass(slots=True)
 class PartWatch:
-    """Counters of a part's samples, and arrays of the last sample."""
+    """Counters of a part's samples, and arrays of the last sample.
 
+    Attributes:
+        late_samples: a triangle that was not received for fewer samples in a row is only late.
+        lost: int64[k], for how many samples in a row each triangle was not received; None if all
+            were.
+        late: bool[m], taxels that are late and were valid before.
+        doubted: bool[16 b, 12], pads that were in doubt after the last sample but one, and after
+            the last one: its own doubts are between them.
+    """
+
+    late_samples: int
     last_ns: int = 0
     frames: int = 0
     rate_hz: float = 0.0
@@ -38,14 +50,21 @@ class PartWatch:
     touched: NDArray[np.bool_] | None = None
     beyond: NDArray[np.bool_] | None = None
     raw: NDArray[np.uint8] | None = None
+    lost: NDArray[np.int64] | None = None
+    late: NDArray[np.bool_] | None = None
+    doubted: tuple[Mask | None, Mask | None] = (None, None)
+    sample_ns: int = 0
 
-    def note(self, step: Step) -> None:
-        """Take in a processed sample."""
+    def note(self, step: Step, doubted: Mask | None) -> None:
+        """Take in a processed sample, with the pads that are in doubt now."""
         frame = step.frame
+        self.sample_ns = frame.t_ns
+        self.doubted = self.doubted[1], doubted
         if any_of(frame.valid):
             self.last_ns = frame.t_ns
             self.frames += 1
             self.rate_frames += 1
+        self._note_lost(frame)
         self.valid = frame.valid
         self.touched = frame.touched
         self.beyond = frame.beyond_range
@@ -58,6 +77,17 @@ class PartWatch:
             self.rate_hz = self.rate_frames / elapsed_s if elapsed_s > 0.0 else 0.0
             self.rate_since_ns = frame.t_ns
             self.rate_frames = 0
+
+    def _note_lost(self, frame: PressureFrame) -> None:
+        # Where nothing was received there is 0. A sample of nothing reports silence.
+        if b"\0" not in frame.raw.tobytes() or not frame.raw.any() or self.valid is None:
+            self.lost = self.late = None
+            return
+        lost = np.logical_not(frame.raw.reshape(-1, TAXELS_PER_TRIANGLE).any(axis=1))
+        count = np.zeros(lost.shape, np.int64) if self.lost is None else self.lost
+        self.lost = np.where(lost, count + 1, 0)
+        late = np.repeat(lost & (self.lost < self.late_samples), TAXELS_PER_TRIANGLE)
+        self.late = late & (self.valid if self.late is None else self.valid | self.late)
 
 
 @dataclass(slots=True)
@@ -139,7 +169,9 @@ class Watch:
             board: engine.layout.boards[board].settings.period_ms * 1_000_000
             for board in engine.boards
         }
-        self.parts = {part: PartWatch() for part in engine.parts}
+        #: By then a board that sends nothing has timed out.
+        late_samples = int(periods) + 1
+        self.parts = {part: PartWatch(late_samples) for part in engine.parts}
         self.boards = {board: BoardWatch() for board in engine.boards}
         self.buses = {
             bus: BusWatch(
@@ -161,7 +193,7 @@ class Watch:
     def note(self, output: Output) -> None:
         """Take in one output of the core."""
         for step in output.steps:
-            self.parts[step.part].note(step)
+            self.parts[step.part].note(step, self._engine.intake.liveness.doubted)
 
     def tick(self, now_ns: int, ports: dict[str, Port], boards: dict[str, Boards]) -> None:
         """Read all counters; to be called several times a second."""

@@ -1,15 +1,19 @@
 """The whole daemon lives by the clock that it is given: robot, buses and host in one event loop."""
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import pytest
 
 from emulator.probes.scene import Fault, Place, Probe, Scene
 from skin_host.clock import EPOCH_NS, SteppedClock
 from skin_host.config.settings import Bus
 from skin_host.health import Record
 from skin_host.mqtt.messages import ContactState
+from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.events import TouchEvent
 from tests.support.live import Live, living
 from tests.support.stepped import stepped
@@ -119,6 +123,63 @@ async def test_a_clock_that_is_set_changes_no_contact(clock: SteppedClock, tmp_p
             clock.set(jump_s)
             await clock.sleep(0.1511)
         assert said == {("left_hand", "ON"), ("left_hand", "move"), ("left_forearm", "OFF")}
+
+
+@stepped
+async def test_a_board_has_its_time_before_it_is_called_absent(
+    clock: SteppedClock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[tuple[float, str, str]] = []
+    put = Publisher.put_health
+    began_s = clock.monotonic_s()
+
+    def note(self: Publisher, part: str, record: Mapping[str, Any]) -> None:
+        at_s = clock.monotonic_s() - began_s
+        said.extend((at_s, fault["code"], fault["where"]) for fault in record["faults"])
+        put(self, part, record)
+
+    monkeypatch.setattr(Publisher, "put_health", note)
+    bus = Bus(interface="virtual", channel="stepped-i")
+    # First without a calibration, then with one, and the second time a board stays silent.
+    async with living(bus, tmp_path, clock=clock) as live:
+        await live.until_well(but=LATELY)
+    silent = {"bus_silent", "board_absent", "board_silent", "triangle_missing"}
+    assert not {code for _, code, _ in said} & silent
+    said.clear()
+    began_s = clock.monotonic_s()
+    async with living(bus, tmp_path, clock=clock, hung=["hand"]) as live:
+        await live.until("board_absent")
+        await clock.sleep(5.0)
+    absent = [at_s for at_s, code, where in said if (code, where) == ("board_absent", "hand")]
+    assert 0.5 < absent[0] < 2.0
+    assert max(np.diff(absent)) < 1.5  # it does not come and go
+    assert {where for _, code, where in said if code in silent} == {"hand"}
+
+
+@stepped
+async def test_what_comes_late_or_is_well_again_is_no_pad_that_fails(
+    clock: SteppedClock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whenever health is made, every taxel that is not valid has a reason that is known."""
+    async with well(clock, tmp_path, "stepped-j") as live:
+        said: set[str] = set()
+
+        async def watched(seconds: float) -> None:
+            for _ in range(round(seconds / 0.02)):
+                await clock.sleep(0.02)
+                said.update(code for code, _ in live.faults())
+
+        for fault in (
+            Fault(name="frame_loss", bus="can0", value=0.002),
+            Fault(name="chip_gone", board="hand", triangle=2),
+            Fault(name="board_silent", board="forearm_outer"),
+        ):
+            mend = live.robot.inject(fault)
+            await watched(1.0)
+            mend()
+            await watched(2.0)
+        assert "board_silent" in said
+        assert "taxel_unproven" not in said
 
 
 @stepped

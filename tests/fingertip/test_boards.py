@@ -79,7 +79,7 @@ class Bench:
 
 async def test_a_board_is_asked_for_its_full_scales_set_up_and_zeroed() -> None:
     bench = Bench()
-    assert bench.codes() == ["absent"]
+    assert "absent" not in bench.codes()
     assert bench.record()["state"] == "no data"
     await bench.boards.bring_up()
     await bench.run(0.4)
@@ -91,6 +91,18 @@ async def test_a_board_is_asked_for_its_full_scales_set_up_and_zeroed() -> None:
     assert record["rate_hz"] == pytest.approx(333, rel=0.05)
     assert record["lone"] == 0
     assert bench.record("thumb")["rate_hz"] == pytest.approx(100, rel=0.05)
+
+
+async def test_a_board_that_never_sends_is_absent_once_it_has_had_its_time() -> None:
+    bench = Bench()
+    bench.robot.inject(parse("board_silent board=index"))
+    await bench.boards.bring_up()
+    await bench.run(0.2)
+    assert "absent" not in bench.codes()
+    await bench.run(1.5)
+    assert "absent" in bench.codes()
+    assert bench.record()["state"] == "no data"
+    assert "absent" not in bench.codes("thumb")
 
 
 async def test_metrics_tell_of_fingertips() -> None:
