@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from emulator.boards.arithmetic import TAXELS
 from emulator.chips.noise import SENT_UNIT_FF, PadNoise
-from emulator.probes.air import AirCourse, read_course
 from emulator.probes.contacts import ContactPads, Contacts, ContactSource, joined
 from emulator.probes.coverage import Coverage
 from emulator.probes.foam import INFINERGY_LOSS, Drive, Foam, FoamLayer, Footprint
 from emulator.probes.pads import Jumps, Pads, draw_dead, draw_noise_ff, draw_resting_ff
-from emulator.probes.scene import Air, Moment, Probe, Scene, Script
+from emulator.probes.scene import Air, AirCourse, Moment, Probe, Scene, Script, read_air
 from emulator.probes.viscoelastic import FoamTruth
 from skin_host.bus.compensation import GAIN, GAIN_V2
 from skin_host.errors import ConfigurationError
@@ -177,7 +176,7 @@ class Skin:
         for number, air in enumerate(airs):
             try:
                 part = self._layout.part(air.part)
-                keyframes = read_course(Path(air.file)) if air.file else air.pressure_kpa
+                keyframes = read_air(Path(air.file)) if air.file else air.pressure_kpa
             except KeyError:
                 raise ConfigurationError(f'air[{number}].part: no part "{air.part}"') from None
             except ConfigurationError as error:

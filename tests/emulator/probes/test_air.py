@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emulator.probes.air import AirCourse, read_course
-from emulator.probes.scene import Air, Probe, Scene, load
+from emulator.probes.scene import Air, AirCourse, Probe, Scene, load, read_air
 from emulator.robot import Robot
 from skin_host.config.settings import load as load_settings
 from skin_host.errors import ConfigurationError
@@ -77,7 +76,7 @@ def test_a_recorded_course_is_read_without_its_spikes(tmp_path: Path) -> None:
     path.write_text("time_s,pressure_kpa\n100,5\n100.1,5\n100.2,25\n100.3,6\n100.4,-1\n")
 
     wanted = [(0, 5), (0.1, 5), (0.2, 6), (0.3, 6), (0.4, 0)]
-    np.testing.assert_allclose(read_course(path), wanted, atol=1e-9)
+    np.testing.assert_allclose(read_air(path), wanted, atol=1e-9)
 
 
 def test_a_scene_finds_its_course_beside_itself(tmp_path: Path) -> None:
