@@ -23,12 +23,13 @@ from skin_host.processing.core import Engine
 from skin_host.processing.curves import Curves
 from skin_host.processing.fitting.course import (
     Course,
+    GainFit,
     activations,
     find_lag,
     fit_course,
+    fit_gains,
     median_of_moving,
 )
-from skin_host.processing.fitting.gains import GainFit, fit_gains
 from skin_host.processing.fitting.hold import Fit, HoldRecord, fit, merge
 from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.relaxation import make_model, parameters_of

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.errors import RequestError, SkinError
+from skin_host.errors import RequestError, SkinError, required
 from skin_host.files import write_atomic
 from skin_host.layout import Layout, PadKind
 from skin_host.processing.calibration import Calibration, Verdict
@@ -235,13 +235,7 @@ def _pyplot() -> Any:
     Raises:
         SkinError: it is not installed.
     """
-    try:
-        import matplotlib as mpl
-    except ImportError:
-        raise SkinError(
-            "pictures need the package matplotlib, which is not installed; "
-            "mend it with: pip install 'skin-host[plots]'"
-        ) from None
+    mpl = required("matplotlib", "pictures", "plots")
     mpl.use("Agg")
     from matplotlib import pyplot
 

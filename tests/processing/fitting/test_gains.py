@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skin_host.processing.fitting.gains import BEND_RANGE, GAIN_RANGE, fit_gains
+from skin_host.processing.fitting.course import BEND_RANGE, GAIN_RANGE, fit_gains
 
 LEVELS_FF = np.linspace(10.0, 200.0, 6)[:, np.newaxis]
 
