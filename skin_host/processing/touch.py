@@ -258,7 +258,7 @@ class Residuals:
     def __init__(self, n: int) -> None:
         self._on = np.zeros(n, np.float32)
         self._firmer = np.zeros(n, np.float32)
-        self._votes = np.full(n, 2, np.int64)
+        self._votes = np.zeros(n, np.int64)
         #: The hardest press of each taxel, fading.
         self._pressed = np.zeros(n, np.float32)
         self._felt = np.zeros(n, np.float32)
@@ -280,8 +280,8 @@ class Residuals:
             votes: int[n], measurements in a row that end a firm press.
         """
         np.copyto(self._on, on, casting="same_kind")
-        firmer = np.where(np.isfinite(on), firm, 0.0) - np.where(np.isfinite(on), on, 0.0)
-        np.copyto(self._firmer, np.fmax(firmer, on), casting="same_kind")
+        with np.errstate(invalid="ignore"):  # both are infinite where nothing is touched
+            np.copyto(self._firmer, np.fmax(firm - on, on), casting="same_kind")
         self._votes = votes
 
     def step(self, touched: Mask, signal: Array, repeated: Mask | None = None) -> Mask:

@@ -34,6 +34,11 @@ def connected(
     return outbox
 
 
+def test_before_anything_was_put_nothing_is_counted() -> None:
+    counters = Outbox(16).counters
+    assert not any(getattr(counters, name) for name in counters.__slots__)
+
+
 @given(st.lists(st.sampled_from(["a", "b", "c"])))
 def test_every_frame_is_taken_or_counted(parts: list[str]) -> None:
     outbox = connected()

@@ -65,8 +65,9 @@ def test_an_erratic_pad_is_believed_again_when_it_was_calm_for_a_minute():
     assert not found.pads.any()
 
 
-def test_a_new_zero_begins_without_old_jumps():
-    found = jumping(10)
+@pytest.mark.parametrize("jumps", [0, 10])
+def test_a_new_zero_begins_without_old_jumps(jumps: int):
+    found = jumping(jumps)
     found.reset(np.array([False, True, False]))
     assert not found.any
     found.look(samples(0, 9, 0))

@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 from itertools import pairwise
 
@@ -104,6 +105,12 @@ def test_a_weak_press_needs_as_many_measurements_as_its_noise_demands():
     assert touched_over([6] * 5, found=found).index(True) == 1
 
 
+@pytest.mark.parametrize(("units", "idle"), [(0, True), (2, True), (3, False)])
+def test_a_sweep_is_skipped_unless_it_adds_evidence(units: int, idle: bool) -> None:
+    detector = detector_of(levels_of(2.0, 1.0, 1.0, 1.0))
+    assert detector.is_idle(np.array([REST - units], np.uint8)) is idle
+
+
 def test_a_taxel_without_a_vote_is_never_touched():
     found = levels_of(np.inf, np.inf, 1.0, 1.0)
     assert not any(touched_over([200] * 20, found=found))
@@ -199,6 +206,16 @@ def test_noise_reaches_its_span_as_rarely_as_it_was_made_for(spread):
         begun += int(np.count_nonzero(touched & ~before))
         before = touched
     assert begun < n * steps / 1e4
+
+
+@pytest.mark.parametrize("spread", [0.5, 1.0, 2.0])
+def test_noise_alone_takes_a_thousand_million_measurements_for_a_touch(spread: float) -> None:
+    """By Siegmund's mean time to a false alarm of a cumulative sum."""
+    found = levels(np.zeros(1), np.array([spread]), TouchSettings(hysteresis_units=0.1))
+    drift = found.enter[0] / spread
+    bound = found.span[0] / spread + 1.166  # the sum goes beyond its bound by so much
+    measurements = math.exp(2 * drift * bound) / (2 * drift**2)
+    assert measurements == pytest.approx(1e9)
 
 
 def reported_after_a_press(press, rest, *, rest_s=0.0):
