@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Set
 from contextlib import AbstractContextManager
 from itertools import chain, pairwise
 from typing import Protocol
@@ -46,17 +46,24 @@ class OpenPort(Protocol):
         """See `bus.opening.open_port`."""
 
 
-def _by_time(batches: list[tuple[str, FrameBatch]]) -> Iterator[tuple[str, FrameBatch]]:
-    """Yield what was read of several buses in slices of time, the frames of a slice bus by bus.
+def _by_time(
+    batches: list[tuple[str, FrameBatch]], joined: Set[str]
+) -> Iterator[tuple[str, FrameBatch]]:
+    """Yield what was read of several buses, and what `joined` ones sent in slices of time, the
+    frames of a slice bus by bus.
 
     After a pause of this computer each bus has several sweeps waiting. Taken bus by bus, the last
-    sweep of one would join the first of another to one frame of a part.
+    sweep of one would join the first of another to one frame of a part. Buses without such a part
+    are taken whole, because slices cost most when this computer is late already.
     """
     if len(batches) < 2 or all(batch.t_ns[-1] - batch.t_ns[0] < SLICE_NS for _, batch in batches):
         yield from batches
         return
     slices: list[tuple[int, str, FrameBatch]] = []
     for bus, batch in batches:
+        if bus not in joined:
+            yield bus, batch
+            continue
         # The order of a bus's frames is kept, even where its clock was set back.
         number = np.maximum.accumulate(batch.t_ns) // SLICE_NS
         starts = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), len(batch)]
@@ -109,6 +116,9 @@ class Link:
             # Negative keys never collide with board indices.
             for tip in fingertips.tips.values():
                 periods_ns[~tip.number] = tip.settings.period_ms * 1_000_000
+        bus_of = {i: layout.boards[i].settings.bus for i in engine.boards}
+        of_parts = [{bus_of[i] for i in layout.parts[part].boards} for part in engine.parts]
+        self._joined = {bus for buses in of_parts if len(buses) > 1 for bus in buses}
         alone = [(key,) for key in periods_ns if key < 0]
         fastest_ns = [
             min(periods_ns[one] for one in layout.parts[part].boards) for part in engine.parts
@@ -201,7 +211,7 @@ class Link:
             drained &= len(batch) < port.capacity
             record(bus, batch)
             batches.append((bus, batch))
-        for bus, batch in _by_time(batches):
+        for bus, batch in _by_time(batches, self._joined):
             output = self._engine.feed(bus, batch)
             if output.answers:
                 self._note_answers(bus, output.answers)

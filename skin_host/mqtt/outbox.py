@@ -271,11 +271,15 @@ class Outbox:
         return {topic: self.retained[topic] for topic in islice(self.pending, most)}
 
     def states_sent(self, states: dict[str, bytes]) -> None:
-        """Note that these have arrived. Newer payloads of their topics are still to be sent."""
+        """Note that these have arrived. Newer payloads of their topics are still to be sent, after
+        all others that wait.
+        """
         self.counters.retained_sent += len(states)
         for topic, payload in states.items():
-            if self.retained[topic] is payload:
-                self.pending.pop(topic, None)
+            was_pending = topic in self.pending
+            self.pending.pop(topic, None)
+            if was_pending and self.retained[topic] is not payload:
+                self.pending[topic] = None
             self.trials.arrived(topic)
         if not self.pending:
             self.emptied.set()

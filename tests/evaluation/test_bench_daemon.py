@@ -7,6 +7,7 @@ import pytest
 
 from skin_host.bus.wire import TAXELS, TRIANGLES
 from skin_host.evaluation.body_stream import Body
+from skin_host.evaluation.can_stream import CAN_FRAME
 from skin_host.evaluation.measured_daemon import RoomClock, _room_of
 from skin_host.layout import build_layout
 from skin_host.processing import curves
@@ -16,10 +17,11 @@ from skin_host.processing import curves
 def test_no_bus_carries_more_than_it_can(hz: int) -> None:
     body = Body.of(10_000, hz)
     ticks = body.ticks(np.zeros((body.boards, TRIANGLES, TAXELS), np.uint8))
-    per_bus = np.bincount([bus for tick in ticks for bus, _ in tick])
+    frames = [(bus, len(burst) // CAN_FRAME.size) for tick in ticks for bus, burst in tick]
+    per_bus = np.bincount([bus for bus, _ in frames], [n for _, n in frames])
     assert per_bus.sum() == 2 * body.triangles
     assert per_bus.max() <= 8000 / hz
-    assert max(len(tick) for tick in ticks) <= 9 * len(body.ports)
+    assert max(n for _, n in frames) <= 9
 
 
 def test_a_body_has_the_taxels_that_were_asked_for(tmp_path) -> None:  # type: ignore[no-untyped-def]

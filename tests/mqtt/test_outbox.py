@@ -362,6 +362,17 @@ def test_states_are_taken_in_their_order_and_stay_until_they_have_arrived() -> N
     assert outbox.emptied.is_set()
 
 
+def test_states_that_change_whenever_they_are_sent_do_not_keep_the_others_waiting() -> None:
+    outbox = connected()
+    for topic in ("restless", "restless too", "quiet"):
+        outbox.put_state(topic, b"0")
+    first = outbox.take_states(2)
+    for topic in first:
+        outbox.put_state(topic, b"1")
+    outbox.states_sent(first)
+    assert list(outbox.take_states(3)) == ["quiet", "restless", "restless too"]
+
+
 def test_a_state_that_the_broker_does_not_take_is_not_repeated_until_it_changes() -> None:
     outbox = connected()
     outbox.put_state("t", b"too long")
