@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable, Iterator, Set
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from itertools import chain, pairwise
 from typing import Protocol
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 #: Waiting sweeps and samples are checked this often.
 EXPIRE_NS = 20_000_000
-#: Frames that several buses sent within this time may be taken bus by bus.
+#: Frames that several buses with a common part sent within this time may be taken bus by bus.
 SLICE_NS = 10_000_000
 #: A turn that comes later than planned by this was held up by other work on this computer.
 HELD_UP_NS = 25_000_000
@@ -47,25 +47,21 @@ class OpenPort(Protocol):
 
 
 def _by_time(
-    batches: list[tuple[str, FrameBatch]], joined: Set[str]
+    batches: list[tuple[str, FrameBatch]], slice_ns: int
 ) -> Iterator[tuple[str, FrameBatch]]:
-    """Yield what was read of several buses, and what `joined` ones sent in slices of time, the
-    frames of a slice bus by bus.
+    """Yield what was read of several buses in slices of time, the frames of a slice bus by bus.
 
     After a pause of this computer each bus has several sweeps waiting. Taken bus by bus, the last
-    sweep of one would join the first of another to one frame of a part. Buses without such a part
-    are taken whole, because slices cost most when this computer is late already.
+    sweep of one would join the first of another to one frame of a part, and the chips of all boards
+    would be judged once for each bus and period, not once for each period.
     """
-    if len(batches) < 2 or all(batch.t_ns[-1] - batch.t_ns[0] < SLICE_NS for _, batch in batches):
+    if len(batches) < 2 or all(batch.t_ns[-1] - batch.t_ns[0] < slice_ns for _, batch in batches):
         yield from batches
         return
     slices: list[tuple[int, str, FrameBatch]] = []
     for bus, batch in batches:
-        if bus not in joined:
-            yield bus, batch
-            continue
         # The order of a bus's frames is kept, even where its clock was set back.
-        number = np.maximum.accumulate(batch.t_ns) // SLICE_NS
+        number = np.maximum.accumulate(batch.t_ns) // slice_ns
         starts = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), len(batch)]
         rows = RecordBatch(batch.id, batch.dlc, batch.data, batch.t_ns)
         slices += [(int(number[begin]), bus, rows[begin:end]) for begin, end in pairwise(starts)]
@@ -118,7 +114,10 @@ class Link:
                 periods_ns[~tip.number] = tip.settings.period_ms * 1_000_000
         bus_of = {i: layout.boards[i].settings.bus for i in engine.boards}
         of_parts = [{bus_of[i] for i in layout.parts[part].boards} for part in engine.parts]
-        self._joined = {bus for buses in of_parts if len(buses) > 1 for bus in buses}
+        # Buses that share no part keep their time to a period: so each slice has a sweep of every
+        # board, and there are few slices, which matters most when this computer is late already.
+        shared = any(len(buses) > 1 for buses in of_parts)
+        self._slice_ns = SLICE_NS if shared else min(periods_ns.values(), default=SLICE_NS)
         alone = [(key,) for key in periods_ns if key < 0]
         fastest_ns = [
             min(periods_ns[one] for one in layout.parts[part].boards) for part in engine.parts
@@ -211,7 +210,7 @@ class Link:
             drained &= len(batch) < port.capacity
             record(bus, batch)
             batches.append((bus, batch))
-        for bus, batch in _by_time(batches, self._joined):
+        for bus, batch in _by_time(batches, self._slice_ns):
             output = self._engine.feed(bus, batch)
             if output.answers:
                 self._note_answers(bus, output.answers)

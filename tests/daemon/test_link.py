@@ -139,20 +139,16 @@ def test_a_silent_board_is_found_on_a_computer_that_pauses_again_and_again(reade
     assert reader.now_ns - began_ns <= 1000 * MS
 
 
-def late_turn(parts: dict[str, list[str]]) -> list[Output]:
-    """What a turn gives after eight periods of boards b and c, each on its own bus."""
+def test_what_waited_on_several_buses_is_taken_by_its_time_and_not_by_its_bus() -> None:
+    """Otherwise a frame of a part would join sweeps of different times."""
     boards = {"b": Board(bus="can0", address=1), "c": Board(bus="can1", address=1)}
     settings = Settings(
         robot="r",
         buses={"can0": Bus(), "can1": Bus()},
         boards=boards,
-        parts={
-            part: Part(patches=[Patch(board=name, triangles="0-3") for name in names])
-            for part, names in parts.items()
-        },
+        parts={"p": Part(patches=[Patch(board=name, triangles="0-3") for name in boards])},
     )
-    engine = Engine(settings, build_layout(settings, Path()), list(range(len(parts))))
-    link = Link(engine, open_port=StillPort)
+    link = Link(Engine(settings, build_layout(settings, Path()), [0]), open_port=StillPort)
     values = np.full((TRIANGLES, 12), 240, np.uint8)
     ids, data = wire.encode_sweep(1, np.arange(TRIANGLES), values, np.zeros(TRIANGLES, np.uint16))
     for number, port in enumerate(link.ports.values()):
@@ -166,18 +162,6 @@ def late_turn(parts: dict[str, list[str]]) -> list[Output]:
         port.waiting.append(FrameBatch.of(frames))
     outputs: list[Output] = []
     link.turn(T0 + 8 * PERIOD, outputs.append)
-    return outputs
-
-
-def test_what_waited_on_several_buses_is_taken_by_its_time_and_not_by_its_bus() -> None:
-    """Otherwise a frame of a part would join sweeps of different times."""
-    outputs = late_turn({"p": ["b", "c"]})
     sweeps = [(sweep.t_ns, sweep.board) for output in outputs for sweep in output.sweeps]
     assert len(sweeps) == 16
     assert sweeps == sorted(sweeps)
-
-
-def test_what_waited_on_buses_that_share_no_part_is_taken_at_once_for_each() -> None:
-    """Slices cost most when this computer is late already."""
-    outputs = [output for output in late_turn({"p": ["b"], "q": ["c"]}) if output.sweeps]
-    assert [len(output.sweeps) for output in outputs] == [8, 8]
