@@ -8,5 +8,5 @@
   41 three-axis elements on a dome, and the hand that grasps with them (`grasp_loops`).
 - "A study of multi-axial tactile sensors": two beams and three gauges (`force_torque`).
 
-`truth` and `fingertip_trials` are the emulated fingertips that the methods are measured against.
+`truth` has the emulated fingertips that the methods are measured against.
 """

@@ -20,14 +20,13 @@ from skin_host.evaluation.localization_trials import (
     localizer_for,
     separation,
 )
-from skin_host.evaluation.papers.fingertip_trials import (
+from skin_host.evaluation.papers.force_torque import PlanarStructure, intrinsic_errors
+from skin_host.evaluation.papers.fusion import (
     METHODS,
     SINGLE_METHODS,
-    intrinsic_errors,
     rms,
     task_errors,
 )
-from skin_host.evaluation.papers.force_torque import PlanarStructure
 from skin_host.evaluation.papers.grasp_loops import DETECTORS, false_alarms_per_hour, slip_trials
 from skin_host.fingertip.intrinsic import PUBLISHED_FRICTION_FACTOR, sphere_error_bound
 

@@ -8,7 +8,7 @@ columns, usually fx fy fz (N) and mx my mz (N mm).
 Where gauges are placed: two published fingertips as parametric models, and a search.
 `cylinder_response` is the thin-walled cylinder with six gauges of Bicchi and Dario, eqs. 16-17.
 `PlanarStructure` is the pair of beams of the multi-axial study, Tables 1-3. Both give response
-matrices for `condition_number`.
+matrices for `condition_number`. `intrinsic_errors` locates contacts by force and torque alone.
 """
 
 from collections.abc import Callable
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skin_host.errors import CalibrationError
+from skin_host.fingertip.intrinsic import locate, point_covariance, sphere
 
 Floats = NDArray[np.float64]
 
@@ -314,3 +315,39 @@ def pattern_search(
         if not improved:
             shrink *= 0.5
     return best, lowest
+
+
+def intrinsic_errors(
+    force_n: float, rng: np.random.Generator, samples: int, *, radius_mm: float = 13.0
+) -> tuple[float, float, float]:
+    """Contacts on the sphere of Bicchi and Dario with noise that gives 0.2 mm at 1 N.
+
+    Returns:
+        rms error and its first-order prediction, mm, and the share of samples in which no
+        single contact was found.
+    """
+    normal = rng.normal(size=(samples, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    side = np.cross(normal, rng.normal(size=(samples, 3)))
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    lean = rng.uniform(0.0, 0.3, (samples, 1))
+    force = force_n * (lean * side - normal) / np.sqrt(1.0 + lean**2)
+    point = radius_mm * normal
+    torque = np.cross(point, force)
+    # Two tangential directions, each moved by force and torque noise alike.
+    unit = 0.2 / radius_mm / 2.0
+    sd = np.array([unit, unit, unit, radius_mm * unit, radius_mm * unit, radius_mm * unit])
+    noisy = np.hstack([force, torque]) + sd * rng.normal(size=(samples, 6))
+    found = locate(
+        noisy[:, :3],
+        noisy[:, 3:],
+        sphere(radius_mm),
+        minimum_force_n=0.05,
+        pitch_limit_mm=np.inf,
+    )
+    error = np.linalg.norm(found.point_mm - point, axis=1)
+    exact = locate(force, torque, sphere(radius_mm), minimum_force_n=0.05)
+    covariance = point_covariance(force, torque, exact, np.diag(sd**2))
+    predicted = np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean())
+    rms = float(np.sqrt(np.nanmean(np.square(error))))
+    return rms, float(predicted), float(np.isnan(error).mean())

@@ -2,21 +2,19 @@ import numpy as np
 import pytest
 
 from skin_host.errors import CalibrationError
-from skin_host.evaluation.papers.fingertip_trials import (
+from skin_host.evaluation.papers.fusion import (
     RADIUS_MM,
     RATE_HZ,
     SINGLE_METHODS,
     TASKS,
     TrialFingertip,
-    make_task,
-    rms,
-    task_errors,
-)
-from skin_host.evaluation.papers.fusion import (
     calibrate_fusion,
     contact_angle,
+    make_task,
+    rms,
     shear_ratio,
     strip_array,
+    task_errors,
 )
 from skin_host.evaluation.papers.truth import planar_load
 

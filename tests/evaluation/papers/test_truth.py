@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from skin_host.evaluation.papers.fingertip_trials import RATE_HZ, TASKS, make_task
+from skin_host.evaluation.papers.fusion import RATE_HZ, TASKS, make_task
 from skin_host.evaluation.papers.truth import (
     PRINTED_MATRIX,
     LoadPatch,
