@@ -13,10 +13,9 @@ from skin_host.client.presence import Contact
 from skin_host.client.session import SkinClient
 from skin_host.client.streams import Stream
 from skin_host.mqtt.address import Broker
-from skin_host.mqtt.frames import Frame
 from skin_host.mqtt.grasping import Over, Slip
 from skin_host.mqtt.info import NodeInfo
-from skin_host.mqtt.messages import Touch
+from skin_host.mqtt.messages import Frame, Touch
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)

@@ -4,9 +4,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 from skin_host.client.presence import Contact
-from skin_host.mqtt.frames import Frame, decode_frame
 from skin_host.mqtt.grasping import Over, Slip, decode_over, decode_slip
-from skin_host.mqtt.messages import Touch, decode_contact, decode_health, decode_touch
+from skin_host.mqtt.messages import Frame, Touch, decode_contact, decode_health, decode_touch
 from skin_host.mqtt.payload import MessageError
 from skin_host.mqtt.topics import PartTopic
 
@@ -60,6 +59,9 @@ def read(
             raise MessageError(f'a {kind} of "{event.part}" among those of "{part}"')
         return event
     if kind == "frame":
+        # numpy makes up half of the time that it takes to import the client.
+        from skin_host.mqtt.frames import decode_frame
+
         return decode_frame(part, payload)
     if not payload:
         return None

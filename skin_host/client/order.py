@@ -6,9 +6,8 @@ are passed on as they arrive.
 
 from dataclasses import dataclass, field
 
-from skin_host.mqtt.frames import Frame
 from skin_host.mqtt.grasping import Over, Slip
-from skin_host.mqtt.messages import Touch
+from skin_host.mqtt.messages import Frame, Touch
 from skin_host.mqtt.order import Stamp
 
 Event = Touch | Slip | Over

@@ -25,10 +25,9 @@ from skin_host.mqtt.connection import (
     explain,
     message_properties,
 )
-from skin_host.mqtt.frames import Frame
 from skin_host.mqtt.grasping import Over, Slip
 from skin_host.mqtt.info import NodeInfo, decode_info, join_pieces
-from skin_host.mqtt.messages import Touch
+from skin_host.mqtt.messages import Frame, Touch
 from skin_host.mqtt.order import run_of, stamp_of
 from skin_host.mqtt.payload import JSON_TYPE
 from skin_host.mqtt.topics import ONLINE, PartTopic, Topics

@@ -7,9 +7,8 @@ from typing import Any, Generic, TypeVar, cast
 
 from msgspec.structs import replace
 
-from skin_host.mqtt.frames import Frame
 from skin_host.mqtt.grasping import Over, Slip
-from skin_host.mqtt.messages import Touch
+from skin_host.mqtt.messages import Frame, Touch
 from skin_host.mqtt.topics import PartTopic
 
 #: How many items a stream holds for a slow reader; then the oldest is dropped and counted.

@@ -26,13 +26,12 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from skin_host.errors import SkinError
+from skin_host.mqtt.messages import SCALE_KPA, Frame
 from skin_host.mqtt.packets import pack_number, pack_text
 from skin_host.mqtt.payload import MAX_TAXELS, Count, Int64, MessageError, check_size, decode
 from skin_host.processing.masks import Mask, any_of
 
 FRAME_SCHEMA: Final = "skin.frame/1"
-#: One unit of the values of a frame.
-SCALE_KPA = 0.01
 #: RFC 8746, section 2.1: typed arrays of little-endian signed 16-bit and 32-bit integers.
 _TYPED_ARRAYS: dict[int, np.dtype[Any]] = {77: np.dtype("<i2"), 78: np.dtype("<i4")}
 _INT32 = 2**31 - 1
@@ -101,30 +100,6 @@ if TYPE_CHECKING:
 
 
 HexMask = Annotated[str, Meta(max_length=MAX_TAXELS // 4)]
-
-
-class Frame(Struct, frozen=True, eq=False):
-    """A received frame. Arrays have one entry per taxel [m], in the part's order.
-
-    Attributes:
-        pressure_kpa: float64; 0 where not valid.
-        valid: the taxel was received and is reliable.
-        beyond_range: the pressure is above the calibrated range: its order is right, its
-            value an estimate.
-        raw: uint8, the bytes as the boards sent them; None unless they were requested
-            (command `raw`).
-        missed: how many sweeps of the part lie between this frame and the one received
-            before it. They were lost, or left out on purpose (`mqtt.frame_hz`).
-    """
-
-    part: str
-    seq: int
-    t_ns: int
-    pressure_kpa: NDArray[np.float64]
-    valid: Mask
-    beyond_range: Mask
-    missed: int = 0
-    raw: NDArray[np.uint8] | None = None
 
 
 class _FrameFields(Struct, omit_defaults=True):

@@ -14,16 +14,17 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import msgspec
-import numpy as np
 from msgspec import Meta, Struct
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
-from skin_host.mqtt.frames import SCALE_KPA
+from skin_host.mqtt.messages import SCALE_KPA
 from skin_host.mqtt.payload import MessageError, Vector, decode
 from skin_host.mqtt.topics import Topics
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from skin_host.config.fingertips import Fingertip
     from skin_host.layout import Layout, PartLayout
 
@@ -280,12 +281,12 @@ def _fingertip_info(tip: "Fingertip") -> FingertipInfo:
     )
 
 
-def _rounded(values: NDArray[np.float64], decimals: int) -> Any:
+def _rounded(values: "NDArray[np.float64]", decimals: int) -> Any:
     # Adding 0 turns a rounded -0.0 into 0.0.
-    return (np.round(values, decimals) + 0.0).tolist()
+    return (values.round(decimals) + 0.0).tolist()
 
 
-def _vectors(values: NDArray[np.float64], decimals: int) -> list[Vector]:
+def _vectors(values: "NDArray[np.float64]", decimals: int) -> list[Vector]:
     return [(x, y, z) for x, y, z in _rounded(values, decimals)]
 
 

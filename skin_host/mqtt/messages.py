@@ -1,10 +1,11 @@
 """Messages of touches, contact and health. Pure: converts data to payload bytes and back.
 
-`docs/mqtt.md` is the contract.
+`docs/mqtt.md` is the contract. A received frame is described here, too, and decoded in `frames`:
+programs that only want touches never load numpy.
 """
 
 import math
-from typing import Annotated, Any, Final, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args
 
 import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
@@ -20,10 +21,18 @@ from skin_host.mqtt.payload import (
 )
 from skin_host.processing.events import Load, Reason, TouchEvent
 
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from skin_host.processing.masks import Mask
+
 TOUCH_SCHEMA: Final = "skin.touch/1"
 #: ON: touched; OFF: not touched; UNKNOWN: some of the part cannot feel.
 ContactState = Literal["ON", "OFF", "UNKNOWN"]
 HEALTH_SCHEMA: Final = "skin.health/1"
+#: One unit of the values of a frame.
+SCALE_KPA = 0.01
 #: Decimals of kPa, of mm2, of m (0.001 mm), of N, of N m and of the parts of a unit vector.
 KPA_DECIMALS = 3
 MM2_DECIMALS = 2
@@ -31,6 +40,30 @@ M_DECIMALS = 6
 N_DECIMALS = 4
 NM_DECIMALS = 6
 NORMAL_DECIMALS = 4
+
+
+class Frame(Struct, frozen=True, eq=False):
+    """A received frame. Arrays have one entry per taxel [m], in the part's order.
+
+    Attributes:
+        pressure_kpa: float64; 0 where not valid.
+        valid: the taxel was received and is reliable.
+        beyond_range: the pressure is above the calibrated range: its order is right, its
+            value an estimate.
+        raw: uint8, the bytes as the boards sent them; None unless they were requested
+            (command `raw`).
+        missed: how many sweeps of the part lie between this frame and the one received
+            before it. They were lost, or left out on purpose (`mqtt.frame_hz`).
+    """
+
+    part: str
+    seq: int
+    t_ns: int
+    pressure_kpa: "NDArray[np.float64]"
+    valid: "Mask"
+    beyond_range: "Mask"
+    missed: int = 0
+    raw: "NDArray[np.uint8] | None" = None
 
 
 class LoadMessage(Struct, frozen=True, kw_only=True):

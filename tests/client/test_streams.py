@@ -5,9 +5,8 @@ from msgspec.structs import replace
 
 from skin_host.client.heard import Contact
 from skin_host.client.streams import HELD, Stream
-from skin_host.mqtt.frames import Frame
 from skin_host.mqtt.grasping import Over
-from skin_host.mqtt.messages import Touch
+from skin_host.mqtt.messages import Frame, Touch
 
 
 def touch(count: int, t_ns: int | None = None, part: str = "palm") -> Touch:
