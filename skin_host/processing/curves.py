@@ -33,6 +33,8 @@ GRID_UNITS = 0.25
 _PIECE_AT: NDArray[np.intp] = np.searchsorted(
     KNOTS_UNITS, np.arange(-GRID_UNITS, KNOTS_UNITS[-1], GRID_UNITS), side="right"
 )
+#: The largest power of two that is not above their number.
+HALF_KNOTS = 1 << (len(KNOTS_UNITS).bit_length() - 1)
 #: A curve rises by at least this much per unit, so that it has an inverse.
 LEAST_SLOPE = 1e-3
 #: Below zero a curve is as steep as up to this knot at least: noise may make its first piece flat,
@@ -131,9 +133,13 @@ class TableCurve:
 
     def __init__(self, table_kpa: Floats, beyond_units: Floats) -> None:
         n, knots = table_kpa.shape
-        self._knot_kpa = table_kpa.reshape(-1)
         #: Where each taxel's pieces begin: as many as knots, because one is below zero.
         self._first = np.arange(n) * knots
+        #: Where they end, filled up for a search by halves.
+        ends = np.full((n, 2 * HALF_KNOTS), np.inf)
+        ends[:, : knots - 1] = table_kpa[:, :-1]
+        self._ends_kpa = ends.reshape(-1)
+        self._before = np.arange(n) * 2 * HALF_KNOTS - 1
         self.beyond_units = beyond_units
         rising = np.diff(table_kpa, axis=1) / np.diff(KNOTS_UNITS)
         chord = table_kpa[:, STEEP_KNOT] / KNOTS_UNITS[STEEP_KNOT]
@@ -148,6 +154,7 @@ class TableCurve:
         """Return the curves of some of the taxels; they share the tables of all."""
         chosen = copy(self)
         chosen._first = self._first[taxels]
+        chosen._before = self._before[taxels]
         chosen.beyond_units = self.beyond_units[taxels]
         chosen.linear = self.linear[taxels]
         chosen.straight_kpa = self.straight_kpa[taxels]
@@ -166,16 +173,13 @@ class TableCurve:
     def units(self, kpa: ArrayLike) -> Floats:
         """Return the activation [..., n] in units for these pressures; inverse of kpa."""
         c = np.asarray(kpa, dtype=np.float64)
-        # The piece is the number of knots, without the last, that are not above the pressure.
-        last = len(KNOTS_UNITS) - 1
-        knot = self._first - 1
-        piece = np.zeros(np.broadcast(c, knot).shape, np.intp)
-        step = 1 << (last.bit_length() - 1)
+        end = np.broadcast_to(self._before, np.broadcast(c, self._before).shape).copy()
+        step = HALF_KNOTS
         while step:
-            tried = np.minimum(piece + step, last)
-            piece = np.where(self._knot_kpa.take(tried + knot) <= c, tried, piece)
+            passed = self._ends_kpa.take(end + step) <= c
+            end += passed * step
             step >>= 1
-        place = piece + self._first
+        place = end - self._before + self._first
         result: Floats = (c - self._level.take(place)) / self._slope.take(place)
         return result
 

@@ -630,8 +630,7 @@ class _OwnCurves:
         self._touched: Mask | None = None
         #: Taxels with a filter and a memory of their own: the touched ones, or all.
         self._felt_memory: PlayRelaxation | None = None
-        self._all = np.arange(m)
-        self._set_apart(self._all[:0])
+        self._set_apart(np.zeros(0, np.intp), 0)
         #: Which were touched since the last fold.
         self._felt: Mask = np.zeros(m, np.bool_)
         self._touching = False
@@ -647,35 +646,41 @@ class _OwnCurves:
             self._touched = touched
             self._felt |= touched
             self._take_back()
-            which = np.flatnonzero(touched)
-            # Where much is touched, the rest is likely to feel something, too.
-            self._set_apart(which if 4 * len(which) <= len(touched) else self._all)
+            felt = np.flatnonzero(touched)
+            if 4 * len(felt) <= len(touched):
+                self._set_apart(felt, len(felt))
+            else:
+                # Where much is touched, the rest is likely to feel something, too.
+                self._set_apart(slice(None), len(touched))
             self._report(relaxation_kpa)
         which = self._which
-        if not len(which):
+        if not self._apart:
             return self._reported
         self._touching = True
-        smooth = self._felt_smoother.step(momentary.take(which), dt_s)
+        mine = momentary if isinstance(which, slice) else momentary.take(which)
+        smooth = self._felt_smoother.step(mine, dt_s)
         if self._felt_memory is not None:
             self._felt_memory.step(smooth, dt_s, self._relaxed)
             relaxation_kpa[which] = self._relaxed
         pressure = smooth - self._relaxed
-        np.maximum(pressure, self._zeros[: len(which)], out=pressure)
+        np.maximum(pressure, self._zeros[: self._apart], out=pressure)
+        if isinstance(which, slice):
+            return pressure
         reported = self._reported.copy()
         reported[which] = pressure
         return reported
 
-    def _set_apart(self, which: NDArray[np.intp]) -> None:
-        """Step these taxels apart from the others, in steps that cost as much as they are."""
-        self._which = which
-        self._relaxed = np.zeros(len(which), np.float32)
+    def _set_apart(self, which: NDArray[np.intp] | slice, count: int) -> None:
+        """Step so many taxels apart from the others, in steps that cost as much as they are."""
+        self._which, self._apart = which, count
+        self._relaxed = np.zeros(count, np.float32)
         self._felt_smoother = self._smoother.part(which)
         if self._memory is not None:
             self._felt_memory = self._memory.part(which)
 
     def _take_back(self) -> None:
         """Bring the state of all taxels up to date."""
-        if len(self._which):
+        if self._apart:
             self._smoother.take_back(self._which, self._felt_smoother)
             if self._memory is not None and self._felt_memory is not None:
                 self._memory.take_back(self._which, self._felt_memory)
@@ -692,7 +697,7 @@ class _OwnCurves:
         self._smoother.step(momentary, self._folded_s)
         if self._touching:
             self._smoother.take_back(self._which, self._felt_smoother)
-            self._touching = bool(len(self._which))
+            self._touching = self._apart > 0
             if self._touched is not None:
                 np.copyto(self._felt, self._touched)
         self._folded_s = 0.0
@@ -749,7 +754,7 @@ class _OwnCurves:
         self.erratic.reset(taxels)
         if self._memory is not None:
             self._memory.reset(taxels)
-        self._set_apart(self._which)
+        self._set_apart(self._which, self._apart)
 
     def without_rails(self, raw: NDArray[np.uint8], present: Mask, offset: Floats) -> Mask:
         """Leave out bytes at the ends of the range: 0, and 255 far from rest, are not readings."""

@@ -51,14 +51,14 @@ class StepFilter:
         np.multiply(smooth, kept, out=smooth)
         return np.subtract(kpa, smooth, out=smooth)
 
-    def part(self, taxels: NDArray[np.intp]) -> "StepFilter":
-        """Return a filter of some taxels, int[k], that continues from their present state."""
+    def part(self, taxels: NDArray[np.intp] | slice) -> "StepFilter":
+        """Return a filter of some taxels that continues from their present state."""
         part = StepFilter(self._limit[taxels], self._time_s, self._limit.dtype)
         part.smooth[...] = self.smooth[taxels]
         return part
 
-    def take_back(self, taxels: NDArray[np.intp], part: "StepFilter") -> None:
-        """Adopt the state of some taxels, int[k], from a filter of them."""
+    def take_back(self, taxels: NDArray[np.intp] | slice, part: "StepFilter") -> None:
+        """Adopt the state of some taxels from a filter of them."""
         self.smooth[taxels] = part.smooth
 
     def _share_kept(self, dt_s: float) -> Any:

@@ -13,6 +13,7 @@ from skin_host.processing.relaxation.base import (
     Flush,
     Parameters,
     TumblingMean,
+    all_finite,
     approach,
     as_modes,
     check_modes,
@@ -268,45 +269,47 @@ class PlayRelaxation:
             raise ValueError(f"{len(self._radius)} radii and {len(self._weight)} weights")
         plays = len(self._radius)
         self._plays: Array = np.zeros((plays, n), dtype=dtype)
-        self._near: Array = np.empty_like(self._plays)
-        self._far: Array = np.empty_like(self._plays)
-        self._floor: Array = np.zeros_like(self._plays)
+        #: Both ends of where each play may be, relative to the reading and absolute.
+        self._reach = np.concatenate([-self._radius, self._radius])
+        self._ends: Array = np.empty((2 * plays, n), dtype=dtype)
+        self._near, self._far = self._ends[:plays], self._ends[plays:]
+        self._floor: Array = np.zeros(n, dtype=dtype)
         self._reading: Array = np.zeros(n, dtype=dtype)
-        self._input = FiniteInput(n, dtype)
         self.bytes_per_taxel = (plays + 1) * np.dtype(dtype).itemsize
 
     def step(self, pressure_kpa: Array, dt_s: float, out: Array | None = None) -> Array:
         """Return the relaxation [n] in kPa at the end of the step; see `Relaxation`."""
-        finite = self._input.take(np.asarray(pressure_kpa, dtype=self._plays.dtype))
-        reading = np.fmax(finite, self._floor[0], out=self._reading)
+        reading = np.asarray(pressure_kpa, dtype=self._plays.dtype)
+        if not all_finite(reading):
+            reading = np.where(np.isfinite(reading), reading, self._reading)
+        reading = np.maximum(reading, self._floor, out=self._reading)
         near, far = self._near, self._far
-        np.subtract(reading, self._radius, out=near)
-        np.add(reading, self._radius, out=far)
+        np.add(reading, self._reach, out=self._ends)
         np.maximum(self._plays, near, out=self._plays)
         np.minimum(self._plays, far, out=self._plays)
         np.maximum(near, self._floor, out=near)
         np.subtract(self._plays, near, out=far)
         return mix(self._weight, far, out)
 
-    def part(self, taxels: NDArray[np.intp]) -> "PlayRelaxation":
-        """Return a model of some taxels, int[k], that continues from their present state."""
+    def part(self, taxels: NDArray[np.intp] | slice) -> "PlayRelaxation":
+        """Return a model of some taxels, k of them, that continues from their present state."""
         radius, weight = (
             values if values.shape[1] == 1 else values[:, taxels]
             for values in (self._radius, self._weight)
         )
-        k, dtype = len(taxels), self._plays.dtype
-        part = PlayRelaxation(k, radius_kpa=radius, weight=weight, dtype=dtype)
+        reading, dtype = self._reading[taxels], self._plays.dtype
+        part = PlayRelaxation(len(reading), radius_kpa=radius, weight=weight, dtype=dtype)
         part._plays[...] = self._plays[:, taxels]
-        part._input.last[...] = self._input.last[taxels]
+        part._reading[...] = reading
         return part
 
-    def take_back(self, taxels: NDArray[np.intp], part: "PlayRelaxation") -> None:
-        """Adopt the state of some taxels, int[k], from a model of them."""
+    def take_back(self, taxels: NDArray[np.intp] | slice, part: "PlayRelaxation") -> None:
+        """Adopt the state of some taxels from a model of them."""
         self._plays[:, taxels] = part._plays
-        self._input.last[taxels] = part._input.last
+        self._reading[taxels] = part._reading
 
     def reset(self, mask: NDArray[np.bool_] | None = None) -> None:
         """Forget the history of all taxels, or of those in `mask` [n]."""
         where = slice(None) if mask is None else mask
         self._plays[:, where] = 0.0
-        self._input.last[where] = 0.0
+        self._reading[where] = 0.0
