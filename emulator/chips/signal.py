@@ -62,7 +62,7 @@ class SignalSkin:
         self._n_stages = np.ones(n, np.int64)
         self._stage_ns = np.full(n, reg.STAGE_NS[0], np.int64)
         self._start_ns = np.zeros(n, np.int64)
-        self._taken = np.zeros(n, np.int64)
+        self._taken = np.zeros((n, 1), np.int64)
         self._ideal = np.zeros((n, reg.N_STAGES))
         self._clean = np.zeros((n, reg.N_STAGES))
         self._unseen = np.zeros((n, reg.N_STAGES), bool)
@@ -258,10 +258,7 @@ class SignalSkin:
 
         Returns whether they are; otherwise nothing was done.
         """
-        key = chips.tobytes()
-        if key not in self._pace_of:
-            self._pace_of[key] = self._common_pace(chips)
-        pace = self._pace_of[key]
+        pace = self._pace(chips)
         if pace is None:
             return False
         start_ns, stages, stage_ns = pace
@@ -284,12 +281,16 @@ class SignalSkin:
         self._unseen[rows] = False
         return True
 
-    def _common_pace(self, chips: Ints) -> tuple[int, int, int] | None:
-        paces = {
-            (int(self._start_ns[chip]), int(self._n_stages[chip]), int(self._stage_ns[chip]))
-            for chip in chips
-        }
-        return paces.pop() if len(paces) == 1 else None
+    def _pace(self, chips: Ints) -> tuple[int, int, int] | None:
+        """Return start, stages and time of a stage, if some chips have all of them in common."""
+        key = chips.tobytes()
+        if key not in self._pace_of:
+            paces = {
+                (int(self._start_ns[chip]), int(self._n_stages[chip]), int(self._stage_ns[chip]))
+                for chip in chips
+            }
+            self._pace_of[key] = paces.pop() if len(paces) == 1 else None
+        return self._pace_of[key]
 
     def _rows(self, chips: Ints) -> Ints | slice:
         """The same chips; all of them in their order as a slice, which costs no copies."""
@@ -311,28 +312,36 @@ class SignalSkin:
             ideals: float64[m + 1, k, 12], what conversions give until the first change, and
                 from each change on.
         """
-        stages, stage_ns = self._n_stages[chips], self._stage_ns[chips]
-        sequences, rest_ns = np.divmod(self.t_ns - self._start_ns[chips], stages * stage_ns)
-        ended = sequences * stages + rest_ns // stage_ns
+        # Numbers, where all chips have them in common: that saves most of the work. Or int64[k, 1].
+        start_ns: int | NDArray[np.int64]
+        stages: int | NDArray[np.int64]
+        stage_ns: int | NDArray[np.int64]
+        start_ns, stages, stage_ns = self._pace(chips) or (
+            self._start_ns[chips, None],
+            self._n_stages[chips, None],
+            self._stage_ns[chips, None],
+        )
+        sequences, rest_ns = divmod(self.t_ns - start_ns, stages * stage_ns)
+        reached = rest_ns // stage_ns
+        ended = sequences * stages + reached
         taken = self._taken[chips]
         new = ended - taken
         self._taken[chips] = ended
         # Stages that this pass has not reached yet were converted in the one before.
-        last = sequences[:, None] - ((rest_ns // stage_ns)[:, None] <= _STAGES)
-        began_ns = self._start_ns[chips, None] + last * (stages * stage_ns)[:, None]
+        last = sequences - (reached <= _STAGES)
+        began_ns = start_ns + last * (stages * stage_ns)
         if changed_ns is None or ideals is None:
             ideal = self._ideal[chips]
         else:
-            ended_ns = began_ns + (_STAGES + 1) * stage_ns[:, None]
-            in_force = np.searchsorted(changed_ns, ended_ns)
-            ideal = np.take_along_axis(ideals, in_force[None], axis=0)[0]
-        if new.min(initial=reg.N_STAGES) >= reg.N_STAGES == stages.min(initial=reg.N_STAGES):
+            in_force = np.searchsorted(changed_ns, began_ns + (_STAGES + 1) * stage_ns)
+            ideal = ideals[in_force, np.arange(len(chips))[:, None], _STAGES]
+        if new.min(initial=reg.N_STAGES) >= reg.N_STAGES == np.min(stages):
             self._clean[chips] = ideal
             self._began_ns[chips] = began_ns
             self._unseen[chips] = True
         elif new.any():
-            done = (_STAGES - taken[:, None]) % stages[:, None] < new[:, None]
-            done &= stages[:, None] > _STAGES
+            done = (_STAGES - taken) % stages < new
+            done &= stages > _STAGES
             self._clean[chips] = np.where(done, ideal, self._clean[chips])
             self._began_ns[chips] = np.where(done, began_ns, self._began_ns[chips])
             self._unseen[chips] |= done

@@ -384,7 +384,8 @@ def common_shift(
         triangle_of: int[m].
     """
     common = float(np.median(shift[rests]))
-    own = [np.median(shift[rests & (triangle_of == one)]) for one in np.unique(triangle_of[rests])]
+    # Most parts rest: then one of the first triangles has not moved like the others.
+    own = (np.median(shift[rests & (triangle_of == one)]) for one in np.unique(triangle_of[rests]))
     together = all(one * common > 0.0 and abs(one) >= abs(common) / 2 for one in own)
     return common if together else 0.0
 
