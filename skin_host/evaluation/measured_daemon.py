@@ -111,7 +111,7 @@ class RoomClock:
             module = frame.f_globals.get("__name__", "")
             room = self._rooms.get(module)
             if room is None:
-                room = self._rooms[module] = _room_of(module)
+                room = self._rooms[module] = room_of(module)
             if room:
                 self.samples[room] += 1
                 return
@@ -119,7 +119,7 @@ class RoomClock:
         self.samples[LOOP] += 1
 
 
-def _room_of(module: str) -> str:
+def room_of(module: str) -> str:
     for start, room in ROOMS.items():
         if module.startswith(start):
             return room

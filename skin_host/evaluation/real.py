@@ -344,11 +344,11 @@ def touches(recording: InsoleRecording, course: PlayedCourse, live: Mask, usable
         "begins_per_pad": float(np.count_nonzero(begins) / n) if n else None,
     }
     for level in LEVELS_KPA:
-        row[f"detected_{level:g}kpa"] = _detected(recording, course, usable, level)
+        row[f"detected_{level:g}kpa"] = detected(recording, course, usable, level)
     return row
 
 
-def _detected(
+def detected(
     recording: InsoleRecording, course: PlayedCourse, usable: Mask, over_kpa: float
 ) -> float | None:
     """Share of usable pads that are reported touched within a second of a lasting pressure."""

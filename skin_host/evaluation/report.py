@@ -61,13 +61,13 @@ def run(quick: bool, output: Path | None, recordings: Path | None = None) -> Rep
     start_s, here = time.perf_counter(), machine()
     _tell("real skin")
     real_skin = real.run(quick, None, recordings, with_emulation=not quick)
-    found, seconds_of = _worked_out(_jobs(quick))
+    found, seconds_of = _worked_out(jobs_of(quick))
     report: Report = {
         "schema": SCHEMA,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": here,
         "quick": quick,
-        "default": _key(DEFAULT),
+        "default": key_of(DEFAULT),
         "real_skin": real_skin,
         "rows": [row for rows in found["errors"] for row in rows],
         "fits": [row for rows in found["fits"] for row in rows],
@@ -102,7 +102,7 @@ def run(quick: bool, output: Path | None, recordings: Path | None = None) -> Rep
 Job = tuple[str, Callable[..., Any], tuple[Any, ...]]
 
 
-def _jobs(quick: bool) -> list[Job]:
+def jobs_of(quick: bool) -> list[Job]:
     """What can be worked out in any process: name, function, arguments. The longest first."""
     plan = HistoryPlan(0.25, 5.0) if quick else HistoryPlan()
     truths = accuracy.HELD_OUT if quick else TRUTHS
@@ -131,7 +131,7 @@ def _jobs(quick: bool) -> list[Job]:
     ]
     jobs += [("drift", touching.drift_lags, (1.0 if quick else 10.0, rule)) for rule in RULES]
     jobs.append(("delays", touching.detection_delays, ()))
-    jobs.append(("localisation", _localization, (50 if quick else 400,)))
+    jobs.append(("localisation", localization, (50 if quick else 400,)))
     jobs.append(("unwatched", speed.cost_of_glancing, (30.0 if quick else 300.0,)))
     return jobs
 
@@ -171,7 +171,7 @@ def summary(report: Report) -> list[Row]:
     """
     lines: list[Row] = []
     for variant in accuracy.VARIANTS:
-        key = _key(variant)
+        key = key_of(variant)
         mine = [row for row in select(report["rows"], **key) if _is_judged(row)]
         fitted = select(mine, scenario=accuracy.FITTED_FOAM.name)
         clean = [row["rms_kpa"] for row in fitted if row["noise_units"] == 0.0]
@@ -368,7 +368,7 @@ def _rms(values: list[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _localization(presses: int) -> list[Row]:
+def localization(presses: int) -> list[Row]:
     rows = []
     for probe_mm in PROBES_MM:
         case = Case(probe_mm)
@@ -389,7 +389,7 @@ def _localization(presses: int) -> list[Row]:
     return rows
 
 
-def _key(variant: Variant) -> Row:
+def key_of(variant: Variant) -> Row:
     return {"model": variant.model, "update_s": variant.update_s}
 
 

@@ -33,7 +33,7 @@ def small():
         "date": "2026-01-02T03:04:05+00:00",
         "machine": machine(),
         "quick": True,
-        "default": report._key(DEFAULT),
+        "default": report.key_of(DEFAULT),
         "rows": rows,
         "fits": accuracy.fit_rows("F"),
         "cycles": accuracy.cycles("F", 200, ("published", DEFAULT.model)),
@@ -48,7 +48,7 @@ def small():
             touching.long_hold("F", "short", 600.0, 0.0, 2.5, alone) for alone in (False, True)
         ],
         "hard_cases": touching.negative(2.0),
-        "localization": report._localization(20),
+        "localization": report.localization(20),
         "real_skin": {"absent": "nowhere", "real": [], "published": [], "grasps": None},
         "seconds": 1.0,
     }
@@ -98,7 +98,7 @@ def test_who_knows_the_future_errs_least_most_of_all_where_losses_are_unknown(sm
                 ]
             )
             for name, key in (
-                ("default", report._key(DEFAULT)),
+                ("default", report.key_of(DEFAULT)),
                 ("hindsight", {"model": "hindsight"}),
             )
         }
@@ -148,10 +148,10 @@ def test_headline_and_goals_rest_on_truths_that_no_model_is_kin_to(small):
 
 
 def test_jobs_are_sent_to_processes_with_all_that_they_need():
-    for name, function, arguments in report._jobs(quick=True):
+    for name, function, arguments in report.jobs_of(quick=True):
         assert pickle.loads(pickle.dumps((name, function, arguments)))[0] == name
-    assert {name for name, *_ in report._jobs(quick=True)} == {
-        name for name, *_ in report._jobs(quick=False)
+    assert {name for name, *_ in report.jobs_of(quick=True)} == {
+        name for name, *_ in report.jobs_of(quick=False)
     }
 
 

@@ -8,7 +8,7 @@ import pytest
 from skin_host.bus.wire import TAXELS, TRIANGLES
 from skin_host.evaluation.body_stream import Body
 from skin_host.evaluation.can_stream import CAN_FRAME
-from skin_host.evaluation.measured_daemon import RoomClock, _room_of
+from skin_host.evaluation.measured_daemon import RoomClock, room_of
 from skin_host.layout import build_layout
 from skin_host.processing import curves
 
@@ -42,6 +42,6 @@ def test_cpu_is_put_down_to_the_room_that_takes_it() -> None:
 
 
 def test_each_room_is_named_by_its_modules() -> None:
-    assert _room_of("skin_host.bus.assembler") == "assembler"
-    assert _room_of("paho.mqtt.client") == "mqtt"
-    assert _room_of("asyncio.events") == ""
+    assert room_of("skin_host.bus.assembler") == "assembler"
+    assert room_of("paho.mqtt.client") == "mqtt"
+    assert room_of("asyncio.events") == ""

@@ -128,7 +128,7 @@ def test_a_spike_of_the_pressures_own_record_is_no_press(pressed: InsoleRecordin
     # 60 kPa over rest are passed at 13.6 s, 100 kPa at 14.7 s.
     for level, found in ((60.0, 0.0), (100.0, 1.0)):
         given = course(spiky, pressure, touched)
-        assert real._detected(spiky, given, everyone, level) == found
+        assert real.detected(spiky, given, everyone, level) == found
 
 
 def test_dead_and_still_pads_are_not_live() -> None:

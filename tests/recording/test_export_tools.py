@@ -109,10 +109,10 @@ def test_foxglove_reads_points_contacts_transforms_and_log(series: Series, tmp_p
 
 
 def test_an_arrow_turns_to_where_a_force_points() -> None:
-    from skin_host.recording.export.scene import _turned_from_x
+    from skin_host.recording.export.scene import turned_from_x
 
     for wanted in ([0, 0, -2.0], [0, 1.0, 0], [-1.0, 0, 0], [0.6, 0, 0.8]):
-        x, y, z, w = _turned_from_x(np.array(wanted))
+        x, y, z, w = turned_from_x(np.array(wanted))
         turned = [1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)]
         np.testing.assert_allclose(turned, np.array(wanted) / np.linalg.norm(wanted), atol=1e-9)
 

@@ -347,7 +347,7 @@ def _update(item: Arrows) -> Any:
         where = shown.pose.position
         where.x, where.y, where.z = start_m.tolist()
         turn = shown.pose.orientation
-        turn.x, turn.y, turn.z, turn.w = _turned_from_x(force_n)
+        turn.x, turn.y, turn.z, turn.w = turned_from_x(force_n)
         shown.shaft_length = max(0.0, size_n * ARROW_M_PER_N - HEAD_M)
         shown.shaft_diameter = SHAFT_M
         shown.head_length = min(HEAD_M, size_n * ARROW_M_PER_N)
@@ -369,7 +369,7 @@ def _paint(colour: Any) -> None:
     colour.r, colour.g, colour.b, colour.a = (channel / 255 for channel in ARROW_RGBA)
 
 
-def _turned_from_x(direction: Floats) -> tuple[float, float, float, float]:
+def turned_from_x(direction: Floats) -> tuple[float, float, float, float]:
     """The quaternion x, y, z, w of the shortest turn from the x axis to a direction."""
     size = float(np.linalg.norm(direction))
     if size == 0:
