@@ -13,6 +13,10 @@ from numpy.typing import NDArray
 from skin_host import clock
 
 NS = 1_000_000_000
+#: Two clocks are read as at one moment when no more than this passes meanwhile. A process that is
+#: held up between them reads them again, so often at most.
+AT_ONCE_NS = 100_000
+MOST_READS = 20
 
 
 class Clock(Protocol):
@@ -47,8 +51,24 @@ class RealClock:
 
     def host_ns(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
         """The host's time of day at some emulated times, as its clock is set now."""
-        ago_ns = ((self.now_ns() - t_ns) / self._speed).astype(np.int64)
-        return np.asarray(self._clock.now_ns() - ago_ns)
+        monotonic_ns, host_ns = self._both_ns()
+        now_ns = int((monotonic_ns - self._start_ns) * self._speed)
+        ago_ns = ((now_ns - t_ns) / self._speed).astype(np.int64)
+        return np.asarray(host_ns - ago_ns)
+
+    def _both_ns(self) -> tuple[int, int]:
+        """Return monotonic time and the host's time of day at one moment."""
+        reads: list[tuple[int, int, int]] = []
+        monotonic_ns = self._clock.monotonic_ns()
+        for _ in range(MOST_READS):
+            host_ns = self._clock.now_ns()
+            after_ns = self._clock.monotonic_ns()
+            reads.append((after_ns - monotonic_ns, monotonic_ns, host_ns))
+            if reads[-1][0] <= AT_ONCE_NS:
+                break
+            monotonic_ns = after_ns
+        _, monotonic_ns, host_ns = min(reads)
+        return monotonic_ns, host_ns
 
     async def sleep_until_ns(self, t_ns: int) -> None:
         """Sleep until `t_ns`; a time that has passed still lets other tasks run once."""

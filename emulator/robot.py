@@ -293,7 +293,10 @@ class Robot:
             now_ns = clock.now_ns()
             if now_ns - ahead_ns - self.t_ns > LONGEST_CATCH_UP_NS:
                 self._send(links, self._finish_sweeps(), clock, ahead_ns)
-                ahead_ns += self._to_leave_out_ns(now_ns - ahead_ns - self.t_ns)
+                left_out_ns = self._to_leave_out_ns(now_ns - ahead_ns - self.t_ns)
+                ahead_ns += left_out_ns
+                for board in self._boards:
+                    board.start_ns -= left_out_ns
             passed_ns = now_ns - ahead_ns - self.t_ns
             # Commands came one after the other in this time: boards whose computer was busy
             # must not get them all at once, chips convert between them.

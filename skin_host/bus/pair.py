@@ -31,7 +31,7 @@ MARK = 0xFFFF_FFFF
 #: Marks without frames come this often.
 MARK_EVERY_NS = 10_000_000
 #: An emulator that is farther behind than this counts as one that stands still.
-LONGEST_LAG_NS = 5_000_000_000
+LONGEST_LAG_NS = 60_000_000_000
 #: Frames of one message, and of messages that wait for the other side.
 MOST_FRAMES = 1024
 MOST_WAITING = 20_000

@@ -1,8 +1,10 @@
 import asyncio
 
+import numpy as np
 import pytest
 
 from emulator.clock import NS, RealClock, SteppedClock
+from skin_host import clock as clocks
 
 
 async def test_a_real_clock_wakes_a_sleeper_after_its_time() -> None:
@@ -16,6 +18,32 @@ async def test_an_accelerated_clock_runs_ahead_of_the_machine() -> None:
     fast, slow = RealClock(speed=1000.0), RealClock()
     await asyncio.sleep(0.002)
     assert fast.now_ns() > 100 * slow.now_ns()
+
+
+class HeldUp(clocks.Clock):
+    """A process that loses the processor for 60 ms, some reads of a clock after the next."""
+
+    def __init__(self, reads: int) -> None:
+        super().__init__()
+        self.t_ns, self.reads = 0, reads
+
+    def _read(self) -> int:
+        self.reads -= 1
+        self.t_ns += 60_000_000 if self.reads == 0 else 1000
+        return self.t_ns
+
+    def monotonic_ns(self) -> int:
+        return self._read()
+
+    def now_ns(self) -> int:
+        return 10**18 + self._read()
+
+
+@pytest.mark.parametrize("reads", [2, 3, 4])
+def test_a_process_that_is_held_up_between_two_clocks_stamps_as_before(reads: int) -> None:
+    clock = RealClock(clock=HeldUp(reads))
+    (host_ns,) = clock.host_ns(np.array([5 * NS]))
+    assert host_ns == pytest.approx(10**18 + 5 * NS, abs=200_000)
 
 
 def test_a_clock_that_stands_still_is_refused() -> None:

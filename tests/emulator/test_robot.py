@@ -251,6 +251,7 @@ async def test_boards_do_not_stall_with_their_computer(stalled_s: float) -> None
     settings, layout = load()
     robot = Robot(settings, layout, Scene(noise=False))
     robot.bring_up()
+    brought_up_s = robot.t_ns * 1e-9
     clock = SteppedClock()
     with (
         can.Bus(interface="virtual", channel="test-stall") as inside,
@@ -268,6 +269,8 @@ async def test_boards_do_not_stall_with_their_computer(stalled_s: float) -> None
             await clock.advance(0.001)
         life.cancel()
         frames = list(iter(lambda: outside.recv(0), None))
+    lived_s = [(robot.t_ns - board.start_ns) * 1e-9 for board in robot.boards.values()]
+    assert lived_s == pytest.approx([clock.now_ns() * 1e-9 + brought_up_s] * 3, abs=0.1)
     for board in layout.boards:
         mine = [one for one in frames if one.arbitration_id >> 4 & 0xF == board.settings.address]
         stamps_s = np.array([one.timestamp for one in mine])
