@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 from emulator import faults, state
 from emulator.boards.arithmetic import TAXELS
 from emulator.boards.board import join
-from emulator.boards.bursts import Bursts
+from emulator.boards.contents import Bursts, load_recordings
 from emulator.boards.fingertips import Fingertips
 from emulator.boards.mtb import Mtb, make_board, set_up
-from emulator.boards.recording import load_recordings
 from emulator.chips.converters import Converters, fidelities
 from emulator.clock import Clock, RealClock
 from emulator.link import BoardLink
