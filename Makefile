@@ -25,8 +25,9 @@ test: lint  ## all that needs no root and no hardware
 	@$(BIN)/python -m compileall -q skin_host emulator
 	@tools/timed "pytest" $(BIN)/python -m pytest --numprocesses=3 --dist=loadfile $(AGAIN)
 
-coverage: .venv/dev.stamp .venv/coverage.stamp  ## statements and branches of the core that the tests run: together 95 % at least
-	@$(BIN)/python -m pytest --quiet --numprocesses=3 --dist=loadfile --cov --cov-report=term
+coverage: .venv/dev.stamp .venv/coverage.stamp  ## statements and branches of the core that the tests run: 95 % of the branches at least
+	@$(BIN)/python -m pytest --quiet --numprocesses=3 --dist=loadfile --cov --cov-report=term --cov-report=json:.coverage.json
+	@$(BIN)/python -m tests.support.branches .coverage.json
 
 mutation: .venv/dev.stamp .venv/mutation.stamp  ## small changes of the core that its tests must notice; FILES=... PLACES=40
 	@$(BIN)/python -m tests.support.mutation --places $(or $(PLACES),40) $(FILES)

@@ -269,6 +269,42 @@ def test_frames_in_the_usual_order_are_taken_together_with_the_same_result(data)
         assert all(map(np.array_equal, mine, its))
 
 
+def learnt(triangles: str, n: int, order: list[int] | None = None) -> Assembler:
+    """An assembler that knows the order of a board's frames."""
+    assembler = make(triangles)
+    for period in range(1, 5):
+        swept = frames(values(n, period), period * PERIOD)
+        times = [t_ns for _, _, t_ns in swept]
+        came = [swept[i] for i in order or range(2 * n)]
+        sent = [(*one[:2], t_ns) for one, t_ns in zip(came, times, strict=True)]
+        assert len(feed(assembler, sent)) == 1
+    return assembler
+
+
+@pytest.mark.parametrize("order", [list(range(32)), [*range(16, 32), *range(16)]])
+def test_a_whole_board_of_known_order_keeps_every_byte_in_its_place(order: list[int]) -> None:
+    assembler = learnt("0-15", 16, order)
+    for period in range(5, 8):
+        raw = values(16, period)
+        swept = frames(raw, period * PERIOD)
+        times = [t_ns for _, _, t_ns in swept]
+        sent = [(*swept[i][:2], t_ns) for i, t_ns in zip(order, times, strict=True)]
+        (sweep,) = feed(assembler, sent)
+        np.testing.assert_array_equal(sweep.raw, raw)
+        assert (sweep.present, sweep.t_ns, sweep.missed) == (0xFFFF, times[-1], 0)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_the_end_of_a_sweep_of_known_order_may_come_in_time_and_not_later(first: int) -> None:
+    """A pause of more than half a period ends a sweep, however its frames were read."""
+    for late_ms, present in ((24, [0b1111]), (26, [0b0111, 0b1000])):
+        assembler = learnt("0-3", 4)
+        sent = frames(values(4, 9), 5 * PERIOD, spacing_ns=0)
+        sent[6:] = [(*one[:2], one[2] + late_ms * MS) for one in sent[6:]]
+        sweeps = feed(assembler, sent[:first]) + feed(assembler, sent[first:])
+        assert [sweep.present for sweep in sweeps + assembler.flush()] == present
+
+
 def identifier(message_class: wire.MessageClass, address: int, triangle: int = 0) -> int:
     return message_class << 8 | address << 4 | triangle
 

@@ -45,7 +45,7 @@ OPTIONS = [
     "--hypothesis-profile=mutation",
 ]
 #: Tests that take so much more CPU time than without a change hang.
-SLOWER, SLOWER_S = 3.0, 5.0
+SLOWER, SLOWER_S = 2.0, 3.0
 #: They make the same of what is only ever compared with None.
 SAME = ("ReplaceComparisonOperator_Is_Eq", "ReplaceComparisonOperator_IsNot_NotEq")
 
