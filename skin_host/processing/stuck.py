@@ -262,7 +262,7 @@ class StuckPads:
         self._boards = boards
         self._begun = np.broadcast_to(np.ceil(BEGUN / share), shape).copy()
         self._before = self._begun - 1
-        self._forget = np.minimum(1.0, STEP_SAMPLES * period_s / MEMORY_S)
+        self._forget = STEP_SAMPLES * period_s / MEMORY_S
         resting = share * rate_in_run(repeats.own_noise(noise_units))
         most = np.where(repeats.shifted, MOST_RATE, RESTING_MARGIN * resting)
         self._most = np.minimum(most, MOST_RATE)

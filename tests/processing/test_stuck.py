@@ -10,7 +10,14 @@ from hypothesis import strategies as st
 from emulator.boards.arithmetic import transmit_16, transmit_32
 from skin_host.bus.compensation import GAIN, GAIN_V2, NO_GAIN, THERMAL_TAXEL
 from skin_host.processing import stuck
-from skin_host.processing.stuck import Encoding, Repeats, StuckPads, TouchedPads, inside
+from skin_host.processing.stuck import (
+    Encoding,
+    Repeats,
+    StuckPads,
+    TouchedPads,
+    inside,
+    rate_in_run,
+)
 
 K = 8
 SHAPE = (K, 12)
@@ -99,6 +106,33 @@ def test_a_pad_that_stops_is_stuck_until_it_moves_again() -> None:
     assert not watched.pads.stuck.any()
 
 
+def test_a_stuck_pad_is_valid_after_three_moves_however_long_it_rests_between_them() -> None:
+    watched, rng = lively()
+    sweeps_until_stuck(watched, rng, 239)
+    for moves, byte in ((1, 241), (2, 239), (3, 241)):
+        for _ in range(10):
+            raw = to_bytes(240.3 + 0.8 * rng.standard_normal(SHAPE))
+            raw[1, 5] = byte
+            watched.show(raw)
+            assert watched.pads.stuck[1, 5] == (moves < 3)
+
+
+@pytest.mark.parametrize("sigma", [0.6, 0.8, 1.2])
+def test_after_a_calibration_a_run_is_too_long_by_the_odds_of_a_hundred_samples(
+    sigma: float,
+) -> None:
+    """The beta-binomial of Bayes' rule, after two repeats with which a run begins."""
+    noise = np.full(SHAPE, sigma)
+    plain = Repeats([Encoding(NO_GAIN, 2, NO_LOAD, False)] * K)
+    pads = StuckPads(noise, np.ones(K), np.full(K, PERIOD_S), plain, 1)
+    moves = 100 * rate_in_run(noise)[0, 0]
+    run, still = pads.longest[0, 0] - 2, 100 - moves
+    log_odds = (
+        math.lgamma(100 + run) - math.lgamma(still + run) - math.lgamma(100.0) + math.lgamma(still)
+    )
+    assert log_odds == pytest.approx(math.log(1e11), rel=0.01)
+
+
 def test_a_pad_that_is_stuck_as_if_touched_is_found_as_soon() -> None:
     watched, rng = lively()
     alone = np.zeros(SHAPE, bool)
@@ -166,6 +200,34 @@ def test_a_word_that_stays_is_a_repetition_whatever_is_taken_from_it(
         inside[:, THERMAL_TAXEL] = False
         seen, before_seen = seen | inside, seen
         assert not (moved & before_seen & inside).any()
+
+
+def test_noise_that_the_compensation_adds_is_not_the_pads_own() -> None:
+    """But half of the byte's noise always is: both are estimates."""
+    repeats = Repeats([Encoding(GAIN, 2, NO_LOAD, False)] * K)
+    gain = np.array(GAIN) / 128
+    others = np.delete(np.arange(12), THERMAL_TAXEL)
+    for thermal in (0.0, 1.0, 20.0):
+        noise = np.full(SHAPE, 2.0)
+        noise[:, THERMAL_TAXEL] = thermal
+        own = np.sqrt(np.maximum(2.0**2 - (gain * thermal) ** 2, 1.0))
+        assert repeats.own_noise(noise)[3, others] == pytest.approx(own[others])
+
+
+@pytest.mark.parametrize("end", [0, 255])
+def test_nothing_shows_where_the_thermal_pad_is_at_an_end_of_its_scale(end: int) -> None:
+    rng = np.random.default_rng(3)
+    repeats = Repeats([Encoding(GAIN, 2, NO_LOAD, False)] * K)
+    before = np.full(SHAPE, NO_LOAD, np.uint8)
+    repeats.step(before, np.ones(SHAPE, bool), np.ones(SHAPE, bool))
+    raw = rng.integers(100, 200, SHAPE).astype(np.uint8)
+    raw[2, THERMAL_TAXEL] = end
+    moved, told = repeats.step(raw, raw != before, inside(raw))
+    others = np.delete(np.arange(K), 2)
+    assert not moved[2].any()
+    assert not told[2].any()
+    assert moved[others].all()
+    assert told[others].all()
 
 
 def test_a_stuck_pad_is_found_though_the_noise_of_the_thermal_pad_moves_its_byte() -> None:

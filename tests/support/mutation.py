@@ -131,11 +131,38 @@ def changed(source: str, becomes: str) -> tuple[str, str]:
     return " ".join(before), " ".join(after)
 
 
-def passes(tests: list[str], limit_s: float | None = None) -> bool:
+class Quickest:
+    """Runs the quickest tests first: most changes are noticed before the slow ones begin.
+
+    Args:
+        times: a file in which a first run notes the tests in that order.
+    """
+
+    def __init__(self, times: Path) -> None:
+        self._times = times
+        self._took_s: dict[str, float] = {}
+
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        if self._times.exists():
+            order = self._times.read_text().splitlines()
+            items.sort(key=lambda item: order.index(item.nodeid))
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        took_s = self._took_s.get(report.nodeid, 0.0) + report.duration
+        self._took_s[report.nodeid] = took_s
+
+    def pytest_sessionfinish(self) -> None:
+        if not self._times.exists():
+            order = sorted(self._took_s, key=lambda test: self._took_s[test])
+            self._times.write_text("\n".join(order))
+
+
+def passes(tests: list[str], times: Path, limit_s: float | None = None) -> bool:
     """Whether tests pass, in a child of this process: what they import is compiled, most is loaded.
 
     Args:
         tests: files.
+        times: see `Quickest`.
         limit_s: CPU time that they may take.
     """
     child = os.fork()
@@ -146,7 +173,7 @@ def passes(tests: list[str], limit_s: float | None = None) -> bool:
         os.dup2(silence, 2)
         if limit_s is not None:
             resource.setrlimit(resource.RLIMIT_CPU, (int(limit_s) + 1,) * 2)
-        os._exit(pytest.main([*OPTIONS, *tests]))
+        os._exit(pytest.main([*OPTIONS, *tests], plugins=[Quickest(times)]))
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
@@ -159,7 +186,8 @@ def score(core: Core, equivalents: dict[tuple[str, str, str], str], places: int,
     path = Path(core.file)
     source = path.read_text()
     before_s = children_s()
-    if not passes(core.tests):
+    times = Path(f"{path.name}.times")
+    if not passes(core.tests, times):
         sys.exit(f"{core.file}: its tests fail without a change: pytest {' '.join(core.tests)}")
     limit_s = SLOWER * (children_s() - before_s) + SLOWER_S
     with use_db(":memory:", WorkDB.Mode.create) as work:
@@ -175,7 +203,7 @@ def score(core: Core, equivalents: dict[tuple[str, str, str], str], places: int,
             same += 1
             continue
         path.write_text(becomes)
-        if passes(core.tests, limit_s):
+        if passes(core.tests, times, limit_s):
             lived += 1
             print(
                 f"  {core.file}:{change.start_pos[0]}\n    - {line[0]}\n    + {line[1]}", flush=True
