@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
-import can
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.boards.mtb import Burst, Mtb
+from emulator.boards.mtb import Burst, Mtb, join
 from emulator.chips.converters import Converters, read_rows
+from skin_host.bus.logs import read_channels
 from skin_host.bus.wire import FrameBatch, find_skin_frames
 from skin_host.errors import ConfigurationError, LogError
 from skin_host.layout import Layout
@@ -104,7 +104,7 @@ class Recording:
     """The sweeps of one board in a log.
 
     Args:
-        path: any log that python-can reads (candump's .log, .asc, .blf ...).
+        path: any log that `skin replay` reads (candump's .log, .asc, .blf ...).
         address: the board's address in the log.
 
     Attributes:
@@ -115,29 +115,21 @@ class Recording:
     """
 
     def __init__(self, path: Path, address: int) -> None:
-        try:
-            with can.LogReader(path) as reader:
-                frames = [
-                    (message.arbitration_id, bytes(message.data), 0)
-                    for message in reader
-                    if not (message.is_extended_id or message.is_error_frame)
-                    and message.arbitration_id >> 4 & 0xF == address
-                ]
-        except (OSError, ValueError) as error:
-            raise LogError(f"{path}: cannot be read: {error}") from None
-        batch = FrameBatch.of(frames)
+        batch = join([frames for _, frames in read_channels(path)])
         found = find_skin_frames(batch)
-        if not len(found.row):
+        mine = np.flatnonzero(found.board == address)
+        if not len(mine):
             raise LogError(f"{path}: holds no data frames of a board with address {address}")
+        row, triangle, half = found.row[mine], found.triangle[mine], found.half[mine]
         self.sweeps: list[FrameBatch] = []
         self._next = 0
         seen: set[tuple[int, int]] = set()
         start = 0
-        keys = list(zip(found.triangle.tolist(), found.half.tolist(), strict=True))
+        keys = list(zip(triangle.tolist(), half.tolist(), strict=True))
         for end, key in enumerate([*keys, keys[0]]):
             # A half of a triangle that was there already begins the next sweep.
             if key in seen or end == len(keys):
-                rows = found.row[start:end]
+                rows = row[start:end]
                 self.sweeps.append(
                     FrameBatch(batch.id[rows], batch.dlc[rows], batch.data[rows], batch.t_ns[rows])
                 )

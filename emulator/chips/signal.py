@@ -335,7 +335,7 @@ class SignalSkin:
         else:
             in_force = np.searchsorted(changed_ns, began_ns + (_STAGES + 1) * stage_ns)
             ideal = ideals[in_force, np.arange(len(chips))[:, None], _STAGES]
-        if new.min(initial=reg.N_STAGES) >= reg.N_STAGES == np.min(stages):
+        if new.min(initial=reg.N_STAGES) >= reg.N_STAGES == np.min(stages, initial=reg.N_STAGES):
             self._clean[chips] = ideal
             self._began_ns[chips] = began_ns
             self._unseen[chips] = True

@@ -180,12 +180,13 @@ class Daemon:
             for task in [*tasks, stopping]:
                 task.cancel()
             await asyncio.gather(*tasks, stopping, return_exceptions=True)
-            if self._keeping is not None:
-                await asyncio.wait([self._keeping], timeout=KEEPING_S)
-            await self._keep_zeros(touched=True)
+            # Nothing is felt from now on, however long the disk takes.
             for part in self.engine.parts:
                 self._end_contacts(part)
             self.fingertips.end(self.clock.now_ns())
+            if self._keeping is not None:
+                await asyncio.wait([self._keeping], timeout=KEEPING_S)
+            await self._keep_zeros(touched=True)
             await self.link.stop()
 
     async def calibrate(self, seconds: float, boards: list[int] | None = None) -> Calibration:

@@ -48,7 +48,10 @@ class PartContact:
         #: Valid frames that are still wanted of the taxels where a contact was lost, and of each
         #: triangle.
         self._lost = np.zeros(here.n_taxels, np.uint8)
-        self._usable = np.ones(here.n_taxels, np.bool_)
+        #: A temperature pad is never valid, so nothing is waited for there.
+        self._can_be_valid = np.zeros(here.n_taxels, np.bool_)
+        self._can_be_valid[self._pads] = True
+        self._usable = self._can_be_valid
         self._unsure = np.full(len(pads), SURE_FRAMES, np.uint8)
         #: Whether any of these is wanted.
         self._is_unsure = True
@@ -113,8 +116,8 @@ class PartContact:
 
     def use(self, usable: NDArray[np.bool_]) -> None:
         """A calibration has found which taxels [m] are usable: no other will be valid again."""
-        self._usable = usable
-        self._lost[~usable] = 0
+        self._usable = usable & self._can_be_valid
+        self._lost[~self._usable] = 0
 
     def stop(self, events: Iterable[TouchEvent]) -> ContactState:
         """End the contacts, because no data of the part will come for a while."""

@@ -456,7 +456,7 @@ class Engine:
         ledger = self.ledger
         here = np.repeat(ledger.present[row] & (ledger.error[row] == 0), PADS)
         ledger.rezeros[row] += not rezero.begun
-        if rezero.step(sweep.raw.ravel(), here, sweep.t_ns):
+        if rezero.step(sweep.raw.ravel(), here, ledger.far[row].ravel(), sweep.t_ns):
             taxels = self._taxels_of(sweep.board).ravel()
             fitted = taxels >= 0
             baseline = np.where(fitted, self._pipeline.baseline[taxels], 0.0)
@@ -466,7 +466,7 @@ class Engine:
             self.intake.veto[row] = self.in_doubt(sweep.board)
             return
         # What jumps while a board is set up was not damaged on its way.
-        self.intake.liveness.note_gap(row)
+        self.intake.note_gap(row)
 
     def _process(self, samples: list[PartSample]) -> list[Step]:
         steps = []

@@ -203,6 +203,13 @@ class Intake:
                 samples.append(self._sample(state))
         return samples
 
+    def note_gap(self, row: int) -> None:
+        """A board's next sweep does not follow the one before it: see `Liveness.note_gap`."""
+        if self._waiting[row]:
+            # The one before may itself not be judged yet.
+            self.judge()
+        self.liveness.note_gap(row)
+
     def missing(self) -> list[dict[int, int]]:
         """Of each part, the boards whose sweeps its next sample waits for."""
         return [state.waits for state in self._states]
@@ -245,7 +252,7 @@ class Intake:
         ledger = self._ledger
         last = ledger.last[row]
         if last is not None and last.missed:
-            self.liveness.note_gap(row)
+            self.note_gap(row)
         doubted = self.liveness.doubted
         if doubted is not None:
             doubted = doubted[TRIANGLES * row : TRIANGLES * (row + 1)]

@@ -140,13 +140,14 @@ class Liveness:
         self._pads = StuckPads(noise_units, self._share, period_s, repeats, boards)
         self._rate: Floats = np.minimum(change_rate(noise_units), MOST_RATE)
         self._triangle_rate: Floats = 1.0 - np.prod(1.0 - self._rate, axis=1)
-        # Before the calibration it is not known how much noise is too much.
-        jump = np.maximum(NOISY_UNITS, NOISY_SIGMAS * noise_units)
-        self._jump = jump if calibrated else np.full(shape, np.inf)
+        constant = ~np.any(noise_units > 0.0, axis=1)
+        # Without a calibration, or if a triangle was absent from it or constant, it is not known
+        # how much noise is too much.
+        known = np.repeat(~constant[:, None], PADS, axis=1) & calibrated
+        self._jump = np.where(known, np.maximum(NOISY_UNITS, NOISY_SIGMAS * noise_units), np.inf)
         #: Steps are whole units.
         self._jump_units = np.minimum(np.floor(self._jump), 256.0).astype(np.int16)
         self._spike = np.maximum(SPIKE_UNITS, SPIKE_SIGMAS * noise_units)
-        constant = ~np.any(noise_units > 0.0, axis=1)
 
         self._raw = np.zeros(shape, np.uint8)
         self._present = np.zeros(k, np.bool_)

@@ -48,6 +48,7 @@ class Rezero:
         self._no_load = no_load
         self._sum = np.zeros(len(no_load))
         self._count = np.zeros(len(no_load), np.int64)
+        self._n_far = np.zeros(len(no_load), np.int64)
         self._sweeps = 0
         self._since_ns: int | None = None
         self._ended_ns: int | None = None
@@ -60,17 +61,25 @@ class Rezero:
         rezero._since_ns = rezero._ended_ns = t_ns - SETTLE_NS
         return rezero
 
-    def step(self, raw: NDArray[np.uint8], present: Mask, t_ns: int) -> bool:
-        """Take one sweep: bytes [n], and which were received. Returns True once, when it has
-        enough.
+    def step(self, raw: NDArray[np.uint8], present: Mask, far: Mask, t_ns: int) -> bool:
+        """Take one sweep; return True once, when it has enough.
+
+        Args:
+            raw: uint8[n], the bytes.
+            present: bool[n], which of them were received.
+            far: bool[n], pads that their board marks as far out of range. Such a byte is no
+                reading: boards send it while a data line is shorted, and for some sweeps after.
+            t_ns: time of the sweep.
         """
         if self._since_ns is None:
             self._since_ns = t_ns
         if self._ended_ns is not None:
             return False
         if 0 <= t_ns - self._since_ns < LOOK_NS or self._sweeps < LOOK_SWEEPS:
-            self._sum += np.where(present, self._no_load - raw, 0.0)
-            self._count += present
+            read = present & ~far
+            self._sum += np.where(read, self._no_load - raw, 0.0)
+            self._count += read
+            self._n_far += present & far
             self._sweeps += 1
             return False
         self._ended_ns = t_ns
@@ -93,7 +102,10 @@ class Rezero:
             noise: float64[n], as calibrated.
         """
         mean = self._sum / np.maximum(self._count, 1)
-        known = (self._count >= FEWEST) & ~self.doubted
+        enough = self._count >= FEWEST
+        # What was far out of range all the time may have another zero when it is back.
+        self.doubted |= ~enough & (self._n_far >= FEWEST)
+        known = enough & ~self.doubted
         far = known & (np.abs(mean - baseline) > LARGEST_UNITS)
         # Noise that is cut off at the end of the scale gives a wrong mean.
         highest = self._no_load - mean + SIGMAS_TO_END * noise

@@ -97,6 +97,18 @@ def test_where_an_earlier_daemon_felt_something_it_is_not_off_until_that_is_vali
     assert states == ["UNKNOWN"] * (SURE_FRAMES - 1) + ["OFF"]
 
 
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_a_temperature_pad_whose_zero_is_in_doubt_keeps_no_contact_unknown(
+    calibrated: bool,
+) -> None:
+    """It is never valid, so nothing can confirm there that the contact is over."""
+    contact = watched()
+    if calibrated:
+        contact.use(np.ones(N, np.bool_))
+    contact.doubt(~PADS)
+    assert contact.step(frame(50 * MS), []) == "OFF"
+
+
 def test_without_a_valid_taxel_it_is_unknown_at_once() -> None:
     contact = watched()
     assert contact.step(frame(50 * MS, blind=slice(0, N)), []) == "UNKNOWN"

@@ -165,3 +165,20 @@ def test_a_torn_pad_does_not_silence_the_pressed_ones_beside_it():
     (sample,) = intake().feed([torn, sweep(INNER, PERIOD)])
     assert sample.present[: 16 * 12].reshape(16, 12)[:, 4:].all()
     assert not sample.present[: 16 * 12].reshape(16, 12)[:, :4].any()
+
+
+def test_a_gap_before_a_sweep_is_no_gap_before_the_one_that_is_not_judged_yet():
+    """A board that sends twice in the turn of another: its first sweep still waits."""
+    parts = intake()
+    joined = parts.engine.intake
+    joined.use(np.full(parts.engine.layout.n_taxels, 0.5), np.ones(2, np.bool_))
+    for turn in range(1, 4):
+        parts.feed([sweep(OUTER, turn * PERIOD), sweep(INNER, turn * PERIOD)])
+        joined.judge_whole()
+    away = sweep(OUTER, 4 * PERIOD)
+    away.raw[1, 4] -= 40
+    parts.feed([away])
+    joined.note_gap(parts.engine.ledger.row[OUTER])
+    parts.feed([sweep(OUTER, 5 * PERIOD), sweep(INNER, 5 * PERIOD)])
+    joined.judge()
+    assert joined.liveness.spikes.sum() == 0

@@ -187,3 +187,18 @@ def test_a_press_right_after_a_release_is_no_damaged_byte() -> None:
         raw[1, 4] -= below
         liveness.step(raw, HERE, NO)
     assert liveness.spikes.sum() == 0
+
+
+def test_a_triangle_that_was_absent_when_calibrated_may_be_as_noisy_as_it_is() -> None:
+    """Its noise is not known: it is no damage of its frames, nor a fault of its pads."""
+    rng = np.random.default_rng(5)
+    centre = np.full((K, 12), 240.3)
+    noise = np.full((K, 12), 0.5)
+    noise[1] = 0.0
+    liveness = Liveness(K, noise, PERIOD_S)
+    for _ in range(200):
+        raw = noisy_bytes(rng, 0.5, centre)
+        raw[1] = noisy_bytes(rng, 5.0, centre)[1]
+        liveness.step(raw, HERE, NO)
+    assert liveness.spikes.sum() == 0
+    assert not liveness.noisy.any()

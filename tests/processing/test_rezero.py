@@ -18,7 +18,7 @@ def look(rezero: Rezero, offset_units: np.ndarray, period_s: float) -> tuple[int
     t_ns = 1_700_000_000 * S
     for number in range(1000):
         raw = np.rint(NO_LOAD - offset_units + NOISE_UNITS * rng.standard_normal(N))
-        if rezero.step(np.clip(raw, 0, 255).astype(np.uint8), ~NONE, t_ns):
+        if rezero.step(np.clip(raw, 0, 255).astype(np.uint8), ~NONE, NONE, t_ns):
             return number, t_ns
         t_ns += round(period_s * S)
     raise AssertionError("never ends")
@@ -58,5 +58,26 @@ def test_a_clock_that_is_set_back_does_not_end_the_look_early() -> None:
     rezero = Rezero(NONE, NO_LOAD)
     raw = NO_LOAD.astype(np.uint8)
     t_ns = 1_700_000_000 * S
-    ended = [rezero.step(raw, ~NONE, t_ns - number * S) for number in range(LOOK_SWEEPS + 1)]
+    ended = [rezero.step(raw, ~NONE, NONE, t_ns - number * S) for number in range(LOOK_SWEEPS + 1)]
     assert ended == [False] * LOOK_SWEEPS + [True]
+
+
+def test_what_a_board_marks_as_far_out_of_range_is_no_part_of_its_zero() -> None:
+    """For two sweeps after its data line was shorted, a board sends 0 without an error."""
+    rezero = Rezero(NONE, NO_LOAD)
+    raw = (NO_LOAD - 2.0).astype(np.uint8)
+    for number in range(LOOK_SWEEPS + 1):
+        shorted = np.full(N, number < 2)
+        sent = np.where(shorted, 0, raw).astype(np.uint8)
+        rezero.step(sent, ~NONE, shorted, number * S // 20)
+    found = rezero.finish(np.zeros(N), np.full(N, NOISE_UNITS))
+    assert found.tolist() == [2.0] * N
+    assert not rezero.doubted.any()
+
+
+def test_the_zero_of_what_was_far_out_of_range_all_the_while_is_in_doubt() -> None:
+    rezero = Rezero(NONE, NO_LOAD)
+    for number in range(LOOK_SWEEPS + 1):
+        rezero.step(np.zeros(N, np.uint8), ~NONE, np.arange(N) < 12, number * S // 20)
+    rezero.finish(np.full(N, 240.0), np.zeros(N))
+    assert np.flatnonzero(rezero.doubted).tolist() == list(range(12))

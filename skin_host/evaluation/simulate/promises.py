@@ -391,7 +391,7 @@ class Promises:
             assembled = daemon.engine.assemblers[name].counters.frames
             if assembled != counters.frames:
                 self.break_(f"bus {name}: {assembled} of {counters.frames} frames were taken")
-            self._account_frames(name, daemon.engine.assemblers[name])
+            self._account_frames(life, name, daemon.engine.assemblers[name])
         known = daemon.publisher.counters
         waiting = sum(
             1
@@ -410,8 +410,10 @@ class Promises:
         if not life.dead and got < known.touches_sent:
             self.break_(f"{known.touches_sent} events were acknowledged, {got} arrived")
 
-    def _account_frames(self, bus: str, assembler: Any) -> None:
-        """Each frame is in a sweep, waits to be, or is counted; each sweep came or is counted."""
+    def _account_frames(self, life: Life, bus: str, assembler: Any) -> None:
+        """Each frame is in a sweep, waits to be, or is counted; each sweep came or is counted,
+        until the daemon was asked to end.
+        """
         counters = assembler.counters
         states = assembler._states.values()
         waiting = sum(
@@ -433,7 +435,7 @@ class Promises:
                 f"bus {bus}: {counters.frames} frames came; {self._swept[bus]} are in sweeps, "
                 f"{waiting} wait, {told} are counted otherwise"
             )
-        bursts = self._world.cables[bus].sent.bursts
+        bursts = (life.sent_before_end or {}).get(bus, self._world.cables[bus].sent.bursts)
         known = {board.settings.address for board in self._world.layout.boards}
         sent = sum(count - SLACK for address, count in bursts.items() if address in known)
         came = counters.sweeps + counters.missed

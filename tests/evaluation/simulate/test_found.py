@@ -144,3 +144,26 @@ def test_what_pressed_as_the_daemon_started_is_in_doubt_when_it_lifts_and_no_bro
 
     with world.clock.runner() as runner:
         runner.run(live())
+
+
+def test_a_slow_disk_does_not_make_touches_last_when_the_daemon_ends(world: World) -> None:
+    """It reads nothing any more, so what it retained would be stale until the disk is done."""
+
+    async def live() -> bytes:
+        life = start(world)
+        await world.clock.sleep(8.0)
+        spot = world.spots[0]
+        topic = life.daemon.publisher.topics.part("contact", spot.part)
+        pressing = asyncio.create_task(spot.press(8.0))
+        await world.clock.sleep(2.0)
+        assert world.broker.retained[topic] == b"ON"
+        world.clock.threads_take_s = 3.0
+        ending = asyncio.create_task(world.end())
+        await world.clock.sleep(0.5)
+        assert not ending.done()
+        state = world.broker.retained[topic]
+        await asyncio.gather(ending, pressing)
+        return state
+
+    with world.clock.runner() as runner:
+        assert runner.run(live()) == b"UNKNOWN"
