@@ -146,9 +146,12 @@ class TableCurve:
         self.linear: Floats = np.maximum(rising[:, 0], chord)
         self.straight_kpa: Floats = np.where(rising[:, 0] < self.linear, 0.0, table_kpa[:, 1])
         #: Each piece is level + slope x; the first and the last go on for ever.
-        slope = np.column_stack([self.linear, rising])
-        level = np.column_stack([np.zeros(n), table_kpa[:, :-1] - rising * KNOTS_UNITS[:-1]])
-        self._slope, self._level = slope.reshape(-1), level.reshape(-1)
+        level = table_kpa[:, :-1] - rising * KNOTS_UNITS[:-1]
+        #: As one number of two parts, both are found by one look-up.
+        piece = np.zeros((n, knots), np.complex128)
+        piece.real = np.column_stack([self.linear, rising])
+        piece.imag[:, 1:] = level
+        self._piece = piece.reshape(-1)
 
     def part(self, taxels: Taxels) -> "TableCurve":
         """Return the curves of some of the taxels; they share the tables of all."""
@@ -166,8 +169,9 @@ class TableCurve:
         quarters = np.minimum(np.maximum(x / GRID_UNITS + 1.0, 0.0), len(_PIECE_AT) - 1.0)
         # Places in the whole table: two indices would cost several times as much.
         place = _PIECE_AT.take(quarters.astype(np.intp)) + self._first
-        result: Floats = self._slope.take(place) * x
-        result += self._level.take(place)
+        piece = self._piece.take(place)
+        result: Floats = piece.real * x
+        result += piece.imag
         return result
 
     def units(self, kpa: ArrayLike) -> Floats:
@@ -180,7 +184,8 @@ class TableCurve:
             end += passed * step
             step >>= 1
         place = end - self._before + self._first
-        result: Floats = (c - self._level.take(place)) / self._slope.take(place)
+        piece = self._piece.take(place)
+        result: Floats = (c - piece.imag) / piece.real
         return result
 
 
