@@ -51,7 +51,8 @@ _NO_STATUS = bytes(2 * TRIANGLES)
 NO_STATUS = np.zeros(TRIANGLES, np.uint16)
 NO_STATUS.flags.writeable = False
 _SMALLEST_DLC_B = 6
-#: Fewer frames are taken one by one: that costs no more.
+#: Fewer frames are taken one by one: that costs no more. At a batch's end any number is a run, so
+#: that the rest of the sweep, with which the next batch begins, is one.
 _SHORTEST_RUN = 5
 #: Where a frame's head has its length.
 _DLC_AT = 4
@@ -438,7 +439,8 @@ class Assembler:
         order = state.order
         assert order is not None
         done = state.done
-        n = min(len(order.places) - done, len(records.octets) - at)
+        left = len(records.octets) - at
+        n = min(len(order.places) - done, left)
         begin, end = done * HEAD_BYTES, (done + n) * HEAD_BYTES
         state.expected = -1
         if state.missing != order.missing[done] or not heads.startswith(
@@ -446,7 +448,7 @@ class Assembler:
         ):
             self._note_stray(state)
             return 0
-        if n < _SHORTEST_RUN:
+        if n < _SHORTEST_RUN and n < left:
             return 0
         size = records.form.size
         last = records.form.unpack_from(records.octets.data, (at + n - 1) * size)
