@@ -52,6 +52,22 @@ def test_a_triangle_that_drifts_to_the_quiet_middle_of_its_bytes_is_not_accused(
         assert not liveness.frozen.any()
 
 
+def test_a_board_that_sends_more_seldom_than_another_is_followed_as_well() -> None:
+    """Two boards; the second, of every third turn, drifts to the quiet middle of its bytes."""
+    rng = np.random.default_rng(3)
+    sigma = 0.15
+    noise = np.full((K, 12), 0.55)
+    liveness = Liveness(K, noise, np.array([PERIOD_S, 3 * PERIOD_S]), boards=2)
+    for turn, centre in enumerate(
+        np.concatenate([np.linspace(240.5, 241.0, 2400), np.full(1200, 241.0)])
+    ):
+        came = np.array([True, turn % 3 == 0])
+        centres = np.where(np.arange(K) < K // 2, 240.5, centre)[:, None] * np.ones(12)
+        here = np.repeat(came, K // 2)
+        liveness.step(noisy_bytes(rng, sigma, centres), here, NO, came=came)
+        assert not liveness.frozen.any(), turn
+
+
 @pytest.mark.parametrize("value", [240, 17, 254])
 def test_a_triangle_that_stops_is_found_within_0_7_s(value: int) -> None:
     rng = np.random.default_rng(3)
@@ -121,6 +137,22 @@ def test_a_touch_is_no_noise_and_a_bad_solder_joint_is() -> None:
         liveness.step(raw, HERE, NO)
         assert not liveness.noisy[:3].any()
     assert np.argwhere(liveness.noisy).tolist() == [[3, 0]]
+    assert liveness.doubted is not None
+    assert np.argwhere(liveness.doubted).tolist() == [[3, 0]]
+
+
+def test_one_stuck_pad_is_not_valid_and_its_triangle_is() -> None:
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+    liveness = calibrated(rng, 0.8, centre)
+    for _ in range(100):
+        raw = noisy_bytes(rng, 0.8, centre)
+        raw[2, 7] = 239
+        liveness.step(raw, HERE, NO)
+    assert np.argwhere(liveness.stuck).tolist() == [[2, 7]]
+    assert liveness.doubted is not None
+    assert np.argwhere(liveness.doubted).tolist() == [[2, 7]]
+    assert not liveness.unproven.any()
 
 
 def test_a_held_hand_is_given_more_time() -> None:
