@@ -7,8 +7,7 @@ from skin_host.config.relaxation import FITTED
 from skin_host.evaluation.accuracy import fitted_hold
 from skin_host.evaluation.histories import grasps, record
 from skin_host.processing.fitting.hold import HoldRecord, fit, merge
-from skin_host.processing.relaxation import STAND_INS, ParameterSet, make_model
-from skin_host.processing.relaxation.sets import log_spaced
+from skin_host.processing.relaxation import STAND_INS, ParameterSet, log_spaced, make_model
 
 SHARED_RATIO = ParameterSet(
     (0.09, 0.12, 0.15), (7.0, 130.0, 1500.0), (0.09, 0.12, 0.15), (14.0, 260.0, 3000.0)
