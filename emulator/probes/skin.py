@@ -135,7 +135,8 @@ class Skin:
         elif scene.noise:
             rng = np.random.default_rng([scene.seed, 7])
             thermal = self._layout.pad_kind == PadKind.THERMAL
-            self.noise = PadNoise.drawn(thermal.reshape(-1, TAXELS), rng)
+            calm = [unit.kind.startswith("fingertip") for unit in self._layout.triangles]
+            self.noise = PadNoise.drawn(thermal.reshape(-1, TAXELS), rng, np.array(calm))
             self.noise_ff = SENT_UNIT_FF * self.noise.rms_units.reshape(-1)
             self._jumps = Jumps.drawn(n, TAXELS, rng)
             self._dead = draw_dead(n, rng) & ~thermal

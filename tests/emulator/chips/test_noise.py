@@ -68,6 +68,16 @@ def test_the_same_seed_draws_the_same_noise() -> None:
     assert not np.array_equal(one, other)
 
 
+def test_fingertips_pick_up_nothing_periodic() -> None:
+    others = PadNoise.drawn(NO_THERMAL, np.random.default_rng(2))
+    calm = others.wave.any(axis=1) & (np.arange(20) % 2 == 0)
+    assert calm.any()
+    pads = PadNoise.drawn(NO_THERMAL, np.random.default_rng(2), calm)
+    assert not pads.wave[calm].any()
+    assert pads.rms_units[calm].max() < 2.0
+    assert np.array_equal(pads.rms_units[~calm], others.rms_units[~calm])
+
+
 def test_every_pad_has_the_rms_that_was_drawn_for_it() -> None:
     pads = PadNoise.drawn(NO_THERMAL, np.random.default_rng(2))
     drawn = pads.variates((20_000,), np.random.default_rng(3))
