@@ -365,8 +365,7 @@ class Describer:
         watch = self._watch.buses[name]
         if watch.gained and now_ns is not None:
             record["last_second"] = _last_second(watch.gained, bus.bitrate)
-            awaited = manager is not None and manager.awaits_all
-            record["silent"] = watch.silent and not awaited
+            record["silent"] = watch.silent
         return record
 
 

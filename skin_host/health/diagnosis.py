@@ -342,17 +342,19 @@ def _taxels(record: Record) -> Iterator[Fault]:
             "nothing touches",
         )
     # If the triangle is already reported as missing, its taxels were absent because of that.
-    kinds = ["stuck", "out_of_range", "too_noisy"] + ["absent", "too_few"] * (
-        not record["triangles"]
-    )
-    refused = {taxel for kind in kinds for taxel in verdicts.get(kind, ())}
-    refused &= set(record["invalid"])
+    kinds = {"stuck": "stuck", "out_of_range": "out of range", "too_noisy": "too noisy"}
+    if not record["triangles"]:
+        kinds |= {"absent": "absent", "too_few": "received too rarely"}
+    invalid = set(record["invalid"])
+    why = {kind: invalid & set(verdicts.get(kind, ())) for kind in kinds}
+    refused = set().union(*why.values())
     if refused:
+        reasons = " or ".join(kinds[kind] for kind, taxels in why.items() if taxels)
         yield Fault(
             "taxel_refused",
             part,
-            f"{named(refused)} of {part}: stuck, out of range, too noisy, absent or received too "
-            "rarely when calibrated; not valid until a better calibration",
+            f"{named(refused)} of {part}: {reasons} when calibrated; not valid until a better "
+            "calibration",
         )
     if record["baseline_at_limit"]:
         at_limit = named(record["baseline_at_limit"])

@@ -137,12 +137,17 @@ class BusWatch:
     gained: dict[str, float] = field(default_factory=dict)
     _past: deque[tuple[int, dict[str, int]]] = field(default_factory=deque)
 
-    def note(self, now_ns: int, ledger_ns: int, totals: dict[str, int]) -> None:
-        """Take in all counters, with the time of the time stamps and of the ledger."""
+    def note(
+        self, now_ns: int, ledger_ns: int, totals: dict[str, int], *, awaited: bool = False
+    ) -> None:
+        """Take in all counters, with the time of the time stamps and of the ledger.
+
+        While none of its boards has had the time to send, a bus is not silent: `awaited`.
+        """
         if totals["frames"] != self.frames:
             self.frames = totals["frames"]
             self.received_ns = ledger_ns
-        self.silent = ledger_ns - self.received_ns > self.silent_after_ns
+        self.silent = ledger_ns - self.received_ns > self.silent_after_ns and not awaited
         past = self._past
         if past and now_ns < past[-1][0]:
             past.clear()  # the clock was set back
@@ -198,7 +203,9 @@ class Watch:
     def tick(self, now_ns: int, ports: dict[str, Port], boards: dict[str, Boards]) -> None:
         """Read all counters; to be called several times a second."""
         for bus, bus_watch in self.buses.items():
-            bus_watch.note(now_ns, self._engine.ledger.now_ns, self._totals(bus, ports.get(bus)))
+            totals = self._totals(bus, ports.get(bus))
+            awaited = bus in boards and boards[bus].awaits_all
+            bus_watch.note(now_ns, self._engine.ledger.now_ns, totals, awaited=awaited)
         for index, watch in self.boards.items():
             watch.note(self._events(index, watch, boards), now_ns)
             bus = self._engine.layout.boards[index].settings.bus
