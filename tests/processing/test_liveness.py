@@ -209,6 +209,33 @@ def test_a_press_before_a_gap_and_its_end_after_it_are_no_spike(gap: bool) -> No
     assert liveness.spikes.sum() == (0 if gap else 1)
 
 
+def test_a_gap_of_one_board_hides_no_spike_of_another() -> None:
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+    liveness = Liveness(K, np.full((K, 12), 0.4), PERIOD_S, boards=2)
+    for row in (1, 2):
+        pressed = noisy_bytes(rng, 0.4, centre)
+        pressed[row, 4] -= 40
+        for raw in (noisy_bytes(rng, 0.4, centre), pressed, noisy_bytes(rng, 0.4, centre)):
+            liveness.note_gap(0)
+            liveness.step(raw, HERE, NO)
+    assert liveness.spikes.tolist() == [0, 1]
+
+
+def test_triangles_are_valid_until_a_calibration_finds_them_constant() -> None:
+    rng = np.random.default_rng(3)
+    assert Liveness(K, None, PERIOD_S).doubted is None
+    noise = np.full((K, 12), 0.8)
+    noise[2] = 0.0
+    liveness = Liveness(K, noise, PERIOD_S)
+    for changes in range(4):
+        assert liveness.unproven.tolist() == [False, False, changes < 3, False]
+        liveness.step(noisy_bytes(rng, 0.8, np.full((K, 12), 240.3)), HERE, NO)
+        if not changes:
+            # The first sweep is compared with nothing.
+            liveness.step(noisy_bytes(rng, 0.8, np.full((K, 12), 240.3)), HERE, NO)
+
+
 def test_a_press_right_after_a_release_is_no_damaged_byte() -> None:
     """Up and down within two sweeps, but not back to where it was."""
     rng = np.random.default_rng(4)

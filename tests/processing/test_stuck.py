@@ -151,6 +151,23 @@ def test_while_something_else_is_touched_a_pad_may_rest_for_longer() -> None:
     assert found > 3 * sweeps_until_stuck(again, rng, 239)
 
 
+@pytest.mark.parametrize("pads", [1, 2])
+def test_a_touch_slows_its_own_board_but_neither_others_nor_what_only_feels_itself(
+    pads: int,
+) -> None:
+    """Two boards of four triangles; pads of the first board's second triangle are touched."""
+    touched = np.zeros(SHAPE, bool)
+    touched[1, :pads] = True
+    felt = TouchedPads.of(touched, b"", 2)
+    assert felt.calm.tolist() == [False] * 4 + [True] * 4
+    assert felt.elsewhere.tolist() == [True, False, True, True] + [False] * 4
+    slow = 1.0 / 6.0
+    assert felt.weight[4:].tolist() == np.ones((4, 12)).tolist()
+    assert felt.weight[[0, 2, 3]].tolist() == np.full((3, 12), slow).tolist()
+    # Where two are touched, each feels something else than itself.
+    assert felt.weight[1].tolist() == [1.0 if pads == 1 else slow] * pads + [slow] * (12 - pads)
+
+
 @pytest.mark.parametrize("value", [0, 255])
 def test_a_pad_at_an_end_of_its_scale_is_not_called_stuck(value: int) -> None:
     watched, rng = lively()
