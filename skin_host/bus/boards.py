@@ -402,7 +402,9 @@ class Boards:
         elif isinstance(answer, TimeOfLife):
             record.life_s = answer.seconds
         elif isinstance(answer, TxOverflow):
-            self._ledger.tx_overflows[record.row] += 1
+            # A board that must answer in the middle of a sweep drops the rest of it: no fault.
+            is_queried = not record.started or record.busy is not None
+            self._ledger.tx_overflows[record.row] += not is_queried
 
 
 @dataclass(slots=True)

@@ -166,6 +166,9 @@ class Engine:
         #: When a board's pad last came back from there by itself.
         self._jumped_ns: dict[int, int] = {}
         self._touched = np.zeros(layout.n_taxels, np.bool_)
+        #: Whether each taxel was touched when it was last valid. A board that restarts in a touch
+        #: is silent before it is zeroed: its touches have ended as lost, and may still be there.
+        self._last_touched = np.zeros(layout.n_taxels, np.bool_)
         self._run: _CalibrationRun | None = None
         self._pipeline: Pipeline | None = None
         self._trackers = {part: ContactTracker(layout, part, settings) for part in parts}
@@ -189,6 +192,7 @@ class Engine:
         self._below = after._below
         self._jumped_ns = after._jumped_ns
         self._touched = after._touched
+        self._last_touched = after._last_touched
         self._run = after._run
         for part, tracker in self._trackers.items():
             tracker.go_on(after._trackers[part])
@@ -221,7 +225,9 @@ class Engine:
             self._rezeros.pop(board, None)
         if self.fingertips is not None and boards == self.boards:
             self._ended += self.fingertips.use(calibration.zeros)
-        self._renew_pipeline(self.taxels_of(boards))
+        zeroed = self.taxels_of(boards)
+        self._last_touched[zeroed] = self._touched[zeroed]
+        self._renew_pipeline(zeroed)
 
     def _renew_pipeline(self, zeroed: NDArray[np.bool_]) -> None:
         """Apply settings and calibration to the pipeline; taxels bool[n] were zeroed."""
@@ -345,7 +351,7 @@ class Engine:
                     self._run.samples[part] = 0
         if self.calibration is None:
             return 0
-        touched: NDArray[np.bool_] = self._touched[taxels] & (taxels >= 0) & believed
+        touched: NDArray[np.bool_] = self._last_touched[taxels] & (taxels >= 0) & believed
         before = self._rezeros.get(board)
         if before is not None:
             touched |= before.doubted.reshape(TRIANGLES, PADS)
@@ -368,7 +374,7 @@ class Engine:
         """Return taxels bool[n] whose zero is not known; with `touched`, also those which are
         touched: after another zero, theirs would not be.
         """
-        found = self._touched.copy() if touched else np.zeros_like(self._touched)
+        found = self._last_touched.copy() if touched else np.zeros_like(self._touched)
         for board, rezero in self._rezeros.items():
             found[self._taxels_of(board).ravel()[rezero.doubted]] = True
         return found
@@ -492,6 +498,7 @@ class Engine:
         """Pass the touched pads to the liveness decision, but only when they change."""
         part = self.layout.parts[index]
         touched = self._touched[part.start : part.stop]
+        np.copyto(self._last_touched[part.start : part.stop], frame.touched, where=frame.valid)
         if touched.tobytes() == frame.touched.tobytes():
             return
         touched[:] = frame.touched

@@ -85,7 +85,13 @@ def test_a_board_that_nobody_configured_is_told(heard: Heard) -> None:
     assert ("bus_stranger", "can0/7") in heard.told()
 
 
+def test_a_board_that_must_answer_while_it_sends_is_not_told_to_overflow(heard: Heard) -> None:
+    heard.say((identifier(MessageClass.MANAGEMENT, HAND, TX_OVERFLOW), b""))
+    assert "board_overflows" not in {code for code, _ in heard.told()}
+
+
 def test_a_board_that_could_not_send_is_told(heard: Heard) -> None:
+    heard.boards.records[HAND].started = True
     heard.say((identifier(MessageClass.MANAGEMENT, HAND, TX_OVERFLOW), b""))
     assert ("board_overflows", "hand") in heard.told()
     assert heard.engine.ledger.tx_overflows.sum() == 1

@@ -39,6 +39,8 @@ LASTING = {
 #: is queried, 2 s until it is set up, 2 s for its zero), and the 3 s for which health holds what
 #: comes and goes. Pads that were stuck or noisy need some samples to prove themselves.
 PASSING_NS = 20 * NS
+#: A board that fell silent is queried every 8 s at least, and set up in less than 4 s.
+BACK_NS = 12 * NS
 #: A board that does not send what it should is set up again after up to a minute.
 WRONG_NS = 75 * NS
 SLOW = {
@@ -108,6 +110,15 @@ class Accusations:
         self.troubles = [
             one for one in self.troubles if one[2] is None or now_ns - one[2] < WRONG_NS
         ]
+
+    def may_be_silent(self, board: str) -> bool:
+        """Whether something keeps a board from being received, or did so lately."""
+        now_ns = self._world.clock.monotonic_ns()
+        return any(
+            trouble.accuses("board_silent", board)
+            and (over is None or trouble.lingers or now_ns - over < BACK_NS)
+            for trouble, _, over in self.troubles
+        )
 
     def restarted(self) -> None:
         """Another daemon has reported nothing yet."""

@@ -65,6 +65,7 @@ class Promises:
     Attributes:
         broken: what was broken first, or None.
         touches: events so far.
+        kept: number of the last calibration that the daemon reported as kept, -1 before.
         accusations: what health reports against the troubles.
     """
 
@@ -141,7 +142,7 @@ class Promises:
         self._put: dict[str, int] = {}
         #: Calibrations in the order in which they were taken, and the last that was surely kept.
         self._calibrations: list[str] = []
-        self._kept = -1
+        self.kept = -1
         world.broker.listeners.append(self._hear)
 
     # ------------------------------------------------------------------  its input
@@ -320,7 +321,7 @@ class Promises:
             self._said[topic] = payload, self._now_ns()
 
     def _health(self, part: str, record: Any) -> None:
-        wrong = self.accusations.note(part, record)
+        wrong = self.accusations.note(part, record) or self.accusations.unnamed()
         if wrong is not None:
             self.break_(wrong)
         touched = np.array(record["taxel_verdicts"].get("touched", []), np.intp)
@@ -355,7 +356,7 @@ class Promises:
         result = answer.get("result") or {}
         if answer["ok"] and answer["command"] == "calibrate" and result["kept"]:
             self._note_calibration(result["id"])
-            self._kept = len(self._calibrations) - 1
+            self.kept = len(self._calibrations) - 1
 
     def _note_calibration(self, name: str) -> None:
         if name in self._calibrations:
@@ -365,12 +366,12 @@ class Promises:
     def started(self, life: Life) -> None:
         """A daemon has started, with the calibration that it found."""
         found = life.daemon.engine.calibration
-        if self._kept < 0:
+        if self.kept < 0:
             return
-        kept = self._calibrations[self._kept]
+        kept = self._calibrations[self.kept]
         if found is None:
             self.break_(f"calibration {kept} was kept, and there is none at the next start")
-        elif found.id in self._calibrations[: self._kept]:
+        elif found.id in self._calibrations[: self.kept]:
             self.break_(f"calibration {kept} was kept, and the next start has {found.id}")
         elif found.id not in self._calibrations:
             self._note_calibration(found.id)
@@ -514,11 +515,25 @@ class Promises:
                     f"{name}: taxel {taxel} is valid and reads {frame.pressure_kpa[taxel]:.1f} kPa "
                     "while nothing presses it"
                 )
+        self._missed_boards(now_ns)
         unnamed = self.accusations.unnamed()
         if unnamed is not None:
             self.break_(unnamed)
         if len(asyncio.all_tasks()) > MOST_TASKS:
             self.break_(f"{len(asyncio.all_tasks())} tasks run")
+
+    def _missed_boards(self, now_ns: int) -> None:
+        """A board that nothing keeps silent is received: the daemon itself brings it back."""
+        for board in self._world.layout.boards:
+            taxels = board.taxel_index[board.taxel_index >= 0]
+            quiet_ns = now_ns - int(self._felt_ns[taxels].max())
+            if quiet_ns < STALE_PERIODS * board.settings.period_ms * 1_000_000:
+                continue
+            if not self.accusations.may_be_silent(board.name):
+                self.break_(
+                    f"board {board.name} was last received {quiet_ns / NS:.1f} s ago, and nothing "
+                    "keeps it silent"
+                )
 
     def _exempt_zeroed(self, life: Life, truth: NDArray[np.float64]) -> None:
         """What its board did not feel before it took a zero is in that zero: nobody can know."""

@@ -16,7 +16,7 @@ import msgspec
 from emulator.probes.scene import Fault, Scene, Temperature
 from skin_host.config.settings import Settings
 from skin_host.errors import ConfigurationError
-from skin_host.evaluation.simulate.accusations import NOISE, QUIET_NS, STARTED_NS
+from skin_host.evaluation.simulate.accusations import BACK_NS, NOISE, QUIET_NS, STARTED_NS
 from skin_host.evaluation.simulate.disk import PowerCut
 from skin_host.evaluation.simulate.promises import SAMPLE_S, Promises
 from skin_host.evaluation.simulate.troubles import ACTS, KINDS, WIRING, Trouble, act
@@ -40,6 +40,8 @@ SHORT_S, LONG_S = (0.2, 5.0), (7.0, 11.0)
 LONG_SHARE = 0.3
 #: The temperature moves by at most so much in this time.
 WANDER_S, MOST_WANDER_C = 600.0, 1.0
+#: Presses of rehearsals.
+FIRM_KPA = (40.0, 80.0)
 #: Troubles at one time.
 MOST_TROUBLES = 3
 #: Faults that a calm may keep: they report what happened within the last minute, or real pads.
@@ -168,6 +170,9 @@ class _Run:
         self._injected: Counter[str] = Counter()
         self._requests = 0
         self._drills = 0
+        #: Draws what is rehearsed: storms stay as they are when rehearsals change.
+        self._staging = random.Random(f"{seed} rehearsals")
+        self._rehearsals = 0
 
     async def live(self) -> None:
         """Storm and calm, until the time is over or a promise is broken."""
@@ -221,6 +226,7 @@ class _Run:
             await self._storm()
             await self._calm()
             await self._drill()
+            await self._rehearse()
         await self._end_in_a_press()
 
     # ------------------------------------------------------------------ the daemon's lives
@@ -296,16 +302,16 @@ class _Run:
             return
         if name in WIRING and any(trouble.name in WIRING for trouble in self._troubles):
             return
-        trouble = self._inject(name)
+        trouble = self._inject(name, chance)
         if trouble is None or not trouble.lasts_s[1]:
             return
         await self._last(trouble, min(left_s, chance.uniform(*trouble.lasts_s)))
 
-    def _inject(self, name: str) -> Trouble | None:
+    def _inject(self, name: str, chance: random.Random, *, plain: bool = False) -> Trouble | None:
         """Begin a trouble; None if another one has unplugged the chip that was drawn."""
         world = self.world
         try:
-            trouble = KINDS[name](world, self._chance)
+            trouble = KINDS[name](world, chance, plain)
         except ConfigurationError:
             return None
         world.note(f"trouble: {trouble.about}")
@@ -426,7 +432,7 @@ class _Run:
         self._drills += 1
         quiet_s = max(QUIET_NS, STARTED_NS) / 1e9
         await world.clock.sleep(quiet_s)
-        trouble = self._inject(kind)
+        trouble = self._inject(kind, self._chance, plain=True)
         if trouble is None:
             return
         if trouble.writes:
@@ -435,6 +441,75 @@ class _Run:
             await self._last(trouble, min(trouble.within_s, LONGEST_DRILL_S) + 0.5)
         else:
             await world.clock.sleep(trouble.within_s + 0.5)
+
+    # ------------------------------------------------------------------ rehearsal
+
+    async def _rehearse(self) -> None:
+        """A situation that storms seldom make. All take their turns, also over seeds."""
+        if self.world.life is None:
+            return
+        situations = (
+            self._reset_in_a_press,
+            self._set_up_in_a_press,
+            self._lose_broker_in_presses,
+            self._fail_after_writing,
+        )
+        situation = situations[(self.result.seed + self._rehearsals) % len(situations)]
+        self._rehearsals += 1
+        await situation()
+        if self.world.life is not None:
+            self._promises.account(self.world.life)
+
+    async def _press_all(self, seconds: float) -> None:
+        """Press every place firmly for a while."""
+        async with asyncio.TaskGroup() as group:
+            for spot in self.world.spots:
+                group.create_task(spot.press(seconds, self._staging.uniform(*FIRM_KPA)))
+
+    async def _reset_in_a_press(self) -> None:
+        """A board restarts while it is pressed; the daemon brings it back by itself."""
+        pressing = asyncio.create_task(self._press_all(8.0), name="press all")
+        await self.world.clock.sleep(self._staging.uniform(1.0, 2.0))
+        self._inject("board_reset", self._staging)
+        await pressing
+        await self.world.clock.sleep(BACK_NS / 1e9)
+
+    async def _set_up_in_a_press(self) -> None:
+        """An operator sets boards up while they are pressed."""
+        pressing = asyncio.create_task(self._press_all(8.0), name="press all")
+        await self.world.clock.sleep(self._staging.uniform(1.0, 2.0))
+        board = self._staging.choice(self.world.layout.boards).name
+        self._ask("configure", self._staging.choice(("{}", f'{{"board": "{board}"}}')))
+        await pressing
+
+    async def _lose_broker_in_presses(self) -> None:
+        """The broker fails while the skin is pressed again and again, and then is well again."""
+        kinds = ("broker_absent", "broker_frozen", "broker_refuses", "broker_disconnects")
+        pressing = asyncio.create_task(self._press_all(1.0), name="press all")
+        await self.world.clock.sleep(self._staging.uniform(0.5, 1.0))
+        trouble = self._inject(self._staging.choice(kinds), self._staging)
+        assert trouble is not None
+        lasting = asyncio.create_task(self._last(trouble, 8.0 if trouble.lasts_s[1] else 0.0))
+        await pressing
+        for _ in range(4):
+            await self._press_all(1.0)
+            await self.world.clock.sleep(0.5)
+        await lasting
+        await self.world.clock.sleep(5.0)
+
+    async def _fail_after_writing(self) -> None:
+        """The power fails as soon as the daemon has reported that a calibration is kept."""
+        clock = self.world.clock
+        kept = self._promises.kept
+        self._ask("calibrate", '{"seconds": 0.5}')
+        end_s = clock.monotonic_s() + 5.0
+        while self._promises.kept == kept and clock.monotonic_s() < end_s:
+            await clock.sleep(0.1)
+        self.result.deaths += 1
+        self._kill(power=True)
+        await clock.sleep(self._staging.uniform(0.1, 2.0))
+        self._start()
+        await clock.sleep(5.0)
 
     async def _end_in_a_press(self) -> None:
         """The daemon is asked to end while something touches; every touch ends before it does."""

@@ -123,7 +123,9 @@ class Trouble:
         return self.places is None or where.partition("/")[0] in self.places
 
 
-Begin = Callable[[World, random.Random], Trouble]
+#: Takes the world, what draws target and strength, and whether it is to be so strong that health
+#: must name it (if it must at any strength).
+Begin = Callable[[World, random.Random, bool], Trouble]
 
 
 def _nothing() -> None:
@@ -180,7 +182,7 @@ def _emulated(
         sure: from this value on, it must be reported.
     """
 
-    def begin(world: World, chance: random.Random) -> Trouble:
+    def begin(world: World, chance: random.Random, plain: bool) -> Trouble:
         kind = faults.KINDS[name]
         targets: dict[str, object] = {}
         blind: frozenset[Triangle] = frozenset()
@@ -197,6 +199,8 @@ def _emulated(
         if "bus" in kind.needs:
             targets["bus"] = bus
         value = None if values is None else round(chance.uniform(*values), 4)
+        if plain and value is not None and values is not None and abs(value) < sure:
+            value = round(chance.uniform(sure, values[1]), 4)
         if name in ("wrong_address", "shared_address"):
             value = float((triangle % 4 + chance.randrange(1, 4)) % 4)
         if name == "swapped_lines":
@@ -260,9 +264,11 @@ def _frames(
 ) -> Begin:
     """Something that happens to frames between the bus and the daemon."""
 
-    def begin(world: World, chance: random.Random) -> Trouble:
+    def begin(world: World, chance: random.Random, plain: bool) -> Trouble:
         cable = world.cables[chance.choice(list(world.cables))]
         share = round(chance.uniform(0.1, 1.0) * most, 4)
+        if plain and share < sure:
+            share = round(chance.uniform(sure, most), 4)
         world.move()
         setattr(cable.mischief, name, share)
 
@@ -284,7 +290,7 @@ def _frames(
     return begin
 
 
-def _address_twice(world: World, chance: random.Random) -> Trouble:
+def _address_twice(world: World, chance: random.Random, _: bool) -> Trouble:
     """A second board of the same address sends the same bus full of its own sweeps."""
     board = chance.choice(world.layout.boards)
     cable = world.cables[board.settings.bus]
@@ -307,7 +313,7 @@ def _address_twice(world: World, chance: random.Random) -> Trouble:
 
 
 def _interface(name: str, state: LinkState, must: str) -> Begin:
-    def begin(world: World, chance: random.Random) -> Trouble:
+    def begin(world: World, chance: random.Random, _: bool) -> Trouble:
         cable = world.cables[chance.choice(list(world.cables))]
         cable.set_state(state)
         about = f"{name} bus={cable.name}"
@@ -329,15 +335,16 @@ def _interface(name: str, state: LinkState, must: str) -> Begin:
 _STALLED = _BUS | _BROKER | {"host_stalls", "bus_drops"}
 
 
-def _stall(world: World, chance: random.Random) -> Trouble:
-    seconds = chance.choice((0.05, 0.2, 0.5, 1.5, 4.0)) * chance.uniform(0.8, 1.2)
+def _stall(world: World, chance: random.Random, plain: bool) -> Trouble:
+    seconds = chance.choice((1.5, 4.0) if plain else (0.05, 0.2, 0.5, 1.5, 4.0))
+    seconds *= chance.uniform(0.8, 1.2)
     world.clock.advance(seconds)
     must = frozenset({"host_stalls"} if seconds > 0.7 else ())
     about = f"stall {seconds:.2f} s"
     return Trouble("stall", about, _nothing, _STALLED, must, 1.0, lasts_s=(0.0, 0.0))
 
 
-def _suspended(world: World, chance: random.Random) -> Trouble:
+def _suspended(world: World, chance: random.Random, _: bool) -> Trouble:
     """The computer sleeps: its adapters hear nothing, its monotonic time stops, brokers go on."""
     seconds = round(chance.uniform(2.0, 20.0), 1)
     world.suspend(seconds)
@@ -348,8 +355,10 @@ def _suspended(world: World, chance: random.Random) -> Trouble:
     return Trouble("suspended", about, _nothing, _STALLED, must, 1.0, lasts_s=(0.0, 0.0))
 
 
-def _set_clock(world: World, chance: random.Random) -> Trouble:
+def _set_clock(world: World, chance: random.Random, plain: bool) -> Trouble:
     jump_s = chance.choice((-3600.0, -2.0, -0.3, -0.02, 0.02, 0.3, 2.0, 3600.0))
+    if plain:
+        jump_s = 2.0
     world.move()
     world.clock.set(jump_s)
     may = _BUS | {"host_stalls"}
@@ -363,7 +372,7 @@ _AWAY = frozenset({"broker_away"})
 _BROKER_PLACES = frozenset({"broker"})
 
 
-def _broker_absent(world: World, chance: random.Random) -> Trouble:
+def _broker_absent(world: World, chance: random.Random, _: bool) -> Trouble:
     forget = chance.random() < 0.5
     world.broker.stop(forget=forget)
 
@@ -374,7 +383,7 @@ def _broker_absent(world: World, chance: random.Random) -> Trouble:
     return Trouble("broker_absent", about, end, _BROKER, _AWAY, 1.0, _BROKER_PLACES)
 
 
-def _broker_frozen(world: World, _: random.Random) -> Trouble:
+def _broker_frozen(world: World, _chance: random.Random, _plain: bool) -> Trouble:
     world.broker.set_frozen(frozen=True)
 
     def end() -> None:
@@ -383,7 +392,7 @@ def _broker_frozen(world: World, _: random.Random) -> Trouble:
     return Trouble("broker_frozen", "broker_frozen", end, _BROKER, _AWAY, 6.0, _BROKER_PLACES)
 
 
-def _broker_refuses(world: World, _: random.Random) -> Trouble:
+def _broker_refuses(world: World, _chance: random.Random, _plain: bool) -> Trouble:
     world.broker.refuses = True
     world.broker.disconnect_all(accusing=False)
 
@@ -393,7 +402,7 @@ def _broker_refuses(world: World, _: random.Random) -> Trouble:
     return Trouble("broker_refuses", "broker_refuses", end, _BROKER, _AWAY, 1.0, _BROKER_PLACES)
 
 
-def _broker_disconnects(world: World, chance: random.Random) -> Trouble:
+def _broker_disconnects(world: World, chance: random.Random, _: bool) -> Trouble:
     accusing = chance.random() < 0.3
     world.broker.disconnect_all(accusing=accusing)
     about = f"broker_disconnects accusing={accusing}"
@@ -407,7 +416,7 @@ def _broker_disconnects(world: World, chance: random.Random) -> Trouble:
     )
 
 
-def _broker_doubles(world: World, _: random.Random) -> Trouble:
+def _broker_doubles(world: World, _chance: random.Random, _plain: bool) -> Trouble:
     world.broker.doubles = True
 
     def end() -> None:
@@ -417,7 +426,7 @@ def _broker_doubles(world: World, _: random.Random) -> Trouble:
 
 
 def _disk(name: str, code: int) -> Begin:
-    def begin(world: World, _: random.Random) -> Trouble:
+    def begin(world: World, _chance: random.Random, _plain: bool) -> Trouble:
         world.disk_refuses = code
 
         def end() -> None:
@@ -432,7 +441,7 @@ def _disk(name: str, code: int) -> Begin:
     return begin
 
 
-def _disk_slow(world: World, chance: random.Random) -> Trouble:
+def _disk_slow(world: World, chance: random.Random, _: bool) -> Trouble:
     """Each file takes long; everything else goes on meanwhile."""
     world.clock.threads_take_s = round(chance.uniform(0.1, 3.0), 2)
 
@@ -515,7 +524,11 @@ KINDS: dict[str, Begin] = {
         2.0,
     ),
     "late_period": _emulated(
-        "late_period", _TIMING | _SET_UP | _CHIPS, {"board_period"}, 4.0, values=(3.0, 40.0)
+        "late_period",
+        _TIMING | _SET_UP | _CHIPS | {"bus_silent"},  # it is set up again, and silent meanwhile
+        {"board_period"},
+        4.0,
+        values=(3.0, 40.0),
     ),
     "jittered_period": _emulated(
         "jittered_period",

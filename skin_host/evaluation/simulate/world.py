@@ -212,10 +212,11 @@ class Spot:
         )
         self.pressed = False
 
-    async def press(self, seconds: float) -> None:
-        """Press for a while, then lift."""
+    async def press(self, seconds: float, kpa: float | None = None) -> None:
+        """Press for a while with some pressure, a drawn one if not given; then lift."""
         world = self._world
-        kpa = self._chance.uniform(20.0, 80.0)
+        if kpa is None:
+            kpa = self._chance.uniform(20.0, 80.0)
         world.note(f"press {self.part}/{self.taxel} {kpa:.0f} kPa for {seconds:.1f} s")
         self.pressed = True
         try:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from emulator.probes.scene import Scene
+from emulator.probes.scene import Fault, Scene
 from skin_host.cli.common import load_skin
 from skin_host.demo import configuration
 from skin_host.evaluation.simulate.world import Life, World
@@ -167,3 +167,29 @@ def test_a_slow_disk_does_not_make_touches_last_when_the_daemon_ends(world: Worl
 
     with world.clock.runner() as runner:
         assert runner.run(live()) == b"UNKNOWN"
+
+
+@pytest.mark.parametrize("number", range(2))
+def test_a_board_that_restarts_in_a_press_does_not_zero_it_away(world: World, number: int) -> None:
+    """It is silent before it is set up again; its touches have ended as lost by then."""
+
+    async def live() -> None:
+        life = start(world)
+        await world.clock.sleep(8.0)
+        spot = world.spots[number]
+        pressing = asyncio.create_task(spot.press(8.0, 50.0), name="press")
+        await world.clock.sleep(2.0)
+        part = world.layout.part(spot.part)
+        triangle = world.layout.triangles[int(world.layout.triangle_of[part.start + spot.taxel])]
+        board = world.layout.boards[triangle.board].name
+        world.move()
+        world.robot.inject(Fault(name="board_reset", board=board))
+        await world.clock.sleep(5.0)
+        assert not pressing.done()
+        assert life.daemon.engine.in_doubt(triangle.board).any()
+        topic = life.daemon.publisher.topics.part("contact", spot.part)
+        assert world.broker.retained[topic] == b"UNKNOWN"
+        life.kill()
+
+    with world.clock.runner() as runner:
+        runner.run(live())
