@@ -223,7 +223,8 @@ class SignalSkin:
             # A chip that is gone is not read: its sequencer and its noise go on later.
             there = forced < 0
             words = np.repeat(forced[:, None], TAXELS, axis=1).astype(np.uint16)
-            words[there] = self.read(chips[there])
+            if there.any():
+                words[there] = self.read(chips[there])
             return words
         self._settle(chips)
         results: Words = self._results[chips]

@@ -68,6 +68,14 @@ def test_a_chip_that_reads_zero_makes_the_board_take_a_new_baseline(robot: Robot
     assert triangle(frames(robot, 0.5), 14, 2) == UNTOUCHED
 
 
+def test_a_board_goes_on_sending_when_all_its_chips_are_gone(robot: Robot) -> None:
+    (hand,) = (board for board in robot.layout.boards if board.name == "hand")
+    for number in hand.triangles:
+        robot.inject(Fault(name="chip_gone", board="hand", triangle=number))
+    sent = frames(robot)
+    assert {tuple(triangle(sent, 14, number)[0]) for number in hand.triangles} == {(0,) * 12}
+
+
 def test_a_shorted_finger_takes_its_whole_line_with_it(robot: Robot) -> None:
     robot.inject(Fault(name="shorted_finger", board="hand", triangle=1))
     sent = frames(robot, 0.06)
