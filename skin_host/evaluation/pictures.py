@@ -18,7 +18,6 @@ Floats = NDArray[np.float64]
 #: One hue for each pad or model, dark enough for print.
 HUES = ("#1b5e9e", "#c4541a", "#2e7d4f", "#7a4f9a", "#5f5f5f")
 PROBES_MM = (2.0, 3.0, 4.0, 5.0, 6.0)
-PALM_PITCH_MM = 0.5
 COLOURS = {
     "none": "#8c959f",
     "published": "#cf222e",

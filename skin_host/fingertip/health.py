@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import NotRequired, TypedDict
 
 from skin_host.fingertip.engine import FingertipEngine, TipState
-from skin_host.health.diagnosis import Fault
+from skin_host.health.diagnosis import FoundFault
 from skin_host.health.record import FaultName
 
 #: Rates are means over about this time.
@@ -107,13 +107,13 @@ class FingertipHealth:
             record["age_ms"] = round(age_ms, 1) if state.last_ns else None
         return record
 
-    def _faults(self, state: TipState, now_ns: int | None) -> Iterator[Fault]:
+    def _faults(self, state: TipState, now_ns: int | None) -> Iterator[FoundFault]:
         """Each cause before its consequences: the first fault gives the state."""
         name, table = state.name, state.settings
         here = f"the force/torque board of {name} (bus {table.bus}, address {table.address})"
 
-        def fault(code: str, sentence: str) -> Fault:
-            return Fault(f"fingertip_{code}", name, sentence)
+        def fault(code: str, sentence: str) -> FoundFault:
+            return FoundFault(f"fingertip_{code}", name, sentence)
 
         if not state.frames and not state.awaited:
             yield fault("absent", f"{here} has not sent anything yet; check power and address")
@@ -171,7 +171,7 @@ _STATES = {
 }
 
 
-def _state(tip: TipState, faults: list[Fault]) -> str:
+def _state(tip: TipState, faults: list[FoundFault]) -> str:
     if not tip.frames:
         return "no data"
     return _STATES.get(faults[0].code, "degraded") if faults else "ok"

@@ -13,7 +13,7 @@ import numpy as np
 from skin_host.bus.boards import Boards
 from skin_host.bus.port import Port
 from skin_host.health.describe import ABSENT_SWEEPS, Describer
-from skin_host.health.diagnosis import Fault, diagnose
+from skin_host.health.diagnosis import FoundFault, diagnose
 from skin_host.health.record import Record
 from skin_host.health.watch import Watch
 from skin_host.processing.core import Engine, Output
@@ -64,7 +64,7 @@ class Health:
         self._engine = engine
         self._watch = Watch(engine)
         self._describer = Describer(engine, self._watch)
-        self._held: dict[int, dict[tuple[str, str], tuple[Fault, int]]] = {}
+        self._held: dict[int, dict[tuple[str, str], tuple[FoundFault, int]]] = {}
         self._ticked_ns = 0
         self._stall_ns = 0
         self._stalled_ns = -STALLED_NS
@@ -176,7 +176,7 @@ class Health:
             if abs(now_ns - at_ns) < LATELY_NS
         }
 
-    def _without_own_stalls(self, faults: list[Fault], now_ns: int) -> list[Fault]:
+    def _without_own_stalls(self, faults: list[FoundFault], now_ns: int) -> list[FoundFault]:
         """Drop the faults that a stall of this computer can cause, and add the stall itself."""
         if abs(now_ns - self._stalled_ns) > STALLED_NS:
             return faults
@@ -189,9 +189,9 @@ class Health:
             for key in [key for key in held if key[0] in _ACCUSING]:
                 del held[key]
         kept = [fault for fault in faults if fault.code not in _ACCUSING]
-        return [Fault("host_stalls", "host", sentence), *kept]
+        return [FoundFault("host_stalls", "host", sentence), *kept]
 
-    def _hold(self, part: int, faults: list[Fault], now_ns: int) -> list[Fault]:
+    def _hold(self, part: int, faults: list[FoundFault], now_ns: int) -> list[FoundFault]:
         """Add intermittent faults that were seen within the last `HOLD_NS`."""
         held = self._held.setdefault(part, {})
         for fault in faults:

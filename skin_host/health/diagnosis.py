@@ -52,7 +52,7 @@ _TRIANGLE_SENTENCES = {
 }
 
 
-class Fault(Struct, frozen=True):
+class FoundFault(Struct, frozen=True):
     """A fault.
 
     Attributes:
@@ -66,7 +66,7 @@ class Fault(Struct, frozen=True):
     sentence: str
 
 
-def diagnose(record: Record, lost_lately: Collection[str] = ()) -> list[Fault]:
+def diagnose(record: Record, lost_lately: Collection[str] = ()) -> list[FoundFault]:
     """Return all faults of a part, each cause before its consequences.
 
     Args:
@@ -97,7 +97,7 @@ def diagnose(record: Record, lost_lately: Collection[str] = ()) -> list[Fault]:
     faults += _part(record)
     if record["state"] == "degraded" and not any(map(_invalidates, faults)):
         faults.append(
-            Fault(
+            FoundFault(
                 "taxel_unproven",
                 record["part"],
                 f"{named(record['invalid'])} of {record['part']}: not valid: the pad failed when "
@@ -107,11 +107,11 @@ def diagnose(record: Record, lost_lately: Collection[str] = ()) -> list[Fault]:
     faults += _output(record.get("output"), lost_lately)
     for what, why in record.get("unkept", {}).items():
         sentence = f"{what} in use but not kept: {why}; lost at a restart"
-        faults.append(Fault("state_not_kept", what, sentence))
+        faults.append(FoundFault("state_not_kept", what, sentence))
     return faults
 
 
-def _invalidates(fault: Fault) -> bool:
+def _invalidates(fault: FoundFault) -> bool:
     """Whether a fault is a reason for which taxels are not valid."""
     return fault.code.startswith(("bus_", "board_", "triangle_")) or fault.code in {
         "taxel_stuck",
@@ -124,14 +124,16 @@ def _invalidates(fault: Fault) -> bool:
 _SILENT = {"bus_off", "bus_down", "bus_gone", "bus_silent"}
 
 
-def _bus(bus: BusHealth) -> Iterator[Fault]:
+def _bus(bus: BusHealth) -> Iterator[FoundFault]:
     name = bus["name"]
     state = bus.get("state", "up")
     if state in _BUS_STATES:
         code, sentence = _BUS_STATES[state]
-        yield Fault(code, name, f"bus {name} " + sentence.format(channel=bus.get("channel", name)))
+        yield FoundFault(
+            code, name, f"bus {name} " + sentence.format(channel=bus.get("channel", name))
+        )
     elif bus.get("silent"):
-        yield Fault(
+        yield FoundFault(
             "bus_silent",
             name,
             f"bus {name}: no frames are received; check its plug, the boards' power and bit rate",
@@ -140,7 +142,7 @@ def _bus(bus: BusHealth) -> Iterator[Fault]:
     if recent is None:
         return
     if recent["other_load"] > BABBLE_LOAD:
-        yield Fault(
+        yield FoundFault(
             "bus_babbling",
             name,
             f"bus {name}: frames of other devices take {recent['other_load']:.0%} of it"
@@ -148,80 +150,82 @@ def _bus(bus: BusHealth) -> Iterator[Fault]:
             + "; find the node that sends them",
         )
     if recent["dropped"]:
-        yield Fault(
+        yield FoundFault(
             "bus_drops",
             name,
             f"bus {name}: this computer lost {recent['dropped']} frames in the last second; "
             "see docs/receive.md",
         )
     if recent["halves"] >= FEW_HALVES:
-        yield Fault(
+        yield FoundFault(
             "bus_loses_frames",
             name,
             f"bus {name}: single frames are lost, {recent['halves']} in the last second; "
             "the bus is overloaded or badly terminated",
         )
     if recent["wrong"] or recent["spikes"] >= FEW_SPIKES:
-        yield Fault(
+        yield FoundFault(
             "bus_bit_errors",
             name,
             f"bus {name}: damaged frames ({recent['wrong']} with a wrong header or unreadable, "
             f"{recent['spikes']} single bytes off); suspect a gateway or an adapter",
         )
     if recent["error_frames"] and state == "up":
-        yield Fault(
+        yield FoundFault(
             "bus_errors",
             name,
             f"bus {name}: {recent['error_frames']} error frames in the last second; "
             "check wiring and termination",
         )
     for address, kind in sorted(bus.get("strangers", {}).items()):
-        yield Fault(
+        yield FoundFault(
             "bus_stranger",
             f"{name}/{address}",
             f"bus {name}: a board of type {kind} at address {address} is not in the configuration",
         )
 
 
-def _board(board: BoardHealth) -> Iterator[Fault]:
+def _board(board: BoardHealth) -> Iterator[FoundFault]:
     name = board["name"]
     here = f"board {name} (address {board['address']})"
     if board.get("in_bootloader"):
-        yield Fault("board_in_bootloader", name, f"{here} is in its bootloader: no firmware runs")
+        yield FoundFault(
+            "board_in_bootloader", name, f"{here} is in its bootloader: no firmware runs"
+        )
     elif not board["alive"] and not board.get("awaited"):
         if board["sweeps"]:
-            yield Fault(
+            yield FoundFault(
                 "board_silent",
                 name,
                 f"{here} has stopped sending and is being set up again; check its power",
             )
         else:
-            yield Fault(
+            yield FoundFault(
                 "board_absent", name, f"{here} has not sent anything yet; check power and address"
             )
     if board.get("wrong_type"):
-        yield Fault(
+        yield FoundFault(
             "board_wrong_type",
             name,
             f"{here} reports type {board['board_type']}, which is no skin board",
         )
     events = board.get("lately", {})
     if events.get("resets"):
-        yield Fault("board_reset", name, f"{here} restarted by itself and was set up again")
+        yield FoundFault("board_reset", name, f"{here} restarted by itself and was set up again")
     if events.get("lost_set_ups"):
-        yield Fault(
+        yield FoundFault(
             "board_lost_set_up",
             name,
             f"{here} did not send what it was set up to send, and was set up again",
         )
     if events.get("rezeros"):
-        yield Fault(
+        yield FoundFault(
             "board_rezeroed",
             name,
             f"{here} zeroed itself; its baselines were corrected for that",
         )
     if board.get("in_doubt"):
-        yield Fault(
+        yield FoundFault(
             "board_in_doubt",
             name,
             f"{here} was zeroed while it was touched (taxels: {board['in_doubt']}); those are "
@@ -229,9 +233,11 @@ def _board(board: BoardHealth) -> Iterator[Fault]:
             f"skin command calibrate --board {name}",
         )
     if events.get("tx_overflows"):
-        yield Fault("board_overflows", name, f"{here} could not send all its frames: bus too full")
+        yield FoundFault(
+            "board_overflows", name, f"{here} could not send all its frames: bus too full"
+        )
     if board.get("twice"):
-        yield Fault(
+        yield FoundFault(
             "board_twice",
             name,
             f"{here}: two boards send at this address; give one of them another",
@@ -240,11 +246,11 @@ def _board(board: BoardHealth) -> Iterator[Fault]:
     wanted, seen, jitter_ms = board["period_ms"], board["period_seen_ms"], board["jitter_ms"]
     if board["alive"] and seen is not None and jitter_ms is not None:
         if abs(seen - wanted) > PERIOD_SHARE * wanted:
-            yield Fault(
+            yield FoundFault(
                 "board_period", name, f"{here} sends every {seen:.1f} ms instead of {wanted} ms"
             )
         elif jitter_ms > JITTER_SHARE * wanted:
-            yield Fault(
+            yield FoundFault(
                 "board_jitter",
                 name,
                 f"{here} sends irregularly: its {wanted} ms scatter by {jitter_ms:.1f} ms",
@@ -256,7 +262,7 @@ def _line_of(board: BoardHealth, triangle: int) -> int:
     return slot // LINE
 
 
-def _triangles(record: Record, silent: set[str]) -> Iterator[Fault]:
+def _triangles(record: Record, silent: set[str]) -> Iterator[FoundFault]:
     boards = {board["name"]: board for board in record["boards"]}
     of_line: dict[tuple[str, int], dict[int, str]] = defaultdict(dict)
     for one in record["triangles"]:
@@ -273,7 +279,7 @@ def _triangles(record: Record, silent: set[str]) -> Iterator[Fault]:
         for line in whole:
             if len(fitted[line]) > 1 and set(lines[line].values()) <= {"no ack", "silenced"}:
                 reported.add((name, line))
-                yield Fault(
+                yield FoundFault(
                     "line_shorted",
                     f"{name}/line{line}",
                     f"board {name}: triangles {_list(fitted[line])} all stopped answering: their "
@@ -286,7 +292,7 @@ def _triangles(record: Record, silent: set[str]) -> Iterator[Fault]:
         ]
         if len(mixed) == 2:
             reported |= {(name, line) for line in mixed}
-            yield Fault(
+            yield FoundFault(
                 "lines_swapped",
                 f"{name}/line{mixed[0]}+{mixed[1]}",
                 f"board {name}: the triangles {_list(fitted[mixed[0]])} and "
@@ -301,12 +307,12 @@ def _triangles(record: Record, silent: set[str]) -> Iterator[Fault]:
             if fault == "not connected" and len(faults) > 1:
                 sentence += " (another one on its line reads wrong too: does it have this address?)"
             code = "triangle_" + fault.replace(" ", "_")
-            yield Fault(
+            yield FoundFault(
                 code, f"{name}/{triangle}", f"triangle {triangle} of board {name} {sentence}"
             )
 
 
-def _taxels(record: Record) -> Iterator[Fault]:
+def _taxels(record: Record) -> Iterator[FoundFault]:
     part = record["part"]
     sentence = {
         "stuck": "the same byte for too long in a triangle that otherwise works; not valid",
@@ -317,25 +323,25 @@ def _taxels(record: Record) -> Iterator[Fault]:
     for kind, what in sentence.items():
         taxels = record["taxel_faults"].get(kind)
         if taxels:
-            yield Fault(f"taxel_{kind}", part, f"{named(taxels)} of {part}: {what}")
+            yield FoundFault(f"taxel_{kind}", part, f"{named(taxels)} of {part}: {what}")
     verdicts = record["taxel_verdicts"]
     noisy = verdicts.get("noisy")
     if noisy:
-        yield Fault(
+        yield FoundFault(
             "taxel_decides_late",
             part,
             f"{named(noisy)} of {part}: noisy when calibrated; they need up to "
             f"{record['decides_kpa']:g} kPa to decide within a second",
         )
     if verdicts.get("saturates"):
-        yield Fault(
+        yield FoundFault(
             "taxel_saturates",
             part,
             f"{named(verdicts['saturates'])} of {part}: rest so near 0 that a "
             "press is cut off; set the boards up again, then calibrate",
         )
     if verdicts.get("touched"):
-        yield Fault(
+        yield FoundFault(
             "taxel_pressed",
             part,
             f"{named(verdicts['touched'])} of {part}: touched when calibrated; calibrate when "
@@ -350,7 +356,7 @@ def _taxels(record: Record) -> Iterator[Fault]:
     refused = set().union(*why.values())
     if refused:
         reasons = " or ".join(kinds[kind] for kind, taxels in why.items() if taxels)
-        yield Fault(
+        yield FoundFault(
             "taxel_refused",
             part,
             f"{named(refused)} of {part}: {reasons} when calibrated; not valid until a better "
@@ -358,14 +364,14 @@ def _taxels(record: Record) -> Iterator[Fault]:
         )
     if record["baseline_at_limit"]:
         at_limit = named(record["baseline_at_limit"])
-        yield Fault(
+        yield FoundFault(
             "taxel_at_limit",
             part,
             f"{at_limit} of {part}: the baseline cannot follow any farther; calibrate",
         )
     if record["baseline_frozen"]:
         held = named(record["baseline_frozen"])
-        yield Fault(
+        yield FoundFault(
             "taxel_held",
             part,
             f"{held} of {part}: touched for so long, or with so much drift during the touch, "
@@ -373,25 +379,29 @@ def _taxels(record: Record) -> Iterator[Fault]:
         )
 
 
-def _part(record: Record) -> Iterator[Fault]:
+def _part(record: Record) -> Iterator[FoundFault]:
     part = record["part"]
     if record["state"] == "disabled":
-        yield Fault("part_disabled", part, f"{part} was disabled by command; nothing is published")
+        yield FoundFault(
+            "part_disabled", part, f"{part} was disabled by command; nothing is published"
+        )
         return
     if record["calibration"] is None:
-        yield Fault("part_not_calibrated", part, f"{part} is not calibrated: nothing is published")
+        yield FoundFault(
+            "part_not_calibrated", part, f"{part} is not calibrated: nothing is published"
+        )
     warmth = record.get("warmth")
     if warmth is None:
         return
     if warmth["thermal_units"] is not None and abs(warmth["thermal_units"]) > THERMAL_UNITS:
-        yield Fault(
+        yield FoundFault(
             "part_temperature",
             part,
             f"{part}: its thermal pads read {warmth['thermal_units']:+.0f} units since the "
             "calibration: its temperature has changed; pressures are corrected, less precisely",
         )
     elif abs(warmth["common_units"]) > COMMON_UNITS:
-        yield Fault(
+        yield FoundFault(
             "part_temperature",
             part,
             f"{part}: its untouched taxels all read {warmth['common_units']:+.1f} units off their "
@@ -399,14 +409,14 @@ def _part(record: Record) -> Iterator[Fault]:
         )
 
 
-def _output(output: dict[str, Any] | None, lost_lately: Collection[str]) -> Iterator[Fault]:
+def _output(output: dict[str, Any] | None, lost_lately: Collection[str]) -> Iterator[FoundFault]:
     if output is None:
         return
     if not output["connected"]:
         why = output.get("last_error") or "not yet reached"
-        yield Fault("broker_away", "broker", f"the broker is away: {why}")
+        yield FoundFault("broker_away", "broker", f"the broker is away: {why}")
     if "touches_dropped" in lost_lately:
-        yield Fault(
+        yield FoundFault(
             "touches_dropped",
             "broker",
             f"touch events were lost within the last minute ({output['touches_dropped']} since the "
@@ -414,21 +424,21 @@ def _output(output: dict[str, Any] | None, lost_lately: Collection[str]) -> Iter
         )
     if output.get("withheld"):
         topics = ", ".join(output["withheld"])
-        yield Fault(
+        yield FoundFault(
             "broker_rejects",
             "broker",
             f"the broker does not take what is published at {topics}; check its packet limit and "
             "its access rules",
         )
     if output.get("name_taken"):
-        yield Fault(
+        yield FoundFault(
             "node_name_taken",
             "broker",
             "the broker ends every connection within seconds: does a second daemon run as the same "
             "robot and node? Give one of them another --node",
         )
     if "refused" in lost_lately:
-        yield Fault("broker_refuses", "broker", f"the broker refuses: {output['last_error']}")
+        yield FoundFault("broker_refuses", "broker", f"the broker refuses: {output['last_error']}")
 
 
 def named(taxels: Collection[int]) -> str:

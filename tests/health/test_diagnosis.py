@@ -5,11 +5,11 @@ from typing import Any
 
 import pytest
 
-from skin_host.health.diagnosis import Fault, diagnose
+from skin_host.health.diagnosis import FoundFault, diagnose
 from tests.support.fault_bench import FaultBench
 
 
-def found(bench: FaultBench, lately: tuple[str, ...] = (), **changes: Any) -> dict[str, Fault]:
+def found(bench: FaultBench, lately: tuple[str, ...] = (), **changes: Any) -> dict[str, FoundFault]:
     """Faults by code of a record of the healthy hand with `changes`; `gained` by its bus."""
     record: Any = copy.deepcopy(bench.records["left_hand"])
     bus = record["buses"][0]
