@@ -98,9 +98,8 @@ class Promises:
         self._truth: deque[tuple[int, NDArray[np.float64]]] = deque(maxlen=SAMPLES)
         self._frames: dict[str, PressureFrame] = {}
         self._periods_ns = np.zeros(layout.n_taxels, np.int64)
-        self._ids = np.zeros(layout.n_taxels, np.int64)
-        self._bus_of: dict[str, NDArray[np.intp]] = {}
         self._blind_since: dict[tuple[str, int], int] = {}
+        ids = np.zeros(layout.n_taxels, np.int64)
         buses = np.empty(layout.n_taxels, object)
         for board in layout.boards:
             own = board.settings
@@ -108,10 +107,17 @@ class Promises:
                 taxels = board.taxel_index[number]
                 taxels = taxels[taxels >= 0]
                 self._periods_ns[taxels] = own.period_ms * 1_000_000
-                self._ids[taxels] = 0x400 | own.address << 4 | number
+                ids[taxels] = 0x400 | own.address << 4 | number
                 buses[taxels] = own.bus
-        for bus in world.cables:
-            self._bus_of[bus] = np.flatnonzero(buses == bus)
+        #: Of the whole skin (None) and of each part: on which bus which of the taxels are sent, and
+        #: by which identifiers.
+        self._senders: dict[str | None, list[tuple[str, Mask, NDArray[np.int64]]]] = {
+            name: [(bus, buses[mine] == bus, ids[mine][buses[mine] == bus]) for bus in world.cables]
+            for name, mine in [
+                (None, slice(None)),
+                *((part.name, slice(part.start, part.stop)) for part in layout.parts),
+            ]
+        }
         #: Frames in the sweeps of each bus, in this life of the daemon.
         self._swept: dict[str, int] = {}
         self._bus_of_board = [board.settings.bus for board in layout.boards]
@@ -262,7 +268,7 @@ class Promises:
             self.break_(f"{name}: a pressure is negative or no number")
         if pressure[~frame.valid].any() or (frame.touched & ~frame.valid).any():
             self.break_(f"{name}: taxels that are not valid are touched, or have a pressure")
-        age_ns = self._now_ns() - self._heard_ns(mine)
+        age_ns = self._now_ns() - self._heard_ns(name)
         old = frame.valid & (age_ns > STALE_PERIODS * self._periods_ns[mine])
         if old.any():
             taxel = int(np.flatnonzero(old)[0])
@@ -453,13 +459,12 @@ class Promises:
 
     # ------------------------------------------------------------------ truth
 
-    def _heard_ns(self, taxels: slice) -> NDArray[np.int64]:
-        found = np.full(taxels.stop - taxels.start, -(1 << 62), np.int64)
-        ids = self._ids[taxels]
-        for bus, cable in self._world.cables.items():
-            mine = self._bus_of[bus]
-            mine = mine[(mine >= taxels.start) & (mine < taxels.stop)] - taxels.start
-            found[mine] = cable.read_ns[ids[mine]]
+    def _heard_ns(self, part: str | None = None) -> NDArray[np.int64]:
+        """Return when each taxel of a part, or of the whole skin, was last received (ns)."""
+        senders = self._senders[part]
+        found = np.full(len(senders[0][1]), -(1 << 62), np.int64)
+        for bus, mine, ids in senders:
+            found[mine] = self._world.cables[bus].read_ns[ids]
         return found
 
     def _taxels(self, board: str, triangle: int) -> NDArray[np.intp]:
@@ -560,8 +565,7 @@ class Promises:
             )
             if not rezero.settled(0):
                 self._exempt[taxels] |= spoiled[taxels]
-        whole = slice(0, layout.n_taxels)
-        self._felt_ns = self._heard_ns(whole)
+        self._felt_ns = self._heard_ns()
 
     def contacts(self) -> None:
         """What the broker keeps of a part is no lie: `OFF` means that nothing presses it."""
