@@ -1,7 +1,7 @@
 """Speed against error, part two: what models and pipeline cost.
 
-Everything is timed in the same run, next to a copy of the same numbers in memory, and the
-least of several repeats counts: what is above it is other programs.
+Everything is timed in the same run, next to a copy of the same numbers in memory, in processor
+time of this process, and the least of several repeats counts: what is above it is other programs.
 """
 
 import time
@@ -223,11 +223,10 @@ def _ns_in_turn(runs: Sequence[Callable[[], None]], n: int, seconds: float) -> l
     end = time.perf_counter() + seconds * len(runs)
     while True:
         for number, run in enumerate(runs):
-            start = time.perf_counter()
+            start = time.process_time()
             run()
-            now = time.perf_counter()
-            best[number] = min(best[number], now - start)
-        if now > end:
+            best[number] = min(best[number], time.process_time() - start)
+        if time.perf_counter() > end:
             return [least / STEPS / n * 1e9 for least in best]
 
 
