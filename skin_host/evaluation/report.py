@@ -86,7 +86,7 @@ def run(quick: bool, output: Path | None, recordings: Path | None = None) -> Rep
     report["pipeline"], seconds_of["pipeline"] = _timed(speed.pipeline, (0.1 if quick else 0.6,))
     _tell("speed of own curves")
     report["own_curves"], seconds_of["own curves"] = _timed(
-        speed.own_curves, (0.1 if quick else 2.0,)
+        speed.own_curves, (0.1 if quick else 5.0,)
     )
     _tell("")
     report["summary"] = summary(report)

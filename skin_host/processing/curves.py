@@ -35,6 +35,8 @@ _PIECE_AT: NDArray[np.intp] = np.searchsorted(
 )
 #: The largest power of two that is not above their number.
 HALF_KNOTS = 1 << (len(KNOTS_UNITS).bit_length() - 1)
+#: Up to so many pressures are compared with all knots.
+FEW_VALUES = 64
 #: A curve rises by at least this much per unit, so that it has an inverse.
 LEAST_SLOPE = 1e-3
 #: Below zero a curve is as steep as up to this knot at least: noise may make its first piece flat,
@@ -133,13 +135,10 @@ class TableCurve:
 
     def __init__(self, table_kpa: Floats, beyond_units: Floats) -> None:
         n, knots = table_kpa.shape
-        #: Where each taxel's pieces begin: as many as knots, because one is below zero.
-        self._first = np.arange(n) * knots
-        #: Where they end, filled up for a search by halves.
-        ends = np.full((n, 2 * HALF_KNOTS), np.inf)
-        ends[:, : knots - 1] = table_kpa[:, :-1]
-        self._ends_kpa = ends.reshape(-1)
-        self._before = np.arange(n) * 2 * HALF_KNOTS - 1
+        self._row = np.arange(n)
+        #: Where each piece ends, filled up for a search by halves.
+        self._end_kpa = np.full((n, 2 * HALF_KNOTS), np.inf)
+        self._end_kpa[:, : knots - 1] = table_kpa[:, :-1]
         self.beyond_units = beyond_units
         rising = np.diff(table_kpa, axis=1) / np.diff(KNOTS_UNITS)
         chord = table_kpa[:, STEEP_KNOT] / KNOTS_UNITS[STEEP_KNOT]
@@ -147,7 +146,8 @@ class TableCurve:
         self.straight_kpa: Floats = np.where(rising[:, 0] < self.linear, 0.0, table_kpa[:, 1])
         #: Each piece is level + slope x; the first and the last go on for ever.
         level = table_kpa[:, :-1] - rising * KNOTS_UNITS[:-1]
-        #: As one number of two parts, both are found by one look-up.
+        #: There are as many as knots, because one is below zero. As one number of two parts, both
+        #: are found by one look-up.
         piece = np.zeros((n, knots), np.complex128)
         piece.real = np.column_stack([self.linear, rising])
         piece.imag[:, 1:] = level
@@ -156,8 +156,7 @@ class TableCurve:
     def part(self, taxels: Taxels) -> "TableCurve":
         """Return the curves of some of the taxels; they share the tables of all."""
         chosen = copy(self)
-        chosen._first = self._first[taxels]
-        chosen._before = self._before[taxels]
+        chosen._row = self._row[taxels]
         chosen.beyond_units = self.beyond_units[taxels]
         chosen.linear = self.linear[taxels]
         chosen.straight_kpa = self.straight_kpa[taxels]
@@ -168,7 +167,7 @@ class TableCurve:
         x = np.asarray(units, dtype=np.float64)
         quarters = np.minimum(np.maximum(x / GRID_UNITS + 1.0, 0.0), len(_PIECE_AT) - 1.0)
         # Places in the whole table: two indices would cost several times as much.
-        place = _PIECE_AT.take(quarters.astype(np.intp)) + self._first
+        place = _PIECE_AT.take(quarters.astype(np.intp)) + self._row * len(KNOTS_UNITS)
         piece = self._piece.take(place)
         result: Floats = piece.real * x
         result += piece.imag
@@ -177,16 +176,26 @@ class TableCurve:
     def units(self, kpa: ArrayLike) -> Floats:
         """Return the activation [..., n] in units for these pressures; inverse of kpa."""
         c = np.asarray(kpa, dtype=np.float64)
-        end = np.broadcast_to(self._before, np.broadcast(c, self._before).shape).copy()
-        step = HALF_KNOTS
-        while step:
-            passed = self._ends_kpa.take(end + step) <= c
-            end += passed * step
-            step >>= 1
-        place = end - self._before + self._first
-        piece = self._piece.take(place)
+        number = self._passed(c) if c.size > FEW_VALUES else self._passed_of_few(c)
+        piece = self._piece.take(number + self._row * len(KNOTS_UNITS))
         result: Floats = (c - piece.imag) / piece.real
         return result
+
+    def _passed(self, kpa: Floats) -> NDArray[np.intp]:
+        """Return how many pieces [..., n] end below these pressures, by halves."""
+        before = self._row * 2 * HALF_KNOTS - 1
+        end = np.broadcast_to(before, np.broadcast(kpa, before).shape).copy()
+        step = HALF_KNOTS
+        while step:
+            end += (self._end_kpa.take(end + step) <= kpa) * step
+            step >>= 1
+        return end - before
+
+    def _passed_of_few(self, kpa: Floats) -> NDArray[np.intp]:
+        """Return the same with fewer calls, each over all knots."""
+        passed = self._end_kpa[self._row] <= kpa[..., np.newaxis]
+        number: NDArray[np.intp] = np.count_nonzero(passed, axis=-1)
+        return number
 
 
 def rising(kpa: Floats) -> Floats:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from skin_host.errors import RequestError
 from skin_host.evaluation.rig import Rig
 from skin_host.processing.curves import (
+    FEW_VALUES,
     KNOTS_UNITS,
     Curves,
     CurveVerdict,
@@ -137,6 +138,8 @@ def test_a_curve_rises_and_has_an_inverse(slopes, units):
     kpa = curve.kpa(units)
     assert curve.kpa(units + 1.0) > kpa
     assert curve.kpa(curve.units(kpa)) == pytest.approx(kpa, rel=1e-6, abs=1e-6)
+    many = curve.units(np.full((2 * FEW_VALUES, 1), kpa))
+    assert np.all(many == curve.units(kpa))
 
 
 @given(
