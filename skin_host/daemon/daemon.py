@@ -30,7 +30,7 @@ from skin_host.daemon.state import (
 from skin_host.errors import ConfigurationError, RequestError, SkinError
 from skin_host.fingertip.health import FingertipRecord
 from skin_host.fingertip.service import FingertipPublisher
-from skin_host.health import FaultLog, Health, Record
+from skin_host.health import FaultLog, HealthWatch, Record
 from skin_host.layout import Layout, build_layout, parts_of
 from skin_host.mqtt.connection import connect
 from skin_host.mqtt.contact import PartContact
@@ -116,7 +116,7 @@ class Daemon:
         if calibration is not None and calibration.id == self._zeros.calibration:
             doubted = _taxels(layout, self._zeros)
             self.engine.doubt(doubted)
-        self.health = Health(self.engine)
+        self.health = HealthWatch(self.engine)
         self.control = Control(self)
         self.publisher = Publisher(
             settings.mqtt,

@@ -18,7 +18,7 @@ from skin_host.health.record import Record
 from skin_host.health.watch import Watch
 from skin_host.processing.core import Engine, Output
 
-__all__ = ["FaultLog", "Health", "Record"]
+__all__ = ["FaultLog", "HealthWatch", "Record"]
 
 log = logging.getLogger(__name__)
 #: An intermittent fault stays in the record for this long after it was last seen.
@@ -53,7 +53,7 @@ _PASSING = {
 _LOSSES = ("wrong", "halves", "spikes", "dropped", "error_frames")
 
 
-class Health:
+class HealthWatch:
     """Watches what passes through the daemon and describes it on request.
 
     All times are on the clock of the frames' time stamps. The time passed in should be the time up

@@ -29,7 +29,7 @@ from skin_host.config.settings import Settings, load, skin_hash
 from skin_host.errors import ConfigurationError, LogError, RequestError, SkinError, required
 from skin_host.fingertip.events import FingertipEvent, SlipEvent
 from skin_host.fingertip.health import FingertipHealth
-from skin_host.health import Health
+from skin_host.health import HealthWatch
 from skin_host.layout import Layout, build_layout
 from skin_host.mqtt.grasping import grasp_message
 from skin_host.mqtt.messages import KPA_DECIMALS, health_keys, touch_message
@@ -235,7 +235,7 @@ def write_lines(
     Raises:
         LogError: the recording cannot be read, or ends with damage.
     """
-    health = Health(engine)
+    health = HealthWatch(engine)
     lines = EventLines()
     number = 0
     for result in replay(log, engine):

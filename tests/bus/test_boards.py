@@ -9,7 +9,7 @@ from skin_host.bus.boards import Boards
 from skin_host.bus.commands import BoardType, Message
 from skin_host.bus.wire import FrameBatch, MessageClass, identifier
 from skin_host.config.settings import load
-from skin_host.health import Health, Record
+from skin_host.health import HealthWatch, Record
 from skin_host.layout import build_layout
 from skin_host.processing.core import Engine
 from tests.support.stack import ROOT
@@ -36,7 +36,7 @@ class Heard:
         self.engine = Engine(settings, layout, [0, 1])
         boards = [(i, layout.boards[i]) for i in self.engine.boards]
         self.boards = Boards("can0", Nowhere(), boards, layout.triangles, self.engine.ledger)
-        self.health = Health(self.engine)
+        self.health = HealthWatch(self.engine)
         self.now_ns = 1_700_000_000 * S
         self.look()
 

@@ -17,7 +17,7 @@ from skin_host.config.settings import Settings, changed, load, skin_hash
 from skin_host.daemon.control import Control
 from skin_host.daemon.state import load_state
 from skin_host.errors import NewerFileError, RequestError, SkinError
-from skin_host.health import Health
+from skin_host.health import HealthWatch
 from skin_host.layout import Layout, build_layout
 from skin_host.mqtt.commands import CommandHandler, decode_result
 from skin_host.processing import calibration as calibrations
@@ -66,7 +66,7 @@ class Buses:
         settings, layout = skin()
         self.engine = Engine(settings, layout, list(range(len(layout.parts))))
         self.engine.begin_calibration(0.5)
-        self.health = Health(self.engine)
+        self.health = HealthWatch(self.engine)
         boards = [(i, layout.boards[i]) for i in self.engine.boards]
         self.boards = Boards("can0", _Port(), boards, layout.triangles, self.engine.ledger)
         self.t_ns = 1_700_000_000_000_000_000

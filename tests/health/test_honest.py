@@ -7,13 +7,13 @@ import numpy as np
 from emulator.probes.scene import Place, Probe, Scene
 from emulator.robot import Robot
 from skin_host.bus.wire import FrameBatch
-from skin_host.health import LATELY_NS, STALLED_NS, Health
+from skin_host.health import LATELY_NS, STALLED_NS, HealthWatch
 from tests.support.fault_bench import FaultBench
 
 OUTPUT: dict[str, Any] = {"connected": True, "touches_dropped": 0, "refused": 0, "last_error": ""}
 
 
-def codes(health: Health, now_ns: int, **output: Any) -> set[str]:
+def codes(health: HealthWatch, now_ns: int, **output: Any) -> set[str]:
     record = health.record(0, now_ns, {}, {}, OUTPUT | output)
     return {fault["code"] for fault in record["faults"]}
 

@@ -18,7 +18,7 @@ import numpy as np
 from emulator.probes.scene import load as load_scene
 from skin_host.bus.wire import FrameBatch, encode_sweep
 from skin_host.config.settings import Bus, load
-from skin_host.health import Health
+from skin_host.health import HealthWatch
 from skin_host.layout import build_layout
 from skin_host.processing.core import Engine
 from tests.support.broker import Mosquitto
@@ -70,7 +70,7 @@ def test_an_accelerated_month(tmp_path: Path) -> None:
     settings = load(config)
     layout = build_layout(settings, tmp_path)
     engine = Engine(settings, layout, [0])
-    health = Health(engine)
+    health = HealthWatch(engine)
     rng = np.random.default_rng(1)
     noise = np.rint(0.8 * rng.standard_normal((997, 12))).astype(np.int16)
     triangle = np.zeros(1, np.intp)

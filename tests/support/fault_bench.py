@@ -10,7 +10,7 @@ from emulator.probes.scene import Fault, Scene
 from emulator.robot import Robot
 from skin_host.bus.assembler import Sweep
 from skin_host.config.settings import changed, load
-from skin_host.health import Health, Record
+from skin_host.health import HealthWatch, Record
 from skin_host.layout import build_layout
 from skin_host.processing.core import Engine, Output
 
@@ -39,7 +39,7 @@ class FaultBench:
         self.robot.converters.by_bus = True
         self.robot.bring_up()
         self.engine = Engine(settings, self.layout, list(range(len(self.layout.parts))))
-        self.health = Health(self.engine)
+        self.health = HealthWatch(self.engine)
         self.t_s = 0.0
         self.told: dict[tuple[str, str], float] = {}
         self.first_told: dict[tuple[str, str], float] = {}
