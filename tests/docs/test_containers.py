@@ -34,6 +34,15 @@ def test_the_linter_finds_nothing() -> None:
     subprocess.run([hadolint, FOLDER / "Containerfile"], check=True)
 
 
+def test_the_services_follow_the_compose_specification() -> None:
+    """By the schema that it publishes; nothing here runs them."""
+    schema = ["--builtin-schema", "vendor.compose-spec"]
+    program = shutil.which("check-jsonschema", path=str(Path(sys.executable).parent))
+    if program is None:
+        pytest.skip("check-jsonschema is not installed (extra `dev`)")
+    subprocess.run([program, *schema, FOLDER / "compose.yaml"], check=True)
+
+
 def test_the_commands_of_the_services_are_ours() -> None:
     services = yaml.safe_load((FOLDER / "compose.yaml").read_text())["services"]
     for name in ("daemon", "page"):
