@@ -337,8 +337,10 @@ class Calibrator:
         apart = 255 - np.argmax(seen[:, ::-1], axis=1) - np.argmax(seen, axis=1)
         limit = np.maximum(PRESSED_UNITS, apart)
         found = np.zeros(len(baseline), np.bool_)
-        for triangle in np.unique(layout.triangle_of[known]):
-            mine = known & (layout.triangle_of == triangle)
+        triangles = layout.triangle_of[known]
+        order = np.argsort(triangles, kind="stable")
+        ends = np.flatnonzero(np.diff(triangles[order])) + 1
+        for mine in np.split(np.flatnonzero(known)[order], ends) if len(order) else ():
             found[mine] = baseline[mine] - np.median(baseline[mine]) > limit[mine]
         for part in layout.parts:
             span = slice(part.start, part.stop)
@@ -423,28 +425,35 @@ class _Course:
         self.number[taxels] = 0
 
     @property
+    def _begun(self) -> Floats:
+        """The means [n, b] up to the last that any taxel has; b is a multiple of `JOINED`."""
+        most = max(int(self.number.max(initial=0)), 1)
+        return self.means[:, : -(-most // JOINED) * JOINED]
+
+    @property
     def _full(self) -> Mask:
-        full: Mask = np.arange(MOST_BLOCKS) < self.number[:, None]
+        """Which of these [n, b] are full."""
+        full: Mask = np.arange(self._begun.shape[1]) < self.number[:, None]
         return full
 
     @property
     def highest(self) -> Floats:
         """Largest mean [n]; 0 where there is none."""
-        found: Floats = self.means.max(axis=1, where=self._full, initial=0.0)
+        found: Floats = self._begun.max(axis=1, where=self._full, initial=0.0)
         return found
 
     @property
     def lowest(self) -> Floats:
         """Smallest mean [n]; 0 where there is none."""
-        found: Floats = self.means.min(axis=1, where=self._full, initial=255.0)
+        found: Floats = self._begun.min(axis=1, where=self._full, initial=255.0)
         return np.where(self.number > 0, found, 0.0)
 
     @property
     def joined_variance(self) -> Floats:
         """Return the variance [n] of joined blocks; 0 where there are fewer than two."""
-        means = self.means.reshape(len(self.means), -1, JOINED).mean(axis=2)
+        means = self._begun.reshape(len(self.means), -1, JOINED).mean(axis=2)
         number = self.number // JOINED
-        full = np.arange(MOST_BLOCKS // JOINED) < number[:, None]
+        full = np.arange(means.shape[1]) < number[:, None]
         mean = means.sum(axis=1, where=full) / np.maximum(number, 1)
         squares = np.square(means - mean[:, None]).sum(axis=1, where=full)
         found: Floats = squares / np.maximum(number - 1, 1)
@@ -455,7 +464,7 @@ class _Course:
         """Return the standard error of a mean [n], from the median step between neighbours: a press
         makes few large steps.
         """
-        steps = np.abs(np.diff(self.means, axis=1))
+        steps = np.abs(np.diff(self._begun, axis=1))
         steps[~self._full[:, 1:]] = np.inf
         steps.sort(axis=1)
         count = np.maximum(self.number - 1, 0)
@@ -471,7 +480,7 @@ class _Course:
         third = (high - low) / 3.0
         state = np.zeros(len(low), np.int64)
         found = np.zeros(len(low), np.int64)
-        for mean, full in zip(self.means.T, self._full.T, strict=True):
+        for mean, full in zip(self._begun.T, self._full.T, strict=True):
             now = np.where(mean > high - third, 1, np.where(mean < low + third, -1, state))
             found += full & (state != 0) & (now != state)
             state = np.where(full, now, state)
