@@ -151,11 +151,19 @@ def measure(brokers: Brokers, plan: FleetPlan) -> dict[str, Any]:
         worker.start()
         pipes.append(mine)
         workers.append(worker)
+
+    async def conduct() -> dict[str, Any]:
+        try:
+            return await _conduct(brokers, plan, pipes)
+        finally:
+            # Before the loop ends, which waits for threads that wait for an answer of these.
+            for worker in workers:
+                worker.kill()
+
     try:
-        return asyncio.run(_conduct(brokers, plan, pipes))
+        return asyncio.run(conduct())
     finally:
         for worker in workers:
-            worker.kill()
             worker.join()
 
 

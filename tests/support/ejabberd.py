@@ -25,6 +25,7 @@ _LIBRARIES = "/usr/lib/x86_64-linux-gnu"
 _CONFIGURATION = """\
 hosts: [fleet]
 loglevel: error
+net_ticktime: {tick_s} seconds
 auth_method: [anonymous]
 anonymous_protocol: login_anon
 allow_multiple_connections: true
@@ -38,17 +39,25 @@ modules:
     session_expiry: 10 minutes
     match_retained_limit: 10000
 """
+#: The time after which the nodes give up one that does not answer, plus or minus a quarter.
+_STOCK_TICK_S = 60
 
 
 class Ejabberds:
-    """A cluster whose nodes can be hurt."""
+    """A cluster whose nodes can be hurt.
+
+    Args:
+        folder: for the nodes' files.
+        tick_s: their `net_ticktime`.
+    """
 
     name = "three nodes of ejabberd as a cluster"
     username: str | None = "robot"
     password: str | None = "any"
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, tick_s: int) -> None:
         self._folder = folder
+        self._tick_s = tick_s
         self._distribution = free_port()
         self._processes: list[subprocess.Popen[bytes]] = []
         self._ports = [free_port() for _ in range(3)]
@@ -58,7 +67,8 @@ class Ejabberds:
         cookie.chmod(0o400)
         for number, port in enumerate(self._ports):
             (folder / str(number)).mkdir()
-            (folder / str(number) / "ejabberd.yml").write_text(_CONFIGURATION.format(port=port))
+            configuration = _CONFIGURATION.format(port=port, tick_s=tick_s)
+            (folder / str(number) / "ejabberd.yml").write_text(configuration)
 
     def form(self) -> None:
         """Start the nodes and join them."""
@@ -66,8 +76,20 @@ class Ejabberds:
         for number in range(3):
             self._wait(number)
         for number in (1, 2):
-            self._control(number, "join_cluster", self._node(0))
+            self._join(number)
             self._wait(number)
+
+    def _join(self, number: int) -> None:
+        """Join the first node, which takes no other while it starts, though its port is open."""
+        until_s = time.monotonic() + _START_S
+        while True:
+            try:
+                self._control(number, "join_cluster", self._node(0))
+                return
+            except subprocess.CalledProcessError:
+                if time.monotonic() > until_s:
+                    raise
+            time.sleep(1.0)
 
     def _node(self, number: int) -> str:
         return f"n{number}@127.0.0.{number + 1}"
@@ -77,7 +99,11 @@ class Ejabberds:
         return os.environ | more | {"ERL_CRASH_DUMP_BYTES": "0"}
 
     def _erl(self, name: str, *more: str) -> list[str]:
-        common = f"-kernel logger_level error -erl_epmd_port {self._distribution} -start_epmd false"
+        common = (
+            f"-kernel logger_level error -erl_epmd_port {self._distribution} -start_epmd false "
+            # A change of the ticking time takes effect after a minute; this one holds at once.
+            f"-kernel net_ticktime {self._tick_s}"
+        )
         return ["erl", "-name", name, *common.split(), "-noinput", *more]
 
     def _run(self, number: int) -> "subprocess.Popen[bytes]":
@@ -147,10 +173,10 @@ class Ejabberds:
 
 
 @contextmanager
-def ejabberds() -> Iterator[Ejabberds]:
+def ejabberds(tick_s: int = _STOCK_TICK_S) -> Iterator[Ejabberds]:
     """Run a cluster for as long as the block lasts."""
     with tempfile.TemporaryDirectory() as folder:
-        cluster = Ejabberds(Path(folder))
+        cluster = Ejabberds(Path(folder), tick_s)
         try:
             cluster.form()
             yield cluster
@@ -168,10 +194,11 @@ def main() -> None:
     parser.add_argument("--health", type=float, default=plan.health_s, metavar="S")
     parser.add_argument("--phase", type=float, default=plan.phase_s, metavar="S")
     parser.add_argument("--plain", action="store_true", help="as `skin bench fleet --full`")
+    parser.add_argument("--tick", type=int, default=_STOCK_TICK_S, metavar="S")
     given = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # and end the nodes
     plan = bench_fleet.FleetPlan(given.robots, given.pace, given.health, given.phase, given.plain)
-    with ejabberds() as cluster:
+    with ejabberds(given.tick) as cluster:
         document = bench_fleet.measure(cluster, plan)
     sys.stdout.write(bench_fleet.describe(document) + "\n")
 
