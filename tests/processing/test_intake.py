@@ -5,6 +5,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -71,6 +72,17 @@ def test_a_dead_board_is_waited_for_no_longer_than_its_second_turn():
     assert not sample.present[16 * 12 :].any()
 
 
+@pytest.mark.parametrize("direction", [1, -1])
+def test_a_sample_waits_for_a_whole_period_of_a_clock_that_may_be_set_back(direction: int):
+    parts = intake()
+    assert parts.feed([sweep(OUTER, 2 * PERIOD)]) == []
+    for waited_ns in (0, 1, PERIOD - MS, PERIOD):
+        assert parts.engine.intake.expire(2 * PERIOD + direction * waited_ns) == []
+    (sample,) = parts.engine.intake.expire(2 * PERIOD + direction * (PERIOD + 1))
+    assert sample.present[: 16 * 12].all()
+    assert not sample.present[16 * 12 :].any()
+
+
 def test_what_the_board_doubts_is_not_present():
     (sample,) = intake().feed([sweep(OUTER, PERIOD, status=2), sweep(INNER, PERIOD)])
     assert not sample.present[: 16 * 12].any()
@@ -132,6 +144,25 @@ def test_what_sweeps_say_of_a_chips_life_holds_from_the_next_one_on():
     assert frozen_at is not None
 
 
+def test_chips_are_judged_as_soon_as_every_board_that_sends_has_sent() -> None:
+    parts = intake()
+    inner = parts.engine.intake
+    inner.judge()
+    for turn in range(1, 4):
+        assert not inner.is_whole
+        parts.feed([sweep(OUTER, turn * PERIOD)])
+        assert not inner.is_whole
+        parts.feed([sweep(INNER, turn * PERIOD + MS)])
+        assert inner.is_whole
+        inner.judge_whole()
+    # A board that has timed out is not waited for.
+    for turn in range(4, 12):
+        parts.engine.ledger.look(turn * PERIOD)
+        parts.feed([sweep(OUTER, turn * PERIOD)])
+    assert parts.engine.ledger.any_silent
+    assert inner.is_whole
+
+
 def far(pads: int) -> int:
     """A status word that calls the first pads far out of range."""
     return ((1 << pads) - 1) << 4
@@ -156,6 +187,10 @@ def test_fine_scales_can_be_pressed_far_out() -> None:
     _, layout = skin()
     fine = dataclasses.replace(layout, unit_ff=np.full(layout.n_taxels, 0.36))
     assert not unpressable(fine, OUTER, 360.0).any()
+    # The limit is half as much again as the end of the curve of pads of 0.73: 395 fF.
+    for unit_ff, beyond in ((0.8, False), (0.85, True)):
+        coarse = dataclasses.replace(layout, unit_ff=np.full(layout.n_taxels, unit_ff))
+        assert unpressable(coarse, OUTER, 360.0).all() == beyond
     assert unpressable(layout, OUTER, 360.0).all()
 
 

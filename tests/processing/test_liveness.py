@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skin_host.processing.liveness import CONVERSION_S, Liveness, change_rate
+from skin_host.processing.stuck import longest_run
 
 K = 4
 HERE = np.ones(K, bool)
@@ -82,6 +83,22 @@ def test_a_triangle_that_stops_is_found_within_0_7_s(value: int) -> None:
     assert liveness.frozen.tolist() == [False, False, True, False]
     assert liveness.doubted is not None
     assert liveness.doubted.all(axis=1).tolist() == [False, False, True, False]
+
+
+@pytest.mark.parametrize("sigma", [0.21, 0.25, 0.8])
+def test_a_triangle_is_frozen_by_the_first_repeat_beyond_what_chance_allows(sigma: float) -> None:
+    """Of which the calibration knows as much as from five seconds."""
+    rng = np.random.default_rng(3)
+    liveness = Liveness(K, np.full((K, 12), sigma), PERIOD_S)
+    changes = min(1.0 - (1.0 - 2.0 * sigma**2) ** 12, 0.9) if sigma < 0.5 else 0.9
+    (allowed,) = longest_run(np.array([changes]), 5.0 / PERIOD_S, 1e9)
+    raw = noisy_bytes(rng, 3.0, np.full((K, 12), 200.0))
+    # The last triangle does not change together with the others.
+    liveness.step(raw + np.array([[1], [1], [1], [0]], np.uint8), HERE, NO)
+    liveness.step(raw, HERE, NO)
+    for repeats in range(1, int(allowed) + 2):
+        liveness.step(raw, HERE, NO)
+        assert liveness.frozen[:3].tolist() == [repeats > allowed] * 3
 
 
 def test_a_triangle_at_the_end_of_its_scale_is_pressed_not_dead() -> None:
@@ -183,6 +200,26 @@ def test_any_bytes_at_all_are_survived(seed: int) -> None:
     assert np.isfinite(liveness._pads.longest).all()
 
 
+def test_the_last_pad_that_can_move_is_given_its_own_time_though_another_board_is_touched() -> None:
+    """A pad that changes in a quarter of all sweeps may rest for some 70 of them."""
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.0)
+    liveness = Liveness(K, np.full((K, 12), 0.4), PERIOD_S, boards=2)
+    touched = np.zeros((K, 12), bool)
+    touched[0, 0] = True
+    for _ in range(1000):
+        liveness.step(noisy_bytes(rng, 0.4, centre), HERE, NO, touched)
+    frozen_after = None
+    for sweep in range(100):
+        raw = noisy_bytes(rng, 0.4, centre)
+        raw[3] = [240] + [0] * 11
+        liveness.step(raw, HERE, NO, touched)
+        if frozen_after is None and liveness.frozen[3]:
+            frozen_after = sweep
+    assert frozen_after is not None
+    assert 35 < frozen_after < 100
+
+
 @pytest.mark.parametrize("every", [8, 10, 15])
 def test_one_pad_that_jumps_now_and_then_is_not_taken_for_errors_of_the_bus(every: int) -> None:
     rng = np.random.default_rng(3)
@@ -207,6 +244,42 @@ def test_a_press_before_a_gap_and_its_end_after_it_are_no_spike(gap: bool) -> No
             liveness.note_gap(0)
         liveness.step(raw, HERE, NO)
     assert liveness.spikes.sum() == (0 if gap else 1)
+
+
+@pytest.mark.parametrize(("units", "spikes"), [(5, 0), (7, 0), (8, 1), (200, 1)])
+def test_one_sweep_off_by_more_than_seven_units_and_back_is_a_spike(
+    units: int, spikes: int
+) -> None:
+    liveness = Liveness(K, np.full((K, 12), 0.4), PERIOD_S)
+    for off in (0, units, 0, 0):
+        raw = np.full((K, 12), 240, np.uint8)
+        raw[1, 4] -= off
+        liveness.step(raw, HERE, NO)
+    assert liveness.spikes.tolist() == [spikes]
+
+
+def test_a_new_calibration_of_one_board_keeps_what_is_known_of_the_other() -> None:
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+
+    def new() -> Liveness:
+        return Liveness(K, np.full((K, 12), 0.8), PERIOD_S, boards=2)
+
+    before = new()
+    dead = np.array([True, False, False, True])
+    for _ in range(40):
+        raw = noisy_bytes(rng, 0.8, centre)
+        raw[dead] = 240
+        before.step(raw, HERE, NO)
+    assert before.frozen.tolist() == dead.tolist()
+    after = new()
+    after.keep(before, np.array([False, True]))
+    assert after.frozen.tolist() == [False, False, False, True]
+    assert after.doubted is not None
+    assert after.doubted.all(axis=1).tolist() == [False, False, False, True]
+    for _ in range(6):
+        after.step(noisy_bytes(rng, 0.8, centre), HERE, NO)
+    assert after.doubted is None
 
 
 def test_a_gap_of_one_board_hides_no_spike_of_another() -> None:
