@@ -19,7 +19,7 @@ AT_ONCE_NS = 100_000
 MOST_READS = 20
 
 
-class Clock(Protocol):
+class EmulatedTime(Protocol):
     """Emulated time in nanoseconds since the clock was made, and how to wait for it."""
 
     def now_ns(self) -> int:
@@ -75,7 +75,7 @@ class RealClock:
         await self._clock.sleep(max(0, t_ns - self.now_ns()) / (NS * self._speed))
 
 
-class SteppedClock:
+class SteppedTime:
     """Time that moves only by `advance`, or by a sleeper if the clock runs freely.
 
     With `free` every sleep jumps straight to its end, so a loop runs as fast as the machine

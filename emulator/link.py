@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from smbus2 import SMBus
 
 from emulator.boards.mtb import I2cChips, make_board
-from emulator.clock import Clock, RealClock
+from emulator.clock import EmulatedTime, RealClock
 from skin_host.bus.pair import PairBus
 from skin_host.bus.wire import FrameBatch, MessageClass
 
@@ -125,7 +125,11 @@ class BoardLink:
 
 
 async def run_board(
-    model: str, address: int, lines: Sequence[SMBus], bus: can.BusABC, clock: Clock | None = None
+    model: str,
+    address: int,
+    lines: Sequence[SMBus],
+    bus: can.BusABC,
+    clock: EmulatedTime | None = None,
 ) -> None:
     """Be a board made of a single-board computer, until cancelled: the firmware on real chips.
 

@@ -22,7 +22,7 @@ from emulator.boards.contents import Bursts, load_recordings
 from emulator.boards.fingertips import Fingertips
 from emulator.boards.mtb import Mtb, make_board, set_up
 from emulator.chips.converters import Converters, fidelities
-from emulator.clock import Clock, RealClock
+from emulator.clock import EmulatedTime, RealClock
 from emulator.link import BoardLink
 from emulator.probes.contacts import ContactSource
 from emulator.probes.scene import Fault, Probe, Scene, check
@@ -272,7 +272,7 @@ class Robot:
     def _command(self, number: int, message: Message) -> None:
         self.receive(self._bus_of[number], *command_frame(message, self._boards[number].address))
 
-    async def run(self, buses: Mapping[str, can.BusABC], clock: Clock | None = None) -> None:
+    async def run(self, buses: Mapping[str, can.BusABC], clock: EmulatedTime | None = None) -> None:
         """Live on real or virtual buses until cancelled.
 
         Args:
@@ -311,7 +311,7 @@ class Robot:
         self,
         links: Mapping[str, BoardLink],
         steps: Sequence[Mapping[str, FrameBatch]],
-        clock: Clock,
+        clock: EmulatedTime,
         ahead_ns: int,
     ) -> None:
         """Send what the boards sent in some steps, of each bus at once.

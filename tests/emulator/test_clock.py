@@ -3,7 +3,7 @@ import asyncio
 import numpy as np
 import pytest
 
-from emulator.clock import NS, RealClock, SteppedClock
+from emulator.clock import NS, RealClock, SteppedTime
 from skin_host import clock as clocks
 
 
@@ -52,7 +52,7 @@ def test_a_clock_that_stands_still_is_refused() -> None:
 
 
 async def test_a_stepped_clock_moves_only_when_it_is_moved() -> None:
-    clock = SteppedClock()
+    clock = SteppedTime()
     sleeper = asyncio.create_task(clock.sleep_until_ns(NS))
     await asyncio.sleep(0)
     await clock.advance(0.5)
@@ -63,6 +63,6 @@ async def test_a_stepped_clock_moves_only_when_it_is_moved() -> None:
 
 
 async def test_a_free_clock_jumps_over_every_sleep() -> None:
-    clock = SteppedClock(free=True)
+    clock = SteppedTime(free=True)
     await clock.sleep_until_ns(3600 * NS)
     assert clock.now_ns() == 3600 * NS

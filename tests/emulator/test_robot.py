@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from smbus2 import i2c_msg
 
-from emulator.clock import SteppedClock
+from emulator.clock import SteppedTime
 from emulator.probes import scene as scenes
 from emulator.probes.scene import Place, Probe, Scene
 from emulator.robot import Robot
@@ -201,7 +201,7 @@ async def test_a_robot_answers_and_streams_on_a_python_can_bus() -> None:
 async def test_boards_whose_computer_was_busy_get_their_commands_one_after_the_other() -> None:
     settings, layout = load()
     robot = Robot(settings, layout, Scene(noise=False))
-    clock = SteppedClock()
+    clock = SteppedTime()
     with (
         can.Bus(interface="virtual", channel="test-busy") as inside,
         can.Bus(interface="virtual", channel="test-busy") as outside,
@@ -226,7 +226,7 @@ async def test_boards_whose_computer_was_busy_get_their_commands_one_after_the_o
 async def test_a_busy_computer_delays_frames_but_not_their_time_stamps() -> None:
     robot = Robot(*load(), Scene(noise=False))
     robot.bring_up()
-    clock = SteppedClock()
+    clock = SteppedTime()
     with (
         can.Bus(interface="virtual", channel="test-late") as inside,
         can.Bus(interface="virtual", channel="test-late") as outside,
@@ -252,7 +252,7 @@ async def test_boards_do_not_stall_with_their_computer(stalled_s: float) -> None
     robot = Robot(settings, layout, Scene(noise=False))
     robot.bring_up()
     brought_up_s = robot.t_ns * 1e-9
-    clock = SteppedClock()
+    clock = SteppedTime()
     with (
         can.Bus(interface="virtual", channel="test-stall") as inside,
         can.Bus(interface="virtual", channel="test-stall") as outside,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from emulator import link
 from emulator.chips.ad7147 import AD7147
 from emulator.chips.i2c import build_lines
-from emulator.clock import Clock, SteppedClock
+from emulator.clock import EmulatedTime, SteppedTime
 from skin_host.bus.commands import (
     Discover,
     Message,
@@ -26,7 +26,7 @@ class ChipsInTime:
     """A stepped clock that carries chips along."""
 
     def __init__(self, chips: list[AD7147]) -> None:
-        self._clock = SteppedClock(free=True)
+        self._clock = SteppedTime(free=True)
         self._chips = chips
 
     def now_ns(self) -> int:
@@ -42,7 +42,7 @@ class ChipsInTime:
             chip.advance((self.now_ns() - before_ns) * 1e-9)
 
 
-async def listen(bus: can.BusABC, clock: Clock, seconds: float) -> list[can.Message]:
+async def listen(bus: can.BusABC, clock: EmulatedTime, seconds: float) -> list[can.Message]:
     """Messages that come within so much emulated time."""
     until_ns = clock.now_ns() + round(seconds * 1e9)
     messages: list[can.Message] = []
