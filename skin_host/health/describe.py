@@ -73,6 +73,7 @@ class Describer:
         pipeline = self._engine.pipeline
         calibration = self._engine.calibration
         valid = self._valid(part)
+        triangles, others = self._triangles(part, boards)
         record: Record = {
             "part": layout.name,
             "state": self._state(part, pressure, valid),
@@ -82,7 +83,7 @@ class Describer:
             "valid_taxels": 0 if valid is None else int(np.count_nonzero(valid)),
             "invalid": _listed(None if valid is None else pressure & ~valid),
             "beyond_range": _listed(watch.beyond),
-            "triangles": self._triangles(part, boards),
+            "triangles": triangles,
             "taxel_verdicts": self._verdicts(part, pressure),
             "decides_kpa": self._decides_kpa(part),
             "taxel_faults": self._taxel_faults(part, pressure),
@@ -95,6 +96,8 @@ class Describer:
             if calibration is None
             else {"id": calibration.id, "time": calibration.time},
         }
+        if others:
+            record["other_triangles"] = others
         if now_ns is not None:
             record["age_ms"] = _age_ms(now_ns, watch.last_ns or None)
         return record
@@ -139,18 +142,22 @@ class Describer:
             return "silent"
         return "ok" if valid[pressure].all() else "degraded"
 
-    def _triangles(self, part: int, boards: dict[str, Boards]) -> list[TriangleHealth]:
-        """Return the triangles of a part that have a fault."""
+    def _triangles(
+        self, part: int, boards: dict[str, Boards]
+    ) -> tuple[list[TriangleHealth], list[TriangleHealth]]:
+        """Return the triangles with a fault of a part, and those of other parts on its boards."""
         unwell: list[TriangleHealth] = []
+        others: list[TriangleHealth] = []
         for board, numbers in self._fitted[part].items():
             if self._all_well(board) or self._awaits(board, boards):
                 continue
             name = self._layout.boards[board].name
-            for number in numbers:
+            for number in self._layout.boards[board].triangles:
                 fault = self._triangle_fault(board, number)
                 if fault is not None:
-                    unwell.append({"board": name, "triangle": number, "fault": fault})
-        return unwell
+                    found = unwell if number in numbers else others
+                    found.append({"board": name, "triangle": number, "fault": fault})
+        return unwell, others
 
     def _all_well(self, board: int) -> bool:
         """Whether no triangle of the board can have a fault: the common case, checked first."""

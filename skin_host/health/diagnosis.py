@@ -265,10 +265,15 @@ def _line_of(board: BoardHealth, triangle: int) -> int:
 def _triangles(record: Record, silent: set[str]) -> Iterator[FoundFault]:
     boards = {board["name"]: board for board in record["boards"]}
     of_line: dict[tuple[str, int], dict[int, str]] = defaultdict(dict)
-    for one in record["triangles"]:
-        if one["board"] not in silent:
-            line = _line_of(boards[one["board"]], one["triangle"])
-            of_line[one["board"], line][one["triangle"]] = one["fault"]
+    own: dict[tuple[str, int], dict[int, str]] = defaultdict(dict)
+    for of, ones in ((own, record["triangles"]), (of_line, record.get("other_triangles", []))):
+        for one in ones:
+            if one["board"] not in silent:
+                line = _line_of(boards[one["board"]], one["triangle"])
+                of[one["board"], line][one["triangle"]] = one["fault"]
+    # A line that parts share fails as a whole; each of them reports it.
+    for where, faults in own.items():
+        of_line[where] |= faults
     reported: set[tuple[str, int]] = set()
     for name, board in boards.items():
         lines = {line: faults for (owner, line), faults in of_line.items() if owner == name}
@@ -277,7 +282,8 @@ def _triangles(record: Record, silent: set[str]) -> Iterator[FoundFault]:
             fitted[_line_of(board, triangle)].add(triangle)
         whole = [line for line, faults in lines.items() if set(faults) == fitted[line]]
         for line in whole:
-            if len(fitted[line]) > 1 and set(lines[line].values()) <= {"no ack", "silenced"}:
+            dead = set(lines[line].values()) <= {"no ack", "silenced"}
+            if dead and len(fitted[line]) > 1 and (name, line) in own:
                 reported.add((name, line))
                 yield FoundFault(
                     "line_shorted",
@@ -287,10 +293,10 @@ def _triangles(record: Record, silent: set[str]) -> Iterator[FoundFault]:
                 )
         mixed = [
             line
-            for line in whole
+            for line in sorted(whole)
             if (name, line) not in reported and set(lines[line].values()) & {"out of range"}
         ]
-        if len(mixed) == 2:
+        if len(mixed) == 2 and any((name, line) in own for line in mixed):
             reported |= {(name, line) for line in mixed}
             yield FoundFault(
                 "lines_swapped",
@@ -299,12 +305,12 @@ def _triangles(record: Record, silent: set[str]) -> Iterator[FoundFault]:
                 f"{_list(fitted[mixed[1]])} all read wrong at once: are the plugs of their two "
                 "data lines swapped? Put them right, or calibrate and change the configuration",
             )
-    for (name, line), faults in of_line.items():
+    for (name, line), faults in own.items():
         if (name, line) in reported:
             continue
         for triangle, fault in sorted(faults.items()):
             sentence = _TRIANGLE_SENTENCES[fault]
-            if fault == "not connected" and len(faults) > 1:
+            if fault == "not connected" and len(of_line[name, line]) > 1:
                 sentence += " (another one on its line reads wrong too: does it have this address?)"
             code = "triangle_" + fault.replace(" ", "_")
             yield FoundFault(

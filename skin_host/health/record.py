@@ -127,7 +127,12 @@ class FaultName(TypedDict):
 
 
 class Record(TypedDict):
-    """One part. Taxels are given by their number in the part; `output` are `PublisherCounters`."""
+    """One part.
+
+    Taxels are given by their number in the part; `output` are `PublisherCounters`;
+    `other_triangles` are those with a fault that other parts have on its boards: parts may share a
+    data line.
+    """
 
     part: str
     frames: int
@@ -147,6 +152,7 @@ class Record(TypedDict):
     baseline_at_limit: list[int]
     calibration: CalibrationName | None
     state: str
+    other_triangles: NotRequired[list[TriangleHealth]]
     age_ms: NotRequired[float | None]
     output: NotRequired[dict[str, Any]]
     unkept: NotRequired[dict[str, str]]

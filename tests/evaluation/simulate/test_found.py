@@ -193,3 +193,28 @@ def test_a_board_that_restarts_in_a_press_does_not_zero_it_away(world: World, nu
 
     with world.clock.runner() as runner:
         runner.run(live())
+
+
+def test_a_shorted_data_line_that_two_parts_share_is_named_by_both(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each has only two of the four triangles that stop answering."""
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
+    small = Path(__file__).with_name("small.toml")
+    settings, layout = load_skin(small)
+    world = World(settings, layout, small, 1, Scene(quiet=True))
+
+    async def live() -> None:
+        life = start(world)
+        await world.clock.sleep(8.0)
+        world.move()
+        world.robot.inject(Fault(name="shorted_finger", board="left", triangle=0))
+        await world.clock.sleep(1.0)
+        for record in life.daemon.records().values():
+            codes = {fault["code"] for fault in record["faults"] if fault["where"] != "broker"}
+            assert "line_shorted" in codes
+            assert not {code for code in codes if code.startswith("triangle_")}
+        life.kill()
+
+    with world.clock.runner() as runner:
+        runner.run(live())
