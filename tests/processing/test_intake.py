@@ -163,6 +163,22 @@ def test_chips_are_judged_as_soon_as_every_board_that_sends_has_sent() -> None:
     assert inner.is_whole
 
 
+def test_while_a_board_is_touched_its_other_chips_may_repeat_for_longer() -> None:
+    parts = intake()
+    touched = np.zeros((16, 12), np.bool_)
+    touched[1, 0] = True
+    parts.engine.intake.touched[0] = touched
+    for turn in range(1, 25):
+        samples = parts.feed([sweep(OUTER, turn * PERIOD), sweep(INNER, turn * PERIOD)])
+    parts.engine.intake.judge()
+    frozen = parts.engine.intake.liveness.frozen
+    # The touch may be the dead chip's own.
+    assert np.flatnonzero(frozen[:16]).tolist() == [1]
+    assert np.flatnonzero(frozen[16:]).tolist() == list(range(8))
+    present = samples[-1].present.reshape(-1, 12).all(axis=1)
+    assert present.tolist() == [triangle < 16 and triangle != 1 for triangle in range(24)]
+
+
 def far(pads: int) -> int:
     """A status word that calls the first pads far out of range."""
     return ((1 << pads) - 1) << 4
