@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from skin_host.bus.assembler import Sweep
 from skin_host.cli.common import load_skin
 from skin_host.processing.core import Engine
-from skin_host.processing.intake import PartSample, unpressable
+from skin_host.processing.intake import PartSample, below_zero, unpressable
 
 MS = 1_000_000
 PERIOD = 50 * MS
@@ -177,6 +177,24 @@ def test_while_a_board_is_touched_its_other_chips_may_repeat_for_longer() -> Non
     assert np.flatnonzero(frozen[16:]).tolist() == list(range(8))
     present = samples[-1].present.reshape(-1, 12).all(axis=1)
     assert present.tolist() == [triangle < 16 and triangle != 1 for triangle in range(24)]
+
+
+def test_a_veto_makes_a_taxel_invalid_that_was_received() -> None:
+    parts = intake()
+    vetoed = np.zeros((16, 12), np.bool_)
+    vetoed[2, 3] = True
+    parts.engine.intake.veto[0] = vetoed
+    (sample,) = parts.feed([sweep(OUTER, PERIOD), sweep(INNER, PERIOD)])
+    assert np.flatnonzero(~sample.present).tolist() == [2 * 12 + 3]
+    assert sample.received.all()
+
+
+def test_single_pads_far_below_zero_are_named_and_those_of_another_chip_are_not() -> None:
+    raw = np.full((3, 12), 255, np.uint8)
+    raw[0, 0] = 254
+    far_pads = np.arange(12) < np.array([[6], [7], [0]])
+    found = below_zero(raw, far_pads)
+    assert np.argwhere(found).tolist() == [[0, pad] for pad in range(1, 6)]
 
 
 def far(pads: int) -> int:
