@@ -338,7 +338,7 @@ class FoamLayer:
         self._drive = drive
 
     def _release(self, before: Footprint, footprint: Footprint, dt_s: float) -> None:
-        """Let go of the foam that a new footprint no longer covers; it has `dt_s` to come back."""
+        """Release the foam that a new footprint no longer covers; it has `dt_s` to come back."""
         is_touched = np.zeros(len(self.foam), bool)
         is_touched[footprint.taxel] = True
         left = self._touched[~is_touched[self._touched]]

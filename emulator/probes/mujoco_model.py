@@ -168,7 +168,7 @@ class MujocoModel:
         self.data.ctrl[held] = self._held[held]
 
     def set_control(self, name: str, value: float) -> None:
-        """Let an actuator's control stay at a value from now on, whatever the keyframes say.
+        """Let an actuator's control stay at a value from now on, whatever the keyframes give.
 
         Raises:
             RequestError: there is no such actuator.

@@ -105,7 +105,7 @@ class AdapterPort(Port):
         try:
             return bus.recv(0)
         except can.CanOperationError as error:
-            # Everybody in the network may send datagrams. What is in them says nothing about the
+            # Everybody in the network may send datagrams. Their content shows nothing about the
             # socket, whose own failures are caused by an OSError.
             if self._settings.interface != MULTICAST or isinstance(error.__cause__, OSError):
                 raise

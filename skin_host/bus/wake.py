@@ -28,7 +28,7 @@ SLIP_NS = 50_000
 #: With a plan for every board, the ports are read at least this often: once between two sweeps of
 #: a board at 20 Hz.
 LONGEST_NS = 26_000_000
-#: A board that has not been heard of for this long is searched for no oftener than that.
+#: A board that has sent nothing for this long is searched for no oftener than that.
 SEARCH_NS = 2_000_000_000
 #: At this rate of samples one is always due: then reads are one polling interval apart, and
 #: proportionally with fewer samples, so that wake-ups never cost more than the frames.

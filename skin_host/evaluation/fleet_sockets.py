@@ -4,8 +4,8 @@ A `PlainEar` receives what a `client.links.BrokerLink` does. A `PlainRobot` is p
 `mqtt.publisher.Publisher` is put, and does the same with it where it matters for a fleet: events
 wait in a queue, go out in order, are acknowledged (QoS 1), and are sent again after a loss; the
 next broker gets what was acknowledged shortly before, and all states again; messages have the
-numbers by which clients tell old from new. It has no frames, commands, access rules, packet limits
-or bounds of its queue. paho and aiomqtt have no part in either.
+numbers by which clients distinguish old from new. It has no frames, commands, access rules, packet
+limits or bounds of its queue. paho and aiomqtt have no part in either.
 Source: MQTT 5.0, sections 3.1 to 3.4 and 3.8.
 """
 

@@ -474,7 +474,7 @@ def errors_in_hindsight(kpa: Floats, valid: Mask, true_kpa: Floats) -> list[Row]
     """Errors of reported pressures, and what is left of them when something of the truth is known.
 
     What the best possible estimators would make of a recording whose true pressure they know. None
-    of them can be built: each is told something that no calibration can know. What error is left
+    of them can be built: each knows something that no calibration can know. What error is left
     when it is known shows where the rest comes from.
 
     Args:

@@ -26,7 +26,7 @@ from skin_host.processing.pipeline import PressureFrame
 REPEAT_S = 10.0
 REPEATED = 1000
 #: While more events than this wait, a newer `move` takes the place of the one before it: what waits
-#: longer would tell of the past. The first ones, as many, may be on their way.
+#: longer would describe the past. The first ones, as many, may be on their way.
 BACKLOG = 100
 #: `move` events may fill half of the queue, because a begin or an end is more important.
 MOVE_SHARE = 0.5

@@ -378,7 +378,7 @@ class PageRecording:
         return {"marks": self._marks}
 
     async def stop(self) -> dict[str, Any]:
-        """End the recording in progress, and say what it holds.
+        """End the recording in progress, and return what it holds.
 
         Raises:
             RequestError: there is none.

@@ -294,7 +294,7 @@ def _page_files() -> dict[str, tuple[str, bytes]]:
     page = resources.files("skin_host.viewer").joinpath("page")
     files = {}
     for prefix, folder in (("", page), ("vendor/", page.joinpath("vendor"))):
-        # Where neither npm nor PyPI was reached there are no libraries; the page says so.
+        # Where neither npm nor PyPI was reached there are no libraries; the page shows that.
         for file in folder.iterdir() if folder.is_dir() else ():
             kind = TYPES.get(file.name.rpartition(".")[2])
             if kind is not None:
