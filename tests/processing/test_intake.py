@@ -28,9 +28,9 @@ def skin():
 class Joined:
     """Ledger and intake of an engine, as its sweeps pass through them."""
 
-    def __init__(self) -> None:
+    def __init__(self, parts: tuple[int, ...] = (1,)) -> None:
         configuration, layout = skin()
-        self.engine = Engine(configuration, layout, [1])
+        self.engine = Engine(configuration, layout, list(parts))
 
     def feed(self, sweeps: list[Sweep]) -> list[PartSample]:
         return self.engine._take(sweeps)
@@ -98,6 +98,18 @@ def test_a_silent_part_says_so_at_once_and_then_once_a_second():
     assert len(said) == 3
     assert not any(sample.present.any() for sample in said)
     assert said[0].t_ns <= PERIOD + 4 * PERIOD
+
+
+def test_a_part_that_is_silent_holds_up_no_other() -> None:
+    parts = Joined((0, 1))
+    said: list[PartSample] = []
+    for turn in range(1, 10):
+        parts.feed([sweep(OUTER, turn * PERIOD), sweep(INNER, turn * PERIOD)])
+        said += parts.expire(turn * PERIOD)
+    assert [sample.part for sample in said] == [0]
+    parts.feed([sweep(OUTER, 10 * PERIOD)])
+    (sample,) = parts.expire(11 * PERIOD + 1)
+    assert sample.part == 1
 
 
 @given(
