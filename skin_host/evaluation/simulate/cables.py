@@ -98,7 +98,9 @@ class Sent:
             if half is None or half[0] == header or t_ns - half[2] > PAIR_NS:
                 self._half[key] = header, payload, t_ns
                 continue
-            del self._half[key]
+            # A bus that was full passes sweeps close together, and one may have lost its first
+            # half: this frame may be the first of the next.
+            self._half[key] = header, payload, t_ns
             if header == HEADER_B and half[0] == HEADER_A:
                 first, second = half[1], payload
             elif header == HEADER_A and half[0] == HEADER_B:

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from emulator.probes.scene import Fault, Scene
+from skin_host.bus.wire import HEADER_A, HEADER_B, FrameBatch
 from skin_host.cli.common import load_skin
 from skin_host.demo import configuration
+from skin_host.evaluation.simulate.cables import Sent
 from skin_host.evaluation.simulate.world import Life, World
 
 DEMO = configuration("demo.toml")
@@ -218,3 +220,14 @@ def test_a_shorted_data_line_that_two_parts_share_is_named_by_both(
 
     with world.clock.runner() as runner:
         runner.run(live())
+
+
+def test_halves_of_sweeps_that_a_full_bus_held_up_are_paired_though_one_was_lost() -> None:
+    """Sweeps follow each other within a millisecond then; what is left of the first is one half."""
+    sent = Sent()
+    first, second = bytes([HEADER_A, *range(7)]), bytes([HEADER_B, *range(7, 12), 0, 0])
+    left = bytes([HEADER_B, *[99] * 5, 0, 0])
+    frames = [(0x411, data, number * 100_000) for number, data in enumerate((left, first, second))]
+    sent.note(FrameBatch.of(frames))
+    assert [answered for answered, _ in sent.find(1, 1, bytes(range(12)))] == [True]
+    assert not list(sent.find(1, 1, bytes([*range(7), *[98] * 5])))
