@@ -520,7 +520,8 @@ class Promises:
                     f"{name}: taxel {taxel} is valid and reads {frame.pressure_kpa[taxel]:.1f} kPa "
                     "while nothing presses it"
                 )
-        self._missed_boards(now_ns)
+        if not life.stop.is_set():  # a daemon that ends reads no more, and stops the boards
+            self._missed_boards(now_ns)
         unnamed = self.accusations.unnamed()
         if unnamed is not None:
             self.break_(unnamed)
