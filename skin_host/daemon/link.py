@@ -201,13 +201,15 @@ class Link:
             now_ns: the time, on the clock of the frames' time stamps.
             deliver, record: see `read`.
         """
-        drained = True
+        # Until when each bus that is not empty has been read.
+        behind_ns: list[int] = []
         batches: list[tuple[str, FrameBatch]] = []
         for bus, port in self.ports.items():
             batch = port.read()
             if not len(batch):
                 continue
-            drained &= len(batch) < port.capacity
+            if len(batch) >= port.capacity:
+                behind_ns.append(int(batch.t_ns[-1]))
             record(bus, batch)
             batches.append((bus, batch))
         for bus, batch in _by_time(batches, self._slice_ns):
@@ -216,11 +218,11 @@ class Link:
                 self._note_answers(bus, output.answers)
             self._note(output)
             deliver(output)
-        if not drained:
-            return
         read_ns = min((port.read_until_ns(now_ns) for port in self.ports.values()), default=now_ns)
+        read_ns = min([read_ns, *behind_ns])
         self.read_ns = read_ns
-        if self._is_patient(now_ns):
+        # What is behind is complete up to its last frame, whatever held this computer up.
+        if not behind_ns and self._is_patient(now_ns):
             self._engine.ledger.pass_over(read_ns)
             return
         self._engine.ledger.look(read_ns)

@@ -215,10 +215,8 @@ async def test_while_the_daemon_is_behind_no_board_is_set_up(
         for command in (none, SetTxMode(TxMode.START)):
             identifier, data = command_frame(command, 14)
             bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
-        await clock.sleep(0.5)
-        read_ns = link.read_ns
-        await clock.sleep(2.5)
-        assert link.read_ns == read_ns
+        await clock.sleep(3.0)
+        assert len(waiting) >= FRAMES_BEHIND
         assert record.configurations == 1
         assert not live.daemon.engine.ledger.lost_set_ups.any()
         port.read, port.capacity = usual  # type: ignore[method-assign]

@@ -165,3 +165,16 @@ def test_what_waited_on_several_buses_is_taken_by_its_time_and_not_by_its_bus() 
     sweeps = [(sweep.t_ns, sweep.board) for output in outputs for sweep in output.sweeps]
     assert len(sweeps) == 16
     assert sweeps == sorted(sweeps)
+
+
+def test_on_a_bus_that_never_ends_a_board_that_dies_has_timed_out(reader: Reader) -> None:
+    reader.period(ALL)
+    reader.period(ALL)
+    assert not reader.engine.ledger.is_silent(0)
+    # Somebody floods the bus: each read is full, and what comes after it waits.
+    port = reader.link.ports["can0"]
+    port.capacity = 4
+    for _ in range(1000):
+        reader.arrive([(0x100, b"", reader.now_ns + i) for i in range(4)])
+        reader.wait(1)
+    assert reader.engine.ledger.is_silent(0)
