@@ -407,7 +407,8 @@ class Promises:
         )
         put = sum(self._put.values())
         ended = life.task.done()
-        kept = known.touches_sent + known.touches_dropped + (0 if ended else waiting)
+        kept = known.touches_sent + known.touches_dropped + known.moves_replaced
+        kept += 0 if ended else waiting
         if not life.dead and put != kept:
             self.break_(f"{put} touch events were put, {kept} are accounted for")
         gaps = sum(max(seen, default=0) - len(seen) for seen in self._counts.values())

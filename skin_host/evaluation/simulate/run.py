@@ -111,6 +111,7 @@ def simulate(
         try:
             scene = _scene(seed, seconds)
             world = World(settings, layout, config, seed, scene)
+            world.trace.unnamed = state.encode()
             with world.clock.runner() as runner:
                 run = _Run(world, Path(state), seed, seconds, until_s)
                 runner.run(run.live())
@@ -492,8 +493,8 @@ class _Run:
         lasting = asyncio.create_task(self._last(trouble, 8.0 if trouble.lasts_s[1] else 0.0))
         await pressing
         for _ in range(4):
-            await self._press_all(1.0)
             await self.world.clock.sleep(0.5)
+            await self._press_all(1.0)
         await lasting
         await self.world.clock.sleep(5.0)
 

@@ -13,7 +13,11 @@ class Trace:
     Attributes:
         count: events so far.
         last: the last ones that are worth showing, as lines.
+        unnamed: a name that is another in every run, as that of the state's folder; it may stand in
+            messages and is not hashed.
     """
+
+    unnamed = b""
 
     def __init__(self) -> None:
         self._hash = blake2b(digest_size=16)
@@ -25,7 +29,7 @@ class Trace:
         self.count += 1
         self._hash.update(b"%d %s" % (t_ns, kind.encode()))
         for value in values:
-            self._hash.update(value)
+            self._hash.update(value.replace(self.unnamed, b"") if self.unnamed else value)
 
     def note(self, t_ns: int, text: str) -> None:
         """An event that is hashed and shown."""

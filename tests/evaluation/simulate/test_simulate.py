@@ -52,3 +52,10 @@ def test_the_same_seed_gives_the_same_events_in_another_process(tmp_path: Path) 
     here = run(4, until_s=14.0)
     assert (other["hash"], other["events"]) == (here.digest, here.events)
     assert run(5, until_s=14.0).digest != here.digest
+
+
+def test_where_the_files_are_does_not_count_among_the_events() -> None:
+    """A disk becomes read-only, and health names the file that cannot be written."""
+    first, second = (run(15, SMALL, until_s=20.3) for _ in range(2))
+    assert "disk_read_only" in first.troubles
+    assert first.digest == second.digest
