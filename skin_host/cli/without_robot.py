@@ -60,8 +60,7 @@ def add_commands(commands: Commands) -> None:
         "skin emulate config/icub_hand.toml --channel vcan0",
     )
     add_config(emulate)
-    emulate.add_argument("--scene", type=Path, help="what happens to the skin (TOML)")
-    add_mujoco(emulate)
+    _add_scene(emulate)
     emulate.add_argument(
         "--fidelity", choices=("signal", "chip"), default="signal", help="how deep the chips go"
     )
@@ -75,9 +74,6 @@ def add_commands(commands: Commands) -> None:
     emulate.add_argument("--speed", type=positive, default=1.0, help="times real time")
     emulate.add_argument("--interface", help="replaces that of every bus in CONFIG")
     emulate.add_argument("--channel", help="replaces that of the only bus in CONFIG")
-    emulate.add_argument(
-        "--duration", type=positive, metavar="S", help="end after this many seconds"
-    )
     emulate.add_argument("--board", metavar="NAME", help="only this board; see the next two")
     emulate.add_argument(
         "--i2c",
@@ -102,9 +98,7 @@ def add_commands(commands: Commands) -> None:
     demo.add_argument(
         "config", metavar="CONFIG", nargs="?", type=Path, help="any robot; the demo's own without"
     )
-    demo.add_argument("--scene", type=Path, help="what happens to the skin (TOML)")
-    demo.add_argument("--duration", type=positive, metavar="S", help="end after this many seconds")
-    add_mujoco(demo)
+    _add_scene(demo)
     demo.add_argument(
         "--page-port",
         type=int,
@@ -173,13 +167,17 @@ def _add_measurements(commands: Commands) -> None:
     simulate.set_defaults(run=_simulate)
 
 
-def add_mujoco(parser: argparse.ArgumentParser) -> None:
-    """Add the option for a simulation of bodies."""
+def _add_scene(parser: argparse.ArgumentParser) -> None:
+    """Add what every emulated robot has: what happens to it, and for how long."""
+    parser.add_argument("--scene", type=Path, help="what happens to the skin (TOML)")
     parser.add_argument(
         "--mujoco",
         type=Path,
         metavar="MODEL",
         help="a MuJoCo model whose contacts press the skin, see docs/mujoco.md",
+    )
+    parser.add_argument(
+        "--duration", type=positive, metavar="S", help="end after this many seconds"
     )
 
 

@@ -218,9 +218,8 @@ class Link:
                 self._note_answers(bus, output.answers)
             self._note(output)
             deliver(output)
-        read_ns = min((port.read_until_ns(now_ns) for port in self.ports.values()), default=now_ns)
-        read_ns = min([read_ns, *behind_ns])
-        self.read_ns = read_ns
+        until_ns = (port.read_until_ns(now_ns) for port in self.ports.values())
+        self.read_ns = read_ns = min(chain(until_ns, behind_ns), default=now_ns)
         # What is behind is complete up to its last frame, whatever held this computer up.
         if not behind_ns and self._is_patient(now_ns):
             self._engine.ledger.pass_over(read_ns)
