@@ -23,10 +23,10 @@ AGAIN := --reruns=1 -rR
 
 test: lint  ## all that needs no root and no hardware
 	@$(BIN)/python -m compileall -q skin_host emulator
-	@tools/timed "pytest" $(BIN)/python -m pytest --numprocesses=5 --dist=loadfile $(AGAIN)
+	@tools/timed "pytest" $(BIN)/python -m pytest --numprocesses=3 --dist=loadfile $(AGAIN)
 
 coverage: .venv/dev.stamp .venv/coverage.stamp  ## statements and branches of the core that the tests run: 95 % of the branches at least
-	@$(BIN)/python -m pytest --quiet --numprocesses=5 --dist=loadfile --cov --cov-report=term --cov-report=json:.coverage.json
+	@$(BIN)/python -m pytest --quiet --numprocesses=3 --dist=loadfile --cov --cov-report=term --cov-report=json:.coverage.json
 	@$(BIN)/python -m tests.support.branches .coverage.json
 
 mutation: .venv/dev.stamp .venv/mutation.stamp  ## small changes of the core that its tests must notice; FILES=... PLACES=40
