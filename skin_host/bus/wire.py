@@ -332,14 +332,3 @@ def out_of_range(status: NDArray[np.uint16]) -> NDArray[np.bool_]:
 def status_error(status: NDArray[np.uint16]) -> NDArray[np.uint8]:
     """Error nibbles of status words, see `StatusError`."""
     return (status & 0xF).astype(np.uint8)
-
-
-def legacy_values(dlc: int, data: bytes) -> tuple[int, ...] | None:
-    """Return the values of the reduced legacy formats (class 3, MTB3), or None for other frames.
-
-    DLC 2 is one average of all twelve pads, DLC 4 three values.
-    Source: mtb3/main_V3.c, CONFIG_ALL and CONFIG_THREE.
-    """
-    if data[:1] == bytes([HEADER_A]) and dlc in {2, 4}:
-        return tuple(data[1:dlc])
-    return None

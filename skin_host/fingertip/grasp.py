@@ -1,4 +1,4 @@
-"""Flags of a grasping hand, and the finger speed that follows from them (Ohka et al., 3.3).
+"""Flags of a grasping hand (Ohka et al., 3.3).
 
 SEARCH: fingers approach until something touches. MOVE: the hand manipulates. TOUCH: the normal
 force of an element is above F1, or it slips. SLIP: |dFs/dt| of an element is above dr. OVER: the
@@ -8,7 +8,6 @@ re-compression along the inward normal of the element with the largest normal fo
 
 from dataclasses import dataclass
 from enum import IntFlag
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,19 +78,6 @@ def next_mode(mode: Flags, *, touch: bool, lost: bool, done: bool) -> Flags:
     return Flags.MOVE if touch else Flags.SEARCH
 
 
-@dataclass(frozen=True, slots=True)
-class GraspEvent:
-    """A finger begins or stops to slip, or to press too hard.
-
-    `value` is what crossed its threshold: N/s for `slip`, N for `over`; 0 at the end.
-    """
-
-    kind: Literal["slip", "over"]
-    event: Literal["begin", "end"]
-    t_ns: int
-    value: float
-
-
 class FingerFlags:
     """The flags of one finger over time."""
 
@@ -110,8 +96,8 @@ class FingerFlags:
         slips: bool = False,
         others_touch: bool = True,
         done: bool = False,
-    ) -> list[GraspEvent]:
-        """Update the flags; return what began or ended.
+    ) -> Flags:
+        """Update the flags; return those that changed.
 
         Args:
             normal_n: float64[n], normal force on each element.
@@ -137,48 +123,7 @@ class FingerFlags:
             done=done,
         )
         before, self.flags = self.flags, seen | mode
-        events = []
-        for flag, kind, values in (
-            (Flags.SLIP, "slip", shear_rate_n_s),
-            (Flags.OVER, "over", normal_n),
-        ):
-            if flag & (before ^ self.flags):
-                began = bool(flag & self.flags)
-                events.append(
-                    GraspEvent(
-                        "slip" if kind == "slip" else "over",
-                        "begin" if began else "end",
-                        t_ns,
-                        float(values.max(initial=0.0)) if began else 0.0,
-                    )
-                )
-        return events
-
-
-def finger_velocity(
-    flags: Flags,
-    *,
-    search_mm_s: Floats,
-    move_mm_s: Floats,
-    squeeze_mm_s: float,
-    normal_n: Floats,
-    inward: Floats,
-) -> Floats:
-    """Velocity of the fingertip, mm/s (Fig. 16).
-
-    Args:
-        flags: of this finger.
-        search_mm_s: velocity v0 while it searches.
-        move_mm_s: velocity vm while it manipulates.
-        squeeze_mm_s: speed of re-compression at a slip.
-        normal_n: float64[n], normal force on each element.
-        inward: float64[n, d], unit vectors in which pressing harder moves the fingertip,
-            the outward normals of the elements.
-    """
-    velocity = (search_mm_s if flags & Flags.SEARCH else move_mm_s).astype(np.float64)
-    if flags & Flags.SLIP and not flags & Flags.OVER:
-        velocity = velocity + squeeze_mm_s * inward[int(normal_n.argmax())]
-    return velocity
+        return before ^ self.flags
 
 
 def _within(since_ns: int | None, t_ns: int, seconds: float) -> bool:

@@ -24,8 +24,8 @@ from skin_host.fingertip.intrinsic import (
     locate,
     point_covariance,
 )
+from skin_host.fingertip.low_pass import Butterworth2
 from skin_host.fingertip.slip import SlipWatch
-from skin_host.fingertip.wrench import Butterworth2
 from skin_host.processing.calibration import Zero
 from skin_host.processing.contacts import ALIVE_NS, LOST_NS, MOVED_M, PRESSED_SHARE
 from skin_host.processing.events import Load, Reason, TouchEvent
@@ -148,7 +148,7 @@ class Tip:
         self._contact: IntrinsicContact | None = None
         self._last_ns = 0
         self._cause: Cause = "rate"
-        self._ids: dict[str, int] = {}
+        self._ids: dict[Flags, int] = {}
         self._noise_n = 0.0
         self._covariance = np.zeros((6, 6))
         self._forget()
@@ -250,10 +250,10 @@ class Tip:
         """End all contacts, because the fingertip will not send for a while."""
         events: list[FingertipEvent] = []
         if self.flags & Flags.SLIP:
-            number = self._ids["slip"]
+            number = self._ids[Flags.SLIP]
             events.append(SlipEvent("end", number, t_ns, self._name, self._cause, 0.0, 0.0, 0.0))
         if self.flags & Flags.OVER:
-            events.append(OverEvent("end", self._ids["over"], t_ns, self._name, 0.0))
+            events.append(OverEvent("end", self._ids[Flags.OVER], t_ns, self._name, 0.0))
         if self._reported is not None:
             events += self._end(t_ns, reason)
         self._forget()
@@ -311,23 +311,24 @@ class Tip:
         normal_n = seen.normal_n if touches else 0.0
         if seen.cause is not None and not self.flags & Flags.SLIP:
             self._cause = seen.cause
-        changes = self._finger.step(
+        changed = self._finger.step(
             np.array([normal_n]),
             np.array([seen.rate_n_s]),
             t_ns,
             slips=seen.cause is not None,
         )
         events: list[FingertipEvent] = []
-        for one in changes:
-            if one.event == "begin":
+        for flag in changed & (Flags.SLIP | Flags.OVER):
+            event: Literal["begin", "end"] = "begin" if flag & self.flags else "end"
+            if event == "begin":
                 # The contact may begin with this same sample.
-                self._ids[one.kind] = self._next_id if self._reported is None else self._reported.id
-            number = self._ids[one.kind]
-            if one.kind == "over":
-                events.append(OverEvent(one.event, number, t_ns, self._name, normal_n))
+                self._ids[flag] = self._next_id if self._reported is None else self._reported.id
+            number = self._ids[flag]
+            if flag == Flags.OVER:
+                events.append(OverEvent(event, number, t_ns, self._name, normal_n))
                 continue
             forces = normal_n, seen.shear_n, seen.rate_n_s
-            events.append(SlipEvent(one.event, number, t_ns, self._name, self._cause, *forces))
+            events.append(SlipEvent(event, number, t_ns, self._name, self._cause, *forces))
         return events
 
     def _touch(self, load: Floats, t_ns: int) -> list[FingertipEvent]:

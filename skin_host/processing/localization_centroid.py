@@ -134,21 +134,6 @@ class PeakLocalizer:
         return index, np.linalg.pinv(design), basis
 
 
-def quadratic_peak(before: Floats, middle: Floats, after: Floats, pitch: float) -> Floats:
-    """Return the offset of the top of a parabola through three readings in a row from the middle
-    one.
-
-    (p / 2)(a - c) / (a - 2 b + c). 0 where the three have no top, and never more than half
-    a pitch: beyond that, another reading would have been the greatest.
-    """
-    bend = before - 2.0 * middle + after
-    with np.errstate(divide="ignore", invalid="ignore"):
-        offset = 0.5 * pitch * (before - after) / bend
-    offset = np.where(bend < 0.0, offset, 0.0)
-    limited: Floats = np.clip(offset, -0.5 * pitch, 0.5 * pitch)
-    return limited
-
-
 def nearest_distance(position_m: Floats) -> Floats:
     """Return the distance from each taxel to the nearest other, float64[n]; 0 without others."""
     n = len(position_m)

@@ -108,12 +108,6 @@ def test_the_firmware_that_sends_its_second_frame_with_class_6_is_understood():
     assert frames.other == 1
 
 
-def test_reduced_legacy_frames_decode():
-    assert wire.legacy_values(2, bytes.fromhex("40F1")) == (0xF1,)
-    assert wire.legacy_values(4, bytes.fromhex("40F1F2F3")) == (0xF1, 0xF2, 0xF3)
-    assert wire.legacy_values(8, bytes.fromhex("40F0F0F0F0F0F0F0")) is None
-
-
 @given(
     board=st.integers(1, 14),
     values=npst.arrays(np.uint8, (16, 12)),

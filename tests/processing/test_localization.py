@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from skin_host.layout import builtin_kinds
 from skin_host.processing.localization import Method, covered_share, make_localizer, separate
-from skin_host.processing.localization_centroid import quadratic_peak, tangent_plane
+from skin_host.processing.localization_centroid import tangent_plane
 
 METHODS = get_args(Method)
 RADIUS_MM = 2.1
@@ -272,24 +272,6 @@ def test_separation_loses_no_taxel_and_keeps_the_strongest_first(heights):
     assert sorted(chain.from_iterable(groups)) == list(range(8))
     tops = [units[group].max() for group in groups]
     assert tops == sorted(tops, reverse=True)
-
-
-@given(
-    middle=st.floats(1.0, 100.0),
-    left=st.floats(0.0, 100.0),
-    right=st.floats(0.0, 100.0),
-    pitch=st.floats(0.5, 5.0),
-)
-def test_the_top_of_three_readings_stays_within_half_a_pitch(middle, left, right, pitch):
-    offset = quadratic_peak(np.array(left), np.array(middle), np.array(right), pitch)
-    assert abs(offset) <= 0.5 * pitch
-
-
-def test_the_top_of_a_parabola_is_found():
-    x = np.array([-2.0, 0.0, 2.0])
-    a, b, c = 9.0 - (x - 0.37) ** 2
-    assert quadratic_peak(a, b, c, 2.0) == pytest.approx(0.37)
-    assert quadratic_peak(np.array(5.0), np.array(5.0), np.array(5.0), 2.0) == 0.0
 
 
 def test_covered_shares_agree_with_counted_points():

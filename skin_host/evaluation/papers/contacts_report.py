@@ -20,7 +20,12 @@ from skin_host.evaluation.localization_trials import (
     localizer_for,
     separation,
 )
-from skin_host.evaluation.papers.force_torque import PlanarStructure, intrinsic_errors
+from skin_host.evaluation.papers.force_torque import (
+    PUBLISHED_FRICTION_FACTOR,
+    PlanarStructure,
+    intrinsic_errors,
+    sphere_error_bound,
+)
 from skin_host.evaluation.papers.fusion import (
     METHODS,
     SINGLE_METHODS,
@@ -28,7 +33,6 @@ from skin_host.evaluation.papers.fusion import (
     task_errors,
 )
 from skin_host.evaluation.papers.grasp_loops import DETECTORS, false_alarms_per_hour, slip_trials
-from skin_host.fingertip.intrinsic import PUBLISHED_FRICTION_FACTOR, sphere_error_bound
 
 Row = dict[str, Any]
 Report = dict[str, list[Row]]

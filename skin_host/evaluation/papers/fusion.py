@@ -35,8 +35,7 @@ from skin_host.evaluation.papers.truth import (
     pin_patch,
     planar_load,
 )
-from skin_host.fingertip.wrench import Butterworth2
-from skin_host.processing.localization_centroid import quadratic_peak
+from skin_host.fingertip.low_pass import Butterworth2
 
 Floats = NDArray[np.float64]
 
@@ -129,6 +128,21 @@ def peak(response: ArrayLike, around_mm: Floats) -> Floats:
     offset = quadratic_peak(a, b, c, float(around_mm[1] - around_mm[0]))
     place = around_mm[column] + np.where(inner == column, offset, 0.0)
     return np.where(p.max(axis=(1, 2)) > 0.0, place, np.nan)
+
+
+def quadratic_peak(before: Floats, middle: Floats, after: Floats, pitch: float) -> Floats:
+    """Return the offset of the top of a parabola through three readings in a row from the middle
+    one.
+
+    (p / 2)(a - c) / (a - 2 b + c). 0 where the three have no top, and never more than half
+    a pitch: beyond that, another reading would have been the greatest.
+    """
+    bend = before - 2.0 * middle + after
+    with np.errstate(divide="ignore", invalid="ignore"):
+        offset = 0.5 * pitch * (before - after) / bend
+    offset = np.where(bend < 0.0, offset, 0.0)
+    limited: Floats = np.clip(offset, -0.5 * pitch, 0.5 * pitch)
+    return limited
 
 
 def smooth_peak(response: ArrayLike, around_mm: Floats, *, steps: int = 8) -> Floats:

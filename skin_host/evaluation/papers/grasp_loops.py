@@ -17,13 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from emulator.probes.held_objects import Friction, HeldObjects, StickSlip
 from skin_host.errors import CalibrationError
 from skin_host.evaluation.papers.truth import OpticalDome
-from skin_host.fingertip.grasp import (
-    FingerFlags,
-    Flags,
-    GraspEvent,
-    GraspThresholds,
-    finger_velocity,
-)
+from skin_host.fingertip.grasp import FingerFlags, Flags, GraspThresholds
 from skin_host.fingertip.slip import RatioDrop, ShearRate, friction_used
 
 Floats = NDArray[np.float64]
@@ -342,6 +336,32 @@ class CapWorld:
         return np.stack([share * (axes @ force) for axes in (south, east, normals)], axis=1)
 
 
+def finger_velocity(
+    flags: Flags,
+    *,
+    search_mm_s: Floats,
+    move_mm_s: Floats,
+    squeeze_mm_s: float,
+    normal_n: Floats,
+    inward: Floats,
+) -> Floats:
+    """Velocity of the fingertip, mm/s (Fig. 16).
+
+    Args:
+        flags: of this finger.
+        search_mm_s: velocity v0 while it searches.
+        move_mm_s: velocity vm while it manipulates.
+        squeeze_mm_s: speed of re-compression at a slip.
+        normal_n: float64[n], normal force on each element.
+        inward: float64[n, d], unit vectors in which pressing harder moves the fingertip,
+            the outward normals of the elements.
+    """
+    velocity = (search_mm_s if flags & Flags.SEARCH else move_mm_s).astype(np.float64)
+    if flags & Flags.SLIP and not flags & Flags.OVER:
+        velocity = velocity + squeeze_mm_s * inward[int(normal_n.argmax())]
+    return velocity
+
+
 @dataclass(frozen=True, slots=True)
 class HoldResult:
     """How an object under a rising load was held, over servo samples [n]."""
@@ -349,7 +369,7 @@ class HoldResult:
     load_n: Floats
     grip_n: Floats
     slipped_mm: Floats
-    events: list[GraspEvent]
+    slip: NDArray[np.bool_]  # flagged
 
 
 def hold_object(
@@ -379,12 +399,12 @@ def hold_object(
     stiffness_n_mm, grip = 2.0, 2.0
     n = int(seconds * FORCE_HZ)
     load_n = load_rate_n_s * np.arange(n, dtype=np.float64) / FORCE_HZ
-    grips, slips, events = np.zeros(n), np.zeros(n), []
+    grips, slips, flagged = np.zeros(n), np.zeros(n), np.zeros(n, np.bool_)
     for i in range(n):
         shear = objects.advance(load_n[i], grip, 1 / FORCE_HZ)
         seen = np.array([grip, shear[0], 0.0]) + NOISE_N * rng.normal(size=3)
         rate = detector.step(seen[None, 1:])
-        events += finger.step(seen[:1], rate, int(i / FORCE_HZ * 1e9))
+        finger.step(seen[:1], rate, int(i / FORCE_HZ * 1e9))
         squeeze = finger_velocity(
             finger.flags,
             search_mm_s=np.zeros(1),
@@ -396,7 +416,8 @@ def hold_object(
         if respond:
             grip += stiffness_n_mm * float(squeeze[0]) / FORCE_HZ
         grips[i], slips[i] = grip, objects.slipped_mm[0]
-    return HoldResult(load_n, grips, slips, events)
+        flagged[i] = finger.flags & Flags.SLIP
+    return HoldResult(load_n, grips, slips, flagged)
 
 
 @dataclass(frozen=True, slots=True)

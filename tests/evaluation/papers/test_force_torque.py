@@ -5,10 +5,13 @@ from hypothesis import strategies as st
 
 from skin_host.errors import CalibrationError
 from skin_host.evaluation.papers.force_torque import (
+    PUBLISHED_FRICTION_FACTOR,
     calibrate,
     condition_number,
     relative_error_bound,
+    sphere_error_bound,
 )
+from skin_host.fingertip.intrinsic import locate, sphere
 
 #: The load-from-signal matrix that Son et al. print (section 3.2).
 PRINTED = np.array([[-126.0, -51, 127], [378, -6, -72], [396, -128, 22]])
@@ -137,3 +140,50 @@ def test_the_matrix_error_of_a_calibration_covers_the_true_one():
         true_error = np.linalg.norm(found.response - truth, 2) / np.linalg.norm(truth, 2)
         inside += true_error <= found.relative_response_error(np.ones(3))
     assert inside >= 75
+
+
+def worst_case(radius, relative_error, friction):
+    """Greatest error over all signs of relative errors of the non-zero components."""
+    q = np.arctan(friction)
+    point = np.array([-radius, 0, 0])
+    force = np.array([np.cos(q), np.sin(q), 0.0])
+    load = np.concatenate([force, np.cross(point, force)])
+    signs = np.array(np.meshgrid(*[[-1, 0, 1]] * 6)).reshape(6, -1).T
+    noisy = load * (1 + relative_error * signs)
+    found = locate(noisy[:, :3], noisy[:, 3:], sphere(radius)).point_mm
+    return np.nanmax(np.linalg.norm(found - point, axis=1))
+
+
+def test_the_frictionless_bound_is_the_papers_and_holds():
+    assert sphere_error_bound(10.0, 0.01) == pytest.approx(0.2)
+    assert np.rad2deg(0.2 / 10.0) == pytest.approx(1.15, abs=0.01)  # the paper rounds to 1
+    assert worst_case(10.0, 0.01, 0.0) <= 0.2
+
+
+@pytest.mark.parametrize(("friction", "derived"), [(0.1, 1.07), (0.3, 1.52), (0.5, 2.13)])
+def test_the_friction_bound_is_near_the_printed_one_and_holds(friction, derived):
+    factor = sphere_error_bound(1.0, 0.5, friction)
+    assert factor == pytest.approx(derived, abs=0.006)
+    printed = PUBLISHED_FRICTION_FACTOR[friction]
+    assert 0.92 < factor / printed <= 1.0
+    found = worst_case(10.0, 0.01, friction) / (2 * 10.0 * 0.01)
+    assert found == pytest.approx(friction, rel=0.05)  # both bounds are loose by 4 to 10
+
+
+@given(
+    friction=st.floats(0.0, 0.6),
+    error=st.floats(1e-4, 0.02),
+    seed=st.integers(0, 2**32 - 1),
+)
+@settings(max_examples=40, deadline=None)
+def test_random_relative_errors_stay_below_the_friction_bound(friction, error, seed):
+    rng = np.random.default_rng(seed)
+    q = np.arctan(friction)
+    point = np.array([-10.0, 0, 0])
+    force = np.array([np.cos(q), np.sin(q), 0.0])
+    load = np.concatenate([force, np.cross(point, force)])
+    noisy = load * (1 + error * rng.uniform(-1, 1, (200, 6)))
+    found = locate(noisy[:, :3], noisy[:, 3:], sphere(10.0)).point_mm
+    assert np.linalg.norm(found - point, axis=1).max() <= sphere_error_bound(
+        10.0, error, friction
+    ) * (1 + 1e-9)

@@ -1,5 +1,7 @@
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from skin_host.errors import CalibrationError
 from skin_host.evaluation.papers.fusion import (
@@ -11,6 +13,7 @@ from skin_host.evaluation.papers.fusion import (
     calibrate_fusion,
     contact_angle,
     make_task,
+    quadratic_peak,
     rms,
     shear_ratio,
     strip_array,
@@ -115,3 +118,21 @@ def test_too_few_presses_are_refused():
         calibrate_fusion(
             np.zeros(5), np.tile([3.0, 0, 0], (5, 1)), np.ones((5, 8, 8)), AROUND, RADIUS_MM
         )
+
+
+@given(
+    middle=st.floats(1.0, 100.0),
+    left=st.floats(0.0, 100.0),
+    right=st.floats(0.0, 100.0),
+    pitch=st.floats(0.5, 5.0),
+)
+def test_the_top_of_three_readings_stays_within_half_a_pitch(middle, left, right, pitch):
+    offset = quadratic_peak(np.array(left), np.array(middle), np.array(right), pitch)
+    assert abs(offset) <= 0.5 * pitch
+
+
+def test_the_top_of_a_parabola_is_found():
+    x = np.array([-2.0, 0.0, 2.0])
+    a, b, c = 9.0 - (x - 0.37) ** 2
+    assert quadratic_peak(a, b, c, 2.0) == pytest.approx(0.37)
+    assert quadratic_peak(np.array(5.0), np.array(5.0), np.array(5.0), 2.0) == 0.0

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from skin_host.fingertip.wrench import Butterworth2, FingertipMass, steady
+from skin_host.fingertip.low_pass import Butterworth2
 
 
 def gain(filter_hz, tone_hz, rate_hz):
@@ -25,30 +25,8 @@ def test_the_filter_starts_at_rest_on_its_first_sample_and_survives_a_nan():
     np.testing.assert_allclose(low_pass.step([3.0, -1.0]), [3.0, -1.0])
     low_pass.step([np.nan, -1.0])
     np.testing.assert_allclose(low_pass.step([3.0, -1.0]), [3.0, -1.0])
-    low_pass.reset()
-    np.testing.assert_allclose(low_pass.step([7.0, 7.0]), [7.0, 7.0])
 
 
 def test_a_corner_beyond_half_the_rate_is_refused():
     with pytest.raises(ValueError, match="cutoff 200"):
         Butterworth2(200.0, 300.0)
-
-
-def test_inertia_of_the_fingertip_is_taken_out():
-    mass = FingertipMass(0.035, centre_mm=(1.0, 2.0, 3.0))
-    contact_force, contact_torque = np.array([[1.0, 0.2, -3.0]]), np.array([[4.0, 5.0, 6.0]])
-    acceleration = np.array([[1.3, -0.8, 9.81]])
-    inertial = -0.035 * acceleration
-    force, torque = mass.remove_inertia(
-        contact_force + inertial,
-        contact_torque + np.cross([1.0, 2.0, 3.0], inertial),
-        acceleration,
-    )
-    np.testing.assert_allclose(force, contact_force)
-    np.testing.assert_allclose(torque, contact_torque)
-
-
-def test_light_and_fast_changing_forces_are_not_fit():
-    force = np.array([[0.0, 0], [0.05, 0], [3.0, 0], [3.0, 0.01], [3.0, 0.02], [3.0, 2.0]])
-    fit = steady(force, 1 / 300, minimum_force_n=0.5, rate_limit_n_s=30.0)
-    assert fit.tolist() == [False, False, False, True, True, False]
