@@ -2,7 +2,7 @@
 
 import json
 
-from skin_host.mqtt.grasping import Over, Slip
+from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.messages import Touch
 
 #: What first indicated a slip.

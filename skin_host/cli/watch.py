@@ -95,7 +95,9 @@ def _listen(arguments: argparse.Namespace) -> int:
                 if event.event == "move" and not arguments.moves:
                     continue
                 if arguments.json:
-                    print(msgspec.json.encode(event).decode(), flush=True)
+                    # Its schema too, and what is published only where it is not None or 0.
+                    whole = msgspec.to_builtins(event) | msgspec.structs.asdict(event)
+                    print(msgspec.json.encode(whole).decode(), flush=True)
                 else:
                     print(event_line(event), flush=True)
                 printed += 1

@@ -13,8 +13,8 @@ from skin_host.client.heard import Health
 from skin_host.client.presence import Contact
 from skin_host.client.session import CommandError, Node, SkinClient
 from skin_host.client.streams import Stream
+from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.address import Broker
-from skin_host.mqtt.grasping import Over, Slip
 from skin_host.mqtt.info import NodeInfo, PartInfo
 from skin_host.mqtt.messages import Frame, Touch
 

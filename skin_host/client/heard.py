@@ -4,8 +4,16 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 from skin_host.client.presence import Contact
-from skin_host.mqtt.grasping import Over, Slip, decode_over, decode_slip
-from skin_host.mqtt.messages import Frame, Touch, decode_contact, decode_health, decode_touch
+from skin_host.fingertip.events import Over, Slip
+from skin_host.mqtt.messages import (
+    Frame,
+    Touch,
+    decode_contact,
+    decode_health,
+    decode_over,
+    decode_slip,
+    decode_touch,
+)
 from skin_host.mqtt.payload import MessageError
 from skin_host.mqtt.topics import PartTopic
 

@@ -6,7 +6,7 @@ are passed on as they arrive.
 
 from dataclasses import dataclass, field
 
-from skin_host.mqtt.grasping import Over, Slip
+from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.messages import Frame, Touch
 from skin_host.mqtt.order import Stamp
 

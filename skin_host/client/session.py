@@ -16,6 +16,7 @@ from skin_host.client.order import EventOrder, Newest
 from skin_host.client.presence import Contact, Presence
 from skin_host.client.streams import Stream
 from skin_host.errors import BrokerError, RequestError, SkinError
+from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.commands import Result, decode_result, encode_request
 from skin_host.mqtt.connection import (
@@ -25,7 +26,6 @@ from skin_host.mqtt.connection import (
     explain,
     message_properties,
 )
-from skin_host.mqtt.grasping import Over, Slip
 from skin_host.mqtt.info import NodeInfo, decode_info, join_pieces
 from skin_host.mqtt.messages import Frame, Touch
 from skin_host.mqtt.order import run_of, stamp_of

@@ -7,7 +7,7 @@ from typing import Any, Generic, TypeVar, cast
 
 from msgspec.structs import replace
 
-from skin_host.mqtt.grasping import Over, Slip
+from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.messages import Frame, Touch
 from skin_host.mqtt.topics import PartTopic
 

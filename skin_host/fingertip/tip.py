@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from skin_host.bus.strain import SILENT_NS, Wrench
 from skin_host.config.fingertips import Fingertip
-from skin_host.fingertip.events import Cause, FingertipEvent, OverEvent, SlipEvent
+from skin_host.fingertip.events import Cause, FingertipEvent, Over, Slip
 from skin_host.fingertip.grasp import FingerFlags, Flags, GraspThresholds
 from skin_host.fingertip.intrinsic import (
     ContactVerdict,
@@ -28,7 +28,14 @@ from skin_host.fingertip.low_pass import Butterworth2
 from skin_host.fingertip.slip import SlipWatch
 from skin_host.processing.calibration import Zero
 from skin_host.processing.contacts import ALIVE_NS, LOST_NS, MOVED_M, PRESSED_SHARE
-from skin_host.processing.events import Load, Reason, TouchEvent
+from skin_host.processing.events import (
+    N_DECIMALS,
+    NM_DECIMALS,
+    Load,
+    Reason,
+    TouchEvent,
+    rounded,
+)
 
 Floats = NDArray[np.float64]
 
@@ -101,6 +108,7 @@ def locate_with_skin(
     return ContactPlace(point, normal, math.sqrt(max(float(np.trace(covariance)), 0.0)))
 
 
+Change = Literal["begin", "end"]
 Told = Literal["contact", "no_single_contact", "several_contacts", "saturated"]
 _VERDICTS: dict[int, Told] = {
     ContactVerdict.CONTACT: "contact",
@@ -251,9 +259,9 @@ class Tip:
         events: list[FingertipEvent] = []
         if self.flags & Flags.SLIP:
             number = self._ids[Flags.SLIP]
-            events.append(SlipEvent("end", number, t_ns, self._name, self._cause, 0.0, 0.0, 0.0))
+            events.append(self._slip("end", number, t_ns, 0.0, 0.0, 0.0))
         if self.flags & Flags.OVER:
-            events.append(OverEvent("end", self._ids[Flags.OVER], t_ns, self._name, 0.0))
+            events.append(self._over("end", self._ids[Flags.OVER], t_ns, 0.0))
         if self._reported is not None:
             events += self._end(t_ns, reason)
         self._forget()
@@ -319,17 +327,36 @@ class Tip:
         )
         events: list[FingertipEvent] = []
         for flag in changed & (Flags.SLIP | Flags.OVER):
-            event: Literal["begin", "end"] = "begin" if flag & self.flags else "end"
+            event: Change = "begin" if flag & self.flags else "end"
             if event == "begin":
                 # The contact may begin with this same sample.
                 self._ids[flag] = self._next_id if self._reported is None else self._reported.id
             number = self._ids[flag]
             if flag == Flags.OVER:
-                events.append(OverEvent(event, number, t_ns, self._name, normal_n))
-                continue
-            forces = normal_n, seen.shear_n, seen.rate_n_s
-            events.append(SlipEvent(event, number, t_ns, self._name, self._cause, *forces))
+                events.append(self._over(event, number, t_ns, normal_n))
+            else:
+                events.append(
+                    self._slip(event, number, t_ns, normal_n, seen.shear_n, seen.rate_n_s)
+                )
         return events
+
+    def _slip(
+        self, event: Change, number: int, t_ns: int, force_n: float, shear_n: float, rate_n_s: float
+    ) -> Slip:
+        return Slip(
+            event=event,
+            id=number,
+            t_ns=t_ns,
+            part=self._name,
+            cause=self._cause,
+            force_n=round(force_n, N_DECIMALS),
+            shear_n=round(shear_n, N_DECIMALS),
+            shear_rate_n_s=round(rate_n_s, N_DECIMALS),
+        )
+
+    def _over(self, event: Change, number: int, t_ns: int, force_n: float) -> Over:
+        force_n = round(force_n, N_DECIMALS)
+        return Over(event=event, id=number, t_ns=t_ns, part=self._name, force_n=force_n)
 
     def _touch(self, load: Floats, t_ns: int) -> list[FingertipEvent]:
         before = self._reported
@@ -357,8 +384,9 @@ class Tip:
         normal_n, shear = float(np.linalg.norm(load[:3])), None
         if place is not None:
             normal_n = max(0.0, -float(load[:3] @ place.normal))
-            shear = (load[:3] + normal_n * place.normal).tolist()
-        torque_nm = (1e-3 * load[3:]).tolist()
+            shear = rounded((load[:3] + normal_n * place.normal).tolist(), N_DECIMALS)
+        force_n = rounded(load[:3].tolist(), N_DECIMALS)
+        torque_nm = rounded((1e-3 * load[3:]).tolist(), NM_DECIMALS)
         before = self._reported
         return TouchEvent(
             "begin" if before is None else "move",
@@ -374,13 +402,13 @@ class Tip:
             math.nan if skin is None else skin.mean_kpa,
             normal_n,
             None if place is None else 1e-3 * place.sigma_mm,
-            Load(verdict, load[:3].tolist(), torque_nm, shear, self.flag_names),
+            Load(verdict, force_n, torque_nm, shear, self.flag_names),
         )
 
     def _end(self, t_ns: int, reason: Reason = "released") -> list[FingertipEvent]:
         last, self._reported = self._reported, None
         assert last is not None and last.load is not None
-        zero = [0.0, 0.0, 0.0]
+        zero = (0.0, 0.0, 0.0)
         load = Load(last.load.verdict, zero, zero, zero, self.flag_names)
         return [replace(last.ended(self.samples, t_ns, reason), load=load)]
 

@@ -18,8 +18,9 @@ from msgspec import Meta, Struct
 from msgspec.structs import replace
 
 from skin_host.mqtt.messages import SCALE_KPA
-from skin_host.mqtt.payload import MessageError, Vector, decode
+from skin_host.mqtt.payload import MessageError, decode
 from skin_host.mqtt.topics import Topics
+from skin_host.processing.events import Vector
 
 if TYPE_CHECKING:
     import numpy as np

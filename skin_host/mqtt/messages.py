@@ -1,4 +1,4 @@
-"""Messages of touches, contact and health. Pure: converts data to payload bytes and back.
+"""Messages of touches, slips, contact and health. Pure: converts data to payload bytes and back.
 
 `docs/mqtt.md` is the contract. A received frame is described here, too, and decoded in `frames`:
 programs that only want touches never load numpy.
@@ -8,18 +8,23 @@ import math
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args
 
 import msgspec
-from msgspec import UNSET, Meta, Struct, UnsetType
+from msgspec import Meta, Struct, field
+from msgspec.structs import replace
 
-from skin_host.mqtt.payload import (
-    MAX_TAXELS,
+from skin_host.fingertip.events import Over, PartName, Slip
+from skin_host.mqtt.payload import MAX_TAXELS, MessageError, decode, decode_event
+from skin_host.processing.events import (
+    M_DECIMALS,
+    N_DECIMALS,
+    NORMAL_DECIMALS,
     Count,
     Int64,
-    MessageError,
+    Load,
+    Reason,
+    TouchEvent,
     Vector,
-    decode,
-    decode_event,
+    rounded,
 )
-from skin_host.processing.events import Load, Reason, TouchEvent
 
 if TYPE_CHECKING:
     import numpy as np
@@ -27,19 +32,14 @@ if TYPE_CHECKING:
 
     from skin_host.processing.masks import Mask
 
-TOUCH_SCHEMA: Final = "skin.touch/1"
 #: ON: touched; OFF: not touched; UNKNOWN: some of the part cannot feel.
 ContactState = Literal["ON", "OFF", "UNKNOWN"]
 HEALTH_SCHEMA: Final = "skin.health/1"
 #: One unit of the values of a frame.
 SCALE_KPA = 0.01
-#: Decimals of kPa, of mm2, of m (0.001 mm), of N, of N m and of the parts of a unit vector.
+#: Decimals of kPa and of mm2; see `processing.events` for the others.
 KPA_DECIMALS = 3
 MM2_DECIMALS = 2
-M_DECIMALS = 6
-N_DECIMALS = 4
-NM_DECIMALS = 6
-NORMAL_DECIMALS = 4
 
 
 class Frame(Struct, frozen=True, eq=False):
@@ -66,24 +66,9 @@ class Frame(Struct, frozen=True, eq=False):
     raw: "NDArray[np.uint8] | None" = None
 
 
-class LoadMessage(Struct, frozen=True, kw_only=True):
-    """Force/torque data of the contact on a fingertip.
-
-    Attributes:
-        verdict: whether one push on the surface gives this force and torque.
-        force_n, torque_nm: of the touching object on the fingertip, about the origin of its frame.
-        shear_n: the share of the force along the surface; None without a place.
-        flags: of the finger: search, move, touch, slip, over.
-    """
-
-    verdict: Literal["contact", "no_single_contact", "several_contacts", "saturated"]
-    force_n: Vector
-    torque_nm: Vector
-    shear_n: Vector | None
-    flags: Annotated[list[Annotated[str, Meta(max_length=16)]], Meta(max_length=16)]
-
-
-class TouchMessage(Struct, frozen=True, kw_only=True):
+class Touch(
+    Struct, frozen=True, kw_only=True, omit_defaults=True, tag_field="schema", tag="skin.touch/1"
+):
     """A contact begins, moves or ends: the payload of `<part>/touch`.
 
     Attributes:
@@ -95,15 +80,16 @@ class TouchMessage(Struct, frozen=True, kw_only=True):
         area_mm2, peak_kpa, mean_kpa: None on a fingertip without skin.
         sigma_m: radial standard error of `centroid_m`; None where it is not known.
         reason: why it ended, only with an end.
+        load: only of fingertips on force/torque boards.
+        missed: of a received event: so many of its part were lost just before it.
     """
 
-    schema: Literal["skin.touch/1"] = TOUCH_SCHEMA
     event: Literal["begin", "move", "end"]
     id: Count
     seq: Count
     t_ns: Int64
     count: Count = 0
-    part: Annotated[str, Meta(max_length=64)]
+    part: PartName
     taxels: Annotated[list[Annotated[int, Meta(ge=0, le=MAX_TAXELS)]], Meta(max_length=MAX_TAXELS)]
     centroid_m: Vector | None
     normal: Vector | None
@@ -111,24 +97,10 @@ class TouchMessage(Struct, frozen=True, kw_only=True):
     peak_kpa: float | None
     mean_kpa: float | None
     force_n: float
-    sigma_m: Annotated[float, Meta(ge=0)] | None = None
-    reason: Reason | UnsetType | None = UNSET
-
-
-class FingertipTouchMessage(TouchMessage, frozen=True, kw_only=True):
-    """As `TouchMessage`, for a fingertip on a force/torque board, with the board's data."""
-
-    load: LoadMessage
-
-
-class Touch(TouchMessage, frozen=True, kw_only=True):
-    """A received event; `missed` events of its part were lost just before it.
-
-    Only fingertips on force/torque boards have a `load`, only an end has a `reason`.
-    """
-
+    #: Written even where it is None: only a plain default is left out.
+    sigma_m: Annotated[float, Meta(ge=0)] | None = field(default_factory=lambda: None)
     reason: Reason | None = None
-    load: LoadMessage | None = None
+    load: Load | None = None
     missed: int = 0
 
 
@@ -137,33 +109,31 @@ _CONTACT_STATES: dict[bytes, ContactState] = {
     state.encode(): state for state in get_args(ContactState)
 }
 _touch_decoder = msgspec.json.Decoder(Touch)
+_slip_decoder = msgspec.json.Decoder(Slip)
+_over_decoder = msgspec.json.Decoder(Over)
 _health_decoder = msgspec.json.Decoder(dict[str, Any])
 
 
-def touch_message(event: TouchEvent, count: int) -> TouchMessage:
-    """Return the message of an event; `count` as in `TouchMessage`. Numbers are rounded as
-    above.
-    """
-    said: dict[str, Any] = {
-        "event": event.event,
-        "id": event.id,
-        "seq": event.seq,
-        "t_ns": event.t_ns,
-        "count": count,
-        "part": event.part,
-        "taxels": event.taxels,
-        "centroid_m": _vector(event.centroid_m, M_DECIMALS),
-        "normal": _vector(event.normal, NORMAL_DECIMALS),
-        "area_mm2": _known(event.area_mm2, MM2_DECIMALS),
-        "peak_kpa": _known(event.peak_kpa, KPA_DECIMALS),
-        "mean_kpa": _known(event.mean_kpa, KPA_DECIMALS),
-        "force_n": round(event.force_n, N_DECIMALS),
-        "sigma_m": None if event.sigma_m is None else round(event.sigma_m, M_DECIMALS),
-        "reason": UNSET if event.reason is None else event.reason,
-    }
-    if event.load is None:
-        return TouchMessage(**said)
-    return FingertipTouchMessage(**said, load=_load_message(event.load))
+def touch_message(event: TouchEvent, count: int) -> Touch:
+    """Return the message of an event; `count` as in `Touch`. Numbers are rounded."""
+    return Touch(
+        event=event.event,
+        id=event.id,
+        seq=event.seq,
+        t_ns=event.t_ns,
+        count=count,
+        part=event.part,
+        taxels=event.taxels,
+        centroid_m=_vector(event.centroid_m, M_DECIMALS),
+        normal=_vector(event.normal, NORMAL_DECIMALS),
+        area_mm2=_known(event.area_mm2, MM2_DECIMALS),
+        peak_kpa=_known(event.peak_kpa, KPA_DECIMALS),
+        mean_kpa=_known(event.mean_kpa, KPA_DECIMALS),
+        force_n=round(event.force_n, N_DECIMALS),
+        sigma_m=None if event.sigma_m is None else round(event.sigma_m, M_DECIMALS),
+        reason=event.reason,
+        load=event.load,
+    )
 
 
 def encode_touch(event: TouchEvent, count: int) -> bytes:
@@ -178,6 +148,21 @@ def decode_touch(payload: bytes) -> Touch:
         MessageError: it is not such a payload.
     """
     return decode_event(_touch_decoder, payload, "touch")
+
+
+def decode_slip(payload: bytes) -> Slip:
+    """Read the payload of `<part>/slip`; see `decode_touch`."""
+    return decode_event(_slip_decoder, payload, "slip")
+
+
+def decode_over(payload: bytes) -> Over:
+    """Read the payload of `<part>/over`; see `decode_touch`."""
+    return decode_event(_over_decoder, payload, "over")
+
+
+def encode_grasp(event: Slip | Over, count: int) -> bytes:
+    """Write the payload of `<part>/slip` or `<part>/over`; `count` as in the events."""
+    return _encoder.encode(replace(event, count=count))
 
 
 def encode_contact(state: ContactState) -> bytes:
@@ -220,26 +205,9 @@ def decode_health(payload: bytes) -> dict[str, Any]:
     return record
 
 
-def _load_message(load: Load) -> LoadMessage:
-    return LoadMessage(
-        verdict=load.verdict,
-        force_n=_rounded(load.force_n, N_DECIMALS),
-        torque_nm=_rounded(load.torque_nm, NM_DECIMALS),
-        shear_n=_vector(load.shear_n, N_DECIMALS),
-        flags=load.flags,
-    )
-
-
 def _known(value: float, decimals: int) -> float | None:
     return None if math.isnan(value) else round(value, decimals)
 
 
 def _vector(values: list[float] | None, decimals: int) -> Vector | None:
-    if values is None:
-        return None
-    return _rounded(values, decimals)
-
-
-def _rounded(values: list[float], decimals: int) -> Vector:
-    x, y, z = (round(value, decimals) + 0.0 for value in values)
-    return x, y, z
+    return None if values is None else rounded(values, decimals)

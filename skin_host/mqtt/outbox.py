@@ -13,10 +13,9 @@ from itertools import islice
 from typing import NamedTuple
 
 from skin_host.clock import SYSTEM, Clock
-from skin_host.fingertip.events import OverEvent, SlipEvent
+from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.connection import MessageProperties
-from skin_host.mqtt.grasping import encode_grasp
-from skin_host.mqtt.messages import encode_touch
+from skin_host.mqtt.messages import encode_grasp, encode_touch
 from skin_host.mqtt.trials import Trials
 from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
@@ -183,7 +182,7 @@ class Outbox:
         return False
 
     def put_grasp(
-        self, topic: str, event: SlipEvent | OverEvent, properties: MessageProperties | None
+        self, topic: str, event: Slip | Over, properties: MessageProperties | None
     ) -> None:
         """Take an event of a slip, or of pressing too hard, in the same way."""
         limit = self._event_limit

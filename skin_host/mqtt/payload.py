@@ -4,10 +4,10 @@ Sizes and types are checked, and every error is a `MessageError`. Unknown keys a
 a later daemon may add some.
 """
 
-from typing import Annotated, TypeVar
+from typing import TypeVar
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import Struct
 from msgspec.structs import replace
 
 from skin_host.errors import SkinError
@@ -21,9 +21,6 @@ MAX_TAXELS = 100_000
 JSON_TYPE = "application/json"
 CBOR_TYPE = "application/cbor"
 
-Int64 = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
-Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-Vector = tuple[float, float, float]
 T = TypeVar("T")
 S = TypeVar("S", bound=Struct)
 

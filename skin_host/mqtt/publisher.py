@@ -18,7 +18,7 @@ import msgspec
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Mqtt
 from skin_host.errors import SkinError
-from skin_host.fingertip.events import OverEvent, SlipEvent
+from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.address import Broker, CredentialError
 from skin_host.mqtt.commands import CommandHandler, Handler
 from skin_host.mqtt.connection import (
@@ -210,9 +210,9 @@ class Publisher:
         topic = self.topics.part("touch", event.part)
         self._outbox.put_touch(topic, event, self._event_properties)
 
-    def put_grasp(self, event: SlipEvent | OverEvent) -> None:
+    def put_grasp(self, event: Slip | Over) -> None:
         """Send an event of a slip or of pressing too hard, as reliably as a touch event."""
-        kind: Literal["slip", "over"] = "slip" if isinstance(event, SlipEvent) else "over"
+        kind: Literal["slip", "over"] = "slip" if isinstance(event, Slip) else "over"
         topic = self.topics.part(kind, event.part)
         self._outbox.put_grasp(topic, event, self._event_properties)
 

@@ -1,17 +1,30 @@
 """What the pipeline reports of contacts. Plain data: subscribers import this without numpy."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+
+Int64 = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
+Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+Vector = tuple[float, float, float]
 
 #: Why a contact ended: it is no longer felt; nothing valid comes from where it was; or the daemon
 #: stopped, or changed how it decides.
 Reason = Literal["released", "lost", "stopped"]
 
 
-@dataclass(frozen=True, slots=True)
-class Load:
-    """Force/torque data of the contact on a fingertip.
+#: Published decimals of m (0.001 mm), of N, of N m and of the parts of a unit vector.
+M_DECIMALS = 6
+N_DECIMALS = 4
+NM_DECIMALS = 6
+NORMAL_DECIMALS = 4
+
+
+class Load(Struct, frozen=True):
+    """Force/torque data of the contact on a fingertip, as it is published.
 
     Attributes:
         verdict: whether one push on the surface gives this force and torque.
@@ -21,10 +34,10 @@ class Load:
     """
 
     verdict: Literal["contact", "no_single_contact", "several_contacts", "saturated"]
-    force_n: list[float]
-    torque_nm: list[float]
-    shear_n: list[float] | None
-    flags: list[str]
+    force_n: Vector
+    torque_nm: Vector
+    shear_n: Vector | None
+    flags: Annotated[list[Annotated[str, Meta(max_length=16)]], Meta(max_length=16)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,3 +80,9 @@ class TouchEvent:
             force_n=0.0,
             reason=reason,
         )
+
+
+def rounded(values: Sequence[float], decimals: int) -> Vector:
+    """Round a vector; without -0.0."""
+    x, y, z = (round(value, decimals) + 0.0 for value in values)
+    return x, y, z

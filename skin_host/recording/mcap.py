@@ -20,8 +20,7 @@ from msgspec import Struct
 from skin_host.bus.wire import FrameBatch
 from skin_host.errors import LogError, SkinError, required
 from skin_host.mqtt.frames import decode_frame, encode_frame
-from skin_host.mqtt.grasping import decode_over, decode_slip
-from skin_host.mqtt.messages import Frame, decode_touch
+from skin_host.mqtt.messages import Frame, decode_over, decode_slip, decode_touch
 from skin_host.mqtt.topics import PartTopic, Topics
 from skin_host.processing.pipeline import PressureFrame
 

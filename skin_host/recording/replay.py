@@ -27,11 +27,10 @@ from skin_host.bus.logs import read_channels
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import Settings, load, skin_hash
 from skin_host.errors import ConfigurationError, LogError, RequestError, SkinError, required
-from skin_host.fingertip.events import FingertipEvent, SlipEvent
+from skin_host.fingertip.events import FingertipEvent, Slip
 from skin_host.fingertip.health import FingertipHealth
 from skin_host.health import HealthWatch
 from skin_host.layout import Layout, build_layout
-from skin_host.mqtt.grasping import grasp_message
 from skin_host.mqtt.messages import KPA_DECIMALS, health_keys, touch_message
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration
@@ -89,8 +88,8 @@ class EventLines:
         count = self._counts[key]
         if isinstance(event, TouchEvent):
             return _line("touch", msgspec.to_builtins(touch_message(event, count)))
-        kind = "slip" if isinstance(event, SlipEvent) else "over"
-        return _line(kind, msgspec.to_builtins(grasp_message(event, count)))
+        kind = "slip" if isinstance(event, Slip) else "over"
+        return _line(kind, msgspec.to_builtins(msgspec.structs.replace(event, count=count)))
 
 
 def _line(kind: str, keys: dict[str, Any]) -> bytes:

@@ -5,11 +5,12 @@ import json
 import sys
 from pathlib import Path
 
+from msgspec.structs import replace
+
 from skin_host.cli.lines import missed_line
 from skin_host.config.settings import Mqtt, load
-from skin_host.fingertip.events import OverEvent, SlipEvent
+from skin_host.fingertip.events import Over, Slip
 from skin_host.layout import build_layout
-from skin_host.mqtt.grasping import Slip
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.events import TouchEvent
@@ -22,9 +23,18 @@ NAN = float("nan")
 BEGUN = TouchEvent(
     "begin", 4, 1, 5, "index", [], [0.001, 0.002, 0.013], [0, 0, 1.0], NAN, NAN, NAN, 2.0
 )
-SLIP = SlipEvent("begin", 4, 6, "index", "fall", 2.01, 1.14, -4.8)
-SLIP_END = SlipEvent("end", 4, 7, "index", "fall", 2.0, 0.6, 0.0)
-OVER = OverEvent("begin", 4, 8, "index", 10.4)
+SLIP = Slip(
+    event="begin",
+    id=4,
+    t_ns=6,
+    part="index",
+    cause="fall",
+    force_n=2.01,
+    shear_n=1.14,
+    shear_rate_n_s=-4.8,
+)
+SLIP_END = replace(SLIP, event="end", t_ns=7, force_n=2.0, shear_n=0.6, shear_rate_n_s=0.0)
+OVER = Over(event="begin", id=4, t_ns=8, part="index", force_n=10.4)
 ENDED = BEGUN.ended(9, 9)
 LINES = """\
 index          begin #4    (   1.0,   2.0) mm               2.00 N
@@ -76,20 +86,11 @@ async def test_programs_get_each_event_as_a_document(mosquitto: Mosquitto) -> No
     assert kinds >= {("skin.slip/1", "begin"), ("skin.slip/1", "end"), ("skin.over/1", "begin")}
     slip = next(one for one in documents if one["schema"] == "skin.slip/1")
     assert (slip["cause"], slip["force_n"], slip["shear_n"]) == ("fall", 2.01, 1.14)
+    assert slip["missed"] == 0
 
 
 def test_what_was_missed_is_said_by_kind_and_part() -> None:
-    slip = Slip(
-        event="end",
-        id=1,
-        t_ns=2,
-        part="thumb",
-        cause="rate",
-        force_n=1,
-        shear_n=1,
-        shear_rate_n_s=0,
-        missed=3,
-    )
+    slip = replace(SLIP_END, part="thumb", missed=3)
     assert missed_line(slip, as_json=False) == "(3 slip events of thumb were missed)"
     assert json.loads(missed_line(slip, as_json=True)) == {
         "missed": 3,

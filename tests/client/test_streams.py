@@ -5,7 +5,7 @@ from msgspec.structs import replace
 
 from skin_host.client.heard import Contact
 from skin_host.client.streams import HELD, Stream
-from skin_host.mqtt.grasping import Over
+from skin_host.fingertip.events import Over
 from skin_host.mqtt.messages import Frame, Touch
 
 

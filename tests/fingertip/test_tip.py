@@ -8,7 +8,7 @@ import pytest
 
 from skin_host.bus.strain import Wrench
 from skin_host.config.fingertips import Fingertip
-from skin_host.fingertip.events import FingertipEvent, OverEvent, SlipEvent
+from skin_host.fingertip.events import FingertipEvent, Over, Slip
 from skin_host.fingertip.tip import Tip
 from skin_host.processing.calibration import Zero
 from skin_host.processing.events import TouchEvent
@@ -47,8 +47,8 @@ def touches(events: list[FingertipEvent]) -> list[TouchEvent]:
     return [event for event in events if isinstance(event, TouchEvent)]
 
 
-def slips(events: list[FingertipEvent]) -> list[SlipEvent]:
-    return [event for event in events if isinstance(event, SlipEvent)]
+def slips(events: list[FingertipEvent]) -> list[Slip]:
+    return [event for event in events if isinstance(event, Slip)]
 
 
 DIRECTION = np.array([0.36, 0.48, 0.8])
@@ -122,7 +122,7 @@ def test_pressing_too_hard_is_told_with_the_touch_it_belongs_to() -> None:
     bench = Bench(over_n=5.0)
     events = bench.hold(10, POINT, -2 * DIRECTION) + bench.hold(10, POINT, -8 * DIRECTION)
     events += bench.hold(10, POINT, -2 * DIRECTION)
-    over = [event for event in events if isinstance(event, OverEvent)]
+    over = [event for event in events if isinstance(event, Over)]
     assert [(event.event, event.id) for event in over] == [("begin", 1), ("end", 1)]
     assert over[0].force_n == pytest.approx(8.0, abs=0.05)
     assert any("over" in event.load.flags for event in touches(events) if event.load)
@@ -170,7 +170,7 @@ def test_a_board_that_falls_silent_ends_its_touch_and_slip() -> None:
     assert bench.tip.expire(bench.t_ns + 400 * MS) == []
     ended = bench.tip.expire(bench.t_ns + 600 * MS)
     assert [(type(event), event.event) for event in ended] == [
-        (SlipEvent, "end"),
+        (Slip, "end"),
         (TouchEvent, "end"),
     ]
     assert not bench.tip.touched

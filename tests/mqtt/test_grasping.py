@@ -6,19 +6,28 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skin_host.fingertip.events import OverEvent, SlipEvent
-from skin_host.mqtt import grasping, messages
+from skin_host.fingertip.events import Over, Slip
+from skin_host.mqtt import messages
 from skin_host.mqtt.outbox import Outbox
 from skin_host.mqtt.payload import MessageError
 from skin_host.processing.events import Load, TouchEvent
 
-SLIP = SlipEvent("begin", 4, 10, "index", "rate", 2.01, 1.14, 7.5)
-OVER = OverEvent("end", 4, 12, "index", 9.5)
-LOAD = Load("contact", [0.1, 0.0, -2.0], [0.001, 0.0, 0.0], [0.1, 0.0, 0.0], ["touch"])
+SLIP = Slip(
+    event="begin",
+    id=4,
+    t_ns=10,
+    part="index",
+    cause="rate",
+    force_n=2.01,
+    shear_n=1.14,
+    shear_rate_n_s=7.5,
+)
+OVER = Over(event="end", id=4, t_ns=12, part="index", force_n=9.5)
+LOAD = Load("contact", (0.1, 0.0, -2.0), (0.001, 0.0, 0.0), (0.1, 0.0, 0.0), ["touch"])
 
 
 def test_what_was_said_is_what_is_heard() -> None:
-    slip = grasping.decode_slip(grasping.encode_grasp(SLIP, 3))
+    slip = messages.decode_slip(messages.encode_grasp(SLIP, 3))
     assert (slip.event, slip.id, slip.count, slip.part, slip.cause) == (
         "begin",
         4,
@@ -27,13 +36,13 @@ def test_what_was_said_is_what_is_heard() -> None:
         "rate",
     )
     assert (slip.force_n, slip.shear_n, slip.shear_rate_n_s) == (2.01, 1.14, 7.5)
-    over = grasping.decode_over(grasping.encode_grasp(OVER, 1))
+    over = messages.decode_over(messages.encode_grasp(OVER, 1))
     assert (over.event, over.id, over.t_ns, over.force_n) == ("end", 4, 12, 9.5)
 
 
 @given(st.binary(max_size=200))
 def test_no_payload_of_a_stranger_raises_anything_else(payload: bytes) -> None:
-    for decode in (grasping.decode_slip, grasping.decode_over):
+    for decode in (messages.decode_slip, messages.decode_over):
         with pytest.raises(MessageError):
             decode(payload)
 

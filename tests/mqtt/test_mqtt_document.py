@@ -6,10 +6,12 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from skin_host.mqtt import frames, grasping, messages
+from skin_host.fingertip.events import Over, Slip
+from skin_host.mqtt import frames, messages
 from skin_host.mqtt.commands import decode_result
 from skin_host.mqtt.info import FingertipInfo, NodeInfo, PartInfo, TriangleInfo
 from skin_host.mqtt.outbox import PublisherCounters
+from skin_host.processing.events import Load
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "mqtt.md").read_text()
 EXAMPLES = {
@@ -28,17 +30,18 @@ def test_the_touch_of_the_document_has_exactly_the_keys_of_a_touch() -> None:
     touch = messages.decode_touch(EXAMPLES["skin.touch/1"])
     assert touch.count == 52
     keys = list(msgspec.json.decode(EXAMPLES["skin.touch/1"]))
-    assert [*keys, "reason"] == list(messages.TouchMessage.__struct_fields__)
+    whole = ["schema", *messages.Touch.__struct_fields__]
+    assert [*keys, "reason", "load", "missed"] == whole
 
 
 def test_slips_and_excess_of_the_document_have_exactly_their_keys() -> None:
-    slip = grasping.decode_slip(EXAMPLES["skin.slip/1"])
+    slip = messages.decode_slip(EXAMPLES["skin.slip/1"])
     assert slip.cause == "fall"
     keys = list(msgspec.json.decode(EXAMPLES["skin.slip/1"]))
-    assert keys == list(grasping.SlipMessage.__struct_fields__)
-    assert grasping.decode_over(EXAMPLES["skin.over/1"]).force_n == 10.4
+    assert [*keys, "missed"] == ["schema", *Slip.__struct_fields__]
+    assert messages.decode_over(EXAMPLES["skin.over/1"]).force_n == 10.4
     keys = list(msgspec.json.decode(EXAMPLES["skin.over/1"]))
-    assert keys == list(grasping.OverMessage.__struct_fields__)
+    assert [*keys, "missed"] == ["schema", *Over.__struct_fields__]
 
 
 def test_the_result_of_the_document_is_a_result() -> None:
@@ -47,14 +50,14 @@ def test_the_result_of_the_document_is_a_result() -> None:
 
 def test_the_document_names_every_key() -> None:
     keys = {
-        *messages.TouchMessage.__struct_fields__,
-        *messages.LoadMessage.__struct_fields__,
+        *messages.Touch.__struct_fields__,
+        *Load.__struct_fields__,
         *frames._FrameFields.__struct_fields__,
         *NodeInfo.__struct_fields__,
         *PartInfo.__struct_fields__,
         *TriangleInfo.__struct_fields__,
         *FingertipInfo.__struct_fields__,
-    }
+    } - {"missed"}  # never sent
     missing = {key for key in keys if not re.search(rf"[`\"]{key}[`\"]", DOCUMENT)}
     assert not missing
     assert "touches_dropped" in DOCUMENT

@@ -16,7 +16,7 @@ import numpy as np
 
 from skin_host.errors import RequestError, SkinError, required
 from skin_host.files import write_atomic
-from skin_host.mqtt.messages import TouchMessage
+from skin_host.mqtt.messages import Touch
 from skin_host.recording.export.series import (
     TOUCH_NUMBERS,
     HealthLine,
@@ -131,7 +131,7 @@ def _table(part: PartSeries) -> str:
     return text.getvalue()
 
 
-def _touch_table(touches: list[TouchMessage]) -> str:
+def _touch_table(touches: list[Touch]) -> str:
     text = StringIO()
     text.write(",".join([*TOUCH_COLUMNS, *TOUCH_NUMBERS, "taxels"]) + "\n")
     for touch in touches:

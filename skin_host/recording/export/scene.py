@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from skin_host.errors import RequestError, SkinError, required
 from skin_host.mqtt.info import PartInfo
-from skin_host.mqtt.messages import TouchMessage
+from skin_host.mqtt.messages import Touch
 from skin_host.recording.export.series import HealthLine, Series
 
 ROOT = "robot"
@@ -131,7 +131,7 @@ class SkinScene:
         colours[~np.isfinite(kpa)] = INVALID_RGBA
         return colours
 
-    def arrows(self, part: str, t_ns: int, touches: Iterable[TouchMessage]) -> Arrows:
+    def arrows(self, part: str, t_ns: int, touches: Iterable[Touch]) -> Arrows:
         """The contacts of a part after some of its events."""
         there = self._arrows[part]
         for touch in touches:
@@ -190,7 +190,7 @@ class RecordedScene:
             yield self.scene.arrows(name, t_ns, touches)
 
 
-def _arrow(touch: TouchMessage) -> Arrow | None:
+def _arrow(touch: Touch) -> Arrow | None:
     if touch.event == "end" or touch.centroid_m is None:
         return None
     x, y, z = touch.normal or (0.0, 0.0, 1.0)

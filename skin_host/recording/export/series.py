@@ -13,7 +13,7 @@ from skin_host.errors import LogError
 from skin_host.layout import Layout
 from skin_host.mqtt.frames import decode_frame
 from skin_host.mqtt.info import PartInfo, decode_info, node_info
-from skin_host.mqtt.messages import TouchMessage, decode_health, decode_touch, touch_message
+from skin_host.mqtt.messages import Touch, decode_health, decode_touch, touch_message
 from skin_host.mqtt.payload import MessageError
 from skin_host.processing.calibration import Calibration
 from skin_host.processing.core import Engine
@@ -71,7 +71,7 @@ class Series:
     """
 
     parts: dict[str, PartSeries]
-    touches: list[TouchMessage]
+    touches: list[Touch]
     shapes: dict[str, PartInfo]
     health: list[HealthLine] = field(default_factory=list)
 
@@ -118,7 +118,7 @@ def read_messages(recording: Path) -> Series:
         LogError: it cannot be read, or holds no frames.
     """
     parts: dict[str, _Growing] = {}
-    touches: list[TouchMessage] = []
+    touches: list[Touch] = []
     shapes: dict[str, PartInfo] = {}
     health: list[HealthLine] = []
     latest: dict[str, HealthLine] = {}
@@ -173,7 +173,7 @@ def read_frames(log: Path, settings: Settings, layout: Layout, calibration: Cali
     """
     engine = Engine(settings, layout, list(range(len(layout.parts))), calibration)
     parts = {part.name: _Growing() for part in layout.parts}
-    touches: list[TouchMessage] = []
+    touches: list[Touch] = []
     counts = dict.fromkeys(parts, 0)
     for step in steps(log, engine):
         frame = step.frame

@@ -14,7 +14,7 @@ from skin_host.bus.strain import start_frames
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import load
 from skin_host.errors import ConfigurationError
-from skin_host.fingertip.events import SlipEvent
+from skin_host.fingertip.events import Slip
 from skin_host.layout import build_layout
 from skin_host.processing.core import Engine
 from skin_host.processing.events import TouchEvent
@@ -54,8 +54,8 @@ class World:
     def touches(self, part: str) -> list[TouchEvent]:
         return [one for one in self.events if isinstance(one, TouchEvent) and one.part == part]
 
-    def slips(self) -> list[SlipEvent]:
-        return [one for one in self.events if isinstance(one, SlipEvent)]
+    def slips(self) -> list[Slip]:
+        return [one for one in self.events if isinstance(one, Slip)]
 
 
 def test_the_host_finds_the_press_on_a_bare_fingertip_where_it_is() -> None:
