@@ -3,7 +3,13 @@
 import asyncio
 from dataclasses import dataclass, field
 
-from skin_host.bus.commands import BoardType, Message, SetBoardConfig, SetTriangleConfig
+from skin_host.bus.commands import (
+    SKIN_BOARD_TYPES,
+    BoardType,
+    Message,
+    SetBoardConfig,
+    SetTriangleConfig,
+)
 from skin_host.layout import BoardLayout, TriangleLayout
 
 MTB3_GAP_PERIODS = 2.5
@@ -52,6 +58,11 @@ class BoardRecord:
         if self.board_type is None:
             return self.layout.settings.model == "mtb3"
         return self.board_type == BoardType.SKIN
+
+    @property
+    def is_wrong_type(self) -> bool:
+        """Whether it has answered that it reads no skin."""
+        return self.board_type is not None and self.board_type not in SKIN_BOARD_TYPES
 
     @property
     def gap_s(self) -> float:

@@ -6,7 +6,8 @@ MF4, and the text formats compressed (.gz).
 Lines of candump (`candump -L`) of one form are decoded together, as arrays:
 `(1700000000.000125) can0 4E4#40F4F4F3F4F4F3F4`, with six decimals, a standard identifier and whole
 bytes. All other lines (extended identifiers, remote and error frames, CAN FD, damage) go through
-python-can one by one, so that the result does not depend on how a line was read.
+python-can one by one, so that the result does not depend on how a line was read. It is imported
+only for them and for the other formats: that takes longer than ten seconds of a board's frames.
 """
 
 import contextlib
@@ -17,16 +18,16 @@ from bisect import bisect_left
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, cast
+from typing import TYPE_CHECKING, BinaryIO, NamedTuple, cast
 
-import can
-import can.io.player
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.bus.adapters import identifier, nanoseconds, one_line
 from skin_host.bus.wire import FrameBatch, RecordBatch
 from skin_host.errors import LogError
+
+if TYPE_CHECKING:
+    import can
 
 #: One batch holds at most this many frames.
 CAPACITY = 1024
@@ -52,7 +53,7 @@ _NEWLINE = ord("\n")
 
 #: A classic frame as (identifier with flags, data, t_ns); None for any other message.
 Frame = tuple[int, bytes, int]
-Convert = Callable[[can.Message], tuple[str, Frame] | None]
+Convert = Callable[["can.Message"], tuple[str, Frame] | None]
 
 
 class DamageError(Exception):
@@ -152,10 +153,10 @@ def _parse(text: bytes, names: list[str], convert: Convert) -> Block:
         np.zeros(n, np.int64),
     )
     rows.kind[lengths == 0] = _EMPTY
-    for length in np.unique(lengths[lengths > 0]).tolist():
-        of_length = np.flatnonzero(lengths == length)
-        if length >= _LONGEST_ALIKE:
+    for length in np.flatnonzero(np.bincount(lengths)).tolist():
+        if not 0 < length < _LONGEST_ALIKE:
             continue
+        of_length = np.flatnonzero(lengths == length)
         if len(of_length) == n and n * (length + 1) == len(buffer):
             lines = buffer.reshape(n, -1)[:, :length]
         else:
@@ -222,6 +223,8 @@ def _number(digits: NDArray[np.uint8]) -> NDArray[np.int64]:
 
 
 def _decode_one(line: bytes, row: int, rows: _Rows, names: list[str], convert: Convert) -> None:
+    import can
+
     rows.kind[row] = _EMPTY
     for message in can.CanutilsLogReader(io.StringIO(line.decode(), newline=None)):
         if rows.kind[row] != _EMPTY:
@@ -287,6 +290,8 @@ def read_channels(path: Path, window_ns: int = WINDOW_NS) -> Iterator[tuple[str,
             rest, rest_channel, names = batch[begin:], channel[begin:], block.names
             damage = block.damage
     if damage is not None:
+        from skin_host.bus.adapters import one_line
+
         where = f"damaged after frame {n}" if n else "cannot be read in the format of its name"
         raise LogError(f"{path}: {where}: {one_line(damage)}") from None
     if not n:
@@ -330,12 +335,14 @@ def _by_channel(
         yield names[code], batch[np.flatnonzero(channel == code)]
 
 
-def _frame(message: can.Message) -> tuple[str, Frame] | None:
+def _frame(message: "can.Message") -> tuple[str, Frame] | None:
     """Channel and frame of a message; None for one of CAN FD.
 
     Raises:
         ValueError: it is not to be believed.
     """
+    from skin_host.bus.adapters import identifier, nanoseconds
+
     if message.is_fd:
         return None
     channel = "" if message.channel is None else str(message.channel)
@@ -364,6 +371,8 @@ def _blocks(path: Path) -> Generator[Block, None, None]:
 
 def _messages(path: Path) -> Iterator[Block]:
     """The same by python-can's readers."""
+    import can
+
     names: list[str] = []
     frames: list[tuple[str, Frame]] = []
     n = 0
@@ -394,9 +403,12 @@ def _check(path: Path, suffixes: list[str]) -> None:
     Raises:
         LogError: there is none.
     """
-    known = sorted(can.io.player.MESSAGE_READERS)
-    if not any(suffix in known for suffix in suffixes[-2:]):
-        raise LogError(f"{path}: unknown format of file name; known are {', '.join(known)}")
+    if ".log" not in suffixes[-2:]:
+        import can.io.player
+
+        known = sorted(can.io.player.MESSAGE_READERS)
+        if not any(suffix in known for suffix in suffixes[-2:]):
+            raise LogError(f"{path}: unknown format of file name; known are {', '.join(known)}")
     try:
         with path.open("rb"):
             pass

@@ -6,17 +6,19 @@ finds the faults. The record is published as `<part>/health` and shown by `skin 
 """
 
 import logging
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from skin_host.bus.boards import Boards
-from skin_host.bus.port import Port
 from skin_host.health.describe import ABSENT_SWEEPS, Describer
 from skin_host.health.diagnosis import FoundFault, diagnose
 from skin_host.health.record import Record
 from skin_host.health.watch import Watch
 from skin_host.processing.core import Engine, Output
+
+if TYPE_CHECKING:
+    from skin_host.bus.boards import Boards
+    from skin_host.bus.port import Port
 
 __all__ = ["FaultLog", "HealthWatch", "Record"]
 
@@ -81,7 +83,7 @@ class HealthWatch:
         """Take in one output of the core."""
         self._watch.note(output)
 
-    def tick(self, now_ns: int, ports: dict[str, Port], boards: dict[str, Boards]) -> None:
+    def tick(self, now_ns: int, ports: dict[str, "Port"], boards: dict[str, "Boards"]) -> None:
         """Read all counters; to be called ten times a second."""
         pause_ns = now_ns - self._ticked_ns
         if self._ticked_ns and STALL_NS < pause_ns < LATELY_NS:
@@ -89,7 +91,7 @@ class HealthWatch:
         self._ticked_ns = now_ns
         self._watch.tick(now_ns, ports, boards)
 
-    def pulse(self, ports: dict[str, Port], boards: dict[str, Boards]) -> tuple[object, ...]:
+    def pulse(self, ports: dict[str, "Port"], boards: dict[str, "Boards"]) -> tuple[object, ...]:
         """Return a value that differs from the last one when a fault may have begun or ended.
 
         It is taken ten times a second; only when it differs, and once a second, are the records
@@ -123,8 +125,8 @@ class HealthWatch:
         self,
         part: int,
         now_ns: int,
-        ports: dict[str, Port],
-        boards: dict[str, Boards],
+        ports: dict[str, "Port"],
+        boards: dict[str, "Boards"],
         output: dict[str, Any] | None = None,
         unkept: dict[str, str] | None = None,
     ) -> Record:

@@ -1,15 +1,12 @@
 """Builds the health record of a part from what `watch` has noted."""
 
 from statistics import fmean, median
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.bus.boards import Boards
-from skin_host.bus.commands import SKIN_BOARD_TYPES
-from skin_host.bus.port import Port
 from skin_host.bus.wire import TRIANGLES, StatusError
 from skin_host.health.record import (
     BoardHealth,
@@ -25,6 +22,10 @@ from skin_host.processing.calibration import Verdict
 from skin_host.processing.core import Engine
 from skin_host.processing.intake import FAR_PADS, lifted
 from skin_host.processing.masks import Mask
+
+if TYPE_CHECKING:
+    from skin_host.bus.boards import Boards
+    from skin_host.bus.port import Port
 
 #: An event of a board stays in the record for this long.
 LATELY_NS = 60_000_000_000
@@ -63,7 +64,7 @@ class Describer:
                 of_board.append(triangle.number)
 
     def part(
-        self, part: int, now_ns: int | None, ports: dict[str, Port], boards: dict[str, Boards]
+        self, part: int, now_ns: int | None, ports: dict[str, "Port"], boards: dict[str, "Boards"]
     ) -> Record:
         """Return the health record of a part."""
         watch = self._watch.parts[part]
@@ -143,7 +144,7 @@ class Describer:
         return "ok" if valid[pressure].all() else "degraded"
 
     def _triangles(
-        self, part: int, boards: dict[str, Boards]
+        self, part: int, boards: dict[str, "Boards"]
     ) -> tuple[list[TriangleHealth], list[TriangleHealth]]:
         """Return the triangles with a fault of a part, and those of other parts on its boards."""
         unwell: list[TriangleHealth] = []
@@ -171,7 +172,7 @@ class Describer:
             and not self._of_board(self._engine.intake.liveness.unproven, row).any()
         )
 
-    def _awaits(self, board: int, boards: dict[str, Boards]) -> bool:
+    def _awaits(self, board: int, boards: dict[str, "Boards"]) -> bool:
         """Whether a board has not had the time to send yet."""
         settings = self._layout.boards[board].settings
         return settings.bus in boards and boards[settings.bus].awaits(settings.address)
@@ -286,7 +287,7 @@ class Describer:
         pipeline = self._engine.pipeline
         return None if pipeline is None else round(pipeline.decides_kpa(part), 1)
 
-    def _board(self, index: int, now_ns: int | None, boards: dict[str, Boards]) -> BoardHealth:
+    def _board(self, index: int, now_ns: int | None, boards: dict[str, "Boards"]) -> BoardHealth:
         board = self._layout.boards[index]
         watch = self._watch.boards[index]
         ledger = self._engine.ledger
@@ -312,10 +313,9 @@ class Describer:
         manager = boards.get(board.settings.bus)
         if manager is not None:
             known = manager.records[board.settings.address]
-            kind = known.board_type
             record |= {
-                "board_type": kind,
-                "wrong_type": kind is not None and kind not in SKIN_BOARD_TYPES,
+                "board_type": known.board_type,
+                "wrong_type": known.is_wrong_type,
                 "firmware": known.firmware,
                 "in_bootloader": known.in_bootloader,
                 "awaited": manager.awaits(board.settings.address),
@@ -353,8 +353,8 @@ class Describer:
         self,
         name: str,
         now_ns: int | None,
-        ports: dict[str, Port],
-        boards: dict[str, Boards],
+        ports: dict[str, "Port"],
+        boards: dict[str, "Boards"],
     ) -> BusHealth:
         bus = self._engine.settings.buses[name]
         counters = msgspec.to_builtins(self._engine.assemblers[name].counters)

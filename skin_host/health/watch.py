@@ -6,16 +6,19 @@ been read": while nothing is read (a stopped process, a suspended computer) noth
 
 from collections import deque
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.bus.boards import Boards
-from skin_host.bus.port import Port
 from skin_host.layout import TAXELS_PER_TRIANGLE
 from skin_host.processing.core import Engine, Output, Step
 from skin_host.processing.masks import Mask, any_of
 from skin_host.processing.pipeline import PressureFrame
+
+if TYPE_CHECKING:
+    from skin_host.bus.boards import Boards
+    from skin_host.bus.port import Port
 
 #: Rates are means over about this time.
 RATE_S = 2.0
@@ -200,7 +203,7 @@ class Watch:
         for step in output.steps:
             self.parts[step.part].note(step, self._engine.intake.liveness.doubted)
 
-    def tick(self, now_ns: int, ports: dict[str, Port], boards: dict[str, Boards]) -> None:
+    def tick(self, now_ns: int, ports: dict[str, "Port"], boards: dict[str, "Boards"]) -> None:
         """Read all counters; to be called several times a second."""
         for bus, bus_watch in self.buses.items():
             totals = self._totals(bus, ports.get(bus))
@@ -211,7 +214,7 @@ class Watch:
             bus = self._engine.layout.boards[index].settings.bus
             watch.note_crowded(self._engine.assemblers[bus].crowded[index], now_ns)
 
-    def _totals(self, bus: str, port: Port | None) -> dict[str, int]:
+    def _totals(self, bus: str, port: "Port | None") -> dict[str, int]:
         counters = self._engine.assemblers[bus].counters
         damaged = 0 if port is None else port.counters.damaged
         return {
@@ -227,7 +230,7 @@ class Watch:
             "error_frames": 0 if port is None else port.counters.error_frames,
         }
 
-    def _events(self, index: int, watch: BoardWatch, boards: dict[str, Boards]) -> dict[str, int]:
+    def _events(self, index: int, watch: BoardWatch, boards: dict[str, "Boards"]) -> dict[str, int]:
         ledger = self._engine.ledger
         row = ledger.row[index]
         events = {"rezeros": int(ledger.rezeros[row])}

@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate, chain, pairwise
+from statistics import median
 
 import numpy as np
 from numpy.typing import NDArray
@@ -562,4 +563,4 @@ def _pitch_m(position_m: Floats, neighbours: Sequence[Sequence[int]]) -> float:
         for taxel, near in enumerate(neighbours)
         if near
     ]
-    return float(np.median(nearest)) if nearest else 0.0
+    return median(nearest) if nearest else 0.0

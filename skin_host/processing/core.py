@@ -5,7 +5,7 @@ takes frames and times, and returns frames of pressure and events.
 """
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,6 @@ from skin_host.bus.assembler import Assembler, Sweep
 from skin_host.bus.ledger import BoardLedger
 from skin_host.bus.wire import TRIANGLES, FrameBatch, StatusError
 from skin_host.config.settings import Settings, skin_hash
-from skin_host.fingertip.engine import FingertipEngine
 from skin_host.fingertip.events import FingertipEvent
 from skin_host.layout import Layout
 from skin_host.processing.calibration import Calibration, Calibrator, with_zeros
@@ -26,6 +25,9 @@ from skin_host.processing.masks import Mask
 from skin_host.processing.pipeline import Pipeline, PressureFrame
 from skin_host.processing.pressure import PressureCurve, vertex
 from skin_host.processing.rezero import BELOW_SWEEPS, JUMPS_NS, Rezero
+
+if TYPE_CHECKING:
+    from skin_host.fingertip.engine import FingertipEngine
 
 #: A calibration takes at least this many samples of each part, even if its boards are slow: the
 #: 95th percentile of fewer would be the largest.
@@ -125,8 +127,7 @@ class Engine:
         self.configuration = skin_hash(settings)
         self.calibration = calibration
         self.boards = sorted({board for part in parts for board in layout.parts[part].boards})
-        made = FingertipEngine(settings, layout, parts) if settings.fingertips else None
-        self.fingertips = made if made is not None and made.tips else None
+        self.fingertips = _fingertips(settings, layout, parts)
         buses = {layout.boards[i].settings.bus for i in self.boards}
         if self.fingertips is not None:
             buses |= self.fingertips.buses
@@ -526,3 +527,13 @@ class Engine:
         if in_time or samples < FEWEST_SAMPLES:
             run.calibrator.add(sample.part, sample.raw, sample.received, sample.t_ns)
             run.samples[sample.part] += 1
+
+
+def _fingertips(settings: Settings, layout: Layout, parts: list[int]) -> "FingertipEngine | None":
+    """Those of these parts' nodes; most skins have none, and do not need what they need."""
+    if not settings.fingertips:
+        return None
+    from skin_host.fingertip.engine import FingertipEngine
+
+    made = FingertipEngine(settings, layout, parts)
+    return made if made.tips else None

@@ -12,13 +12,11 @@ import signal
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import lru_cache
-from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import msgspec
 import numpy as np
@@ -28,7 +26,6 @@ from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import Settings, load, skin_hash
 from skin_host.errors import ConfigurationError, LogError, RequestError, SkinError, required
 from skin_host.fingertip.events import FingertipEvent, Slip
-from skin_host.fingertip.health import FingertipHealth
 from skin_host.health import HealthWatch
 from skin_host.layout import Layout, build_layout
 from skin_host.mqtt.messages import KPA_DECIMALS, health_keys, touch_message
@@ -38,6 +35,9 @@ from skin_host.processing.core import Engine, Output, Step
 from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.recording.mcap import SUFFIX, read_can
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
 
 #: A recording without a calibration file begins with this time of untouched skin.
 UNTOUCHED_S = 5.0
@@ -248,6 +248,8 @@ def write_lines(
     for part in engine.parts:
         output.write(health_line(health.replayed(part)))
     if engine.fingertips is not None:
+        from skin_host.fingertip.health import FingertipHealth
+
         for record in FingertipHealth(engine.fingertips).records(None).values():
             output.write(health_line(record))
     return number
@@ -287,6 +289,9 @@ def process_all(
     if scheduler is not None:
         yield from _on_cluster(ordered, scheduler)
         return
+    from concurrent.futures import ProcessPoolExecutor, as_completed
+    from multiprocessing import get_context
+
     processes = min(len(ordered), len(os.sched_getaffinity(0)))
     with ProcessPoolExecutor(processes, get_context("spawn"), _leave_interrupts) as pool:
         futures = {pool.submit(process, task): task for task in ordered}

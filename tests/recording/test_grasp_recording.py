@@ -52,6 +52,16 @@ def recorded() -> tuple[np.ndarray, np.ndarray]:
     return np.array([by_cycle[c] for c in cycles]), np.array([last_ns[c] for c in cycles])
 
 
+def test_a_candump_log_is_replayed_without_what_it_does_not_need(tmp_path: Path) -> None:
+    script = "import sys; from skin_host.cli import main; main(sys.argv[1:]); "
+    script += "print(*{'can', 'aiomqtt', 'multiprocessing'} & set(sys.modules))"
+    command = [sys.executable, "-c", script, "replay", str(LOG)]
+    command += ["--config", str(ROOT / "config/icub_hand.toml")]
+    command += ["--output", str(tmp_path / "grasp.jsonl")]
+    ran = subprocess.run(command, check=True, capture_output=True, text=True)
+    assert ran.stdout.split() == []
+
+
 def test_every_recorded_byte_arrives_in_one_frame_a_sweep(frames, recorded):
     values, last_ns = recorded
     assert [frame["seq"] for frame in frames] == list(range(len(values)))
