@@ -122,12 +122,14 @@ _Value = Annotated[int, Meta(ge=-(2**31), le=_INT32)]
 _Values = Annotated[list[_Value], Meta(max_length=MAX_TAXELS)]
 
 
-class _JsonFrame(_FrameFields, omit_defaults=True):
+class JsonFrame(_FrameFields, omit_defaults=True):
+    """Pressure of a part at one instant, one value a taxel: `<part>/frame` in JSON."""
+
     values: _Values
 
 
 _encoder = msgspec.json.Encoder()
-_decoder = msgspec.json.Decoder(_JsonFrame)
+_decoder = msgspec.json.Decoder(JsonFrame)
 
 
 def encode_mask(mask: Mask) -> str:

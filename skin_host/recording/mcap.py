@@ -19,8 +19,18 @@ from msgspec import Struct
 
 from skin_host.bus.wire import FrameBatch
 from skin_host.errors import LogError, SkinError, required
-from skin_host.mqtt.frames import decode_frame, encode_frame
-from skin_host.mqtt.messages import Frame, decode_over, decode_slip, decode_touch
+from skin_host.fingertip.events import Over, Slip
+from skin_host.health.record import Record
+from skin_host.mqtt.frames import FRAME_SCHEMA, JsonFrame, decode_frame, encode_frame
+from skin_host.mqtt.info import INFO_SCHEMA, NodeInfo
+from skin_host.mqtt.messages import (
+    HEALTH_SCHEMA,
+    Frame,
+    Touch,
+    decode_over,
+    decode_slip,
+    decode_touch,
+)
 from skin_host.mqtt.topics import PartTopic, Topics
 from skin_host.processing.pipeline import PressureFrame
 
@@ -45,10 +55,27 @@ class RecordedMessage(NamedTuple):
 
 
 class _Text(Struct):
+    """State of a part's contact (ON, OFF, UNKNOWN), or of a node (online, offline)."""
+
     text: str
 
 
+class _Mark(Struct, tag_field="schema", tag="skin.mark/1"):
+    """A moment that somebody marked."""
+
+    t_ns: int
+    text: str
+
+
+class _Health(Record):
+    """Health of a part."""
+
+    schema: str
+
+
 class _CanFrames(Struct):
+    """CAN frames of one channel: times, identifiers (flags as SocketCAN's), data in hex."""
+
     t_ns: list[int]
     id: list[int]
     data: list[str]
@@ -142,8 +169,7 @@ class Recorder:
         Raises:
             SkinError: the disk is full or gone.
         """
-        mark = {"schema": "skin.mark/1", "t_ns": t_ns, "text": text}
-        self._add(MARKS, "mark", t_ns, t_ns, msgspec.json.encode(mark))
+        self._add(MARKS, "mark", t_ns, t_ns, msgspec.json.encode(_Mark(t_ns, text)))
 
     def close(self) -> None:
         """End the recording and give it its name.
@@ -166,8 +192,8 @@ class Recorder:
         with self._told():
             if topic not in self._channels:
                 if kind not in self._schemas:
-                    name, schema = _SCHEMAS[kind]
-                    encoded = msgspec.json.encode(schema)
+                    name, content = _TYPES[kind]
+                    encoded = msgspec.json.encode(_schema(name, content))
                     self._schemas[kind] = self._writer.register_schema(name, "jsonschema", encoded)
                 self._channels[topic] = self._writer.register_channel(
                     topic=topic, message_encoding="json", schema_id=self._schemas[kind]
@@ -352,157 +378,48 @@ def _mcap(name: str) -> Any:
     return required(name, "MCAP recordings", "record")
 
 
-#: The messages' JSON schemas are in the plain form that Foxglove's plots understand.
-_INTEGER = {"type": "integer"}
-_NUMBER = {"type": "number"}
-_STRING = {"type": "string"}
-_NUMBERS = {"type": "array", "items": _NUMBER}
-_INTEGERS = {"type": "array", "items": _INTEGER}
-_STRINGS = {"type": "array", "items": _STRING}
+#: By kind of message: the schema's name, and the type of the content.
+_TYPES: dict[str, tuple[str, type]] = {
+    "frame": (FRAME_SCHEMA, JsonFrame),
+    "touch": ("skin.touch/1", Touch),
+    "slip": ("skin.slip/1", Slip),
+    "over": ("skin.over/1", Over),
+    "mark": ("skin.mark/1", _Mark),
+    "health": (HEALTH_SCHEMA, _Health),
+    "info": (INFO_SCHEMA, NodeInfo),
+    "contact": ("skin.contact", _Text),
+    "status": ("skin.status", _Text),
+    "can": ("skin.can/1", _CanFrames),
+}
+_ABOUT = {
+    "t_ns": "ns since 1970",
+    "scale": "one unit of the values, in `unit`",
+    "valid": "hexadecimal mask, bit i is taxel i",
+    "reason": "of an end: released, lost or stopped",
+}
 
 
-def _object(title: str, about: str, **keys: Any) -> dict[str, Any]:
+def _schema(name: str, kind: type) -> dict[str, Any]:
+    """Return a type's JSON schema in the plain form that Foxglove's plots understand."""
+    _, found = msgspec.json.schema_components([kind])
+    keys = found[kind.__name__]["properties"]
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": title,
-        "description": about,
+        "title": name,
+        "description": (kind.__doc__ or "").partition("\n")[0],
         "type": "object",
-        "properties": keys,
+        "properties": {
+            key: _plain(schema) | ({"description": _ABOUT[key]} if key in _ABOUT else {})
+            for key, schema in keys.items()
+            if key != "missed"  # only of received events
+        },
     }
 
 
-def _about(kind: dict[str, Any], text: str) -> dict[str, Any]:
-    return kind | {"description": text}
-
-
-#: By kind of message: the schema's name, and the schema.
-_SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
-    "frame": (
-        "skin.frame/1",
-        _object(
-            "skin.frame/1",
-            "Pressure of a part at one instant, one value a taxel",
-            schema=_STRING,
-            seq=_INTEGER,
-            t_ns=_about(_INTEGER, "time of the sweep's last CAN frame, ns since 1970"),
-            unit=_STRING,
-            scale=_about(_NUMBER, "one unit of the values, in `unit`"),
-            values=_INTEGERS,
-            valid=_about(_STRING, "hexadecimal mask, bit i is taxel i"),
-            beyond_range=_about(_STRING, "hexadecimal mask, bit i is taxel i"),
-            raw={"type": "string", "contentEncoding": "base64"},
-        ),
-    ),
-    "touch": (
-        "skin.touch/1",
-        _object(
-            "skin.touch/1",
-            "A contact begins, moves or ends",
-            schema=_STRING,
-            event=_STRING,
-            id=_INTEGER,
-            seq=_INTEGER,
-            t_ns=_INTEGER,
-            count=_INTEGER,
-            part=_STRING,
-            taxels=_INTEGERS,
-            centroid_m=_NUMBERS,
-            normal=_NUMBERS,
-            area_mm2=_NUMBER,
-            peak_kpa=_NUMBER,
-            mean_kpa=_NUMBER,
-            force_n=_NUMBER,
-            sigma_m=_NUMBER,
-            load={"type": "object"},
-            reason=_about(_STRING, "of an end: released, lost or stopped"),
-        ),
-    ),
-    "mark": (
-        "skin.mark/1",
-        _object(
-            "skin.mark/1",
-            "A moment that somebody marked",
-            schema=_STRING,
-            t_ns=_INTEGER,
-            text=_STRING,
-        ),
-    ),
-    "slip": (
-        "skin.slip/1",
-        _object(
-            "skin.slip/1",
-            "A fingertip begins or ends to slip",
-            schema=_STRING,
-            event=_STRING,
-            id=_INTEGER,
-            t_ns=_INTEGER,
-            count=_INTEGER,
-            part=_STRING,
-            cause=_STRING,
-            force_n=_NUMBER,
-            shear_n=_NUMBER,
-            shear_rate_n_s=_NUMBER,
-        ),
-    ),
-    "over": (
-        "skin.over/1",
-        _object(
-            "skin.over/1",
-            "A fingertip begins or ends to press too hard",
-            schema=_STRING,
-            event=_STRING,
-            id=_INTEGER,
-            t_ns=_INTEGER,
-            count=_INTEGER,
-            part=_STRING,
-            force_n=_NUMBER,
-        ),
-    ),
-    "health": (
-        "skin.health/1",
-        _object(
-            "skin.health/1",
-            "Health of a part",
-            schema=_STRING,
-            part=_STRING,
-            state=_STRING,
-            rate_hz=_NUMBER,
-            taxels=_INTEGER,
-            valid_taxels=_INTEGER,
-            sentences=_STRINGS,
-        ),
-    ),
-    "info": (
-        "skin.info/1",
-        _object(
-            "skin.info/1",
-            "Description of a node: its parts, the order and places of their taxels",
-            schema=_STRING,
-            robot=_STRING,
-            node=_STRING,
-            version=_STRING,
-            parts={"type": "object"},
-        ),
-    ),
-    "contact": (
-        "skin.contact",
-        _object(
-            "skin.contact", "Whether anything touches a part: ON, OFF or UNKNOWN", text=_STRING
-        ),
-    ),
-    "status": (
-        "skin.status",
-        _object("skin.status", "Whether a node is connected: online or offline", text=_STRING),
-    ),
-    "can": (
-        "skin.can/1",
-        _object(
-            "skin.can/1",
-            "CAN frames of one channel: times, identifiers (flags as SocketCAN's), data in hex",
-            t_ns=_INTEGERS,
-            id=_INTEGERS,
-            data=_STRINGS,
-            dropped=_INTEGER,
-        ),
-    ),
-}
+def _plain(schema: dict[str, Any]) -> dict[str, Any]:
+    """Reduce the schema of a key to its type, without references, alternatives and limits."""
+    schema = next((one for one in schema.get("anyOf", ()) if one != {"type": "null"}), schema)
+    kind = schema.get("type", "object" if "$ref" in schema else "string")
+    if kind == "array":
+        return {"type": kind, "items": _plain(schema.get("items") or schema["prefixItems"][0])}
+    return {"type": kind} | {key: schema[key] for key in schema if key == "contentEncoding"}
