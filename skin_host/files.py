@@ -166,6 +166,11 @@ def on_disk(disk: Disk) -> Iterator[None]:
         _disk.reset(token)
 
 
+def write_document(path: Path, document: object) -> None:
+    """Replace `path` by a document as indented JSON; see `write_atomic`."""
+    write_atomic(path, msgspec.json.format(msgspec.json.encode(document), indent=1) + b"\n")
+
+
 def write_atomic(path: Path, data: bytes) -> None:
     """Replace `path` by `data` in one step that survives a crash at any moment.
 

@@ -18,16 +18,9 @@ from skin_host.daemon import metrics, service
 from skin_host.daemon.calibrate import calibration_path, collect
 from skin_host.daemon.control import Control
 from skin_host.daemon.link import Link, OpenPort
-from skin_host.daemon.state import (
-    NodeState,
-    Thresholds,
-    Zeros,
-    load_state,
-    load_zeros,
-    save_state,
-    save_zeros,
-)
+from skin_host.daemon.state import NodeState, Thresholds, Zeros, load_kept
 from skin_host.errors import ConfigurationError, RequestError, SkinError
+from skin_host.files import write_document
 from skin_host.fingertip.health import FingertipRecord
 from skin_host.fingertip.service import FingertipPublisher
 from skin_host.health import FaultLog, HealthWatch, Record
@@ -102,7 +95,7 @@ class Daemon:
         self.layout = layout
         self._node = node
         self._configuration = configuration
-        state = load_state(self._path("state"))
+        state = load_kept(self._path("state"), NodeState)
         self._configured = settings
         self.thresholds = state.thresholds
         self.settings = settings = state.thresholds.over_settings(settings)
@@ -111,7 +104,7 @@ class Daemon:
             i for i in self.engine.parts if layout.parts[i].name in state.disabled
         }
         self.engine.touch_only = _touch_only(settings, layout, self.engine.parts)
-        self._zeros = load_zeros(self._path("zeros"))
+        self._zeros = load_kept(self._path("zeros"), Zeros)
         doubted = np.zeros(layout.n_taxels, np.bool_)
         if calibration is not None and calibration.id == self._zeros.calibration:
             doubted = _taxels(layout, self._zeros)
@@ -284,7 +277,7 @@ class Daemon:
         """
         path = self._path("state")
         try:
-            save_state(path, state)
+            write_document(path, state)
         except OSError as error:
             self.unkept["state"] = f"{path}: {error.strerror}"
             raise
@@ -436,7 +429,7 @@ class Daemon:
             return
         path = self._path("zeros")
         try:
-            await self.clock.in_thread(save_zeros, path, zeros)
+            await self.clock.in_thread(write_document, path, zeros)
         except OSError as error:
             if "zeros" not in self.unkept:
                 log.error("zeros not kept: %s: %s", path, error.strerror)

@@ -8,19 +8,16 @@ and reported, so that the service can always start.
 import logging
 import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct, field
 
 from skin_host.config.fields import Name
 from skin_host.config.settings import Settings, TouchSettings, changed
-from skin_host.files import read_document, set_aside, write_atomic
+from skin_host.files import read_document, set_aside
 
 log = logging.getLogger(__name__)
-
-SCHEMA = "skin.state/1"
-ZEROS_SCHEMA = "skin.zeros/1"
 
 
 class Thresholds(Struct, forbid_unknown_fields=True, omit_defaults=True):
@@ -46,39 +43,11 @@ class Thresholds(Struct, forbid_unknown_fields=True, omit_defaults=True):
 class NodeState(Struct, forbid_unknown_fields=True):
     """Changes by operators since the configuration was written."""
 
-    schema: str = SCHEMA
+    WITHOUT: ClassVar = "starting without it"
+
+    schema: str = "skin.state/1"
     disabled: list[Name] = []
     thresholds: Thresholds = field(default_factory=Thresholds)
-
-
-def load_state(path: Path) -> NodeState:
-    """Read the state of a node.
-
-    A missing or unreadable file gives an unchanged one; so does a damaged one, which is set aside.
-
-    Raises:
-        NewerFileError: a newer version has written it.
-    """
-    if not os.access(path, os.F_OK):
-        return NodeState()
-    if not os.access(path, os.R_OK):
-        log.error("%s: cannot be read: no permission; starting without it", path)
-        return NodeState()
-    try:
-        return read_document(path, NodeState, SCHEMA, "state", ValueError)
-    except ValueError as error:
-        log.error("%s: damaged (%s); starting without it", path, error)
-        set_aside(path)
-        return NodeState()
-
-
-def save_state(path: Path, state: NodeState) -> None:
-    """Store the state of a node.
-
-    Raises:
-        OSError: it cannot be written; the old one is unchanged.
-    """
-    write_atomic(path, msgspec.json.format(msgspec.json.encode(state), indent=1) + b"\n")
 
 
 class Zeros(Struct, forbid_unknown_fields=True):
@@ -92,31 +61,34 @@ class Zeros(Struct, forbid_unknown_fields=True):
         unknown: numbers of taxels by part.
     """
 
-    schema: str = ZEROS_SCHEMA
+    WITHOUT: ClassVar = "calibrate when nothing touches the skin"
+
+    schema: str = "skin.zeros/1"
     calibration: str = ""
     unknown: dict[Name, list[int]] = {}
 
 
-def load_zeros(path: Path) -> Zeros:
-    """Read which zeros are not known; see `load_state`.
+Kept = TypeVar("Kept", NodeState, Zeros)
+
+
+def load_kept(path: Path, kind: type[Kept]) -> Kept:
+    """Read what a node keeps.
+
+    A missing or unreadable file gives an unchanged one; so does a damaged one, which is set aside.
 
     Raises:
         NewerFileError: a newer version has written it.
     """
+    unchanged = kind()
     if not os.access(path, os.F_OK):
-        return Zeros()
+        return unchanged
+    if not os.access(path, os.R_OK):
+        log.error("%s: cannot be read: no permission; starting without it", path)
+        return unchanged
+    what = unchanged.schema.removeprefix("skin.").partition("/")[0]
     try:
-        return read_document(path, Zeros, ZEROS_SCHEMA, "zeros", ValueError)
+        return read_document(path, kind, unchanged.schema, what, ValueError)
     except ValueError as error:
-        log.error("%s: damaged (%s); calibrate when nothing touches the skin", path, error)
+        log.error("%s: damaged (%s); %s", path, error, kind.WITHOUT)
         set_aside(path)
-        return Zeros()
-
-
-def save_zeros(path: Path, zeros: Zeros) -> None:
-    """Store which zeros are not known.
-
-    Raises:
-        OSError: it cannot be written; the old one is unchanged.
-    """
-    write_atomic(path, msgspec.json.encode(zeros) + b"\n")
+        return unchanged

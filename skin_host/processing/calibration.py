@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from skin_host.config.settings import TouchSettings
 from skin_host.errors import CalibrationError, NewerFileError, OtherSkinError
-from skin_host.files import read_document, write_atomic
+from skin_host.files import read_document, write_document
 from skin_host.layout import Layout, PadKind
 from skin_host.processing.conversions import Conversions
 from skin_host.processing.curves import KNOTS_UNITS, Curves, CurveVerdict, Memory, rising
@@ -664,7 +664,7 @@ def save(path: Path, calibration: Calibration, layout: Layout) -> None:
         zeros,
         None if calibration.curves is None else _curves_file(calibration.curves, layout),
     )
-    write_atomic(path, msgspec.json.format(msgspec.json.encode(content), indent=1) + b"\n")
+    write_document(path, content)
 
 
 def _curves_file(curves: Curves, layout: Layout) -> _CurvesFile:

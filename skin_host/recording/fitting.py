@@ -9,14 +9,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.config.relaxation import RELAXATION_SCHEMA
 from skin_host.config.settings import Settings
 from skin_host.errors import LogError, RequestError
-from skin_host.files import write_atomic
+from skin_host.files import write_document
 from skin_host.layout import Layout, PadKind
 from skin_host.processing.calibration import Calibration, Verdict, with_curves, with_gains
 from skin_host.processing.core import Engine
@@ -225,7 +224,7 @@ def save_relaxation(path: Path, found: Fit, settings: Settings, record: HoldReco
         "uncertain": found.uncertain,
         "remarks": list(found.remarks),
     }
-    write_atomic(path, msgspec.json.format(msgspec.json.encode(document), indent=1) + b"\n")
+    write_document(path, document)
 
 
 def fit_pressures(

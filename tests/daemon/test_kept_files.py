@@ -14,7 +14,7 @@ from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus, Mqtt, changed, load
 from skin_host.daemon import metrics
 from skin_host.daemon.calibrate import calibration_path, stored_calibration
-from skin_host.daemon.state import NodeState, load_state
+from skin_host.daemon.state import NodeState, load_kept
 from skin_host.errors import NewerFileError, OtherSkinError
 from skin_host.layout import build_layout
 from skin_host.mqtt.publisher import Publisher
@@ -40,7 +40,7 @@ def test_a_state_of_a_newer_version_is_refused_and_left_as_it_is(
     path = tmp_path / "state.json"
     path.write_text(json.dumps(content))
     with pytest.raises(NewerFileError, match="start that version, or move the file away with: mv"):
-        load_state(path)
+        load_kept(path, NodeState)
     assert json.loads(path.read_text()) == content
     assert list(tmp_path.iterdir()) == [path]
 
@@ -49,7 +49,7 @@ def test_a_state_of_a_newer_version_is_refused_and_left_as_it_is(
 def test_a_damaged_state_is_set_aside(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "state.json"
     path.write_bytes(content)
-    assert load_state(path) == NodeState()
+    assert load_kept(path, NodeState) == NodeState()
     (aside,) = tmp_path.iterdir()
     assert aside.name.startswith("state.json.damaged-")
     assert aside.read_bytes() == content

@@ -16,8 +16,9 @@ from skin_host.bus.wire import FrameBatch, encode_sweep
 from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus, TouchSettings, changed
 from skin_host.daemon import metrics, service
-from skin_host.daemon.state import NodeState, Thresholds, load_state, save_state
+from skin_host.daemon.state import NodeState, Thresholds, load_kept
 from skin_host.errors import RequestError
+from skin_host.files import write_document
 from skin_host.health import LINE_S, FaultLog
 from skin_host.importing import configuration_text
 from skin_host.recording.capture import FrameRecorder, candump_lines
@@ -29,8 +30,8 @@ from tests.support.stepped import stepped
 def test_what_operators_changed_comes_back(tmp_path: Path) -> None:
     path = tmp_path / "a" / "state.json"
     state = NodeState(disabled=["left_hand"], thresholds=Thresholds(margin_units=0.0, votes_of_3=3))
-    save_state(path, state)
-    assert load_state(path) == state
+    write_document(path, state)
+    assert load_kept(path, NodeState) == state
     touch = state.thresholds.over(TouchSettings())
     assert (touch.margin_units, touch.votes_of_3) == (0.0, 3)
     assert touch.hysteresis_units == TouchSettings().hysteresis_units
@@ -42,7 +43,7 @@ def test_damaged_state_is_an_unchanged_one(
 ) -> None:
     path = tmp_path / "state.json"
     path.write_bytes(content)
-    assert load_state(path) == NodeState()
+    assert load_kept(path, NodeState) == NodeState()
     assert "damaged" in caplog.text
 
 

@@ -15,7 +15,7 @@ from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SYSTEM
 from skin_host.config.settings import Settings, changed, load, skin_hash
 from skin_host.daemon.control import Control
-from skin_host.daemon.state import load_state
+from skin_host.daemon.state import NodeState, load_kept
 from skin_host.errors import NewerFileError, RequestError, SkinError
 from skin_host.health import HealthWatch
 from skin_host.layout import Layout, build_layout
@@ -118,7 +118,7 @@ def state_file(data: bytes) -> None:
     path = folder() / "state.json"
     path.write_bytes(data)
     with contextlib.suppress(NewerFileError):
-        load_state(path)
+        load_kept(path, NodeState)
 
 
 class Commands:
@@ -144,7 +144,7 @@ class Commands:
             configure=nothing,
             reload=nothing,
             disable=engine.disabled.add,
-            thresholds=load_state(folder() / "none").thresholds,
+            thresholds=load_kept(folder() / "none", NodeState).thresholds,
             set_thresholds=lambda new: setattr(daemon, "thresholds", new),
             keep=lambda _: None,
             status=dict,

@@ -16,7 +16,7 @@ from emulator.probes.scene import Scene
 from skin_host.bus.logs import read_channels
 from skin_host.config.settings import skin_hash
 from skin_host.daemon.daemon import Daemon
-from skin_host.daemon.state import load_state
+from skin_host.daemon.state import NodeState, load_kept
 from skin_host.errors import SkinError
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration
@@ -109,7 +109,7 @@ async def refused_by_the_disk(
     calibrations.load(
         state / "load-main.calibration.json", daemon.layout, skin_hash(daemon.settings)
     )
-    assert load_state(state / "load-main.state.json").thresholds.margin_units == 3.0
+    assert load_kept(state / "load-main.state.json", NodeState).thresholds.margin_units == 3.0
     if filler is None:
         remount(state, "rw")
     else:
