@@ -12,7 +12,7 @@ from typing import Protocol, TypeVar
 import msgspec
 
 from skin_host.clock import SYSTEM
-from skin_host.errors import NewerFileError
+from skin_host.errors import NewerFileError, SkinError
 
 log = logging.getLogger(__name__)
 
@@ -190,3 +190,38 @@ def write_atomic(path: Path, data: bytes) -> None:
         disk.remove(temporary)
         raise
     disk.sync(path.parent)
+
+
+def growing(path: Path) -> Path:
+    """Return the name of a file that takes its own name when it is complete."""
+    return path.with_name(f".{path.stem}.growing{path.suffix}")
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn the error of a disk that is full, gone or read-only into one that names the file.
+
+    Raises:
+        SkinError: in place of an OSError.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise SkinError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+@contextlib.contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Yield where to write a file that appears complete or not at all.
+
+    Raises:
+        SkinError: it cannot be written.
+    """
+    temporary = growing(path)
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            yield temporary
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)

@@ -31,6 +31,7 @@ from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Settings
 from skin_host.errors import RequestError, SkinError
+from skin_host.files import growing, writing
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import Retry, connect, explain, first_error
 from skin_host.mqtt.payload import MAX_PACKET_BYTES
@@ -76,12 +77,10 @@ class CanLog:
             raise RequestError(f'{path}: suffix "{path.suffix}"; wanted one of {known}')
         self.frames = 0
         self._path = path
-        self._growing = path.with_name(f".{path.stem}.growing{path.suffix}")
-        try:
+        self._growing = growing(path)
+        with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._logger = can.Logger(self._growing)
-        except OSError as error:
-            raise SkinError(f"{path}: cannot be recorded to: {error.strerror}") from None
 
     def __enter__(self) -> Self:
         return self
@@ -99,7 +98,7 @@ class CanLog:
         Raises:
             SkinError: the disk is full or gone.
         """
-        try:
+        with writing(self._path):
             for row in range(len(batch)):
                 flags = int(batch.id[row])
                 dlc = int(batch.dlc[row])
@@ -115,8 +114,6 @@ class CanLog:
                     )
                 )
                 self.frames += 1
-        except OSError as error:
-            raise SkinError(f"{self._path}: cannot be recorded to: {error.strerror}") from None
 
     def close(self) -> None:
         """End the recording and give it its name."""
@@ -233,15 +230,13 @@ class FrameRecorder:
         self._until_s = clock.monotonic_s() + seconds
         self._finishing = threading.Event()
         self._queue: queue.Queue[tuple[str, FrameBatch] | None] = queue.Queue(WAITING_BATCHES)
-        try:
+        with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             if sum(1 for _ in path.parent.iterdir()) >= MAX_RECORDINGS:
                 raise SkinError(
                     f"{path.parent}: holds {MAX_RECORDINGS} recordings already; move some away"
                 )
             self._file = path.open("xb", buffering=0)
-        except OSError as error:
-            raise SkinError(f"{path}: cannot be recorded to: {error.strerror}") from None
         self._thread = clock.thread(self._write, "recorder")
 
     def put(self, channel: str, batch: FrameBatch) -> None:

@@ -9,7 +9,6 @@ closed; an interrupted one can be repaired with `mcap recover`.
 import logging
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, NamedTuple, Self, get_args
 
@@ -19,6 +18,7 @@ from msgspec import Struct
 
 from skin_host.bus.wire import FrameBatch
 from skin_host.errors import LogError, SkinError, required
+from skin_host.files import growing, writing
 from skin_host.fingertip.events import Over, Slip
 from skin_host.health.record import Record
 from skin_host.mqtt.frames import FRAME_SCHEMA, JsonFrame, decode_frame, encode_frame
@@ -100,12 +100,10 @@ class Recorder:
         self.unreadable = 0
         self.gaps = 0
         self._path = path
-        self._growing = path.with_name(f".{path.stem}.growing{path.suffix}")
-        try:
+        self._growing = growing(path)
+        with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file: IO[bytes] = self._growing.open("wb")
-        except OSError as error:
-            raise SkinError(f"{path}: cannot be recorded to: {error.strerror}") from None
         self._writer = mcap_writer.Writer(self._file)
         self._writer.start(profile="", library="skin-host")
         self._schemas: dict[str, int] = {}
@@ -179,7 +177,7 @@ class Recorder:
         """
         if self._file.closed:
             return
-        with self._told(), self._file:
+        with writing(self._path), self._file:
             counts = {f"messages_{kind}": str(n) for kind, n in sorted(self.messages.items())}
             told = counts | {"unreadable": str(self.unreadable), "gaps": str(self.gaps)}
             self._writer.add_metadata("skin", told)
@@ -189,7 +187,7 @@ class Recorder:
         os.replace(self._growing, self._path)
 
     def _add(self, topic: str, kind: str, t_ns: int, sent_ns: int, data: bytes) -> None:
-        with self._told():
+        with writing(self._path):
             if topic not in self._channels:
                 if kind not in self._schemas:
                     name, content = _TYPES[kind]
@@ -207,13 +205,6 @@ class Recorder:
                 data=data,
             )
         self.messages[kind] = self.messages.get(kind, 0) + 1
-
-    @contextmanager
-    def _told(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise SkinError(f"{self._path}: cannot be recorded to: {error.strerror}") from None
 
 
 def read_messages_of(path: Path) -> Iterator[RecordedMessage]:

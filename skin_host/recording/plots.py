@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.errors import RequestError, SkinError, required
-from skin_host.files import write_atomic
+from skin_host.errors import RequestError, required
+from skin_host.files import write_atomic, writing
 from skin_host.layout import Layout, PadKind
 from skin_host.processing.calibration import Calibration, Verdict
 from skin_host.processing.curves import KNOTS_UNITS, Curves, CurveVerdict
@@ -248,7 +248,5 @@ def _write(figure: Any, output: Path) -> None:
     buffer = BytesIO()
     figure.savefig(buffer, format=output.suffix[1:], dpi=110)
     _pyplot().close(figure)
-    try:
+    with writing(output):
         write_atomic(output, buffer.getvalue())
-    except OSError as error:
-        raise SkinError(f"{output}: cannot be written: {error.strerror}") from None

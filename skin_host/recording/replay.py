@@ -6,10 +6,8 @@ this computer, or the workers of an existing Dask cluster (extra `cluster`). A t
 files; a cluster's workers must find them under the same absolute paths.
 """
 
-import contextlib
 import os
 import signal
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -25,6 +23,7 @@ from skin_host.bus.logs import read_channels
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import Settings, load, skin_hash
 from skin_host.errors import ConfigurationError, LogError, RequestError, SkinError, required
+from skin_host.files import whole_file
 from skin_host.fingertip.events import FingertipEvent, Slip
 from skin_host.health import HealthWatch
 from skin_host.layout import Layout, build_layout
@@ -268,7 +267,7 @@ def process(task: Task, progress: Callable[[int], None] = lambda _: None) -> int
         raise ConfigurationError(f"{task.config}: {error}") from None
     found = calibration_for(task.log, settings, layout, task.calibration, task.calibrate_seconds)
     engine = Engine(settings, layout, list(range(len(layout.parts))), found)
-    with whole_file(task.output) as output:
+    with whole_file(task.output) as growing, growing.open("wb") as output:
         return write_lines(task.log, engine, output, progress)
 
 
@@ -300,20 +299,6 @@ def process_all(
                 yield futures[future], _result(future)
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
-
-
-@contextlib.contextmanager
-def whole_file(path: Path) -> Iterator[BinaryIO]:
-    """Yield a file that appears complete or not at all."""
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            yield file
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
 
 
 def _size(task: Task) -> int:

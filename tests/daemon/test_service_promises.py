@@ -63,7 +63,7 @@ async def test_commands_work_and_say_so_where_nothing_can_be_written(
         assert live.daemon.records()["left_hand"]["state"] == "disabled"
         await handle("enable", b'{"part":"left_hand"}')
         await handle("calibrate", b'{"seconds":0.3,"part":"left_hand"}')
-        with pytest.raises(Exception, match="cannot be recorded"):
+        with pytest.raises(Exception, match="cannot be written"):
             await handle("record", b"{}")
         with pytest.raises(Exception, match="no part"):
             await handle("disable", b'{"part":"tail"}')

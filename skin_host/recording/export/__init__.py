@@ -14,8 +14,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from skin_host.errors import RequestError, SkinError, required
-from skin_host.files import write_atomic
+from skin_host.errors import RequestError, required
+from skin_host.files import write_atomic, writing
 from skin_host.mqtt.messages import Touch
 from skin_host.recording.export.series import (
     TOUCH_NUMBERS,
@@ -66,7 +66,6 @@ def export(
         raise RequestError(
             f"{output}: a data set of LeRobot is a folder; wanted a name without end"
         )
-    written = []
     if output.suffix == ".parquet" or lerobot:
         write = write_lerobot if lerobot else write_parquet
         return write(series, output)
@@ -80,21 +79,13 @@ def export(
 
         write_foxglove(series, recording, output)
         return [output]
-    try:
-        if output.suffix == ".npz":
-            buffer = BytesIO()
-            np.savez_compressed(buffer, **dict(_arrays(series)))
-            write_atomic(output, buffer.getvalue())
-            return [output]
-        for name, part in series.parts.items():
-            path = output / f"{name}.csv"
-            write_atomic(path, _table(part).encode())
-            written.append(path)
-        path = output / "touches.csv"
-        write_atomic(path, _touch_table(series.touches).encode())
-    except OSError as error:
-        raise SkinError(f"{output}: cannot be written: {error.strerror}") from None
-    return [*written, path]
+    if output.suffix == ".npz":
+        buffer = BytesIO()
+        np.savez_compressed(buffer, **dict(_arrays(series)))
+        return [_written(output, buffer.getvalue())]
+    tables = {name: _table(part) for name, part in series.parts.items()}
+    tables["touches"] = _touch_table(series.touches)
+    return [_written(output / f"{name}.csv", text.encode()) for name, text in tables.items()]
 
 
 def _arrays(series: Series) -> Iterator[tuple[str, Any]]:
@@ -299,15 +290,7 @@ def write_lerobot(series: Series, output: Path) -> list[Path]:
         "episodes.jsonl": json.dumps({"episode_index": 0, "tasks": [TASK], "length": n}) + "\n",
         "episodes_stats.jsonl": json.dumps({"episode_index": 0, "stats": stats}) + "\n",
     }
-    written = [data]
-    for name, text in meta.items():
-        path = output / "meta" / name
-        try:
-            write_atomic(path, text.encode())
-        except OSError as error:
-            raise SkinError(f"{path}: cannot be written: {error.strerror}") from None
-        written.append(path)
-    return written
+    return [data, *(_written(output / "meta" / name, text.encode()) for name, text in meta.items())]
 
 
 def _write(path: Path, table: Any) -> None:
@@ -316,7 +299,10 @@ def _write(path: Path, table: Any) -> None:
 
     buffer = pa.BufferOutputStream()
     parquet.write_table(table, buffer, compression="zstd")
-    try:
-        write_atomic(path, buffer.getvalue())
-    except OSError as error:
-        raise SkinError(f"{path}: cannot be written: {error.strerror}") from None
+    _written(path, buffer.getvalue())
+
+
+def _written(path: Path, data: bytes) -> Path:
+    with writing(path):
+        write_atomic(path, data)
+    return path

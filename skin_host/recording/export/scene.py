@@ -8,8 +8,6 @@ A configuration does not contain where on the body a part is: the parts lie side
 its frame.
 """
 
-import contextlib
-import os
 from collections.abc import Iterable, Iterator
 from heapq import merge
 from itertools import groupby
@@ -19,7 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.errors import RequestError, SkinError, required
+from skin_host.errors import RequestError, required
+from skin_host.files import whole_file
 from skin_host.mqtt.info import PartInfo
 from skin_host.mqtt.messages import Touch
 from skin_host.recording.export.series import HealthLine, Series
@@ -227,7 +226,7 @@ def write_foxglove(series: Series, recording: Path | None, output: Path) -> None
     from mcap.writer import Writer
 
     scene = RecordedScene(series)
-    with _new(output) as growing, growing.open("wb") as file:
+    with whole_file(output) as growing, growing.open("wb") as file:
         writer: Any = Writer(file)
         writer.start(profile="", library="skin-host")
         if recording is not None and recording.suffix == ".mcap":
@@ -400,7 +399,7 @@ def write_rerun(series: Series, output: Path) -> None:
     """
     rr = required("rerun", "recordings for Rerun", "rerun")
     scene = RecordedScene(series)
-    with _new(output) as growing:
+    with whole_file(output) as growing:
         stream = rr.RecordingStream("skin-host")
         stream.save(growing)
         shown = RerunStream(stream, scene.scene)
@@ -449,21 +448,3 @@ class RerunStream:
             case HealthLine():
                 level = "INFO" if item.state == "ok" else "WARN"
                 stream.log("health", rr.TextLog(item.text, level=level))
-
-
-@contextlib.contextmanager
-def _new(output: Path) -> Iterator[Path]:
-    """Yield a temporary path for a file that gets its name when it is complete.
-
-    Raises:
-        SkinError: it cannot be written.
-    """
-    growing = output.with_name(f".{output.stem}.growing{output.suffix}")
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        yield growing
-        os.replace(growing, output)
-    except OSError as error:
-        raise SkinError(f"{output}: cannot be written: {error.strerror}") from None
-    finally:
-        growing.unlink(missing_ok=True)

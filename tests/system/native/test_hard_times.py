@@ -144,7 +144,7 @@ async def test_a_read_only_state_directory_is_told_and_costs_nothing_else(
     async with daemon_of(four_parts(tmp_path), QUIET, state=small_disk) as daemon:
         await refused_by_the_disk(daemon, small_disk, caplog, "Read-only file system")
         remount(small_disk, "ro")
-        with pytest.raises(Exception, match="cannot be recorded to: Read-only file system"):
+        with pytest.raises(Exception, match="cannot be written: Read-only file system"):
             await daemon.control.handle("record", b"{}")
     # And from the start: it takes a calibration anew and goes on with it.
     (tmp_path / "again").mkdir()
