@@ -330,6 +330,8 @@ class Publisher:
     async def _talk(self, connection: Connection) -> None:
         """Send and listen until the end of the publisher; an error means a lost broker."""
         self._connection = connection
+        # Who sees this node online may ask it at once: it listens first.
+        await self._subscribe(connection)
         self._outbox.counters.connected = True
         self._outbox.counters.connections += 1
         _log.info("broker %s: connected", self._broker)
@@ -381,13 +383,15 @@ class Publisher:
             put_stamp(properties, self._numbers.online if online else self._numbers.offline)
         return properties
 
-    async def _listen(self, connection: Connection) -> None:
+    async def _subscribe(self, connection: Connection) -> None:
         wanted = [self._status]
         if self._command_handler is not None:
             wanted.append(self.topics.command(self._node, "+"))
         for topic in wanted:
             if not await connection.listen_to(topic):
                 _log.warning("broker %s: may not subscribe to %s", self._broker, topic)
+
+    async def _listen(self, connection: Connection) -> None:
         async for message in connection.messages:
             self._take(message)
 

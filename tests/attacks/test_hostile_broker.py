@@ -8,6 +8,7 @@ import pytest
 
 from skin_host.config.settings import Mqtt
 from skin_host.mqtt.publisher import Publisher
+from tests.support.packets import SUBSCRIBE, packet, suback
 from tests.support.waiting import until
 
 CONNACK_5 = bytes([0x20, 3, 0, 0, 0])
@@ -91,11 +92,15 @@ async def test_a_message_without_a_topic_or_with_a_number_for_it_is_left_out(
         nonlocal connections, answered
         connections += 1
         try:
-            await reader.readuntil(b"MQTT")
+            await packet(reader)
             writer.write(CONNACK_5)
             for body in bodies:
                 writer.write(bytes([0x30 | qos << 1, len(body)]) + body)
             await writer.drain()
+            kind, subscribe = await packet(reader)
+            while kind != SUBSCRIBE:
+                kind, subscribe = await packet(reader)
+            writer.write(suback(subscribe))
             await reader.readuntil(b"online")
             answered += 1
             await reader.read()
