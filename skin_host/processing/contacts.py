@@ -364,7 +364,7 @@ class ContactTracker:
         self, weight: Floats, taxels: NDArray[np.intp], total: float
     ) -> list[float] | None:
         direction = weight @ self._normal[taxels]
-        length = float(np.linalg.norm(direction))
+        length = math.sqrt(direction.dot(direction))
         found: list[float] = (direction / length).tolist()
         return found if length > 1e-9 * total else None
 

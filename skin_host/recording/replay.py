@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import msgspec
 import numpy as np
 
-from skin_host.bus.logs import read_channels
+from skin_host.bus.logs import WINDOW_NS, read_channels
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import Settings, load, skin_hash
 from skin_host.errors import ConfigurationError, LogError, RequestError, SkinError, required
@@ -86,25 +86,37 @@ class EventLines:
         self._counts[key] += 1
         count = self._counts[key]
         if isinstance(event, TouchEvent):
-            return _line("touch", msgspec.to_builtins(touch_message(event, count)))
+            return _struct_line("touch", touch_message(event, count))
         kind = "slip" if isinstance(event, Slip) else "over"
-        return _line(kind, msgspec.to_builtins(msgspec.structs.replace(event, count=count)))
+        return _struct_line(kind, msgspec.structs.replace(event, count=count))
+
+
+def _struct_line(kind: str, message: msgspec.Struct) -> bytes:
+    # The message has keys of its own, so a comma follows the type.
+    return b'{"type":"%b",%b\n' % (kind.encode(), _encoder.encode(message)[1:])
 
 
 def _line(kind: str, keys: dict[str, Any]) -> bytes:
     return _encoder.encode({"type": kind} | keys) + b"\n"
 
 
-def read_buses(log: Path, settings: Settings) -> Iterator[tuple[str, FrameBatch]]:
+def read_buses(
+    log: Path, settings: Settings, window_ns: int = WINDOW_NS
+) -> Iterator[tuple[str, FrameBatch]]:
     """Yield batches of a recording with the name of the configured bus they belong to.
 
     With one bus in the configuration all frames belong to it, whatever the recording calls its
     channel. With several, channels go by name; others are ignored.
 
+    Args:
+        log: the recording.
+        settings: with its buses.
+        window_ns: a batch of a recording that is no MCAP spans at most this time.
+
     Raises:
         LogError: see `logs.read_channels`; or several buses, and none of their channels in it.
     """
-    channels = read_can(log) if log.suffix == SUFFIX else read_channels(log)
+    channels = read_can(log) if log.suffix == SUFFIX else read_channels(log, window_ns)
     if len(settings.buses) == 1:
         (only,) = settings.buses
         for _, batch in channels:
@@ -186,9 +198,17 @@ def replay(log: Path, engine: Engine) -> Iterator[Output]:
     Raises:
         LogError: the recording cannot be read, or ends with damage.
     """
-    for bus, batch in read_buses(log, engine.settings):
+    for bus, batch in read_buses(log, engine.settings, _window_ns(engine)):
         yield engine.feed(bus, batch)
     yield engine.flush()
+
+
+def _window_ns(engine: Engine) -> int:
+    """How long batches may be, for fewer of them: no board of an only bus sends twice in one."""
+    boards = [board.settings for board in engine.layout.boards]
+    if len(engine.settings.buses) > 1 or engine.fingertips is not None or not boards:
+        return WINDOW_NS
+    return max(WINDOW_NS, min(board.period_ms for board in boards) * 1_000_000 // 2)
 
 
 def steps(log: Path, engine: Engine) -> Iterator[Step]:

@@ -1,5 +1,6 @@
 """A real recording of a real hand, through the whole pipeline by the command line."""
 
+import io
 import json
 import subprocess
 import sys
@@ -9,6 +10,12 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
+
+from skin_host.bus.logs import WINDOW_NS
+from skin_host.config.settings import load
+from skin_host.layout import build_layout
+from skin_host.processing.core import Engine
+from skin_host.recording import replay as processing
 
 ROOT = Path(__file__).parents[2]
 LOG = ROOT / "../shared/data/icub_grasp.log"
@@ -60,6 +67,16 @@ def test_a_candump_log_is_replayed_without_what_it_does_not_need(tmp_path: Path)
     command += ["--output", str(tmp_path / "grasp.jsonl")]
     ran = subprocess.run(command, check=True, capture_output=True, text=True)
     assert ran.stdout.split() == []
+
+
+def test_how_many_frames_are_taken_at_once_changes_no_byte(output: bytes, monkeypatch) -> None:
+    monkeypatch.setattr(processing, "_window_ns", lambda engine: WINDOW_NS)
+    settings = load(ROOT / "config/icub_hand.toml")
+    layout = build_layout(settings, ROOT / "config")
+    found = processing.calibration_for(LOG, settings, layout, None, None)
+    lines = io.BytesIO()
+    processing.write_lines(LOG, Engine(settings, layout, [0], found), lines)
+    assert lines.getvalue() == output
 
 
 def test_every_recorded_byte_arrives_in_one_frame_a_sweep(frames, recorded):
