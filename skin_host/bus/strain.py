@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from skin_host.bus.commands import Analog, SetTransmissionPeriod, SetTxMode, command_frame, message
 from skin_host.bus.wire import HOST_ADDRESS, FrameBatch, MessageClass, identifier
@@ -120,21 +120,6 @@ def parse_strain(batch: FrameBatch) -> StrainFrames:
     )
 
 
-def encode_strain(
-    board: int, kind: StrainType, value: ArrayLike, *, overflow: int = 0
-) -> tuple[int, bytes]:
-    """Return one frame (identifier and payload) with three values in -32768..32767.
-
-    Raises:
-        ValueError: a value does not fit its word.
-    """
-    words = np.asarray(value, np.int64) + ZERO_WORD
-    if words.shape != (3,) or words.min() < 0 or words.max() > 0xFFFF:
-        raise ValueError(f"{value!r}: wanted three values in -32768..32767")
-    payload = words.astype("<u2").tobytes() + (bytes([overflow]) if overflow else b"")
-    return identifier(MessageClass.ANALOG_STREAM, board, kind), payload
-
-
 @dataclass(frozen=True, slots=True)
 class Wrench:
     """Force and torque of one sample. `t_ns` is the arrival of its later frame."""
@@ -182,12 +167,8 @@ class WrenchAssembler:
     counters: StrainCounters = field(default_factory=StrainCounters)
     _half: tuple[int, int, NDArray[np.int32], bool] | None = None
 
-    def add(self, batch: FrameBatch) -> list[Wrench]:
-        """Take a batch of the bus; return the samples that it completes."""
-        return self.take(parse_strain(batch), batch.t_ns)
-
     def take(self, frames: StrainFrames, t_ns_of: NDArray[np.int64]) -> list[Wrench]:
-        """As `add`, for frames that were picked out already and the batch's times [n]."""
+        """Take a batch's frames, and its times [n]; return the samples that they complete."""
         self.counters.wrong_length += frames.wrong_length
         mine = (frames.board == self.board) & (frames.type >= StrainType.FORCE)
         samples = []

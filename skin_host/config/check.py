@@ -5,8 +5,9 @@ mistakes are listed as warnings, with their path in the file.
 """
 
 import math
+from collections.abc import Sequence
 from itertools import combinations, groupby
-from typing import TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -213,8 +214,9 @@ def _part(number: int, layout: Layout) -> PartRecord:
 def _bus_warnings(buses: list[BusRecord], used: set[str]) -> list[str]:
     return (
         [
-            f"buses.{bus['name']}: skin frames take {_load(bus)} of the bus; wanted at most "
-            f"{WARN_LOAD:.0%}: raise period_ms of its boards, or move boards to another bus"
+            f"buses.{bus['name']}: skin frames take {_load(bus['load'])} of the bus; "
+            f"wanted at most {WARN_LOAD:.0%}: raise period_ms of its boards, or move boards to "
+            "another bus"
             for bus in buses
             if bus["load"][1] > WARN_LOAD
         ]
@@ -293,109 +295,70 @@ def _part_warnings(layout: Layout) -> list[str]:
     return warnings
 
 
+#: Tables for people: what their rows are, and the keys of a record that are shown.
+_TABLES = {
+    "bus": "name interface channel boards triangles frames_per_s load",
+    "board": "name bus address model skin_type period_ms triangles taxels parts",
+    "part": "name node boards triangles taxels thermal area_cm2",
+    "fingertip": "name node bus address period_ms shape array",
+}
+#: Heads that are not the key itself.
+_HEADS = {
+    "frames_per_s": "frames/s",
+    "skin_type": "type",
+    "period_ms": "period",
+    "area_cm2": "area",
+}
+
+
 def table(description: Description) -> str:
     """The description as text for a terminal, without a newline at its end."""
-    total = description["total"]
-    sections = [
-        f"robot {description['robot']}, configuration {description['configuration']}",
-        columns(
-            ["bus", "interface", "channel", ">boards", ">triangles", ">frames/s", ">load"],
-            [
-                [
-                    bus["name"],
-                    bus["interface"],
-                    bus["channel"],
-                    bus["boards"],
-                    bus["triangles"],
-                    f"{bus['frames_per_s']:.0f}",
-                    _load(bus),
-                ]
-                for bus in description["buses"]
-            ],
-        ),
-        columns(
-            [
-                "board",
-                "bus",
-                ">address",
-                "model",
-                ">type",
-                ">period",
-                "triangles",
-                ">taxels",
-                "parts",
-            ],
-            [
-                [
-                    board["name"],
-                    board["bus"],
-                    board["address"],
-                    board["model"],
-                    board["skin_type"],
-                    f"{board['period_ms']} ms",
-                    board["triangles"],
-                    board["taxels"],
-                    ", ".join(board["parts"]),
-                ]
-                for board in description["boards"]
-            ],
-        ),
-        columns(
-            ["part", "node", ">boards", ">triangles", ">taxels", ">thermal", ">area"],
-            [
-                [
-                    part["name"],
-                    part["node"],
-                    part["boards"],
-                    part["triangles"],
-                    part["taxels"],
-                    part["thermal"],
-                    f"{part['area_cm2']:.0f} cm²",
-                ]
-                for part in [
-                    *description["parts"],
-                    PartRecord(
-                        name="total",
-                        node="",
-                        boards=total["boards"],
-                        triangles=total["triangles"],
-                        taxels=total["taxels"],
-                        thermal=total["thermal"],
-                        area_cm2=total["area_cm2"],
-                    ),
-                ]
-            ],
-        ),
-    ]
-    if description["fingertips"]:
+    records: dict[str, list[Any]] = {
+        "bus": [*description["buses"]],
+        "board": [*description["boards"]],
+        "part": [*description["parts"], {"name": "total", "node": "", **description["total"]}],
+        "fingertip": [*description["fingertips"]],
+    }
+    sections = [f"robot {description['robot']}, configuration {description['configuration']}"]
+    for kind, shown in _TABLES.items():
+        if not records[kind]:
+            continue
+        keys, first = shown.split(), records[kind][0]
+        heads = [kind if key == "name" else _HEADS.get(key, key) for key in keys]
+        aligned = [
+            f">{head}" if isinstance(first[key], int | float | tuple) else head
+            for key, head in zip(keys, heads, strict=True)
+        ]
         sections.append(
-            columns(
-                ["fingertip", "node", "bus", ">address", ">period", "shape", "array"],
-                [
-                    [
-                        tip["name"],
-                        tip["node"],
-                        tip["bus"],
-                        tip["address"],
-                        f"{tip['period_ms']} ms",
-                        tip["shape"],
-                        tip["array"] or "-",
-                    ]
-                    for tip in description["fingertips"]
-                ],
-            )
+            columns(aligned, [[_cell(k, one[k]) for k in keys] for one in records[kind]])
         )
     if description["warnings"]:
         sections.append("\n".join(f"warning: {text}" for text in description["warnings"]))
     return "\n\n".join(sections)
 
 
-def _load(bus: BusRecord) -> str:
-    least, most = bus["load"]
+def _cell(key: str, value: Any) -> str:
+    match key:
+        case "frames_per_s":
+            return f"{value:.0f}"
+        case "area_cm2":
+            return f"{value:.0f} cm²"
+        case "load":
+            return _load(value)
+        case "period_ms":
+            return f"{value} ms"
+        case "parts":
+            return ", ".join(value)
+        case _:
+            return "-" if value is None else str(value)
+
+
+def _load(load: tuple[float, float]) -> str:
+    least, most = load
     return f"{100 * least:.0f} .. {100 * most:.0f} %"
 
 
-def columns(heads: list[str], rows: list[list[str | int]]) -> str:
+def columns(heads: list[str], rows: Sequence[Sequence[str | int]]) -> str:
     """Format columns as wide as their longest entry; a head that starts with > is right-aligned."""
     cells = [[head.removeprefix(">") for head in heads], *([str(x) for x in row] for row in rows)]
     widths = [max(len(row[column]) for row in cells) for column in range(len(heads))]

@@ -26,13 +26,13 @@ from skin_host.bus.strain import (
     GetFullScale,
     StrainMode,
     StrainType,
-    encode_strain,
     start_frames,
 )
 from skin_host.bus.wire import encode_sweep, status_word
 from skin_host.config.settings import changed, load
 from skin_host.errors import RequestError
 from skin_host.layout import build_layout
+from tests.support.strain import encode_strain
 
 CONFIG = Path(__file__).parents[2] / "config"
 

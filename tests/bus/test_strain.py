@@ -10,12 +10,12 @@ from skin_host.bus.strain import (
     StrainMode,
     StrainType,
     WrenchAssembler,
-    encode_strain,
     parse_full_scale,
     parse_strain,
     start_frames,
 )
 from skin_host.bus.wire import FrameBatch
+from tests.support.strain import encode_strain, samples_of
 
 MS = 1_000_000
 SCALE = np.array([2000.0, 2000, 1000, 40, 40, 20])
@@ -83,7 +83,7 @@ def test_other_answers_are_not_full_scales(can_id, payload):
 def test_no_traffic_on_the_bus_can_break_the_assembler(frames):
     batch = FrameBatch.of([(can_id, data, i * MS) for i, (can_id, data) in enumerate(frames)])
     assembler = WrenchAssembler(13, 10, SCALE)
-    for sample in assembler.add(batch):
+    for sample in samples_of(assembler, batch):
         assert np.isfinite(sample.force_n).all()
         assert (np.abs(sample.force_n) <= SCALE[:3]).all()
     strain = [
@@ -108,8 +108,9 @@ def stream(*entries):
 def test_force_and_torque_are_paired_in_either_order_and_scaled(order):
     assembler = WrenchAssembler(13, 10, SCALE)
     value = {"f": 0x4000, "t": -0x2000}
-    samples = assembler.add(
-        stream(*[(10 * i + 0.1 * k, o, value[o]) for i in range(3) for k, o in enumerate(order)])
+    samples = samples_of(
+        assembler,
+        stream(*[(10 * i + 0.1 * k, o, value[o]) for i in range(3) for k, o in enumerate(order)]),
     )
     assert len(samples) == 3
     assert samples[0].force_n[0] == 1000.0
@@ -120,10 +121,11 @@ def test_force_and_torque_are_paired_in_either_order_and_scaled(order):
 
 def test_a_lost_half_never_joins_two_samples():
     assembler = WrenchAssembler(13, 10, SCALE)
-    samples = assembler.add(
+    samples = samples_of(
+        assembler,
         stream(
             (0, "f", 1), (0.1, "t", 1), (10, "f", 2), (20.1, "t", 3), (30, "f", 4), (30.1, "t", 4)
-        )
+        ),
     )
     assert [s.force_n[0] / s.torque_nm[0] for s in samples] == [2000 / 40, 2000 / 40]
     assert assembler.counters.samples == 2
@@ -132,16 +134,16 @@ def test_a_lost_half_never_joins_two_samples():
 
 def test_pairs_may_be_split_over_batches_and_other_boards_are_not_mixed_in():
     assembler = WrenchAssembler(13, 10, SCALE)
-    assert assembler.add(stream((0, "f", 1))) == []
+    assert samples_of(assembler, stream((0, "f", 1))) == []
     other_id, payload = encode_strain(12, StrainType.TORQUE, (5, 5, 5))
-    assert assembler.add(FrameBatch.of([(other_id, payload, 50_000)])) == []
-    assert len(assembler.add(stream((0.1, "t", 1)))) == 1
+    assert samples_of(assembler, FrameBatch.of([(other_id, payload, 50_000)])) == []
+    assert len(samples_of(assembler, stream((0.1, "t", 1)))) == 1
 
 
 def test_saturation_is_told():
     assembler = WrenchAssembler(13, 10, SCALE)
-    samples = assembler.add(
-        stream((0, "f", 0x7FFF, 1), (0.1, "t", 0), (10, "f", 1, 0), (10.1, "t", 0))
+    samples = samples_of(
+        assembler, stream((0, "f", 0x7FFF, 1), (0.1, "t", 0), (10, "f", 1, 0), (10.1, "t", 0))
     )
     assert [sample.saturated for sample in samples] == [True, False]
     assert assembler.counters.saturated == 1

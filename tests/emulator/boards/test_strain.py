@@ -11,6 +11,7 @@ from skin_host.bus.strain import (
     parse_strain,
     start_frames,
 )
+from tests.support.strain import samples_of
 
 MS = 1_000_000
 LOAD = np.array([10.0, -20.0, 300.0, 0.5, -1.0, 2.0])
@@ -35,7 +36,9 @@ def test_the_host_reads_the_load_that_lies_on_the_board(torque_first):
     board, scale = started(torque_first=torque_first)
     assert scale.tolist() == [2000, 2000, 2000, 40, 40, 40]
     assembler = WrenchAssembler(13, 10, scale)
-    samples = [sample for t in range(0, 1008, 7) for sample in assembler.add(board.step(t * MS))]
+    samples = [
+        sample for t in range(0, 1008, 7) for sample in samples_of(assembler, board.step(t * MS))
+    ]
     assert len(samples) == 100
     assert assembler.counters.lone == 0
     force = np.mean([sample.force_n for sample in samples], axis=0)
