@@ -17,7 +17,7 @@ import msgspec
 
 from skin_host.errors import RequestError
 
-MAGIC = b"skin-emulator-state/3\n"
+MAGIC = b"skin-emulator-state/4\n"
 DIGEST_BYTES = 32
 #: More than a robot of 100 000 taxels needs.
 MOST_BYTES = 2_000_000_000

@@ -78,8 +78,9 @@ class SignalSkin:
         #: By the numbers of chips that are read together: the start, the stages and the time of a
         #: stage that all of them have, or None.
         self._pace_of: dict[bytes, tuple[int, int, int] | None] = {}
-        #: The chip whose registers were read last, and when.
-        self._settled: tuple[int, int] | None = None
+        #: The chips whose registers were read last, and when.
+        self._settled: set[int] = set()
+        self._settled_ns = 0
 
     def set_capacitance_ff(self, chips: Ints, values: Floats) -> None:
         """Change the inputs of some chips from now on: float64[k, 12] (fF).
@@ -208,9 +209,12 @@ class SignalSkin:
         if reg.CDC_RESULT <= address < reg.DEVICE_ID:
             if self.forced[chip] >= 0:
                 return int(self.forced[chip])
-            if self._settled != (chip, self.t_ns):
+            if self._settled_ns != self.t_ns:
+                self._settled.clear()
+                self._settled_ns = self.t_ns
+            if chip not in self._settled:
                 self._settle(np.array([chip]))
-                self._settled = chip, self.t_ns
+                self._settled.add(chip)
             return int(self._results[chip, address - reg.CDC_RESULT])
         if reg.BANK_2 <= address < reg.BANK_3:
             return int(self._bank_2[chip][divmod(address - reg.BANK_2, reg.STAGE_WORDS)])

@@ -283,3 +283,57 @@ class TestFaults:
         assert read_bus(bus, 0x2C, 0x000, 10) == b"\0\0\0\0\x0f\xf0\x01\x64\xff\xff"
         assert read_bus(bus, 0x2C, 0x00B, 24) == bytes(24)
         assert read_bus(bus, 0x2C, 0x081) == b"\x00\x01"
+
+
+def _bit_by_bit(out: int, lines: int, half_ns: int) -> None:
+    """In place of `I2cWire.clock_byte`: each byte goes clock by clock."""
+
+
+class TestWholeBytes:
+    """Bytes that are clocked at once are those that are clocked bit by bit."""
+
+    def everything(self, seed: int, *, at_once: bool) -> list[object]:
+        """What comes of random faults and messages on three lines, with all states on the way."""
+        rng = np.random.default_rng(seed)
+        wire = wire_of(4, 2, 0)
+        if not at_once:
+            wire.clock_byte = _bit_by_bit  # type: ignore[method-assign]
+        seen: list[object] = []
+        for _ in range(12):
+            line = wire.lines[rng.integers(3)]
+            address = 0x2C + int(rng.integers(4))
+            match rng.integers(9):
+                case 0:
+                    line.refuse(address, int(rng.integers(4)))
+                case 1:
+                    line.refuse(address, None)
+                case 2:
+                    line.share(address, marked(0x55) if rng.random() < 0.5 else None)
+                case 3:
+                    line.hold(int(rng.choice([0, 3, 20, FOR_EVER])))
+                case 4:
+                    line.flip(float(rng.choice([0.0, 0.002, 0.05])))
+                case 5:
+                    line.rise_slowly(int(rng.choice([0, 1, 3, 7])))
+                case 6:
+                    line.slip(int(rng.integers(3)))
+                case 7:
+                    line.stretch(address, None if rng.random() < 0.6 else 3000)
+            master = BitMaster(wire, int(rng.integers(1, 8)))
+            chip = 0x2C + int(rng.integers(4))
+            data = rng.integers(0, 256, 2 * rng.integers(3)).tolist()
+            seen.append(put(master, chip << 1, 0x00, 0x80, *data))
+            if rng.random() < 0.7:
+                seen.append(put(master, chip << 1 | 1))
+                n = int(rng.integers(1, 8))
+                seen += [master.get(acknowledge=at < n - 1) for at in range(n)]
+            if rng.random() < 0.9:
+                master.stop()
+            seen += [wire.t_ns, wire.sda]
+            for one in wire.lines:
+                seen.append((one.level, one.seen, one.asleep, one.faulty))
+        return seen
+
+    @pytest.mark.parametrize("seed", range(60))
+    def test_they_give_the_same_whatever_goes_wrong(self, seed: int) -> None:
+        assert self.everything(seed, at_once=True) == self.everything(seed, at_once=False)
