@@ -250,22 +250,22 @@ class DataLine:
         return (
             (self._count == 0 or self._state is _State.IDLE)
             and self._held_clocks <= 0
-            and not self._stretched_ns
             and (not self._flip_share or self._until_flip > CLOCKS_OF_A_BYTE)
         )
 
-    def clock_byte(self, out: int) -> int:
+    def clock_byte(self, out: int) -> tuple[int, int]:
         """Do what `drive`, `rise` and `fall` do in the nine clocks of a byte.
 
         Args:
             out: what the master outputs, nine bits.
 
         Returns:
-            The nine bits that were sampled.
+            The nine bits that were sampled; and for how long a chip holds the clock then, ns.
         """
         if self.asleep and out == _RELEASED:
-            return out
+            return out, 0
         self.asleep = False
+        held_ns = 0
         if self._flip_share:
             self._until_flip -= CLOCKS_OF_A_BYTE
         # Held for ever: nobody sees a 1.
@@ -278,7 +278,7 @@ class DataLine:
             taken = byte << 1 | self._sample(free & 1, 1)
             self._acknowledged = not taken & 1
             self._count = CLOCKS_OF_A_BYTE
-            self._send()
+            held_ns = self._send()
         else:
             self._byte = byte = self._sample(free >> 1, 8)
             self._count = 8
@@ -286,13 +286,13 @@ class DataLine:
             if self._state is _State.LISTENING:
                 taken = byte << 1 | self._sample(0, 1)
                 self._count = CLOCKS_OF_A_BYTE
-                self._listen()
+                held_ns = self._listen()
             else:
                 taken = byte << 1 | self._sample(free & 1, 1)
                 self.asleep = self.seen and not self.faulty
         self._master = bool(out & 1)
         self._settle(clock=False)
-        return taken
+        return taken, held_ns
 
     def _sample(self, levels: int, n: int) -> int:
         """The bits that are sampled of a line with these levels, where none is flipped."""
@@ -452,10 +452,12 @@ class I2cWire:
         self.t_ns += 2 * CLOCKS_OF_A_BYTE * half_ns
         self._released = False
         self._levels = -1 if out & 1 else ~lines
-        return [
+        taken = [
             line.clock_byte(out if lines >> number & 1 else _RELEASED)
             for number, line in enumerate(self.lines)
         ]
+        self._held_until_ns = self.t_ns + max(held_ns for _, held_ns in taken)
+        return [bits for bits, _ in taken]
 
     def set_sda(self, levels: int) -> None:
         """Release data lines (1) or hold them low (0)."""

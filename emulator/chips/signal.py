@@ -6,6 +6,7 @@ is first read. Given the same capacitances at the same times and the same genera
 kinds of chip answer the same words.
 """
 
+from bisect import bisect_left
 from collections.abc import Iterable
 
 import numpy as np
@@ -71,10 +72,13 @@ class SignalSkin:
         self._results = np.zeros((n, reg.N_STAGES), np.uint16)
         #: When the pass began that last converted each stage.
         self._began_ns = np.zeros((n, reg.N_STAGES), np.int64)
-        #: Chips whose inputs have changed, when, and to what, since they were last worked out.
+        #: Chips whose inputs have changed, when, and to what, since they were last worked out; and
+        #: where in `_changed` each of them is.
         self._changed = np.zeros(0, np.intp)
         self._is_changed = np.zeros(n, np.bool_)
-        self._changes: list[tuple[int, Floats]] = []
+        self._place = np.zeros(n, np.intp)
+        self._changed_ns: list[int] = []
+        self._changes: list[Floats] = []
         #: By the numbers of chips that are read together: the start, the stages and the time of a
         #: stage that all of them have, or None.
         self._pace_of: dict[bytes, tuple[int, int, int] | None] = {}
@@ -96,19 +100,21 @@ class SignalSkin:
                 return
             self._changed = chips
             self._is_changed[chips] = True
-        self._changes.append((self.t_ns, values.copy()))
+            self._place[chips] = np.arange(len(chips))
+        self._changed_ns.append(self.t_ns)
+        self._changes.append(values.copy())
 
     def _work_out(self) -> None:
         """Take what was converted while the inputs changed."""
         if self._changes:
             chips = self._changed
-            times_ns, values = zip(*self._changes, strict=True)
-            ideals = self._ideal_of(chips, np.stack(values))
+            ideals = self._ideal_of(chips, np.stack(self._changes))
             ideals = np.concatenate([self._ideal[chips][None], ideals])
-            self._take(chips, np.array(times_ns), ideals)
-            self._capacitance_ff[chips, :TAXELS] = values[-1]
+            self._take(chips, np.array(self._changed_ns), ideals)
+            self._capacitance_ff[chips, :TAXELS] = self._changes[-1]
             self._ideal[chips] = ideals[-1]
             self._changes = []
+            self._changed_ns = []
         self._is_changed[self._changed] = False
         self._changed = np.zeros(0, np.intp)
 
@@ -236,11 +242,13 @@ class SignalSkin:
 
     def _settle(self, chips: Ints) -> None:
         """Store the results of the conversions that have ended, with their noise."""
-        # What has changed at other chips can wait, for more of it.
-        if self._is_changed[chips].any():
-            self._work_out()
-        elif self._settle_in_step(chips):
+        changed = self._is_changed[chips]
+        is_changed = bool(changed.any())
+        if self._settle_in_step(chips, changed if is_changed else None):
             return
+        # What has changed at other chips can wait, for more of it.
+        if is_changed:
+            self._work_out()
         self._take(chips)
         fresh = self._unseen[chips].any(axis=1)
         if not fresh.any():
@@ -258,8 +266,12 @@ class SignalSkin:
         )
         self._unseen[rows] = False
 
-    def _settle_in_step(self, chips: Ints) -> bool:
+    def _settle_in_step(self, chips: Ints, changed: NDArray[np.bool_] | None) -> bool:
         """Do the same for chips that convert in step, and all of whose stages are new.
+
+        Args:
+            chips: which ones.
+            changed: bool[k], those of them whose inputs have changed; None if none have.
 
         Returns whether they are; otherwise nothing was done.
         """
@@ -274,10 +286,16 @@ class SignalSkin:
             return False
         self._taken[chips] = ended
         rows = self._rows(chips)
+        began_ns = start_ns + sequences * stages * stage_ns
+        before_ns = began_ns - stages * stage_ns
         codes = self._ideal[rows]
+        if changed is not None:
+            ended_ns = np.where(done > _STAGES, began_ns, before_ns) + (_STAGES + 1) * stage_ns
+            mine = np.flatnonzero(changed)
+            if isinstance(rows, slice):
+                codes = codes.copy()
+            codes[mine] = self._ideal_at(chips[mine], ended_ns)
         if self._noise is not None:
-            began_ns = start_ns + sequences * stages * stage_ns
-            before_ns = began_ns - stages * stage_ns
             noise = self._noise.in_step(rows, began_ns if done else before_ns, before_ns, done)
             noise *= self._sigma[rows]
             noise += codes
@@ -350,6 +368,26 @@ class SignalSkin:
             self._clean[chips] = np.where(done, ideal, self._clean[chips])
             self._began_ns[chips] = np.where(done, began_ns, self._began_ns[chips])
             self._unseen[chips] |= done
+
+    def _ideal_at(self, chips: Ints, ended_ns: NDArray[np.int64]) -> Floats:
+        """What changed chips converted in stages that ended then, int64[12]: float64[k, 12]."""
+        times_ns = self._changed_ns
+        # Those in force at all of these times: the last one before, and those amid them.
+        first = max(0, bisect_left(times_ns, int(ended_ns.min())) - 1)
+        last = bisect_left(times_ns, int(ended_ns.max()))
+        if not last:
+            return self._ideal[chips]
+        place = self._place[chips]
+        ideals = self._ideal_of(
+            chips, np.stack([values[place] for values in self._changes[first:last]])
+        )
+        in_force = np.searchsorted(times_ns[first:last], ended_ns)
+        if len(ideals) == 1 and in_force.all():
+            only: Floats = ideals[0]
+            return only
+        ideals = np.concatenate([self._ideal[chips][None], ideals])
+        at: Floats = ideals[in_force, np.arange(len(chips))[:, None], _STAGES]
+        return at
 
     def _ideal_of(self, chips: Ints, values: Floats) -> Floats:
         """What plain chips convert such inputs to."""
