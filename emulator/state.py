@@ -16,6 +16,7 @@ from typing import Any
 import msgspec
 
 from skin_host.errors import RequestError
+from skin_host.files import read_whole
 
 MAGIC = b"skin-emulator-state/4\n"
 DIGEST_BYTES = 32
@@ -120,9 +121,7 @@ def read(path: Path) -> bytes:
         StateError: the file cannot be read, or is too large.
     """
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise StateError(f"larger than {MOST_BYTES // 1_000_000} MB")
-        return path.read_bytes()
+        return read_whole(path, MOST_BYTES)
     except OSError as error:
         raise StateError(f"cannot be read: {error.strerror}") from None
 

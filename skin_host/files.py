@@ -1,8 +1,10 @@
-"""Writes files completely or not at all, and checks the schema of files that are read."""
+"""Writes files completely or not at all; reads files of limited size, and checks their schema."""
 
 import contextlib
+import errno
 import logging
 import os
+import stat
 import tempfile
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
@@ -25,10 +27,49 @@ class _WithSchema(Protocol):
 
 
 T = TypeVar("T", bound=_WithSchema)
+_PIECE_BYTES = 1 << 20
 
 
 class _Head(msgspec.Struct):
     schema: str = ""
+
+
+def read_whole(path: Path, most_bytes: int = MAX_DOCUMENT_BYTES) -> bytes:
+    """Read a file that somebody names, whatever it is: a device without end, a pipe, a file that
+    grows.
+
+    A named pipe that nobody has open for writing is refused, not waited for.
+
+    Args:
+        path: of the file.
+        most_bytes: the largest size of a regular file; of anything else not more than
+            `MAX_DOCUMENT_BYTES` are read.
+
+    Raises:
+        OSError: the file cannot be read, or is larger; `strerror` is the reason.
+    """
+
+    def at_once(name: str, flags: int) -> int:
+        return os.open(name, flags | os.O_NONBLOCK)
+
+    try:
+        file = open(path, "rb", opener=at_once)  # noqa: SIM115
+    except ValueError as error:  # a zero byte in the name
+        raise OSError(errno.EINVAL, str(error), str(path)) from None
+    with file:
+        os.set_blocking(file.fileno(), True)
+        mode = os.fstat(file.fileno()).st_mode
+        if not stat.S_ISREG(mode):
+            most_bytes = min(most_bytes, MAX_DOCUMENT_BYTES)
+        pieces, left = [], most_bytes + 1
+        while left and (piece := file.read(min(left, _PIECE_BYTES))):
+            pieces.append(piece)
+            left -= len(piece)
+    if stat.S_ISFIFO(mode) and not pieces:
+        raise OSError(errno.ENODATA, "a pipe that nobody writes to", str(path))
+    if not left:
+        raise OSError(errno.EFBIG, f"larger than {most_bytes} bytes", str(path))
+    return b"".join(pieces)
 
 
 def read_document(
@@ -49,12 +90,9 @@ def read_document(
         Exception: result of `wrong`, if the file is unreadable, damaged or of another schema.
     """
     try:
-        with path.open("rb") as file:
-            data = file.read(MAX_DOCUMENT_BYTES + 1)
+        data = read_whole(path)
     except OSError as error:
         raise wrong(f"cannot be read: {error.strerror}") from None
-    if len(data) > MAX_DOCUMENT_BYTES:
-        raise wrong(f"not a {what} file: it has more than {MAX_DOCUMENT_BYTES} bytes")
     _refuse_newer(path, data, schema, what)
     try:
         found = msgspec.json.decode(data, type=kind)
@@ -82,8 +120,7 @@ def refuse_newer(path: Path, schema: str, what: str) -> None:
         NewerFileError: `path` is such a file.
     """
     try:
-        with path.open("rb") as file:
-            data = file.read(MAX_DOCUMENT_BYTES + 1)
+        data = read_whole(path)
     except OSError:
         return
     _refuse_newer(path, data, schema, what)

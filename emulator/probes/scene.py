@@ -6,6 +6,7 @@ was recorded. Places are mm in the part's own frame, or a triangle's
 centre, or a taxel. `docs/scenes.md` explains every key.
 """
 
+import io
 import zipfile
 from bisect import bisect_right
 from collections.abc import Sequence
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from skin_host.config.settings import read_toml
 from skin_host.errors import ConfigurationError
+from skin_host.files import read_whole
 from skin_host.layout import TAXELS_PER_TRIANGLE, Layout
 
 Seconds = Annotated[float, Meta(ge=0)]
@@ -438,9 +440,8 @@ def read_air(path: Path) -> list[tuple[float, float]]:
         ConfigurationError: unreadable, or not such a course.
     """
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise ConfigurationError(f"{path}: larger than {MOST_BYTES // 1_000_000} MB")
-        times_s, kpa = _npz(path) if path.suffix == ".npz" else _csv(path)
+        data = io.BytesIO(read_whole(path, MOST_BYTES))
+        times_s, kpa = _npz(data) if path.suffix == ".npz" else _csv(data)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         reason = str(error).splitlines()[0]
         raise ConfigurationError(
@@ -457,8 +458,8 @@ def read_air(path: Path) -> list[tuple[float, float]]:
     return list(zip((times_s - times_s[0]).tolist(), kpa.tolist(), strict=True))
 
 
-def _npz(path: Path) -> tuple[Floats, Floats]:
-    with np.load(path, allow_pickle=False) as arrays:
+def _npz(data: io.BytesIO) -> tuple[Floats, Floats]:
+    with np.load(data, allow_pickle=False) as arrays:
         times_s, kpa = (np.asarray(arrays[name], np.float64) for name in ("t_s", "pressure_kpa"))
     if times_s.ndim != 1 or kpa.ndim != 1:
         raise ValueError("t_s or pressure_kpa is no row of numbers")
@@ -466,8 +467,8 @@ def _npz(path: Path) -> tuple[Floats, Floats]:
     return times_s[:n], kpa[:n]
 
 
-def _csv(path: Path) -> tuple[Floats, Floats]:
-    with path.open(encoding="utf-8") as file:
+def _csv(data: io.BytesIO) -> tuple[Floats, Floats]:
+    with io.TextIOWrapper(data, encoding="utf-8") as file:
         head = file.readline(200).strip()
         if head != "time_s,pressure_kpa":
             raise ValueError(f'begins with "{head[:40]}"')

@@ -369,16 +369,43 @@ def _blocks(path: Path) -> Generator[Block, None, None]:
         yield from _messages(path)
 
 
+class _Lines(io.TextIOWrapper):
+    """A text whose lines have a limited length."""
+
+    def __next__(self) -> str:  # type: ignore[override]
+        line = self.readline()
+        if not line:
+            raise StopIteration
+        return line
+
+    def readline(self, size: int | None = -1, /) -> str:  # type: ignore[override]
+        line = super().readline(_LONGEST_LINE)
+        if len(line) == _LONGEST_LINE:
+            raise ValueError(f"a line of more than {_LONGEST_LINE} characters")
+        return line
+
+
+def _reader(path: Path) -> "can.io.generic.MessageReader":
+    """python-can's reader, which would read a line of any length."""
+    import can
+
+    zipped = path.suffix.lower() == ".gz"
+    kind = can.io.player.MESSAGE_READERS[path.suffixes[-2 if zipped else -1].lower()]
+    if not issubclass(kind, can.io.generic.TextIOMessageReader):
+        return can.LogReader(path)
+    file = gzip.open(path) if zipped else path.open("rb")  # noqa: SIM115  # the reader closes it
+    return kind(_Lines(cast(BinaryIO, file), errors="strict"))
+
+
 def _messages(path: Path) -> Iterator[Block]:
     """The same by python-can's readers."""
-    import can
 
     names: list[str] = []
     frames: list[tuple[str, Frame]] = []
     n = 0
     damage: Exception | None = None
     try:
-        with can.LogReader(path) as reader:
+        with _reader(path) as reader:
             for message in reader:
                 n += 1
                 frame = _frame(message)
@@ -410,6 +437,8 @@ def _check(path: Path, suffixes: list[str]) -> None:
         if not any(suffix in known for suffix in suffixes[-2:]):
             raise LogError(f"{path}: unknown format of file name; known are {', '.join(known)}")
     try:
+        if path.is_fifo():  # which would be waited for
+            raise LogError(f"{path}: not a file; wanted a recording")
         with path.open("rb"):
             pass
     except OSError as error:

@@ -19,6 +19,7 @@ from skin_host.config.fields import Name, NotNegative, Positive
 from skin_host.config.fingertips import Fingertip as Fingertip  # noqa: PLC0414 (for others too)
 from skin_host.config.relaxation import RelaxationSettings, with_file, wrong_parameters
 from skin_host.errors import ConfigurationError, RequestError
+from skin_host.files import read_whole
 
 Byte = Annotated[int, Meta(ge=0, le=255)]
 T = TypeVar("T", bound=Struct)
@@ -276,7 +277,7 @@ def read_toml(path: Path, table: type[T], named: Named) -> T:
         ConfigurationError: unreadable, not TOML, or wrong; the message names file and key.
     """
     try:
-        data = path.read_bytes()
+        data = read_whole(path)
     except OSError as error:
         raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from None
     try:
@@ -422,7 +423,7 @@ def load_running(path: Path) -> Settings:
         RequestError: it is absent or damaged.
     """
     try:
-        return msgspec.json.decode(path.read_bytes(), type=Settings)
+        return msgspec.json.decode(read_whole(path), type=Settings)
     except OSError as error:
         raise RequestError(
             f"{path}: {error.strerror}; a daemon that runs under systemd writes it"

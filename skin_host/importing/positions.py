@@ -27,6 +27,7 @@ from skin_host.config.settings import (
     parse_triangles,
 )
 from skin_host.errors import ConfigurationError
+from skin_host.files import read_whole
 from skin_host.importing.report import Findings
 from skin_host.layout import TAXELS_PER_TRIANGLE, builtin_kinds
 from skin_host.layout.geometry import fit_unit
@@ -65,7 +66,7 @@ def read_table(path: Path, findings: Findings) -> Table:
         ConfigurationError: it cannot be read or holds no rows.
     """
     try:
-        text = path.read_bytes()[:LARGEST_FILE].decode("utf-8", errors="replace")
+        text = read_whole(path, LARGEST_FILE).decode("utf-8", errors="replace")
     except OSError as error:
         raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from None
     rows: list[list[float]] = []

@@ -24,6 +24,7 @@ from skin_host.config.settings import (
     parse_triangles,
 )
 from skin_host.errors import ConfigurationError
+from skin_host.files import read_whole
 from skin_host.importing.report import Findings
 from skin_host.layout import TAXELS_PER_TRIANGLE, builtin_kinds
 
@@ -93,7 +94,7 @@ def read_display(path: Path, findings: Findings) -> Display:
         ConfigurationError: it cannot be read, or places nothing.
     """
     try:
-        text = path.read_bytes()[:LARGEST_FILE].decode("utf-8", errors="replace")
+        text = read_whole(path, LARGEST_FILE).decode("utf-8", errors="replace")
     except OSError as error:
         raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from None
     keys: dict[str, list[str]] = {}

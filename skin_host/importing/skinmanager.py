@@ -7,6 +7,7 @@ import msgspec
 
 from skin_host.config.settings import Settings
 from skin_host.errors import ConfigurationError
+from skin_host.files import read_whole
 from skin_host.importing.report import Findings
 
 LARGEST_FILE = 1_000_000
@@ -83,7 +84,7 @@ def _entries(file: Path, findings: Findings) -> list[tuple[int, str, list[str]]]
     robot's own reader ends the list. Here it ends with its parenthesis.
     """
     try:
-        text = file.read_bytes()[:LARGEST_FILE].decode("utf-8", errors="replace")
+        text = read_whole(file, LARGEST_FILE).decode("utf-8", errors="replace")
     except OSError as error:
         raise ConfigurationError(f"{file}: cannot be read: {error.strerror}") from None
     entries: list[tuple[int, str, list[str]]] = []

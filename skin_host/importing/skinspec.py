@@ -21,6 +21,7 @@ import msgspec
 from skin_host.config.check import format_triangles
 from skin_host.config.settings import Board, Bus, Part, Patch, Settings
 from skin_host.errors import ConfigurationError
+from skin_host.files import read_whole
 from skin_host.importing.report import Findings
 
 #: The robot's own hosts ignore special sets beyond these numbers, with only a warning.
@@ -75,11 +76,9 @@ class Document:
 
     def _read(self) -> None:
         try:
-            data = self.path.read_bytes()[: LARGEST_FILE + 1]
+            data = read_whole(self.path, LARGEST_FILE)
         except OSError as error:
             raise ConfigurationError(f"{self.path}: cannot be read: {error.strerror}") from None
-        if len(data) > LARGEST_FILE:
-            raise ConfigurationError(f"{self.path}: larger than {LARGEST_FILE} bytes")
         text = self._without_comments(data.decode("utf-8", errors="replace"))
         # The text is already decoded, so it must not name another encoding.
         text = re.sub(r"^\s*<\?xml[^>]*\?>", "", text)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal
 from urllib.parse import SplitResult, unquote, urlsplit
 
 from skin_host.errors import ConfigurationError, RequestError
+from skin_host.files import read_whole
 
 if TYPE_CHECKING:
     from skin_host.config.settings import Mqtt
@@ -148,7 +149,7 @@ def _from_environment(parts: SplitResult) -> str | None:
     if file is None:
         return os.environ.get("SKIN_MQTT_PASSWORD")
     try:
-        return Path(file).read_text(encoding="utf-8").rstrip("\r\n")
+        return read_whole(Path(file)).decode().rstrip("\r\n")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8"
         raise RequestError(f"SKIN_MQTT_PASSWORD_FILE: {file}: {reason}") from None
@@ -167,7 +168,7 @@ def _password(settings: "Mqtt", folder: Path) -> str | None:
         if not path.exists():
             return None
     try:
-        password = path.read_text(encoding="utf-8").rstrip("\r\n")
+        password = read_whole(path).decode().rstrip("\r\n")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8"
         raise CredentialError(f"mqtt.password_file: {path}: {reason}") from None

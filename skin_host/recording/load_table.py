@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.errors import RequestError
+from skin_host.files import read_whole
 
 Floats = NDArray[np.float64]
 
@@ -34,12 +35,7 @@ def read_table(path: Path) -> tuple[Floats, Floats]:
         RequestError: unreadable, or not such a table; the message names file and line.
     """
     try:
-        size = path.stat().st_size
-        if size > LARGEST_BYTES:
-            raise RequestError(
-                f"{path}: {size / 1e6:.0f} MB, at most {LARGEST_BYTES / 1e6:.0f}; {WANTED}"
-            )
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = read_whole(path, LARGEST_BYTES).decode().splitlines()
     except OSError as error:
         raise RequestError(f"{path}: {error.strerror}; {WANTED}") from None
     except UnicodeDecodeError:

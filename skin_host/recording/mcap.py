@@ -257,6 +257,8 @@ def _messages(path: Path) -> Iterator[tuple[str, int, bytes]]:
     """(topic, time, data) of every message, in order of time."""
     reader = _mcap("mcap.reader")
     try:
+        if path.is_fifo():  # which would be waited for
+            raise LogError(f"{path}: not a file; wanted a recording")
         file = path.open("rb")
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from None

@@ -1,5 +1,6 @@
 """Hostile files and arguments end in one line and exit status 2 or 1, never in a traceback."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -7,6 +8,7 @@ import pytest
 from skin_host.cli import main
 from skin_host.daemon import metrics
 from skin_host.errors import RequestError, SkinError
+from skin_host.files import read_whole
 from skin_host.mqtt.address import Broker
 from skin_host.recording.capture import MAX_RECORDINGS, FrameRecorder
 
@@ -76,3 +78,51 @@ def test_metrics_are_in_seconds_not_negative_and_name_faults() -> None:
     text = metrics.exposition({"palm": record})  # type: ignore[dict-item]
     assert 'skin_age_seconds{part="palm"} 0\n' in text
     assert 'skin_fault{part="palm",code="board_silent",where="hand"} 1\n' in text
+
+
+#: How each command reads a file that somebody names.
+READERS = {
+    "x.toml": ["check", "{}"],
+    "running.json": ["check", str(CONFIG), "--running", "{}"],
+    "scene.toml": ["emulate", str(CONFIG), "--scene", "{}"],
+    "state": ["emulate", str(CONFIG), "--state", "{}"],
+    "x.log": ["replay", "{}", "--config", str(CONFIG)],
+    "x.asc": ["replay", "{}", "--config", str(CONFIG)],
+    "x.mcap": ["export", "{}", "x.npz"],
+    "skin.xml": ["import", "skinspec", "{}", "--output", "x.toml"],
+    "skin.ini": ["import", "skingui", "{}", "--output", "x.toml"],
+    "places.txt": ["import", "positions", "{}", "--output", "x.toml"],
+}
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("name", READERS)
+def test_a_pipe_that_nobody_writes_to_is_not_waited_for(
+    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    os.mkfifo(tmp_path / name)
+    arguments = [one.replace("{}", str(tmp_path / name)) for one in READERS[name]]
+    assert main(arguments) in (1, 2)
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("name", READERS)
+def test_a_file_of_a_terabyte_is_refused_before_it_fills_the_memory(
+    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with (tmp_path / name).open("wb") as file:
+        file.truncate(1 << 40)
+    arguments = [one.replace("{}", str(tmp_path / name)) for one in READERS[name]]
+    assert main(arguments) in (1, 2)
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_a_device_without_end_is_not_read_to_its_end(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", "/dev/zero"]) == 2
+    assert "/dev/zero: cannot be read: larger than" in capsys.readouterr().err
+
+
+def test_a_name_with_a_zero_byte_is_a_file_that_cannot_be_read() -> None:
+    with pytest.raises(OSError, match="null byte"):
+        read_whole(Path("a\0b"))
