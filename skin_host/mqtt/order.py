@@ -23,6 +23,8 @@ STAMP = "stamp"
 RUN = "run"
 #: Longer numbers are not nanoseconds.
 _MAX_DIGITS = 19
+#: A run that comes after a later one than this would have a longer number.
+_LAST_RUN = 10**_MAX_DIGITS - 10**9
 
 
 class Stamp(NamedTuple):
@@ -70,8 +72,11 @@ class Numbers:
         return Stamp(self.connection, self._message)
 
     def overtake(self, stamp: Stamp) -> bool:
-        """Begin a run that is newer than one that left a message, if that one looks newer."""
-        if stamp.connection <= self.connection:
+        """Begin a run that is newer than one that left a message, if that one looks newer.
+
+        A forged number that leaves no room above it is not followed: nobody could read ours.
+        """
+        if not self.connection < stamp.connection < _LAST_RUN:
             return False
         self._last = max(self._last, stamp.connection)
         self.run = self._next()

@@ -17,8 +17,9 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 from msgspec import Meta, Struct
 from websockets.asyncio.server import Server, ServerConnection, serve
-from websockets.datastructures import Headers
+from websockets.datastructures import Headers, MultipleValuesError
 from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 
 from skin_host.client import SkinClient, Stream
@@ -34,6 +35,10 @@ NODES_S = 0.25
 RETRY_S = 2.0
 MAX_PAGES = 32
 MAX_REQUEST_BYTES = 4096
+#: A page sends each request as one; pieces without bytes could go on for ever.
+MAX_PIECES = 16
+#: Of any kind: a page takes two or three, and only for a moment more than one.
+MAX_CONNECTIONS = 256
 #: A page's requests that are carried out at a time.
 MAX_WISHES = 8
 #: The longest calibration that a page waits for, and the timeout of other commands.
@@ -72,6 +77,15 @@ class _Wish(Struct, forbid_unknown_fields=True):
     part: str | None = None
     text: Annotated[str, Meta(max_length=200)] = ""
     ago_s: Annotated[float, Meta(ge=0.0, le=MAX_AGO_S)] = 0.0
+
+
+class _Visit(ServerConnection):
+    """A connection; of too many the last are closed before anything is read."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        if len(self.server.handlers) > MAX_CONNECTIONS:
+            self.transport.abort()
 
 
 class Viewer:
@@ -124,6 +138,7 @@ class Viewer:
                 max_size=MAX_REQUEST_BYTES,
                 compression=None,
                 server_header=None,
+                create_connection=_Visit,
             )
         except (OSError, OverflowError) as error:
             number = error.errno if isinstance(error, OSError) else None
@@ -155,13 +170,17 @@ class Viewer:
 
     def _answer(self, request: Request, *, local: bool) -> Response | None:
         """Answer a request for a file; None lets a page's WebSocket through."""
-        host = request.headers.get("Host", "")
+        try:
+            host = request.headers.get("Host", "")
+            origin = request.headers.get("Origin")
+        except MultipleValuesError:
+            return _response(HTTPStatus.BAD_REQUEST, "text/plain", b"two hosts or origins\n")
         if local and host.rpartition(":")[0].strip("[]") not in LOOPBACK:
             # A page from another host whose name was made to point at this machine.
             return _response(HTTPStatus.FORBIDDEN, "text/plain", b"not served under this name\n")
         path = request.path.partition("?")[0]
         if path == "/live":
-            if request.headers.get("Origin") not in (f"http://{host}", f"https://{host}"):
+            if origin not in (f"http://{host}", f"https://{host}"):
                 return _response(HTTPStatus.FORBIDDEN, "text/plain", b"not from our own page\n")
             if self._pages >= MAX_PAGES:
                 return _response(HTTPStatus.SERVICE_UNAVAILABLE, "text/plain", b"too many pages\n")
@@ -177,7 +196,7 @@ class Viewer:
         telling = asyncio.create_task(self._tell(page))
         wishes: set[asyncio.Task[None]] = set()
         try:
-            async for message in page:
+            async for message in _messages(page):
                 # A mark does not wait for a calibration.
                 wishes.add(wish := asyncio.create_task(self._take_wish(page, message)))
                 wish.add_done_callback(wishes.discard)
@@ -202,7 +221,7 @@ class Viewer:
             due_s = max(due_s + TICK_S, now_s())
             await asyncio.sleep(due_s - now_s())
 
-    async def _take_wish(self, page: ServerConnection, message: str | bytes) -> None:
+    async def _take_wish(self, page: ServerConnection, message: bytes) -> None:
         answer: dict[str, Any] = {"type": "answer"}
         try:
             wish = msgspec.json.decode(message, type=_Wish)
@@ -277,6 +296,18 @@ class Viewer:
                 "recording": self._recording.state,
             }
         )
+
+
+async def _messages(page: ServerConnection) -> AsyncIterator[bytes]:
+    """What a page sends, until it closes or sends a message in too many pieces."""
+    while True:
+        pieces: list[bytes] = []
+        async for piece in page.recv_streaming(decode=False):
+            pieces.append(piece)
+            if len(pieces) > MAX_PIECES:
+                await page.close(CloseCode.MESSAGE_TOO_BIG)
+                return
+        yield b"".join(pieces)
 
 
 async def _pass_on(stream: Stream[T], take: Callable[[T], None]) -> None:

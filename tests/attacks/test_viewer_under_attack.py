@@ -1,0 +1,105 @@
+"""Whoever reaches the port of the live page, and is no browser, stops nothing."""
+
+import asyncio
+import base64
+import resource
+
+import pytest
+
+from skin_host.viewer.server import MAX_CONNECTIONS, MAX_PIECES, Viewer
+from tests.viewer.test_server import fetch, nowhere, page
+
+_TEXT, _MORE = 0x01, 0x00
+
+
+def piece(kind: int, data: bytes = b"") -> bytes:
+    """A masked frame of a message that goes on."""
+    return bytes([kind, 0x80 | len(data), 0, 0, 0, 0]) + data
+
+
+def place(url: str) -> tuple[str, int]:
+    host, _, port = url.removeprefix("http://").strip("/").partition(":")
+    return host, int(port)
+
+
+async def answer(url: str, request: str) -> bytes:
+    """Send a request as it is; return what came until the server closed."""
+    reader, writer = await asyncio.open_connection(*place(url))
+    writer.write(request.encode())
+    try:
+        return await reader.read()
+    finally:
+        writer.close()
+
+
+async def test_a_message_in_endless_empty_pieces_ends_its_connection() -> None:
+    async with Viewer(nowhere(), robot="demo").serving(port=0) as url:
+        reader, writer = await asyncio.open_connection(*place(url))
+        key = base64.b64encode(bytes(16)).decode()
+        writer.write(
+            f"GET /live HTTP/1.1\r\nHost: localhost:1\r\nOrigin: http://localhost:1\r\n"
+            "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+            f"Sec-WebSocket-Key: {key}\r\n\r\n".encode()
+        )
+        await reader.readuntil(b"\r\n\r\n")
+        writer.write(piece(_TEXT, b"{") + piece(_MORE) * 10 * MAX_PIECES)
+        async with asyncio.timeout(30):
+            said = await reader.read()
+        writer.close()
+        assert b"\x88\x02\x03\xf1" in said  # closed: 1009, message too big
+        assert (await fetch(url))[0] == 200
+
+
+async def test_more_connections_than_files_may_be_open_are_survived_in_silence(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard < 4096:
+        pytest.skip("this machine allows too few open files")
+    # Both ends are in this process.
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, 4096), hard))
+    try:
+        async with Viewer(nowhere(), robot="demo").serving(port=0) as url:
+            crowd = [
+                await asyncio.open_connection(*place(url)) for _ in range(MAX_CONNECTIONS + 50)
+            ]
+            refused = 0
+            for reader, _ in crowd:
+                try:
+                    async with asyncio.timeout(0.05):
+                        refused += await reader.read() == b""
+                except TimeoutError:
+                    pass
+                except ConnectionError:
+                    refused += 1
+            assert refused >= 50
+            for _, writer in crowd:
+                writer.close()
+            async with asyncio.timeout(30):
+                while True:
+                    try:
+                        assert (await fetch(url))[0] == 200
+                        break
+                    except OSError:
+                        await asyncio.sleep(0.05)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert not [one for one in caplog.records if one.name in ("asyncio", "websockets.server")]
+
+
+@pytest.mark.parametrize("name", ["Host", "Origin"])
+async def test_a_request_with_two_hosts_or_origins_is_refused(name: str) -> None:
+    async with Viewer(nowhere(), robot="demo").serving(port=0) as url:
+        said = await answer(
+            url, f"GET / HTTP/1.1\r\nHost: localhost:1\r\n{name}: a\r\n{name}: b\r\n\r\n"
+        )
+        assert said.startswith(b"HTTP/1.1 400 ")
+
+
+async def test_a_page_that_sends_a_request_in_a_few_pieces_is_answered() -> None:
+    async with Viewer(nowhere(), robot="demo").serving(port=0) as url, page(url) as socket:
+        await socket.send(iter(["{", '"do":', "1}"]))
+        async with asyncio.timeout(30):
+            async for said in socket:
+                if '"answer"' in str(said):
+                    break
