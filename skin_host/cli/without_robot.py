@@ -5,7 +5,7 @@ import asyncio
 import contextlib
 import logging
 import sys
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterable
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -155,7 +155,9 @@ def _add_measurements(commands: Commands) -> None:
         help="configuration file (TOML); the demo's if not given",
     )
     simulate.add_argument("--seed", type=int, default=1, help="decides everything that happens")
-    simulate.add_argument("--seeds", type=int, default=1, metavar="N", help="so many, from --seed")
+    simulate.add_argument(
+        "--seeds", type=int, default=1, metavar="N", help="so many, from --seed, on all cores"
+    )
     simulate.add_argument("--hours", type=float, default=1.0, metavar="H", help="of each seed")
     simulate.add_argument(
         "--until",
@@ -404,7 +406,7 @@ def _report(arguments: argparse.Namespace) -> int:
 
 def _simulate(arguments: argparse.Namespace) -> int:
     from skin_host.demo import configuration
-    from skin_host.evaluation.simulate.run import coverage, simulate
+    from skin_host.evaluation.simulate.run import coverage, simulate, simulate_all
 
     if arguments.seeds < 1 or arguments.hours <= 0 or arguments.seed < 0:
         raise RequestError("wanted --seed of 0 or more, --seeds of 1 or more and --hours above 0")
@@ -418,23 +420,24 @@ def _simulate(arguments: argparse.Namespace) -> int:
         logging.basicConfig(level=logging.DEBUG, format="%(levelname)-7s %(name)s: %(message)s")
     progress = Progress("simulating")
     results: list[RunResult] = []
+    asked = settings, layout, config
+    seconds = arguments.hours * HOUR_S
+    running: Iterable[RunResult]
     try:
-        for number in range(arguments.seeds):
-            progress.update(number / arguments.seeds, f"seed {arguments.seed + number}")
-            result = simulate(
-                settings,
-                layout,
-                config,
-                arguments.seed + number,
-                arguments.hours * HOUR_S,
-                until_s=arguments.until,
-            )
+        progress.update(0.0)
+        if arguments.until is not None:
+            running = [simulate(*asked, arguments.seed, seconds, until_s=arguments.until)]
+        else:
+            seeds = range(arguments.seed, arguments.seed + arguments.seeds)
+            running = simulate_all(*asked, seeds, seconds)
+        for result in running:
             results.append(result)
             if not arguments.json:
                 progress.close()
                 print(_line(result), flush=True)
                 if result.broken:
                     print(_story(result, arguments, config), flush=True)
+            progress.update(len(results) / arguments.seeds, f"seed {result.seed}")
     finally:
         progress.close()
         logging.disable(logging.NOTSET)

@@ -1,13 +1,17 @@
 """One run: storms of troubles and touches, each followed by a calm in which all must be well."""
 
 import asyncio
+import logging
 import os
 import random
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +20,7 @@ import msgspec
 from emulator.probes.scene import Fault, Scene, Temperature
 from skin_host.config.settings import Settings
 from skin_host.errors import ConfigurationError
+from skin_host.evaluation.machine import cores
 from skin_host.evaluation.simulate.accusations import BACK_NS, NOISE, QUIET_NS, STARTED_NS
 from skin_host.evaluation.simulate.disk import PowerCut
 from skin_host.evaluation.simulate.promises import SAMPLE_S, Promises
@@ -123,6 +128,31 @@ def simulate(
     result = run.result
     result.cpu_s = time.process_time() - began_s
     return result
+
+
+def simulate_all(
+    settings: Settings, layout: Layout, config: Path, seeds: Sequence[int], seconds: float
+) -> Iterator[RunResult]:
+    """Run `simulate` for several seeds, side by side on all cores; yield in the order of the seeds.
+
+    The daemon logs nothing meanwhile.
+    """
+    run = partial(simulate, settings, layout, config, seconds=seconds)
+    at_once = min(cores(), len(seeds))
+    if at_once == 1:
+        yield from map(run, seeds)
+        return
+    # Fresh processes: the parent may run threads, which a fork would not survive.
+    with ProcessPoolExecutor(
+        at_once, get_context("spawn"), logging.disable, (logging.CRITICAL,)
+    ) as pool:
+        running = [pool.submit(run, seed) for seed in seeds]
+        try:
+            for future in running:
+                yield future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def coverage(results: Iterable[RunResult]) -> dict[str, list[str]]:

@@ -10,7 +10,7 @@ import pytest
 
 from skin_host.cli.common import load_skin
 from skin_host.demo import configuration
-from skin_host.evaluation.simulate.run import RunResult, simulate
+from skin_host.evaluation.simulate.run import RunResult, simulate, simulate_all
 
 DEMO = configuration("demo.toml")
 SMALL = Path(__file__).with_name("small.toml")
@@ -59,3 +59,10 @@ def test_where_the_files_are_does_not_count_among_the_events() -> None:
     first, second = (run(15, SMALL, until_s=20.3) for _ in range(2))
     assert "disk_read_only" in first.troubles
     assert first.digest == second.digest
+
+
+def test_seeds_that_run_side_by_side_give_what_each_gives_alone() -> None:
+    settings, layout = load_skin(SMALL)
+    found = list(simulate_all(settings, layout, SMALL, (6, 5), SECONDS))
+    assert [result.seed for result in found] == [6, 5]
+    assert found[1].digest == run(5, SMALL).digest
