@@ -10,7 +10,7 @@ export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo docs test coverage mutation test-system simulate install uninstall lint format clean
+.PHONY: help demo docs test quick coverage mutation test-system simulate install uninstall lint format clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z.-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -21,12 +21,19 @@ demo: .venv/demo.stamp  ## emulator, daemon, broker and page together; DURATION=
 # Real time on a shared computer: a test that fails is run once more, and the summary names it.
 AGAIN := --reruns=1 -rR
 
-test: lint  ## all that needs no root and no hardware
+# What comes in files stays in one process with its fixtures; the order is that of tests/conftest.py.
+BY_FILE := --numprocesses=3 --dist=loadfile --no-loadscope-reorder
+
+# In a fresh clone mypy takes as long as a fifth of the tests: it runs beside them.
+test: .venv/dev.stamp  ## all that needs no root, no hardware and no broker, and takes no minutes
+	@$(MAKE) --no-print-directory --jobs=2 lint quick
+
+quick: .venv/dev.stamp
 	@$(BIN)/python -m compileall -q skin_host emulator
-	@tools/timed "pytest" $(BIN)/python -m pytest --numprocesses=3 --dist=loadfile $(AGAIN)
+	@tools/timed "pytest" $(BIN)/python -m pytest -m "not mosquitto and not long" $(BY_FILE) $(AGAIN)
 
 coverage: .venv/dev.stamp .venv/coverage.stamp  ## statements and branches of the core that the tests run: 95 % of the branches at least
-	@$(BIN)/python -m pytest --quiet --numprocesses=3 --dist=loadfile --cov --cov-report=term --cov-report=json:.coverage.json
+	@$(BIN)/python -m pytest --quiet $(BY_FILE) --cov --cov-report=term --cov-report=json:.coverage.json
 	@$(BIN)/python -m tests.support.branches .coverage.json
 
 mutation: .venv/dev.stamp .venv/mutation.stamp  ## small changes of the core that its tests must notice; FILES=... PLACES=40
@@ -37,9 +44,8 @@ test-system: .venv/dev.stamp .venv/fuzz.stamp  ## real CAN, I2C, systemd, broker
 	@$(BIN)/python -m compileall -q skin_host emulator tests
 	@tools/timed "on this host: broker, browser, the lane itself" \
 		$(BIN)/python -m pytest tests/system/native --require-mosquitto $(AGAIN)
-	@tools/timed "on this host: the other tests with a broker" \
-		$(BIN)/python -m pytest tests -m mosquitto --require-mosquitto \
-		--numprocesses=3 --dist=loadfile $(AGAIN)
+	@tools/timed "on this host: the other tests with a broker, which wait, and the long ones, which compute" \
+		$(BIN)/python -m pytest tests -m "mosquitto or long" --require-mosquitto $(BY_FILE) $(AGAIN)
 	@tools/timed "in the lane: vcan and CUSE" \
 		tools/lane/run $(BIN)/python -m pytest tests/stack tests/system/lane \
 		--bus=vcan --require-mosquitto -o faulthandler_timeout=300 $(AGAIN)

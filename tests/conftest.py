@@ -19,6 +19,32 @@ from tests.support.watchdog import watchdog  # noqa: F401  (fixture for all)
 
 _numbers = itertools.count()
 
+#: Files that take more than five seconds, as `--durations=0` found them.
+LONGEST_FIRST = (
+    "tests/evaluation/simulate/test_simulate.py",
+    "tests/attacks/test_hostile_bus.py",
+    "tests/cli/test_running_commands.py",
+    "tests/processing/test_long_contact.py",
+    "tests/mqtt/test_rejected.py",
+    "tests/docs/test_pages.py",
+    "tests/daemon/test_daemon_contact.py",
+    "tests/stack/test_three_presses.py",
+    "tests/stack/test_fingertips.py",
+    "tests/attacks/test_daemon_under_attack.py",
+    "tests/examples/test_gripper.py",
+    "tests/cli/test_demo.py",
+    "tests/client/test_client.py",
+    "tests/client/test_fleet.py",
+    "tests/evaluation/test_accuracy_report.py",
+    "tests/daemon/test_slow_disk.py",
+    "tests/evaluation/test_rig_report.py",
+    "tests/mqtt/test_publisher.py",
+    "tests/recording/test_fitting.py",
+    "tests/daemon/test_stepped_daemon.py",
+    "tests/evaluation/papers/test_contacts_report.py",
+    "tests/processing/test_pipeline.py",
+)
+
 # A slow machine is no failure.
 hypothesis.settings.register_profile("project", deadline=None)
 # support/mutation.py: the same few examples in every run, and none is made smaller.
@@ -49,15 +75,28 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Declare the marker that `pytest_collection_modifyitems` sets."""
+    """Declare what `make test` leaves to `make test-system`."""
     config.addinivalue_line("markers", "mosquitto: uses a real mosquitto (set by its fixture)")
+    config.addinivalue_line(
+        "markers",
+        "long: the whole system over hours of its time, and what no robot runs, in seconds of ours:"
+        " storms of the simulation, holds of hours, reports, benchmarks, reproductions of papers",
+    )
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that use a broker, so that `-m mosquitto` finds them."""
+    """Mark the tests that use a broker, and begin with the files that take longest.
+
+    A process gets a whole file at a time: a long one that came last would run alone.
+    """
     for item in items:
         if "mosquitto" in getattr(item, "fixturenames", ()):
             item.add_marker("mosquitto")
+    items.sort(key=lambda item: _place(item.nodeid.partition("::")[0]))
+
+
+def _place(file: str) -> int:
+    return LONGEST_FIRST.index(file) if file in LONGEST_FIRST else len(LONGEST_FIRST)
 
 
 @pytest.fixture

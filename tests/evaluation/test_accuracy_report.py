@@ -21,6 +21,8 @@ from skin_host.evaluation.machine import machine
 from skin_host.evaluation.rig import Rig
 from skin_host.processing.pipeline import Pipeline
 
+pytestmark = pytest.mark.long
+
 PLAN = HistoryPlan(0.01, 2.5)
 
 

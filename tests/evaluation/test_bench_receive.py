@@ -5,6 +5,8 @@ import pytest
 from skin_host.evaluation.bench_receive import measure
 from skin_host.evaluation.can_stream import StreamWire
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.parametrize("path", ["batch", "kernel"])
 def test_a_path_reads_the_whole_stream(path: str) -> None:

@@ -13,6 +13,8 @@ from skin_host.evaluation import insole, page, real
 from skin_host.evaluation.insole import PADS, InsoleRecording
 from skin_host.evaluation.real import PlayedCourse
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[2]
 TOOL = ROOT.parent / "shared" / "tools" / "insole_log"
 PERIOD_NS = 20_400_000

@@ -7,6 +7,8 @@ from skin_host.evaluation.cup_grasp import PERIOD_S
 from skin_host.evaluation.pictures import Results
 from skin_host.evaluation.rig_report import Row
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def results() -> Results:

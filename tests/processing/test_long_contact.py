@@ -21,6 +21,7 @@ def test_a_hold_of_ten_minutes_is_told_to_its_end_and_no_longer(truth, pressed):
     assert not held.after[-round(60 * hz) :].any()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("pressed", "drift", "seconds"), [(FEW, 0.0, EIGHT_HOURS_S), (ALL, 0.0001, TWO_HOURS_S)]
 )

@@ -19,6 +19,8 @@ from skin_host.evaluation.papers.contacts_report import (
     write_page,
 )
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.parametrize(("probe_mm", "limit_mm"), [(10.0, 0.3), (6.0, 0.8)])
 def test_on_the_emulated_skin_the_template_reaches_its_goal(probe_mm, limit_mm):

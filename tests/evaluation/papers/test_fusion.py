@@ -21,6 +21,8 @@ from skin_host.evaluation.papers.fusion import (
 )
 from skin_host.evaluation.papers.truth import planar_load
 
+pytestmark = pytest.mark.long
+
 AROUND = strip_array().around_mm
 
 

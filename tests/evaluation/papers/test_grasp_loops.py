@@ -6,6 +6,8 @@ import pytest
 from skin_host.evaluation.papers.grasp_loops import close_cap, finger_velocity, hold_object
 from skin_host.fingertip.grasp import Flags
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.parametrize("friction", [0.4, 0.7])
 def test_an_object_under_a_rising_load_is_held(friction):

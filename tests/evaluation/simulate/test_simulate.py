@@ -28,6 +28,7 @@ def run(seed: int, config: Path = DEMO, *, until_s: float | None = None) -> RunR
     return simulate(settings, layout, config, seed, SECONDS, until_s=until_s)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("config", "seed"), FIXED, ids=lambda value: getattr(value, "stem", value))
 def test_every_promise_holds_through_a_storm(config: Path, seed: int) -> None:
     result = run(seed, config)
