@@ -77,7 +77,7 @@ async def run(
     Raises:
         SkinError: a broker, a bus or the emulator cannot be started.
     """
-    settings, layout, happening = _prepared(config, scene)
+    settings, layout, happening = prepared(config, scene)
     if mujoco is not None and scene is None:
         happening = structs.replace(happening, probe=[])
     if duration_s is not None:
@@ -125,7 +125,7 @@ async def run(
     return 0
 
 
-def _prepared(config: Path | None, scene: Path | None) -> "tuple[Settings, Layout, Scene]":
+def prepared(config: Path | None, scene: Path | None) -> "tuple[Settings, Layout, Scene]":
     """Return the robot of a configuration on buses of this process, as one node; and its scene."""
     from emulator.probes import scene as scenes
 
@@ -153,7 +153,10 @@ def _prepared(config: Path | None, scene: Path | None) -> "tuple[Settings, Layou
 
 
 def presses(settings: Settings, layout: Layout) -> "Scene":
-    """A scene for any robot: a press in the middle of each part, one part after the other."""
+    """A scene for any robot: a press in the middle of each part, one part after the other.
+
+    Its pads are healthy: health would name many of those of recorded real skin.
+    """
     from emulator.probes.scene import Place, Probe, Scene
 
     # A fingertip under an array of taxels is pressed through the array.
@@ -184,7 +187,8 @@ def presses(settings: Settings, layout: Layout) -> "Scene":
                 repeat_s=every_s,
             )
         )
-    return Scene(about="One part after the other is pressed.", seed=8, probe=probes)
+    about = "One part after the other is pressed."
+    return Scene(about=about, seed=8, quiet=True, probe=probes)
 
 
 @contextlib.asynccontextmanager

@@ -33,6 +33,9 @@ SCHEMA = "skin.calibration/1"
 NOISY_MARGINS = 1.5
 #: ... and unusable if it needs more than this multiple: 16 units are half the scale of real skin.
 USELESS_MARGINS = 8.0
+#: Both are of units at this shift, which nearly all boards send. A pad that is sent in finer units
+#: may need more of them: that is no more pressure.
+USUAL_SHIFT = 2
 #: With more than this share of its samples at the ends of the scale, a taxel is out of range.
 SATURATED_SHARE = 0.05
 #: With fewer samples than this, neither rest position nor noise of a taxel is known.
@@ -164,6 +167,8 @@ class Calibrator:
         self._percentile = percentile
         self._touch = touch or TouchSettings()
         self._range_units = np.full(n, np.inf) if range_units is None else range_units
+        finer = [max(USUAL_SHIFT - triangle.shift, 0) for triangle in layout.triangles]
+        self._fineness = np.exp2(np.array(finer))[layout.triangle_of]
         self._received = np.zeros(n, dtype=np.int64)
         self._counts = np.zeros((n, 256), dtype=np.int64)
         self._course = _Course(n)
@@ -232,7 +237,7 @@ class Calibrator:
         spread = np.sqrt(upward * np.where(touched, 1.0, lasting))
 
         rest = no_load - baseline
-        margin = self._touch.margin_units
+        margin = self._touch.margin_units * self._fineness
         decides = levels(percentile - baseline, spread, self._touch).decides
         cut_off = (rest < self._range_units) & np.isfinite(self._range_units)
         ends = counts[:, 0] + counts[:, 255]

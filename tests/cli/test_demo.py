@@ -79,7 +79,7 @@ async def test_where_the_usual_port_is_taken_the_page_is_at_another(monkeypatch)
 
 @pytest.mark.parametrize("name", ["icub", "fingertips", "kaspar"])
 def test_the_scene_for_any_robot_presses_each_of_its_parts(name):
-    settings, layout, scene = demo._prepared(demo.configuration(f"{name}.toml"), None)
+    settings, layout, scene = demo.prepared(demo.configuration(f"{name}.toml"), None)
     bare = {name for name, tip in settings.fingertips.items() if tip.array is None}
     assert {probe.part for probe in scene.probe} == {*settings.parts, *bare}
     # The robot is built with it: every place is one of the skin.

@@ -2,14 +2,17 @@
 
 from pathlib import Path
 
+import pytest
 from msgspec.structs import replace
 
 from emulator.probes.scene import Scene
 from emulator.probes.scene import load as load_scene
 from emulator.robot import Robot
+from skin_host import demo
 from skin_host.config.settings import load
 from skin_host.layout import build_layout
 from skin_host.processing.core import Engine
+from tests.support.fault_bench import FaultBench
 
 CONFIG = Path(__file__).parents[2] / "config"
 CALIBRATION_S = 4.5
@@ -43,16 +46,25 @@ def begun_in(scene: Scene) -> dict[str, list[float]]:
 
 
 def test_every_press_is_one_contact() -> None:
-    scene = replace(load_scene(CONFIG / "scenes" / "demo.toml"), quiet=True)
-    begun = begun_in(scene)
+    begun = begun_in(load_scene(CONFIG / "scenes" / "demo.toml"))
     for part, at_s in PRESSES.items():
         late_s = [begin - wanted for begin, wanted in zip(begun[part], at_s, strict=True)]
         assert all(0.0 < late < 0.4 for late in late_s), (part, begun[part])
 
 
 def test_no_press_is_missed_or_late_on_pads_as_noisy_as_real_ones() -> None:
-    begun = begun_in(load_scene(CONFIG / "scenes" / "demo.toml"))
+    begun = begun_in(replace(load_scene(CONFIG / "scenes" / "demo.toml"), quiet=False))
     for part, at_s in PRESSES.items():
         for wanted in at_s:
             assert any(0.0 < begin - wanted < 0.4 for begin in begun[part]), (part, wanted)
         assert min(begun[part]) > min(at_s)
+
+
+@pytest.mark.parametrize("config", ["demo.toml", "icub.toml", "fingertips.toml", "nao.toml"])
+def test_a_robot_of_the_demo_is_healthy_before_and_while_it_is_pressed(config: str) -> None:
+    settings, layout, _ = demo.prepared(CONFIG / config, None)
+    bench = FaultBench(3.0, demo.presses(settings, layout), config=CONFIG / config)
+    for _ in range(8):
+        bench.run(1.0)
+        wrong = {part: record["sentences"] for part, record in bench.records.items()}
+        assert wrong == {part: [] for part in wrong}

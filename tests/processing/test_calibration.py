@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -66,6 +67,17 @@ def test_a_noisy_taxel_is_named_and_used():
     found = calibrated(sweeps)
     assert found.verdict[5] == Verdict.NOISY
     assert found.usable[5]
+
+
+def test_a_pad_in_finer_units_is_judged_by_the_same_pressure():
+    fine = replace(
+        LAYOUT, triangles=tuple(replace(triangle, shift=0) for triangle in LAYOUT.triangles)
+    )
+    for layout, verdict in ((LAYOUT, Verdict.NOISY), (fine, Verdict.OK)):
+        calibrator = Calibrator(layout)
+        for raw in noisy(np.random.default_rng(3), sd=3.0, level=220.0):
+            calibrator.add(0, raw.astype(np.uint8), PRESENT)
+        assert np.mean(calibrator.finish("abc", TIME).verdict == verdict) > 0.99
 
 
 @pytest.mark.parametrize("sd", [3.0, 5.0, 8.0])

@@ -14,6 +14,7 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
+from msgspec.structs import replace
 
 from emulator.probes.scene import load as load_scene
 from skin_host.bus.wire import FrameBatch, encode_sweep
@@ -122,7 +123,7 @@ def test_an_accelerated_month(tmp_path: Path) -> None:
 
 
 async def test_an_hour_of_robot_daemon_and_broker(mosquitto: Mosquitto, tmp_path: Path) -> None:
-    scene = load_scene(ROOT / "config/scenes/demo.toml")
+    scene = replace(load_scene(ROOT / "config/scenes/demo.toml"), quiet=False)
     bus = Bus(interface="virtual", channel="soak")
     touches = tmp_path / "touches"
     listen = [require("mosquitto_sub"), "-p", str(mosquitto.port), "-q", "1"]
