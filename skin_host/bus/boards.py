@@ -130,8 +130,11 @@ class Boards:
         Raises:
             BusError: the bus does not take frames.
         """
+        while busy := [one.busy for one in self.records.values() if one.busy is not None]:
+            await asyncio.wait(busy)
         try:
-            await self._bring_up(listen)
+            # Occupied: discovery stops an MTB3, so nobody sets up a board in the middle of it.
+            await self._occupy(list(self.records.values()), self._bring_up(listen))
         except BusError:
             self._failed = True
             raise
@@ -191,7 +194,7 @@ class Boards:
         while record.busy is not None:
             await asyncio.wait([record.busy])
         # Occupied, so that `supervise` does not act on its silence at the same time.
-        await self._occupy(record, self._set_up(record))
+        await self._occupy([record], self._set_up(record))
 
     async def _set_up(self, record: BoardRecord) -> None:
         address = record.layout.settings.address
@@ -305,18 +308,24 @@ class Boards:
             except BusError as error:
                 log.debug("bus %s: %s", self.bus, error)
 
-        self._occupy(record, do())
+        self._occupy([record], do())
 
     @staticmethod
-    def _occupy(record: BoardRecord, work: Coroutine[None, None, None]) -> "asyncio.Task[None]":
-        """Run an action on a board; until it ends, no other action is started on that board."""
+    def _occupy(
+        records: list[BoardRecord], work: Coroutine[None, None, None]
+    ) -> "asyncio.Task[None]":
+        """Run an action on boards; until it ends, no other action is started on them."""
 
         def end(_: "asyncio.Task[None]") -> None:
-            record.busy = None
+            for record in records:
+                record.busy = None
 
-        record.busy = asyncio.create_task(work, name=f"board {record.layout.name}")
-        record.busy.add_done_callback(end)
-        return record.busy
+        names = ", ".join(record.layout.name for record in records)
+        task = asyncio.create_task(work, name=f"boards {names}")
+        for record in records:
+            record.busy = task
+        task.add_done_callback(end)
+        return task
 
     async def _revive(self, record: BoardRecord) -> None:
         """Query a timed-out board for its type and uptime, and take the action that they call
@@ -388,6 +397,8 @@ class Boards:
                 answer.firmware_build,
             )
             record.in_bootloader = False
+            if record.is_mtb3:
+                self._ledger.is_mtb3(record.row)
             if answer.board_type not in SKIN_BOARD_TYPES:
                 log.warning(
                     "bus %s: board %s is of type %d, which is no skin board",

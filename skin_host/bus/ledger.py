@@ -33,6 +33,9 @@ INTERVALS = 16
 STALE_INTERVALS_NS = 1_000_000_000
 #: Triangles are missing after this many sweeps in a row: single frames get lost and sweeps get cut.
 MISSING_SWEEPS = 5
+#: An MTB3 that zeroes itself, after five bad readings, sends nothing for four periods. It times out
+#: no earlier than after this many: to query it then would stop it.
+MTB3_PERIODS = 6.0
 #: For a regular board all intervals, except the longest and shortest fifth, lie within this share.
 UNEVEN = 0.1
 _BITS = np.arange(TRIANGLES)
@@ -44,12 +47,14 @@ class BoardLedger:
 
     Args:
         boards: (index in `Layout.boards`, board) of each.
-        silent_periods: a board has timed out after this many of its periods without a sweep.
+        silent_periods: a board has timed out after this many of its periods without a sweep, an
+            MTB3 after `MTB3_PERIODS` if that is more.
         poll_ms: longest planned pause between two reads of the buses.
 
     Attributes:
         row: of each board, by its index.
         now_ns: the ledger's own clock; starts at 0.
+        silent_after_ns: int64[b], after so long without a sweep a board has timed out.
         received_ns: int64[b], when the last sweep was received, on that clock.
         last: the last sweep of each board.
         sweeps: int64[b], how many were received.
@@ -76,8 +81,12 @@ class BoardLedger:
         self._looked = False
         self._longest_ns = LONGEST_PAUSE_NS + int(poll_ms * 1e6)
         self._period_ns = np.array([board.settings.period_ms for _, board in boards]) * 1_000_000
-        self._silent_after_ns = (silent_periods * self._period_ns).astype(np.int64)
+        self.silent_after_ns = (silent_periods * self._period_ns).astype(np.int64)
         self._enabled = [board.enabled for _, board in boards]
+
+        for row, (_, board) in enumerate(boards):
+            if board.settings.model == "mtb3":
+                self.is_mtb3(row)
 
         self.received_ns = np.zeros(n, np.int64)
         self._none_silent_until_ns = -1
@@ -98,6 +107,11 @@ class BoardLedger:
         self.lost_set_ups = np.zeros(n, np.int64)
         self.tx_overflows = np.zeros(n, np.int64)
         self.rezeros = np.zeros(n, np.int64)
+
+    def is_mtb3(self, row: int) -> None:
+        """A board is an MTB3: it may pause to zero itself."""
+        least_ns = int(MTB3_PERIODS * self._period_ns[row])
+        self.silent_after_ns[row] = max(int(self.silent_after_ns[row]), least_ns)
 
     def look(self, now_ns: int) -> None:
         """Everything received up to `now_ns` has been read (clock of the time stamps)."""
@@ -158,13 +172,13 @@ class BoardLedger:
         if self.now_ns <= self._none_silent_until_ns:
             return False
         # Boards that send meanwhile only move this further away.
-        self._none_silent_until_ns = int((self.received_ns + self._silent_after_ns).min())
+        self._none_silent_until_ns = int((self.received_ns + self.silent_after_ns).min())
         return self.now_ns > self._none_silent_until_ns
 
     @property
     def silent(self) -> Mask:
         """Return the boards that have timed out, bool[b]."""
-        return self.now_ns - self.received_ns > self._silent_after_ns
+        return self.now_ns - self.received_ns > self.silent_after_ns
 
     def is_silent(self, row: int) -> bool:
         """Return whether a board has timed out."""
@@ -173,7 +187,7 @@ class BoardLedger:
     def overdue(self, row: int, since_ns: int) -> bool:
         """As `is_silent`, for a board that could not send before `since_ns` (ledger's clock)."""
         quiet_ns = self.now_ns - max(int(self.received_ns[row]), since_ns)
-        return quiet_ns > int(self._silent_after_ns[row])
+        return quiet_ns > int(self.silent_after_ns[row])
 
     def missing(self, row: int) -> int:
         """Return a mask of the enabled triangles that a board has not sent since it was set up, or

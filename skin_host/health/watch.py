@@ -26,8 +26,8 @@ RATE_S = 2.0
 RECENT_NS = 1_000_000_000
 #: Two boards at one address are reported when sweeps have come too soon for this long.
 TWICE_NS = 2_000_000_000
-#: Assumed period of a bus without skin boards: its force/torque boards are faster.
-ALONE_NS = 50_000_000
+#: A bus without skin boards is silent after this long: force/torque boards send often.
+ALONE_NS = 200_000_000
 
 
 @dataclass(slots=True)
@@ -133,7 +133,6 @@ class BusWatch:
         received_ns: when a frame was last received, on the ledger's clock.
     """
 
-    silent_after_ns: int
     frames: int = -1
     received_ns: int = 0
     silent: bool = False
@@ -141,16 +140,23 @@ class BusWatch:
     _past: deque[tuple[int, dict[str, int]]] = field(default_factory=deque)
 
     def note(
-        self, now_ns: int, ledger_ns: int, totals: dict[str, int], *, awaited: bool = False
+        self,
+        now_ns: int,
+        ledger_ns: int,
+        totals: dict[str, int],
+        *,
+        silent_after_ns: int,
+        awaited: bool = False,
     ) -> None:
         """Take in all counters, with the time of the time stamps and of the ledger.
 
-        While none of its boards has had the time to send, a bus is not silent: `awaited`.
+        Without a frame for longer than `silent_after_ns` a bus is silent; not while none of its
+        boards has had the time to send (`awaited`).
         """
         if totals["frames"] != self.frames:
             self.frames = totals["frames"]
             self.received_ns = ledger_ns
-        self.silent = ledger_ns - self.received_ns > self.silent_after_ns and not awaited
+        self.silent = ledger_ns - self.received_ns > silent_after_ns and not awaited
         past = self._past
         if past and now_ns < past[-1][0]:
             past.clear()  # the clock was set back
@@ -173,21 +179,11 @@ class Watch:
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
         periods = engine.settings.receive.silent_periods
-        period_ns = {
-            board: engine.layout.boards[board].settings.period_ms * 1_000_000
-            for board in engine.boards
-        }
         #: By then a board that sends nothing has timed out.
         late_samples = int(periods) + 1
         self.parts = {part: PartWatch(late_samples) for part in engine.parts}
         self.boards = {board: BoardWatch() for board in engine.boards}
-        self.buses = {
-            bus: BusWatch(
-                int(periods * max((period_ns[i] for i in self._boards_of(bus)), default=ALONE_NS))
-            )
-            for bus in engine.assemblers
-        }
-
+        self.buses = {bus: BusWatch() for bus in engine.assemblers}
         ledger_row = engine.ledger.row
         self._rows = {
             bus: np.array([ledger_row[i] for i in self._boards_of(bus)], np.intp)
@@ -205,10 +201,16 @@ class Watch:
 
     def tick(self, now_ns: int, ports: dict[str, "Port"], boards: dict[str, "Boards"]) -> None:
         """Read all counters; to be called several times a second."""
+        ledger = self._engine.ledger
         for bus, bus_watch in self.buses.items():
-            totals = self._totals(bus, ports.get(bus))
-            awaited = bus in boards and boards[bus].awaits_all
-            bus_watch.note(now_ns, self._engine.ledger.now_ns, totals, awaited=awaited)
+            rows = self._rows[bus]
+            bus_watch.note(
+                now_ns,
+                ledger.now_ns,
+                self._totals(bus, ports.get(bus)),
+                silent_after_ns=int(ledger.silent_after_ns[rows].max()) if len(rows) else ALONE_NS,
+                awaited=bus in boards and boards[bus].awaits_all,
+            )
         for index, watch in self.boards.items():
             watch.note(self._events(index, watch, boards), now_ns)
             bus = self._engine.layout.boards[index].settings.bus

@@ -1,5 +1,6 @@
 """What boards say of themselves is noted, and told with the health of their part."""
 
+import asyncio
 from collections.abc import Iterable
 
 import pytest
@@ -8,11 +9,13 @@ from skin_host.bus.answers import Discovered, DiscoveredBootloader, answer_frame
 from skin_host.bus.boards import Boards
 from skin_host.bus.commands import BoardType, Message
 from skin_host.bus.wire import FrameBatch, MessageClass, identifier
+from skin_host.clock import SteppedClock
 from skin_host.config.settings import load
 from skin_host.health import HealthWatch, Record
 from skin_host.layout import build_layout
 from skin_host.processing.core import Engine
 from tests.support.stack import ROOT
+from tests.support.stepped import stepped
 
 CONFIG = ROOT / "config" / "demo.toml"
 S = 1_000_000_000
@@ -102,3 +105,30 @@ def test_a_board_tells_its_firmware(heard: Heard) -> None:
     (hand,) = heard.record()["boards"]
     assert hand.get("firmware") == (1, 25, 3)
     assert hand.get("board_type") == BoardType.MTB4
+
+
+class Kept:
+    """Keeps what is sent, with the time."""
+
+    def __init__(self, clock: SteppedClock) -> None:
+        self._clock = clock
+        self.sent: list[tuple[float, int]] = []
+
+    async def send(self, frames: Iterable[tuple[int, bytes]], gap_s: float = 0.0) -> None:
+        self.sent += [(self._clock.monotonic_s(), can_id >> 8) for can_id, _ in frames]
+
+
+@stepped
+async def test_no_board_is_set_up_while_the_bus_is_being_discovered(clock: SteppedClock) -> None:
+    """Discovery stops an MTB3 that has just been started, which then looks like one that reset."""
+    heard, port = Heard(), Kept(clock)
+    listed = [(i, heard.engine.layout.boards[i]) for i in heard.engine.boards]
+    layout, ledger = heard.engine.layout, heard.engine.ledger
+    boards = Boards("can0", port, listed, layout.triangles, ledger, clock=clock)
+    beginning = asyncio.create_task(boards.bring_up(listen=True))
+    await clock.sleep(0.02)
+    assert not port.sent
+    await boards.set_up(HAND)
+    assert beginning.done()
+    (discovered_s,) = (s for s, kind in port.sent if kind == MessageClass.MANAGEMENT)
+    assert min(s for s, kind in port.sent if kind != MessageClass.MANAGEMENT) > discovered_s + 0.4

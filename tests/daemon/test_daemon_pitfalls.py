@@ -53,6 +53,33 @@ async def test_boards_of_the_mtb3_are_set_up_once_and_a_reset_one_is_found(
         assert counted(live)["forearm_outer"] == counted(live)["forearm_inner"] == (1, 0, 0)
 
 
+@stepped
+async def test_an_mtb3_that_pauses_to_zero_itself_is_left_alone(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    """After five bad readings it sends nothing for four periods; a query would stop it."""
+    config = changed(tmp_path, 'model = "mtb4"', 'model = "mtb3"')
+    async with living(can_bus_settings, tmp_path, config=config, clock=clock) as live:
+        await live.until_well(but=LATELY)
+        for board in live.robot.boards.values():
+            board.count_no_ack(5)
+        told = set[str]()
+        ledger = live.daemon.engine.ledger
+        end = ledger.sweeps + 100
+        longest_ms = 0.0
+
+        def have_sent() -> bool:
+            nonlocal longest_ms
+            longest_ms = max(longest_ms, 1e-6 * (ledger.now_ns - ledger.received_ns).max())
+            told.update(code for code, _ in live.faults())
+            return bool((ledger.sweeps >= end).all())
+
+        await live.wait(have_sent)
+        assert longest_ms > 190.0
+        assert set(counted(live).values()) == {(1, 0, 0)}
+        assert not told & {"bus_silent", "board_silent", "board_absent"}
+
+
 @pytest.mark.parametrize("model", ["mtb3", "mtb4", "mtb4c"])
 @stepped
 async def test_a_zero_that_a_new_cdc_offset_would_spoil_is_taken_again(

@@ -449,7 +449,8 @@ class _Run:
         else:
             self._kill(power=kind == "power")
         await world.clock.sleep(min(left_s, chance.uniform(0.1, 5.0)))
-        self._start()
+        if world.life is None:  # Else another end, begun meanwhile, has started it.
+            self._start()
 
     # ------------------------------------------------------------------ drill
 

@@ -487,11 +487,16 @@ KINDS: dict[str, Begin] = {
         spoils=True,
     ),
     "shorted_finger": _emulated("shorted_finger", _CHIPS | _SET_UP, _LINE, 1.0),
-    "wrong_address": _emulated("wrong_address", _SWAPPED, _ELSEWHERE, 1.0, spoils=True),
+    # Where two chips drive one data line, their bytes mix, differently in each sweep.
+    "wrong_address": _emulated(
+        "wrong_address", _SWAPPED | {"bus_bit_errors"}, _ELSEWHERE, 1.0, spoils=True
+    ),
     "swapped_lines": _emulated(
         "swapped_lines", _SWAPPED, _ELSEWHERE | _LINE | {"lines_swapped"}, 1.0, spoils=True
     ),
-    "shared_address": _emulated("shared_address", _SWAPPED, _ELSEWHERE, 1.0, spoils=True),
+    "shared_address": _emulated(
+        "shared_address", _SWAPPED | {"bus_bit_errors"}, _ELSEWHERE, 1.0, spoils=True
+    ),
     "no_acknowledge": _emulated("no_acknowledge", _CHIPS | _SET_UP, _LINE, 1.0),
     # It holds for one sweep, which may pass between two looks of health; what follows does not.
     "data_held_low": _emulated(

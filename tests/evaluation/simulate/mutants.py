@@ -102,8 +102,8 @@ MUTANTS = [
     Mutant(
         "a board is never silent",
         "bus/ledger.py",
-        "return quiet_ns > int(self._silent_after_ns[row])",
-        "return quiet_ns > 1000 * int(self._silent_after_ns[row])",
+        "return quiet_ns > int(self.silent_after_ns[row])",
+        "return quiet_ns > 1000 * int(self.silent_after_ns[row])",
     ),
     Mutant(
         "a new zero is trusted whatever touched",
