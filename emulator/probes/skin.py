@@ -103,8 +103,9 @@ class Skin:
             foam = foam.infinergy()
         self._foam = FoamLayer(foam, truth)
         self._draw_flaws(scene, rng)
-        self._times_s = [t_s for t_s, _ in scene.temperature.keyframes_c]
-        self._degrees_c = [c for _, c in scene.temperature.keyframes_c]
+        self._times_s = np.array([t_s for t_s, _ in scene.temperature.keyframes_c])
+        self._degrees_c = np.array([c for _, c in scene.temperature.keyframes_c])
+        self._warmed_s = float(self._times_s[-1])
         self._shift_c = 0.0
         self._none = self._touched = self._felt = self._jumping = np.zeros(0, np.intp)
         self._is_left = False
@@ -217,7 +218,7 @@ class Skin:
         """When the mechanics has to be worked out again: a time of its own grid."""
         if self._changed_ns == self._t_ns or self._source is not None:
             return self._t_ns + MOVING_NS
-        quiet = not len(self._active) and self._idle and self._t_ns * 1e-9 >= self._times_s[-1]
+        quiet = not len(self._active) and self._idle and self._t_ns * 1e-9 >= self._warmed_s
         due_ns = NEVER_NS if quiet else self._t_ns + self._holding_ns
         if np.isfinite(self._still_until_s):
             change_ns = round(self._still_until_s * 1e9)
@@ -311,8 +312,8 @@ class Skin:
 
     def _warm(self, t_s: float) -> bool:
         # Beyond the last keyframe, as nearly always, there is nothing to look up.
-        now_c = self._degrees_c[-1]
-        if t_s < self._times_s[-1]:
+        now_c = float(self._degrees_c[-1])
+        if t_s < self._warmed_s:
             now_c = float(np.interp(t_s, self._times_s, self._degrees_c))
         shift_c = now_c + self.temperature_step_c - REFERENCE_C
         if abs(shift_c - self._shift_c) < STEP_C:

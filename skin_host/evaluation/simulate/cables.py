@@ -36,6 +36,8 @@ ERROR = 0xF
 #: Sweeps of a triangle that are kept.
 KEPT = 128
 _STREAMS = {int(MessageClass.SKIN_STREAM), int(MessageClass.ANALOG_STREAM)}
+#: First bytes of the frames of a sweep: of 16 triangles at most.
+_HEADERS = bytes([HEADER_A, HEADER_B]) * 16
 _NOTHING = FrameBatch.of([])
 
 
@@ -85,6 +87,43 @@ class Sent:
 
     def note(self, batch: FrameBatch) -> None:
         """Take frames in the order in which they passed, stamped with the robot's time."""
+        if not self._note_sweep(batch):
+            self._note_frames(batch)
+
+    def _note_sweep(self, batch: FrameBatch) -> bool:
+        """Take the frames of one whole sweep of one board; False if they are not that."""
+        ids = batch.id.tolist()
+        keys = ids[::2]
+        if ids[1::2] != keys or len(set(keys)) < len(keys):
+            return False
+        address = keys[0] >> 4
+        octets = batch.data.tobytes()
+        if (
+            address >> 4 not in _STREAMS
+            or any(key >> 4 != address for key in keys)
+            or octets[::8] != _HEADERS[: len(ids)]
+            or batch.dlc.tobytes().count(8) < len(ids)
+        ):
+            return False
+        address &= 0xF
+        times_ns = batch.t_ns.tolist()
+        if times_ns[0] - self._last_ns.get(address, -BURST_NS) < BURST_NS:
+            return False
+        if times_ns[-1] - times_ns[0] > PAIR_NS:
+            return False
+        self.bursts[address] = self.bursts.get(address, 0) + 1
+        self._last_ns[address] = times_ns[-1]
+        for at, (identifier, t_ns) in enumerate(zip(keys, times_ns[1::2], strict=True)):
+            key = identifier & 0xFF
+            pair = octets[16 * at : 16 * at + 16]
+            self._half[key] = HEADER_B, pair[9:], t_ns
+            whole = self._whole.get(key)
+            if whole is None:
+                whole = self._whole[key] = deque(maxlen=KEPT)
+            whole.append((pair[1:8] + pair[9:14], pair[14] << 8 | pair[15], t_ns))
+        return True
+
+    def _note_frames(self, batch: FrameBatch) -> None:
         for seconds, nanoseconds, identifier, dlc, header, payload in batch.frames():
             if identifier >> 8 not in _STREAMS or dlc != 8:
                 continue

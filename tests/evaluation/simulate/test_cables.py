@@ -1,0 +1,54 @@
+"""What passed over a bus is known, however the frames come."""
+
+import numpy as np
+import pytest
+
+from skin_host.bus.wire import FrameBatch, encode_sweep
+from skin_host.evaluation.simulate.cables import Sent, _rows
+
+MS = 1_000_000
+
+
+def traffic(seed: int) -> list[FrameBatch]:
+    """Sweeps of two boards, whole, cut, with frames missing, twice, damaged or out of order."""
+    rng = np.random.default_rng(seed)
+    batches = []
+    t_ns = 0
+    for _ in range(60):
+        t_ns += int(rng.choice([2, 11, 13, 17, 50])) * MS
+        triangles = np.sort(rng.choice(16, int(rng.integers(1, 6)), replace=False))
+        values = rng.integers(0, 3, (len(triangles), 12)).astype(np.uint8)
+        status = rng.integers(0, 3, len(triangles)).astype(np.uint16)
+        ids, data = encode_sweep(int(rng.integers(2, 4)), triangles, values, status)
+        n = len(ids)
+        step_ns = int(rng.choice([120_000, 4 * MS]))
+        times_ns = t_ns + step_ns * np.arange(n)
+        batch = FrameBatch(ids, np.full(n, 8, np.uint8), data, times_ns)
+        match rng.integers(8):
+            case 0:
+                batch = _rows(batch, rng.random(n) < 0.7)
+            case 1:
+                batch = _rows(batch, np.sort(rng.integers(0, n, n)))
+            case 2:
+                batch = _rows(batch, rng.permutation(n))
+            case 3:
+                batch.data[rng.integers(n), 0] ^= 0x80
+            case 4:
+                batch.dlc[rng.integers(n)] = 6
+            case 5:
+                batch.id[rng.integers(n)] ^= 0x100
+        cut = int(rng.integers(0, n)) if rng.random() < 0.3 else 0
+        batches += [_rows(batch, slice(0, cut)), _rows(batch, slice(cut, None))]
+    return [batch for batch in batches if len(batch)]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_sweep_that_comes_whole_is_noted_as_its_frames_are(seed: int) -> None:
+    at_once, by_frames = Sent(), Sent()
+    for batch in traffic(seed):
+        at_once.note(batch)
+        by_frames._note_frames(batch)
+        assert at_once.bursts == by_frames.bursts
+    assert at_once._whole == by_frames._whole
+    assert at_once._half == by_frames._half
+    assert any(by_frames._whole.values())
