@@ -197,6 +197,8 @@ class Robot:
             chips = np.unique(self.layout.triangle_of[taxels]).astype(np.intp)
             if not np.array_equal(chips, self._felt_chips):
                 self._gather(chips)
+        elif self.skin.is_still:
+            return
         if len(taxels):
             self._pass_on()
 

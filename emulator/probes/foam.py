@@ -203,6 +203,7 @@ class FoamLayer:
     Attributes:
         pressure_kpa: float64[n], true pressure on the covered part of each pad.
         force_n, depth_mm: float64[c], of each contact in the last step.
+        is_still: the last step changed nothing: nothing pressed, and no foam was due that recovers.
     """
 
     #: Foam that nothing touches any more is followed in steps of this length.
@@ -227,6 +228,7 @@ class FoamLayer:
         self._drive = Drive.by_force([])
         self._a = self._b = self._unit = np.zeros(0)
         self._is_moved = False
+        self.is_still = False
         #: Strains of the last step, and of the two before it.
         self._strain = np.zeros(0)
         self._strains_before = self._strain, self._strain
@@ -239,10 +241,16 @@ class FoamLayer:
         A footprint object that stays the same from step to step saves finding out what it
         covers; make a new one only for contacts that moved, came or went.
         """
-        self._take(footprint, drive, dt_s)
+        is_bare = footprint is self._footprint and not len(footprint.area_mm2)
+        if not is_bare:
+            self._take(footprint, drive, dt_s)
         self._waited_s += dt_s
-        if self._waited_s >= self.RECOVERY_STEP_S:
+        is_due = self._waited_s >= self.RECOVERY_STEP_S
+        if is_due:
             self._recover()
+        self.is_still = is_bare and not is_due
+        if is_bare:
+            return Felt(self._felt_taxel, *self._left)
         rows = footprint
         imprint = self.truth.relaxation_kpa[rows.taxel]
         strain = self._press(drive, imprint)[rows.contact] * rows.share

@@ -58,6 +58,7 @@ class Skin:
         noise_ff: float64[n], its rms.
         probes: the scene's probes on skin, then the live ones.
         numbers: of the former, in the scene.
+        is_still: nothing that is touched has changed in the last step: only foam recovers.
 
     Args:
         layout: of the skin.
@@ -109,6 +110,7 @@ class Skin:
         self._shift_c = 0.0
         self._none = self._touched = self._felt = self._jumping = np.zeros(0, np.intp)
         self._is_left = False
+        self.is_still = False
         self._set_untouched()
         self._all = np.arange(n)
         self.capacitance_ff = self.resting_ff.copy()
@@ -274,6 +276,7 @@ class Skin:
         t_s = t_ns * 1e-9
         warmed = self._warm(t_s)
         touched = self._none
+        self.is_still = False
         moment = self._script.at(t_s)
         self._still_until_s = self._script.still_until_s(t_s)
         if self._still_until_s <= t_s:
@@ -285,7 +288,10 @@ class Skin:
             touched = (
                 np.concatenate([touched, self._under_air]) if len(touched) else self._under_air
             )
-        return self._all if warmed else touched
+        if not warmed:
+            return touched
+        self.is_still = False
+        return self._all
 
     def _blow(self, t_s: float, dt_s: float) -> bool:
         """Let air press; whether anything is, or was until now, squeezed by it."""
@@ -336,6 +342,9 @@ class Skin:
             value = np.append(value, given.force_n[self._on_skin])
         drive = Drive(value, self._by_depth_now, self._compliance_now)
         felt = self._foam.step(self._footprint, drive, dt_s)
+        if self._foam.is_still and felt.taxel is self._felt and not (self._is_left or self._air):
+            self.is_still = True
+            return self._touched
         if felt.taxel is not self._felt or self._is_left:
             self._touch(felt.taxel)
         touched = self._touched
