@@ -39,13 +39,13 @@ def run(*, quick: bool = False) -> dict[str, Any]:
     """Measure every size, rate and scene.
 
     Args:
-        quick: 2 s for each row instead of 8 s, at 20 Hz only.
+        quick: 4 s for each row instead of 8 s, at 20 Hz only.
 
     Raises:
         BrokerError: mosquitto is not installed.
         SkinError: the daemon did not come up.
     """
-    seconds, rates = (2.0, RATES_HZ[:1]) if quick else (8.0, RATES_HZ)
+    seconds, rates = (4.0, RATES_HZ[:1]) if quick else (8.0, RATES_HZ)
     rows: list[Row] = []
     for taxels, hz in product(SIZES, rates):
         rows += measure(taxels, hz, seconds)

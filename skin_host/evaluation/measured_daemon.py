@@ -3,22 +3,26 @@
 `skin bench daemon` and `skin bench scale` run it beside mosquitto, a subscriber of all frames, one
 of all touches, and senders.
 
-Which room of the program takes the CPU: a timer on the process's own CPU time interrupts it some
-hundred times a second; each time the innermost function of this project, or of its MQTT libraries,
-names the room. It costs nothing between two samples, unlike a profiler that is called at each
-function. What wakes the event loop is counted by its selector.
+Which room of the program takes the CPU: while the event loop is awake, a timer interrupts it once a
+millisecond, at first after a random part of one; each time the innermost function of this project,
+or of its MQTT libraries, names the room. A sample counts as much as the thread had a core since the
+one before. It costs some 15 us and nothing between two, unlike a profiler that is called at each
+function. (The kernel looks at timers on CPU time only with its own tick: that would be a hundred
+samples in the time of a row.) The selector of the loop tells when it sleeps, and counts what wakes
+it.
 """
 
 import asyncio
 import gc
 import logging
 import multiprocessing
+import random
 import resource
 import selectors
 import signal
 import tempfile
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from multiprocessing.connection import Connection
@@ -63,6 +67,8 @@ ROOMS = {
 }
 #: The event loop itself, and everything that runs outside of these rooms.
 LOOP = "loop"
+#: Falling asleep and waking up, in the kernel, and what other threads take.
+SLEEP = "sleep"
 #: Causes by the beginning of the module whose function is called; the first that fits counts.
 _CAUSES = {
     "skin_host.bus": "plan",
@@ -73,7 +79,7 @@ _CAUSES = {
 }
 #: A timer of the loop itself.
 TIMER = "timer"
-_INTERVAL_S = 0.002
+_INTERVAL_S = 0.001
 
 
 TOUCHED = ("untouched", "hand", "all")
@@ -84,39 +90,68 @@ _PERIODS = 20
 
 
 class RoomClock:
-    """Counts samples by room, in the main thread of this process.
+    """Samples the rooms in which the main thread of this process is while it is awake.
 
     Attributes:
-        samples: how many fell into each room since `begin`.
+        samples: what fell into each room since `begin`.
     """
 
     def __init__(self) -> None:
-        self.samples: Counter[str] = Counter()
+        self.samples: defaultdict[str, float] = defaultdict(float)
         self._rooms: dict[str, str] = {}
+        self._counting = False
+        self._began_s = 0.0
+        self._woke_s = 0.0
+        #: CPU time of the thread, and the time, at the last sample.
+        self._sampled_s = 0.0, 0.0
+        self._awake_s = 0.0
 
     def begin(self) -> None:
         """Count from now on."""
         self.samples.clear()
-        signal.signal(signal.SIGPROF, self._sample)
-        signal.setitimer(signal.ITIMER_PROF, _INTERVAL_S, _INTERVAL_S)
+        signal.signal(signal.SIGALRM, self._sample)
+        self._counting = True
+        self._began_s = time.process_time()
+        self._awake_s = 0.0
+        self.wake()
 
     def end(self) -> dict[str, float]:
-        """Stop counting; return the share of each room."""
-        signal.setitimer(signal.ITIMER_PROF, 0.0)
-        total = self.samples.total()
-        return {room: count / total for room, count in self.samples.most_common()}
+        """Stop counting; return the CPU time of each room, s, the largest first."""
+        self.sleep()
+        self._counting = False
+        total = sum(self.samples.values()) or 1.0
+        rooms = {room: self._awake_s * n / total for room, n in self.samples.items()}
+        rooms[SLEEP] = time.process_time() - self._began_s - self._awake_s
+        return dict(sorted(rooms.items(), key=lambda room: -room[1]))
+
+    def wake(self) -> None:
+        """The thread goes on."""
+        if self._counting:
+            self._woke_s = time.thread_time()
+            self._sampled_s = self._woke_s, time.monotonic()
+            # Turns are shorter than the interval: from their begin, none would reach their end.
+            signal.setitimer(signal.ITIMER_REAL, random.uniform(1e-6, _INTERVAL_S), _INTERVAL_S)
+
+    def sleep(self) -> None:
+        """The thread is about to wait."""
+        if self._counting:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            self._awake_s += time.thread_time() - self._woke_s
 
     def _sample(self, _number: int, frame: FrameType | None) -> None:
+        before_s, self._sampled_s = self._sampled_s, (time.thread_time(), time.monotonic())
+        had_s, passed_s = (now - then for now, then in zip(self._sampled_s, before_s, strict=True))
+        weight = min(1.0, had_s / max(passed_s, 1e-9))
         while frame is not None:
             module = frame.f_globals.get("__name__", "")
             room = self._rooms.get(module)
             if room is None:
                 room = self._rooms[module] = room_of(module)
             if room:
-                self.samples[room] += 1
+                self.samples[room] += weight
                 return
             frame = frame.f_back
-        self.samples[LOOP] += 1
+        self.samples[LOOP] += weight
 
 
 def room_of(module: str) -> str:
@@ -131,16 +166,23 @@ class Wakeups(selectors.DefaultSelector):
 
     Attributes:
         counts: sleeps by cause. Turns of the loop between which it did not sleep are not counted.
+        rooms: is told when the loop sleeps.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.counts: Counter[str] = Counter()
+        self.rooms = RoomClock()
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        found = super().select(timeout)
-        if timeout != 0:
-            self.counts[_cause(found[0][0].data) if found else TIMER] += 1
+        if timeout == 0:
+            return super().select(timeout)
+        self.rooms.sleep()
+        try:
+            found = super().select(timeout)
+        finally:
+            self.rooms.wake()
+        self.counts[_cause(found[0][0].data) if found else TIMER] += 1
         return found
 
     def runner(self) -> asyncio.Runner:
@@ -201,7 +243,7 @@ def run_daemon(
 
 
 async def _obey(parent: Connection, daemon: Daemon, wakeups: Wakeups) -> None:
-    rooms = RoomClock()
+    rooms = wakeups.rooms
     began: list[tuple[float, ...]] = []
 
     def now() -> tuple[float, ...]:
@@ -222,16 +264,15 @@ async def _obey(parent: Connection, daemon: Daemon, wakeups: Wakeups) -> None:
             wakeups.counts.clear()
             rooms.begin()
             return
-        shares = rooms.end()
+        by_room_s = rooms.end()
         wall_s, cpu_s, waited_s, sleeps, dropped, skipped = (
             end - begin for end, begin in zip(now(), began[0], strict=True)
         )
         causes = {cause: round(n / wall_s, 1) for cause, n in wakeups.counts.most_common()}
-        percent = 100 * cpu_s / wall_s
         parent.send(
             {
-                "cpu_percent": round(percent, 2),
-                "by_room": {room: round(share * percent, 2) for room, share in shares.items()},
+                "cpu_percent": round(100 * cpu_s / wall_s, 2),
+                "by_room": {room: round(100 * s / wall_s, 2) for room, s in by_room_s.items()},
                 "waited_percent": round(100 * waited_s / wall_s, 2),
                 "wakeups_hz": round(sleeps / wall_s),
                 "wakeups_by_cause_hz": causes,
