@@ -38,6 +38,10 @@ USELESS_MARGINS = 8.0
 USUAL_SHIFT = 2
 #: With more than this share of its samples at the ends of the scale, a taxel is out of range.
 SATURATED_SHARE = 0.05
+#: A press is cut off if less than this share of the pressure curve's units fits between rest and 0.
+#: The rest of a healthy pad is some noise beside its no-load value; at equation (1) the last
+#: twentieth of the units are 3 % of the pressure.
+CUT_OFF_SHARE = 0.95
 #: With fewer samples than this, neither rest position nor noise of a taxel is known.
 FEWEST_SAMPLES = 10
 #: The course of a calibration is kept as means of this many samples, ...
@@ -239,7 +243,7 @@ class Calibrator:
         rest = no_load - baseline
         margin = self._touch.margin_units * self._fineness
         decides = levels(percentile - baseline, spread, self._touch).decides
-        cut_off = (rest < self._range_units) & np.isfinite(self._range_units)
+        cut_off = (rest < CUT_OFF_SHARE * self._range_units) & np.isfinite(self._range_units)
         ends = counts[:, 0] + counts[:, 255]
         verdict = np.full(len(samples), Verdict.OK, dtype=np.uint8)
         verdict[decides > NOISY_MARGINS * margin] = Verdict.NOISY

@@ -231,6 +231,7 @@ def test_noise_beyond_use_has_no_vote():
 def test_a_rest_so_near_an_end_of_the_scale_that_a_press_is_cut_off_is_named():
     sweeps = noisy(np.random.default_rng(21))
     sweeps[:, 48:60] -= 180.0
+    sweeps[:, 60:72] -= 158.0  # noise at the zero of a healthy pad, not a press that is cut off
     calibrator = Calibrator(LAYOUT, range_units=np.full(N, 85.0))
     for raw in sweeps:
         calibrator.add(0, raw.astype(np.uint8), PRESENT)
