@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from skin_host.clock import SYSTEM, Clock
+from skin_host.connections import in_tasks
 from skin_host.fingertip.health import FingertipRecord
 from skin_host.health import Record
 
@@ -141,7 +142,9 @@ async def serve(port: int, records: Callable[[], Records], clock: Clock = SYSTEM
     said = False
     while True:
         try:
-            server = await asyncio.start_server(answer, "127.0.0.1", port, limit=MAX_REQUEST_BYTES)
+            server = await asyncio.start_server(
+                in_tasks(answer), "127.0.0.1", port, limit=MAX_REQUEST_BYTES
+            )
         except OSError as error:
             if not said:
                 said = True

@@ -13,9 +13,11 @@ import tempfile
 import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from skin_host.connections import in_tasks
 from skin_host.errors import BrokerError
 
 HOST = "127.0.0.1"
@@ -121,21 +123,19 @@ async def embedded_broker() -> AsyncIterator[LocalBroker]:
 
     class TidyBroker(Broker):  # type: ignore[misc]
         """Ends a connection silently where amqtt lets asyncio report a cancelled task as a
-        failure.
+        failure, and knows its subscriptions and messages as `Steady` ones.
         """
 
         def __init__(self, config: BrokerConfig) -> None:
             super().__init__(config)
             self._subscriptions = Steady()
             self._retained_messages = Steady()
+            self._connected = in_tasks(partial(super().stream_connected, listener_name="default"))
 
-        async def stream_connected(
+        def stream_connected(
             self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, listener_name: str
         ) -> None:
-            try:
-                await super().stream_connected(reader, writer, listener_name)
-            except asyncio.CancelledError:
-                writer.close()
+            self._connected(reader, writer)
 
     port = _free_port()
     everybody = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}}
