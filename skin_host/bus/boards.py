@@ -429,7 +429,6 @@ class FoundBoard:
     triangles: list[int]
 
     def as_record(self) -> dict[str, Any]:
-        """Return the board as a JSON record."""
         return asdict(self)
 
 
@@ -482,7 +481,6 @@ async def scan(bus: Bus) -> list[FoundBoard]:
 
 
 def scan_table(found: list[FoundBoard], channel: str) -> str:
-    """A table of what was found."""
     if not found:
         return (
             f"{channel}: nobody answered. Are the boards powered, is the bitrate 1 Mbit/s, is the "

@@ -174,7 +174,6 @@ class Port(ABC):
                 await self._clock.sleep(gap_s)
 
     def close(self) -> None:
-        """Close the interface."""
         if self._bus is not None:
             self._bus.shutdown()
             self._bus = None

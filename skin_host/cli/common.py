@@ -85,7 +85,6 @@ def load_skin(config: Path) -> "tuple[Settings, Layout]":
 
 
 def print_json(document: object) -> None:
-    """One JSON document on stdout."""
     print(json.dumps(document, indent=2, ensure_ascii=False))
 
 

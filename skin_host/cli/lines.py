@@ -14,7 +14,6 @@ _CAUSES = {
 
 
 def event_line(event: Touch | Slip | Over) -> str:
-    """Return one readable line for an event."""
     match event:
         case Touch():
             return _touch_line(event)

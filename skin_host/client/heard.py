@@ -42,7 +42,6 @@ class Health(NamedTuple):
 
     @property
     def sentences(self) -> list[str]:
-        """Return the faults as sentences."""
         return self.record.get("sentences", [])
 
 

@@ -24,7 +24,6 @@ class Contact(NamedTuple):
 
     @property
     def known(self) -> bool:
-        """Return whether the state is known."""
         return self.state != "UNKNOWN"
 
     @property
@@ -90,7 +89,6 @@ class Presence:
             self._parts[part].alive_s = now_s
 
     def take_touch(self, touch: Touch, now_s: float) -> None:
-        """Take a touch event."""
         part = self._parts.setdefault(touch.part, _Part(None, now_s))
         part.alive_s = now_s
         if touch.event == "end":
@@ -99,14 +97,12 @@ class Presence:
             part.touches[touch.id] = touch, now_s
 
     def take_node(self, node: str, online: bool | None) -> None:
-        """Take the status of a node."""
         if online is False:
             self._offline.add(node)
         else:
             self._offline.discard(node)
 
     def take_info(self, node: str, parts: Iterable[str]) -> None:
-        """Take which parts a node has."""
         self._node_of |= dict.fromkeys(parts, node)
 
     def take_loss(self, broker: int = 0) -> None:
@@ -117,7 +113,6 @@ class Presence:
                 part.received = None
 
     def forget(self) -> None:
-        """Forget all parts."""
         self._parts.clear()
 
     def contact(self, part: str, now_s: float) -> Contact | None:

@@ -131,7 +131,6 @@ class SkinClient:
 
     @property
     def robot(self) -> str:
-        """Return the name of the robot."""
         return self._robot or ""
 
     @property

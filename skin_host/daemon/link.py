@@ -293,7 +293,6 @@ class Link:
                     await boards.stop()
 
     def close(self) -> None:
-        """Close the interfaces."""
         for port in self.ports.values():
             port.close()
 

@@ -29,7 +29,6 @@ class Thresholds(Struct, forbid_unknown_fields=True, omit_defaults=True):
     votes_of_3: Literal[1, 2, 3] | None = None
 
     def over(self, touch: TouchSettings) -> TouchSettings:
-        """Return the settings with these changes."""
         changes = msgspec.structs.asdict(self)
         known = {key: value for key, value in changes.items() if value is not None}
         return msgspec.structs.replace(touch, **known)

@@ -184,7 +184,6 @@ def share_of(settings: Settings, node: str, number: int, n: int) -> Settings:
 
 
 def share_name(node: str, number: int) -> str:
-    """The node that a share is."""
     return f"{node}-{number}"
 
 

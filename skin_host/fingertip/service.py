@@ -136,7 +136,6 @@ class FingertipPublisher:
         self._put_contacts()
 
     def deliver(self, events: Iterable[FingertipEvent]) -> None:
-        """Publish events of the fingertips."""
         if self._engine is None:
             return
         for event in events:
@@ -159,7 +158,6 @@ class FingertipPublisher:
             self._publisher.put_contact(name, known if state.tip.feels else "UNKNOWN")
 
     def records(self, now_ns: int) -> dict[str, FingertipRecord]:
-        """The health record of every fingertip."""
         return {} if self._health is None else self._health.records(now_ns)
 
     def publish_health(self, now_ns: int) -> dict[tuple[str, str], str]:

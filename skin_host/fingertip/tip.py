@@ -168,7 +168,6 @@ class Tip:
 
     @property
     def flag_names(self) -> list[str]:
-        """The names of the flags, as they are published."""
         return _names(self.flags)
 
     @property

@@ -40,7 +40,6 @@ class LocalBroker(NamedTuple):
 
     @property
     def url(self) -> str:
-        """Return the URL for `Broker.from_url`."""
         return f"mqtt://{self.host}:{self.port}" + "?protocol=3.1.1" * (self.protocol != "5")
 
     @property

@@ -503,11 +503,9 @@ class PackedProperties(Properties):
 
     @classmethod
     def of(cls, properties: Properties | None) -> "PackedProperties | None":
-        """Pack properties, if there are any."""
         return None if properties is None else cls(properties)
 
     def pack(self) -> bytes:
-        """The bytes of the properties."""
         packed: bytes = object.__getattribute__(self, "_packed")
         return packed
 

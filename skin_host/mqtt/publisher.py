@@ -166,7 +166,6 @@ class Publisher:
 
     @property
     def counters(self) -> PublisherCounters:
-        """Return a copy of the counters."""
         known, handler, connection = self._outbox.counters, self._command_handler, self._connection
         return replace(
             known,

@@ -59,7 +59,6 @@ class PressureCurve:
         self.tail_slope[bent] += 2.0 * self.square[bent] * self.beyond_units[bent]
 
     def part(self, taxels: slice | NDArray[np.bool_]) -> "PressureCurve":
-        """Return the curves of some of the taxels."""
         chosen = copy(self)
         chosen.square = self.square[taxels]
         chosen.linear = self.linear[taxels]

@@ -104,7 +104,6 @@ class Picture:
             self._status_changed += 1
 
     def take_frame(self, frame: Frame) -> None:
-        """Take a frame."""
         part = self.parts.get(frame.part)
         if part is not None and len(frame.pressure_kpa) == part.n_taxels:
             part.frame = frame
@@ -112,7 +111,6 @@ class Picture:
             part.missed += frame.missed
 
     def take_touch(self, touch: Touch) -> None:
-        """Take the event of a contact."""
         part = self.parts.get(touch.part)
         if part is None:
             return
@@ -132,7 +130,6 @@ class Picture:
             part.contacts_changed += 1
 
     def take_health(self, health: Health) -> None:
-        """Take a part's health."""
         part = self.parts.get(health.part)
         if part is not None:
             part.health = dict(health.record)

@@ -54,7 +54,6 @@ class HoldRecord:
 
     @property
     def hold_s(self) -> float:
-        """Length of the hold."""
         return float(self.dt_s[: self.released].sum())
 
     @property
@@ -64,7 +63,6 @@ class HoldRecord:
 
     @property
     def rest_s(self) -> float:
-        """Length of the rest after it."""
         return float(self.dt_s[self.released :].sum())
 
 

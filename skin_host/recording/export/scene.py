@@ -421,7 +421,6 @@ class RerunStream:
             stream.log(f"{ROOT}/{part}", rr.Transform3D(translation=origin_m), static=True)
 
     def show(self, item: Item) -> None:
-        """Log one item."""
         rr, stream = self._rr, self._stream
         stream.set_time("time", timestamp=np.datetime64(item.t_ns, "ns"))
         where = f"{ROOT}/{item.part}"

@@ -160,7 +160,6 @@ def read_messages(recording: Path) -> Series:
 
 
 def health_line(part: str, t_ns: int, record: Mapping[str, Any]) -> HealthLine:
-    """A record of health as a line."""
     state, sentences = str(record.get("state", "?")), record.get("sentences") or []
     return HealthLine(part, t_ns, state, "; ".join([f"{part}: {state}", *map(str, sentences)]))
 
