@@ -3,7 +3,7 @@
 import json
 
 from skin_host.fingertip.events import Over, Slip
-from skin_host.mqtt.messages import Touch
+from skin_host.processing.events import Touch
 
 #: What first indicated a slip.
 _CAUSES = {

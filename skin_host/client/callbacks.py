@@ -15,7 +15,8 @@ from skin_host.client.streams import Stream
 from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.info import NodeInfo
-from skin_host.mqtt.messages import Frame, Touch
+from skin_host.mqtt.messages import Frame
+from skin_host.processing.events import Touch
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)

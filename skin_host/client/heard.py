@@ -7,7 +7,6 @@ from skin_host.client.presence import Contact
 from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.messages import (
     Frame,
-    Touch,
     decode_contact,
     decode_health,
     decode_over,
@@ -16,6 +15,7 @@ from skin_host.mqtt.messages import (
 )
 from skin_host.mqtt.payload import MessageError
 from skin_host.mqtt.topics import PartTopic
+from skin_host.processing.events import Touch
 
 if TYPE_CHECKING:
     from skin_host.health.record import Record

@@ -7,8 +7,9 @@ are passed on as they arrive.
 from dataclasses import dataclass, field
 
 from skin_host.fingertip.events import Over, Slip
-from skin_host.mqtt.messages import Frame, Touch
+from skin_host.mqtt.messages import Frame
 from skin_host.mqtt.order import Stamp
+from skin_host.processing.events import Touch
 
 Event = Touch | Slip | Over
 

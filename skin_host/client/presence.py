@@ -8,7 +8,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
-from skin_host.mqtt.messages import ContactState, Touch
+from skin_host.mqtt.messages import ContactState
+from skin_host.processing.events import Touch
 
 #: Why a contact state is unknown: the node cannot feel all of the part; the node, or only this
 #: part, has not been received for too long; the node has stopped; the broker is lost.

@@ -27,10 +27,11 @@ from skin_host.mqtt.connection import (
     message_properties,
 )
 from skin_host.mqtt.info import NodeInfo, decode_info, join_pieces
-from skin_host.mqtt.messages import Frame, Touch
+from skin_host.mqtt.messages import Frame
 from skin_host.mqtt.order import run_of, stamp_of
 from skin_host.mqtt.payload import JSON_TYPE
 from skin_host.mqtt.topics import ONLINE, PartTopic, Topics
+from skin_host.processing.events import Touch
 
 #: An event waits this long for an earlier one, which may come from another broker.
 HOLD_S = 1.0

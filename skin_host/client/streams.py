@@ -8,8 +8,9 @@ from typing import Any, Generic, TypeVar, cast
 from msgspec.structs import replace
 
 from skin_host.fingertip.events import Over, Slip
-from skin_host.mqtt.messages import Frame, Touch
+from skin_host.mqtt.messages import Frame
 from skin_host.mqtt.topics import PartTopic
+from skin_host.processing.events import Touch
 
 #: How many items a stream holds for a slow reader; then the oldest is dropped and counted.
 HELD = {

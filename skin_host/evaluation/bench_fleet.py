@@ -43,11 +43,11 @@ from skin_host.evaluation.fleet_sockets import Heard, PlainEar, PlainRobot
 from skin_host.evaluation.machine import machine
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import Connection, Message
-from skin_host.mqtt.messages import Touch, decode_contact, decode_touch
+from skin_host.mqtt.messages import decode_contact, decode_touch
 from skin_host.mqtt.order import run_of, stamp_of
 from skin_host.mqtt.publisher import Publisher
 from skin_host.mqtt.topics import ONLINE
-from skin_host.processing.events import TouchEvent
+from skin_host.processing.events import Touch
 
 TRAFFIC = Path(__file__).parent / "fleet_traffic.jsonl"
 BASE = "skin"
@@ -548,10 +548,8 @@ async def _play(
                 contacts.append((time.time(), item["said"]))
 
 
-def _event(said: dict[str, Any]) -> TouchEvent:
-    touch = decode_touch(msgspec.json.encode(said))
-    keys = {key: getattr(touch, key) for key in TouchEvent.__dataclass_fields__}
-    return TouchEvent(**keys)
+def _event(said: dict[str, Any]) -> Touch:
+    return decode_touch(msgspec.json.encode(said))
 
 
 def describe(document: dict[str, Any]) -> str:

@@ -20,13 +20,13 @@ from skin_host.config.settings import Mqtt
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import FIRST_RETRY_S, GOOD_S, TIMEOUT_S, Retry, message_properties
 from skin_host.mqtt.courier import RETAINED_WINDOW, TOUCH_WINDOW
-from skin_host.mqtt.messages import ContactState, encode_contact, encode_health, encode_touch
+from skin_host.mqtt.messages import ContactState, encode_contact, encode_event, encode_health
 from skin_host.mqtt.order import RUN, STAMP, Numbers, Stamp, put_run
 from skin_host.mqtt.outbox import REPEAT_S, REPEATED
 from skin_host.mqtt.packets import pack_number, pack_text, unpack_number
 from skin_host.mqtt.payload import JSON_TYPE
 from skin_host.mqtt.topics import OFFLINE, ONLINE, Topics
-from skin_host.processing.events import TouchEvent
+from skin_host.processing.events import Touch
 
 _CONNACK, _PUBLISH, _PUBACK, _SUBACK = 0x20, 0x30, 0x40, 0x90
 _EVENT, _STATE = b"\x32", b"\x33"  # PUBLISH with QoS 1; the second is retained
@@ -82,11 +82,11 @@ class PlainRobot(asyncio.Protocol):
         """How many events and states are not acknowledged."""
         return len(self.events) + len(self._pending)
 
-    def put_touch(self, event: TouchEvent) -> None:
+    def put_touch(self, event: Touch) -> None:
         """Send an event."""
         self._touch_topic = self._touch_topic or pack_text(self._topics.part("touch", event.part))
         self.count += 1
-        self.events.append(encode_touch(event, self.count))
+        self.events.append(encode_event(event, self.count))
         self._send()
 
     def put_contact(self, part: str, state: ContactState) -> None:

@@ -23,7 +23,7 @@ from skin_host.fingertip.events import FingertipEvent
 from skin_host.fingertip.tip import Tip
 from skin_host.layout import Layout
 from skin_host.processing.calibration import Zero
-from skin_host.processing.events import TouchEvent
+from skin_host.processing.events import Touch
 
 Floats = NDArray[np.float64]
 
@@ -164,7 +164,7 @@ class FingertipEngine:
                     felt.events.extend(self._step(state, wrench))
         return felt
 
-    def note_skin(self, part: int, events: Iterable[TouchEvent], t_ns: int) -> None:
+    def note_skin(self, part: int, events: Iterable[Touch], t_ns: int) -> None:
         """Take in the contacts of a processed frame of a part (index in the layout)."""
         state = self._of_part.get(part)
         if state is not None:

@@ -1,18 +1,18 @@
-"""Events of a fingertip besides touches: it slips, or it presses too hard. Their published form.
+"""Events of a fingertip besides touches: it slips, or it presses too hard.
 
 In both, `id` is that of the contact in the part's touches, and `count` numbers the events of a kind
 and part from this node; `missed` of them were lost just before a received one.
 """
 
-from typing import Annotated, Literal
+from typing import Literal
 
-from msgspec import Meta, Struct
+from msgspec import Struct
+from msgspec.structs import replace
 
-from skin_host.processing.events import Count, Int64, TouchEvent
+from skin_host.processing.events import N_DECIMALS, Count, Int64, PartName, Touch
 
 #: What indicated a slip.
 Cause = Literal["rate", "friction", "fall"]
-PartName = Annotated[str, Meta(max_length=64)]
 
 
 class Slip(
@@ -37,6 +37,16 @@ class Slip(
     shear_rate_n_s: float
     missed: int = 0
 
+    def published(self, count: int) -> "Slip":
+        """Return the event as it is sent: numbered, and rounded."""
+        return replace(
+            self,
+            count=count,
+            force_n=round(self.force_n, N_DECIMALS),
+            shear_n=round(self.shear_n, N_DECIMALS),
+            shear_rate_n_s=round(self.shear_rate_n_s, N_DECIMALS),
+        )
+
 
 class Over(
     Struct, frozen=True, kw_only=True, omit_defaults=True, tag_field="schema", tag="skin.over/1"
@@ -51,5 +61,9 @@ class Over(
     force_n: float
     missed: int = 0
 
+    def published(self, count: int) -> "Over":
+        """Return the event as it is sent: numbered, and rounded."""
+        return replace(self, count=count, force_n=round(self.force_n, N_DECIMALS))
 
-FingertipEvent = TouchEvent | Slip | Over
+
+FingertipEvent = Touch | Slip | Over

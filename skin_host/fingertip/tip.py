@@ -7,10 +7,11 @@ precision along the surface. Times are those of the frames, ns.
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from skin_host.bus.strain import SILENT_NS, Wrench
@@ -33,7 +34,8 @@ from skin_host.processing.events import (
     NM_DECIMALS,
     Load,
     Reason,
-    TouchEvent,
+    Touch,
+    Vector,
     rounded,
 )
 
@@ -71,7 +73,7 @@ def locate_with_skin(
     contact: IntrinsicContact,
     surface: Surface,
     noise: Floats,
-    felt: TouchEvent | None,
+    felt: Touch | None,
 ) -> ContactPlace:
     """Return the place of the contact of one sample.
 
@@ -146,11 +148,11 @@ class Tip:
         self._rate_hz = 1000.0 / settings.period_ms
         self.move_hz = move_hz
         self._fresh_ns = int(FRESH_PERIODS * array_period_ns)
-        self._skin: dict[int, TouchEvent] = {}
+        self._skin: dict[int, Touch] = {}
         self._skin_ns = 0
         self._zero: Zero | None = None
         self._next_id = 1
-        self._reported: TouchEvent | None = None
+        self._reported: Touch | None = None
         self._begun_ns = 0
         self._located_ns = 0
         self._contact: IntrinsicContact | None = None
@@ -196,7 +198,7 @@ class Tip:
             self.threshold_n = max(self._settings.threshold_n, LEAST_NOISES * self._noise_n)
         self._forget()
 
-    def note_skin(self, events: Iterable[TouchEvent], t_ns: int) -> None:
+    def note_skin(self, events: Iterable[Touch], t_ns: int) -> None:
         """Take in the contact events of a frame of the skin on the fingertip."""
         self._skin_ns = t_ns
         for event in events:
@@ -302,7 +304,7 @@ class Tip:
             pitch_limit_mm=PITCH_LIMIT_MM + PITCH_NOISES * noise_nmm / force_n,
         )
 
-    def _felt(self) -> list[TouchEvent]:
+    def _felt(self) -> list[Touch]:
         """Return the contacts of the skin, if it still sends."""
         fresh = abs(self._last_ns - self._skin_ns) <= self._fresh_ns
         return list(self._skin.values()) if fresh else []
@@ -348,13 +350,12 @@ class Tip:
             t_ns=t_ns,
             part=self._name,
             cause=self._cause,
-            force_n=round(force_n, N_DECIMALS),
-            shear_n=round(shear_n, N_DECIMALS),
-            shear_rate_n_s=round(rate_n_s, N_DECIMALS),
+            force_n=force_n,
+            shear_n=shear_n,
+            shear_rate_n_s=rate_n_s,
         )
 
     def _over(self, event: Change, number: int, t_ns: int, force_n: float) -> Over:
-        force_n = round(force_n, N_DECIMALS)
         return Over(event=event, id=number, t_ns=t_ns, part=self._name, force_n=force_n)
 
     def _touch(self, load: Floats, t_ns: int) -> list[FingertipEvent]:
@@ -368,7 +369,7 @@ class Tip:
         self._reported = touch
         return [touch]
 
-    def _described(self, load: Floats, contact: IntrinsicContact | None, t_ns: int) -> TouchEvent:
+    def _described(self, load: Floats, contact: IntrinsicContact | None, t_ns: int) -> Touch:
         """Return the contact as it is now; one without a location is saturated."""
         felt = self._felt()
         skin = felt[0] if len(felt) == 1 else None
@@ -387,21 +388,21 @@ class Tip:
         force_n = rounded(load[:3].tolist(), N_DECIMALS)
         torque_nm = rounded((1e-3 * load[3:]).tolist(), NM_DECIMALS)
         before = self._reported
-        return TouchEvent(
-            "begin" if before is None else "move",
-            self._next_id if before is None else before.id,
-            self.samples,
-            t_ns,
-            self._name,
-            [] if skin is None else skin.taxels,
-            None if place is None else (1e-3 * place.point_mm).tolist(),
-            None if place is None else place.normal.tolist(),
-            math.nan if skin is None else skin.area_mm2,
-            math.nan if skin is None else skin.peak_kpa,
-            math.nan if skin is None else skin.mean_kpa,
-            normal_n,
-            None if place is None else 1e-3 * place.sigma_mm,
-            Load(verdict, force_n, torque_nm, shear, self.flag_names),
+        return Touch(
+            event="begin" if before is None else "move",
+            id=self._next_id if before is None else before.id,
+            seq=self.samples,
+            t_ns=t_ns,
+            part=self._name,
+            taxels=[] if skin is None else skin.taxels,
+            centroid_m=None if place is None else _vector(1e-3 * place.point_mm),
+            normal=None if place is None else _vector(place.normal),
+            area_mm2=None if skin is None else skin.area_mm2,
+            peak_kpa=None if skin is None else skin.peak_kpa,
+            mean_kpa=None if skin is None else skin.mean_kpa,
+            force_n=normal_n,
+            sigma_m=None if place is None else 1e-3 * place.sigma_mm,
+            load=Load(verdict, force_n, torque_nm, shear, self.flag_names),
         )
 
     def _end(self, t_ns: int, reason: Reason = "released") -> list[FingertipEvent]:
@@ -411,7 +412,7 @@ class Tip:
         load = Load(last.load.verdict, zero, zero, zero, self.flag_names)
         return [replace(last.ended(self.samples, t_ns, reason), load=load)]
 
-    def _worth_reporting(self, said: TouchEvent, now: TouchEvent) -> bool:
+    def _worth_reporting(self, said: Touch, now: Touch) -> bool:
         assert said.load is not None and now.load is not None
         if now.t_ns - said.t_ns >= ALIVE_NS:
             return True
@@ -428,3 +429,8 @@ class Tip:
 
 def _names(flags: Flags) -> list[str]:
     return [str(flag.name).lower() for flag in Flags if flag & flags]
+
+
+def _vector(values: Floats) -> Vector:
+    x, y, z = values.tolist()
+    return x, y, z

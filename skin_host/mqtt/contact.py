@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from skin_host.layout import Layout, PadKind
 from skin_host.mqtt.messages import ContactState
 from skin_host.processing.contacts import LOST_NS
-from skin_host.processing.events import TouchEvent
+from skin_host.processing.events import Touch
 from skin_host.processing.masks import all_of, any_of
 from skin_host.processing.pipeline import PressureFrame
 
@@ -64,7 +64,7 @@ class PartContact:
         #: By how much the clock was set forward since the last frame.
         self._jump_ns = 0
 
-    def step(self, frame: PressureFrame, events: Iterable[TouchEvent]) -> ContactState:
+    def step(self, frame: PressureFrame, events: Iterable[Touch]) -> ContactState:
         """Take a frame and the events of its contacts; return the state."""
         for event in events:
             if event.event == "end":
@@ -119,7 +119,7 @@ class PartContact:
         self._usable = usable & self._can_be_valid
         self._lost[~self._usable] = 0
 
-    def stop(self, events: Iterable[TouchEvent]) -> ContactState:
+    def stop(self, events: Iterable[Touch]) -> ContactState:
         """End the contacts, because no data of the part will come for a while."""
         self._present.difference_update(event.id for event in events)
         self._felt_ns[:] = _NEVER_NS

@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 from skin_host.errors import SkinError
 from skin_host.mqtt.messages import SCALE_KPA, Frame
 from skin_host.mqtt.packets import pack_number, pack_text
-from skin_host.mqtt.payload import MAX_TAXELS, MessageError, check_size, decode
-from skin_host.processing.events import Count, Int64
+from skin_host.mqtt.payload import MessageError, check_size, decode
+from skin_host.processing.events import MAX_TAXELS, Count, Int64
 from skin_host.processing.masks import Mask, any_of
 
 FRAME_SCHEMA: Final = "skin.frame/1"

@@ -15,9 +15,9 @@ from typing import NamedTuple
 from skin_host.clock import SYSTEM, Clock
 from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.connection import MessageProperties
-from skin_host.mqtt.messages import encode_grasp, encode_touch
+from skin_host.mqtt.messages import encode_event
 from skin_host.mqtt.trials import Trials
-from skin_host.processing.events import TouchEvent
+from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
 
 #: Events that are sent again to another broker: acknowledged within this time, and at most this
@@ -148,9 +148,7 @@ class Outbox:
         self.counters.frames_skipped += len(self.frames)
         self.frames.clear()
 
-    def put_touch(
-        self, topic: str, touch: TouchEvent, properties: MessageProperties | None
-    ) -> None:
+    def put_touch(self, topic: str, touch: Touch, properties: MessageProperties | None) -> None:
         """Take a touch event, or count it as lost; either way it is numbered.
 
         While many events wait, a `move` takes the place and the number of the contact's last one.
@@ -161,12 +159,12 @@ class Outbox:
             return
         self._last_moves.pop(contact, None)
         limit = self._move_limit if moves else self._event_limit
-        event = self._put_counted(topic, lambda n: encode_touch(touch, n), properties, limit)
+        event = self._put_counted(topic, lambda n: encode_event(touch, n), properties, limit)
         if moves and event is not None:
             self._last_moves[contact] = event, self._counts[topic]
 
     def _replace_move(
-        self, contact: tuple[str, int], touch: TouchEvent, properties: MessageProperties | None
+        self, contact: tuple[str, int], touch: Touch, properties: MessageProperties | None
     ) -> bool:
         """Put a move in the place of the contact's last event, if that is a waiting move."""
         last, count = self._last_moves.get(contact, (None, 0))
@@ -174,7 +172,7 @@ class Outbox:
             return False
         for back, event in enumerate(islice(reversed(self.events), len(self.events) - BACKLOG)):
             if event is last:
-                newer = last._replace(payload=encode_touch(touch, count), properties=properties)
+                newer = last._replace(payload=encode_event(touch, count), properties=properties)
                 self.events[-1 - back] = newer
                 self._last_moves[contact] = newer, count
                 self.counters.moves_replaced += 1
@@ -186,7 +184,7 @@ class Outbox:
     ) -> None:
         """Take an event of a slip, or of pressing too hard, in the same way."""
         limit = self._event_limit
-        self._put_counted(topic, lambda n: encode_grasp(event, n), properties, limit)
+        self._put_counted(topic, lambda n: encode_event(event, n), properties, limit)
 
     def _put_counted(
         self,

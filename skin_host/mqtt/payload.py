@@ -12,11 +12,10 @@ from msgspec.structs import replace
 
 from skin_host.errors import SkinError
 
-#: No valid message is longer, with stated exceptions; no part has more taxels.
+#: No valid message is longer, with stated exceptions.
 MAX_BYTES = 4 * 1024 * 1024
 #: The largest valid payload with its topic and properties.
 MAX_PACKET_BYTES = MAX_BYTES + 80_000
-MAX_TAXELS = 100_000
 
 JSON_TYPE = "application/json"
 CBOR_TYPE = "application/cbor"

@@ -44,7 +44,7 @@ from skin_host.mqtt.outbox import Event, Outbox, PublisherCounters
 from skin_host.mqtt.payload import CBOR_TYPE, JSON_TYPE
 from skin_host.mqtt.topics import OFFLINE, ONLINE, Topics
 from skin_host.mqtt.trials import TRIES
-from skin_host.processing.events import TouchEvent
+from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
 
 FRAME_EXPIRY_S = 1
@@ -204,7 +204,7 @@ class Publisher:
         """Send the boards' own bytes with the frames for this time; 0 ends it."""
         self._courier.show_raw(seconds)
 
-    def put_touch(self, event: TouchEvent) -> None:
+    def put_touch(self, event: Touch) -> None:
         """Send a touch event; those of a part arrive in order, and at least once."""
         topic = self.topics.part("touch", event.part)
         self._outbox.put_touch(topic, event, self._event_properties)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from skin_host.config.settings import Settings
 from skin_host.layout import Layout, PadKind
-from skin_host.processing.events import Reason, TouchEvent
+from skin_host.processing.events import Reason, Touch, Vector
 from skin_host.processing.localization import Localizer, make_localizer, separate
 from skin_host.processing.localization_centroid import GEOMETRY_PITCHES
 from skin_host.processing.masks import Mask, all_of, any_of
@@ -48,7 +48,7 @@ class _Contact:
     taxels: frozenset[int]
     #: The same in rising order, intp.
     order: NDArray[np.intp]
-    said: TouchEvent
+    said: Touch
     heard_ns: int
     #: The recent highest pressure.
     firm_kpa: float
@@ -96,7 +96,7 @@ class ContactTracker:
         self._t_ns = before._t_ns
         self._seen = None
 
-    def step(self, frame: PressureFrame) -> list[TouchEvent]:
+    def step(self, frame: PressureFrame) -> list[Touch]:
         """Return the events since the last frame: ends first, then moves and begins."""
         if not self._contacts and not any_of(frame.touched):
             return []
@@ -109,7 +109,7 @@ class ContactTracker:
         ]
         return events + self._reported(found, frame)
 
-    def end_all(self, seq: int, t_ns: int) -> list[TouchEvent]:
+    def end_all(self, seq: int, t_ns: int) -> list[Touch]:
         """End every contact, because no data of the part will come for a while."""
         self._seen = None
         return [self._closed(name, seq, t_ns, "stopped") for name in list(self._contacts)]
@@ -283,7 +283,7 @@ class ContactTracker:
                 self._next_id += 1
         return [names[number] for number in range(len(groups))]
 
-    def _reported(self, found: "_Grouping", frame: PressureFrame) -> list[TouchEvent]:
+    def _reported(self, found: "_Grouping", frame: PressureFrame) -> list[Touch]:
         """Return the events of the contacts of a frame, and update the contacts."""
         if not found.names:
             return []
@@ -325,7 +325,8 @@ class ContactTracker:
                 if self._places is not None:
                     centroid, sigma = self._places.locate(index)
                 else:
-                    centroid = centroids[number]
+                    x, y, z = centroids[number]
+                    centroid = x, y, z
                     # Noise adds little to the uncertainty from the coarse pads.
                     sigma = GEOMETRY_PITCHES * self._pitch_m / math.sqrt(len(index))
             if before is not None and not _worth_reporting(
@@ -337,20 +338,20 @@ class ContactTracker:
                 span = found.span(number)
                 normal = self._mean_normal(weight[span], found.order[span], totals[number])
             area_mm2 = found.area_mm2[number]
-            event = TouchEvent(
-                "begin" if before is None else "move",
-                name,
-                frame.seq,
-                frame.t_ns,
-                self._name,
-                index,
-                centroid,
-                normal,
-                area_mm2,
-                peak,
-                totals[number] / area_mm2,
-                totals[number] * 1e-3,  # kPa mm2 is mN
-                sigma,
+            event = Touch(
+                event="begin" if before is None else "move",
+                id=name,
+                seq=frame.seq,
+                t_ns=frame.t_ns,
+                part=self._name,
+                taxels=index,
+                centroid_m=centroid,
+                normal=normal,
+                area_mm2=area_mm2,
+                peak_kpa=peak,
+                mean_kpa=totals[number] / area_mm2,
+                force_n=totals[number] * 1e-3,  # kPa mm2 is mN
+                sigma_m=sigma,
             )
             events.append(event)
             if known is None:
@@ -360,20 +361,18 @@ class ContactTracker:
                 known.said = event
         return events
 
-    def _mean_normal(
-        self, weight: Floats, taxels: NDArray[np.intp], total: float
-    ) -> list[float] | None:
+    def _mean_normal(self, weight: Floats, taxels: NDArray[np.intp], total: float) -> Vector | None:
         direction = weight @ self._normal[taxels]
         length = math.sqrt(direction.dot(direction))
-        found: list[float] = (direction / length).tolist()
-        return found if length > 1e-9 * total else None
+        x, y, z = (direction / length).tolist()
+        return (x, y, z) if length > 1e-9 * total else None
 
     def _reason(self, name: int, frame: PressureFrame) -> Reason:
         """A contact is released only if all its taxels are valid and none is touched."""
         known = frame.valid[list(self._contacts[name].taxels)].all()
         return "released" if known else "lost"
 
-    def _closed(self, name: int, seq: int, t_ns: int, reason: Reason) -> TouchEvent:
+    def _closed(self, name: int, seq: int, t_ns: int, reason: Reason) -> Touch:
         return self._contacts.pop(name).said.ended(seq, t_ns, reason)
 
 
@@ -486,12 +485,13 @@ class _Grouping:
 
 
 def _worth_reporting(
-    said: TouchEvent, t_ns: int, taxels: list[int], peak_kpa: float, centroid_m: list[float] | None
+    said: Touch, t_ns: int, taxels: list[int], peak_kpa: float, centroid_m: Vector | None
 ) -> bool:
     """Return whether a contact has changed since its last event, or its next event is due."""
     if taxels != said.taxels or t_ns - said.t_ns >= ALIVE_NS:
         return True
-    if abs(peak_kpa - said.peak_kpa) > max(PRESSED_KPA, PRESSED_SHARE * said.peak_kpa):
+    said_kpa = said.peak_kpa or 0.0
+    if abs(peak_kpa - said_kpa) > max(PRESSED_KPA, PRESSED_SHARE * said_kpa):
         return True
     if centroid_m is None or said.centroid_m is None:
         return centroid_m is not said.centroid_m
@@ -545,7 +545,7 @@ class _Places:
         self._believed = frame.valid
         return contacts
 
-    def locate(self, taxels: list[int]) -> tuple[list[float] | None, float | None]:
+    def locate(self, taxels: list[int]) -> tuple[Vector | None, float | None]:
         """Position in the part's frame and its standard error, m, of one of the contacts."""
         index = np.array(taxels, np.intp)
         usable = self._free.copy()
@@ -553,7 +553,8 @@ class _Places:
         location = self._localizer.locate(index, self._units, usable)
         if location is None:
             return None, None
-        return location.position_m.tolist(), location.sigma_m
+        x, y, z = location.position_m.tolist()
+        return (x, y, z), location.sigma_m
 
 
 def _pitch_m(position_m: Floats, neighbours: Sequence[Sequence[int]]) -> float:

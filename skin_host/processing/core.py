@@ -18,7 +18,7 @@ from skin_host.fingertip.events import FingertipEvent
 from skin_host.layout import Layout
 from skin_host.processing.calibration import Calibration, Calibrator, with_zeros
 from skin_host.processing.contacts import ContactTracker
-from skin_host.processing.events import TouchEvent
+from skin_host.processing.events import Touch
 from skin_host.processing.intake import Intake, PartSample, below_zero
 from skin_host.processing.liveness import PADS
 from skin_host.processing.masks import Mask
@@ -49,7 +49,7 @@ class Step:
 
     part: int
     frame: PressureFrame
-    events: list[TouchEvent]
+    events: list[Touch]
 
 
 class Output(NamedTuple):
@@ -396,7 +396,7 @@ class Engine:
             for board in sorted(self._rezeros.keys() | self._below.keys())
         }
 
-    def end_part(self, part: int, t_ns: int) -> list[TouchEvent]:
+    def end_part(self, part: int, t_ns: int) -> list[Touch]:
         """End every contact of a part."""
         seq = self._pipeline.seq(part) if self._pipeline else 0
         events = self._trackers[part].end_all(seq, t_ns)

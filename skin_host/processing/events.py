@@ -1,22 +1,27 @@
-"""What the pipeline reports of contacts. Plain data: subscribers import this without numpy."""
+"""Events of contacts, from the pipeline to the subscriber. Imported without numpy."""
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, field
+from msgspec.structs import replace
+
+#: No part has more.
+MAX_TAXELS = 100_000
 
 Int64 = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Vector = tuple[float, float, float]
+PartName = Annotated[str, Meta(max_length=64)]
 
 #: Why a contact ended: it is no longer felt; nothing valid comes from where it was; or the daemon
 #: stopped, or changed how it decides.
 Reason = Literal["released", "lost", "stopped"]
 
 
-#: Published decimals of m (0.001 mm), of N, of N m and of the parts of a unit vector.
+#: Published decimals of kPa, mm2, m (0.001 mm), N, N m and of the parts of a unit vector.
+KPA_DECIMALS = 3
+MM2_DECIMALS = 2
 M_DECIMALS = 6
 N_DECIMALS = 4
 NM_DECIMALS = 6
@@ -40,36 +45,48 @@ class Load(Struct, frozen=True):
     flags: Annotated[list[Annotated[str, Meta(max_length=16)]], Meta(max_length=16)]
 
 
-@dataclass(frozen=True, slots=True)
-class TouchEvent:
-    """A contact begins, moves or ends.
+class Touch(
+    Struct, frozen=True, kw_only=True, omit_defaults=True, tag_field="schema", tag="skin.touch/1"
+):
+    """A contact begins, moves or ends: what `<part>/touch` publishes.
 
-    Taxels are numbered within their part. Positions are in the part's frame. `sigma_m` is the
-    radial standard error of `centroid_m`, in the skin; None where the place is not known. `end`
-    has the last place of the contact, and its pressures are 0. Without skin, on a fingertip that
-    has only a force/torque board, area and pressures are NaN; `load` is given only there.
-    `reason` is that of an end.
+    Attributes:
+        id: of the contact, among those of its part.
+        seq, t_ns: of the frame in which it happened.
+        count: number of events of the part from this node so far, this one included; 0 before it
+            is published. A gap is a loss; it starts again at 1 with the node.
+        taxels: numbers within the part.
+        centroid_m, normal: in the part's frame; None where the place is not known. An end has the
+            last place of the contact; its pressures are 0.
+        area_mm2, peak_kpa, mean_kpa: None on a fingertip without skin.
+        sigma_m: radial standard error of `centroid_m`, in the skin; None where it is not known.
+        reason: why it ended, only with an end.
+        load: only of fingertips on force/torque boards.
+        missed: of a received event: so many of its part were lost just before it.
     """
 
     event: Literal["begin", "move", "end"]
-    id: int
-    seq: int
-    t_ns: int
-    part: str
-    taxels: list[int]
-    centroid_m: list[float] | None
-    normal: list[float] | None
-    area_mm2: float
-    peak_kpa: float
-    mean_kpa: float
+    id: Count
+    seq: Count
+    t_ns: Int64
+    count: Count = 0
+    part: PartName
+    taxels: Annotated[list[Annotated[int, Meta(ge=0, le=MAX_TAXELS)]], Meta(max_length=MAX_TAXELS)]
+    centroid_m: Vector | None
+    normal: Vector | None
+    area_mm2: float | None
+    peak_kpa: float | None
+    mean_kpa: float | None
     force_n: float
-    sigma_m: float | None = None
-    load: Load | None = None
+    #: Written even where it is None: only a plain default is left out.
+    sigma_m: Annotated[float, Meta(ge=0)] | None = field(default_factory=lambda: None)
     reason: Reason | None = None
+    load: Load | None = None
+    missed: int = 0
 
-    def ended(self, seq: int, t_ns: int, reason: Reason = "released") -> "TouchEvent":
+    def ended(self, seq: int, t_ns: int, reason: Reason = "released") -> "Touch":
         """The contact's end: where it was last; what is known of its pressures is 0."""
-        nothing_kpa = math.nan if math.isnan(self.area_mm2) else 0.0
+        nothing_kpa = None if self.area_mm2 is None else 0.0
         return replace(
             self,
             event="end",
@@ -80,6 +97,24 @@ class TouchEvent:
             force_n=0.0,
             reason=reason,
         )
+
+    def published(self, count: int) -> "Touch":
+        """Return the event as it is sent: numbered, and rounded."""
+        return replace(
+            self,
+            count=count,
+            centroid_m=_rounded(self.centroid_m, M_DECIMALS),
+            normal=_rounded(self.normal, NORMAL_DECIMALS),
+            area_mm2=None if self.area_mm2 is None else round(self.area_mm2, MM2_DECIMALS),
+            peak_kpa=None if self.peak_kpa is None else round(self.peak_kpa, KPA_DECIMALS),
+            mean_kpa=None if self.mean_kpa is None else round(self.mean_kpa, KPA_DECIMALS),
+            force_n=round(self.force_n, N_DECIMALS),
+            sigma_m=None if self.sigma_m is None else round(self.sigma_m, M_DECIMALS),
+        )
+
+
+def _rounded(vector: Vector | None, decimals: int) -> Vector | None:
+    return None if vector is None else rounded(vector, decimals)
 
 
 def rounded(values: Sequence[float], decimals: int) -> Vector:

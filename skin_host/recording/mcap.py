@@ -23,15 +23,9 @@ from skin_host.fingertip.events import Over, Slip
 from skin_host.health.record import Record
 from skin_host.mqtt.frames import FRAME_SCHEMA, JsonFrame, decode_frame, encode_frame
 from skin_host.mqtt.info import INFO_SCHEMA, NodeInfo
-from skin_host.mqtt.messages import (
-    HEALTH_SCHEMA,
-    Frame,
-    Touch,
-    decode_over,
-    decode_slip,
-    decode_touch,
-)
+from skin_host.mqtt.messages import HEALTH_SCHEMA, Frame, decode_over, decode_slip, decode_touch
 from skin_host.mqtt.topics import PartTopic, Topics
+from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
 
 SUFFIX = ".mcap"

@@ -24,14 +24,14 @@ from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import Settings, load, skin_hash
 from skin_host.errors import ConfigurationError, LogError, RequestError, SkinError, required
 from skin_host.files import whole_file
-from skin_host.fingertip.events import FingertipEvent, Slip
+from skin_host.fingertip.events import FingertipEvent
 from skin_host.health import HealthWatch
 from skin_host.layout import Layout, build_layout
-from skin_host.mqtt.messages import KPA_DECIMALS, health_keys, touch_message
+from skin_host.mqtt.messages import encode_event, health_keys
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration
 from skin_host.processing.core import Engine, Output, Step
-from skin_host.processing.events import TouchEvent
+from skin_host.processing.events import KPA_DECIMALS
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.recording.mcap import SUFFIX, read_can
 
@@ -85,15 +85,9 @@ class EventLines:
         key = event.part, type(event)
         self._counts[key] += 1
         count = self._counts[key]
-        if isinstance(event, TouchEvent):
-            return _struct_line("touch", touch_message(event, count))
-        kind = "slip" if isinstance(event, Slip) else "over"
-        return _struct_line(kind, msgspec.structs.replace(event, count=count))
-
-
-def _struct_line(kind: str, message: msgspec.Struct) -> bytes:
-    # The message has keys of its own, so a comma follows the type.
-    return b'{"type":"%b",%b\n' % (kind.encode(), _encoder.encode(message)[1:])
+        kind = type(event).__name__.lower()
+        # The message has keys of its own, so a comma follows the type.
+        return b'{"type":"%b",%b\n' % (kind.encode(), encode_event(event, count)[1:])
 
 
 def _line(kind: str, keys: dict[str, Any]) -> bytes:

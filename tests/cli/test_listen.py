@@ -13,15 +13,14 @@ from skin_host.fingertip.events import Over, Slip
 from skin_host.layout import build_layout
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
-from skin_host.processing.events import TouchEvent
 from tests.support.broker import Mosquitto
+from tests.support.said import touch_event
 from tests.support.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / "config" / "fingertips.toml"
-NAN = float("nan")
-BEGUN = TouchEvent(
-    "begin", 4, 1, 5, "index", [], [0.001, 0.002, 0.013], [0, 0, 1.0], NAN, NAN, NAN, 2.0
+BEGUN = touch_event(
+    "begin", 4, 1, 5, "index", [], [0.001, 0.002, 0.013], [0, 0, 1.0], None, None, None, 2.0
 )
 SLIP = Slip(
     event="begin",

@@ -21,9 +21,10 @@ from skin_host.errors import BrokerError, RequestError
 from skin_host.layout import build_layout
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
-from skin_host.processing.events import TouchEvent
+from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
 from tests.support.broker import Mosquitto, free_port
+from tests.support.said import touch_event
 from tests.support.waiting import PATIENCE_S, until
 
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
@@ -38,8 +39,8 @@ def frame(seq: int, part: str = "palm") -> PressureFrame:
     return PressureFrame(part, seq, seq, np.zeros(m, np.uint8), kpa, none, valid, none)
 
 
-def touch(number: int, part: str = "palm", event: Any = "move") -> TouchEvent:
-    return TouchEvent(event, 1, number, number, part, [1], None, None, 1.0, 2.0, 2.0, 0.1)
+def touch(number: int, part: str = "palm", event: Any = "move") -> Touch:
+    return touch_event(event, 1, number, number, part, [1], None, None, 1.0, 2.0, 2.0, 0.1)
 
 
 async def answer(name: str, payload: bytes) -> Mapping[str, Any]:

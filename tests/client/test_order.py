@@ -6,8 +6,8 @@ import pytest
 from msgspec.structs import replace
 
 from skin_host.client.order import MAX_HELD, EventOrder, Newest
-from skin_host.mqtt.messages import Touch
 from skin_host.mqtt.order import Numbers, Stamp
+from skin_host.processing.events import Touch
 from tests.client.test_presence import seen
 
 

@@ -11,8 +11,8 @@ from skin_host.client.presence import Presence
 from skin_host.config.settings import load
 from skin_host.layout import build_layout
 from skin_host.mqtt.info import node_info
-from skin_host.mqtt.messages import Touch
 from skin_host.mqtt.publisher import Publisher
+from skin_host.processing.events import Touch
 from tests.client.test_client import hearing, publishing, take, touch
 from tests.support.broker import Mosquitto
 from tests.support.waiting import until

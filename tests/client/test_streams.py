@@ -6,7 +6,8 @@ from msgspec.structs import replace
 from skin_host.client.heard import Contact
 from skin_host.client.streams import HELD, Stream
 from skin_host.fingertip.events import Over
-from skin_host.mqtt.messages import Frame, Touch
+from skin_host.mqtt.messages import Frame
+from skin_host.processing.events import Touch
 
 
 def touch(count: int, t_ns: int | None = None, part: str = "palm") -> Touch:

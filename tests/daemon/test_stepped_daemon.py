@@ -14,7 +14,7 @@ from skin_host.config.settings import Bus
 from skin_host.health import Record
 from skin_host.mqtt.messages import ContactState
 from skin_host.mqtt.publisher import Publisher
-from skin_host.processing.events import TouchEvent
+from skin_host.processing.events import Touch
 from tests.support.live import Live, living
 from tests.support.stepped import stepped
 
@@ -47,7 +47,7 @@ async def lived(clock: SteppedClock, state: Path, channel: str) -> list[object]:
     async with living(bus, state, scene=Scene(quiet=True, probe=[PRESS]), clock=clock) as live:
         put = live.daemon.publisher.put_touch
 
-        def note(event: TouchEvent) -> None:
+        def note(event: Touch) -> None:
             said.append((event.event, event.id, event.t_ns, event.taxels, event.force_n))
             put(event)
 
@@ -113,7 +113,7 @@ async def test_a_clock_that_is_set_changes_no_contact(clock: SteppedClock, tmp_p
             said.add((part, state))
             put_contact(part, state)
 
-        def note_touch(event: TouchEvent) -> None:
+        def note_touch(event: Touch) -> None:
             said.add((event.part, event.event))
             put_touch(event)
 

@@ -19,16 +19,16 @@ from skin_host.config.settings import Mqtt, load
 from skin_host.layout import build_layout
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
-from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
 from tests.support import ros
 from tests.support.broker import Mosquitto
+from tests.support.said import touch_event
 from tests.support.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
 CONFIG = ROOT / "config" / "demo.toml"
-BEGIN = TouchEvent(
+BEGIN = touch_event(
     "begin", 7, 3, 10**18 + 5, "left_hand", [0, 1], [0.1, 0, 0], [0, 0, 1.0], 40.0, 31, 20.0, 2.0
 )
 

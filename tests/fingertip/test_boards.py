@@ -26,7 +26,7 @@ from skin_host.layout import build_layout
 from skin_host.mqtt import messages
 from skin_host.processing.calibration import Zero
 from skin_host.processing.core import Engine
-from skin_host.processing.events import TouchEvent
+from skin_host.processing.events import Touch
 
 CONFIG = Path(__file__).parents[2] / "config"
 
@@ -207,11 +207,11 @@ def test_no_traffic_on_the_bus_breaks_the_engine_or_gives_numbers_that_are_none(
     felt += bench.tips.end_all(t_ns)
     open_now: dict[str, set[tuple[str, int]]] = {"touch": set(), "slip": set(), "over": set()}
     for event in felt:
-        kind = "touch" if isinstance(event, TouchEvent) else type(event).__name__.lower()
+        kind = "touch" if isinstance(event, Touch) else type(event).__name__.lower()
         assert math.isfinite(event.force_n)
-        if isinstance(event, TouchEvent):
+        if isinstance(event, Touch):
             assert event.centroid_m is None or np.isfinite(event.centroid_m).all()
-            messages.decode_touch(messages.encode_touch(event, 1))
+            messages.decode_touch(messages.encode_event(event, 1))
         key = event.part, event.id
         if event.event == "begin":
             assert key not in open_now[kind] or kind != "touch"

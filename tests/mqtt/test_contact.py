@@ -11,10 +11,11 @@ from skin_host.layout import PadKind, build_layout
 from skin_host.mqtt.contact import SURE_FRAMES, PartContact
 from skin_host.processing.contacts import LOST_NS
 from skin_host.processing.core import Output
-from skin_host.processing.events import TouchEvent
+from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
 from tests.support.branch import branch
 from tests.support.fault_bench import CONFIG, FaultBench
+from tests.support.said import touch_event
 
 LAYOUT = build_layout(load(CONFIG), CONFIG.parent)
 PART = LAYOUT.parts.index(LAYOUT.part("left_forearm"))
@@ -34,8 +35,8 @@ def frame(t_ns: int, touched: list[int] | None = None, blind: slice | None = Non
     return PressureFrame("left_forearm", 1, t_ns, np.zeros(N, np.uint8), kpa, touches, valid, none)
 
 
-def begin(taxels: list[int]) -> TouchEvent:
-    return TouchEvent("begin", 1, 1, 1, "left_forearm", taxels, None, None, 1.0, 1.0, 1.0, 1.0)
+def begin(taxels: list[int]) -> Touch:
+    return touch_event("begin", 1, 1, 1, "left_forearm", taxels, None, None, 1.0, 1.0, 1.0, 1.0)
 
 
 def watched(t_ns: int = 0) -> PartContact:
@@ -208,7 +209,7 @@ def test_no_board_or_triangle_that_dies_while_it_is_touched_looks_untouched(
 ) -> None:
     bench = branch(soon_pressed)
     contact = PartContact(bench.layout, PART)
-    events: list[TouchEvent] = []
+    events: list[Touch] = []
     states: list[str] = []
     note = bench._note
 

@@ -1,7 +1,5 @@
 """Slips and pressing too hard: payloads, and touches of fingertips without skin."""
 
-import math
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -10,7 +8,8 @@ from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt import messages
 from skin_host.mqtt.outbox import Outbox
 from skin_host.mqtt.payload import MessageError
-from skin_host.processing.events import Load, TouchEvent
+from skin_host.processing.events import Load
+from tests.support.said import touch_event
 
 SLIP = Slip(
     event="begin",
@@ -27,7 +26,7 @@ LOAD = Load("contact", (0.1, 0.0, -2.0), (0.001, 0.0, 0.0), (0.1, 0.0, 0.0), ["t
 
 
 def test_what_was_said_is_what_is_heard() -> None:
-    slip = messages.decode_slip(messages.encode_grasp(SLIP, 3))
+    slip = messages.decode_slip(messages.encode_event(SLIP, 3))
     assert (slip.event, slip.id, slip.count, slip.part, slip.cause) == (
         "begin",
         4,
@@ -36,7 +35,7 @@ def test_what_was_said_is_what_is_heard() -> None:
         "rate",
     )
     assert (slip.force_n, slip.shear_n, slip.shear_rate_n_s) == (2.01, 1.14, 7.5)
-    over = messages.decode_over(messages.encode_grasp(OVER, 1))
+    over = messages.decode_over(messages.encode_event(OVER, 1))
     assert (over.event, over.id, over.t_ns, over.force_n) == ("end", 4, 12, 9.5)
 
 
@@ -48,11 +47,23 @@ def test_no_payload_of_a_stranger_raises_anything_else(payload: bytes) -> None:
 
 
 def test_a_touch_without_skin_has_neither_area_nor_pressure() -> None:
-    nan = math.nan
-    event = TouchEvent(
-        "begin", 1, 2, 3, "index", [], [0.0, 0.0, 0.01], [0, 0, 1], nan, nan, nan, 2.0, 1e-4, LOAD
+    event = touch_event(
+        "begin",
+        1,
+        2,
+        3,
+        "index",
+        [],
+        [0.0, 0.0, 0.01],
+        [0, 0, 1],
+        None,
+        None,
+        None,
+        2.0,
+        1e-4,
+        LOAD,
     )
-    payload = messages.encode_touch(event, 1)
+    payload = messages.encode_event(event, 1)
     assert b'"area_mm2":null,"peak_kpa":null,"mean_kpa":null,"force_n":2.0' in payload
     touch = messages.decode_touch(payload)
     assert touch.load is not None

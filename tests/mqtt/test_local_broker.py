@@ -13,8 +13,8 @@ from skin_host.config.settings import Mqtt
 from skin_host.errors import BrokerError
 from skin_host.mqtt import broker as local
 from skin_host.mqtt.publisher import Publisher
-from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
+from tests.support.said import touch_event
 from tests.support.waiting import until
 
 
@@ -30,7 +30,7 @@ async def publish_and_listen(host: str, port: int, protocol: str) -> list[str]:
     frame = PressureFrame(
         "palm", 1, 1, np.zeros(12, np.uint8), np.zeros(12, np.float32), mask, ~mask, mask
     )
-    touch = TouchEvent("begin", 1, 1, 1, "palm", [1], None, None, 1.0, 1.0, 1.0, 0.1)
+    touch = touch_event("begin", 1, 1, 1, "palm", [1], None, None, 1.0, 1.0, 1.0, 0.1)
     async with aiomqtt.Client(host, port) as client:
         await client.subscribe("skin/#", qos=1)
         task = asyncio.create_task(listen(client))

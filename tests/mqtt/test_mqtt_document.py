@@ -11,7 +11,7 @@ from skin_host.mqtt import frames, messages
 from skin_host.mqtt.commands import decode_result
 from skin_host.mqtt.info import FingertipInfo, NodeInfo, PartInfo, TriangleInfo
 from skin_host.mqtt.outbox import PublisherCounters
-from skin_host.processing.events import Load
+from skin_host.processing.events import Load, Touch
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "mqtt.md").read_text()
 EXAMPLES = {
@@ -30,7 +30,7 @@ def test_the_touch_of_the_document_has_exactly_the_keys_of_a_touch() -> None:
     touch = messages.decode_touch(EXAMPLES["skin.touch/1"])
     assert touch.count == 52
     keys = list(msgspec.json.decode(EXAMPLES["skin.touch/1"]))
-    whole = ["schema", *messages.Touch.__struct_fields__]
+    whole = ["schema", *Touch.__struct_fields__]
     assert [*keys, "reason", "load", "missed"] == whole
 
 
@@ -50,7 +50,7 @@ def test_the_result_of_the_document_is_a_result() -> None:
 
 def test_the_document_names_every_key() -> None:
     keys = {
-        *messages.Touch.__struct_fields__,
+        *Touch.__struct_fields__,
         *Load.__struct_fields__,
         *frames._FrameFields.__struct_fields__,
         *NodeInfo.__struct_fields__,

@@ -11,8 +11,9 @@ from msgspec import json
 
 from skin_host.clock import SteppedClock
 from skin_host.mqtt.outbox import BACKLOG, REPEAT_S, REPEATED, Event, Outbox
-from skin_host.processing.events import TouchEvent
+from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
+from tests.support.said import touch_event
 
 
 def frame(part: str, seq: int, t_ns: int = 0) -> PressureFrame:
@@ -22,8 +23,8 @@ def frame(part: str, seq: int, t_ns: int = 0) -> PressureFrame:
     )
 
 
-def touch(event: str, part: str = "palm", contact: int = 1, t_ns: int = 1) -> TouchEvent:
-    return TouchEvent(event, contact, 1, t_ns, part, [1], None, None, 1.0, 1.0, 1.0, 0.1)  # type: ignore[arg-type]
+def touch(event: str, part: str = "palm", contact: int = 1, t_ns: int = 1) -> Touch:
+    return touch_event(event, contact, 1, t_ns, part, [1], None, None, 1.0, 1.0, 1.0, 0.1)  # type: ignore[arg-type]
 
 
 def connected(

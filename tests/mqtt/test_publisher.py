@@ -18,9 +18,10 @@ from skin_host.config.settings import Mqtt
 from skin_host.errors import ConfigurationError, RequestError
 from skin_host.mqtt.order import Stamp
 from skin_host.mqtt.publisher import Publisher
-from skin_host.processing.events import TouchEvent
+from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
 from tests.support.broker import Mosquitto, free_port
+from tests.support.said import touch_event
 from tests.support.waiting import PATIENCE_S, until
 
 STATUS = "skin/robot/nodes/main/status"
@@ -35,8 +36,8 @@ def frame(seq: int, t_ns: int = 0, part: str = "palm") -> PressureFrame:
     return PressureFrame(part, seq, t_ns, np.zeros(m, np.uint8), pressure, mask, ~mask, mask)
 
 
-def touch(number: int, event: Any = "begin", part: str = "palm") -> TouchEvent:
-    return TouchEvent(
+def touch(number: int, event: Any = "begin", part: str = "palm") -> Touch:
+    return touch_event(
         event, number, number, number, part, [1], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0], 1, 2.0, 2.0, 0.1
     )
 

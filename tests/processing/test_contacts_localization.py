@@ -13,7 +13,7 @@ from skin_host.config.settings import Settings, load
 from skin_host.errors import ConfigurationError
 from skin_host.layout import Layout, build_layout
 from skin_host.processing.contacts import ContactTracker
-from skin_host.processing.events import TouchEvent
+from skin_host.processing.events import Touch
 from skin_host.processing.localization import Method
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.processing.pressure import PressureCurve
@@ -88,12 +88,12 @@ class PressedPalm:
         return PressureFrame("palm", self.seq, t_ns, raw, kpa, touched, valid, ~valid)
 
 
-def off_mm(event: TouchEvent, place: np.ndarray) -> float:
+def off_mm(event: Touch, place: np.ndarray) -> float:
     assert event.centroid_m is not None
     return float(np.linalg.norm(1e3 * np.array(event.centroid_m[:2]) - place))
 
 
-def first_events(tracker: ContactTracker, frame: PressureFrame) -> list[TouchEvent]:
+def first_events(tracker: ContactTracker, frame: PressureFrame) -> list[Touch]:
     """What is told of a frame when no contact was there before it."""
     events = tracker.step(frame)
     tracker.end_all(frame.seq, frame.t_ns)

@@ -10,7 +10,7 @@ import pytest
 from skin_host.cli import main
 from skin_host.errors import RequestError, SkinError, required
 from skin_host.mqtt.info import PartInfo, TriangleInfo
-from skin_host.mqtt.messages import Touch
+from skin_host.processing.events import Touch
 from skin_host.recording.export import HealthLine, PartSeries, Series, export
 from skin_host.recording.export.scene import ARROW_M_PER_N, POINT, RecordedScene
 from tests.support.rerun import chunks

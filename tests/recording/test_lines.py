@@ -3,7 +3,7 @@
 import numpy as np
 from msgspec import json
 
-from skin_host.mqtt.messages import encode_touch
+from skin_host.mqtt.messages import encode_event
 from skin_host.recording.replay import EventLines, frame_line
 from tests.support.said import make_event, make_frame
 
@@ -20,4 +20,4 @@ def test_a_line_of_a_touch_is_the_payload_and_its_type() -> None:
     lines = EventLines()
     for count in (1, 2):
         line = json.decode(lines.line(make_event()))
-        assert line == {"type": "touch"} | json.decode(encode_touch(make_event(), count))
+        assert line == {"type": "touch"} | json.decode(encode_event(make_event(), count))

@@ -20,16 +20,16 @@ from skin_host.config.settings import Mqtt, load
 from skin_host.layout import build_layout
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
-from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.recording.export import live
 from tests.support.broker import Mosquitto, free_port
 from tests.support.rerun import chunks
+from tests.support.said import touch_event
 from tests.support.waiting import until
 
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
 PATIENCE_S = 60.0
-TOUCH = TouchEvent(
+TOUCH = touch_event(
     "begin", 7, 3, 10**18 + 5, "left_hand", [0, 1], [0.1, 0, 0], [0, 0, 1.0], 40.0, 31, 20.0, 2.0
 )
 

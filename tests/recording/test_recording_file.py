@@ -13,10 +13,10 @@ from mcap.reader import make_reader
 from skin_host.bus.wire import FrameBatch
 from skin_host.errors import LogError
 from skin_host.mqtt.frames import encode_frame
-from skin_host.mqtt.messages import encode_touch
-from skin_host.processing.events import TouchEvent
+from skin_host.mqtt.messages import encode_event
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.recording.mcap import Recorder, read_can, read_messages_of
+from tests.support.said import touch_event
 
 TOPIC = "skin/demo/palm"
 
@@ -32,8 +32,8 @@ def frame(seq: int, encoding: Any = "json", *, raw: bool = False) -> bytes:
 
 
 def touch(event: Any, number: int) -> bytes:
-    return encode_touch(
-        TouchEvent(event, 7, number, 500, "palm", [1, 2], None, None, 40.0, 3.0, 2.0, 0.1), number
+    return encode_event(
+        touch_event(event, 7, number, 500, "palm", [1, 2], None, None, 40.0, 3.0, 2.0, 0.1), number
     )
 
 

@@ -1,9 +1,22 @@
 """A frame and a touch to say, of which a test changes what it is about."""
 
+from typing import Any
+
 import numpy as np
 
-from skin_host.processing.events import TouchEvent
+from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
+
+#: In this order a test may give what it is about.
+_KEYS = (
+    *("event", "id", "seq", "t_ns", "part", "taxels", "centroid_m", "normal"),
+    *("area_mm2", "peak_kpa", "mean_kpa", "force_n", "sigma_m", "load"),
+)
+
+
+def touch_event(*values: Any) -> Touch:
+    """A touch from values in the order of `_KEYS`."""
+    return Touch(**dict(zip(_KEYS, values, strict=False)))
 
 
 def make_frame(pressure_kpa: list[float], **changes: object) -> PressureFrame:
@@ -21,7 +34,7 @@ def make_frame(pressure_kpa: list[float], **changes: object) -> PressureFrame:
     return PressureFrame(**(keys | changes))  # type: ignore[arg-type]
 
 
-def make_event(**changes: object) -> TouchEvent:
+def make_event(**changes: object) -> Touch:
     keys: dict[str, object] = {
         "event": "begin",
         "id": 3,
@@ -37,4 +50,4 @@ def make_event(**changes: object) -> TouchEvent:
         "force_n": 0.123456,
         "sigma_m": 0.00123456,
     }
-    return TouchEvent(**(keys | changes))  # type: ignore[arg-type]
+    return Touch(**(keys | changes))  # type: ignore[arg-type]

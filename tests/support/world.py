@@ -20,7 +20,7 @@ from skin_host.config.settings import Bus, load
 from skin_host.layout import build_layout
 from skin_host.mqtt.frames import encode_frame
 from skin_host.mqtt.info import encode_info, node_info
-from skin_host.mqtt.messages import encode_touch
+from skin_host.mqtt.messages import encode_event
 from skin_host.processing import calibration
 from skin_host.processing.core import Engine
 from skin_host.recording.capture import CanLog
@@ -110,7 +110,7 @@ class World:
                     payload = encode_frame(step.frame)
                     recorder.say(f"{topic}/frame", step.frame.t_ns, payload)
                     for i, event in enumerate(step.events):
-                        payload = encode_touch(event, i + 1)
+                        payload = encode_event(event, i + 1)
                         recorder.say(f"{topic}/touch", event.t_ns, payload)
 
     def write_imports(self) -> None:

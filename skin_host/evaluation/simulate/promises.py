@@ -19,7 +19,7 @@ from skin_host.evaluation.simulate.accusations import Accusations
 from skin_host.evaluation.simulate.troubles import Trouble
 from skin_host.evaluation.simulate.world import Life, World
 from skin_host.layout import PadKind
-from skin_host.processing.events import TouchEvent
+from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
 
 NS = 1_000_000_000
@@ -239,7 +239,7 @@ class Promises:
 
     # ------------------------------------------------------------------ where things leave the core
 
-    def _touch(self, event: TouchEvent) -> None:
+    def _touch(self, event: Touch) -> None:
         now = self._open.setdefault(event.part, set())
         self.touches += 1
         self._put[event.part] = self._put.get(event.part, 0) + 1

@@ -16,7 +16,7 @@ import numpy as np
 
 from skin_host.errors import RequestError, required
 from skin_host.files import write_atomic, writing
-from skin_host.mqtt.messages import Touch
+from skin_host.processing.events import Touch
 from skin_host.recording.export.series import (
     TOUCH_NUMBERS,
     HealthLine,

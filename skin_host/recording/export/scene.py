@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from skin_host.errors import RequestError, required
 from skin_host.files import whole_file
 from skin_host.mqtt.info import PartInfo
-from skin_host.mqtt.messages import Touch
+from skin_host.processing.events import Touch
 from skin_host.recording.export.series import HealthLine, Series
 
 ROOT = "robot"

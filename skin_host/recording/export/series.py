@@ -13,10 +13,11 @@ from skin_host.errors import LogError
 from skin_host.layout import Layout
 from skin_host.mqtt.frames import decode_frame
 from skin_host.mqtt.info import PartInfo, decode_info, node_info
-from skin_host.mqtt.messages import Touch, decode_health, decode_touch, touch_message
+from skin_host.mqtt.messages import decode_health, decode_touch
 from skin_host.mqtt.payload import MessageError
 from skin_host.processing.calibration import Calibration
 from skin_host.processing.core import Engine
+from skin_host.processing.events import Touch
 from skin_host.recording.mcap import read_messages_of
 from skin_host.recording.replay import steps
 
@@ -181,7 +182,7 @@ def read_frames(log: Path, settings: Settings, layout: Layout, calibration: Cali
         )
         for event in step.events:
             counts[event.part] += 1
-            touches.append(touch_message(event, counts[event.part]))
+            touches.append(event.published(counts[event.part]))
     shapes = {
         name: part
         for node in {part.node for part in layout.parts}

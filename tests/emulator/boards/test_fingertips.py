@@ -17,7 +17,7 @@ from skin_host.errors import ConfigurationError
 from skin_host.fingertip.events import Slip
 from skin_host.layout import build_layout
 from skin_host.processing.core import Engine
-from skin_host.processing.events import TouchEvent
+from skin_host.processing.events import Touch
 
 CONFIG = Path(__file__).parents[3] / "config"
 PATH = CONFIG / "fingertips.toml"
@@ -51,8 +51,8 @@ class World:
     def step(self) -> FrameBatch:
         return self.robot.step(0.02)["can0"]
 
-    def touches(self, part: str) -> list[TouchEvent]:
-        return [one for one in self.events if isinstance(one, TouchEvent) and one.part == part]
+    def touches(self, part: str) -> list[Touch]:
+        return [one for one in self.events if isinstance(one, Touch) and one.part == part]
 
     def slips(self) -> list[Slip]:
         return [one for one in self.events if isinstance(one, Slip)]

@@ -10,9 +10,9 @@ import pytest
 from skin_host.client import SkinClient, Stream, Touch
 from skin_host.config.settings import Mqtt
 from skin_host.mqtt.publisher import Publisher
-from skin_host.processing.events import TouchEvent
 from skin_host.processing.pipeline import PressureFrame
 from tests.support.broker import Mosquitto, break_at_random
+from tests.support.said import touch_event
 
 PARTS = [f"part_{i}" for i in range(10)]
 TAXELS = 200  # of each of ten parts
@@ -59,7 +59,7 @@ class Load:
             kind = "begin" if step == 0 else "end" if step == 9 else "move"
             contact = self.sweeps // 10
             self.publisher.put_touch(
-                TouchEvent(kind, contact, self.sweeps, t_ns, part, [1], None, None, 1, 1, 1, 0.1)  # type: ignore[arg-type]
+                touch_event(kind, contact, self.sweeps, t_ns, part, [1], None, None, 1, 1, 1, 0.1)  # type: ignore[arg-type]
             )
             self.touches += 1
 
@@ -96,7 +96,7 @@ async def test_every_touch_arrives_or_its_loss_is_told(mosquitto: Mosquitto, see
             await skin.ready()
             for part in PARTS:
                 publisher.put_touch(
-                    TouchEvent("end", 999_999, 0, 10**18, part, [], None, None, 1, 1, 1, 0.1)
+                    touch_event("end", 999_999, 0, 10**18, part, [], None, None, 1, 1, 1, 0.1)
                 )
             # A move that a newer one replaced while many waited is neither sent nor a loss.
             sent = load.touches + len(PARTS) - publisher.counters.moves_replaced

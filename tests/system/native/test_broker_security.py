@@ -14,10 +14,11 @@ from skin_host.client import Broker, SkinClient
 from skin_host.config.settings import Mqtt
 from skin_host.errors import BrokerError
 from skin_host.mqtt.publisher import Publisher
-from skin_host.processing.events import TouchEvent
+from skin_host.processing.events import Touch
 from tests.support import programs
 from tests.support.broker import Mosquitto
 from tests.support.certificates import authority, certificate
+from tests.support.said import touch_event
 
 PATIENCE_S = 30.0
 PASSWORD = "open-sesame"
@@ -29,8 +30,8 @@ async def until(condition: Callable[[], object]) -> None:
             await asyncio.sleep(0.02)
 
 
-def touch(number: int) -> TouchEvent:
-    return TouchEvent("begin", number, number, number, "palm", [1], None, None, 1, 1.0, 1.0, 0.1)
+def touch(number: int) -> Touch:
+    return touch_event("begin", number, number, number, "palm", [1], None, None, 1, 1.0, 1.0, 0.1)
 
 
 @pytest.fixture(scope="module")

@@ -18,10 +18,11 @@ from skin_host.config.settings import Mqtt, load
 from skin_host.layout import Layout, build_layout
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
-from skin_host.processing.events import TouchEvent
+from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
 from tests.support.broker import Mosquitto
 from tests.support.devtools import Page
+from tests.support.said import touch_event
 from tests.support.steady import whole_skin
 from tests.support.viewing import LIVE, viewing
 
@@ -83,8 +84,8 @@ class Robot:
             due_s += 1 / RATE_HZ
             await asyncio.sleep(max(0.0, due_s - time.monotonic()))
 
-    def touch(self, contact: int, first: int, t_ns: int) -> TouchEvent:
-        return TouchEvent(
+    def touch(self, contact: int, first: int, t_ns: int) -> Touch:
+        return touch_event(
             "begin" if self.seq == 1 else "move",
             *(contact, self.seq, t_ns, self.part.name, list(range(first, first + 6))),
             *([0.01 * contact, 0.0, 0.0], [0.0, 0.0, 1.0], 30.0, 33.0, 20.0, 1.5),
