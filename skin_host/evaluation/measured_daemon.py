@@ -8,8 +8,8 @@ millisecond, at first after a random part of one; each time the innermost functi
 or of its MQTT libraries, names the room. A sample counts as much as the thread had a core since the
 one before. It costs some 15 us and nothing between two, unlike a profiler that is called at each
 function. (The kernel looks at timers on CPU time only with its own tick: that would be a hundred
-samples in the time of a row.) The selector of the loop tells when it sleeps, and counts what wakes
-it.
+samples in the time of a row.) The selector of the loop reports when it sleeps, and counts
+what wakes it.
 """
 
 import asyncio
@@ -166,7 +166,7 @@ class Wakeups(selectors.DefaultSelector):
 
     Attributes:
         counts: sleeps by cause. Turns of the loop between which it did not sleep are not counted.
-        rooms: is told when the loop sleeps.
+        rooms: gets a call when the loop sleeps.
     """
 
     def __init__(self) -> None:

@@ -75,7 +75,7 @@ _BUS = _TIMING | _SET_UP | _CHIPS | {"bus_silent", "board_overflows"}
 _SWAPPED = _CHIPS | _SET_UP | {"part_temperature"}
 #: Until a calibration at rest.
 FOR_EVER_S = 1e6
-#: A broker ends the connection of a client that it has not heard for longer.
+#: A broker ends the connection of a client from which nothing came for longer.
 KEEP_ALIVE_S = 10.0
 #: While it lasts, the chip that it names does not measure.
 SILENCING = {"chip_gone"}
@@ -345,7 +345,7 @@ def _stall(world: World, chance: random.Random, plain: bool) -> Trouble:
 
 
 def _suspended(world: World, chance: random.Random, _: bool) -> Trouble:
-    """The computer sleeps: its adapters hear nothing, its monotonic time stops, brokers go on."""
+    """The computer sleeps: its adapters receive nothing, monotonic time stops, brokers go on."""
     seconds = round(chance.uniform(2.0, 20.0), 1)
     world.suspend(seconds)
     if seconds > KEEP_ALIVE_S:

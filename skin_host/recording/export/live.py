@@ -48,7 +48,7 @@ async def run(
     robot: str | None,
     stop: asyncio.Event,
     serving: Serving,
-    tell: Callable[[str], None],
+    show_url: Callable[[str], None],
     clock: Clock = SYSTEM,
 ) -> None:
     """Show a robot's skin in a viewer until `stop`.
@@ -57,7 +57,7 @@ async def run(
         broker, robot: whose skin, as `SkinClient` takes them.
         stop: set it to end.
         serving: `foxglove` or `rerun`.
-        tell: receives the viewer's URL.
+        show_url: receives the viewer's URL.
         clock: gives the time of a record of health.
 
     Raises:
@@ -69,7 +69,7 @@ async def run(
         async with serving as (url, begin):
             scene = SkinScene(shapes)
             show = begin(scene)
-            tell(url)
+            show_url(url)
             tasks = [
                 asyncio.create_task(_follow(skin, shapes, scene, show, clock)),
                 asyncio.create_task(stop.wait()),

@@ -112,7 +112,7 @@ MUTANTS = [
         "self._zeroed(record.index, False)",
     ),
     Mutant(
-        "a board that was reset is only told to start",
+        "a board that was reset is only started again",
         "bus/boards.py",
         "            await self._set_up(record)\n\n    async def stop",
         "            await self._port.send([command_frame(SetTxMode(TxMode.START), address)])\n\n"
@@ -155,7 +155,7 @@ MUTANTS = [
         "",
     ),
     Mutant(
-        "a period that is off is not told",
+        "a period that is off is not reported",
         "health/diagnosis.py",
         "PERIOD_SHARE = 0.05",
         "PERIOD_SHARE = 5.0",
