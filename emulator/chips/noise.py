@@ -15,6 +15,7 @@ the first 5 s of `left_calibration`; units as they are sent):
   is the noise of the thermal pad, 0.70 units. Triangles share nothing (0.0002 units^2).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -148,20 +149,21 @@ class ChipNoise:
             normal_at, wave_at = _normal_at(mixed), _wave_at(mixed)
         return self._drawn(chips, normal_at + _STAGES, wave_at + _STAGES)
 
-    def in_step(self, chips: Ints | slice, began_ns: int, before_ns: int, stages: int) -> Floats:
-        """The same for chips whose passes begin at the same times.
+    def in_step(
+        self, chips: Ints | slice, began_ns: NDArray[np.int64], stages: Sequence[int]
+    ) -> Floats:
+        """The same at m times, for chips whose passes begin at the same times: float64[m, k, 12].
 
         Args:
             chips: which ones, intp[k].
-            began_ns, before_ns: when the pass began in which the first `stages` stages were
-                converted, and the one of the others.
+            began_ns: int64[m, 2], when the pass began that goes on, and the one before.
+            stages: [m], how many stages the first of them has converted.
         """
-        keys = self._keys[chips][:, None]
-        mixed = _mixed((keys + np.array((began_ns, before_ns))).astype(np.uint64))
-        of_pass = _PASS_OF[stages]
-        return self._drawn(
-            chips, _normal_at(mixed)[:, of_pass] + _STAGES, _wave_at(mixed)[:, of_pass] + _STAGES
+        mixed = _mixed((self._keys[chips][:, None] + began_ns[:, None]).astype(np.uint64))
+        normal_at, wave_at = (
+            _of_passes(at, stages) + _STAGES for at in (_normal_at(mixed), _wave_at(mixed))
         )
+        return self._drawn(chips, normal_at, wave_at)
 
     def _drawn(self, chips: Ints | slice, normal_at: Ints, wave_at: Ints) -> Floats:
         normals, waves = _tables()
@@ -170,6 +172,14 @@ class ChipNoise:
             noise *= self._normal[chips]
             noise += self._pads.wave[chips] * waves[wave_at]
         return noise
+
+
+def _of_passes(at: Ints, stages: Sequence[int]) -> Ints:
+    """Of the two passes of each chip, intp[m, k, 2], the one of each stage: intp[m, k, 12]."""
+    if len(at) == 1:
+        now: Ints = at[:, :, _PASS_OF[stages[0]]]
+        return now
+    return np.take_along_axis(at, _PASS_OF[list(stages)][:, None], axis=2)
 
 
 def _normal_at(mixed: NDArray[np.uint64]) -> Ints:

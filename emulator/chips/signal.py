@@ -8,6 +8,7 @@ kinds of chip answer the same words.
 
 from bisect import bisect_left
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +24,32 @@ _NO_SET_UP = np.zeros((reg.N_STAGES, reg.STAGE_WORDS), np.uint16)
 _MOST_CHANGES = 64
 #: A sequence that never comes to its end.
 _STOPPED_NS = 1 << 58
+#: The noise of so many reads is drawn together, of no more chips: of many, a read costs what its
+#: numbers cost and not what its calls do.
+_READS_AHEAD = 16
+_MOST_CHIPS_AHEAD = 64
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
+
+
+@dataclass(slots=True)
+class _Ahead:
+    """The noise of chips that are read together at an interval, at their next reads.
+
+    Attributes:
+        last_ns: when they were last read.
+        interval_ns: since the read before.
+        version: of what the noise depends on.
+        row: of the last read in `noise`.
+        noise: float64[m, k, 12] (codes).
+    """
+
+    last_ns: int
+    interval_ns: int
+    version: int
+    row: int
+    noise: Floats
 
 
 class SignalSkin:
@@ -85,6 +109,9 @@ class SignalSkin:
         #: The chips whose registers were read last, and when.
         self._settled: set[int] = set()
         self._settled_ns = 0
+        #: By the numbers of chips that are read together; and what changes with their noise.
+        self._ahead: dict[bytes, _Ahead] = {}
+        self._noise_version = 0
 
     def set_capacitance_ff(self, chips: Ints, values: Floats) -> None:
         """Change the inputs of some chips from now on: float64[k, 12] (fF).
@@ -172,6 +199,7 @@ class SignalSkin:
         self._start_ns[chip] = self.t_ns
         self._taken[chip] = 0
         self._pace_of.clear()
+        self._noise_version += 1
 
     def brown_out(self, chip: int, ram: NDArray[np.uint16]) -> None:
         """Let the supply of a chip fail for a moment, see `AD7147.brown_out`."""
@@ -296,13 +324,44 @@ class SignalSkin:
                 codes = codes.copy()
             codes[mine] = self._ideal_at(chips[mine], ended_ns)
         if self._noise is not None:
-            noise = self._noise.in_step(rows, began_ns if done else before_ns, before_ns, done)
-            noise *= self._sigma[rows]
+            noise = self._noise_in_step(self._noise, chips, rows, pace)
             noise += codes
             codes = noise
         self._results[rows] = np.minimum(np.maximum(np.rint(codes), 0), reg.FULL_SCALE)
         self._unseen[rows] = False
         return True
+
+    def _noise_in_step(
+        self, noise: ChipNoise, chips: Ints, rows: Ints | slice, pace: tuple[int, int, int]
+    ) -> Floats:
+        """The noise of chips that convert in step, float64[k, 12] (codes), for the caller to keep.
+
+        At reads that come at an interval, several are drawn together.
+        """
+        m, interval_ns = 1, 0
+        is_few = len(chips) <= _MOST_CHIPS_AHEAD
+        key = chips.tobytes() if is_few else b""
+        ahead = self._ahead.get(key) if is_few else None
+        if ahead is not None:
+            interval_ns = self.t_ns - ahead.last_ns
+            if interval_ns == ahead.interval_ns:
+                m = _READS_AHEAD
+                ahead.row += 1
+                if ahead.row < len(ahead.noise) and ahead.version == self._noise_version:
+                    ahead.last_ns = self.t_ns
+                    now: Floats = ahead.noise[ahead.row]
+                    return now
+        start_ns, stages, stage_ns = pace
+        pass_ns = stages * stage_ns
+        passed_ns = [(self.t_ns - start_ns + interval_ns * i) % pass_ns for i in range(m)]
+        began_ns = [self.t_ns + interval_ns * i - passed_ns[i] for i in range(m)]
+        both_ns = np.array([(one_ns, one_ns - pass_ns) for one_ns in began_ns])
+        codes = noise.in_step(rows, both_ns, [one_ns // stage_ns for one_ns in passed_ns])
+        codes *= self._sigma[rows]
+        if is_few:
+            self._ahead[key] = _Ahead(self.t_ns, interval_ns, self._noise_version, 0, codes)
+        first: Floats = codes[0]
+        return first
 
     def _pace(self, chips: Ints) -> tuple[int, int, int] | None:
         """Return start, stages and time of a stage, if some chips have all of them in common."""
@@ -413,6 +472,7 @@ class SignalSkin:
         own = reg.NOISE_CODES_RMS[self._power[chip].decimation]
         sigma = np.sqrt(own**2 + np.square(weights) @ squares)
         self._sigma[chip] = sigma * ~self._held[chip]
+        self._noise_version += 1
 
 
 class SignalChips:
