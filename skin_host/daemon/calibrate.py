@@ -103,13 +103,14 @@ async def collect(
         if share > before and falls <= MOST_FALLS:
             grown_s = clock.monotonic_s()
         progress(share)
-    found = engine().end_calibration(clock.today().isoformat(timespec="seconds"))
+    compute = engine().collected(clock.today().isoformat(timespec="seconds"))
     if share == 0.0 and not falls:
         raise SkinError(
             "no calibration: no board sent a sweep; check with `skin scan` whether the boards are "
             "powered and answer"
         )
-    return found
+    # Of a large skin this takes a second, in which the boards' frames must be read.
+    return await clock.in_thread(compute)
 
 
 def calibration_path(settings: Settings, node: str) -> Path:

@@ -394,7 +394,7 @@ class Daemon:
                         said[part], said_s[part] = state, now_s
                         self.publisher.put_health(self.layout.parts[part].name, record)
             told |= of_parts
-            if self.engine.calibrating:
+            if self._calibration_lock.locked():
                 told = {key: says for key, says in told.items() if key[0] not in _UNTIL_CALIBRATED}
             self._fault_log.note(told, now_s)
             if now_s - self._status_s >= HEALTH_S:

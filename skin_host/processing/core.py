@@ -4,6 +4,7 @@ One engine serves both the daemon and the replay of recordings. It has no clock 
 takes frames and times, and returns frames of pressure and events.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -171,6 +172,8 @@ class Engine:
         #: is silent before it is zeroed: its touches have ended as lost, and may still be there.
         self._last_touched = np.zeros(layout.n_taxels, np.bool_)
         self._run: _CalibrationRun | None = None
+        #: Between `collected` and `use`: the boards that were zeroed, and `believed` of each.
+        self._zeroed_since: dict[int, bool] | None = None
         self._pipeline: Pipeline | None = None
         self._trackers = {part: ContactTracker(layout, part, settings) for part in parts}
         if after is not None:
@@ -195,6 +198,7 @@ class Engine:
         self._touched = after._touched
         self._last_touched = after._last_touched
         self._run = after._run
+        self._zeroed_since = after._zeroed_since
         for part, tracker in self._trackers.items():
             tracker.go_on(after._trackers[part])
         self.calibration = after.calibration
@@ -229,6 +233,10 @@ class Engine:
         zeroed = self.taxels_of(boards)
         self._last_touched[zeroed] = self._touched[zeroed]
         self._renew_pipeline(zeroed)
+        since, self._zeroed_since = self._zeroed_since or {}, None
+        for board, believed in since.items():
+            if board in boards:
+                self.rezero(board, believed)
 
     def _renew_pipeline(self, zeroed: NDArray[np.bool_]) -> None:
         """Apply settings and calibration to the pipeline; taxels bool[n] were zeroed."""
@@ -276,10 +284,27 @@ class Engine:
         Args:
             time: now, ISO 8601 in UTC.
         """
+        return self.collected(time)()
+
+    def collected(self, time: str) -> Callable[[], Calibration]:
+        """Stop collecting; return what computes the calibration, in a thread if wanted.
+
+        A large skin takes a second. Boards that are zeroed between this call and `use` have
+        another zero than this calibration, and `use` treats them so.
+
+        Args:
+            time: now, ISO 8601 in UTC.
+        """
         assert self._run is not None
         run, self._run = self._run, None
-        found = run.calibrator.finish(self.configuration, time)
-        return found if self.fingertips is None else with_zeros(found, self.fingertips.end_zero())
+        self._zeroed_since = {}
+        zeros = None if self.fingertips is None else self.fingertips.end_zero()
+
+        def compute() -> Calibration:
+            found = run.calibrator.finish(self.configuration, time)
+            return found if zeros is None else with_zeros(found, zeros)
+
+        return compute
 
     def feed(self, bus: str, batch: FrameBatch) -> Output:
         """Process a batch of frames of one bus."""
@@ -344,6 +369,8 @@ class Engine:
             How many taxels were touched.
         """
         taxels = self._taxels_of(board)
+        if self._zeroed_since is not None:
+            self._zeroed_since[board] = believed
         if self._run is not None:
             # A calibration of two zeros would be that of none.
             self._run.calibrator.forget(taxels[taxels >= 0].astype(np.intp))

@@ -84,3 +84,26 @@ def test_a_board_that_is_zeroed_during_a_calibration_is_calibrated_with_its_new_
     no_load = engine.layout.boards[0].settings.no_load
     assert (found.verdict[mine] == Verdict.OK).all()
     assert np.abs(found.baseline[mine] - (no_load - 239.5)).max() < 1.5
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_a_board_that_is_zeroed_while_its_calibration_is_computed_finds_its_zero_anew(
+    engine: Engine, first: bool
+) -> None:
+    if not first:
+        sweeps_taken(engine, lambda number: 1.0 + 0.05 * number)
+        engine.use(engine.end_calibration("2026-01-01T00:00:00+00:00"))
+    sweeps_taken(engine, lambda number: 10.0 + 0.05 * number)
+    compute = engine.collected("2026-01-01T00:00:00+00:00")
+    engine.rezero(0)
+    engine.use(compute())
+    assert engine.intake.veto[0].all()
+
+
+def test_a_zero_from_before_is_over_with_the_next_calibration(engine: Engine) -> None:
+    sweeps_taken(engine, lambda number: 1.0 + 0.05 * number)
+    engine.use(engine.end_calibration("2026-01-01T00:00:00+00:00"))
+    engine.rezero(0)
+    sweeps_taken(engine, lambda number: 10.0 + 0.05 * number)
+    engine.use(engine.end_calibration("2026-01-01T00:00:00+00:00"))
+    assert not engine.intake.veto
