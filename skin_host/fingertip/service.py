@@ -15,7 +15,6 @@ from skin_host.fingertip.events import FingertipEvent
 from skin_host.fingertip.health import FingertipHealth, FingertipRecord
 from skin_host.mqtt.messages import ContactState
 from skin_host.mqtt.publisher import Publisher
-from skin_host.processing.events import Touch
 
 #: Health is published at once when something changes, otherwise this often.
 HEALTH_NS = 1_000_000_000
@@ -139,10 +138,7 @@ class FingertipPublisher:
         if self._engine is None:
             return
         for event in events:
-            if isinstance(event, Touch):
-                self._publisher.put_touch(event)
-            else:
-                self._publisher.put_grasp(event)
+            self._publisher.put_touch(event)
         self._put_contacts()
 
     def end(self, t_ns: int) -> None:

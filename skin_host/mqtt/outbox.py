@@ -13,11 +13,10 @@ from itertools import islice
 from typing import NamedTuple
 
 from skin_host.clock import SYSTEM, Clock
-from skin_host.fingertip.events import Over, Slip
+from skin_host.fingertip.events import FingertipEvent
 from skin_host.mqtt.connection import MessageProperties
 from skin_host.mqtt.messages import encode_event
 from skin_host.mqtt.trials import Trials
-from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
 
 #: Events that are sent again to another broker: acknowledged within this time, and at most this
@@ -148,8 +147,10 @@ class Outbox:
         self.counters.frames_skipped += len(self.frames)
         self.frames.clear()
 
-    def put_touch(self, topic: str, touch: Touch, properties: MessageProperties | None) -> None:
-        """Take a touch event, or count it as lost; either way it is numbered.
+    def put_touch(
+        self, topic: str, touch: FingertipEvent, properties: MessageProperties | None
+    ) -> None:
+        """Take a touch, slip or excess, or count it as lost; either way it is numbered.
 
         While many events wait, a `move` takes the place and the number of the contact's last one.
         """
@@ -159,12 +160,12 @@ class Outbox:
             return
         self._last_moves.pop(contact, None)
         limit = self._move_limit if moves else self._event_limit
-        event = self._put_counted(topic, lambda n: encode_event(touch, n), properties, limit)
+        event = self._put_counted(topic, touch, properties, limit)
         if moves and event is not None:
             self._last_moves[contact] = event, self._counts[topic]
 
     def _replace_move(
-        self, contact: tuple[str, int], touch: Touch, properties: MessageProperties | None
+        self, contact: tuple[str, int], touch: FingertipEvent, properties: MessageProperties | None
     ) -> bool:
         """Put a move in the place of the contact's last event, if that is a waiting move."""
         last, count = self._last_moves.get(contact, (None, 0))
@@ -179,17 +180,10 @@ class Outbox:
                 return True
         return False
 
-    def put_grasp(
-        self, topic: str, event: Slip | Over, properties: MessageProperties | None
-    ) -> None:
-        """Take an event of a slip, or of pressing too hard, in the same way."""
-        limit = self._event_limit
-        self._put_counted(topic, lambda n: encode_event(event, n), properties, limit)
-
     def _put_counted(
         self,
         topic: str,
-        encode: Callable[[int], bytes],
+        event: FingertipEvent,
         properties: MessageProperties | None,
         limit: int,
     ) -> Event | None:
@@ -199,9 +193,9 @@ class Outbox:
             self.counters.rejected += 1
             return None
         if len(self.events) < limit:
-            event = Event(topic, encode(count), properties, is_touch=True)
-            self.put_event(event)
-            return event
+            waiting = Event(topic, encode_event(event, count), properties, is_touch=True)
+            self.put_event(waiting)
+            return waiting
         self.counters.touches_dropped += 1
         if not self._overflowing:
             self._overflowing = True

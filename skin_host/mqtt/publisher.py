@@ -11,14 +11,14 @@ from contextlib import AbstractAsyncContextManager, AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import msgspec
 
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Mqtt
 from skin_host.errors import SkinError
-from skin_host.fingertip.events import Over, Slip
+from skin_host.fingertip.events import FingertipEvent, Over, Slip
 from skin_host.mqtt.address import Broker, CredentialError
 from skin_host.mqtt.commands import CommandHandler, Handler
 from skin_host.mqtt.connection import (
@@ -42,7 +42,7 @@ from skin_host.mqtt.messages import ContactState, encode_contact, encode_health
 from skin_host.mqtt.order import Numbers, last_will, put_run, put_stamp, stamp_of
 from skin_host.mqtt.outbox import Event, Outbox, PublisherCounters
 from skin_host.mqtt.payload import CBOR_TYPE, JSON_TYPE
-from skin_host.mqtt.topics import OFFLINE, ONLINE, Topics
+from skin_host.mqtt.topics import OFFLINE, ONLINE, PartTopic, Topics
 from skin_host.mqtt.trials import TRIES
 from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
@@ -56,6 +56,8 @@ FIRST_TAKEN_S = 2.0
 LAST_TAKEN_S = 30.0
 #: At most this many withheld topics are named.
 MAX_NAMED = 8
+
+_TOPICS: dict[type, PartTopic] = {Touch: "touch", Slip: "slip", Over: "over"}
 
 #: Makes a connection to a broker, see `connection.connect`.
 Connect = Callable[..., AbstractAsyncContextManager[Connection]]
@@ -204,16 +206,10 @@ class Publisher:
         """Send the boards' own bytes with the frames for this time; 0 ends it."""
         self._courier.show_raw(seconds)
 
-    def put_touch(self, event: Touch) -> None:
-        """Send a touch event; those of a part arrive in order, and at least once."""
-        topic = self.topics.part("touch", event.part)
+    def put_touch(self, event: FingertipEvent) -> None:
+        """Send a touch, slip or excess; those of a part arrive in order, and at least once."""
+        topic = self.topics.part(_TOPICS[type(event)], event.part)
         self._outbox.put_touch(topic, event, self._event_properties)
-
-    def put_grasp(self, event: Slip | Over) -> None:
-        """Send an event of a slip or of pressing too hard, as reliably as a touch event."""
-        kind: Literal["slip", "over"] = "slip" if isinstance(event, Slip) else "over"
-        topic = self.topics.part(kind, event.part)
-        self._outbox.put_grasp(topic, event, self._event_properties)
 
     def put_contact(self, part: str, state: ContactState) -> None:
         """Publish whether a part is touched, if that has changed."""

@@ -63,7 +63,7 @@ async def listened(broker: Mosquitto, *options: str) -> list[str]:
             while not said.done():
                 publisher.put_touch(BEGUN)
                 for event in (SLIP, SLIP_END, OVER):
-                    publisher.put_grasp(event)
+                    publisher.put_touch(event)
                 publisher.put_touch(ENDED)
                 await asyncio.wait([said], timeout=0.2)
     out, _ = await said

@@ -74,6 +74,6 @@ def test_a_touch_without_skin_has_neither_area_nor_pressure() -> None:
 def test_each_kind_of_event_is_numbered_by_itself_and_counts_when_it_is_lost() -> None:
     outbox = Outbox(event_limit=2)
     for topic, event in (("a/slip", SLIP), ("a/over", OVER), ("a/slip", SLIP)):
-        outbox.put_grasp(topic, event, None)
+        outbox.put_touch(topic, event, None)
     assert [b'"count":1' in event.payload for event in outbox.events] == [True, True]
     assert outbox.counters.touches_dropped == 1

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from skin_host.evaluation.simulate.accusations import Accusations
 from skin_host.evaluation.simulate.troubles import Trouble
 from skin_host.evaluation.simulate.world import Life, World
+from skin_host.fingertip.events import FingertipEvent
 from skin_host.layout import PadKind
 from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
@@ -239,7 +240,9 @@ class Promises:
 
     # ------------------------------------------------------------------ where things leave the core
 
-    def _touch(self, event: Touch) -> None:
+    def _touch(self, event: FingertipEvent) -> None:
+        if not isinstance(event, Touch):
+            return
         now = self._open.setdefault(event.part, set())
         self.touches += 1
         self._put[event.part] = self._put.get(event.part, 0) + 1
