@@ -532,6 +532,8 @@ class _ThermalReference:
 
     def step(self, units: Array, baseline: Array, free: Mask, dt_s: float) -> Array:
         """Return the predicted change [n] of the baselines; learn from the untouched taxels."""
+        if dt_s <= 0.0:  # two samples of one time, as after a stall: nothing has changed
+            return np.zeros(len(baseline))
         sums = np.bincount(
             self._triangle[self._pads], units[self._pads], minlength=len(self._pads_of)
         )

@@ -330,6 +330,15 @@ def test_thermal_pads_tell_of_drift_when_everything_is_touched():
     assert np.abs(error).max() < 0.8
 
 
+def test_two_samples_of_one_time_teach_nothing_of_the_temperature():
+    thermal = np.arange(N) % 12 >= 10
+    track = tracker(thermal=thermal)
+    for warmth in (0.0, 5.0):
+        with np.errstate(all="raise"):
+            track.step(np.where(thermal, warmth, 0.0), ~thermal, NOBODY, 0.0)
+    assert (track.baseline == 0.0).all()
+
+
 def test_thermal_pads_that_do_not_feel_the_drift_do_no_harm():
     thermal = np.arange(N) % 12 >= 10
     track = tracker(thermal=thermal)
