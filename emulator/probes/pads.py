@@ -340,12 +340,17 @@ class Jumps:
         self.can = np.isfinite(at_kpa)
 
     @classmethod
-    def drawn(cls, n: int, per_triangle: int, rng: np.random.Generator) -> "Jumps":
-        """n pads, one triangle in twelve with jumping ones."""
-        triangles = n // per_triangle
+    def drawn(cls, thermal: NDArray[np.bool_], rng: np.random.Generator) -> "Jumps":
+        """One triangle in twelve with jumping pads.
+
+        Args:
+            thermal: bool[k, 12], the temperature pads: what presses does not reach them.
+            rng: draws.
+        """
+        triangles, n = len(thermal), thermal.size
         at_kpa = np.where(rng.random(triangles) < 1 / 12, rng.uniform(30, 120, triangles), np.inf)
         size = rng.uniform(15, 40, n) * SENT_UNIT_FF
-        return cls(np.repeat(at_kpa, per_triangle), size)
+        return cls(np.where(thermal, np.inf, at_kpa[:, None]).ravel(), size)
 
     @classmethod
     def none(cls, n: int) -> "Jumps":

@@ -141,7 +141,7 @@ class Skin:
             calm = [unit.kind.startswith("fingertip") for unit in self._layout.triangles]
             self.noise = PadNoise.drawn(thermal.reshape(-1, TAXELS), rng, np.array(calm))
             self.noise_ff = SENT_UNIT_FF * self.noise.rms_units.reshape(-1)
-            self._jumps = Jumps.drawn(n, TAXELS, rng)
+            self._jumps = Jumps.drawn(thermal.reshape(-1, TAXELS), rng)
             self._dead = draw_dead(n, rng) & ~thermal
 
     def _set_probes(self, probes: list[Probe], bare: Collection[str]) -> None:

@@ -259,8 +259,8 @@ class Describer:
         if thermal.any():
             shift = units[thermal] - calibration.baseline[span][thermal]
             warmth["thermal_units"] = round(float(np.median(shift)), 1)
-        rests = watch.valid if watch.touched is None else watch.valid & ~watch.touched
-        if np.count_nonzero(rests) >= FEWEST_RESTING:
+        rests = watch.rests()
+        if rests is not None and np.count_nonzero(rests) >= FEWEST_RESTING:
             shift = units - pipeline.baseline[span]
             common = common_shift(shift, rests, self._layout.triangle_of[span])
             # Noise that the pads of a triangle share passes from one sweep to the next.

@@ -28,6 +28,8 @@ RECENT_NS = 1_000_000_000
 TWICE_NS = 2_000_000_000
 #: A bus without skin boards is silent after this long: force/torque boards send often.
 ALONE_NS = 200_000_000
+#: Foam that was pressed pushes for so long that a pad reads too much, as drift's `SETTLE_S`.
+FOAM_NS = 5_000_000_000
 
 
 @dataclass(slots=True)
@@ -38,6 +40,7 @@ class PartWatch:
         late_samples: a triangle that was not received for fewer samples in a row is only late.
         lost: int64[k], for how many samples in a row each triangle was not received; None if all
             were.
+        touched_ns: when each taxel [m] was last touched; None if none ever was.
         late: bool[m], taxels that are late and were valid before.
         doubted: bool[16 b, 12], pads that were in doubt after the last sample but one, and after
             the last one: its own doubts are between them.
@@ -51,6 +54,7 @@ class PartWatch:
     rate_frames: int = 0
     valid: NDArray[np.bool_] | None = None
     touched: NDArray[np.bool_] | None = None
+    touched_ns: NDArray[np.int64] | None = None
     beyond: NDArray[np.bool_] | None = None
     raw: NDArray[np.uint8] | None = None
     lost: NDArray[np.int64] | None = None
@@ -70,6 +74,10 @@ class PartWatch:
         self._note_lost(frame)
         self.valid = frame.valid
         self.touched = frame.touched
+        if any_of(frame.touched):
+            if self.touched_ns is None:
+                self.touched_ns = np.full(len(frame.touched), -FOAM_NS, np.int64)
+            self.touched_ns[frame.touched] = frame.t_ns
         self.beyond = frame.beyond_range
         self.raw = frame.raw
         if not self.rate_since_ns:
@@ -80,6 +88,15 @@ class PartWatch:
             self.rate_hz = self.rate_frames / elapsed_s if elapsed_s > 0.0 else 0.0
             self.rate_since_ns = frame.t_ns
             self.rate_frames = 0
+
+    def rests(self) -> Mask | None:
+        """Return the valid taxels, bool[m], that nothing touches and no foam still pushes."""
+        if self.valid is None or self.touched_ns is None:
+            return self.valid
+        passed_ns = self.sample_ns - self.touched_ns
+        # A touch in the future was before the clock was set back.
+        rests: Mask = self.valid & ((passed_ns < 0) | (passed_ns >= FOAM_NS))
+        return rests
 
     def _note_lost(self, frame: PressureFrame) -> None:
         # Where nothing was received there is 0. A sample of nothing reports silence.

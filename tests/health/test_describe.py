@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 
 from skin_host.health.describe import _period, common_shift
+from skin_host.health.watch import FOAM_NS, PartWatch
+from skin_host.processing.core import Step
+from skin_host.processing.pipeline import PressureFrame
 
 TRIANGLES = np.repeat(np.arange(3), 10)
 MS = 1_000_000
@@ -29,3 +32,24 @@ def test_a_pause_among_the_first_sweeps_is_no_longer_period() -> None:
     assert _period(np.array([50] * 7 + [200]) * MS, 50) == (None, None)
     assert _period(np.array([50] * 8 + [200]) * MS, 50) == (50.0, 0.0)
     assert _period(np.array([90] * 8) * MS, 50) == (90.0, 0.0)
+
+
+def test_a_pad_that_was_pressed_does_not_rest_until_its_foam_has_recovered() -> None:
+    """After many presses most pads of a part read too much together, as if it became warmer."""
+    watch = PartWatch(late_samples=3)
+    n, valid = 12, np.arange(12) > 0
+
+    def rests_at(t_ns: int, touched: int | None = None) -> list[int]:
+        raw, none = np.full(n, 240, np.uint8), np.zeros(n, np.bool_)
+        kpa, touches = np.zeros(n, np.float32), np.arange(n) == touched
+        watch.note(Step(0, PressureFrame("arm", 0, t_ns, raw, kpa, touches, valid, none), []), None)
+        rests = watch.rests()
+        assert rests is not None
+        return np.flatnonzero(~rests).tolist()
+
+    assert rests_at(0) == [0]
+    assert rests_at(1_000 * MS, touched=3) == [0, 3]
+    assert rests_at(2_000 * MS) == [0, 3]
+    assert rests_at(1_000 * MS + FOAM_NS) == [0]
+    # The clock was set back: nobody knows how long ago it was.
+    assert rests_at(0) == [0]

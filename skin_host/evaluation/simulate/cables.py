@@ -272,13 +272,12 @@ class Cable:
         if n:
             self.sent.note(batch)
         if self._late:
-            due = [one for at_ns, one in self._late if at_ns <= self._clock.monotonic_ns()]
+            now_ns = self._clock.monotonic_ns()
+            due = [one for at_ns, one in self._late if at_ns <= now_ns]
             if due:
-                now_ns = self._clock.monotonic_ns()
                 self._late = [one for one in self._late if one[0] > now_ns]
-                for one in due:
-                    one.t_ns = np.full(len(one), now_ns, np.int64)
                 batch = join([*due, batch])
+                batch = _rows(batch, np.argsort(batch.t_ns, kind="stable"))
         if n and self.mischief.any():
             batch = self._spoil(batch)
         if not len(batch):
@@ -336,8 +335,11 @@ class Cable:
         if what.late:
             late = rng.random(n) < what.late
             if late.any():
+                # They come by then, whenever somebody reads what came.
                 at_ns = self._clock.monotonic_ns() + what.late_ns
-                self._late.append((at_ns, _rows(batch, late)))
+                others = _rows(batch, late)
+                others.t_ns = np.full(len(others), at_ns, np.int64)
+                self._late.append((at_ns, others))
                 batch = _rows(batch, ~late)
                 n = len(batch)
         if what.lost:

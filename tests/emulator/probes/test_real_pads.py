@@ -106,6 +106,15 @@ def test_a_pad_jumps_above_its_pressure_and_back_well_below() -> None:
     assert jumps.step_ff(pads, np.full(2, 300.0))[1] == 0
 
 
+def test_a_temperature_pad_does_not_jump() -> None:
+    """Nothing presses it; a board with compensation would take its jump off all other pads."""
+    thermal = np.tile(np.isin(np.arange(12), (6, 10)), (300, 1))
+    jumps = Jumps.drawn(thermal, np.random.default_rng(1))
+
+    assert jumps.can.any()
+    assert not jumps.can[thermal.ravel()].any()
+
+
 def test_a_pressed_pad_that_jumps_moves_by_tens_of_units() -> None:
     def deepest(*, quiet: bool) -> NDArray[np.float64]:
         everywhere = [

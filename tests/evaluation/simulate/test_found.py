@@ -10,8 +10,11 @@ import pytest
 from emulator.probes.scene import Fault, Scene
 from skin_host.bus.wire import HEADER_A, HEADER_B, FrameBatch
 from skin_host.cli.common import load_skin
+from skin_host.clock import SteppedClock
+from skin_host.config.settings import Bus
 from skin_host.demo import configuration
-from skin_host.evaluation.simulate.cables import Sent
+from skin_host.evaluation.simulate.cables import Cable, Sent, SimulatedPort
+from skin_host.evaluation.simulate.trace import Trace
 from skin_host.evaluation.simulate.world import Life, World
 
 DEMO = configuration("demo.toml")
@@ -231,3 +234,23 @@ def test_halves_of_sweeps_that_a_full_bus_held_up_are_paired_though_one_was_lost
     sent.note(FrameBatch.of(frames))
     assert [answered for answered, _ in sent.find(1, 1, bytes(range(12)))] == [True]
     assert not list(sent.find(1, 1, bytes([*range(7), *[98] * 5])))
+
+
+def test_a_frame_that_comes_late_is_stamped_when_it_came_not_when_it_was_read() -> None:
+    """Read much later, it would stand between the halves of a sweep that came meanwhile."""
+    clock = SteppedClock(seed=1)
+    rng = np.random.default_rng(1)
+    cable = Cable("can0", clock, lambda: None, lambda *_: None, lambda: True, rng, Trace())
+    port = SimulatedPort(cable, Bus(interface="virtual", channel="late"), clock)
+    cable.mischief.late = 1.0
+    began_ns = clock.monotonic_ns()
+    cable.arrive(FrameBatch.of([(0x411, bytes([HEADER_B, *range(7)]), began_ns)]))
+    cable.mischief.late = 0.0
+    assert not len(port.read())
+    clock.advance(0.025)
+    after = bytes([HEADER_A, *range(7)])
+    cable.arrive(FrameBatch.of([(0x411, after, began_ns + 20_000_000)]))
+    batch = port.read()
+    since_ns = batch.t_ns - (clock.now_ns() - clock.monotonic_ns()) - began_ns
+    assert since_ns.tolist() == [cable.mischief.late_ns, 20_000_000]
+    assert batch.data[:, 0].tolist() == [HEADER_B, HEADER_A]
