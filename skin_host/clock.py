@@ -154,16 +154,15 @@ class SteppedClock(Clock):
     """Time that moves when nothing is left to do at the present, or by `advance`.
 
     Args:
-        epoch_ns: the time of day at which it begins.
         seed: of the random numbers: the same seed gives the same ones.
 
     Attributes:
         threads_take_s: how long what runs beside the event loop takes.
     """
 
-    def __init__(self, epoch_ns: int = EPOCH_NS, seed: int = 0) -> None:
+    def __init__(self, seed: int = 0) -> None:
         self._random = random.Random(seed)
-        self._epoch_ns = epoch_ns
+        self._epoch_ns = EPOCH_NS
         self._t_ns = 0
         self.threads_take_s = 0.0
 

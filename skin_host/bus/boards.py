@@ -20,8 +20,8 @@ Properties of the firmware decide the order (reference of the wire, sections 3 a
 import asyncio
 import logging
 from collections.abc import Callable, Coroutine, Iterable
-from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Protocol
 
 from skin_host.bus.answers import (
     Discovered,
@@ -427,9 +427,6 @@ class FoundBoard:
     firmware: str | None
     in_bootloader: bool
     triangles: list[int]
-
-    def as_record(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 async def scan(bus: Bus) -> list[FoundBoard]:

@@ -6,6 +6,7 @@ import gc
 import json
 import logging
 import signal
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -220,7 +221,7 @@ def _scan(arguments: argparse.Namespace) -> int:
     bus = Bus(interface=arguments.interface, channel=arguments.channel)
     found = asyncio.run(scan(bus))
     if arguments.json:
-        print_json({"boards": [one.as_record() for one in found]})
+        print_json({"boards": [asdict(one) for one in found]})
     else:
         print(scan_table(found, arguments.channel))
     return 0 if found else 1

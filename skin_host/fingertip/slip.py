@@ -53,24 +53,22 @@ class RatioDrop:
 
     Args:
         contacts: n.
-        window: samples in each of the two windows.
-        drop: least fall of the ratio.
         force_sd_n: noise of one force reading; the fall must exceed 6 times its effect.
         minimum_n: contacts with less normal force are ignored.
     """
+
+    #: Samples in each of the two windows, and least fall of the ratio.
+    WINDOW = 2
+    LEAST_DROP = 0.04
 
     def __init__(
         self,
         contacts: int,
         *,
-        window: int = 2,
-        drop: float = 0.04,
         force_sd_n: float = 0.013,
         minimum_n: float = 0.2,
     ) -> None:
-        self._past = np.full((2 * window, contacts), np.nan)
-        self._window = window
-        self._drop = drop
+        self._past = np.full((2 * self.WINDOW, contacts), np.nan)
         self._force_sd_n = force_sd_n
         self._minimum_n = minimum_n
 
@@ -82,10 +80,10 @@ class RatioDrop:
         safe = np.where(heavy, normal, 1.0)
         self._past[:-1] = self._past[1:]
         self._past[-1] = np.where(heavy, tangential / safe, np.nan)
-        before = self._past[: self._window].mean(axis=0)
-        after = self._past[self._window :].mean(axis=0)
-        noise = self._force_sd_n / safe * np.sqrt((1.0 + after**2) * 2.0 / self._window)
-        slips: Mask = before - after > np.maximum(self._drop, 6.0 * noise)
+        before = self._past[: self.WINDOW].mean(axis=0)
+        after = self._past[self.WINDOW :].mean(axis=0)
+        noise = self._force_sd_n / safe * np.sqrt((1.0 + after**2) * 2.0 / self.WINDOW)
+        slips: Mask = before - after > np.maximum(self.LEAST_DROP, 6.0 * noise)
         return slips
 
 

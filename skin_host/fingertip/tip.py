@@ -170,7 +170,7 @@ class Tip:
 
     @property
     def flag_names(self) -> list[str]:
-        return _names(self.flags)
+        return [str(flag.name).lower() for flag in self.flags]
 
     @property
     def zeroed(self) -> bool:
@@ -425,10 +425,6 @@ class Tip:
             return now.centroid_m is not said.centroid_m
         moved_m = math.dist(now.centroid_m, said.centroid_m)
         return moved_m > max(MOVED_M, now.sigma_m or 0.0)
-
-
-def _names(flags: Flags) -> list[str]:
-    return [str(flag.name).lower() for flag in Flags if flag & flags]
 
 
 def _vector(values: Floats) -> Vector:

@@ -78,7 +78,7 @@ async def mosquitto_broker(program: str) -> AsyncIterator[LocalBroker]:
     Raises:
         BrokerError: it did not start.
     """
-    port = _free_port()
+    port = free_port()
     with tempfile.TemporaryDirectory(prefix="skin-broker-") as folder:
         process = _start_mosquitto(program, port, Path(folder))
         try:
@@ -136,7 +136,7 @@ async def embedded_broker() -> AsyncIterator[LocalBroker]:
         ) -> None:
             self._connected(reader, writer)
 
-    port = _free_port()
+    port = free_port()
     everybody = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}}
     broker = TidyBroker(
         BrokerConfig(
@@ -185,8 +185,9 @@ async def _answers(process: "subprocess.Popen[bytes]", port: int) -> bool:
     return False
 
 
-def _free_port() -> int:
+def free_port(host: str = HOST) -> int:
+    """Return a port that nobody listens on now."""
     with socket.socket() as probe:
-        probe.bind((HOST, 0))
+        probe.bind((host, 0))
         port: int = probe.getsockname()[1]
         return port

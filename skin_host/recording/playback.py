@@ -42,6 +42,10 @@ async def paced(items: Iterable[T], t_ns: Callable[[T], int], speed: float) -> A
         yield item
 
 
+def _last_ns(item: tuple[str, FrameBatch]) -> int:
+    return int(item[1].t_ns[-1])
+
+
 async def play_on_buses(
     log: Path, settings: Settings, buses: Mapping[str, can.BusABC], speed: float = 1.0
 ) -> int:
@@ -59,10 +63,7 @@ async def play_on_buses(
     """
     sent = 0
 
-    def last_ns(item: tuple[str, FrameBatch]) -> int:
-        return int(item[1].t_ns[-1])
-
-    async for name, batch in paced(read_buses(log, settings), last_ns, speed):
+    async for name, batch in paced(read_buses(log, settings), _last_ns, speed):
         for row in range(len(batch)):
             flags = int(batch.id[row])
             if flags & _NO_DATA:
@@ -128,28 +129,24 @@ def _renamed(topic: str, robot: str) -> str:
     return "/".join(words)
 
 
-async def play_processed(
-    log: Path, engine: Engine, broker_settings: Settings, speed: float = 1.0, node: str = "main"
-) -> int:
+async def play_processed(log: Path, engine: Engine, settings: Settings, speed: float = 1.0) -> int:
     """Process a recording of CAN frames with the pipeline and publish the results.
 
     Args:
         log: any recording that `skin replay` reads.
         engine: calibrated already.
-        broker_settings: its table `mqtt` gives the broker.
+        settings: its table `mqtt` gives the broker.
         speed: 2 is twice as fast as recorded.
-        node: as which node.
 
     Raises:
         LogError: the recording cannot be read.
     """
-    settings = broker_settings
     n = 0
-    async with Publisher(settings.mqtt, engine.layout.robot, node) as publisher:
+    async with Publisher(settings.mqtt, engine.layout.robot) as publisher:
         publisher.put_info(
             node_info(
                 engine.layout,
-                node,
+                "main",
                 version=__version__,
                 configuration=skin_hash(settings),
                 encoding=settings.mqtt.encoding,
@@ -157,9 +154,6 @@ async def play_processed(
                 fingertips=settings.fingertips,
             )
         )
-
-        def last_ns(item: tuple[str, FrameBatch]) -> int:
-            return int(item[1].t_ns[-1])
 
         fingertips = FingertipPublisher(engine.fingertips, publisher)
         contacts = {part: PartContact(engine.layout, part) for part in engine.parts}
@@ -174,7 +168,7 @@ async def play_processed(
                 publisher.put_contact(step.frame.part, state)
             return len(output.steps)
 
-        async for bus, batch in paced(read_buses(log, settings), last_ns, speed):
+        async for bus, batch in paced(read_buses(log, settings), _last_ns, speed):
             n += publish(engine.feed(bus, batch))
         n += publish(engine.flush())
     return n

@@ -1,6 +1,7 @@
 """A scan lists boards that answer, that are in their bootloader, and that only stream."""
 
 import asyncio
+from dataclasses import asdict
 
 import can
 import numpy as np
@@ -47,7 +48,7 @@ async def test_boards_are_listed_by_address_with_what_they_run_and_send(
         found = await scan(can_bus_settings)
         answering.cancel()
         await asyncio.gather(answering, return_exceptions=True)
-    assert [one.as_record() for one in found] == [
+    assert [asdict(one) for one in found] == [
         {
             "address": address,
             "board_type": board_type,

@@ -8,7 +8,6 @@ import contextlib
 import os
 import secrets
 import signal
-import socket
 import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
@@ -20,6 +19,7 @@ import numpy as np
 from skin_host.client import SkinClient
 from skin_host.clock import SYSTEM, Clock
 from skin_host.errors import SkinError, required
+from skin_host.mqtt.broker import free_port
 from skin_host.mqtt.info import PartInfo
 from skin_host.recording.export.scene import (
     Item,
@@ -179,7 +179,7 @@ async def rerun(host: str, port: int | None) -> AsyncIterator[tuple[str, Show]]:
         SkinError: its server does not start, or the extra `rerun` is not installed.
     """
     rr = required("rerun", "views in Rerun", "rerun")
-    page, feed = RERUN_PORT if port is None else port or _free_port(host), _free_port(host)
+    page, feed = RERUN_PORT if port is None else port or free_port(host), free_port(host)
     url = f"rerun+http://{host}:{feed}/proxy"
     program = await asyncio.create_subprocess_exec(
         *(str(Path(sys.executable).with_name("rerun")), "--serve-web", "--bind", host),
@@ -222,10 +222,3 @@ async def _answers(program: asyncio.subprocess.Process, host: str, ports: tuple[
                     break
     except TimeoutError:
         raise SkinError(f"{host}:{port}: rerun does not answer; wanted its viewer there") from None
-
-
-def _free_port(host: str) -> int:
-    with socket.socket() as probe:
-        probe.bind((host, 0))
-        port: int = probe.getsockname()[1]
-        return port
