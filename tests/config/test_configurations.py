@@ -110,3 +110,20 @@ def test_what_one_finger_touches_is_no_contact_of_the_next(name: str) -> None:
             start, stop = layout.neighbour_start[part.start + taxel : part.start + taxel + 2]
             near = layout.neighbour[start:stop] - part.start
             assert (unit[near] == unit[taxel]).all()
+
+
+def test_the_whole_icub_lies_in_space_but_for_its_hands() -> None:
+    layout = build_layout(load(CONFIG / "icub.toml"), CONFIG)
+    for part in layout.parts:
+        mine = slice(part.start, part.stop)
+        position_mm, normal = 1e3 * layout.position_m[mine], layout.normal[mine]
+        triangle = layout.triangle_of[mine]
+        apart_mm = np.linalg.norm(position_mm[:, np.newaxis] - position_mm, axis=2)
+        # Triangles do not overlap.
+        assert apart_mm[triangle[:, np.newaxis] != triangle].min() > 5.0, part.name
+        if part.name.endswith(("hand", "foot")):
+            assert np.ptp(position_mm[:, 2]) < 1e-6
+            continue
+        assert np.ptp(position_mm, axis=0).min() > 20.0
+        outward_mm = ((position_mm - np.median(position_mm, axis=0)) * normal).sum(axis=1)
+        assert outward_mm.min() > 0.0, part.name
