@@ -38,6 +38,8 @@ class BoardLink:
     """Sends the frames of boards, and returns the commands of a host.
 
     Attributes:
+        shows_pauses: the host is shown up to when the boards have lived; on other buses it cannot
+            distinguish a pause of this process from silence.
         sent, lost: frames that the bus took, and that it did not (too slow, down, bus-off).
     """
 
@@ -52,6 +54,7 @@ class BoardLink:
             # A frame is stamped when its board sent it, as by a kernel, not when this process got
             # the processor to pass it on.
             bus.preserve_timestamps = True
+        self.shows_pauses = isinstance(bus, PairBus)
         self._waiting: list[can.Message] = []
         self._failing = False
         self.sent = 0

@@ -4,6 +4,7 @@
 commands. Nothing here knows the time of day; only `run` communicates with the outside.
 """
 
+import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -37,6 +38,8 @@ from skin_host.files import write_atomic
 from skin_host.layout import Layout
 
 NS = 1_000_000_000
+log = logging.getLogger(__name__)
+
 #: Boards that are due within the same millisecond are computed together.
 TICK_NS = 1_000_000
 #: How often `run` looks at buses and boards.
@@ -44,6 +47,10 @@ POLL_NS = 2_000_000
 #: Boards do not stall with a computer: a process that was held up catches up. One that was stopped
 #: for longer than this first leaves out whole periods of its boards.
 LONGEST_CATCH_UP_NS = 5_000_000_000
+#: After a longer pause the host has found boards silent, on a bus that does not show it a pause.
+STALL_NS = 150_000_000
+#: Pauses are reported this often.
+REPORT_NS = 10_000_000_000
 #: Before time is left out, sweeps in progress get so long to end; a full bus is never idle.
 LONGEST_SWEEP_NS = 100_000_000
 
@@ -285,6 +292,7 @@ class Robot:
         links = {name: BoardLink(name, bus) for name, bus in buses.items()}
         # The clock also counts the time before this and what is left out.
         ahead_ns = clock.now_ns() - self.t_ns
+        looked_ns, reported_ns = clock.now_ns(), -REPORT_NS
         while True:
             commands = [
                 (name, can_id, data)
@@ -292,6 +300,16 @@ class Robot:
                 for can_id, data in link.received()
             ]
             now_ns = clock.now_ns()
+            if now_ns - looked_ns > STALL_NS and now_ns - reported_ns > REPORT_NS:
+                reported_ns = now_ns
+                for name in [name for name, link in links.items() if not link.shows_pauses]:
+                    log.warning(
+                        "bus %s: this computer held the emulator up for %.0f ms; a host took the "
+                        "boards for silent, and what followed for late",
+                        name,
+                        (now_ns - looked_ns) / 1e6,
+                    )
+            looked_ns = now_ns
             if now_ns - ahead_ns - self.t_ns > LONGEST_CATCH_UP_NS:
                 self._send(links, self._finish_sweeps(), clock, ahead_ns)
                 left_out_ns = self._to_leave_out_ns(now_ns - ahead_ns - self.t_ns)

@@ -19,6 +19,7 @@ from skin_host.bus.commands import (
     TxMode,
     command_frame,
 )
+from skin_host.bus.pair import PairBus, pair
 from skin_host.bus.wire import FrameBatch, find_skin_frames
 from skin_host.config import settings as configurations
 from skin_host.config.settings import Settings, changed
@@ -244,6 +245,28 @@ async def test_a_busy_computer_delays_frames_but_not_their_time_stamps() -> None
     assert len(stamps_s) >= 14
     assert np.diff(stamps_s) == pytest.approx(0.05, abs=0.002)
     assert stamps_s[-1] <= clock.now_ns() * 1e-9
+
+
+async def test_a_pause_that_a_host_takes_for_silence_is_reported(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """As on vcan and udp_multicast; the demo's own bus shows pauses to the daemon."""
+    robot, clock = Robot(*load()), SteppedTime()
+    ours, theirs = pair()
+    with can.Bus(interface="virtual", channel="test-pause") as plain:
+        life = asyncio.create_task(robot.run({"can0": plain}, clock))
+        for passed_s in (0.002, 0.1, 0.4, 0.3):
+            await clock.advance(passed_s)
+        life.cancel()
+    (said,) = caplog.messages
+    assert said.startswith("bus can0: this computer held the emulator up for 400 ms")
+    caplog.clear()
+    with PairBus(ours) as marked, theirs:
+        life = asyncio.create_task(robot.run({"can0": marked}, clock))
+        for passed_s in (0.002, 0.4):
+            await clock.advance(passed_s)
+        life.cancel()
+    assert not caplog.messages
 
 
 @pytest.mark.parametrize("stalled_s", [0.3, 1.2, 7.33, 3600.01])
