@@ -7,6 +7,7 @@ stderr; a user's mistake never shows a traceback. Heavy imports wait until a com
 import argparse
 import contextlib
 import difflib
+import io
 import logging
 import os
 import re
@@ -64,6 +65,20 @@ def _complain(line: str) -> None:
     print(line, file=sys.stderr)
 
 
+def _make_printable() -> None:
+    """What is printed where nobody can read it goes nowhere, and never ends a command.
+
+    A stream that was closed (`>&-`) gets its number again, before a file or socket takes it. A
+    character that the locale's encoding has not becomes a question mark.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115
+        elif mode == "w" and isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+
+
 def build_parser() -> argparse.ArgumentParser:
     """The parser of the whole command line."""
     parser = _Parser(
@@ -85,6 +100,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # numpy, imported later, would otherwise start threads that spin: on a busy machine they make a
     # product of 100 000 taxels take seven times as long, and never help one of a few thousand.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    _make_printable()
     emulator_path.provide()
     parser = build_parser()
     completion.complete_if_asked(parser)

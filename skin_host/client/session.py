@@ -33,8 +33,9 @@ from skin_host.mqtt.payload import JSON_TYPE
 from skin_host.mqtt.topics import ONLINE, PartTopic, Topics
 from skin_host.processing.events import Touch
 
-#: An event waits this long for an earlier one, which may come from another broker.
-HOLD_S = 1.0
+#: An event waits this long for an earlier one, which may come from another broker: as long as a
+#: robot sends events again there (`mqtt.outbox.REPEAT_S`). Only after an earlier one is missing.
+HOLD_S = 10.0
 #: Timeouts are checked this often.
 WATCH_S = 0.25
 #: Further topics that a stream needs: a contact state is valid only while its part lives.

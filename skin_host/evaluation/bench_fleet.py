@@ -174,7 +174,11 @@ async def _conduct(brokers: Brokers, plan: FleetPlan, pipes: list[Pipe]) -> dict
     for number, address in enumerate(brokers.addresses):
         broker, name = _broker(address, brokers), f"ear-{os.getpid()}-{number}"
         if plan.plain:
-            links.append(_Ear(number, broker, name, ear))
+            # Some brokers have one message on its way to a subscriber at a time.
+            links += [
+                _Ear(number, broker, f"{name}-{kind}", ear, topic)
+                for kind, topic in enumerate(ear.wanted())
+            ]
         else:
             links.append(_FullEar(number, broker, name, ear))
     tasks = [asyncio.create_task(link.run()) for link in links]
@@ -255,13 +259,15 @@ class _FullEar(BrokerLink):
 
 
 class _Ear(PlainEar):
-    """One that costs little."""
+    """One that costs little, of one kind of message."""
 
-    def __init__(self, number: int, broker: Broker, name: str, receiver: "_Receiver") -> None:
+    def __init__(
+        self, number: int, broker: Broker, name: str, receiver: "_Receiver", topic: str
+    ) -> None:
         super().__init__(
             broker,
             name,
-            receiver.wanted(),
+            [topic],
             lambda heard: receiver.hear(number, heard),
             lambda: None if self.connected else receiver.lose(number),
         )

@@ -49,13 +49,15 @@ class Ejabberds:
     Args:
         folder: for the nodes' files.
         tick_s: their `net_ticktime`.
+        in_memory: what is retained is kept in memory, not in a file of each node.
     """
 
     name = "three nodes of ejabberd as a cluster"
     username: str | None = "robot"
     password: str | None = "any"
 
-    def __init__(self, folder: Path, tick_s: int) -> None:
+    def __init__(self, folder: Path, tick_s: int, *, in_memory: bool) -> None:
+        self._in_memory = in_memory
         self._folder = folder
         self._tick_s = tick_s
         self._distribution = free_port()
@@ -78,6 +80,16 @@ class Ejabberds:
         for number in (1, 2):
             self._join(number)
             self._wait(number)
+        if self._in_memory:
+            for number in range(3):
+                self._keep_retained_in_memory(number)
+
+    def _keep_retained_in_memory(self, number: int) -> None:
+        """What the web admin does for a table: Nodes, the node, Database, "RAM copy"."""
+        node = f"'{self._node(number)}'"
+        change = f"mnesia, change_table_copy_type, [mqtt_pub, {node}, ram_copies]"
+        call = f"{{atomic, ok}} = rpc:call({node}, {change}), halt()."
+        self._ask("-eval", call)
 
     def _join(self, number: int) -> None:
         """Join the first node, which takes no other while it starts, though its port is open."""
@@ -116,6 +128,8 @@ class Ejabberds:
         command = self._erl(
             self._node(number),
             *("-kernel", "inet_dist_use_interface", f"{{127,0,0,{number + 1}}}"),
+            # Three of them share this machine: none spins while it waits.
+            *("+sbwt", "none", "+sbwtdcpu", "none", "+sbwtdio", "none"),
             *("+P", "250000", "-mnesia", "dir", f'"{home}/spool"', "-s", "ejabberd"),
         )
         with (home / "out").open("ab") as log:
@@ -130,10 +144,12 @@ class Ejabberds:
             )
 
     def _control(self, number: int, *command: str) -> None:
+        self._ask("-s", "ejabberd_ctl", "-extra", self._node(number), *command)
+
+    def _ask(self, *arguments: str) -> None:
         name = f"control{os.getpid()}-{time.monotonic_ns()}@127.0.0.1"
-        more = ["-hidden", "-dist_listen", "false", "-s", "ejabberd_ctl", "-extra"]
         subprocess.run(
-            self._erl(name, *more, self._node(number), *command),
+            self._erl(name, "-hidden", "-dist_listen", "false", *arguments),
             cwd=self._folder,
             env=self._environment(),
             check=True,
@@ -173,10 +189,10 @@ class Ejabberds:
 
 
 @contextmanager
-def ejabberds(tick_s: int = _STOCK_TICK_S) -> Iterator[Ejabberds]:
+def ejabberds(tick_s: int = _STOCK_TICK_S, *, in_memory: bool = True) -> Iterator[Ejabberds]:
     """Run a cluster for as long as the block lasts."""
     with tempfile.TemporaryDirectory() as folder:
-        cluster = Ejabberds(Path(folder), tick_s)
+        cluster = Ejabberds(Path(folder), tick_s, in_memory=in_memory)
         try:
             cluster.form()
             yield cluster
@@ -195,10 +211,11 @@ def main() -> None:
     parser.add_argument("--phase", type=float, default=plan.phase_s, metavar="S")
     parser.add_argument("--plain", action="store_true", help="as `skin bench fleet --full`")
     parser.add_argument("--tick", type=int, default=_STOCK_TICK_S, metavar="S")
+    parser.add_argument("--files", action="store_true", help="retained in files, as installed")
     given = parser.parse_args()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # and end the nodes
     plan = bench_fleet.FleetPlan(given.robots, given.pace, given.health, given.phase, given.plain)
-    with ejabberds(given.tick) as cluster:
+    with ejabberds(given.tick, in_memory=not given.files) as cluster:
         document = bench_fleet.measure(cluster, plan)
     sys.stdout.write(bench_fleet.describe(document) + "\n")
 
