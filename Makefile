@@ -45,7 +45,8 @@ test-system: .venv/dev.stamp .venv/fuzz.stamp  ## real CAN, I2C, systemd, broker
 	@tools/timed "on this host: broker, browser, the lane itself" \
 		$(BIN)/python -m pytest tests/system/native --require-mosquitto $(AGAIN)
 	@tools/timed "on this host: the other tests with a broker, which wait, and the long ones, which compute" \
-		$(BIN)/python -m pytest tests -m "mosquitto or long" --require-mosquitto $(BY_FILE) $(AGAIN)
+		$(BIN)/python -m pytest tests -m "mosquitto or long or hypothesis" --hypothesis-profile=far \
+		--require-mosquitto $(BY_FILE) $(AGAIN)
 	@tools/timed "in the lane: vcan and CUSE" \
 		tools/lane/run $(BIN)/python -m pytest tests/stack tests/system/lane \
 		--bus=vcan --require-mosquitto -o faulthandler_timeout=300 $(AGAIN)

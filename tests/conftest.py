@@ -19,6 +19,8 @@ from tests.support.watchdog import watchdog  # noqa: F401  (fixture for all)
 
 _numbers = itertools.count()
 
+#: Fixtures that start a broker: for one test, and for all pages of the documentation.
+BROKERS = {"mosquitto", "world"}
 #: Files that take more than five seconds, as `--durations=0` found them.
 LONGEST_FIRST = (
     "tests/evaluation/simulate/test_simulate.py",
@@ -46,7 +48,9 @@ LONGEST_FIRST = (
 )
 
 # A slow machine is no failure.
-hypothesis.settings.register_profile("project", deadline=None)
+hypothesis.settings.register_profile("project", deadline=None, max_examples=40)
+# `make test-system` looks further: --hypothesis-profile=far.
+hypothesis.settings.register_profile("far", deadline=None, max_examples=200)
 # support/mutation.py: the same few examples in every run, and none is made smaller.
 hypothesis.settings.register_profile(
     "mutation",
@@ -76,7 +80,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Declare what `make test` leaves to `make test-system`."""
-    config.addinivalue_line("markers", "mosquitto: uses a real mosquitto (set by its fixture)")
+    config.addinivalue_line("markers", "mosquitto: uses a real mosquitto (set by its fixtures)")
     config.addinivalue_line(
         "markers",
         "long: the whole system over hours of its time, and what no robot runs, in seconds of ours:"
@@ -90,7 +94,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     A process gets a whole file at a time: a long one that came last would run alone.
     """
     for item in items:
-        if "mosquitto" in getattr(item, "fixturenames", ()):
+        if BROKERS & set(getattr(item, "fixturenames", ())):
             item.add_marker("mosquitto")
     items.sort(key=lambda item: _place(item.nodeid.partition("::")[0]))
 

@@ -49,6 +49,7 @@ def test_a_slow_mode_in_float32_reaches_what_float64_reaches_in_steps_of_a_secon
     assert answer == pytest.approx(exact, abs=3e-3)
 
 
+@pytest.mark.long
 def test_days_of_noisy_work_in_float32_stay_with_float64():
     """Windows of 50 and of 100 samples side by side: hours-long holds, and grasps."""
     rng = np.random.default_rng(5)
@@ -81,6 +82,7 @@ def test_samples_of_an_hour_in_float32_stay_with_float64(hz):
             model.step(np.full(2, level), 59.0)
 
 
+@pytest.mark.long
 def test_after_1e5_cycles_the_default_in_float32_repeats_itself():
     model = default(dtype="float32")
     pressed, free = np.full(1, 50.0, np.float32), np.zeros(1, np.float32)

@@ -12,6 +12,8 @@ from skin_host.cli.common import load_skin
 from skin_host.demo import configuration
 from skin_host.evaluation.simulate.run import RunResult, simulate, simulate_all
 
+pytestmark = pytest.mark.long
+
 DEMO = configuration("demo.toml")
 SMALL = Path(__file__).with_name("small.toml")
 #: Simulated time of each fixed seed: one storm and its calm.
@@ -28,7 +30,6 @@ def run(seed: int, config: Path = DEMO, *, until_s: float | None = None) -> RunR
     return simulate(settings, layout, config, seed, SECONDS, until_s=until_s)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("config", "seed"), FIXED, ids=lambda value: getattr(value, "stem", value))
 def test_every_promise_holds_through_a_storm(config: Path, seed: int) -> None:
     result = run(seed, config)
