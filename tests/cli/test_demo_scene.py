@@ -60,6 +60,7 @@ def test_no_press_is_missed_or_late_on_pads_as_noisy_as_real_ones() -> None:
         assert min(begun[part]) > min(at_s)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("config", ["demo.toml", "icub.toml", "fingertips.toml", "nao.toml"])
 def test_a_robot_of_the_demo_is_healthy_before_and_while_it_is_pressed(config: str) -> None:
     settings, layout, _ = demo.prepared(CONFIG / config, None)
