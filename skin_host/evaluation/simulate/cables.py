@@ -198,6 +198,8 @@ class Cable:
         mischief: what happens to frames.
         state: of the interface, as the port is to find it.
         damaged_ns: when a frame was last damaged.
+        blurred_ns: when frames last came late while a second board sent at their address: what
+            belongs to which sweep cannot be known then.
         fate: what became of the frames since the port was opened.
         sent: what passed over the bus.
     """
@@ -217,7 +219,7 @@ class Cable:
         self.state = LinkState.UP
         self.fate = Fate()
         self.sent = Sent()
-        self.damaged_ns = -(1 << 62)
+        self.damaged_ns = self.blurred_ns = -(1 << 62)
         self.move = move
         self._clock = clock
         self._command = command
@@ -269,6 +271,8 @@ class Cable:
         if self._port is None or self.state in (LinkState.GONE, LinkState.DOWN):
             fate.unheard += n
             return
+        if self.mischief.twin is not None and (self.mischief.late or self._late):
+            self.blurred_ns = self._clock.monotonic_ns()
         if n:
             self.sent.note(batch)
         if self._late:

@@ -302,7 +302,8 @@ class Promises:
             if b"\1" not in valid[at : at + 12]:
                 continue
             cable = world.cables[bus]
-            if cable.mischief.damaged or self._now_ns() - cable.damaged_ns < 2 * NS:
+            wrong_ns = max(cable.damaged_ns, cable.blurred_ns)
+            if cable.mischief.damaged or self._now_ns() - wrong_ns < 2 * NS:
                 continue
             found = "no sweep of it"
             for answered, t_ns in cable.sent.find(address, number, raw[at : at + 12]):
