@@ -371,9 +371,13 @@ class Daemon:
         said_s = dict.fromkeys(self.engine.parts, 0.0)
         of_parts: dict[tuple[str, str], str] = {}
         pulse: tuple[object, ...] = ()
+        zeroed = 0
         while True:
             await self.clock.sleep(LOOK_S)
             self.link.supervise()
+            if zeroed != (zeroed := int(self.engine.ledger.rezeros.sum())):
+                # At once: what was pressed then must be doubted after a crash, too.
+                self._begin_to_keep_zeros()
             now_s = self.clock.monotonic_s()
             self.health.tick(self.link.read_ns, self.link.ports, self.link.boards)
             told = self.fingertips.publish_health(self.link.read_ns)
@@ -399,8 +403,7 @@ class Daemon:
             self._fault_log.note(told, now_s)
             if now_s - self._status_s >= HEALTH_S:
                 self._status_s = now_s
-                if self._keeping is None or self._keeping.done():
-                    self._keeping = asyncio.create_task(self._keep_zeros(), name="keep zeros")
+                self._begin_to_keep_zeros()
                 service.notify("STATUS=" + self._status(len(told)))
 
     def _pulse(self) -> tuple[object, ...]:
@@ -411,6 +414,10 @@ class Daemon:
             (output.connected, output.last_error, output.touches_dropped, output.refused),
             (tuple(output.withheld), output.name_taken, tuple(self.unkept)),
         )
+
+    def _begin_to_keep_zeros(self) -> None:
+        if self._keeping is None or self._keeping.done():
+            self._keeping = asyncio.create_task(self._keep_zeros(), name="keep zeros")
 
     async def _keep_zeros(self, *, touched: bool = False) -> None:
         """Write which zeros are not known, or with `touched` will not be, if that has changed."""

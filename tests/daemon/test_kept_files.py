@@ -7,8 +7,10 @@ import socket
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from emulator.probes.scene import Place, Probe, Scene
 from skin_host.cli import main
 from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus, Mqtt, changed, load
@@ -26,6 +28,8 @@ from tests.support.stepped import stepped
 from tests.support.waiting import PATIENCE_S, until
 
 STATE = {"schema": "skin.state/1", "disabled": ["left_hand"]}
+#: A press that lasts.
+PRESSED = [(0.0, 0.0), (0.1, 60.0), (1000.0, 60.0)]
 NEWER: list[dict[str, Any]] = [
     STATE | {"schema": "skin.state/2"},
     STATE | {"sensitivity": 3},
@@ -165,3 +169,26 @@ async def test_a_password_that_comes_late_is_read_then(
         await until(lambda: publisher.counters.connected)
     assert "Traceback" not in caplog.text
     assert "sesame" not in caplog.text
+
+
+@stepped
+async def test_what_was_pressed_when_its_board_was_zeroed_is_in_a_file_at_once(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    """A crash a moment later must not make a pressed taxel look untouched."""
+    press = Probe(
+        part="left_hand", at=Place(triangle=4), diameter_mm=10, pressure_kpa=PRESSED, start_s=4.0
+    )
+    scene = Scene(probe=[press], quiet=True)
+    async with living(can_bus_settings, tmp_path, scene=scene, clock=clock) as live:
+        engine = live.daemon.engine
+        await live.wait(lambda: bool(engine.zero_at_risk(touched=True).any()))
+        touched = np.flatnonzero(engine.zero_at_risk(touched=True))  # the hand begins at 0
+        file = tmp_path / "demo-main.zeros.json"
+        assert not file.exists()
+        before = engine.ledger.rezeros.sum()
+        configuring = asyncio.create_task(live.daemon.configure())
+        await live.wait(lambda: engine.ledger.rezeros.sum() > before)
+        await clock.sleep(0.2)
+        assert set(json.loads(file.read_bytes())["unknown"]["left_hand"]) >= set(touched.tolist())
+        await configuring

@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.daemon.daemon import Daemon
 from skin_host.evaluation.simulate.accusations import Accusations
 from skin_host.evaluation.simulate.troubles import Trouble
 from skin_host.evaluation.simulate.world import Life, World
@@ -229,6 +230,12 @@ class Promises:
             ("put_health", self._health),
         ):
             setattr(publisher, name, _after(life, look, getattr(publisher, name)))
+
+    def forget(self, daemon: Daemon) -> None:
+        """A daemon is killed: the doubts that the disk refused, or had not taken yet, are lost."""
+        keeping = daemon._keeping
+        if "zeros" in daemon.unkept or (keeping is not None and not keeping.done()):
+            self._exempt |= daemon.engine.zero_at_risk(touched=False)
 
     def over(self, life: Life, *, whole: bool) -> None:
         """A life has ended; `whole`: as it was asked to."""
@@ -587,7 +594,8 @@ class Promises:
         connections = life.daemon.publisher.counters.connections
         if self._connected_ns is None or self._connection != connections:
             self._connection, self._connected_ns = connections, now_ns
-        self._retained(now_ns)
+        if not life.stop.is_set():  # Then `offline` is the last of all.
+            self._retained(now_ns)
         for name, since_ns in self._blank_since.items():
             topic = life.daemon.publisher.topics.part("contact", name)
             long = now_ns - max(since_ns, self._connected_ns) > UNKNOWN_NS

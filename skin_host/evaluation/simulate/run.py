@@ -292,6 +292,7 @@ class _Run:
         if life is None:
             return
         world.note("the power fails" if power else "the daemon is killed")
+        self._promises.forget(life.daemon)
         if power:
             life.disk.cut()
         life.kill()
