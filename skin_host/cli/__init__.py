@@ -76,7 +76,8 @@ def _make_printable() -> None:
         if stream is None:
             setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115
         elif mode == "w" and isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")
+            with contextlib.suppress(OSError):  # a stream that changed under our feet
+                stream.reconfigure(errors="replace")
 
 
 def build_parser() -> argparse.ArgumentParser:

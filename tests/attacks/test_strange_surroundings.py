@@ -25,6 +25,7 @@ def said_by(shell: str, **environment: str) -> "subprocess.CompletedProcess[byte
         "CHECK >&-",
         "CHECK <&- >&- 2>&-",
         "CHECK | head -n 1",
+        "CHECK > here; CHECK >> here",
         "ulimit -n 32; CHECK",
         "mkdir gone_$$; cd gone_$$; rmdir ../gone_$$; CHECK",
     ],
