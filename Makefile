@@ -10,7 +10,7 @@ export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo docs test quick coverage mutation test-system simulate install uninstall lint format clean
+.PHONY: help demo docs test quick coverage mutation test-system test-lane test-containers simulate install uninstall lint format clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z.-]+:.*## / {printf "make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -47,12 +47,20 @@ test-system: .venv/dev.stamp .venv/fuzz.stamp  ## real CAN, I2C, systemd, broker
 	@tools/timed "on this host: the other tests with a broker, which wait, and the long ones, which compute" \
 		$(BIN)/python -m pytest tests -m "mosquitto or long or hypothesis" --hypothesis-profile=far \
 		--require-mosquitto $(BY_FILE) $(AGAIN)
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target test-lane test-containers
+	@tools/timed "a Debian that boots: systemd and CAN cards" \
+		$(BIN)/python -m pytest tests/system/systemd --numprocesses=2 --dist=loadfile $(AGAIN)
+
+# The lane's machine has one processor: meanwhile the other makes a disk and an image.
+test-lane: .venv/dev.stamp
 	@tools/timed "in the lane: vcan and CUSE" \
 		tools/lane/run $(BIN)/python -m pytest tests/stack tests/system/lane \
 		--bus=vcan --require-mosquitto -o faulthandler_timeout=300 $(AGAIN)
+
+test-containers: .venv/dev.stamp
 	@tools/timed "a Debian that boots: its disk" tools/lane/debian
-	@tools/timed "a Debian that boots: systemd and CAN cards" \
-		$(BIN)/python -m pytest tests/system/systemd --numprocesses=2 --dist=loadfile $(AGAIN)
+	@tools/timed "containers: the image is built, it and the compose file run" \
+		tools/lane/image $(BIN)/python -m pytest tests/system/containers $(AGAIN)
 
 docs: .venv/docs.stamp  ## a site from docs/ with an API reference, in site/; every link is checked
 	@$(BIN)/mkdocs build --strict

@@ -1,4 +1,4 @@
-"""The container files name what there is. They are not built by a test: that needs a registry."""
+"""The container files name what there is. tests/system/containers builds and runs them, as root."""
 
 import re
 import shlex
@@ -35,7 +35,7 @@ def test_the_linter_finds_nothing() -> None:
 
 
 def test_the_services_follow_the_compose_specification() -> None:
-    """By the schema that it publishes; nothing here runs them."""
+    """By the schema that it publishes."""
     schema = ["--builtin-schema", "vendor.compose-spec"]
     program = shutil.which("check-jsonschema", path=str(Path(sys.executable).parent))
     if program is None:
