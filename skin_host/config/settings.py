@@ -285,7 +285,7 @@ def read_toml(path: Path, table: type[T], named: Named) -> T:
     except msgspec.ValidationError as error:
         what = explain(msgspec.toml.decode(data), error, table, named)
         raise ConfigurationError(f"{path}: {what}") from None
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, ValueError) as error:  # numbers of 4300 digits, too
         raise ConfigurationError(f"{path}: not TOML: {error}") from None
     except RecursionError:
         raise ConfigurationError(f"{path}: not a configuration: nested too deep") from None

@@ -45,6 +45,16 @@ def test_a_configuration_nested_without_end_is_refused_in_a_line(
     assert "nested too deep" in said.err + said.out
 
 
+def test_a_number_of_5000_digits_is_refused_in_a_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "x.toml"
+    path.write_text("robot = " + "9" * 5000)
+    assert main(["check", str(path)]) == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert "x.toml: not TOML" in said
+
+
 def test_an_impossible_port_is_refused_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["view", "--port", "99999"]) != 0
     (said,) = capsys.readouterr().err.splitlines()
