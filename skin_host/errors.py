@@ -11,7 +11,8 @@
     |- BrokerError            the MQTT broker: refused us, or sent an invalid answer
 
 A message is one line: what, where, the value seen, the value wanted, and the command that helps.
-The command line prints it and exits with `exit_status`. `required` imports an extra, or raises.
+The command line prints it (`visible`) and exits with `exit_status`. `required` imports an extra, or
+raises.
 """
 
 import importlib
@@ -56,6 +57,17 @@ class BusError(SkinError):
 
 class BrokerError(SkinError):
     """The MQTT broker refused us, and waiting does not help."""
+
+
+def visible(text: str, longest: int = 1000) -> str:
+    """Return text with control characters shown as escapes, and cut; it may come from a stranger.
+
+    A terminal obeys them: they move the cursor, change the title, hide what was printed before.
+    """
+    shown = text[:longest] + (" ..." if len(text) > longest else "")
+    if shown.isprintable():
+        return shown
+    return "".join(one if one.isprintable() else repr(one)[1:-1] for one in shown)
 
 
 def required(module: str, what: str, extra: str) -> Any:

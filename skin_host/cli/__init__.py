@@ -27,7 +27,7 @@ from skin_host.cli import (
     without_robot,
 )
 from skin_host.daemon import service
-from skin_host.errors import SkinError
+from skin_host.errors import SkinError, visible
 
 
 class _Parser(argparse.ArgumentParser):
@@ -61,6 +61,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _complain(line: str) -> None:
+    line = "\n".join(map(visible, line.splitlines()))
     line = service.with_priority(line, logging.ERROR) if service.to_journal() else line
     print(line, file=sys.stderr)
 

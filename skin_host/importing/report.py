@@ -4,6 +4,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from skin_host.errors import visible
+
+#: Most remarks of a grade that are printed, and most characters of one.
+MOST, LONGEST = 100, 300
+
 Grade = Literal["odd", "assumed", "dropped"]
 GRADES: dict[Grade, str] = {
     "odd": "wrong or unusual in the files, and how it was read",
@@ -23,7 +28,7 @@ class Finding:
 
     def __str__(self) -> str:
         place = f"{self.file}:{self.line}" if self.line else str(self.file)
-        return f"{place}: {self.text}"
+        return visible(f"{place}: {self.text}", LONGEST)
 
 
 @dataclass(slots=True)
@@ -48,7 +53,10 @@ class Findings:
         """Return all remarks as text, by grade; empty if there are none."""
         sections = []
         for grade, title in GRADES.items():
-            lines = [f"  {item}" for item in self.items if item.grade == grade]
+            found = [item for item in self.items if item.grade == grade]
+            lines = [f"  {item}" for item in found[:MOST]]
+            if len(found) > MOST:
+                lines.append(f"  and {len(found) - MOST} more")
             if lines:
                 sections.append("\n".join([f"{title}:", *lines]))
         return "\n".join(sections)

@@ -55,6 +55,24 @@ def test_a_number_of_5000_digits_is_refused_in_a_line(
     assert "x.toml: not TOML" in said
 
 
+def test_what_a_file_says_does_not_steer_the_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Escape sequences are shown, not obeyed; of thousands of remarks the first are printed."""
+    path = tmp_path / "x.ini"
+    path.write_text("\n".join(["evil\x1b]0;title\x07 \x9b31m " * 5] * 3000))
+    assert main(["import", "skingui", str(path), "--output", str(tmp_path / "out.toml")]) == 2
+    said = capsys.readouterr().err
+    assert not {one for one in said if one != "\n" and not one.isprintable()}
+    assert len(said) < 100_000
+    assert "evil\\x1b" in said
+    configuration = tmp_path / "x.toml"
+    configuration.write_text('"a\\u001B[2J\\u0007" = 1\n')
+    assert main(["check", str(configuration)]) == 2
+    said = "".join(capsys.readouterr())
+    assert not {one for one in said if one != "\n" and not one.isprintable()}
+
+
 def test_an_impossible_port_is_refused_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["view", "--port", "99999"]) != 0
     (said,) = capsys.readouterr().err.splitlines()
