@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from skin_host.config.settings import load, skin_hash
-from skin_host.daemon.state import SCHEMA, NodeState
+from skin_host.daemon.state import NodeState
 from skin_host.layout import build_layout
 from skin_host.processing import calibration as calibrations
 from tests.support.broker import Mosquitto
@@ -117,7 +117,7 @@ def test_kill_9_at_any_moment_damages_nothing(mosquitto: Mosquitto, tmp_path: Pa
         kept = state / "demo-main.state.json"
         if kept.exists():
             content = json.loads(kept.read_bytes())
-            assert content["schema"] == SCHEMA
+            assert content["schema"] == NodeState().schema
             assert set(content) == set(NodeState.__struct_fields__)
     assert len(back_s) == ROUNDS
     soon = sum(back <= BACK_S for back in back_s)
