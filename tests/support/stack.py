@@ -78,7 +78,7 @@ class Stack:
             r"(?m)^start_s = (\S+)", lambda found: f"start_s = {float(found[1]) + later_s}", text
         )
         # Offsets of boards are drawn: another seed would be another robot.
-        text = re.sub(r"(?m)^seed = .*\n", "", text)
+        text = re.sub(r"(?m)^(seed|quiet) = .*\n", "", text)
         path = self.directory / (scene.name if scene else "untouched.toml")
         path.write_text(f"quiet = true\n{text}")
         return path
