@@ -60,7 +60,7 @@ class BrokerError(SkinError):
 
 
 def visible(text: str, longest: int = 1000) -> str:
-    """Return text with control characters shown as escapes, and cut; it may come from a stranger.
+    """Return text with control characters shown as escapes, and cut; anybody may have written it.
 
     A terminal obeys them: they move the cursor, change the title, hide what was printed before.
     """
