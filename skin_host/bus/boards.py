@@ -130,11 +130,11 @@ class Boards:
         Raises:
             BusError: the bus does not take frames.
         """
-        while busy := [one.busy for one in self.records.values() if one.busy is not None]:
-            await asyncio.wait(busy)
+        records = list(self.records.values())
+        await self._until_free(records)
         try:
             # Occupied: discovery stops an MTB3, so nobody sets up a board in the middle of it.
-            await self._occupy(list(self.records.values()), self._bring_up(listen))
+            await self._occupy(records, self._bring_up(listen))
         except BusError:
             self._failed = True
             raise
@@ -191,8 +191,7 @@ class Boards:
             BusError: the bus does not take frames.
         """
         record = self.records[address]
-        while record.busy is not None:
-            await asyncio.wait([record.busy])
+        await self._until_free([record])
         # Occupied, so that `supervise` does not act on its silence at the same time.
         await self._occupy([record], self._set_up(record))
 
@@ -311,6 +310,11 @@ class Boards:
         self._occupy([record], do())
 
     @staticmethod
+    async def _until_free(records: list[BoardRecord]) -> None:
+        while busy := [record.busy for record in records if record.busy is not None]:
+            await asyncio.wait(busy)
+
+    @staticmethod
     def _occupy(
         records: list[BoardRecord], work: Coroutine[None, None, None]
     ) -> "asyncio.Task[None]":
@@ -398,7 +402,7 @@ class Boards:
             )
             record.in_bootloader = False
             if record.is_mtb3:
-                self._ledger.is_mtb3(record.row)
+                self._ledger.expect_pauses(record.row)
             if answer.board_type not in SKIN_BOARD_TYPES:
                 log.warning(
                     "bus %s: board %s is of type %d, which is no skin board",

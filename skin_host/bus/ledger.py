@@ -86,7 +86,7 @@ class BoardLedger:
 
         for row, (_, board) in enumerate(boards):
             if board.settings.model == "mtb3":
-                self.is_mtb3(row)
+                self.expect_pauses(row)
 
         self.received_ns = np.zeros(n, np.int64)
         self._none_silent_until_ns = -1
@@ -108,8 +108,8 @@ class BoardLedger:
         self.tx_overflows = np.zeros(n, np.int64)
         self.rezeros = np.zeros(n, np.int64)
 
-    def is_mtb3(self, row: int) -> None:
-        """A board is an MTB3: it may pause to zero itself."""
+    def expect_pauses(self, row: int) -> None:
+        """Give a board, an MTB3, the time to zero itself before it has timed out."""
         least_ns = int(MTB3_PERIODS * self._period_ns[row])
         self.silent_after_ns[row] = max(int(self.silent_after_ns[row]), least_ns)
 
