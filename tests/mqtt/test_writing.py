@@ -18,6 +18,7 @@ from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import PackedProperties, connect, message_properties
 from skin_host.mqtt.frames import publish_head, publish_packet
 from tests.support.certificates import authority, certificate
+from tests.support.packets import packet_with_flags
 from tests.support.waiting import PATIENCE_S, until
 
 CONNECT, PUBLISH, DISCONNECT = 0x10, 0x30, 0xE0
@@ -34,15 +35,7 @@ class SlowBroker:
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
             while True:
-                command = (await reader.readexactly(1))[0]
-                length = shift = 0
-                while True:
-                    byte = (await reader.readexactly(1))[0]
-                    length |= (byte & 0x7F) << shift
-                    shift += 7
-                    if byte < 0x80:
-                        break
-                packet = await reader.readexactly(length)
+                command, packet = await packet_with_flags(reader)
                 self.packets.append((command, packet))
                 if command == CONNECT:
                     writer.write(b"\x20\x03\x00\x00\x00")

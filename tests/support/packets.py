@@ -8,6 +8,12 @@ CONNACK = bytes([0x20, 3, 0, 0, 0])
 
 async def packet(reader: asyncio.StreamReader) -> tuple[int, bytes]:
     """The type of the next packet and what follows its length."""
+    first, rest = await packet_with_flags(reader)
+    return first >> 4, rest
+
+
+async def packet_with_flags(reader: asyncio.StreamReader) -> tuple[int, bytes]:
+    """The first byte of the next packet, type and flags, and what follows its length."""
     first = (await reader.readexactly(1))[0]
     length = shift = 0
     while True:
@@ -15,7 +21,7 @@ async def packet(reader: asyncio.StreamReader) -> tuple[int, bytes]:
         length |= (byte & 0x7F) << shift
         shift += 7
         if byte < 0x80:
-            return first >> 4, await reader.readexactly(length)
+            return first, await reader.readexactly(length)
 
 
 def suback(subscribe: bytes) -> bytes:
