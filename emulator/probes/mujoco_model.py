@@ -10,6 +10,7 @@ simulation's own constraint solver left them. The foam yields to the forces, but
 not feel it: its depth does not come back into the simulation.
 """
 
+import logging
 from bisect import bisect_right
 from itertools import pairwise
 from pathlib import Path
@@ -36,6 +37,16 @@ REPEAT = "repeat_s"
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
+log = logging.getLogger(__name__)
+
+
+def _line(text: str) -> str:
+    return " ".join(text.split())
+
+
+def _warn(text: str) -> None:
+    log.warning("MuJoCo: %s", _line(text))
+
 
 class MujocoModel:
     """A model that runs in the emulator's time, as a source of contacts.
@@ -56,11 +67,18 @@ class MujocoModel:
     def __init__(self, path: Path, layout: Layout) -> None:
         self._mujoco = required("mujoco", "simulations of bodies", "mujoco")
         self._path = path
+        # Otherwise MuJoCo appends its warnings to a file in the user's working directory.
+        warnings: list[str] = []
+        self._mujoco.set_mju_user_warning(warnings.append)
         try:
             self.model = self._mujoco.MjModel.from_xml_path(str(path))
         except (ValueError, OSError) as error:
-            reason = " ".join(str(error).split())
+            reason = _line(" ".join([*warnings, str(error)]))
             raise ConfigurationError(f"{path}: MuJoCo cannot read it: {reason}") from None
+        finally:
+            self._mujoco.set_mju_user_warning(_warn)
+        for text in warnings:
+            _warn(text)
         if self.model.opt.timestep > LONGEST_STEP_S:
             raise ConfigurationError(
                 f"{path}: option timestep {self.model.opt.timestep:g} s; "

@@ -391,14 +391,34 @@ def test_an_actuator_that_there_is_not_is_named(tmp_path: Path) -> None:
         model.set_control("grip", 1.0)
 
 
-def test_a_simulation_that_bursts_ends_with_a_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_simulation_that_bursts_ends_with_a_sentence_and_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.chdir(tmp_path)  # MuJoCo writes its log where it is.
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
     lying = Lying(balls(tmp_path, [(40, 40)]))
     lying.model.set_control("push0", 9e9)
     with pytest.raises(SkinError, match=r"became unstable at .* smaller option timestep"):
         lying.go_on(1.0)
+    assert not list(here.iterdir())
+    assert "The simulation is unstable" in caplog.text
+
+
+def test_a_model_that_is_too_large_or_no_file_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    large = tmp_path / "large.xml"
+    with large.open("wb") as file:
+        file.truncate(3 * 2**30)  # a sparse file
+    for path in (large, here):
+        with pytest.raises(ConfigurationError, match=r"File size over 2GB is not supported"):
+            MujocoModel(path, LAYOUT)
+    assert not list(here.iterdir())
+    assert capfd.readouterr() == ("", "")
 
 
 def test_a_robot_under_a_model_is_not_saved() -> None:
