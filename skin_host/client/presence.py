@@ -1,9 +1,11 @@
 """Contact state of the parts, and whether it is still known. Pure: takes times.
 
 Fails safe: a part whose node is offline or silent, or whose broker is lost, is UNKNOWN, whatever
-was received from it last.
+was received from it last. So is a part whose messages come much later than before: a broker that
+was frozen, or has too much to do, delivers what was true then.
 """
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
@@ -33,15 +35,50 @@ class Contact(NamedTuple):
         return self.state != "OFF"
 
 
+#: A distance between two clocks is the least one that was seen for this long, or twice as long.
+DISTANCE_S = 120.0
+
+
+class Lateness:
+    """How much later than before the messages of a sender come.
+
+    Its clock and ours are not the same. What can be seen is that the distance between the two times
+    grows: it is compared with the least of the last `DISTANCE_S` to twice that. So a clock that was
+    set back looks late for this long, and no longer.
+    """
+
+    def __init__(self) -> None:
+        self._least_s = self._least_before_s = math.inf
+        self._since_s = -math.inf
+
+    def of(self, sent_s: float, now_s: float) -> float:
+        """Return how late a message is, 0 or more; the sender's clock shows `sent_s`."""
+        distance_s = now_s - sent_s
+        if now_s - self._since_s > DISTANCE_S:
+            self._least_before_s, self._least_s = self._least_s, distance_s
+            self._since_s = now_s
+        self._least_s = min(self._least_s, distance_s)
+        return distance_s - min(self._least_s, self._least_before_s)
+
+
 @dataclass(slots=True)
 class _Part:
     #: None: not yet received over this connection.
     received: ContactState | None
     alive_s: float
+    lateness: Lateness = field(default_factory=Lateness)
+    #: How late the last message was whose time is known.
+    late_s: float = 0.0
     #: Brokers from which the state came; without any it is out of date.
     over: set[int] = field(default_factory=set)
     reported: Contact | None = None
     touches: dict[int, tuple[Touch, float]] = field(default_factory=dict)
+
+    def hear(self, now_s: float, sent_s: float | None) -> None:
+        """Take a sign of life: it shows that the part lived when it was sent."""
+        if sent_s is not None:
+            self.late_s = self.lateness.of(sent_s, now_s)
+        self.alive_s = max(self.alive_s, now_s - self.late_s)
 
 
 class Presence:
@@ -65,6 +102,7 @@ class Presence:
         broker: int = 0,
         *,
         again: bool = False,
+        sent_s: float | None = None,
     ) -> None:
         """Take the newest contact state; None: it was deleted.
 
@@ -74,24 +112,26 @@ class Presence:
             now_s: the time.
             broker: from which it came.
             again: it came from another broker before.
+            sent_s: when it was sent, by the node's clock. None: not known, or it was stored.
         """
         if state is None:
             self._parts.pop(part, None)
             return
         known = self._parts.setdefault(part, _Part(state, now_s))
-        known.received, known.alive_s = state, now_s
+        known.received = state
+        known.hear(now_s, sent_s)
         known.over = known.over | {broker} if again else {broker}
         if state == "OFF":
             known.touches.clear()
 
-    def take_sign(self, part: str, now_s: float) -> None:
+    def take_sign(self, part: str, now_s: float, sent_s: float | None = None) -> None:
         """Take any other message of a part that was not a retained one."""
         if part in self._parts:
-            self._parts[part].alive_s = now_s
+            self._parts[part].hear(now_s, sent_s)
 
     def take_touch(self, touch: Touch, now_s: float) -> None:
         part = self._parts.setdefault(touch.part, _Part(None, now_s))
-        part.alive_s = now_s
+        part.hear(now_s, None)
         if touch.event == "end":
             part.touches.pop(touch.id, None)
         else:

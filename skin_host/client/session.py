@@ -74,7 +74,8 @@ class SkinClient:
         base: of the topics; "skin" unless the URL or this states otherwise.
         protocol: of MQTT, for a broker given by URL.
         patience_s: how long entering waits for a broker that cannot be reached.
-        stale_s: a part that was not received for this long is UNKNOWN to `contacts`.
+        stale_s: a part that was not received for this long, or only so late, is UNKNOWN to
+            `contacts`.
 
     Attributes:
         nodes: the robot's daemons by name, as far as they have been received.
@@ -481,6 +482,8 @@ class SkinClient:
             return
         item = read(kind, part, payload)
         now_s = _now_s()
+        stamp = None if message.retain else stamp_of(message.properties)
+        sent_s = None if stamp is None else stamp.sent_s
         if isinstance(item, Touch | Slip | Over):
             run = run_of(message.properties)
             for event in self._order.take(item, run, now_s):
@@ -495,10 +498,12 @@ class SkinClient:
             if newness is not False:
                 state = None if item is None else item.state
                 again = newness is None
-                self._presence.take_state(part, state, now_s, link.number, again=again)
+                self._presence.take_state(
+                    part, state, now_s, link.number, again=again, sent_s=sent_s
+                )
         elif self._newness(kind, part, message):
             if not message.retain:
-                self._presence.take_sign(part, now_s)
+                self._presence.take_sign(part, now_s, sent_s)
             if item is None:
                 self._latest.pop(part, None)
             else:

@@ -326,12 +326,13 @@ class _Receiver:
             return
         newness = robot.newest.take(kind, words[2], heard.stamp)
         at_s = time.monotonic()
+        sent_s = None if heard.retained or heard.stamp is None else heard.stamp.sent_s
         if kind == "contact" and newness is not False:
             state = decode_contact(heard.payload)
             again = newness is None
-            robot.presence.take_state(PART, state, at_s, number, again=again)
+            robot.presence.take_state(PART, state, at_s, number, again=again, sent_s=sent_s)
         elif kind == "health" and newness and not heard.retained:
-            robot.presence.take_sign(PART, at_s)
+            robot.presence.take_sign(PART, at_s, sent_s)
         elif kind == "status" and newness:
             online = heard.payload == ONLINE
             robot.presence.take_node("main", online)
@@ -547,7 +548,7 @@ async def _play(
             continue
         item = due.pop(0)
         if item["kind"] == "touch":
-            publisher.put_touch(replace(item["said"], t_ns=time.time_ns()))
+            publisher.put_touch(msgspec.structs.replace(item["said"], t_ns=time.time_ns()))
         else:
             publisher.put_contact(PART, item["said"])
             if not contacts or contacts[-1][1] != item["said"]:

@@ -53,7 +53,7 @@ class PlainRobot(asyncio.Protocol):
         self._topics = Topics(settings.base, robot)
         self._identifier = f"skin-{robot}-main"
         self._status = self._topics.node("status", "main")
-        self._numbers = Numbers(time.time_ns)
+        self._numbers = Numbers(time.time_ns, time.monotonic_ns)
         properties: Any = message_properties(self._brokers[0], JSON_TYPE)
         put_run(properties, self._numbers.run)
         self._event_properties: bytes = properties.pack()

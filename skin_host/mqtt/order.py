@@ -8,7 +8,9 @@ order:
 - `stamp`, of retained messages: two numbers with a dot between, that of the connection and that of
   the message in it.
 
-Runs and connections have rising numbers: nanoseconds since 1970, by the clock of the node.
+Runs and connections have rising numbers: nanoseconds since 1970, by the clock of the node. Those of
+messages rise with the nanoseconds since the connection began: a subscriber that sees the distance
+to its own clock grow knows that messages come late.
 """
 
 from collections.abc import Callable
@@ -33,18 +35,26 @@ class Stamp(NamedTuple):
     connection: int
     message: int
 
+    @property
+    def sent_s(self) -> float:
+        """When it was published, by the node's clock."""
+        return (self.connection + self.message) * 1e-9
+
 
 class Numbers:
     """Gives the numbers of a node.
 
     Args:
         now_ns: time of day; it may be set back.
+        monotonic_ns: a time that is never set.
     """
 
-    def __init__(self, now_ns: Callable[[], int]) -> None:
+    def __init__(self, now_ns: Callable[[], int], monotonic_ns: Callable[[], int]) -> None:
         self._now_ns = now_ns
+        self._monotonic_ns = monotonic_ns
         self._last = 0
         self._message = 0
+        self._began_ns = monotonic_ns()
         self.run = self.connection = self._next()
 
     def _next(self) -> int:
@@ -54,7 +64,8 @@ class Numbers:
     def connect(self) -> None:
         """Continue with the numbers of the next connection."""
         self.connection = self._next()
-        self._message = len(("online", "offline"))
+        self._message = len(("online", "offline")) - 1
+        self._began_ns = self._monotonic_ns()
 
     @property
     def online(self) -> Stamp:
@@ -68,7 +79,7 @@ class Numbers:
 
     def state(self) -> Stamp:
         """Return the stamp of any other retained message."""
-        self._message += 1
+        self._message = max(self._message + 1, self._monotonic_ns() - self._began_ns)
         return Stamp(self.connection, self._message)
 
     def overtake(self, stamp: Stamp) -> bool:

@@ -127,7 +127,7 @@ class Publisher:
 
         self._outbox = Outbox(settings.event_queue, settings.frame_hz, clock)
         self._outbox.put_state(self._status, ONLINE)
-        self._numbers = Numbers(clock.now_ns)
+        self._numbers = Numbers(clock.now_ns, clock.monotonic_ns)
         self._turn = 0  # index of the broker in use
         self._untried = len(self._brokers)
         self._last_broker: str | None = None

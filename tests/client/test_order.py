@@ -81,7 +81,7 @@ def test_the_newest_state_wins_over_what_comes_late() -> None:
 
 def test_numbers_rise_while_the_clock_is_set_back() -> None:
     times = iter([100, 50, 51, 200])
-    numbers = Numbers(lambda: next(times))
+    numbers = Numbers(lambda: next(times), lambda: 0)
     given = [numbers.run]
     for _ in range(3):
         numbers.connect()
@@ -90,8 +90,22 @@ def test_numbers_rise_while_the_clock_is_set_back() -> None:
     assert given == [100, 101, 102, 200]
 
 
+def test_the_number_of_a_state_tells_when_it_was_published() -> None:
+    passed_ns = 7
+    numbers = Numbers(lambda: 10**18, lambda: passed_ns)
+    numbers.connect()
+    passed_ns += 5 * 10**9
+    first = numbers.state()
+    passed_ns += 10**9
+    later = numbers.state()
+    assert later > first
+    assert first.sent_s == pytest.approx(numbers.connection * 1e-9 + 5.0)
+    assert later.sent_s - first.sent_s == pytest.approx(1.0)
+    assert numbers.state() > later
+
+
 def test_a_run_overtakes_one_that_had_a_clock_ahead() -> None:
-    numbers = Numbers(lambda: 5)
+    numbers = Numbers(lambda: 5, lambda: 0)
     assert not numbers.overtake(Stamp(5, 1))
     assert numbers.overtake(Stamp(1000, 1))
     assert numbers.run > 1000

@@ -5,9 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from skin_host.client import Contact, SkinCallbacks
-from skin_host.client.presence import Presence
+from skin_host.client.presence import DISTANCE_S, Lateness, Presence
 from skin_host.config.settings import load
 from skin_host.layout import build_layout
 from skin_host.mqtt.info import node_info
@@ -55,6 +57,53 @@ def test_a_part_of_which_nothing_comes_is_stale() -> None:
     assert presence.changes(5.1) == [Contact("palm", "UNKNOWN", "stale")]
     presence.take_sign("palm", 6.0)
     assert presence.changes(6.0) == [Contact("palm", "OFF")]
+
+
+def test_a_part_of_which_all_comes_late_is_stale() -> None:
+    presence = Presence(stale_s=3.0)
+    ahead_s = 1e6  # the node's clock is another
+    presence.take_state("palm", "OFF", 0.0, sent_s=ahead_s)
+    presence.take_sign("palm", 1.0, ahead_s + 0.9)
+    assert presence.changes(1.0) == [Contact("palm", "OFF")]
+    # The broker was held up, and delivers what it has, with the times of then.
+    presence.take_sign("palm", 10.0, ahead_s + 1.9)
+    assert presence.changes(10.0) == [Contact("palm", "UNKNOWN", "stale")]
+    presence.take_state("palm", "ON", 10.1, sent_s=ahead_s + 2.9)
+    assert presence.changes(10.1) == []
+    # It has caught up.
+    presence.take_sign("palm", 11.0, ahead_s + 10.5)
+    assert presence.changes(11.0) == [Contact("palm", "ON")]
+
+
+def test_a_late_sign_of_life_takes_nothing_from_an_earlier_one() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_state("palm", "OFF", 0.0, sent_s=0.0)
+    presence.take_sign("palm", 9.0, 9.0)
+    presence.take_sign("palm", 9.5, 5.0)  # from another broker, which is slow
+    assert presence.contact("palm", 9.6) == Contact("palm", "OFF")
+
+
+def test_a_clock_that_was_set_back_looks_late_for_a_limited_time() -> None:
+    lateness = Lateness()
+    assert lateness.of(100.0, 0.0) == 0.0
+    late_s = [lateness.of(at_s - 900.0, float(at_s)) for at_s in range(1, 400)]
+    assert late_s[0] == 1000.0
+    assert late_s[int(2 * DISTANCE_S) + 2 :] == [0.0] * (399 - int(2 * DISTANCE_S) - 2)
+
+
+@given(
+    st.lists(st.tuples(st.floats(0.0, 5.0), st.floats(0.0, 20.0)), min_size=1, max_size=50),
+    st.floats(-1e9, 1e9),
+)
+def test_no_message_looks_later_than_it_is(
+    steps: list[tuple[float, float]], ahead_s: float
+) -> None:
+    lateness = Lateness()
+    sent_s = 0.0
+    for step_s, late_s in steps:
+        sent_s += step_s
+        found_s = lateness.of(sent_s + ahead_s, sent_s + late_s)
+        assert 0.0 <= found_s <= late_s + 1e-6
 
 
 def test_a_node_that_stops_takes_its_parts_with_it() -> None:
