@@ -18,17 +18,13 @@ from numpy.typing import NDArray
 from skin_host.config.check import format_triangles
 from skin_host.config.settings import (
     TRIANGLES_PER_BOARD,
-    Board,
-    Bus,
     KindSettings,
-    Part,
     Patch,
     Settings,
     parse_triangles,
 )
 from skin_host.errors import ConfigurationError
-from skin_host.files import read_whole
-from skin_host.importing.report import Findings
+from skin_host.importing.report import Findings, read_source, with_part
 from skin_host.layout import TAXELS_PER_TRIANGLE, builtin_kinds
 from skin_host.layout.geometry import fit_unit
 
@@ -65,10 +61,7 @@ def read_table(path: Path, findings: Findings) -> Table:
     Raises:
         ConfigurationError: it cannot be read or holds no rows.
     """
-    try:
-        text = read_whole(path, LARGEST_FILE).decode("utf-8", errors="replace")
-    except OSError as error:
-        raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from None
+    text = read_source(path, LARGEST_FILE)
     rows: list[list[float]] = []
     lines: list[int] = []
     represented: NDArray[np.int64] | None = None
@@ -81,9 +74,11 @@ def read_table(path: Path, findings: Findings) -> Table:
             represented = np.array([int(entry) for entry in entries], np.int64)
         elif words[0] == "spatial_sampling":
             if words[1:] != ["taxel"]:
-                findings.dropped(path, number, f"spatial_sampling {' '.join(words[1:])}: not used")
+                findings.dropped(
+                    (path, number), f"spatial_sampling {' '.join(words[1:])}: not used"
+                )
         elif words[0][0].isalpha() and words[0].lower() not in ("nan", "inf"):
-            findings.dropped(path, number, f"{' '.join(words)[:40]}: not used")
+            findings.dropped((path, number), f"{' '.join(words)[:40]}: not used")
         else:
             rows.append(_row(path, number, words, findings))
             lines.append(number)
@@ -92,13 +87,13 @@ def read_table(path: Path, findings: Findings) -> Table:
     table = np.array(rows)
     missing = -len(table) % TAXELS_PER_TRIANGLE
     if missing:
-        findings.odd(path, lines[-1], f"{len(table)} rows, not twelve a triangle; zeros added")
+        findings.odd((path, lines[-1]), f"{len(table)} rows, not twelve a triangle; zeros added")
         table = np.concatenate([table, np.zeros((missing, 6))])
         lines += [lines[-1]] * missing
     if represented is not None and len(represented) != len(table):
         n = len(represented)
         use = f"the first {len(table)} are used" if n > len(table) else "not used"
-        findings.odd(path, 0, f"taxel2Repr has {n} entries for {len(table)} rows; {use}")
+        findings.odd((path, 0), f"taxel2Repr has {n} entries for {len(table)} rows; {use}")
         represented = represented[: len(table)] if n > len(table) else None
     return Table(path, table, lines, represented)
 
@@ -111,7 +106,7 @@ def _row(path: Path, number: int, words: list[str], findings: Findings) -> list[
         row = []
     if len(row) != 6 or not np.isfinite(row).all():
         seen = " ".join(words)[:60]
-        findings.odd(path, number, f'seen "{seen}", wanted x y z nx ny nz; taken as no place')
+        findings.odd((path, number), f'seen "{seen}", wanted x y z nx ny nz; taken as no place')
         return [0.0] * 6
     return row
 
@@ -168,31 +163,16 @@ def _part_of(file: Path, settings: Settings) -> str:
 def _with_boards(settings: Settings, name: str, table: Table, findings: Findings) -> Settings:
     """Make a bus, boards and a part for the triangles that have positions."""
     n_boards = -(-len(table.rows) // TAXELS_PER_BOARD)
-    boards: dict[str, Board] = {}
-    patches = []
-    for board in range(n_boards):
-        n_here = min(TRIANGLES_PER_BOARD, len(table.rows) // 12 - TRIANGLES_PER_BOARD * board)
-        on = [i for i in range(n_here) if table.present(TRIANGLES_PER_BOARD * board + i)]
+    boards = {}
+    for first in range(0, len(table.rows) // TAXELS_PER_TRIANGLE, TRIANGLES_PER_BOARD):
+        slots = range(first, min(first + TRIANGLES_PER_BOARD, len(table.rows) // 12))
+        on = [slot for slot in slots if table.present(slot)]
         if on:
-            boards[f"{name}_{board + 1}"] = Board(bus=name, address=board + 1)
-            kind = _kind(table, [TRIANGLES_PER_BOARD * board + i for i in on])
-            patches.append(
-                Patch(board=f"{name}_{board + 1}", triangles=format_triangles(on), kind=kind)
-            )
-    if not patches or n_boards > 14:
-        raise ConfigurationError(f"{table.file}: {len(patches)} boards with places; wanted 1 to 14")
-    findings.assumed(
-        table.file,
-        0,
-        f'a bus "{name}" on channel can{len(settings.buses)}; {len(boards)} board(s) with '
-        "addresses from 1 and default set-up; `skin import skinspec` brings the robot's own",
-    )
-    return msgspec.structs.replace(
-        settings,
-        buses=settings.buses | {name: Bus(channel=f"can{len(settings.buses)}")},
-        boards=settings.boards | boards,
-        parts=settings.parts | {name: Part(patches=patches)},
-    )
+            numbers = [slot - first for slot in on]
+            boards[first // TRIANGLES_PER_BOARD + 1] = numbers, _kind(table, on)
+    if not boards or n_boards > 14:
+        raise ConfigurationError(f"{table.file}: {len(boards)} boards with places; wanted 1 to 14")
+    return with_part(settings, table.file, name, boards, findings)
 
 
 def _kind(table: Table, triangles: list[int]) -> str:
@@ -248,8 +228,7 @@ def _locate(
                 left += members
         if left:
             findings.odd(
-                table.file,
-                0,
+                (table.file, 0),
                 f'no places for triangles {format_triangles(left)} of board "{patch.board}"; they '
                 "keep theirs, in a frame of their own",
             )
@@ -272,8 +251,7 @@ def _locate(
     ]
     for slot in extra:
         findings.odd(
-            table.file,
-            table.lines[TAXELS_PER_TRIANGLE * slot],
+            (table.file, table.lines[TAXELS_PER_TRIANGLE * slot]),
             f"places for triangle {slot % TRIANGLES_PER_BOARD} of board "
             f'"{boards[slot // TRIANGLES_PER_BOARD]}", which is not on; not used',
         )
@@ -297,7 +275,7 @@ def _unit(
     measured = placed & _own_places(table, index, rows)
     normal = rows[placed, 3:].mean(axis=0)
     if not normal.any():
-        findings.odd(table.file, line, f"{label}: no normals; taken: +z")
+        findings.odd((table.file, line), f"{label}: no normals; taken: +z")
         normal = np.array([0.0, 0.0, 1.0])
     normal /= np.linalg.norm(normal)
     pads = np.array(kind.pads_mm)
@@ -318,7 +296,7 @@ def _unit(
         if abs(across @ normal) < OBLIQUE:
             remarks.append("its normal is oblique to the plane of its taxels")
     if remarks:
-        findings.odd(table.file, line, f"{label}: {'; '.join(remarks)}")
+        findings.odd((table.file, line), f"{label}: {'; '.join(remarks)}")
     return rows
 
 

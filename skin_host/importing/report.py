@@ -1,14 +1,21 @@
-"""Remarks on an import: each irregularity with its file and line."""
+"""What imports share: reading a file, remarks with file and line, a part made from a file alone."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from skin_host.errors import visible
+import msgspec
+
+from skin_host.config.check import format_triangles
+from skin_host.config.settings import Board, Bus, Part, Patch, Settings
+from skin_host.errors import ConfigurationError, visible
+from skin_host.files import read_whole
 
 #: Most remarks of a grade that are printed, and most characters of one.
 MOST, LONGEST = 100, 300
 
+#: A file and a line of it; 0 means the file as a whole.
+Place = tuple[Path, int]
 Grade = Literal["odd", "assumed", "dropped"]
 GRADES: dict[Grade, str] = {
     "odd": "wrong or unusual in the files, and how it was read",
@@ -19,15 +26,15 @@ GRADES: dict[Grade, str] = {
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One remark; `line` 0 means the file as a whole."""
+    """One remark."""
 
     grade: Grade
-    file: Path
-    line: int
+    at: Place
     text: str
 
     def __str__(self) -> str:
-        place = f"{self.file}:{self.line}" if self.line else str(self.file)
+        file, line = self.at
+        place = f"{file}:{line}" if line else str(file)
         return visible(f"{place}: {self.text}", LONGEST)
 
 
@@ -37,17 +44,17 @@ class Findings:
 
     items: list[Finding] = field(default_factory=list)
 
-    def odd(self, file: Path, line: int, text: str) -> None:
+    def odd(self, at: Place, text: str) -> None:
         """Note something wrong or unusual, and how it was read."""
-        self.items.append(Finding("odd", file, line, text))
+        self.items.append(Finding("odd", at, text))
 
-    def assumed(self, file: Path, line: int, text: str) -> None:
+    def assumed(self, at: Place, text: str) -> None:
         """Note a value that is missing in the files and was assumed."""
-        self.items.append(Finding("assumed", file, line, text))
+        self.items.append(Finding("assumed", at, text))
 
-    def dropped(self, file: Path, line: int, text: str) -> None:
+    def dropped(self, at: Place, text: str) -> None:
         """Note something that has no counterpart here."""
-        self.items.append(Finding("dropped", file, line, text))
+        self.items.append(Finding("dropped", at, text))
 
     def table(self) -> str:
         """Return all remarks as text, by grade; empty if there are none."""
@@ -60,3 +67,52 @@ class Findings:
             if lines:
                 sections.append("\n".join([f"{title}:", *lines]))
         return "\n".join(sections)
+
+
+def read_source(path: Path, most_bytes: int) -> str:
+    """Read a file to import; what is no UTF-8 in it is replaced.
+
+    Raises:
+        ConfigurationError: it cannot be read, or is larger.
+    """
+    try:
+        return read_whole(path, most_bytes).decode("utf-8", errors="replace")
+    except OSError as error:
+        raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def with_part(
+    settings: Settings,
+    file: Path,
+    name: str,
+    boards: dict[int, tuple[list[int], str]],
+    findings: Findings,
+) -> Settings:
+    """Add a part on a bus of its own, with boards of default set-up.
+
+    Args:
+        settings: to add to.
+        file: that describes the part.
+        name: of the part and its bus.
+        boards: by address, their triangles and the kind of these; some have no triangles.
+        findings: receives what is assumed.
+    """
+    channel = f"can{len(settings.buses)}"
+    names = {address: f"{name}_{address}" for address in boards}
+    findings.assumed(
+        (file, 0),
+        f'a bus "{name}" on channel {channel}; boards {", ".join(names.values())} with default '
+        "set-up; `skin import skinspec` brings the robot's own",
+    )
+    patches = [
+        Patch(board=names[address], triangles=format_triangles(triangles), kind=kind)
+        for address, (triangles, kind) in boards.items()
+        if triangles
+    ]
+    return msgspec.structs.replace(
+        settings,
+        buses=settings.buses | {name: Bus(channel=channel)},
+        boards=settings.boards
+        | {names[address]: Board(bus=name, address=address) for address in boards},
+        parts=settings.parts | {name: Part(patches=patches)},
+    )

@@ -15,8 +15,6 @@ import msgspec
 from skin_host.config.check import format_triangles
 from skin_host.config.settings import (
     TRIANGLES_PER_BOARD,
-    Board,
-    Bus,
     Part,
     Patch,
     PlaceSettings,
@@ -24,8 +22,7 @@ from skin_host.config.settings import (
     parse_triangles,
 )
 from skin_host.errors import ConfigurationError
-from skin_host.files import read_whole
-from skin_host.importing.report import Findings
+from skin_host.importing.report import Findings, read_source, with_part
 from skin_host.layout import TAXELS_PER_TRIANGLE, builtin_kinds
 
 LARGEST_FILE = 1_000_000
@@ -93,10 +90,7 @@ def read_display(path: Path, findings: Findings) -> Display:
     Raises:
         ConfigurationError: it cannot be read, or places nothing.
     """
-    try:
-        text = read_whole(path, LARGEST_FILE).decode("utf-8", errors="replace")
-    except OSError as error:
-        raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from None
+    text = read_source(path, LARGEST_FILE)
     keys: dict[str, list[str]] = {}
     units: list[Unit] = []
     taken: dict[int, int] = {}
@@ -117,14 +111,14 @@ def read_display(path: Path, findings: Findings) -> Display:
             slots = range(unit.slot, unit.slot + unit.n_triangles)
             twin = next((taken[slot] for slot in slots if slot in taken), None)
             if twin is not None:
-                findings.odd(path, number, f"id {unit.slot} is placed in line {twin}; not read")
+                findings.odd((path, number), f"id {unit.slot} is placed in line {twin}; not read")
                 continue
             taken |= dict.fromkeys(slots, number)
             units.append(unit)
     if not units:
         raise ConfigurationError(f"{path}: contains no unit; wanted lines after [SENSORS]")
     if gains:
-        findings.dropped(path, 0, f"gain {', '.join(sorted(gains))}: brightness of the display")
+        findings.dropped((path, 0), f"gain {', '.join(sorted(gains))}: brightness of the display")
     part = (keys.get("robotPart") or [path.stem])[0].lower().replace(" ", "_")
     addresses = [int(word) for word in keys.get("cardid", []) if word.isdecimal()]
     return Display(path, part, addresses, units)
@@ -135,10 +129,10 @@ def _key(
 ) -> None:
     if words[0] in KEYS:
         if words[0] in keys:
-            findings.odd(path, number, f"{words[0]} a second time; the first one is used")
+            findings.odd((path, number), f"{words[0]} a second time; the first one is used")
         keys.setdefault(words[0], words[1:])
     else:
-        findings.dropped(path, number, f"{words[0]}: of the display's window or its CAN card")
+        findings.dropped((path, number), f"{words[0]}: of the display's window or its CAN card")
 
 
 def _unit(
@@ -146,26 +140,26 @@ def _unit(
 ) -> Unit | None:
     """One line of [SENSORS], or None with a finding."""
     if words[0] not in KINDS:
-        findings.odd(path, number, f'"{words[0]}" is not a known kind of unit; not read')
+        findings.odd((path, number), f'"{words[0]}" is not a known kind of unit; not read')
         return None
     numbers = [_float(word) for word in words[1:]]
     if len(numbers) < 4 or None in numbers:
         seen = " ".join(words)[:60]
-        findings.odd(path, number, f'seen "{seen}", wanted a type and 4 to 7 numbers; not read')
+        findings.odd((path, number), f'seen "{seen}", wanted a type and 4 to 7 numbers; not read')
         return None
     slot, x_mm, y_mm, turn_deg, *more = [n for n in numbers if n is not None]
     gains.update(words[5:6])
     mirror, layout = [*more[1:], 0.0, 0.0][:2]
     if slot != int(slot) or not 0 <= slot < MAX_ID:
-        findings.odd(path, number, f"id {words[1]}; wanted 0 to {MAX_ID - 1}; not read")
+        findings.odd((path, number), f"id {words[1]}; wanted 0 to {MAX_ID - 1}; not read")
         return None
     if layout == 1:
         findings.odd(
-            path, number, "layoutNum 1 reverses the taxels, which is not supported; not reversed"
+            (path, number), "layoutNum 1 reverses the taxels, which is not supported; not reversed"
         )
     mirrored = mirror == 1
     if mirrored and words[0] in NEVER_MIRRORED:
-        findings.odd(path, number, f"lrMirror 1: the display itself never mirrors a {words[0]}")
+        findings.odd((path, number), f"lrMirror 1: the display itself never mirrors a {words[0]}")
         mirrored = False
     place = PlaceSettings(x_mm=x_mm, y_mm=y_mm, turn_deg=turn_deg, mirror=mirrored)
     return Unit(number, int(slot), KINDS[words[0]], place)
@@ -207,38 +201,13 @@ def _with_boards(settings: Settings, display: Display, findings: Findings) -> Se
     if len(addresses) < n or len(set(addresses)) < n or not all(1 <= a <= 14 for a in addresses):
         addresses = list(range(1, n + 1))
         findings.odd(
-            display.file,
-            0,
+            (display.file, 0),
             f"cardid {display.addresses} does not name the {n} boards that the ids need; taken: "
             f"addresses 1 to {n}",
         )
-    bus = display.part
-    names = [f"{display.part}_{address}" for address in addresses]
-    findings.assumed(
-        display.file,
-        0,
-        f'a bus "{bus}" on channel can{len(settings.buses)}; boards {names} with default set-up; '
-        "`skin import skinspec` brings the robot's own",
-    )
-    return msgspec.structs.replace(
-        settings,
-        buses=settings.buses | {bus: Bus(channel=f"can{len(settings.buses)}")},
-        boards=settings.boards
-        | {
-            name: Board(bus=bus, address=address)
-            for name, address in zip(names, addresses, strict=True)
-        },
-        parts=settings.parts
-        | {
-            display.part: Part(
-                patches=[
-                    Patch(board=name, triangles=format_triangles(sorted(display.slots_of(i))))
-                    for i, name in enumerate(names)
-                    if display.slots_of(i)
-                ]
-            )
-        },
-    )
+    slots = {address: sorted(display.slots_of(i)) for i, address in enumerate(addresses)}
+    boards = {address: (numbers, "triangle") for address, numbers in slots.items()}
+    return with_part(settings, display.file, display.part, boards, findings)
 
 
 def _place(settings: Settings, display: Display, boards: list[str], findings: Findings) -> Settings:
@@ -258,8 +227,7 @@ def _place(settings: Settings, display: Display, boards: list[str], findings: Fi
         missing = [number for number in numbers if (board, number) not in set_up]
         if missing:
             findings.odd(
-                display.file,
-                unit.line,
+                (display.file, unit.line),
                 f'triangle {format_triangles(missing)} of board "{board}" is not on; not placed',
             )
             continue
@@ -320,8 +288,7 @@ def _without(
                 )
             if left and patch.board in touched:
                 findings.odd(
-                    display.file,
-                    0,
+                    (display.file, 0),
                     f'triangles {format_triangles(left)} of board "{patch.board}" are on but not '
                     f'placed; they stay in part "{name}", side by side: remove them if they are '
                     "not fitted",
@@ -369,8 +336,7 @@ def _boards(settings: Settings, display: Display, findings: Findings) -> list[st
     addresses = [settings.boards[board].address for board in best]
     if addresses != display.addresses:
         findings.odd(
-            display.file,
-            0,
+            (display.file, 0),
             f"cardid {display.addresses} are not the boards whose triangles are on, in their "
             f'order; taken: {addresses} on bus "{settings.boards[best[0]].bus}"',
         )

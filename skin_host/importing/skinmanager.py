@@ -7,8 +7,7 @@ import msgspec
 
 from skin_host.config.settings import Settings
 from skin_host.errors import ConfigurationError
-from skin_host.files import read_whole
-from skin_host.importing.report import Findings
+from skin_host.importing.report import Findings, read_source
 
 LARGEST_FILE = 1_000_000
 #: Keys without a counterpart here, and why.
@@ -51,8 +50,7 @@ def import_manager(files: list[Path], base: Settings | None, findings: Findings)
                 gain_per_s = round(value * STEP * 1000 / period_ms, 6)
                 drift = msgspec.structs.replace(drift, rule="proportional", gain_per_s=gain_per_s)
                 findings.odd(
-                    file,
-                    number,
+                    (file, number),
                     f"compensationGain: taken as {gain_per_s} of the distance in a second; there "
                     "it is divided by each taxel's own threshold besides",
                 )
@@ -62,17 +60,17 @@ def import_manager(files: list[Path], base: Settings | None, findings: Findings)
             elif key == "zeroUpRawData":
                 if words != ["false"]:
                     findings.odd(
-                        file, number, "zeroUpRawData true: here values always fall with pressure"
+                        (file, number), "zeroUpRawData true: here values always fall with pressure"
                     )
             elif key == "taxelPositionFiles":
                 _check_files(file, number, words, findings)
             elif key == "period":
-                findings.dropped(file, number, "period: sweeps are processed as they arrive")
+                findings.dropped((file, number), "period: sweeps are processed as they arrive")
             elif key in DROPPED:
-                findings.dropped(file, number, f"{key}: {DROPPED[key]}")
+                findings.dropped((file, number), f"{key}: {DROPPED[key]}")
             else:
                 seen = " ".join([key, *words])[:60]
-                findings.odd(file, number, f'"{seen}" is not understood; not read')
+                findings.odd((file, number), f'"{seen}" is not understood; not read')
     processing = msgspec.structs.replace(base.processing, touch=touch, drift=drift)
     return msgspec.structs.replace(base, processing=processing)
 
@@ -83,10 +81,7 @@ def _entries(file: Path, findings: Findings) -> list[tuple[int, str, list[str]]]
     A list is meant to be continued by a backslash at the end of a line; where one is missing, the
     robot's own reader ends the list. Here it ends with its parenthesis.
     """
-    try:
-        text = read_whole(file, LARGEST_FILE).decode("utf-8", errors="replace")
-    except OSError as error:
-        raise ConfigurationError(f"{file}: cannot be read: {error.strerror}") from None
+    text = read_source(file, LARGEST_FILE)
     entries: list[tuple[int, str, list[str]]] = []
     depth = 0
     continued = True
@@ -101,8 +96,7 @@ def _entries(file: Path, findings: Findings) -> list[tuple[int, str, list[str]]]
             words = words[1:]
         elif not continued:
             findings.odd(
-                file,
-                number,
+                (file, number),
                 "the line before lacks its backslash; taken as one list, the robot's own reader "
                 "ends it there",
             )
@@ -130,6 +124,6 @@ def _check_files(file: Path, number: int, words: list[str], findings: Findings) 
     for word in words:
         path = file.parent / word
         if path.exists():
-            findings.dropped(file, number, f"{word}: `skin import positions {path}` brings it")
+            findings.dropped((file, number), f"{word}: `skin import positions {path}` brings it")
         else:
-            findings.odd(file, number, f"{word}: not found")
+            findings.odd((file, number), f"{word}: not found")

@@ -21,8 +21,7 @@ import msgspec
 from skin_host.config.check import format_triangles
 from skin_host.config.settings import Board, Bus, Part, Patch, Settings
 from skin_host.errors import ConfigurationError
-from skin_host.files import read_whole
-from skin_host.importing.report import Findings
+from skin_host.importing.report import Findings, Place, read_source
 
 #: The robot's own hosts ignore special sets beyond these numbers, with only a warning.
 HOSTS_READ_TRIANGLE_SETS = 20
@@ -38,10 +37,9 @@ LARGEST_FILE = 4_000_000
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One `param`: its position in the file and its content."""
+    """One `param`: where it is, and its content."""
 
-    file: Path
-    line: int
+    at: Place
     name: str
     words: list[str]
 
@@ -75,11 +73,7 @@ class Document:
         return next((entry for entry in self.group(group) if entry.name == name), None)
 
     def _read(self) -> None:
-        try:
-            data = read_whole(self.path, LARGEST_FILE)
-        except OSError as error:
-            raise ConfigurationError(f"{self.path}: cannot be read: {error.strerror}") from None
-        text = self._without_comments(data.decode("utf-8", errors="replace"))
+        text = self._without_comments(read_source(self.path, LARGEST_FILE))
         # The text is already decoded, so it must not name another encoding.
         text = re.sub(r"^\s*<\?xml[^>]*\?>", "", text)
         parser = expat.ParserCreate()
@@ -92,8 +86,7 @@ class Document:
             parser.Parse(text, True)
         except expat.ExpatError as error:
             self.findings.odd(
-                self.path,
-                error.lineno,
+                (self.path, error.lineno),
                 f"not valid XML from here: {expat.ErrorString(error.code)}; the rest is not read",
             )
 
@@ -106,19 +99,18 @@ class Document:
             end = text.find("-->", start + 4)
             line = text.count("\n", 0, start) + 1
             if end < 0:
-                self.findings.odd(self.path, line, "a comment without an end; it takes the rest")
+                self.findings.odd((self.path, line), "a comment without an end; it takes the rest")
                 return "".join(result)
             inner = text.find("<!--", start + 4, end)
             if inner >= 0:
                 self.findings.odd(
-                    self.path,
-                    text.count("\n", 0, inner) + 1,
+                    (self.path, text.count("\n", 0, inner) + 1),
                     f"a comment within the comment of line {line}; both end at the first -->, "
                     f"line {text.count(chr(10), 0, end) + 1}",
                 )
             if "triangleSetCfg" in text[start:end]:
                 self.findings.odd(
-                    self.path, line, "a comment with sets of triangles in it; they are not read"
+                    (self.path, line), "a comment with sets of triangles in it; they are not read"
                 )
             result.append("\n" * text.count("\n", start, end))
             rest = end + 3
@@ -150,7 +142,7 @@ class Document:
         elif tag == "param" and self._entry is not None:
             line, name = self._entry
             words = self._text.replace("(", " ").replace(")", " ").split()
-            entry = Entry(self.path, line, name, words)
+            entry = Entry((self.path, line), name, words)
             self.groups.setdefault(self._group, []).append(entry)
             self._entry = None
 
@@ -214,7 +206,7 @@ def import_boards(files: list[Path], base: Settings | None, findings: Findings) 
             bus = device.name if len(device.patches) == 1 else f"{device.name}_{number}"
             buses[bus] = Bus(channel=f"can{len(buses)}")
             findings.assumed(
-                file, 0, f'patch {number} is the bus "{bus}" on channel {buses[bus].channel}'
+                (file, 0), f'patch {number} is the bus "{bus}" on channel {buses[bus].channel}'
             )
             for spec in specs:
                 name = f"{bus}_{spec.address}"
@@ -229,12 +221,11 @@ def import_boards(files: list[Path], base: Settings | None, findings: Findings) 
         parts[device.name] = Part(patches=patches)
         kinds = sorted({patch.kind for patch in patches})
         findings.assumed(
-            file,
-            0,
+            (file, 0),
             f"triangles are of the kind {' and '.join(kinds)}, by the type of their boards, and "
             "lie side by side; `skin import skingui` brings kinds and places",
         )
-    findings.assumed(files[0], 0, "boards are of the model mtb4")
+    findings.assumed((files[0], 0), "boards are of the model mtb4")
     return msgspec.structs.replace(
         base, robot=robot or "robot", buses=buses, boards=boards, parts=parts
     )
@@ -274,13 +265,13 @@ def read_device(path: Path, findings: Findings) -> Device:
     for line, href in document.includes:
         included = path.parent / href
         if not included.name.lower().endswith("skinspec.xml"):
-            findings.dropped(path, line, f'includes "{href}"; only skinSpec files are read')
+            findings.dropped((path, line), f'includes "{href}"; only skinSpec files are read')
         elif not included.exists():
-            findings.odd(path, line, f'includes "{href}", which was not found')
+            findings.odd((path, line), f'includes "{href}", which was not found')
         else:
             document.take(Document(included, findings))
     device = Device(_name(path), document.robot, path)
-    for number, boards in _boards(document, findings).items():
+    for number, boards in _boards(document).items():
         if boards:
             device.patches[number] = boards
     return device
@@ -294,31 +285,29 @@ def _name(path: Path) -> str:
     return re.sub(r"[^a-z0-9_]", "_", text).strip("_")[:40] or "skin"
 
 
-def _boards(document: Document, findings: Findings) -> dict[int, list[BoardSpec]]:
+def _boards(document: Document) -> dict[int, list[BoardSpec]]:
     """Return the boards of each patch (bus), with their set-up."""
-    patches = _addresses(document, findings)
+    findings = document.findings
+    patches = _addresses(document)
     default = BoardSpec(
         0,
-        _number(document, "defaultCfgBoard", "period", 50, PERIODS_MS, findings),
-        _number(document, "defaultCfgBoard", "skinType", 0, SKIN_TYPES, findings),
-        _number(document, "defaultCfgBoard", "noLoad", 240, range(256), findings),
+        _number(document, "defaultCfgBoard", "period", 50, PERIODS_MS),
+        _number(document, "defaultCfgBoard", "skinType", 0, SKIN_TYPES),
+        _number(document, "defaultCfgBoard", "noLoad", 240, range(256)),
     )
-    shift = _number(document, "defaultCfgTriangle", "shift", 2, SHIFTS, findings)
-    offset = _number(document, "defaultCfgTriangle", "cdcOffset", 0x2200, range(0x10000), findings)
-    enabled = _enabled(document, findings)
+    shift = _number(document, "defaultCfgTriangle", "shift", 2, SHIFTS)
+    offset = _number(document, "defaultCfgTriangle", "cdcOffset", 0x2200, range(0x10000))
+    enabled = _enabled(document)
     diagnostic = document.find("defaultCfgBoard", "diagnostic")
     if diagnostic is not None:
-        findings.dropped(
-            diagnostic.file, diagnostic.line, "diagnostic: status words are always read here"
-        )
-    triangle_sets = _sets(document, "specialCfgTriangles", "triangleSetCfg", 7, findings)
+        findings.dropped(diagnostic.at, "diagnostic: status words are always read here")
+    triangle_sets = _sets(document, "specialCfgTriangles", "triangleSetCfg", 7)
     for entry, numbers in triangle_sets:
         patch, address = numbers[:2]
         on = [other for other, addresses in patches.items() if address in addresses]
         if patch not in patches and len(on) == 1:
             findings.odd(
-                entry.file,
-                entry.line,
+                entry.at,
                 f"{entry.name}: patch {patch}, but board {address} is on patch {on[0]}; taken as "
                 "that",
             )
@@ -333,7 +322,7 @@ def _boards(document: Document, findings: Findings) -> dict[int, list[BoardSpec]
         ]
         for patch, addresses in patches.items()
     }
-    for entry, numbers in _sets(document, "specialCfgBoards", "boardSetCfg", 6, findings):
+    for entry, numbers in _sets(document, "specialCfgBoards", "boardSetCfg", 6):
         _set_up_boards(entry, numbers, boards, findings)
     for entry, numbers in triangle_sets:
         _set_up_triangles(entry, numbers, boards, findings)
@@ -341,20 +330,18 @@ def _boards(document: Document, findings: Findings) -> dict[int, list[BoardSpec]
     bare = [board for board in every if not board.triangles]
     if enabled is None and bare:
         _turn_on(bare, shift, offset)
-        findings.assumed(document.path, 0, f"boards {_list(bare)}: all 16 triangles are on")
+        findings.assumed((document.path, 0), f"boards {_list(bare)}: all 16 triangles are on")
     elif enabled:
         _turn_on(bare, shift, offset)
         if bare:
             findings.odd(
-                document.path,
-                0,
+                (document.path, 0),
                 f"boards {_list(bare)} have no set of triangles, and all are on by default; all "
                 "16 are taken: remove those that are not fitted",
             )
         if named := [board for board in every if board not in bare]:
             findings.odd(
-                document.path,
-                0,
+                (document.path, 0),
                 f"boards {_list(named)}: triangles without a set are on by default too; only "
                 "those of the sets are taken",
             )
@@ -373,7 +360,7 @@ def _list(boards: list[BoardSpec]) -> str:
     return ", ".join(str(board.address) for board in boards)
 
 
-def _addresses(document: Document, findings: Findings) -> dict[int, list[int]]:
+def _addresses(document: Document) -> dict[int, list[int]]:
     """Return the addresses of each patch, from skinCanAddrsPatchN, or skinCanIds of a CAN card."""
     patches: dict[int, list[int]] = {}
     card = document.find("", "canDeviceNum")
@@ -386,38 +373,33 @@ def _addresses(document: Document, findings: Findings) -> dict[int, list[int]]:
         for word in entry.words:
             address = integer(word)
             if address is None or address not in ADDRESSES:
-                findings.odd(entry.file, entry.line, f'{entry.name}: "{word}" is no address 1..14')
+                document.findings.odd(entry.at, f'{entry.name}: "{word}" is no address 1..14')
             elif address in addresses:
-                findings.odd(entry.file, entry.line, f"{entry.name}: {address} is there twice")
+                document.findings.odd(entry.at, f"{entry.name}: {address} is there twice")
             else:
                 addresses.append(address)
     return patches
 
 
 def _number(
-    document: Document,
-    group: str,
-    name: str,
-    default: int,
-    allowed: range | tuple[int, ...],
-    findings: Findings,
+    document: Document, group: str, name: str, default: int, allowed: range | tuple[int, ...]
 ) -> int:
     entry = document.find(group, name)
     if entry is None:
         if document.group(group):
-            findings.odd(document.path, 0, f"{group}: no {name}; taken: {default}")
+            document.findings.odd((document.path, 0), f"{group}: no {name}; taken: {default}")
         else:
-            findings.assumed(document.path, 0, f"{group}.{name}: {default}")
+            document.findings.assumed((document.path, 0), f"{group}.{name}: {default}")
         return default
     value = integer(entry.words[0]) if entry.words else None
     if value is None or value not in allowed or len(entry.words) > 1:
         seen = " ".join(entry.words)[:40]
-        findings.odd(entry.file, entry.line, f'{name}: seen "{seen}"; taken: {default}')
+        document.findings.odd(entry.at, f'{name}: seen "{seen}"; taken: {default}')
         return default
     return value
 
 
-def _enabled(document: Document, findings: Findings) -> bool | None:
+def _enabled(document: Document) -> bool | None:
     """Return whether triangles are on by default; any value but true counts as false.
 
     None if the file has neither defaults nor sets: the oldest form, where all are on.
@@ -428,16 +410,15 @@ def _enabled(document: Document, findings: Findings) -> bool | None:
         return False if told else None
     word = " ".join(entry.words).lower()
     if word not in ("true", "false", "1", "0"):
-        findings.odd(
-            entry.file,
-            entry.line,
+        document.findings.odd(
+            entry.at,
             f'enabled: seen "{word[:40]}"; taken as false, as the robot\'s own host reads it',
         )
     return word in ("true", "1")
 
 
 def _sets(
-    document: Document, group: str, prefix: str, columns: int, findings: Findings
+    document: Document, group: str, prefix: str, columns: int
 ) -> list[tuple[Entry, list[int]]]:
     """Return the readable numbered sets of a group."""
     announced = document.find(group, "numOfSets")
@@ -448,44 +429,38 @@ def _sets(
         match = re.fullmatch(rf"{prefix}(\d{{1,4}})", entry.name.strip())
         if match is None:
             if entry.name != "numOfSets":
-                findings.odd(entry.file, entry.line, f'"{entry.name}" is no {prefix}N; not read')
+                document.findings.odd(entry.at, f'"{entry.name}" is no {prefix}N; not read')
             continue
         if entry.name in first:
-            findings.odd(
-                entry.file,
-                entry.line,
+            document.findings.odd(
+                entry.at,
                 f"{entry.name} exists already, line {first[entry.name]}; both are taken, "
                 "the robot's own host reads the first alone",
             )
-        first.setdefault(entry.name, entry.line)
+        first.setdefault(entry.name, entry.at[1])
         if limit is not None and int(match[1]) > limit:
-            findings.odd(
-                entry.file,
-                entry.line,
+            document.findings.odd(
+                entry.at,
                 f"{entry.name}: beyond numOfSets {limit}; taken, the robot's own host does not "
                 "read it",
             )
         numbers = [integer(word) for word in entry.words]
         if len(numbers) != columns or None in numbers:
             seen = " ".join(entry.words)[:60]
-            findings.odd(
-                entry.file,
-                entry.line,
-                f'{entry.name}: seen "{seen}", wanted {columns} numbers; not read',
+            document.findings.odd(
+                entry.at, f'{entry.name}: seen "{seen}", wanted {columns} numbers; not read'
             )
             continue
         sets.append((entry, [number for number in numbers if number is not None]))
     if limit is not None and announced is not None:
         if limit > len(first):
-            findings.odd(
-                announced.file,
-                announced.line,
+            document.findings.odd(
+                announced.at,
                 f"numOfSets {limit}, but there are {len(first)}; the robot's own host refuses that",
             )
         if prefix == "triangleSetCfg" and limit > HOSTS_READ_TRIANGLE_SETS:
-            findings.odd(
-                announced.file,
-                announced.line,
+            document.findings.odd(
+                announced.at,
                 f"numOfSets {limit}: the robot's own hosts read {HOSTS_READ_TRIANGLE_SETS} at "
                 "most; all are taken",
             )
@@ -498,18 +473,14 @@ def _set_up_boards(
     patch, first, last, period_ms, skin_type, no_load = numbers
     chosen = [board for board in boards.get(patch, []) if first <= board.address <= last]
     if not chosen:
-        findings.odd(
-            entry.file,
-            entry.line,
-            f"{entry.name}: no board {first}..{last} on patch {patch}; not read",
-        )
+        findings.odd(entry.at, f"{entry.name}: no board {first}..{last} on patch {patch}; not read")
     for column, value, allowed in (
         ("period", period_ms, PERIODS_MS),
         ("skinType", skin_type, SKIN_TYPES),
         ("noLoad", no_load, range(256)),
     ):
         if value not in allowed:
-            findings.odd(entry.file, entry.line, f"{entry.name}: {column} {value}; not read")
+            findings.odd(entry.at, f"{entry.name}: {column} {value}; not read")
             return
     for board in chosen:
         board.period_ms, board.skin_type, board.no_load = period_ms, skin_type, no_load
@@ -528,14 +499,13 @@ def _set_up_triangles(
         ("cdcOffset", 0 <= offset <= 0xFFFF, offset),
     ):
         if not good:
-            findings.odd(entry.file, entry.line, f"{entry.name}: {column} {seen}; not read")
+            findings.odd(entry.at, f"{entry.name}: {column} {seen}; not read")
             return
     assert board is not None
     again = [number for number in range(first, last + 1) if number in board.triangles]
     if again and enabled == 1:
         findings.odd(
-            entry.file,
-            entry.line,
+            entry.at,
             f"{entry.name}: triangles {again[0]} to {again[-1]} of board {address} were in an "
             "earlier set; the later one counts",
         )
