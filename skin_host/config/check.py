@@ -7,7 +7,7 @@ mistakes are listed as warnings, with their path in the file.
 import math
 from collections.abc import Sequence
 from itertools import combinations, groupby
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 
@@ -31,85 +31,21 @@ COMPENSATED_TYPES = {0: 0, 3: 5, 8: 0}
 SAME_PLACE_M = 1e-4
 #: Foam outside this range usually means a wrong unit.
 USUAL_FOAM_MM = (0.3, 30.0)
+#: Settings that are shown as they are.
+_OF_BOARDS = ("bus", "address", "model", "skin_type", "period_ms")
+_OF_FINGERTIPS = ("node", "bus", "address", "period_ms", "shape", "array")
 
 
-class BusRecord(TypedDict):
-    """One bus. `load` is the share of its time for all configured boards, least and most."""
-
-    name: str
-    interface: str
-    channel: str
-    boards: int
-    triangles: int
-    frames_per_s: float
-    load: tuple[float, float]
+#: As `skin check --json` prints them.
+Record = dict[str, Any]
 
 
-class BoardSummary(TypedDict):
-    """One board, and the parts it belongs to."""
+def describe(settings: Settings, layout: Layout) -> Record:
+    """Count what `settings` and their `layout` hold, and look for likely mistakes.
 
-    name: str
-    bus: str
-    address: int
-    model: str
-    skin_type: int
-    period_ms: int
-    triangles: str
-    taxels: int
-    parts: list[str]
-
-
-class PartRecord(TypedDict):
-    """One part; `thermal` of its taxels measure temperature."""
-
-    name: str
-    node: str
-    boards: int
-    triangles: int
-    taxels: int
-    thermal: int
-    area_cm2: float
-
-
-class FingertipSummary(TypedDict):
-    """One fingertip on a force/torque board."""
-
-    name: str
-    node: str
-    bus: str
-    address: int
-    period_ms: int
-    shape: str
-    array: str | None
-
-
-class Totals(TypedDict):
-    """The whole robot."""
-
-    buses: int
-    boards: int
-    parts: int
-    triangles: int
-    taxels: int
-    thermal: int
-    area_cm2: float
-
-
-class Description(TypedDict):
-    """A whole configuration. `configuration` is the hash that calibrations carry."""
-
-    robot: str
-    configuration: str
-    buses: list[BusRecord]
-    boards: list[BoardSummary]
-    parts: list[PartRecord]
-    fingertips: list[FingertipSummary]
-    total: Totals
-    warnings: list[str]
-
-
-def describe(settings: Settings, layout: Layout) -> Description:
-    """Count what `settings` and their `layout` hold, and look for likely mistakes."""
+    `configuration` in the result is the hash that calibrations carry; `thermal` counts the taxels
+    that measure temperature; `load` is the share of a bus that its boards take, least and most.
+    """
     buses = [_bus(name, settings, layout) for name in settings.buses]
     parts = [_part(number, layout) for number in range(len(layout.parts))]
     return {
@@ -119,15 +55,7 @@ def describe(settings: Settings, layout: Layout) -> Description:
         "boards": [_board(board, layout) for board in layout.boards],
         "parts": parts,
         "fingertips": [
-            {
-                "name": name,
-                "node": tip.node,
-                "bus": tip.bus,
-                "address": tip.address,
-                "period_ms": tip.period_ms,
-                "shape": tip.shape,
-                "array": tip.array,
-            }
+            {"name": name} | {key: getattr(tip, key) for key in _OF_FINGERTIPS}
             for name, tip in settings.fingertips.items()
         ],
         "total": {
@@ -157,7 +85,7 @@ def format_triangles(numbers: list[int]) -> str:
     return ",".join(runs)
 
 
-def _bus(name: str, settings: Settings, layout: Layout) -> BusRecord:
+def _bus(name: str, settings: Settings, layout: Layout) -> Record:
     bus = settings.buses[name]
     boards = [board for board in layout.boards if board.settings.bus == name]
     frames_per_s = math.fsum(
@@ -182,21 +110,17 @@ def _bus(name: str, settings: Settings, layout: Layout) -> BusRecord:
     }
 
 
-def _board(board: BoardLayout, layout: Layout) -> BoardSummary:
+def _board(board: BoardLayout, layout: Layout) -> Record:
     return {
         "name": board.name,
-        "bus": board.settings.bus,
-        "address": board.settings.address,
-        "model": board.settings.model,
-        "skin_type": board.settings.skin_type,
-        "period_ms": board.settings.period_ms,
+        **{key: getattr(board.settings, key) for key in _OF_BOARDS},
         "triangles": format_triangles(list(board.triangles)),
         "taxels": TAXELS_PER_TRIANGLE * len(board.triangles),
         "parts": [layout.parts[part].name for part in board.parts],
     }
 
 
-def _part(number: int, layout: Layout) -> PartRecord:
+def _part(number: int, layout: Layout) -> Record:
     part = layout.parts[number]
     taxels = slice(part.start, part.stop)
     thermal = layout.pad_kind[taxels] == PadKind.THERMAL
@@ -211,7 +135,7 @@ def _part(number: int, layout: Layout) -> PartRecord:
     }
 
 
-def _bus_warnings(buses: list[BusRecord], used: set[str]) -> list[str]:
+def _bus_warnings(buses: list[Record], used: set[str]) -> list[str]:
     return (
         [
             f"buses.{bus['name']}: skin frames take {_load(bus['load'])} of the bus; "
@@ -311,13 +235,14 @@ _HEADS = {
 }
 
 
-def table(description: Description) -> str:
+def table(description: Record) -> str:
     """The description as text for a terminal, without a newline at its end."""
-    records: dict[str, list[Any]] = {
-        "bus": [*description["buses"]],
-        "board": [*description["boards"]],
-        "part": [*description["parts"], {"name": "total", "node": "", **description["total"]}],
-        "fingertip": [*description["fingertips"]],
+    total = {"name": "total", "node": "", **description["total"]}
+    records: dict[str, list[Record]] = {
+        "bus": description["buses"],
+        "board": description["boards"],
+        "part": [*description["parts"], total],
+        "fingertip": description["fingertips"],
     }
     sections = [f"robot {description['robot']}, configuration {description['configuration']}"]
     for kind, shown in _TABLES.items():

@@ -10,7 +10,6 @@ import msgspec
 from msgspec import Struct
 
 from skin_host.config.fields import Name
-from skin_host.config.relaxation import RETIRED
 
 Table = type[Struct]
 Named = dict[str, Table]
@@ -70,15 +69,10 @@ def _readable(message: str, place: str, table: Table, document: Any) -> str:
         key = text.split("`")[1]
         near = difflib.get_close_matches(key, kind.__struct_fields__, n=1)
         text = f"unknown key `{key}`" + (f"; meant `{near[0]}`?" if near else "")
-        if key in RETIRED:
-            text = f"`{key}` is no longer there: {RETIRED[key]}"
     elif text.startswith("Invalid enum value"):
         known = ", ".join(str(value) for value in get_args(kind))
         seen = text.removeprefix("Invalid enum value ")
         text = f"seen {seen}, wanted one of: {known}"
-        name = seen.strip("'")
-        if name in RETIRED:
-            text = f"`{name}` is no longer there: {RETIRED[name]}"
     else:
         text = text.replace("Object missing required field", "missing key")
         wanted, _, got = text.replace("Expected", "wanted").partition(", got ")

@@ -21,14 +21,6 @@ Model = Literal["none", FittedModel]
 #: The models that have parameters, and all models.
 FITTED: tuple[FittedModel, ...] = get_args(FittedModel)
 MODELS: tuple[Model, ...] = get_args(Model)
-#: Former models and keys, and their replacements.
-RETIRED = {
-    "published_bleed": "use `asymmetric`, or `published` as it was printed",
-    "prony": "use `asymmetric` with `tau_unload_s` equal to `tau_s`",
-    "asymmetric_log": "use `asymmetric`, which is the same model",
-    "asymmetric_clock": "use `asymmetric`, and fit it again if `beta` and `tau_s` were given",
-    "clock_kpa": "it was of the model `asymmetric_clock`: use `asymmetric`",
-}
 
 
 class RelaxationSettings(Struct, forbid_unknown_fields=True, kw_only=True, frozen=True):
@@ -86,9 +78,6 @@ def with_file(table: RelaxationSettings, configuration: Path) -> RelaxationSetti
     file = configuration.parent / table.file
 
     def wrong(what: str) -> ConfigurationError:
-        gone = next((name for name in RETIRED if f"'{name}'" in what), None)
-        if gone is not None:
-            what = f'the model "{gone}" is no longer there: {RETIRED[gone]}'
         return ConfigurationError(
             f"{configuration}: processing.relaxation.file: {file}: {what}; "
             "make one with: skin calibrate CONFIG --relaxation LOG"

@@ -16,7 +16,7 @@ def described(
     parts: dict[str, object],
     buses: dict[str, object] | None = None,
     folder: Path = Path(),
-) -> check.Description:
+) -> check.Record:
     settings = msgspec.convert(
         {"robot": "test", "buses": buses or {"can0": {}}, "boards": boards, "parts": parts},
         Settings,
@@ -24,7 +24,7 @@ def described(
     return check.describe(settings, build_layout(settings, folder))
 
 
-def full_boards(n: int, **more: object) -> check.Description:
+def full_boards(n: int, **more: object) -> check.Record:
     """`n` boards of 16 triangles on one bus."""
     names = [f"mtb{i}" for i in range(1, n + 1)]
     return described(

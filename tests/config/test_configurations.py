@@ -12,12 +12,12 @@ from skin_host.layout import build_layout
 CONFIG = Path(__file__).parents[2] / "config"
 
 
-def described(name: str) -> check.Description:
+def described(name: str) -> check.Record:
     settings = load(CONFIG / f"{name}.toml")
     return check.describe(settings, build_layout(settings, CONFIG))
 
 
-def taxels(description: check.Description) -> dict[str, int]:
+def taxels(description: check.Record) -> dict[str, int]:
     return {part["name"]: part["taxels"] for part in description["parts"]}
 
 

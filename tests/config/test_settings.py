@@ -101,30 +101,6 @@ TIP = 'fingertips.tip]\nbus = "can0"\naddress = 3\nshape = '
         ),
         (
             TOP,
-            f"{TOP}\n[processing.relaxation]\nmodel = 'asymmetric_clock'",
-            (
-                "processing.relaxation.model: `asymmetric_clock` is no longer there: "
-                "use `asymmetric`, and fit it again if `beta` and `tau_s` were given"
-            ),
-        ),
-        (
-            TOP,
-            f"{TOP}\n[processing.relaxation]\nmodel = 'prony'",
-            (
-                "processing.relaxation.model: `prony` is no longer there: "
-                "use `asymmetric` with `tau_unload_s` equal to `tau_s`"
-            ),
-        ),
-        (
-            TOP,
-            f"{TOP}\n[processing.relaxation]\nclock_kpa = 60.0",
-            (
-                "processing.relaxation: `clock_kpa` is no longer there: "
-                "it was of the model `asymmetric_clock`: use `asymmetric`"
-            ),
-        ),
-        (
-            TOP,
             f'{TOP}\n[{TIP}"cube"',
             "fingertips.tip.shape: seen 'cube', wanted one of: sphere, cylinder, ellipsoid, plane",
         ),

@@ -100,12 +100,12 @@ def test_a_hold_and_release_becomes_a_file_that_the_configuration_takes(bench, h
     assert 0.1 < sum(relaxation.beta) < 0.4
 
 
-def test_a_file_of_a_model_that_is_gone_says_which_to_fit(bench):
-    fitted = {"schema": "skin.relaxation/1", "model": "asymmetric_clock", "clock_kpa": 90.0}
+def test_a_file_of_an_unknown_model_says_how_to_make_one(bench):
+    fitted = {"schema": "skin.relaxation/1", "model": "prony"}
     fitted |= {name: [0.1] for name in ("beta", "tau_s", "beta_unload", "tau_unload_s")}
     bench.with_name("old.json").write_text(json.dumps(fitted))
     bench.write_text(CONFIG + '[processing.relaxation]\nfile = "old.json"\n')
-    with pytest.raises(ConfigurationError, match=r"asymmetric_clock.*no longer.*use `asymmetric`"):
+    with pytest.raises(ConfigurationError, match=r"'prony'.*make one with: skin calibrate"):
         load(bench)
 
 
