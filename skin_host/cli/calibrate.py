@@ -431,7 +431,8 @@ def triangle_verdicts(
 
 def triangle_table(verdicts: list[TriangleVerdict]) -> str:
     """Return a line for each triangle that is not ok, and one for those of a board that are."""
-    from skin_host.config.check import columns, format_triangles
+    from skin_host.config.check import columns
+    from skin_host.config.settings import format_triangles
 
     rows: list[list[str | int]] = []
     for (part, board), triangles in groupby(verdicts, lambda one: (one["part"], one["board"])):

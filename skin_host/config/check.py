@@ -6,12 +6,12 @@ mistakes are listed as warnings, with their path in the file.
 
 import math
 from collections.abc import Sequence
-from itertools import combinations, groupby
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 
-from skin_host.config.settings import Settings, skin_hash
+from skin_host.config.settings import Settings, format_triangles, skin_hash
 from skin_host.layout import TAXELS_PER_TRIANGLE, BoardLayout, Layout, PadKind
 
 #: Bits of a standard frame of eight bytes with its interframe space: without stuff bits, and with
@@ -73,16 +73,6 @@ def describe(settings: Settings, layout: Layout) -> Record:
             *_part_warnings(layout),
         ],
     }
-
-
-def format_triangles(numbers: list[int]) -> str:
-    """Turn [0, 1, 2, 3, 4, 8] into "0-4,8", the form of a configuration file."""
-    runs = []
-    for _, run in groupby(enumerate(numbers), key=lambda item: item[1] - item[0]):
-        members = [number for _, number in run]
-        first, last = members[0], members[-1]
-        runs.append(f"{first}-{last}" if last > first else f"{first}")
-    return ",".join(runs)
 
 
 def _bus(name: str, settings: Settings, layout: Layout) -> Record:

@@ -8,6 +8,7 @@ name the file and the path inside it. `docs/configuration.md` explains every key
 
 import hashlib
 from collections.abc import Callable, Mapping
+from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -263,6 +264,16 @@ def parse_triangles(text: str) -> list[int]:
     if len(set(numbers)) != len(numbers):
         raise ValueError(f'"{text}": a triangle is named twice')
     return numbers
+
+
+def format_triangles(numbers: list[int]) -> str:
+    """Turn rising numbers such as [0, 1, 2, 3, 4, 8] into "0-4,8", as `parse_triangles` reads."""
+    runs = []
+    for _, run in groupby(enumerate(numbers), key=lambda item: item[1] - item[0]):
+        members = [number for _, number in run]
+        first, last = members[0], members[-1]
+        runs.append(f"{first}-{last}" if last > first else f"{first}")
+    return ",".join(runs)
 
 
 def read_toml(path: Path, table: type[T], named: Named) -> T:

@@ -41,6 +41,7 @@ FEWEST_RESTING = 12
 ABSENT_SWEEPS = 3
 #: A baseline counts as drifting when it has moved by more than this share of its limit.
 DRIFTING_SHARE = 0.25
+_COUNTS = ("wrong", "halves", "missed", "unknown", "spikes", "dropped", "error_frames")
 
 
 class Describer:
@@ -416,18 +417,13 @@ def _period(intervals_ns: NDArray[np.int64], wanted_ms: int) -> tuple[float | No
 def _last_second(gained: dict[str, float], bitrate: int) -> LastSecond:
     seconds = max(gained["seconds"], 0.1)
     load = FRAME_BITS / (bitrate * seconds)
-    return {
+    counts = {key: int(gained[key]) for key in _COUNTS}
+    loads = {
         "frames_hz": round(gained["frames"] / seconds),
         "load": round(gained["frames"] * load, 3),
         "other_load": round(gained["other"] * load, 3),
-        "wrong": int(gained["wrong"]),
-        "halves": int(gained["halves"]),
-        "missed": int(gained["missed"]),
-        "unknown": int(gained["unknown"]),
-        "spikes": int(gained["spikes"]),
-        "dropped": int(gained["dropped"]),
-        "error_frames": int(gained["error_frames"]),
     }
+    return cast(LastSecond, loads | counts)
 
 
 def _age_ms(now_ns: int, then_ns: int | None) -> float | None:

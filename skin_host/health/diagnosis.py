@@ -10,6 +10,7 @@ from typing import Any
 
 from msgspec import Struct
 
+from skin_host.config.settings import format_triangles
 from skin_host.health.record import BoardHealth, BusHealth, Record
 
 #: Frames of unconfigured nodes that take more than this share of a bus are a fault.
@@ -41,6 +42,14 @@ _BUS_STATES = {
     "down": ("bus_down", "is down; set it up with `ip link set {channel} up`"),
     "gone": ("bus_gone", "is gone; plug the adapter in again, it is found by its name"),
 }
+_BOARD_EVENTS = {
+    "resets": ("board_reset", " restarted by itself and was set up again"),
+    "lost_set_ups": (
+        "board_lost_set_up",
+        " did not send what it was set up to send, and was set up again",
+    ),
+    "rezeros": ("board_rezeroed", " zeroed itself; its baselines were corrected for that"),
+}
 _TRIANGLE_SENTENCES = {
     "missing": "is missing although its board sends; check that it is enabled there",
     "not connected": "is not connected: its chip does not answer; check cable and address",
@@ -49,6 +58,12 @@ _TRIANGLE_SENTENCES = {
     "frozen": "repeats the same bytes for longer than chance allows: its chip has stopped",
     "constant": "did not change during the calibration and has not changed since",
     "out of range": "reads far outside its range on all pads",
+}
+_TAXEL_FAULTS = {
+    "stuck": "the same byte for too long in a triangle that otherwise works; not valid",
+    "noisy": "much noisier than when calibrated; not valid",
+    "out_of_range": "far out of range; not valid",
+    "drifting": "has moved far from its calibration; calibrate when nothing touches the skin",
 }
 
 
@@ -126,134 +141,100 @@ _SILENT = {"bus_off", "bus_down", "bus_gone", "bus_silent"}
 
 def _bus(bus: BusHealth) -> Iterator[FoundFault]:
     name = bus["name"]
+
+    def fault(code: str, sentence: str, where: str = name) -> FoundFault:
+        return FoundFault(code, where, f"bus {name}{sentence}")
+
     state = bus.get("state", "up")
     if state in _BUS_STATES:
         code, sentence = _BUS_STATES[state]
-        yield FoundFault(
-            code, name, f"bus {name} " + sentence.format(channel=bus.get("channel", name))
-        )
+        yield fault(code, " " + sentence.format(channel=bus.get("channel", name)))
     elif bus.get("silent"):
-        yield FoundFault(
-            "bus_silent",
-            name,
-            f"bus {name}: no frames are received; check its plug, the boards' power and bit rate",
+        yield fault(
+            "bus_silent", ": no frames are received; check its plug, the boards' power and bit rate"
         )
     recent = bus.get("last_second")
     if recent is None:
         return
     if recent["other_load"] > BABBLE_LOAD:
-        yield FoundFault(
+        mostly = f", mostly with identifier {bus['stranger']}" if bus.get("stranger") else ""
+        yield fault(
             "bus_babbling",
-            name,
-            f"bus {name}: frames of other devices take {recent['other_load']:.0%} of it"
-            + (f", mostly with identifier {bus['stranger']}" if bus.get("stranger") else "")
-            + "; find the node that sends them",
+            f": frames of other devices take {recent['other_load']:.0%} of it{mostly}; find the "
+            "node that sends them",
         )
     if recent["dropped"]:
-        yield FoundFault(
+        yield fault(
             "bus_drops",
-            name,
-            f"bus {name}: this computer lost {recent['dropped']} frames in the last second; "
+            f": this computer lost {recent['dropped']} frames in the last second; "
             "see docs/receive.md",
         )
     if recent["halves"] >= FEW_HALVES:
-        yield FoundFault(
+        yield fault(
             "bus_loses_frames",
-            name,
-            f"bus {name}: single frames are lost, {recent['halves']} in the last second; "
+            f": single frames are lost, {recent['halves']} in the last second; "
             "the bus is overloaded or badly terminated",
         )
     if recent["wrong"] or recent["spikes"] >= FEW_SPIKES:
-        yield FoundFault(
+        yield fault(
             "bus_bit_errors",
-            name,
-            f"bus {name}: damaged frames ({recent['wrong']} with a wrong header or unreadable, "
+            f": damaged frames ({recent['wrong']} with a wrong header or unreadable, "
             f"{recent['spikes']} single bytes off); suspect a gateway or an adapter",
         )
     if recent["error_frames"] and state == "up":
-        yield FoundFault(
+        yield fault(
             "bus_errors",
-            name,
-            f"bus {name}: {recent['error_frames']} error frames in the last second; "
+            f": {recent['error_frames']} error frames in the last second; "
             "check wiring and termination",
         )
     for address, kind in sorted(bus.get("strangers", {}).items()):
-        yield FoundFault(
-            "bus_stranger",
-            f"{name}/{address}",
-            f"bus {name}: a board of type {kind} at address {address} is not in the configuration",
-        )
+        what = f": a board of type {kind} at address {address} is not in the configuration"
+        yield fault("bus_stranger", what, f"{name}/{address}")
 
 
 def _board(board: BoardHealth) -> Iterator[FoundFault]:
     name = board["name"]
-    here = f"board {name} (address {board['address']})"
+
+    def fault(code: str, sentence: str) -> FoundFault:
+        here = f"board {name} (address {board['address']})"
+        return FoundFault(code, name, here + sentence)
+
     if board.get("in_bootloader"):
-        yield FoundFault(
-            "board_in_bootloader", name, f"{here} is in its bootloader: no firmware runs"
-        )
+        yield fault("board_in_bootloader", " is in its bootloader: no firmware runs")
     elif not board["alive"] and not board.get("awaited"):
         if board["sweeps"]:
-            yield FoundFault(
-                "board_silent",
-                name,
-                f"{here} has stopped sending and is being set up again; check its power",
+            yield fault(
+                "board_silent", " has stopped sending and is being set up again; check its power"
             )
         else:
-            yield FoundFault(
-                "board_absent", name, f"{here} has not sent anything yet; check power and address"
-            )
+            yield fault("board_absent", " has not sent anything yet; check power and address")
     if board.get("wrong_type"):
-        yield FoundFault(
-            "board_wrong_type",
-            name,
-            f"{here} reports type {board['board_type']}, which is no skin board",
+        yield fault(
+            "board_wrong_type", f" reports type {board['board_type']}, which is no skin board"
         )
     events = board.get("lately", {})
-    if events.get("resets"):
-        yield FoundFault("board_reset", name, f"{here} restarted by itself and was set up again")
-    if events.get("lost_set_ups"):
-        yield FoundFault(
-            "board_lost_set_up",
-            name,
-            f"{here} did not send what it was set up to send, and was set up again",
-        )
-    if events.get("rezeros"):
-        yield FoundFault(
-            "board_rezeroed",
-            name,
-            f"{here} zeroed itself; its baselines were corrected for that",
-        )
+    for event, (code, sentence) in _BOARD_EVENTS.items():
+        if events.get(event):
+            yield fault(code, sentence)
     if board.get("in_doubt"):
-        yield FoundFault(
+        yield fault(
             "board_in_doubt",
-            name,
-            f"{here} was zeroed while it was touched (taxels: {board['in_doubt']}); those are "
+            f" was zeroed while it was touched (taxels: {board['in_doubt']}); those are "
             f"not valid until calibrated untouched: skin command configure --board {name}, then "
             f"skin command calibrate --board {name}",
         )
     if events.get("tx_overflows"):
-        yield FoundFault(
-            "board_overflows", name, f"{here} could not send all its frames: bus too full"
-        )
+        yield fault("board_overflows", " could not send all its frames: bus too full")
     if board.get("twice"):
-        yield FoundFault(
-            "board_twice",
-            name,
-            f"{here}: two boards send at this address; give one of them another",
-        )
+        yield fault("board_twice", ": two boards send at this address; give one of them another")
         return
     wanted, seen, jitter_ms = board["period_ms"], board["period_seen_ms"], board["jitter_ms"]
     if board["alive"] and seen is not None and jitter_ms is not None:
         if abs(seen - wanted) > PERIOD_SHARE * wanted:
-            yield FoundFault(
-                "board_period", name, f"{here} sends every {seen:.1f} ms instead of {wanted} ms"
-            )
+            yield fault("board_period", f" sends every {seen:.1f} ms instead of {wanted} ms")
         elif jitter_ms > JITTER_SHARE * wanted:
-            yield FoundFault(
-                "board_jitter",
-                name,
-                f"{here} sends irregularly: its {wanted} ms scatter by {jitter_ms:.1f} ms",
+            yield fault(
+                "board_jitter", f" sends irregularly: its {wanted} ms scatter by {jitter_ms:.1f} ms"
             )
 
 
@@ -319,39 +300,27 @@ def _triangles(record: Record, silent: set[str]) -> Iterator[FoundFault]:
 
 
 def _taxels(record: Record) -> Iterator[FoundFault]:
-    part = record["part"]
-    sentence = {
-        "stuck": "the same byte for too long in a triangle that otherwise works; not valid",
-        "noisy": "much noisier than when calibrated; not valid",
-        "out_of_range": "far out of range; not valid",
-        "drifting": "has moved far from its calibration; calibrate when nothing touches the skin",
-    }
-    for kind, what in sentence.items():
+    def fault(code: str, taxels: Collection[int], what: str) -> FoundFault:
+        part = record["part"]
+        return FoundFault(code, part, f"{named(taxels)} of {part}: {what}")
+
+    for kind, what in _TAXEL_FAULTS.items():
         taxels = record["taxel_faults"].get(kind)
         if taxels:
-            yield FoundFault(f"taxel_{kind}", part, f"{named(taxels)} of {part}: {what}")
+            yield fault(f"taxel_{kind}", taxels, what)
     verdicts = record["taxel_verdicts"]
-    noisy = verdicts.get("noisy")
-    if noisy:
-        yield FoundFault(
-            "taxel_decides_late",
-            part,
-            f"{named(noisy)} of {part}: noisy when calibrated; they need up to "
-            f"{record['decides_kpa']:g} kPa to decide within a second",
-        )
-    if verdicts.get("saturates"):
-        yield FoundFault(
+    if noisy := verdicts.get("noisy"):
+        what = f"up to {record['decides_kpa']:g} kPa to decide within a second"
+        yield fault("taxel_decides_late", noisy, f"noisy when calibrated; they need {what}")
+    if saturated := verdicts.get("saturates"):
+        yield fault(
             "taxel_saturates",
-            part,
-            f"{named(verdicts['saturates'])} of {part}: rest so near 0 that a "
-            "press is cut off; set the boards up again, then calibrate",
+            saturated,
+            "rest so near 0 that a press is cut off; set the boards up again, then calibrate",
         )
-    if verdicts.get("touched"):
-        yield FoundFault(
-            "taxel_pressed",
-            part,
-            f"{named(verdicts['touched'])} of {part}: touched when calibrated; calibrate when "
-            "nothing touches",
+    if touched := verdicts.get("touched"):
+        yield fault(
+            "taxel_pressed", touched, "touched when calibrated; calibrate when nothing touches"
         )
     # If the triangle is already reported as missing, its taxels were absent because of that.
     kinds = {"stuck": "stuck", "out_of_range": "out of range", "too_noisy": "too noisy"}
@@ -362,89 +331,82 @@ def _taxels(record: Record) -> Iterator[FoundFault]:
     refused = set().union(*why.values())
     if refused:
         reasons = " or ".join(kinds[kind] for kind, taxels in why.items() if taxels)
-        yield FoundFault(
+        yield fault(
             "taxel_refused",
-            part,
-            f"{named(refused)} of {part}: {reasons} when calibrated; not valid until a better "
-            "calibration",
+            refused,
+            f"{reasons} when calibrated; not valid until a better calibration",
         )
     if record["baseline_at_limit"]:
-        at_limit = named(record["baseline_at_limit"])
-        yield FoundFault(
+        yield fault(
             "taxel_at_limit",
-            part,
-            f"{at_limit} of {part}: the baseline cannot follow any farther; calibrate",
+            record["baseline_at_limit"],
+            "the baseline cannot follow any farther; calibrate",
         )
     if record["baseline_frozen"]:
-        held = named(record["baseline_frozen"])
-        yield FoundFault(
+        yield fault(
             "taxel_held",
-            part,
-            f"{held} of {part}: touched for so long, or with so much drift during the touch, "
-            "that the zero is uncertain",
+            record["baseline_frozen"],
+            "touched for so long, or with so much drift during the touch, that the zero is "
+            "uncertain",
         )
 
 
 def _part(record: Record) -> Iterator[FoundFault]:
-    part = record["part"]
+    def fault(code: str, sentence: str) -> FoundFault:
+        return FoundFault(code, record["part"], record["part"] + sentence)
+
     if record["state"] == "disabled":
-        yield FoundFault(
-            "part_disabled", part, f"{part} was disabled by command; nothing is published"
-        )
+        yield fault("part_disabled", " was disabled by command; nothing is published")
         return
     if record["calibration"] is None:
-        yield FoundFault(
-            "part_not_calibrated", part, f"{part} is not calibrated: nothing is published"
-        )
+        yield fault("part_not_calibrated", " is not calibrated: nothing is published")
     warmth = record.get("warmth")
     if warmth is None:
         return
     if warmth["thermal_units"] is not None and abs(warmth["thermal_units"]) > THERMAL_UNITS:
-        yield FoundFault(
+        yield fault(
             "part_temperature",
-            part,
-            f"{part}: its thermal pads read {warmth['thermal_units']:+.0f} units since the "
+            f": its thermal pads read {warmth['thermal_units']:+.0f} units since the "
             "calibration: its temperature has changed; pressures are corrected, less precisely",
         )
     elif abs(warmth["common_units"]) > COMMON_UNITS:
-        yield FoundFault(
+        yield fault(
             "part_temperature",
-            part,
-            f"{part}: its untouched taxels all read {warmth['common_units']:+.1f} units off their "
+            f": its untouched taxels all read {warmth['common_units']:+.1f} units off their "
             "baselines: its temperature is changing",
         )
 
 
 def _output(output: dict[str, Any] | None, lost_lately: Collection[str]) -> Iterator[FoundFault]:
+    def fault(code: str, sentence: str) -> FoundFault:
+        return FoundFault(code, "broker", sentence)
+
     if output is None:
         return
     if not output["connected"]:
         why = output.get("last_error") or "not yet reached"
-        yield FoundFault("broker_away", "broker", f"the broker is away: {why}")
+        yield fault("broker_away", f"the broker is away: {why}")
     if "touches_dropped" in lost_lately:
-        yield FoundFault(
+        yield fault(
             "touches_dropped",
-            "broker",
             f"touch events were lost within the last minute ({output['touches_dropped']} since the "
             "start): the broker was away for too long, or did not take them",
         )
     if output.get("withheld"):
         topics = ", ".join(output["withheld"])
-        yield FoundFault(
+        yield fault(
             "broker_rejects",
-            "broker",
             f"the broker does not take what is published at {topics}; check its packet limit and "
             "its access rules",
         )
     if output.get("name_taken"):
-        yield FoundFault(
+        yield fault(
             "node_name_taken",
-            "broker",
             "the broker ends every connection within seconds: does a second daemon run as the same "
             "robot and node? Give one of them another --node",
         )
     if "refused" in lost_lately:
-        yield FoundFault("broker_refuses", "broker", f"the broker refuses: {output['last_error']}")
+        yield fault("broker_refuses", f"the broker refuses: {output['last_error']}")
 
 
 def named(taxels: Collection[int]) -> str:
@@ -455,13 +417,7 @@ def named(taxels: Collection[int]) -> str:
 def _list(numbers: Iterable[int]) -> str:
     """Numbers as a short list with ranges: 1, 4-7, 9."""
     ordered = sorted(numbers)
-    runs: list[tuple[int, int]] = []
-    for number in ordered:
-        if runs and number == runs[-1][1] + 1:
-            runs[-1] = (runs[-1][0], number)
-        else:
-            runs.append((number, number))
-    texts = [str(a) if a == b else f"{a}-{b}" for a, b in runs]
+    texts = format_triangles(ordered).split(",")
     if len(texts) > 8:
         texts = [*texts[:8], f"... ({len(ordered)} in all)"]
     return ", ".join(texts)

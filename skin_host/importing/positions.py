@@ -15,12 +15,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.config.check import format_triangles
 from skin_host.config.settings import (
     TRIANGLES_PER_BOARD,
     KindSettings,
     Patch,
     Settings,
+    format_triangles,
     parse_triangles,
 )
 from skin_host.errors import ConfigurationError

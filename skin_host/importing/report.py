@@ -6,8 +6,7 @@ from typing import Literal
 
 import msgspec
 
-from skin_host.config.check import format_triangles
-from skin_host.config.settings import Board, Bus, Part, Patch, Settings
+from skin_host.config.settings import Board, Bus, Part, Patch, Settings, format_triangles
 from skin_host.errors import ConfigurationError, visible
 from skin_host.files import read_whole
 

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import msgspec
 
-from skin_host.config.check import format_triangles
 from skin_host.config.settings import (
     TRIANGLES_PER_BOARD,
     Part,
     Patch,
     PlaceSettings,
     Settings,
+    format_triangles,
     parse_triangles,
 )
 from skin_host.errors import ConfigurationError

@@ -18,8 +18,7 @@ from xml.parsers import expat
 
 import msgspec
 
-from skin_host.config.check import format_triangles
-from skin_host.config.settings import Board, Bus, Part, Patch, Settings
+from skin_host.config.settings import Board, Bus, Part, Patch, Settings, format_triangles
 from skin_host.errors import ConfigurationError
 from skin_host.importing.report import Findings, Place, read_source
 

@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skin_host.config.check import format_triangles
-from skin_host.config.settings import load, parse_triangles, skin_hash
+from skin_host.config.settings import format_triangles, load, parse_triangles, skin_hash
 from skin_host.errors import ConfigurationError
 from skin_host.layout import build_layout
 
