@@ -384,7 +384,7 @@ class Engine:
         if before is not None:
             touched |= before.doubted.reshape(TRIANGLES, PADS)
         no_load = np.full(taxels.size, float(self.layout.boards[board].settings.no_load))
-        self._rezeros[board] = Rezero(touched.ravel(), no_load)
+        self._rezeros[board] = Rezero(touched.ravel(), no_load, (taxels >= 0).ravel())
         self.intake.veto[self.ledger.row[board]] = np.ones((TRIANGLES, PADS), np.bool_)
         return int(np.count_nonzero(touched))
 
@@ -470,6 +470,9 @@ class Engine:
         no_load = float(self.layout.boards[sweep.board].settings.no_load)
         if before is not None:
             back = (before > 0) & (before < BELOW_SWEEPS) & answered[:, None]
+            if sweep.board in self._rezeros:
+                # What is known to have been pressed comes back when it is pressed again.
+                back &= ~self._rezeros[sweep.board].doubted.reshape(TRIANGLES, PADS)
             if (back & (sweep.raw < (no_load + 255) / 2)).any():
                 # What was pressed and lifts stays below zero; what a bad wire brings does not.
                 self._jumped_ns[sweep.board] = sweep.t_ns
@@ -492,12 +495,15 @@ class Engine:
         ledger.rezeros[row] += not rezero.begun
         if rezero.step(sweep.raw.ravel(), here, ledger.far[row].ravel(), sweep.t_ns):
             taxels = self._taxels_of(sweep.board).ravel()
-            fitted = taxels >= 0
-            baseline = np.where(fitted, self._pipeline.baseline[taxels], 0.0)
-            found = rezero.finish(baseline, self.calibration.noise[taxels])
-            self._pipeline.set_zero(taxels[fitted], found[fitted])
-        elif rezero.settled(sweep.t_ns):
-            self.intake.veto[row] = self.in_doubt(sweep.board)
+            baseline = np.where(taxels >= 0, self._pipeline.baseline[taxels], 0.0)
+            found, baseline = rezero.finish(baseline, self.calibration.noise[taxels])
+            self._pipeline.set_zero(taxels[found], baseline[found])
+        if rezero.settled(sweep.t_ns):
+            veto = self.in_doubt(sweep.board)
+            unsettled = rezero.unsettled(sweep.t_ns)
+            if unsettled is not None:
+                veto |= unsettled.reshape(TRIANGLES, PADS)
+            self.intake.veto[row] = veto
             return
         # What jumps while a board is set up was not damaged on its way.
         self.intake.note_gap(row)

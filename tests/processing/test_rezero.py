@@ -27,18 +27,19 @@ def look(rezero: Rezero, offset_units: np.ndarray, period_s: float) -> tuple[int
 @pytest.mark.parametrize("period_s", [0.02, 0.05, 0.2, 1.0])
 def test_a_slow_boards_zero_is_known_as_well_as_that_of_a_quick_one(period_s: float) -> None:
     offset = np.linspace(-3.0, 3.0, N)
-    rezero = Rezero(NONE, NO_LOAD)
+    rezero = Rezero(NONE, NO_LOAD, ~NONE)
     sweeps, _ = look(rezero, offset, period_s)
     assert sweeps == max(LOOK_SWEEPS, round(1.0 / period_s))
-    found = rezero.finish(np.zeros(N), np.full(N, NOISE_UNITS))
+    _, found = rezero.finish(np.zeros(N), np.full(N, NOISE_UNITS))
     # A baseline that is off by half a unit makes noise look like a touch.
     assert np.std(found - offset) < 0.2
     assert not rezero.doubted.any()
 
 
 def test_it_settles_a_second_after_the_look_however_long_that_took() -> None:
-    rezero = Rezero(NONE, NO_LOAD)
+    rezero = Rezero(NONE, NO_LOAD, ~NONE)
     _, ended_ns = look(rezero, np.zeros(N), 0.2)
+    rezero.finish(np.zeros(N), np.full(N, NOISE_UNITS))
     assert not rezero.settled(ended_ns)
     assert not rezero.settled(ended_ns + S)
     assert rezero.settled(ended_ns + 2 * S)
@@ -47,15 +48,15 @@ def test_it_settles_a_second_after_the_look_however_long_that_took() -> None:
 def test_a_zero_taken_under_a_press_is_in_doubt() -> None:
     offset = np.where(np.arange(N) == 7, -LARGEST_UNITS - 5.0, 0.0)
     touched = np.arange(N) == 3
-    rezero = Rezero(touched, NO_LOAD)
+    rezero = Rezero(touched, NO_LOAD, ~NONE)
     look(rezero, np.maximum(offset, -60.0), 0.05)
-    found = rezero.finish(np.zeros(N), np.full(N, NOISE_UNITS))
+    _, found = rezero.finish(np.zeros(N), np.full(N, NOISE_UNITS))
     assert np.flatnonzero(rezero.doubted).tolist() == [3, 7]
     assert found[[3, 7]].tolist() == [0.0, 0.0]
 
 
 def test_a_clock_that_is_set_back_does_not_end_the_look_early() -> None:
-    rezero = Rezero(NONE, NO_LOAD)
+    rezero = Rezero(NONE, NO_LOAD, ~NONE)
     raw = NO_LOAD.astype(np.uint8)
     t_ns = 1_700_000_000 * S
     ended = [rezero.step(raw, ~NONE, NONE, t_ns - number * S) for number in range(LOOK_SWEEPS + 1)]
@@ -64,20 +65,46 @@ def test_a_clock_that_is_set_back_does_not_end_the_look_early() -> None:
 
 def test_what_a_board_marks_as_far_out_of_range_is_no_part_of_its_zero() -> None:
     """For two sweeps after its data line was shorted, a board sends 0 without an error."""
-    rezero = Rezero(NONE, NO_LOAD)
+    rezero = Rezero(NONE, NO_LOAD, ~NONE)
     raw = (NO_LOAD - 2.0).astype(np.uint8)
     for number in range(LOOK_SWEEPS + 1):
         shorted = np.full(N, number < 2)
         sent = np.where(shorted, 0, raw).astype(np.uint8)
         rezero.step(sent, ~NONE, shorted, number * S // 20)
-    found = rezero.finish(np.zeros(N), np.full(N, NOISE_UNITS))
+    _, found = rezero.finish(np.zeros(N), np.full(N, NOISE_UNITS))
     assert found.tolist() == [2.0] * N
     assert not rezero.doubted.any()
 
 
 def test_the_zero_of_what_was_far_out_of_range_all_the_while_is_in_doubt() -> None:
-    rezero = Rezero(NONE, NO_LOAD)
+    rezero = Rezero(NONE, NO_LOAD, ~NONE)
     for number in range(LOOK_SWEEPS + 1):
         rezero.step(np.zeros(N, np.uint8), ~NONE, np.arange(N) < 12, number * S // 20)
     rezero.finish(np.full(N, 240.0), np.zeros(N))
     assert np.flatnonzero(rezero.doubted).tolist() == list(range(12))
+
+
+def test_pads_whose_frames_were_lost_in_the_look_are_observed_until_their_zero_is_known() -> None:
+    """A triangle needs both its frames: of 40 % lost ones, eight of twenty sweeps have it."""
+    rezero = Rezero(NONE, NO_LOAD, ~NONE)
+    lost = np.arange(N) < 12
+    absent = np.arange(N) >= 180
+    found_at: dict[int, list[int]] = {}
+    raw = (NO_LOAD - 5.0).astype(np.uint8)
+    for number in range(80):
+        t_ns = number * S // 20
+        present = ~absent & ~(lost & (number % 5 < 3))
+        if rezero.step(raw, present, NONE, t_ns):
+            found, baseline = rezero.finish(np.zeros(N), np.full(N, NOISE_UNITS))
+            found_at[number] = np.flatnonzero(found).tolist()
+            assert (baseline[found] == 5.0).all()
+            late = rezero.unsettled(t_ns)
+            assert late is not None
+            assert late[absent].all()
+    first, last = found_at
+    assert found_at == {first: list(range(12, 180)), last: list(range(12))}
+    assert last > first
+    late = rezero.unsettled(4 * S)
+    assert late is not None
+    assert np.flatnonzero(late).tolist() == list(range(180, N))
+    assert not rezero.doubted.any()

@@ -1,0 +1,79 @@
+"""What is known of a board's zero: pads that were pressed when it was taken, and what looks so."""
+
+import numpy as np
+import pytest
+
+from skin_host.bus.wire import FrameBatch, encode_sweep
+from skin_host.config.settings import load
+from skin_host.layout import build_layout
+from skin_host.processing.core import Engine
+from tests.support.stack import ROOT
+
+CONFIG = ROOT / "config" / "demo.toml"
+PERIOD_NS = 50_000_000
+NO_LOAD = 240
+#: Status words mark pads that are far out of range; a byte of 255 is far below zero.
+FAR_BELOW = 255
+
+
+class Hand:
+    """An engine with a calibrated board, which sends what it is asked to."""
+
+    def __init__(self) -> None:
+        settings = load(CONFIG)
+        layout = build_layout(settings, CONFIG.parent)
+        self.engine = Engine(settings, layout, [layout.parts.index(layout.part("left_hand"))])
+        self._board = layout.boards[0]
+        self._rng = np.random.default_rng(1)
+        self._t_ns = 1_000_000_000
+        self.engine.begin_calibration(2.0)
+        self.send(50)
+        self.engine.use(self.engine.end_calibration("2026-01-01T00:00:00+00:00"))
+
+    def send(self, sweeps: int, **pads: int) -> None:
+        """Send sweeps of an untouched board, but for some pads of its first triangle (`p3=255`)."""
+        triangles = np.array(self._board.triangles)
+        for _ in range(sweeps):
+            values = self._rng.integers(NO_LOAD - 1, NO_LOAD + 2, (len(triangles), 12))
+            status = np.zeros(len(triangles), np.uint16)
+            for name, value in pads.items():
+                values[0, int(name[1:])] = value
+                if value == FAR_BELOW:
+                    status[0] |= 0x10 << int(name[1:])
+            ids, data = encode_sweep(
+                self._board.settings.address, triangles, values.astype(np.uint8), status
+            )
+            self._t_ns += PERIOD_NS
+            frames = [(int(i), bytes(d), self._t_ns) for i, d in zip(ids, data, strict=True)]
+            self.engine.feed(self._board.settings.bus, FrameBatch.of(frames))
+
+    @property
+    def in_doubt(self) -> list[int]:
+        return np.flatnonzero(self.engine.in_doubt(0)[self._board.triangles[0]]).tolist()
+
+
+@pytest.fixture
+def hand() -> Hand:
+    return Hand()
+
+
+def test_a_pad_that_stays_below_zero_was_pressed_when_its_board_was_zeroed(hand: Hand) -> None:
+    hand.send(10, p3=FAR_BELOW)
+    assert hand.in_doubt == [3]
+
+
+def test_a_pad_that_comes_back_at_once_jumps(hand: Hand) -> None:
+    hand.send(2, p3=FAR_BELOW)
+    hand.send(1)
+    hand.send(10, p4=FAR_BELOW)
+    assert hand.in_doubt == []
+
+
+def test_a_pad_in_doubt_that_is_pressed_again_and_again_does_not_jump(hand: Hand) -> None:
+    """It hovers where the board begins to mark it; another pad that lifts meanwhile is known."""
+    hand.send(10, p3=FAR_BELOW)
+    hand.send(2, p3=NO_LOAD)
+    hand.send(2, p3=FAR_BELOW)
+    hand.send(1, p3=NO_LOAD)
+    hand.send(10, p4=FAR_BELOW)
+    assert hand.in_doubt == [3, 4]
