@@ -36,8 +36,8 @@ coverage: .venv/dev.stamp .venv/coverage.stamp  ## statements and branches of th
 	@$(BIN)/python -m pytest --quiet $(BY_FILE) --cov --cov-report=term --cov-report=json:.coverage.json
 	@$(BIN)/python -m tests.support.branches .coverage.json
 
-mutation: .venv/dev.stamp .venv/mutation.stamp  ## small changes of the core that its tests must notice; FILES=... PLACES=40
-	@$(BIN)/python -m tests.support.mutation --places $(or $(PLACES),40) $(FILES)
+mutation: .venv/dev.stamp .venv/mutation.stamp  ## small changes of the core that its tests must notice; FILES=... PLACES=40 SEED=1
+	@$(BIN)/python -m tests.support.mutation --places $(or $(PLACES),40) --seed $(or $(SEED),1) $(FILES)
 
 test-system: .venv/dev.stamp .venv/fuzz.stamp  ## real CAN, I2C, systemd, broker and browser; root, if packages are missing
 	@tools/timed "packages" tools/lane/packages

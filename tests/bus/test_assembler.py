@@ -89,9 +89,12 @@ def test_a_lost_frame_costs_its_triangle_and_is_counted():
     assert assembler.counters.halves == 1
 
 
+#: All A and then all B, or the reverse.
+@pytest.mark.parametrize("order", [[0, 2, 4, 6, 1, 3, 5, 7], [1, 3, 5, 7, 0, 2, 4, 6]])
 @pytest.mark.parametrize("cut", [1, 3, 6])
-def test_frames_that_were_held_up_until_their_sweep_was_closed_are_late_not_lost(cut: int) -> None:
-    order = [0, 2, 4, 6, 1, 3, 5, 7]  # all A, then all B
+def test_frames_that_were_held_up_until_their_sweep_was_closed_are_late_not_lost(
+    cut: int, order: list[int]
+) -> None:
     sent = [frames(values(4), PERIOD, spacing_ns=1000)[place] for place in order]
     assembler = make()
     feed(assembler, sent[:cut])
@@ -500,22 +503,57 @@ def test_a_board_that_only_sends_halves_is_awaited_in_whole_again() -> None:
     assert sweep.present == 0b11
 
 
-def test_once_a_boards_order_is_known_its_frames_are_taken_as_a_whole(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """An order that changes for good is learnt again, after a while."""
-    taken: list[int] = []
+@pytest.fixture
+def taken(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many frames are taken as a whole, each time."""
+    found: list[int] = []
 
     def watched(take: Callable[..., int]) -> Callable[..., int]:
         def note(*args: object) -> int:
             n = take(*args)
-            taken.extend([n] if n else [])
+            found.extend([n] if n else [])
             return n
 
         return note
 
     for name in ("_take_sweep", "_take_run"):
         monkeypatch.setattr(Assembler, name, watched(getattr(Assembler, name)))
+    return found
+
+
+def test_a_sweep_of_known_order_that_is_read_in_parts_is_taken_in_parts(taken: list[int]) -> None:
+    """Of a first part the first frame is taken alone."""
+    assembler = learnt("0-3", 4)
+    taken.clear()
+    for period in range(5, 15):
+        raw = values(4, period)
+        sent = frames(raw, period * PERIOD)
+        assert feed(assembler, sent[:3]) == []
+        (sweep,) = feed(assembler, sent[3:])
+        np.testing.assert_array_equal(sweep.raw[:4], raw)
+    assert taken == [2, 5] * 10
+
+
+def test_an_order_is_learnt_of_a_sweep_of_which_every_triangle_was_awaited(
+    taken: list[int],
+) -> None:
+    """One of them returns amid the first sweep that is whole."""
+    assembler = make()
+    for period in range(1, PATIENCE_SWEEPS + 2):
+        feed(assembler, frames(values(4), period * PERIOD)[2:])
+        assembler.expire((period + 1) * PERIOD - 1)
+    for period in range(10, 20):
+        sent = frames(values(4, period), period * PERIOD)
+        times = [t_ns for _, _, t_ns in sent]
+        came = [
+            (*sent[i][:2], t_ns) for i, t_ns in zip((2, 0, 1, *range(3, 8)), times, strict=True)
+        ]
+        assert len(feed(assembler, came)) == 1
+    assert taken == [8] * 8
+
+
+def test_once_a_boards_order_is_known_its_frames_are_taken_as_a_whole(taken: list[int]) -> None:
+    """An order that changes for good is learnt again, after a while."""
     assembler = make()
 
     def run(periods: range, order: list[int]) -> list[int]:

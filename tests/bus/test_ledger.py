@@ -2,6 +2,7 @@
 
 from functools import cache
 from itertools import accumulate
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 
 from skin_host.bus.assembler import Sweep
 from skin_host.bus.ledger import LONGEST_PAUSE_NS, BoardLedger
-from skin_host.config.settings import load
+from skin_host.config.settings import Board, Bus, Part, Patch, Settings, load
 from skin_host.layout import BoardLayout, build_layout
 from tests.support.stack import ROOT
 
@@ -269,3 +270,30 @@ def test_a_period_is_regular_within_a_tenth(spread_ms: float, regular: bool) -> 
     known = after([10.0] * 3 + [low] * 2 + [50.0] * 5 + [high] * 2 + [300.0] * 3)
     found = known.regular_period_ns(HAND)
     assert found == (50 * MS if regular else None)
+
+
+@pytest.mark.parametrize(("silent_periods", "mtb3_periods"), [(4.0, 6.0), (8.0, 8.0)])
+def test_an_mtb3_may_pause_for_six_periods_and_another_board_as_long_as_is_set(
+    silent_periods: float, mtb3_periods: float
+) -> None:
+    """An MTB3 that zeroes itself sends nothing for four."""
+    skin = build_layout(
+        Settings(
+            robot="r",
+            buses={"can0": Bus()},
+            boards={
+                "old": Board(bus="can0", address=1, model="mtb3"),
+                "new": Board(bus="can0", address=2, model="mtb4"),
+            },
+            parts={
+                name: Part(patches=[Patch(board=name, triangles="0-1")]) for name in ("old", "new")
+            },
+        ),
+        Path(),
+    )
+    known = BoardLedger(list(enumerate(skin.boards)), silent_periods)
+    period_ns = skin.boards[0].settings.period_ms * MS
+    wanted = [mtb3_periods * period_ns, silent_periods * period_ns]
+    assert known.silent_after_ns.tolist() == wanted
+    known.expect_pauses(1)
+    assert known.silent_after_ns.tolist() == [wanted[0]] * 2

@@ -448,3 +448,137 @@ def test_noise_after_a_release_gives_nothing_back_that_was_taken_for_drift():
     for second in range(60):
         follow(track, 2.6 + (0.2 if second % 2 else -0.2))
         assert track.baseline == pytest.approx(np.full(N, 2.6), abs=0.5)
+
+
+#: Too few taxels are free of it to represent the part.
+MOST = np.arange(N) < 21
+
+
+def let_go(press=2.6, relaxed=0.0):
+    """A grip of ten minutes lets go, and what is left of it is taken for drift."""
+    track = tracker()
+    for _ in range(600):
+        follow(track, 0.0, MOST, press=35.0)
+    for _ in range(2):
+        hold(track, press, MOST, relaxed)
+    assert track.baseline[MOST] == pytest.approx(press)
+    return track
+
+
+def hold(track, press, touched=NOBODY, relaxed=0.0):
+    """One second in which the taxels of the grip read so much above the calibration."""
+    units = np.where(MOST, press, 0.0) - track.baseline
+    return track.step(units, touched, NOBODY, 1.0, np.where(MOST, relaxed, 0.0))
+
+
+def test_what_was_taken_for_drift_is_given_back_when_the_foam_pushes_back():
+    track = let_go()
+    for _ in range(10):
+        hold(track, 2.6)
+    for _ in range(2):
+        hold(track, 5.6, MOST)
+    assert track.baseline[MOST] == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize(("seconds", "given_back"), [(178, True), (179, False)])
+def test_what_was_taken_for_drift_may_be_given_back_for_three_minutes(seconds, given_back):
+    track = let_go()
+    for _ in range(seconds):
+        hold(track, 2.6)
+    hold(track, 12.6, MOST)
+    assert track.baseline[MOST] == pytest.approx(0.0 if given_back else 2.6)
+
+
+def test_a_reading_that_overshoots_at_the_release_does_not_make_the_next_ones_a_load():
+    track = let_go(press=1.4)
+    for _ in range(30):
+        hold(track, 2.6)
+        assert track.baseline[MOST].min() > 1.3
+
+
+@pytest.mark.parametrize(("rise", "given_back"), [(2.0, False), (4.0, True)])
+def test_a_rise_of_less_than_half_of_what_free_foam_would_lose_is_its_models_error(
+    rise, given_back
+):
+    track = let_go(relaxed=6.0)
+    for _ in range(10):
+        hold(track, 2.6, relaxed=6.0)
+    for second in range(60):
+        passed = min(second / 10.0, 1.0)
+        hold(track, 2.6 + rise * passed, relaxed=6.0 - 6.0 * passed)
+    assert bool(track.baseline[0] < 1.0) is given_back
+
+
+def test_a_baseline_that_fell_at_a_release_is_never_given_back_upwards():
+    track = let_go(press=-2.0)
+    for press in [-2.0] * 10 + [0.5] * 4:
+        hold(track, press)
+    assert track.baseline[MOST] == pytest.approx(-2.0, abs=0.05)
+
+
+@pytest.mark.parametrize(("left", "is_drift"), [(2.1, True), (2.4, False)])
+def test_a_quarter_of_the_relaxation_may_be_left_of_a_touch_that_let_go(left, is_drift):
+    track = tracker()
+    held = np.arange(N) < 6
+    for _ in range(600):
+        follow(track, 0.0, held, press=35.0)
+    units = np.where(held, left, 0.0)
+    found = [track.step(units, held, NOBODY, 1.0, np.where(held, 8.0, 0.0)) for _ in range(2)]
+    assert (found[1] is not None) is is_drift
+
+
+@pytest.mark.parametrize(("free_s", "after_s"), [(20, 12), (60, 30)])
+def test_a_touch_that_comes_back_soon_goes_on_from_what_has_not_faded(free_s, after_s):
+    """Of 1000 s, e to the power of -20 s / 5 s is 18 s; after a minute all is forgotten."""
+    track = tracker(frozen_report_s=30.0)
+    touched = np.arange(N) < 6
+    for _ in range(1000):
+        follow(track, 0.0, touched, 20.0)
+    for _ in range(free_s):
+        follow(track, 0.0)
+    found = []
+    for _ in range(31):
+        follow(track, 0.0, touched, 20.0)
+        found.append(bool(track.frozen[0]))
+    assert found.index(True) + 1 == after_s
+
+
+def test_after_a_shift_in_touch_a_new_touch_counts_from_its_beginning():
+    track = tracker(frozen_report_s=30.0)
+    touched = np.arange(N) < 6
+    for _ in range(8 * 360):
+        track.step(np.where(touched, 20.0, 0.0) - track.baseline, touched, NOBODY, 10.0)
+    for _ in range(60):
+        follow(track, 0.0)
+    for _ in range(29):
+        follow(track, 0.0, touched, 20.0)
+        assert not track.frozen.any()
+    follow(track, 0.0, touched, 20.0)
+    assert track.frozen[:6].all()
+
+
+@pytest.mark.parametrize("rule", ["paper", "proportional"])
+@pytest.mark.parametrize("dt_s", [0.1, 1.0, 3.0])
+def test_what_a_taxel_reads_alone_moves_its_baseline_at_the_rules_rate_at_most(rule, dt_s):
+    track = tracker(rule)
+    units = np.zeros(N)
+    units[5] = 2.0
+    track.step(units, NOBODY, NOBODY, dt_s)
+    assert track.baseline[5] == pytest.approx(0.1 * dt_s)
+
+
+def test_where_the_zero_of_a_temperature_pad_is_does_not_matter():
+    thermal = np.arange(N) % 12 >= 10
+
+    def followed(zero):
+        track = tracker(thermal=thermal)
+        warmth = 0.0
+        for second in range(900):
+            warmth += 0.02 if second < 300 or second >= 600 else -0.02
+            held = ~thermal if second >= 600 else NOBODY
+            units = 0.5 * warmth - track.baseline + np.where(held, 30.0, 0.0)
+            track.step(np.where(thermal, zero + warmth, units), held, NOBODY, 1.0)
+        return track.baseline[~thermal]
+
+    assert followed(50.0) == pytest.approx(followed(0.0), abs=0.01)
+    assert followed(0.0) == pytest.approx(3.0, abs=0.3)

@@ -1,9 +1,10 @@
 """Twenty faults planted into the daemon, and how many seeds `skin simulate` needs to find each.
 
-    python -m tests.evaluation.simulate.mutants [--seeds 200] [--seconds 30] [--only NAME ...]
+    python -m tests.evaluation.simulate.mutants [--seeds 200] [--results FILE] [--only NAME ...]
 
 Each mutant is a copy of `skin_host` with one line changed, run by itself. A seed finds it if a
-promise is broken that the daemon as it is keeps with that seed.
+promise is broken that the daemon as it is keeps with that seed. FILE is appended to, a line a run:
+the same command with the same sources continues there.
 """
 
 import argparse
@@ -13,16 +14,18 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator
+from hashlib import blake2b
 from pathlib import Path
 from typing import NamedTuple
 
 import aiomqtt  # noqa: F401  (loaded once, not by each run)
 import can  # noqa: F401
-import msgspec  # noqa: F401
+import msgspec
 import numpy as np  # noqa: F401
 
 ROOT = Path(__file__).parents[3]
 SMALL = Path(__file__).with_name("small.toml")
+PACKAGES = ("skin_host", "emulator", "config")
 
 
 class Mutant(NamedTuple):
@@ -125,10 +128,10 @@ MUTANTS = [
         "return masks",
     ),
     Mutant(
-        "a chip that does not answer is believed",
-        "processing/intake.py",
-        "here = here & (ledger.error[row] == 0) & ~lifted(raw, far)",
-        "here = here & ~lifted(raw, far)",
+        "errors of chips are not noted",
+        "bus/ledger.py",
+        "self.error[row] = status_error(sweep.status)",
+        "self.error[row] = 0",
     ),
     Mutant(
         "what did not come stays as it was",
@@ -171,12 +174,42 @@ MUTANTS = [
 
 def plant(mutant: Mutant, folder: Path) -> None:
     """Write a daemon with the fault to a folder."""
-    for package in ("skin_host", "emulator", "config"):
+    for package in PACKAGES:
         shutil.copytree(ROOT / package, folder / package)
     path = folder / "skin_host" / mutant.file
     source = path.read_text()
     assert source.count(mutant.line) == 1, f"{mutant.name}: not once in {mutant.file}"
     path.write_text(source.replace(mutant.line, mutant.planted))
+
+
+class Run(msgspec.Struct, frozen=True):
+    """What came of one seed.
+
+    Attributes:
+        tree: digest of the sources, without the planted fault.
+        mutant: its name; empty for the daemon as it is.
+        seed, seconds: of the run.
+        broken: the promise that was broken, or an empty text.
+        cpu_s: what it took, start and end included.
+    """
+
+    tree: str
+    mutant: str
+    seed: int
+    seconds: int
+    broken: str
+    cpu_s: float
+
+
+def tree_digest() -> str:
+    """Return a digest of what a run depends on."""
+    digest = blake2b(digest_size=8)
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*")):
+            if path.suffix in (".py", ".toml"):
+                digest.update(path.read_bytes())
+    digest.update(SMALL.read_bytes())
+    return digest.hexdigest()
 
 
 def outcome(folder: Path, seed: int, seconds: int) -> str:
@@ -212,49 +245,82 @@ def _simulate(folder: Path, seed: int, seconds: int) -> str:
         return f"{type(error).__name__}: {error}"
 
 
-def find(
-    mutants: Iterable[Mutant], seeds: Iterable[int], seconds: int
-) -> Iterator[tuple[Mutant, int, str]]:
-    """Yield each mutant that is found, with the first seed that finds it and what that broke.
+class Search:
+    """Runs seeds with planted faults, and keeps what came of them.
 
     Args:
         mutants: to be planted.
-        seeds: tried in this order, each with all that is left; one that breaks a promise of the
-            daemon as it is proves nothing and is passed over.
-        seconds: simulated time of each.
+        seconds: simulated time of each run.
+        results: file to append runs to, and to take those from that it has.
     """
-    with tempfile.TemporaryDirectory() as name:
-        left: dict[Mutant, Path] = {}
-        for number, mutant in enumerate(mutants):
-            left[mutant] = Path(name) / str(number)
-            plant(mutant, left[mutant])
-        for seed in seeds:
-            if not left:
-                return
-            plain = outcome(ROOT, seed, seconds)
-            if plain:
-                print(f"seed {seed} does not count: {plain}", flush=True)
-                continue
-            for mutant, folder in list(left.items()):
-                broken = outcome(folder, seed, seconds)
-                if broken:
+
+    def __init__(self, mutants: Iterable[Mutant], seconds: int, results: Path | None) -> None:
+        self._mutants = list(mutants)
+        self._seconds = seconds
+        self._results = results
+        self._tree = tree_digest()
+        self._runs: dict[tuple[str, int], Run] = {}
+        if results is not None and results.exists():
+            for line in results.read_bytes().splitlines():
+                run = msgspec.json.decode(line, type=Run)
+                if (run.tree, run.seconds) == (self._tree, seconds):
+                    self._runs[run.mutant, run.seed] = run
+
+    def find(self, seeds: Iterable[int]) -> Iterator[tuple[Mutant, Run, float]]:
+        """Yield each mutant that is found, the run that finds it, and the CPU time of all its runs.
+
+        Args:
+            seeds: tried in this order, each with all that is left; one that breaks a promise of
+                the daemon as it is proves nothing and is passed over.
+        """
+        spent_s = dict.fromkeys(self._mutants, 0.0)
+        with tempfile.TemporaryDirectory() as name:
+            left = {mutant: Path(name) / str(i) for i, mutant in enumerate(self._mutants)}
+            for mutant, folder in left.items():
+                plant(mutant, folder)
+            for seed in seeds:
+                for mutant, folder in list(left.items()):
+                    run = self._run(mutant.name, folder, seed)
+                    spent_s[mutant] += run.cpu_s
+                    if not run.broken:
+                        continue
+                    plain = self._run("", ROOT, seed)
+                    if plain.broken:
+                        print(f"seed {seed} does not count: {plain.broken}", flush=True)
+                        break
                     del left[mutant]
-                    yield mutant, seed, broken
+                    yield mutant, run, spent_s[mutant]
+
+    def _run(self, name: str, folder: Path, seed: int) -> Run:
+        if (name, seed) not in self._runs:
+            before = os.times()
+            broken = outcome(folder, seed, self._seconds)
+            after = os.times()
+            cpu_s = after.children_user + after.children_system
+            cpu_s -= before.children_user + before.children_system
+            run = Run(self._tree, name, seed, self._seconds, broken, round(cpu_s, 2))
+            self._runs[name, seed] = run
+            if self._results is not None:
+                with self._results.open("ab") as file:
+                    file.write(msgspec.json.encode(run) + b"\n")
+        return self._runs[name, seed]
 
 
 def main() -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("--seeds", type=int, default=200)
     parser.add_argument("--first", type=int, default=1)
-    parser.add_argument("--seconds", type=int, default=30)
+    parser.add_argument("--seconds", type=int, default=29)
+    parser.add_argument("--results", type=Path)
     parser.add_argument("--only", nargs="*", default=[])
     arguments = parser.parse_args()
     chosen = [m for m in MUTANTS if not arguments.only or any(w in m.name for w in arguments.only)]
     seeds = range(arguments.first, arguments.first + arguments.seeds)
     found = 0
-    for mutant, seed, broken in find(chosen, seeds, arguments.seconds):
+    search = Search(chosen, arguments.seconds, arguments.results)
+    for mutant, run, cpu_s in search.find(seeds):
         found += 1
-        print(f"| {mutant.name} | {seed} | {broken[:110]} |", flush=True)
+        print(f"| {mutant.name} | {run.seed} | {run.broken[:110]} | {cpu_s:.0f} s |", flush=True)
     print(f"{found} of {len(chosen)} found within {len(seeds)} seeds")
     return 0
 
