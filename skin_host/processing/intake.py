@@ -362,6 +362,13 @@ class Intake:
             np.array(periods_s),
             Repeats(encodings),
             len(self._boards),
+            np.array(
+                [
+                    number in self._layout.boards[board].triangles
+                    for board in self._boards
+                    for number in range(TRIANGLES)
+                ]
+            ),
         )
 
     def _new_state(self, index: int, silent_periods: float) -> _PartState:

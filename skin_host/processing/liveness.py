@@ -104,6 +104,7 @@ class Liveness:
         period_s: how often each board sends, [boards] or the same for all.
         repeats: finds which pads send something new; without it, those whose byte changes.
         boards: how many boards.
+        fitted: bool[k], triangles that there are, all by default; nothing of others is received.
 
     Attributes:
         frozen: bool[k], triangles that repeat their bytes for longer than chance explains.
@@ -123,6 +124,7 @@ class Liveness:
         period_s: float | Floats,
         repeats: Repeats | None = None,
         boards: int = 1,
+        fitted: Mask | None = None,
     ) -> None:
         shape = (k, PADS)
         self._boards = boards
@@ -137,34 +139,53 @@ class Liveness:
         self._memory: Floats = RATE_MEMORY_S / conversion_s
         self._seen: Floats = CALIBRATED_S / conversion_s
         self._repeats = repeats
-        self._pads = StuckPads(noise_units, self._share, period_s, repeats, boards)
+        self._pads = StuckPads(noise_units, self._share, period_s, repeats, boards, fitted)
+        fitted = np.ones(k, np.bool_) if fitted is None else fitted
+        self._fitted = fitted.tobytes()
+        self._rows = None if all_of(fitted) else np.flatnonzero(fitted)
         self._rate: Floats = np.minimum(change_rate(noise_units), MOST_RATE)
         self._triangle_rate: Floats = 1.0 - np.prod(1.0 - self._rate, axis=1)
-        constant = ~np.any(noise_units > 0.0, axis=1)
+        constant = ~np.any(noise_units > 0.0, axis=1) & fitted
         # Without a calibration, or if a triangle was absent from it or constant, it is not known
         # how much noise is too much.
         known = np.repeat(~constant[:, None], PADS, axis=1) & calibrated
         self._jump = np.where(known, np.maximum(NOISY_UNITS, NOISY_SIGMAS * noise_units), np.inf)
-        #: Steps are whole units.
-        self._jump_units = np.minimum(np.floor(self._jump), 256.0).astype(np.int16)
+        #: Steps are whole units, at most 255.
+        self._jump_units = np.minimum(np.floor(self._jump), 255.0).astype(np.uint8)
         self._spike = np.maximum(SPIKE_UNITS, SPIKE_SIGMAS * noise_units)
 
         self._raw = np.zeros(shape, np.uint8)
         self._present = np.zeros(k, np.bool_)
+        self._all_present = False
+        #: The step to the last bytes; if nothing needed it yet, the bytes before them.
         self._step = np.zeros(shape, np.int16)
+        self._earlier = np.zeros(shape, np.uint8)
+        self._owes_step = False
         self._jumping = np.zeros(shape)
         self._any_jumping = False
         self._felt: TouchedPads | None = None
         self._surprise = np.zeros(k)
-        self._changes = np.zeros(shape, np.int16)
-        self._alive = np.zeros(k, np.int64)
-        self._samples = np.zeros(k, np.int64)
+        self._any_surprise = False
+        # Counts up to `RATE_SAMPLES`.
+        self._changes = np.zeros(shape, np.int8)
+        self._alive = np.zeros(k, np.int8)
+        self._samples = np.zeros(k, np.int8)
+        #: No triangle has enough samples before so many more steps.
+        self._until_learning = RATE_SAMPLES
+        # Work arrays. A triangle has changed if any of its three words has.
+        self._changed = np.zeros(shape, np.bool_)
+        self._words = list(self._changed.view(np.uint32).T)
+        self._any_word = np.zeros(k, np.uint32)
+        self._now_alive = np.zeros(k, np.bool_)
+        self._size, self._least = (np.zeros(shape, np.uint8) for _ in range(2))
+        self._far = np.zeros(shape, np.bool_)
         self._to_show = np.where(constant, PROBATION_CHANGES, 0)
         self.frozen: Mask = np.zeros(k, np.bool_)
-        self.unproven: Mask = constant
+        self.unproven: Mask = constant.copy()
         self._any_to_show = any_of(constant)
         self.silenced: Mask = np.zeros(k, np.bool_)
         self.noisy: Mask = np.zeros(shape, np.bool_)
+        self._any_noisy = False
         self.doubted: Mask | None = None
         self.spikes = np.zeros(boards, np.int64)
         self._pad_expected = np.zeros(shape)
@@ -195,39 +216,49 @@ class Liveness:
             came: bool[boards], boards whose sweep this is, all by default. Nothing of the others is
                 present.
         """
-        compared = present & self._present
         #: Usually every triangle came, now and before.
-        whole = b"\0" not in compared.tobytes()
-        changed = raw != self._raw
+        all_present = present.tobytes() == self._fitted
+        whole = all_present and self._all_present
+        compared = present if whole else present & self._present
+        changed = np.not_equal(raw, self._raw, out=self._changed)
         if not whole:
             changed &= compared[:, None]
+        text = (raw if self._rows is None else raw.take(self._rows, 0)).tobytes()
+        all_inside = b"\0" not in text and b"\xff" not in text
         self._note_jumps(raw, changed, compared, whole)
         felt = None if touched is None else self._what_is_felt(touched)
-        self._note_triangles(raw, changed, compared, erring, felt)
-        within = inside(raw)
-        if not whole:
+        self._note_triangles(raw, compared, erring, felt, whole, all_inside)
+        within: Mask | None = None
+        if not (whole and all_inside):
+            within = inside(raw)
             within &= compared[:, None]
         self._pads.step(raw, changed, within, self.unproven, felt, came)
         if whole:
+            self._raw, self._earlier = self._earlier, self._raw
             self._raw[:] = raw
         else:
             np.copyto(self._raw, raw, where=present[:, None])
         if came is None:
             self._present[:] = present
+            self._all_present = all_present
         else:
             np.copyto(self._present, present, where=np.repeat(came, len(present) // len(came)))
-        if felt is None:
-            self._samples += compared
-            self._changes += changed
-        else:
-            self._samples += compared & felt.calm
-            self._changes += changed & felt.calm_pads
-        if int(np.maximum.reduce(self._samples)) >= RATE_SAMPLES:
-            self._learn()
+            self._all_present = self._present.tobytes() == self._fitted
+        samples, changes = compared.view(np.int8), changed.view(np.int8)
+        if felt is not None:
+            samples, changes = samples * felt.calm, changes * felt.calm_pads
+        self._samples += samples
+        self._changes += changes
+        self._until_learning -= 1
+        if self._until_learning <= 0:
+            if int(np.maximum.reduce(self._samples)) >= RATE_SAMPLES:
+                self._learn()
+            self._until_learning = RATE_SAMPLES - int(np.maximum.reduce(self._samples))
         self._doubt()
 
     def note_gap(self, board: int) -> None:
         """Sweeps of a board (its row) were lost: the next step does not follow the last one."""
+        self._settle()
         triangles = len(self._step) // self._boards
         self._step[triangles * board : triangles * (board + 1)] = 0
 
@@ -235,18 +266,33 @@ class Liveness:
         """Take over the state of a predecessor for the same skin, for some boards
         (bool[boards]).
         """
+        self._settle()
+        before._settle()
         self.spikes = before.spikes
         rows = np.repeat(boards, len(self.frozen) // len(boards))
         for mine, its in ((self, before), (self._pads, before._pads)):
             for name, array in vars(mine).items():
-                if isinstance(array, np.ndarray) and name not in {"spikes", "doubted"}:
+                if not isinstance(array, np.ndarray) or name in {"spikes", "doubted"}:
+                    continue
+                if len(array) in {len(boards), len(rows)}:
                     chosen = boards if len(array) == len(boards) else rows
                     array[chosen] = getattr(its, name)[chosen]
         self._repeats.keep(before._repeats, rows)
         self._any_jumping = any_of(self._jumping > 0.0)
+        self._any_noisy = any_of(self.noisy)
         self._any_to_show = any_of(self.unproven)
+        self._any_surprise = True
+        self._all_present = self._present.tobytes() == self._fitted
+        self._until_learning = 0
         self._pads.any_stuck = any_of(self._pads.stuck)
         self._doubt()
+
+    def _settle(self) -> None:
+        """Compute what was left until somebody needs it."""
+        self._pads.settle()
+        if self._owes_step:
+            self._owes_step = False
+            np.subtract(self._raw, self._earlier, out=self._step, dtype=np.int16)
 
     def _what_is_felt(self, touched: Mask) -> TouchedPads:
         """Return the consequences of which pads are touched; mostly those of the last sweep."""
@@ -256,26 +302,35 @@ class Liveness:
         return self._felt
 
     def _doubt(self) -> None:
-        doubts = self._any_to_show or self._pads.any_stuck or any_of(self.noisy)
+        doubts = self._any_to_show or self._pads.any_stuck or self._any_noisy
         self.doubted = self.unproven[:, None] | self.stuck | self.noisy if doubts else None
 
     def _note_triangles(
         self,
         raw: NDArray[np.uint8],
-        changed: Mask,
         compared: Mask,
         erring: Mask,
         felt: TouchedPads | None,
+        whole: bool,
+        all_inside: bool,
     ) -> None:
-        alive = np.logical_or.reduce(changed, axis=1)
-        self._alive += alive if felt is None else alive & felt.calm
+        one, another, third = self._words
+        np.bitwise_or(one, another, out=self._any_word)
+        np.bitwise_or(self._any_word, third, out=self._any_word)
+        alive = np.not_equal(self._any_word, 0, out=self._now_alive)
+        self._alive += (alive if felt is None else alive & felt.calm).view(np.int8)
         all_alive = alive.tobytes() == compared.tobytes()
         if all_alive and not self._any_to_show and not any_of(erring):
-            self._surprise[compared] = 0.0
+            if whole and self._any_surprise:
+                self._surprise.fill(0.0)
+                self._any_surprise = False
+            elif not whole:
+                self._surprise[compared] = 0.0
             return
+        self._any_surprise = True
         expected = self._expected
-        movable = inside(raw)
-        if not all_of(movable):
+        if not all_inside:
+            movable = inside(raw)
             # A pad at an end of the scale cannot change, even if it works.
             most = (self._pad_expected * movable).sum(axis=1)
             expected = np.where(movable.any(axis=1), np.minimum(expected, most), 0.0)
@@ -296,30 +351,34 @@ class Liveness:
         self, raw: NDArray[np.uint8], changed: Mask, compared: Mask, whole: bool
     ) -> None:
         """A step up followed by a step down is noise; a touch goes in one direction at a time."""
+        size = np.maximum(raw, self._raw, out=self._size)
+        size -= np.minimum(raw, self._raw, out=self._least)
+        far = np.greater(size, self._jump_units, out=self._far)
+        if not whole:
+            far &= changed
+        if whole and not self._any_jumping and not any_of(far):
+            self._owes_step = True
+            return
+        if self._owes_step:
+            self._settle()
         step = np.subtract(raw, self._raw, dtype=np.int16)
         if not whole:
             step *= changed
-        far = np.abs(step) > self._jump_units
-        if not self._any_jumping and not any_of(far):
-            if whole:
-                self._step = step
-            else:
-                np.copyto(self._step, step, where=compared[:, None])
-            return
         jump = far & (np.abs(self._step) > self._jump_units) & ((step ^ self._step) < 0)
         if not self._any_jumping and not any_of(jump):
             np.copyto(self._step, step, where=compared[:, None])
             return
-        size = np.minimum(np.abs(step), np.abs(self._step))
-        spike = jump & (size > self._spike) & (np.abs(step + self._step) <= self._jump_units)
+        both = np.minimum(np.abs(step), np.abs(self._step))
+        spike = jump & (both > self._spike) & (np.abs(step + self._step) <= self._jump_units)
         alone = np.count_nonzero(spike & (self._jumping < LATELY_MEAN), axis=1) == 1
         self.spikes += np.count_nonzero(alone.reshape(self._boards, -1), axis=1)
         np.copyto(self._step, step, where=compared[:, None])
-        jumped = jump * np.minimum(size / self._jump, MOST_JUMP)
+        jumped = jump * np.minimum(both / self._jump, MOST_JUMP)
         self._jumping += compared[:, None] * (jumped - self._jumping) / NOISE_MEMORY_SAMPLES
         self._jumping[self._jumping < 1e-3] = 0.0
         self._any_jumping = any_of(self._jumping > 0.0)
         self.noisy = self._jumping > np.where(self.noisy, CALM_MEAN, NOISY_MEAN)
+        self._any_noisy = any_of(self.noisy)
 
     def _learn(self) -> None:
         """Update the rates of boards with enough samples, for triangles that live."""
@@ -327,7 +386,7 @@ class Liveness:
         rows: Rows = slice(None)
         if not enough.all():
             rows = np.flatnonzero(np.repeat(enough, len(self._samples) // self._boards))
-        samples, rate = self._samples[rows], self._rate[rows]
+        samples, rate = self._samples[rows].astype(np.int64), self._rate[rows]
         seen = np.maximum(samples, 1)
         weight = self._weight[rows] * (~self.unproven[rows] & (samples >= RATE_SAMPLES // 2))
         self._triangle_rate[rows] += weight * (self._alive[rows] / seen - self._triangle_rate[rows])

@@ -20,7 +20,7 @@ commonest byte, 0.4 to 0.9 at the noise of a hand's pads (0.4 to 0.8 units), and
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,7 +63,8 @@ class Repeats:
         self._gain = np.array([one.gain for one in encodings]) / 128
         # Coarser bytes hide the effect of the compensation on them.
         plain = [one.shift > MOST_SHIFT or not any(one.gain) for one in encodings]
-        self._plain = np.flatnonzero(plain)
+        self._plain = _span(np.flatnonzero(plain))
+        self._any_plain = any(plain)
         self._compensated = not all(plain)
         if not self._compensated:
             return
@@ -73,21 +74,31 @@ class Repeats:
         ]
         kinds = sorted(set(encodings))
         tables = [_words(*kind) for kind in kinds]
-        self._lowest = np.concatenate([lowest for lowest, _ in tables])
-        self._pattern = np.concatenate([pattern for _, pattern in tables])
+        lowest = np.concatenate([lowest for lowest, _ in tables])
+        pattern = np.concatenate([pattern for _, pattern in tables])
+        # Half as long where that is enough, for half of the memory's traffic.
+        short = int(pattern.max()) <= np.iinfo(np.uint32).max
+        of_words: type[np.signedinteger[Any]] = np.int32 if short else np.int64
+        self._of_bits: type[np.unsignedinteger[Any]] = np.uint32 if short else np.uint64
+        self._lowest, self._pattern = lowest.astype(of_words), pattern.astype(self._of_bits)
         # At an end of its scale the temperature pad does not show what was subtracted.
         scale = np.arange(256)
         self._tells = np.tile((scale > 0) & (scale < 255), len(kinds))
         self._kind = np.array([256 * kinds.index(one) for one in encodings])
         shape = self._gain.shape
-        cells = np.array([1 << one.shift for one in encodings], np.int64)
+        cells = np.array([1 << one.shift for one in encodings], of_words)
         self._cells = np.repeat(cells, shape[1]).reshape(shape)
-        self._base = np.zeros(shape, np.int64)
-        self._possible = np.zeros(shape, np.uint64)
+        #: Which words explain a run of bytes: the lowest that the last byte may stand for, and bit
+        #: i: that plus i does.
+        self._base = np.zeros(shape, of_words)
+        self._possible = np.zeros(shape, self._of_bits)
         # Work arrays. In a step of two thousand pads, arrays of one shape that are written in place
         # cost a third of masks and broadcasts.
-        self._lowered, self._up, self._left = (np.empty(shape, np.int64) for _ in range(3))
-        self._words, self._shifted = (np.empty(shape, np.uint64) for _ in range(2))
+        self._zeros = np.zeros(shape, of_words)
+        self._none = np.zeros(shape, self._of_bits)
+        self._lowered, self._up, self._left = (np.empty(shape, of_words) for _ in range(3))
+        self._words = np.empty(shape, self._of_bits)
+        self._moved = np.empty(shape, np.bool_)
 
     @property
     def shifted(self) -> Mask:
@@ -95,7 +106,8 @@ class Repeats:
         12].
         """
         shifted = self._gain > 0.0
-        shifted[self._plain] = False
+        if self._any_plain:
+            shifted[self._plain] = False
         return shifted
 
     def keep(self, before: "Repeats", rows: Mask) -> None:
@@ -115,50 +127,65 @@ class Repeats:
         own: Floats = np.sqrt(np.maximum(noise_units**2 - taken**2, noise_units**2 / 4))
         return own
 
-    def step(self, raw: NDArray[np.uint8], changed: Mask, within: Mask) -> tuple[Mask, Mask]:
+    def step(
+        self, raw: NDArray[np.uint8], changed: Mask, within: Mask | None
+    ) -> tuple[Mask, Mask | None]:
         """Take one sweep.
 
         Args:
             raw: uint8[k, 12].
             changed: bool[k, 12], bytes that differ from those before.
-            within: bool[k, 12], bytes that were, now and before, within their scale.
+            within: bool[k, 12], bytes that were, now and before, within their scale; None if all.
 
         Returns:
-            moved: bool[k, 12], no word explains this byte and all those since the last move.
-            decidable: bool[k, 12], whether the byte could show a move.
+            moved: bool[k, 12], no word explains this byte and all those since the last move; the
+                array is reused.
+            decidable: bool[k, 12], whether the byte could show a move; None if all could.
         """
         if not self._compensated:
             return changed, within
         row = self._kind + raw[:, THERMAL_TAXEL]
-        tells = self._tells.take(row)
-        told = within if all_of(tells) else within & tells[:, None]
-        base, up, left = self._lowered, self._up, self._left
-        words, shifted, possible = self._words, self._shifted, self._possible
-        self._lowest.take(row, 0, base, "clip")
+        told = within
+        if within is not None:
+            tells = self._tells.take(row)
+            told = within if all_of(tells) else within & tells[:, None]
+        lowest, up, left = self._lowered, self._up, self._left
+        words, possible = self._words, self._possible
+        self._lowest.take(row, 0, lowest, "clip")
         self._pattern.take(row, 0, words, "clip")
         np.copyto(up, raw)
         np.multiply(up, self._cells, out=up)
-        np.subtract(base, up, out=base)
-        np.subtract(base, self._base, out=up)
-        # Words are moved up or down by so many bits; numpy moves all of them out by 64 and more.
-        np.maximum(up, 0, out=left)
-        np.left_shift(words, left.view(np.uint64), out=shifted)
+        np.subtract(lowest, up, out=lowest)
+        if told is not None:
+            untold = ~told
+            np.putmask(lowest, untold, self._base)
+            np.putmask(words, untold, np.iinfo(self._of_bits).max)
+        # Bits are moved down or up by the way of the lowest word; numpy moves all of them out by as
+        # many as there are and more.
+        np.subtract(self._base, lowest, out=up)
+        np.maximum(up, self._zeros, out=left)
+        np.left_shift(possible, left.view(self._of_bits), out=possible)
         np.subtract(left, up, out=left)
-        np.right_shift(shifted, left.view(np.uint64), out=shifted)
-        all_told = all_of(told)
-        if not all_told:
-            np.putmask(shifted, ~told, _ALL_WORDS)
-        np.bitwise_and(possible, shifted, out=possible)
-        moved: Mask = np.equal(possible, 0)
-        if not all_told:
+        np.right_shift(possible, left.view(self._of_bits), out=possible)
+        np.bitwise_and(possible, words, out=possible)
+        moved = np.equal(possible, self._none, out=self._moved)
+        if told is not None:
             moved &= told
-        np.putmask(self._base, moved, base)
         np.putmask(possible, moved, words)
-        if len(self._plain):
-            told = told.copy()
+        self._base, self._lowered = lowest, self._base
+        if self._any_plain:
             moved[self._plain] = changed[self._plain]
-            told[self._plain] = within[self._plain]
+            if told is not None and within is not None:
+                told = told.copy()
+                told[self._plain] = within[self._plain]
         return moved, told
+
+
+def _span(rows: NDArray[np.intp]) -> "Rows":
+    """Return rising numbers of rows, as a slice where they are successive."""
+    if len(rows) and rows[-1] - rows[0] == len(rows) - 1:
+        return slice(int(rows[0]), int(rows[-1]) + 1)
+    return rows
 
 
 def _words(
@@ -246,6 +273,7 @@ class StuckPads:
         period_s: float64[k], how often the board of each triangle sends.
         repeats: finds which pads send something new.
         boards: how many boards.
+        fitted: bool[k], triangles that there are, all by default.
 
     Attributes:
         stuck: bool[k, 12].
@@ -254,25 +282,46 @@ class StuckPads:
     """
 
     def __init__(
-        self, noise_units: Floats, share: Floats, period_s: Floats, repeats: Repeats, boards: int
+        self,
+        noise_units: Floats,
+        share: Floats,
+        period_s: Floats,
+        repeats: Repeats,
+        boards: int,
+        fitted: Mask | None = None,
     ) -> None:
         shape = noise_units.shape
         share, period_s = share[:, None], period_s[:, None]
         self._repeats = repeats
         self._boards = boards
-        self._begun = np.broadcast_to(np.ceil(BEGUN / share), shape).copy()
-        self._before = self._begun - 1
+        self._unfitted = None if fitted is None or all_of(fitted) else np.flatnonzero(~fitted)
+        begun = np.ceil(BEGUN / share)
+        self._begun: Floats = begun.ravel()[:1] if (begun == begun[0]).all() else begun
+        if len(self._begun) > 1:
+            self._begun = np.broadcast_to(begun, shape).copy()
         self._forget = STEP_SAMPLES * period_s / MEMORY_S
         resting = share * rate_in_run(repeats.own_noise(noise_units))
         most = np.where(repeats.shifted, MOST_RATE, RESTING_MARGIN * resting)
         self._most = np.minimum(most, MOST_RATE)
         self._seen = np.full(shape, float(CALIBRATED_SAMPLES))
         self._moved = resting * CALIBRATED_SAMPLES
+        #: A run has `_passed` repeats more than here.
         self._run = np.zeros(shape)
+        self._passed = 0
+        #: Whether some runs may have fractions of repeats.
+        self._fractions = False
+        #: No run is too long before so many more steps.
+        self._slack = 0
         self._to_show = np.zeros(shape, np.int64)
         self._new_seen = np.zeros(shape)
-        self._new_moved = np.zeros(shape, np.int16)
+        self._new_moved = np.zeros(shape, np.int8)
+        #: Samples of each board, less those of all boards.
         self._samples = np.zeros(boards, np.int64)
+        self._common_samples = 0
+        #: No board has enough samples before so many more steps.
+        self._until_learning = STEP_SAMPLES
+        self._ended = np.zeros(shape, np.bool_)
+        self._gained = np.zeros(shape)
         self.stuck: Mask = np.zeros(shape, np.bool_)
         self.any_stuck = False
         self.longest = np.zeros(shape)
@@ -282,7 +331,7 @@ class StuckPads:
         self,
         raw: NDArray[np.uint8],
         changed: Mask,
-        within: Mask,
+        within: Mask | None,
         unproven: Mask,
         felt: TouchedPads | None = None,
         came: Mask | None = None,
@@ -292,7 +341,8 @@ class StuckPads:
         Args:
             raw: uint8[k, 12].
             changed: bool[k, 12], bytes that differ from those before.
-            within: bool[k, 12], bytes of triangles that were received now and before, see `inside`.
+            within: bool[k, 12], bytes of triangles that were received now and before, see `inside`;
+                None if all were.
             unproven: bool[k], triangles that are not valid as a whole.
             felt: which pads are touched, if any is.
             came: bool[boards], boards whose sweep this is, all by default.
@@ -300,27 +350,48 @@ class StuckPads:
         moved, told = self._repeats.step(raw, changed, within)
         run = self._run
         # A run counts when it ends: a run without an end may not be chance.
-        ended = run >= self._begun
+        begun = self._begun - self._passed
+        ended = np.greater_equal(run, begun, out=self._ended)
         ended &= moved
         if felt is not None:
             ended &= felt.calm_pads
         if any_of(ended):
-            gained = run - self._before
+            begun -= 1.0
+            gained = np.subtract(run, begun, out=self._gained)
             gained *= ended
             self._new_seen += gained
-            self._new_moved += ended
+            self._new_moved += ended.view(np.int8)
         if felt is not None:
-            run += told * felt.weight
-        elif all_of(told):
-            run += 1.0
+            self._catch_up()
+            run += felt.weight if told is None else told * felt.weight
+            self._fractions = True
         else:
-            run += told.astype(np.float64)
-        np.putmask(run, moved, 0.0)
-        self._samples += 1 if came is None else came
-        if int(np.maximum.reduce(self._samples)) >= STEP_SAMPLES:
-            self._learn(unproven)
+            self._passed += 1
+            if told is not None:
+                np.subtract(run, ~told, out=run)
+            if self._fractions:
+                # Sums of fractions are rounded as if all had been added one by one.
+                self._catch_up()
+                self._fractions = False
+        np.putmask(run, moved, -self._passed)
+        if came is None:
+            self._common_samples += 1
+        else:
+            self._samples += came
+        self._until_learning -= 1
+        if self._until_learning <= 0:
+            self.settle()
+            if int(np.maximum.reduce(self._samples)) >= STEP_SAMPLES:
+                self._learn(unproven)
+            self._until_learning = STEP_SAMPLES - int(np.maximum.reduce(self._samples))
+        self._slack -= 1
+        if self._slack >= 0 and not self.any_stuck:
+            return
+        self._catch_up()
         too_long = run > self.longest
         if not self.any_stuck and not any_of(too_long):
+            # Each step lengthens a run by one at most.
+            self._slack = int(min(float(np.min(self.longest - run)), LONGEST_RUN))
             return
         run[unproven] = 0.0
         too_long &= run > 0.0
@@ -328,6 +399,25 @@ class StuckPads:
         self._to_show[too_long] = PROBATION_MOVES
         self.stuck = self._to_show > 0
         self.any_stuck = any_of(self.stuck)
+
+    @property
+    def run(self) -> Floats:
+        """Return how often each pad has repeated its byte in a row, float64[k, 12]."""
+        return self._run + self._passed
+
+    def settle(self) -> None:
+        """Bring the arrays of state up to date."""
+        self._catch_up()
+        if self._common_samples:
+            self._samples += self._common_samples
+            self._common_samples = 0
+        self._until_learning = 0
+        self._slack = 0
+
+    def _catch_up(self) -> None:
+        if self._passed:
+            self._run += self._passed
+            self._passed = 0
 
     def _learn(self, unproven: Mask) -> None:
         """Update the rates of boards with enough samples, for pads that work."""
@@ -347,7 +437,10 @@ class StuckPads:
     def _renew_limits(self, rows: Rows) -> None:
         seen = self._seen[rows]
         rate = np.minimum(self._moved[rows] / np.maximum(seen, 1.0), self._most[rows])
-        self.longest[rows] = self._begun[rows] + longest_run(rate, seen, ODDS)
+        begun = self._begun if len(self._begun) == 1 else self._begun[rows]
+        self.longest[rows] = begun + longest_run(rate, seen, ODDS)
+        if self._unfitted is not None:
+            self.longest[self._unfitted] = np.inf
 
 
 def rate_in_run(noise_units: Floats) -> Floats:
