@@ -171,7 +171,10 @@ class Repeats:
         moved = np.equal(possible, self._none, out=self._moved)
         if told is not None:
             moved &= told
-        np.putmask(possible, moved, words)
+        # No branch that guesses wrong at every other pad, as in a copy with a mask: where it moved,
+        # no bit is left.
+        np.multiply(words, moved, out=words)
+        np.bitwise_or(possible, words, out=possible)
         self._base, self._lowered = lowest, self._base
         if self._any_plain:
             moved[self._plain] = changed[self._plain]
@@ -231,6 +234,8 @@ TOUCHED_PACE = 6
 PROBATION_MOVES = 3
 LONGEST_RUN = 1e6
 NEWTON_STEPS = 8
+#: A step that is shorter ends them.
+CLOSE_SAMPLES = 1e-6
 
 
 class TouchedPads(NamedTuple):
@@ -299,17 +304,14 @@ class StuckPads:
         self._begun: Floats = begun.ravel()[:1] if (begun == begun[0]).all() else begun
         if len(self._begun) > 1:
             self._begun = np.broadcast_to(begun, shape).copy()
+        self._before = self._begun - 1.0
         self._forget = STEP_SAMPLES * period_s / MEMORY_S
         resting = share * rate_in_run(repeats.own_noise(noise_units))
         most = np.where(repeats.shifted, MOST_RATE, RESTING_MARGIN * resting)
         self._most = np.minimum(most, MOST_RATE)
         self._seen = np.full(shape, float(CALIBRATED_SAMPLES))
         self._moved = resting * CALIBRATED_SAMPLES
-        #: A run has `_passed` repeats more than here.
         self._run = np.zeros(shape)
-        self._passed = 0
-        #: Whether some runs may have fractions of repeats.
-        self._fractions = False
         #: No run is too long before so many more steps.
         self._slack = 0
         self._to_show = np.zeros(shape, np.int64)
@@ -320,7 +322,7 @@ class StuckPads:
         self._common_samples = 0
         #: No board has enough samples before so many more steps.
         self._until_learning = STEP_SAMPLES
-        self._ended = np.zeros(shape, np.bool_)
+        self._ended, self._stays = (np.zeros(shape, np.bool_) for _ in range(2))
         self._gained = np.zeros(shape)
         self.stuck: Mask = np.zeros(shape, np.bool_)
         self.any_stuck = False
@@ -350,30 +352,22 @@ class StuckPads:
         moved, told = self._repeats.step(raw, changed, within)
         run = self._run
         # A run counts when it ends: a run without an end may not be chance.
-        begun = self._begun - self._passed
-        ended = np.greater_equal(run, begun, out=self._ended)
+        ended = np.greater_equal(run, self._begun, out=self._ended)
         ended &= moved
         if felt is not None:
             ended &= felt.calm_pads
         if any_of(ended):
-            begun -= 1.0
-            gained = np.subtract(run, begun, out=self._gained)
+            gained = np.subtract(run, self._before, out=self._gained)
             gained *= ended
             self._new_seen += gained
             self._new_moved += ended.view(np.int8)
         if felt is not None:
-            self._catch_up()
             run += felt.weight if told is None else told * felt.weight
-            self._fractions = True
+        elif told is None:
+            run += 1.0
         else:
-            self._passed += 1
-            if told is not None:
-                np.subtract(run, ~told, out=run)
-            if self._fractions:
-                # Sums of fractions are rounded as if all had been added one by one.
-                self._catch_up()
-                self._fractions = False
-        np.putmask(run, moved, -self._passed)
+            run += told
+        run *= np.logical_not(moved, out=self._stays)
         if came is None:
             self._common_samples += 1
         else:
@@ -387,7 +381,6 @@ class StuckPads:
         self._slack -= 1
         if self._slack >= 0 and not self.any_stuck:
             return
-        self._catch_up()
         too_long = run > self.longest
         if not self.any_stuck and not any_of(too_long):
             # Each step lengthens a run by one at most.
@@ -400,24 +393,13 @@ class StuckPads:
         self.stuck = self._to_show > 0
         self.any_stuck = any_of(self.stuck)
 
-    @property
-    def run(self) -> Floats:
-        """Return how often each pad has repeated its byte in a row, float64[k, 12]."""
-        return self._run + self._passed
-
     def settle(self) -> None:
         """Bring the arrays of state up to date."""
-        self._catch_up()
         if self._common_samples:
             self._samples += self._common_samples
             self._common_samples = 0
         self._until_learning = 0
         self._slack = 0
-
-    def _catch_up(self) -> None:
-        if self._passed:
-            self._run += self._passed
-            self._passed = 0
 
     def _learn(self, unproven: Mask) -> None:
         """Update the rates of boards with enough samples, for pads that work."""
@@ -471,12 +453,17 @@ def longest_run(rate: Floats, samples: Floats | float, odds: float) -> Floats:
     still = np.maximum((1.0 - rate) * samples, 0.5)
     n = np.maximum(samples, still)
     wanted = math.log(odds)
+    first = np.log(n / still)
     run = np.zeros_like(still)
     for _ in range(NEWTON_STEPS):
-        slope = np.log((n + run) / (still + run))
-        told = n * np.log1p(run / n) - still * np.log1p(run / still) + run * slope
-        run += (wanted - told) / np.maximum(slope, wanted / LONGEST_RUN)
+        of_all, of_still = np.log1p(run / n), np.log1p(run / still)
+        slope = first + of_all - of_still
+        told = n * of_all - still * of_still + run * slope
+        step = (wanted - told) / np.maximum(slope, wanted / LONGEST_RUN)
+        run += step
         np.minimum(run, LONGEST_RUN, out=run)
+        if float(np.max(step)) < CLOSE_SAMPLES:
+            break
     return run
 
 

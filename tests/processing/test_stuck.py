@@ -58,7 +58,7 @@ def test_false_accusations_are_as_rare_as_the_odds_say(
     watched = Watched(to_bytes(centre + sigma * rng.standard_normal((100, *SHAPE))))
     began = 0
     for _ in range(6000):
-        begins = watched.pads.run == stuck.BEGUN
+        begins = watched.pads._run == stuck.BEGUN
         watched.show(to_bytes(centre + sigma * rng.standard_normal(SHAPE)))
         began += np.count_nonzero(begins)
     expected = began / stuck.ODDS
