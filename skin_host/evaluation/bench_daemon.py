@@ -5,11 +5,13 @@ process sends the boards' frames over stand-in buses; mosquitto is the broker, w
 on all frames and one on all touches. For each size and rate the skin is first untouched, then one
 hand rests on it, then all of it is touched, each with pressures that change from sweep to sweep.
 
-CPU is the daemon process's own. On a machine that others use too it grows with their load, so
-each row has figures from the same seconds to compare with: `plain`, what a message of another
-program takes to the same subscriber, and `yardstick_us`, the CPU time of a fixed piece of work.
-`waited_percent` is how long the daemon was ready to run and had no core: where it is large, the
-latencies and losses of that row are the machine's, not the daemon's.
+CPU is the daemon process's own. Where it goes (`by_room`, scaled to it) and what wakes the daemon
+is sampled afterwards, for half of that time, because sampling takes a tenth more. On a machine that
+others use too CPU grows with their load, so each row has figures from the same seconds to compare
+with: `plain`, what a message of another program takes to the same subscriber, and `yardstick_us`,
+the CPU time of a fixed piece of work. `waited_percent` is how long the daemon was ready to run and
+had no core: where it is large, the latencies and losses of that row are the machine's, not the
+daemon's.
 """
 
 import asyncio
@@ -122,6 +124,13 @@ async def _row(listener: Connection, daemon: Connection, port: int, seconds: flo
     daemon.send("end")
     measured: Row = await asyncio.to_thread(daemon.recv)
     delays_ns = await collected(listener)
+    daemon.send("sample")
+    await asyncio.sleep(0.5 * seconds)
+    daemon.send("rooms")
+    measured |= await asyncio.to_thread(daemon.recv)
+    shares = measured.pop("by_room_share").items()
+    cpu_percent = measured["cpu_percent"]
+    measured["by_room"] = {room: round(cpu_percent * share, 2) for room, share in shares}
     plain_ms = _percentiles_ms(delays_ns.pop(PLAIN_TOPIC, []))
     touch_ms = _percentiles_ms([delay_ns for part in delays_ns.values() for delay_ns in part])
     return measured | {

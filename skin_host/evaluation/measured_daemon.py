@@ -9,7 +9,8 @@ or of its MQTT libraries, names the room. A sample counts as much as the thread 
 one before. It costs some 15 us and nothing between two, unlike a profiler that is called at each
 function. (The kernel looks at timers on CPU time only with its own tick: that would be a hundred
 samples in the time of a row.) The selector of the loop reports when it sleeps, and counts
-what wakes it.
+what wakes it. All this takes a tenth of the daemon's CPU, so the CPU of the daemon is measured
+before, without it.
 """
 
 import asyncio
@@ -23,7 +24,7 @@ import signal
 import tempfile
 import time
 from collections import Counter, defaultdict
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -174,7 +175,20 @@ class Wakeups(selectors.DefaultSelector):
         self.counts: Counter[str] = Counter()
         self.rooms = RoomClock()
 
-    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+    def begin(self) -> None:
+        """Count and sample from now on; before, this is a usual selector that costs no more."""
+        self.counts.clear()
+        vars(self)["select"] = self._counted_select
+        self.rooms.begin()
+
+    def end(self) -> dict[str, float]:
+        """Stop counting; return the CPU time of each room, s, the largest first."""
+        del vars(self)["select"]
+        return self.rooms.end()
+
+    def _counted_select(
+        self, timeout: float | None = None
+    ) -> list[tuple[selectors.SelectorKey, int]]:
         if timeout == 0:
             return super().select(timeout)
         self.rooms.sleep()
@@ -214,8 +228,9 @@ def run_daemon(
     """Process: `skin run`, measured on the parent's commands.
 
     Args:
-        parent: sends `begin`, `end` (answered with figures of the time between) and `count`
-            (answered with CAN frames read and dropped since the start).
+        parent: sends `begin`, `end` (answered with figures of the time between), `sample`, `rooms`
+            (answered with where the CPU of the time between went, and what woke the daemon) and
+            `count` (answered with CAN frames read and dropped since the start).
         body: whose frames it reads.
         broker_port: of the broker on this machine.
         number, shares: this is one of several workers, from 1.
@@ -243,7 +258,6 @@ def run_daemon(
 
 
 async def _obey(parent: Connection, daemon: Daemon, wakeups: Wakeups) -> None:
-    rooms = wakeups.rooms
     began: list[tuple[float, ...]] = []
 
     def now() -> tuple[float, ...]:
@@ -253,34 +267,44 @@ async def _obey(parent: Connection, daemon: Daemon, wakeups: Wakeups) -> None:
         skipped = counters.frames_skipped
         return time.monotonic(), time.process_time(), _waited_s(), sleeps, dropped, skipped
 
-    def order() -> None:
-        wanted = parent.recv()
-        if wanted == "count":
-            counters = [port.counters for port in daemon.link.ports.values()]
-            parent.send((sum(one.frames for one in counters), sum(one.dropped for one in counters)))
-            return
-        if wanted == "begin":
-            began[:] = [now()]
-            wakeups.counts.clear()
-            rooms.begin()
-            return
-        by_room_s = rooms.end()
+    def figures() -> dict[str, float]:
         wall_s, cpu_s, waited_s, sleeps, dropped, skipped = (
             end - begin for end, begin in zip(now(), began[0], strict=True)
         )
-        causes = {cause: round(n / wall_s, 1) for cause, n in wakeups.counts.most_common()}
-        parent.send(
-            {
-                "cpu_percent": round(100 * cpu_s / wall_s, 2),
-                "by_room": {room: round(100 * s / wall_s, 2) for room, s in by_room_s.items()},
-                "waited_percent": round(100 * waited_s / wall_s, 2),
-                "wakeups_hz": round(sleeps / wall_s),
-                "wakeups_by_cause_hz": causes,
-                "us_per_wakeup": round(1e6 * cpu_s / max(sleeps, 1)),
-                "frames_dropped": dropped,
-                "messages_skipped": skipped,
-            }
-        )
+        return {
+            "cpu_percent": round(100 * cpu_s / wall_s, 2),
+            "waited_percent": round(100 * waited_s / wall_s, 2),
+            "wakeups_hz": round(sleeps / wall_s),
+            "us_per_wakeup": round(1e6 * cpu_s / max(sleeps, 1)),
+            "frames_dropped": dropped,
+            "messages_skipped": skipped,
+        }
+
+    def rooms() -> dict[str, dict[str, float]]:
+        by_room_s = wakeups.end()
+        wall_s = time.monotonic() - began[0][0]
+        total_s = sum(by_room_s.values())
+        return {
+            "by_room_share": {room: s / total_s for room, s in by_room_s.items()},
+            "wakeups_by_cause_hz": {
+                cause: round(n / wall_s, 1) for cause, n in wakeups.counts.most_common()
+            },
+        }
+
+    def count() -> tuple[int, int]:
+        counters = [port.counters for port in daemon.link.ports.values()]
+        return sum(one.frames for one in counters), sum(one.dropped for one in counters)
+
+    answers: dict[str, Callable[[], Any]] = {"end": figures, "rooms": rooms, "count": count}
+
+    def order() -> None:
+        wanted = parent.recv()
+        if wanted in answers:
+            parent.send(answers[wanted]())
+            return
+        began[:] = [now()]
+        if wanted == "sample":
+            wakeups.begin()
 
     asyncio.get_running_loop().add_reader(parent.fileno(), order)
     await daemon.run(asyncio.Event(), calibrate=True)
