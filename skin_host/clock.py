@@ -52,17 +52,12 @@ class Clock:
     def __init__(self) -> None:
         self._random = random.Random()
 
-    def now_ns(self) -> int:
-        """Time of day since 1970: that of the frames' time stamps. It may be set."""
-        return time.time_ns()
-
-    def monotonic_ns(self) -> int:
-        """Return a time that is never set."""
-        return time.monotonic_ns()
-
-    def monotonic_s(self) -> float:
-        """The same in seconds."""
-        return self.monotonic_ns() / NS_PER_S
+    #: Time of day since 1970: that of the frames' time stamps. It may be set.
+    now_ns: Callable[[], int] = staticmethod(time.time_ns)
+    #: A time that is never set.
+    monotonic_ns: Callable[[], int] = staticmethod(time.monotonic_ns)
+    #: The same in seconds.
+    monotonic_s: Callable[[], float] = staticmethod(time.monotonic)
 
     def today(self) -> datetime:
         """Date and time of day in UTC."""
@@ -171,6 +166,9 @@ class SteppedClock(Clock):
 
     def monotonic_ns(self) -> int:
         return self._t_ns
+
+    def monotonic_s(self) -> float:
+        return self._t_ns / NS_PER_S
 
     def advance(self, seconds: float) -> None:
         """Move time on, as if the process had been stopped."""

@@ -109,21 +109,24 @@ _recvmmsg.argtypes = [
 
 
 class _ReceivedBatch(FrameBatch):
-    """Records as the kernel wrote them; each array is made when it is first read."""
+    """The first `n` records as the kernel wrote them; each array is made when it is first read."""
 
-    __slots__ = ("_octets", "_records")
+    __slots__ = ("_n", "_octets", "_records")
 
-    def __init__(self, records: NDArray[np.void], octets: NDArray[np.uint8], dropped: int) -> None:
+    def __init__(
+        self, n: int, records: NDArray[np.void], octets: NDArray[np.uint8], dropped: int
+    ) -> None:
+        self._n = n
         self._records = records
         self._octets = octets
         self.dropped = dropped
 
     def __len__(self) -> int:
-        return len(self._records)
+        return self._n
 
     def __getattr__(self, name: str) -> NDArray[Any]:
         """Called once for each array, while its slot is empty."""
-        records = self._records
+        records = self._records[: self._n]
         array: NDArray[Any]
         if name == "t_ns":
             array = records["seconds"].astype(np.int64) * NS_PER_S + records["nanoseconds"]
@@ -139,7 +142,7 @@ class _ReceivedBatch(FrameBatch):
         return True  # the kernel stamps them in this order
 
     def records(self) -> Records:
-        return Records(self._octets, _RECORD, _CONTROL_SIZE)
+        return Records(self._octets[: self._n], _RECORD, _CONTROL_SIZE)
 
 
 class BatchReceiver:
@@ -192,7 +195,7 @@ class BatchReceiver:
         dropped = self._newly_dropped(n)
         # The kernel wrote the lengths it used; reset them to the whole buffer for the next read.
         self._control_length[:n] = _CONTROL_SIZE
-        return _ReceivedBatch(self._records[:n], self._octets[:n], dropped)
+        return _ReceivedBatch(n, self._records, self._octets, dropped)
 
     def saw_flags(self, n: int) -> bool:
         """Return whether any of the `n` frames just read is not a standard data frame."""

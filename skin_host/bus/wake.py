@@ -65,7 +65,8 @@ class Plan:
             t_ns -= late_ns - SLIP_NS
         self._due_ns[board] = t_ns + period_ns
         self._look_ns[board] = t_ns + period_ns + GUARD_NS
-        self._lost_ns.pop(board, None)
+        if self._lost_ns:
+            self._lost_ns.pop(board, None)
 
     def next_ns(self, now_ns: int) -> int:
         """Return when to read next, after all sweeps that ended by now were noted."""
@@ -78,11 +79,21 @@ class Plan:
                 else:
                     del look_ns[board]
                     self._lost_ns[board] = now_ns
-        ends_ns = [
-            [look_ns[board] for board in boards if board in look_ns] for boards in self._missing()
-        ]
-        # With the last but one, what came before it is worked off and does not delay the last.
-        sample_ns = min((sorted(ends)[-2:][0] for ends in ends_ns if ends), default=None)
+        sample_ns: int | None = None
+        for boards in self._missing():
+            # With the last but one, what came before it is worked off and does not delay the last.
+            # In a plain loop, because this is done for every wake-up.
+            last_ns = before_ns = -1
+            for board in boards:
+                if board in look_ns:
+                    at_ns = look_ns[board]
+                    if at_ns > last_ns:
+                        before_ns, last_ns = last_ns, at_ns
+                    elif at_ns > before_ns:
+                        before_ns = at_ns
+            end_ns = last_ns if before_ns < 0 else before_ns
+            if end_ns >= 0 and (sample_ns is None or end_ns < sample_ns):
+                sample_ns = end_ns
         if sample_ns is None:
             return now_ns + self._search_ns(now_ns)
         if self._lost_ns:

@@ -332,22 +332,24 @@ class Daemon:
 
     def _deliver(self, output: Output) -> None:
         self.fingertips.deliver(output.grasps)
-        # Touches first, so that they leave before the frames are encoded.
-        for step in output.steps:
-            for event in step.events:
-                self.publisher.put_touch(event)
-        self.health.note(output)
-        self._follow_clock()
-        for step in output.steps:
-            state = self._contacts[step.part].step(step.frame, step.events)
-            self.publisher.put_contact(step.frame.part, state)
-            if step.part not in self.engine.touch_only:
-                self.publisher.put_frame(step.frame)
+        if output.steps:
+            # Touches first, so that they leave before the frames are encoded.
+            for step in output.steps:
+                for event in step.events:
+                    self.publisher.put_touch(event)
+            self.health.note(output)
+            self._follow_clock()
+            for step in output.steps:
+                state = self._contacts[step.part].step(step.frame, step.events)
+                self.publisher.put_contact(step.frame.part, state)
+                if step.part not in self.engine.touch_only:
+                    self.publisher.put_frame(step.frame)
         # Notify systemd's watchdog only here, after work that was done.
-        now_s = self.clock.monotonic_s()
-        if self._feed_s is not None and now_s - self._fed_s > 0.5 * self._feed_s:
-            self._fed_s = now_s
-            service.notify("WATCHDOG=1")
+        if self._feed_s is not None:
+            now_s = self.clock.monotonic_s()
+            if now_s - self._fed_s > 0.5 * self._feed_s:
+                self._fed_s = now_s
+                service.notify("WATCHDOG=1")
 
     def _clock_against_ns(self) -> int:
         return self.clock.now_ns() - self.clock.monotonic_ns()

@@ -55,7 +55,7 @@ def _by_time(
     sweep of one would join the first of another to one frame of a part, and the chips of all boards
     would be judged once for each bus and period, not once for each period.
     """
-    if len(batches) < 2 or all(batch.t_ns[-1] - batch.t_ns[0] < slice_ns for _, batch in batches):
+    if all(batch.t_ns[-1] - batch.t_ns[0] < slice_ns for _, batch in batches):
         yield from batches
         return
     slices: list[tuple[int, str, FrameBatch]] = []
@@ -127,7 +127,7 @@ class Link:
             settings.receive,
             periods_ns,
             clock,
-            lambda: chain(self._engine.missing(), alone),
+            (lambda: chain(self._missing(), alone)) if alone else self._missing,
             sum(1e9 / period_ns for period_ns in fastest_ns),
         )
         self._expired_ns = 0
@@ -164,6 +164,9 @@ class Link:
         """Continue with another engine, which has the ledger of the one before."""
         self._engine = engine
 
+    def _missing(self) -> list[dict[int, int]]:
+        return self._engine.intake.missing()
+
     def _zeroed(self, board: int, believed: bool) -> None:
         self._engine.rezero(board, believed)
 
@@ -171,21 +174,20 @@ class Link:
         self,
         deliver: Callable[[Output], None],
         record: Callable[[str, FrameBatch], None] = lambda *_: None,
-        together: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext,
+        together: AbstractContextManager[None] = contextlib.nullcontext(),  # noqa: B008  # no state
     ) -> None:
         """Read all buses for ever; pass the results to `deliver`.
 
         Args:
             deliver: called after each batch, and several times a second.
             record: called with each received batch.
-            together: block of code in which each turn delivers; at its end the results leave.
+            together: block in which each turn delivers; at its end the results leave.
         """
 
         def work() -> None:
-            with together():
+            with together:
                 self.turn(self._clock.now_ns(), deliver, record)
-            if self._engine.has_deferred:
-                self._engine.judge()
+            self._engine.judge()
 
         await self._wake_up.run(work)
 
@@ -201,27 +203,28 @@ class Link:
             now_ns: the time, on the clock of the frames' time stamps.
             deliver, record: see `read`.
         """
-        # Until when each bus that is not empty has been read.
-        behind_ns: list[int] = []
+        read_ns, is_behind = now_ns, False
         batches: list[tuple[str, FrameBatch]] = []
         for bus, port in self.ports.items():
             batch = port.read()
-            if not len(batch):
+            read_ns = min(read_ns, port.read_until_ns(now_ns))
+            n = len(batch)
+            if not n:
                 continue
-            if len(batch) >= port.capacity:
-                behind_ns.append(int(batch.t_ns[-1]))
+            if n >= port.capacity:
+                is_behind = True
+                read_ns = min(read_ns, int(batch.t_ns[-1]))
             record(bus, batch)
             batches.append((bus, batch))
-        for bus, batch in _by_time(batches, self._slice_ns):
+        for bus, batch in batches if len(batches) < 2 else _by_time(batches, self._slice_ns):
             output = self._engine.feed(bus, batch)
             if output.answers:
                 self._note_answers(bus, output.answers)
             self._note(output)
             deliver(output)
-        until_ns = (port.read_until_ns(now_ns) for port in self.ports.values())
-        self.read_ns = read_ns = min(chain(until_ns, behind_ns), default=now_ns)
+        self.read_ns = read_ns
         # What is behind is complete up to its last frame, whatever held this computer up.
-        if not behind_ns and self._is_patient(now_ns):
+        if not is_behind and self._is_patient(now_ns):
             self._engine.ledger.pass_over(read_ns)
             return
         self._engine.ledger.look(read_ns)

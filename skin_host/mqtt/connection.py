@@ -64,6 +64,14 @@ _TAKEN_OVER = 0x8E
 _ENVELOPE_BYTES = 128
 #: What paho gives for a connection that was closed without a reason.
 _CLOSED = 0x80
+#: Usual acknowledgements, by their bytes after the number of the message: arrived, with and without
+#: a code, and arrived without anybody who listens. Decoding them costs paho as much as publishing.
+_USUAL_ACKS = {
+    code: ReasonCode(PacketTypes.PUBACK, identifier=code[0] if code else 0)
+    for code in (b"", b"\x00", b"\x10")
+}
+_PUBACK = 0x40
+_NO_PROPERTIES = Properties(PacketTypes.PUBACK)  # type: ignore[no-untyped-call]
 
 MqttError = aiomqtt.MqttError
 Message = aiomqtt.Message
@@ -388,9 +396,14 @@ class Connection(aiomqtt.Client):
     def _checked(self) -> MQTTErrorCode:
         """Handle a packet that was read, unless decoding it would take too long."""
         arrived = self._paho._in_packet
+        command, packet = arrived["command"], arrived["packet"]
+        if command == _PUBACK and (len(packet) == 2 or (len(packet) == 3 and self._v5)):
+            reason = _USUAL_ACKS.get(bytes(packet[2:]))
+            if reason is not None:
+                return self._acknowledged(int.from_bytes(packet[:2], "big"), reason)
         found = unfit(
-            arrived["command"],
-            arrived["packet"],
+            command,
+            packet,
             arrived["remaining_length"],
             self._max_packet,
             self._v5,
@@ -407,6 +420,15 @@ class Connection(aiomqtt.Client):
         if found.mid:
             acknowledged = self._paho._send_puback(found.mid)
         return acknowledged
+
+    def _acknowledged(self, mid: int, reason: ReasonCode) -> MQTTErrorCode:
+        """Do what paho does for an acknowledgement, decoded already."""
+        paho = self._paho
+        code: MQTTErrorCode = MQTT_ERR_SUCCESS
+        with paho._out_message_mutex:
+            if mid in paho._out_messages:
+                code = paho._do_on_publish(mid, reason, _NO_PROPERTIES)
+        return code
 
     def _on_message(self, client: Any, userdata: Any, message: Any) -> None:
         self.discarded += self._queue.full()

@@ -9,10 +9,9 @@ next: if one of them is the reason, it is found, dropped after `trials.TRIES`, c
 """
 
 import asyncio
-import contextlib
 import logging
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import islice
 from typing import Literal, NamedTuple
 
@@ -100,13 +99,13 @@ class Courier:
         self._states_alone: dict[str, None] = {}
         self._frames_alone: dict[str, None] = {}
         self._frame_tried: str | None = None
-        #: The connection for frames, while they may be written.
-        self._frames_to: Connection | None = None
+        #: The connection for events and frames, while they may be written.
+        self._to: Connection | None = None
         self._is_writing_due = False
         self._suspect_came = asyncio.Event()
-        #: By part: the bytes before the payload of its frames.
-        self._heads: dict[str, bytes] = {}
-        outbox.on_frame = self._note_frame
+        #: By part: the topic of its frames, and the bytes before their payload.
+        self._heads: dict[str, tuple[str, bytes]] = {}
+        outbox.on_put = self._note_put
         #: The broker has acknowledged something over this connection; otherwise it may end
         #: connections for other reasons, as a node of a broken cluster does.
         self._works = False
@@ -140,15 +139,15 @@ class Courier:
         self._frames_out.clear()
         self._works = False
         await self._try_alone(connection)
-        self._frames_to = connection
-        connection.when_clear = self._note_frame
-        self._note_frame()
+        self._to = connection
+        connection.when_clear = self._note_put
+        self._note_put()
         try:
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._send_states(connection))
-                group.create_task(self._send_events(connection))
+                group.create_task(self._watch_events())
         finally:
-            self._frames_to = None
+            self._to = None
 
     def note_end(self, connection: Connection) -> str | None:
         """Note the end of the connection; return the topic of a publication that was dropped
@@ -196,6 +195,8 @@ class Courier:
 
     def _fits(self, connection: Connection, topic: str, payload: bytes) -> bool:
         """Whether the broker's limit lets a message through; names the topic if it does not."""
+        if connection.packet_limit is None and not self.too_large:
+            return True
         if connection.fits(topic, payload):
             if self.too_large:
                 self.too_large.pop(topic, None)
@@ -276,102 +277,89 @@ class Courier:
 
     async def _send_suspect(self, connection: Connection, frame: PressureFrame) -> None:
         """Send a frame with QoS 1 and wait for its acknowledgement."""
-        payload = self._encoded(connection, frame)
+        topic = self._topics.part("frame", frame.part)
+        payload = self._encoded(connection, topic, frame)
         if payload is None:
             return
-        topic = self._topics.part("frame", frame.part)
         properties = self._form.properties
         done = connection.send(topic, payload, qos=1, properties=properties)
         self._frames_out[frame.part] = None
         self._outbox.counters.frames_sent += 1
         await within(TIMEOUT_S, done)
 
-    @contextlib.contextmanager
-    def together(self) -> Iterator[None]:
-        """Write at the end of this block what is put in it, without another turn of the loop."""
-        if self._is_writing_due:
-            yield
-            return
+    def __enter__(self) -> None:
+        """Write at the end of the block what is put in it, without another turn of the loop."""
         self._is_writing_due = True
-        try:
-            yield
-        finally:
-            self._write_frames()
 
-    def _note_frame(self) -> None:
-        """Write frames when everything of this turn of the loop has been put."""
-        self._suspect_came.set()
-        if self._frames_to is not None and not self._is_writing_due:
+    def __exit__(self, *_: object) -> None:
+        self._write()
+
+    def _note_put(self) -> None:
+        """Write when everything of this turn of the loop has been put."""
+        if self._frames_alone:
+            self._suspect_came.set()
+        if self._to is not None and not self._is_writing_due:
             self._is_writing_due = True
-            asyncio.get_running_loop().call_soon(self._write_frames)
+            asyncio.get_running_loop().call_soon(self._write)
 
-    def _write_frames(self) -> None:
-        """Write the frames of the outbox, touches first, as far as the socket takes them."""
+    def _write(self) -> None:
+        """Write what is in the outbox, touches first, then frames as far as the socket takes
+        them.
+        """
         self._is_writing_due = False
-        connection, outbox = self._frames_to, self._outbox
+        connection, outbox = self._to, self._outbox
         if connection is None:
             return
-        try:
-            self._fill_window(connection)
-        except MqttError:
-            return  # the reader of the connection finds it lost
+        if len(outbox.events) > len(self._events_out):
+            try:
+                self._fill_window(connection)
+            except MqttError:
+                return  # the reader of the connection finds it lost
         if not outbox.frames or not connection.is_clear():
             return
         frames, packets = [], []
         for _ in range(min(FRAME_WINDOW, len(outbox.frames))):
             frame = outbox.take_frame()
-            payload = self._encoded(connection, frame)
+            topic, head = self._head(frame.part)
+            payload = self._encoded(connection, topic, frame)
             if payload is not None:
                 frames.append(frame)
-                packets.append(publish_packet(self._head(frame.part), payload))
+                packets.append(publish_packet(head, payload))
         taken = connection.write_now(packets) if packets else 0
         for frame in frames[:taken]:
             self._frames_out[frame.part] = None
         outbox.counters.frames_sent += taken
-        outbox.put_back(frames[taken:])
-        if taken == len(packets) and outbox.frames:
-            self._note_frame()
+        if taken < len(packets):
+            outbox.put_back(frames[taken:])
+        elif outbox.frames:
+            self._note_put()
 
-    def _head(self, part: str) -> bytes:
-        head = self._heads.get(part)
-        if head is None:
+    def _head(self, part: str) -> tuple[str, bytes]:
+        """The topic of a part's frames, and the bytes before their payload."""
+        found = self._heads.get(part)
+        if found is None:
             properties = self._form.properties
             packed = None if properties is None else properties.pack()
-            head = self._heads[part] = publish_head(self._topics.part("frame", part), packed)
-        return head
+            topic = self._topics.part("frame", part)
+            found = self._heads[part] = topic, publish_head(topic, packed)
+        return found
 
-    def _encoded(self, connection: Connection, frame: PressureFrame) -> bytes | None:
+    def _encoded(self, connection: Connection, topic: str, frame: PressureFrame) -> bytes | None:
         """The payload of a frame; None for one that the broker does not take, which is counted."""
-        raw = self._clock.monotonic_s() < self._raw_until_s
+        raw = self._raw_until_s > 0.0 and self._clock.monotonic_s() < self._raw_until_s
         payload = encode_frame(frame, self._form.encoding, raw=raw)
-        topic = self._topics.part("frame", frame.part)
         if self._outbox.trials.withholds(topic) or not self._fits(connection, topic, payload):
             self._outbox.counters.frames_skipped += 1
             return None
         return payload
 
-    async def _send_events(self, connection: Connection) -> None:
-        """Send the queue in order. Events that were not acknowledged stay and are sent again."""
-        outbox = self._outbox
-        in_flight = self._events_out
-        outbox.events_put.set()
-        while True:
-            try:
-                async with self._clock.timeout_at(in_flight[0].until_s if in_flight else None):
-                    await outbox.events_put.wait()
-            except TimeoutError:
-                await within(0.0, in_flight[0].done)
-            outbox.events_put.clear()
-            while in_flight and in_flight[0].done.done():
-                in_flight.popleft()
-                outbox.event_sent()
-                self._works = True
-            self._fill_window(connection)
-
     def _fill_window(self, connection: Connection) -> None:
-        """Send events, in order, until as many are on their way as may be."""
+        """Send events, in order, until as many are on their way as may be.
+
+        Events that are not acknowledged stay in the queue and are sent again.
+        """
         outbox, in_flight = self._outbox, self._events_out
-        until_s = asyncio.get_running_loop().time() + TIMEOUT_S
+        until_s = self._clock.monotonic_s() + TIMEOUT_S
         news = False
         while len(in_flight) < min(len(outbox.events), TOUCH_WINDOW):
             event = outbox.events[len(in_flight)]
@@ -379,11 +367,35 @@ class Courier:
                 self._drop_large_event(len(in_flight))
                 continue
             done = connection.send(event.topic, event.payload, qos=1, properties=event.properties)
-            done.add_done_callback(lambda _: outbox.events_put.set())
+            done.add_done_callback(self._note_acknowledged)
             in_flight.append(_InFlight(done, until_s))
             news = True
         if news:
             connection.flush()  # a touch must not wait for the encoding of frames
+
+    def _note_acknowledged(self, _done: "asyncio.Future[None]") -> None:
+        """The first events in the queue may have arrived; others take their places."""
+        in_flight = self._events_out
+        while in_flight and in_flight[0].done.done():
+            in_flight.popleft()
+            self._outbox.event_sent()
+            self._works = True
+        if len(self._outbox.events) > len(in_flight):
+            self._note_put()
+
+    async def _watch_events(self) -> None:
+        """Watch that events are acknowledged in time.
+
+        Raises:
+            MqttError: one was not.
+        """
+        while True:
+            now_s = self._clock.monotonic_s()
+            until_s = self._events_out[0].until_s if self._events_out else now_s + TIMEOUT_S
+            if until_s <= now_s:
+                await within(0.0, self._events_out[0].done)
+            else:
+                await self._clock.sleep(until_s - now_s)
 
     async def _send_states(self, connection: Connection) -> None:
         outbox = self._outbox

@@ -92,8 +92,8 @@ class Outbox:
         retained: the payload of every retained topic, sent or not.
         passed_on: recently acknowledged events.
         pending: the topics of `retained` that are to be sent.
-        on_frame: called when there is a new frame.
-        events_put, retained_put: set when there is something new.
+        on_put: called when there is a new frame or event.
+        retained_put: set when there is something new to be retained.
         emptied: set when no event and nothing retained is left to send.
         counters: results of everything that was put.
         trials: which topics are withheld.
@@ -105,8 +105,7 @@ class Outbox:
         self.retained: dict[str, bytes] = {}
         self.passed_on: deque[tuple[float, Event]] = deque(maxlen=REPEATED)
         self.pending: dict[str, None] = {}
-        self.on_frame: Callable[[], None] = lambda: None
-        self.events_put = asyncio.Event()
+        self.on_put: Callable[[], None] = lambda: None
         self.retained_put = asyncio.Event()
         self.emptied = asyncio.Event()
         self.counters = PublisherCounters()
@@ -132,7 +131,7 @@ class Outbox:
             return
         self.counters.frames_skipped += frame.part in self.frames
         self.frames[frame.part] = frame
-        self.on_frame()
+        self.on_put()
 
     def take_frame(self) -> PressureFrame:
         """Take out the frame of the part that has waited longest."""
@@ -205,7 +204,7 @@ class Outbox:
     def put_event(self, event: Event) -> None:
         """Take a message that must arrive."""
         self.events.append(event)
-        self.events_put.set()
+        self.on_put()
 
     def event_sent(self) -> None:
         """Note that the first event has arrived."""
@@ -247,7 +246,7 @@ class Outbox:
         self.events.extendleft(reversed(again))
         # Subscribers may know the numbers of these and of what was in flight behind them.
         self._last_moves.clear()
-        self.events_put.set()
+        self.on_put()
         return len(again)
 
     def put_state(self, topic: str, payload: bytes) -> None:

@@ -86,7 +86,7 @@ class Publisher:
     Attributes:
         put_frame: sends a frame, unless a newer one of its part comes first. It must not change any
             more.
-        together: at the end of this block, what was put in it is written: touches first, then
+        together: at the end of a block with it, what was put is written: touches first, then
             frames.
 
     Raises:
@@ -127,6 +127,7 @@ class Publisher:
 
         self._outbox = Outbox(settings.event_queue, settings.frame_hz, clock)
         self._outbox.put_state(self._status, ONLINE)
+        self._states_of_contact: dict[str, ContactState] = {}
         self._numbers = Numbers(clock.now_ns, clock.monotonic_ns)
         self._turn = 0  # index of the broker in use
         self._untried = len(self._brokers)
@@ -150,7 +151,7 @@ class Publisher:
             clock,
         )
         self.put_frame: Callable[[PressureFrame], None] = self._outbox.put_frame
-        self.together: Callable[[], AbstractContextManager[None]] = self._courier.together
+        self.together: AbstractContextManager[None] = self._courier
         self._number_messages()
 
     def _number_messages(self) -> None:
@@ -213,10 +214,9 @@ class Publisher:
 
     def put_contact(self, part: str, state: ContactState) -> None:
         """Publish whether a part is touched, if that has changed."""
-        topic = self.topics.part("contact", part)
-        payload = encode_contact(state)
-        if self._outbox.retained.get(topic) != payload:
-            self._outbox.put_state(topic, payload)
+        if self._states_of_contact.get(part) != state:
+            self._states_of_contact[part] = state
+            self._outbox.put_state(self.topics.part("contact", part), encode_contact(state))
 
     def put_health(self, part: str, record: Any) -> None:
         """Publish the health of a part: a record with keys that JSON can hold."""

@@ -318,17 +318,8 @@ class Engine:
         steps = self._process(self._take(sweeps)) if sweeps else []
         return Output(sweeps, steps, samples, grasps, answers)
 
-    def missing(self) -> list[dict[int, int]]:
-        """Of each part, the boards whose sweeps its next sample waits for."""
-        return self.intake.missing()
-
-    @property
-    def has_deferred(self) -> bool:
-        """Whether `judge` has something to do."""
-        return self.intake.is_whole
-
     def judge(self) -> None:
-        """Do deferred work between sweeps, so that the next one does not wait for it."""
+        """Do deferred work, if there is any, so that the next sweep does not wait for it."""
         self.intake.judge_whole()
 
     def expire(self, now_ns: int) -> Output:
