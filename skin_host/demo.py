@@ -29,6 +29,7 @@ from skin_host.daemon.daemon import Daemon
 from skin_host.errors import ConfigurationError, SkinError
 from skin_host.layout import Layout, PadKind, build_layout
 from skin_host.mqtt.broker import LocalBroker, local_broker
+from skin_host.tasks import cancel
 from skin_host.viewer.server import Viewer
 
 if TYPE_CHECKING:
@@ -55,17 +56,15 @@ FINGERTIP_N = [(0.0, 0.0), (0.3, 2.0), (1.8, 2.0), (2.2, 0.0)]
 
 
 async def run(
-    duration_s: float | None,
     stop: asyncio.Event,
     page_port: int | None,
     config: Path | None = None,
     scene: Path | None = None,
     mujoco: Path | None = None,
 ) -> int:
-    """Run until `stop` or for `duration_s`; the last line on stdout is a JSON summary.
+    """Run until `stop`; the last line on stdout is a JSON summary.
 
     Args:
-        duration_s: None runs without end.
         stop: set it to end.
         page_port: where the live page is served on this machine; 0 is any free port, None
             the usual one, or any if that is taken.
@@ -80,8 +79,6 @@ async def run(
     settings, layout, happening = prepared(config, scene)
     if mujoco is not None and scene is None:
         happening = structs.replace(happening, probe=[])
-    if duration_s is not None:
-        asyncio.get_running_loop().call_later(duration_s, stop.set)
     touches: Counter[str] = Counter()
     # The page and the listener log that they found the broker, which is not of interest here.
     logging.getLogger("skin_host.client").setLevel(logging.WARNING)
@@ -107,8 +104,7 @@ async def run(
                 listening = asyncio.create_task(_listen(broker.url, settings.robot, touches))
                 await daemon.run(stop, calibrate=True)
                 await _heard(touches, daemon.publisher.counters.touches_sent)
-                listening.cancel()
-                await asyncio.gather(listening, return_exceptions=True)
+                await cancel(listening)
     sent = daemon.publisher.counters
     assemblers = [assembler.counters for assembler in daemon.engine.assemblers.values()]
     lost = sum(port.counters.dropped for port in daemon.link.ports.values())

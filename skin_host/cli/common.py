@@ -7,8 +7,9 @@ import logging
 import os
 import signal
 import sys
+from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from skin_host.daemon import service
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from skin_host.config.settings import Settings
     from skin_host.layout import Layout
 
+T = TypeVar("T")
 Commands = Any  # argparse's own type of sub-parser collections is private
 
 
@@ -116,14 +118,27 @@ class Progress:
             print("\r" + " " * 79 + "\r", end="", file=sys.stderr)
 
 
-def stop_on_signals(stop: asyncio.Event) -> None:
-    """End cleanly on SIGTERM and SIGINT; a second one of them ends at once."""
-    loop = asyncio.get_running_loop()
+def run(
+    work: Callable[[asyncio.Event], Coroutine[Any, Any, T]], duration_s: float | None = None
+) -> T:
+    """Work, and return the result.
 
-    def end() -> None:
-        stop.set()
+    The event is set by SIGTERM and SIGINT, a second one of which ends at once, and after
+    `duration_s`.
+    """
+
+    async def working() -> T:
+        stop, loop = asyncio.Event(), asyncio.get_running_loop()
+
+        def end() -> None:
+            stop.set()
+            for number in (signal.SIGTERM, signal.SIGINT):
+                loop.remove_signal_handler(number)
+
         for number in (signal.SIGTERM, signal.SIGINT):
-            loop.remove_signal_handler(number)
+            loop.add_signal_handler(number, end)
+        if duration_s is not None:
+            loop.call_later(duration_s, stop.set)
+        return await work(stop)
 
-    for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, end)
+    return asyncio.run(working())

@@ -19,8 +19,8 @@ from skin_host.cli.common import (
     load_skin,
     positive,
     print_json,
+    run,
     set_up_logging,
-    stop_on_signals,
 )
 from skin_host.daemon import service
 from skin_host.errors import OtherSkinError, RequestError, SkinError
@@ -162,9 +162,7 @@ def _run(arguments: argparse.Namespace) -> int:
     if arguments.calibrate:
         calibration = None  # gains come from the file later
 
-    async def work() -> None:
-        stop = asyncio.Event()
-        stop_on_signals(stop)
+    async def work(stop: asyncio.Event) -> None:
         daemon = Daemon(
             settings,
             layout,
@@ -179,11 +177,9 @@ def _run(arguments: argparse.Namespace) -> int:
             (runtime / RUNNING).write_bytes(msgspec.json.encode(settings))
         # The collector would look through all that is loaded by now for 30 ms, again and again.
         gc.freeze()
-        if arguments.duration is not None:
-            daemon.clock.call_later(arguments.duration, stop.set)
         await daemon.run(stop, calibrate=arguments.calibrate)
 
-    asyncio.run(work())
+    run(work, arguments.duration)
     return 0
 
 

@@ -4,6 +4,7 @@ import argparse
 import asyncio
 import contextlib
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from skin_host.cli.common import (
     load_skin,
     positive,
     print_json,
-    stop_on_signals,
+    run,
 )
 from skin_host.errors import BrokerError, RequestError
 
@@ -162,13 +163,13 @@ def _record(arguments: argparse.Namespace) -> int:
         raise RequestError(f"{file}: is there already; remove it or choose another name")
     if file.suffix == SUFFIX:
         with Recorder(file) as recorder:
-            told = asyncio.run(_capture(arguments, recorder))
+            told = run(partial(_capture, arguments, recorder, None), arguments.seconds)
         told |= {"messages": recorder.messages, "unreadable": recorder.unreadable}
     else:
         if arguments.config is None or arguments.broker is not None:
             raise RequestError(f"{file}: holds CAN frames alone and needs --config; or use .mcap")
         with CanLog(file) as log:
-            told = asyncio.run(_capture(arguments, None, log))
+            told = run(partial(_capture, arguments, None, log), arguments.seconds)
         told |= {"frames": log.frames}
     if arguments.config is not None and not told.get("frames", told.get("messages", {}).get("can")):
         print(
@@ -189,14 +190,12 @@ def _plain(value: Any) -> str:
     return str(value)
 
 
-async def _capture(arguments: argparse.Namespace, recorder: Any, log: Any = None) -> dict[str, Any]:
-    """Record until a signal comes or the time is over; report what was lost."""
+async def _capture(
+    arguments: argparse.Namespace, recorder: Any, log: Any, stop: asyncio.Event
+) -> dict[str, Any]:
+    """Record until `stop` is set; report what was lost."""
     from skin_host.recording.capture import capture_broker, capture_buses
 
-    stop = asyncio.Event()
-    stop_on_signals(stop)
-    if arguments.seconds is not None:
-        asyncio.get_running_loop().call_later(arguments.seconds, stop.set)
     told: dict[str, Any] = {}
 
     async def from_broker() -> None:

@@ -12,8 +12,8 @@ from skin_host.cli.common import (
     add_command,
     add_log_level,
     print_json,
+    run,
     set_up_logging,
-    stop_on_signals,
 )
 
 #: `skin status` looks for the broker for this long; a reachable one answers at once.
@@ -180,20 +180,17 @@ def _view(arguments: argparse.Namespace) -> int:
     port = PAGE_PORT if arguments.port is None else arguments.port
     set_up_logging(arguments.verbose)
 
-    async def work() -> None:
-        stop = asyncio.Event()
-        stop_on_signals(stop)
-        viewer = Viewer(
-            arguments.broker,
-            robot=arguments.robot,
-            commands=not arguments.read_only,
-            recordings=arguments.recordings,
-        )
-        await viewer.run(
-            stop, arguments.host, port, lambda url: print(f"the page: {url}", flush=True)
-        )
+    viewer = Viewer(
+        arguments.broker,
+        robot=arguments.robot,
+        commands=not arguments.read_only,
+        recordings=arguments.recordings,
+    )
 
-    asyncio.run(work())
+    def show(url: str) -> None:
+        print(f"the page: {url}", flush=True)
+
+    run(lambda stop: viewer.run(stop, arguments.host, port, show))
     return 0
 
 
@@ -201,18 +198,10 @@ def _view_elsewhere(arguments: argparse.Namespace) -> int:
     from skin_host.recording.export import live
 
     set_up_logging(arguments.verbose)
+    serving = (live.foxglove if arguments.foxglove else live.rerun)(arguments.host, arguments.port)
 
-    async def work() -> None:
-        stop = asyncio.Event()
-        stop_on_signals(stop)
-        serving = live.foxglove if arguments.foxglove else live.rerun
-        await live.run(
-            arguments.broker,
-            arguments.robot,
-            stop,
-            serving(arguments.host, arguments.port),
-            lambda url: print(f"open {url}", flush=True),
-        )
+    def show(url: str) -> None:
+        print(f"open {url}", flush=True)
 
-    asyncio.run(work())
+    run(lambda stop: live.run(arguments.broker, arguments.robot, stop, serving, show))
     return 0

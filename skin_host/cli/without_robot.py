@@ -19,10 +19,11 @@ from skin_host.cli.common import (
     load_skin,
     positive,
     print_json,
+    run,
     set_up_logging,
-    stop_on_signals,
 )
 from skin_host.errors import RequestError
+from skin_host.tasks import until
 
 if TYPE_CHECKING:
     import can
@@ -224,7 +225,7 @@ def _emulate(arguments: argparse.Namespace) -> int:
             opened.callback(buses[name].shutdown)
         channels = ", ".join(bus.channel for bus in wanted.values())
         log.info("%s is emulated on %s", settings.robot, channels)
-        asyncio.run(_until_stopped(lambda: work(buses), arguments.duration))
+        run(lambda stop: until(stop, work(buses)), arguments.duration)
     return 0
 
 
@@ -327,41 +328,12 @@ def _set_control(model: "MujocoModel | None", text: str) -> None:
     model.set_control(name, value)
 
 
-async def _until_stopped(
-    work: Callable[[], Coroutine[Any, Any, None]], duration_s: float | None
-) -> None:
-    stop = asyncio.Event()
-    stop_on_signals(stop)
-    if duration_s is not None:
-        asyncio.get_running_loop().call_later(duration_s, stop.set)
-    running = asyncio.create_task(work())
-    stopping = asyncio.create_task(stop.wait())
-    await asyncio.wait([running, stopping], return_when=asyncio.FIRST_COMPLETED)
-    for task in (running, stopping):
-        task.cancel()
-    result, _ = await asyncio.gather(running, stopping, return_exceptions=True)
-    if isinstance(result, Exception):
-        raise result
-
-
 def _demo(arguments: argparse.Namespace) -> int:
     from skin_host import demo
 
     set_up_logging(arguments.verbose)
-
-    async def work() -> int:
-        stop = asyncio.Event()
-        stop_on_signals(stop)
-        return await demo.run(
-            arguments.duration,
-            stop,
-            arguments.page_port,
-            arguments.config,
-            arguments.scene,
-            arguments.mujoco,
-        )
-
-    return asyncio.run(work())
+    shown = arguments.page_port, arguments.config, arguments.scene, arguments.mujoco
+    return run(lambda stop: demo.run(stop, *shown), arguments.duration)
 
 
 def _bench(arguments: argparse.Namespace) -> int:

@@ -32,6 +32,7 @@ from skin_host.mqtt.order import run_of, stamp_of
 from skin_host.mqtt.payload import JSON_TYPE
 from skin_host.mqtt.topics import ONLINE, PartTopic, Topics
 from skin_host.processing.events import Touch
+from skin_host.tasks import cancel
 
 #: An event waits this long for an earlier one, which may come from another broker: as long as a
 #: robot sends events again there (`mqtt.outbox.REPEAT_S`). Only after an earlier one is missing.
@@ -299,9 +300,7 @@ class SkinClient:
 
     async def _stop(self) -> None:
         self._stopping = True
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await cancel(*self._tasks)
         for stream in list(self._streams):
             stream.close()
 

@@ -12,9 +12,9 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from skin_host.clock import SYSTEM, Clock
-from skin_host.connections import in_tasks
 from skin_host.fingertip.health import FingertipRecord
 from skin_host.health import Record
+from skin_host.tasks import in_tasks
 
 log = logging.getLogger(__name__)
 

@@ -17,8 +17,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from skin_host.connections import in_tasks
 from skin_host.errors import BrokerError
+from skin_host.tasks import in_tasks
 
 HOST = "127.0.0.1"
 START_S = 10.0

@@ -36,6 +36,7 @@ from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import Retry, connect, explain, first_error
 from skin_host.mqtt.payload import MAX_PACKET_BYTES
 from skin_host.recording.mcap import SUFFIX, Recorder, recorded_topics
+from skin_host.tasks import until
 
 #: Takes a batch of a channel.
 CanSink = Callable[[str, FrameBatch], None]
@@ -153,16 +154,7 @@ async def capture_broker(
     Raises:
         SkinError: the recording cannot be written.
     """
-    stopping = asyncio.create_task(stop.wait())
-    listening = asyncio.create_task(_listen(recorder, broker, recorded_topics(base, robot)))
-    try:
-        await asyncio.wait([stopping, listening], return_when=asyncio.FIRST_COMPLETED)
-        if listening.done():
-            listening.result()
-    finally:
-        for task in (stopping, listening):
-            task.cancel()
-        await asyncio.gather(stopping, listening, return_exceptions=True)
+    await until(stop, _listen(recorder, broker, recorded_topics(base, robot)))
     return recorder.gaps
 
 

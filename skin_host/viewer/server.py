@@ -26,6 +26,7 @@ from skin_host.client import SkinClient, Stream
 from skin_host.errors import BrokerError, RequestError, SkinError
 from skin_host.mqtt.address import Broker
 from skin_host.recording.capture import MAX_AGO_S, PageRecording
+from skin_host.tasks import cancel
 from skin_host.viewer.picture import Cursor, Picture
 
 #: Pages get new messages this often; screens show no more.
@@ -151,8 +152,7 @@ class Viewer:
             try:
                 yield f"http://{_shown(host)}:{_port(server)}/"
             finally:
-                listening.cancel()
-                await asyncio.gather(listening, return_exceptions=True)
+                await cancel(listening)
                 await self._recording.close()
 
     async def run(
@@ -206,9 +206,7 @@ class Viewer:
             pass
         finally:
             self._pages -= 1
-            for task in (telling, *wishes):
-                task.cancel()
-            await asyncio.gather(telling, *wishes, return_exceptions=True)
+            await cancel(telling, *wishes)
 
     async def _tell(self, page: ServerConnection) -> None:
         cursor = Cursor()

@@ -11,6 +11,7 @@ import re
 import shutil
 import sqlite3
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ import pytest
 
 from emulator import faults
 from skin_host.cli import build_parser
+from skin_host.cli.common import run
 from skin_host.mqtt.frames import encode_frame
 from skin_host.processing.pipeline import PressureFrame
 from tests.support import programs
@@ -65,14 +67,10 @@ def here(world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     shutil.copytree(world.folder, folder, symlinks=True)
     monkeypatch.chdir(folder)
     monkeypatch.setenv("XDG_STATE_HOME", str(folder))
-    monkeypatch.setattr("skin_host.cli.watch.stop_on_signals", _stop_soon)
+    monkeypatch.setattr("skin_host.cli.watch.run", partial(run, duration_s=WHILE_S))
     monkeypatch.setattr("skin_host.cli.operate.set_up_logging", lambda _: None)
     matplotlib.use("agg")
     return folder
-
-
-def _stop_soon(stop: asyncio.Event) -> None:
-    asyncio.get_running_loop().call_later(WHILE_S, stop.set)
 
 
 @pytest.mark.parametrize("page", FOLLOWED)

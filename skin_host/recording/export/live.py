@@ -29,6 +29,7 @@ from skin_host.recording.export.scene import (
     transforms,
 )
 from skin_host.recording.export.series import health_line
+from skin_host.tasks import until
 
 FOXGLOVE_PORT = 8765
 RERUN_PORT = 9090
@@ -70,16 +71,7 @@ async def run(
             scene = SkinScene(shapes)
             show = begin(scene)
             show_url(url)
-            tasks = [
-                asyncio.create_task(_follow(skin, shapes, scene, show, clock)),
-                asyncio.create_task(stop.wait()),
-            ]
-            done, rest = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            for task in rest:
-                task.cancel()
-            await asyncio.gather(*rest, return_exceptions=True)
-            for task in done:
-                task.result()
+            await until(stop, _follow(skin, shapes, scene, show, clock))
 
 
 async def _follow(

@@ -1,10 +1,32 @@
-"""Servers of streams that end while somebody is connected."""
+"""Tasks of asyncio: to end them, to work until a stop, to serve each connection."""
 
 import asyncio
 from collections.abc import Callable, Coroutine
-from typing import Any
+from typing import Any, TypeVar
 
+T = TypeVar("T")
 Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Coroutine[Any, Any, None]]
+
+
+async def cancel(*tasks: "asyncio.Future[Any]") -> None:
+    """Cancel tasks, and wait until they have ended, with whatever result."""
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def until(stop: asyncio.Event, work: Coroutine[Any, Any, T]) -> T | None:
+    """Work until `stop` is set, and return the result of work that ends before.
+
+    Raises:
+        Exception: what the work raises, before the stop or because of it.
+    """
+    working, stopping = asyncio.create_task(work), asyncio.create_task(stop.wait())
+    try:
+        await asyncio.wait([working, stopping], return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        await cancel(working, stopping)
+    return None if working.cancelled() else working.result()
 
 
 def in_tasks(handler: Handler) -> Callable[[asyncio.StreamReader, asyncio.StreamWriter], None]:
