@@ -5,7 +5,6 @@ Recordings give the foam's relaxation and the pressure curve of each taxel.
 
 import argparse
 import asyncio
-import math
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
@@ -180,7 +179,15 @@ def _relaxation(arguments: argparse.Namespace) -> int:
                 "rest_s": record.rest_s,
                 "level_kpa": record.level_kpa,
                 "unit_rms_kpa": record.unit_rms_kpa,
-                "fits": [_as_record(found) for found in fits],
+                "fits": [
+                    {
+                        "model": found.model,
+                        "rms_hold_kpa": fitting.finite(found.rms_hold_kpa),
+                        "rms_rest_kpa": fitting.finite(found.rms_rest_kpa),
+                        "uncertain": found.uncertain,
+                    }
+                    for found in fits
+                ],
                 "remarks": list(chosen.remarks),
             }
         )
@@ -284,7 +291,8 @@ def _course(arguments: argparse.Namespace) -> int:
                             for number in curves.verdict[part.start : part.stop]
                         ],
                         "error_kpa": [
-                            _number(float(kpa)) for kpa in curves.error_kpa[part.start : part.stop]
+                            fitting.finite(float(kpa))
+                            for kpa in curves.error_kpa[part.start : part.stop]
                         ],
                     }
                     for part in layout.parts
@@ -366,19 +374,6 @@ def _describe(fits: list["Fit"], model: str, record: "HoldRecord") -> str:
         for name, factor in chosen.uncertain.items()
     ]
     return "\n".join(lines)
-
-
-def _as_record(found: "Fit") -> dict[str, object]:
-    return {
-        "model": found.model,
-        "rms_hold_kpa": _number(found.rms_hold_kpa),
-        "rms_rest_kpa": _number(found.rms_rest_kpa),
-        "uncertain": found.uncertain,
-    }
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 class TriangleVerdict(TypedDict):

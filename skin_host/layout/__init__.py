@@ -4,11 +4,12 @@ A part's taxels lie side by side in the flat arrays, in the order of its patches
 their triangles, twelve a triangle. All other packages index by this order.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import IntEnum
 from functools import cache
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -209,10 +210,13 @@ def build_layout(settings: Settings, folder: Path) -> Layout:
         parts.append(
             PartLayout(part_name, part.node, start, taxel, tuple(used), part.covered, part.foam_mm)
         )
-    position_m = np.concatenate([column.position_m for column in columns])
-    normal = np.concatenate([column.normal for column in columns])
-    pitch_mm = np.concatenate([column.pitch_mm for column in columns])
-    neighbour_start, neighbour = _neighbours(position_m, normal, pitch_mm, parts)
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(column, name) for column in columns]) for name in _ARRAYS
+    }
+    pitch_mm = arrays.pop("pitch_mm")
+    neighbour_start, neighbour = _neighbours(
+        arrays["position_m"], arrays["normal"], pitch_mm, parts
+    )
     return Layout(
         robot=settings.robot,
         parts=tuple(parts),
@@ -221,14 +225,7 @@ def build_layout(settings: Settings, folder: Path) -> Layout:
             for name in board_names
         ),
         triangles=tuple(triangles),
-        position_m=position_m,
-        normal=normal,
-        area_mm2=np.concatenate([column.area_mm2 for column in columns]),
-        radius_mm=np.concatenate([column.radius_mm for column in columns]),
-        pad_kind=np.concatenate([column.pad_kind for column in columns]),
-        unit_ff=np.concatenate([column.unit_ff for column in columns]),
-        sensitivity=np.concatenate([column.sensitivity for column in columns]),
-        no_load=np.concatenate([column.no_load for column in columns]),
+        **arrays,
         triangle_of=np.repeat(np.arange(len(triangles), dtype=np.int32), TAXELS_PER_TRIANGLE),
         neighbour_start=neighbour_start,
         neighbour=neighbour,
@@ -249,6 +246,9 @@ class _Columns:
     sensitivity: Floats
     no_load: NDArray[np.uint8]
     outlines_m: list[Floats]
+
+
+_ARRAYS = [one.name for one in fields(_Columns) if one.name != "outlines_m"]
 
 
 def _board_layout(

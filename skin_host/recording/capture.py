@@ -61,6 +61,20 @@ WATCH_S = 0.25
 _log = logging.getLogger(__name__)
 
 
+def message_at(batch: FrameBatch, row: int, channel: str | None = None) -> can.Message:
+    """A frame of a batch as python-can has it."""
+    flags, dlc = int(batch.id[row]), int(batch.dlc[row])
+    return can.Message(
+        timestamp=int(batch.t_ns[row]) * 1e-9,
+        arbitration_id=flags & _ID,
+        is_extended_id=bool(flags & EXTENDED_FLAG),
+        is_remote_frame=bool(flags & REMOTE_FLAG),
+        dlc=dlc,
+        data=batch.data[row, :dlc].tobytes(),
+        channel=channel,
+    )
+
+
 class CanLog:
     """CAN frames in a format of python-can; the file gets its name when it is closed.
 
@@ -101,19 +115,7 @@ class CanLog:
         """
         with writing(self._path):
             for row in range(len(batch)):
-                flags = int(batch.id[row])
-                dlc = int(batch.dlc[row])
-                self._logger.on_message_received(
-                    can.Message(
-                        timestamp=int(batch.t_ns[row]) * 1e-9,
-                        arbitration_id=flags & _ID,
-                        is_extended_id=bool(flags & EXTENDED_FLAG),
-                        is_remote_frame=bool(flags & REMOTE_FLAG),
-                        dlc=dlc,
-                        data=batch.data[row, :dlc].tobytes(),
-                        channel=channel,
-                    )
-                )
+                self._logger.on_message_received(message_at(batch, row, channel))
                 self.frames += 1
 
     def close(self) -> None:

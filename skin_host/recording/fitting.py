@@ -217,8 +217,8 @@ def save_relaxation(path: Path, found: Fit, settings: Settings, record: HoldReco
         "tau_s": list(chosen.tau_s),
         "beta_unload": list(chosen.beta_unload),
         "tau_unload_s": list(chosen.tau_unload_s),
-        "rms_hold_kpa": _finite(found.rms_hold_kpa),
-        "rms_rest_kpa": _finite(found.rms_rest_kpa),
+        "rms_hold_kpa": finite(found.rms_hold_kpa),
+        "rms_rest_kpa": finite(found.rms_rest_kpa),
         "hold_s": record.hold_s,
         "rest_s": record.rest_s,
         "uncertain": found.uncertain,
@@ -377,5 +377,6 @@ def _error(found: Fit) -> float:
     return float(np.sqrt(np.mean(np.square(known))))
 
 
-def _finite(value: float) -> float | None:
+def finite(value: float) -> float | None:
+    """A number for JSON, which has none that are not finite."""
     return value if np.isfinite(value) else None

@@ -9,7 +9,7 @@ from typing import TypeVar
 import can
 
 from skin_host import __version__
-from skin_host.bus.port import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
+from skin_host.bus.port import ERROR_FLAG, REMOTE_FLAG
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import Settings, skin_hash
 from skin_host.errors import BusError, LogError
@@ -21,6 +21,7 @@ from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
 from skin_host.mqtt.topics import OFFLINE
 from skin_host.processing.core import Engine, Output
+from skin_host.recording.capture import message_at
 from skin_host.recording.mcap import read_messages_of
 from skin_host.recording.replay import read_buses
 
@@ -65,17 +66,11 @@ async def play_on_buses(
 
     async for name, batch in paced(read_buses(log, settings), _last_ns, speed):
         for row in range(len(batch)):
-            flags = int(batch.id[row])
-            if flags & _NO_DATA:
+            if batch.id[row] & _NO_DATA:
                 continue
-            message = can.Message(
-                arbitration_id=flags & ~EXTENDED_FLAG,
-                is_extended_id=bool(flags & EXTENDED_FLAG),
-                data=batch.data[row, : batch.dlc[row]].tobytes(),
-            )
             try:
                 # A full queue of the interface is waited for, off the loop.
-                await asyncio.to_thread(buses[name].send, message, 1.0)
+                await asyncio.to_thread(buses[name].send, message_at(batch, row), 1.0)
             except can.CanError as error:
                 raise BusError(f'bus "{name}": cannot send: {error}') from None
             sent += 1

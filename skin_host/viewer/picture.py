@@ -11,6 +11,7 @@ range), and raw values (u8[n]). Everything else is JSON.
 """
 
 import struct
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -41,7 +42,7 @@ _NO_TAXELS: dict[str, Any] = {
 
 @dataclass(slots=True)
 class PartView:
-    """One part or fingertip: its last messages; the counters change with each new one."""
+    """One part or fingertip: its last messages; `changed` counts those of each kind."""
 
     number: int
     node: str
@@ -50,20 +51,23 @@ class PartView:
     received: int = 0
     missed: int = 0
     contacts: dict[int, Touch] = field(default_factory=dict)
-    contacts_changed: int = 0
     health: dict[str, Any] | None = None
-    health_changed: int = 0
+    changed: Counter[str] = field(default_factory=Counter)
+
+    def forget_contacts(self) -> None:
+        """Forget its contacts, whose ends may have been missed."""
+        if self.contacts:
+            self.contacts.clear()
+            self.changed["contacts"] += 1
 
 
 @dataclass(slots=True)
 class Cursor:
-    """State of one page: the counters at the time of its last messages."""
+    """State of one page: the counters at the time of its last messages, of parts by name."""
 
     layout: int = -1
     status: int = -1
-    frames: dict[str, int] = field(default_factory=dict)
-    contacts: dict[str, int] = field(default_factory=dict)
-    health: dict[str, int] = field(default_factory=dict)
+    parts: dict[str, Counter[str]] = field(default_factory=dict)
 
 
 class Picture:
@@ -88,9 +92,8 @@ class Picture:
             return
         gone = [name for name, (online, _) in nodes.items() if not online]
         for part in self.parts.values():
-            if part.node in gone and part.contacts:
-                part.contacts.clear()
-                part.contacts_changed += 1
+            if part.node in gone:
+                part.forget_contacts()
         told = {name: info for name, (_, info) in nodes.items() if info is not None}
         if told != {name: info for name, (_, info) in self._nodes.items() if info is not None}:
             self._lay_out(robot, told)
@@ -109,6 +112,7 @@ class Picture:
             part.frame = frame
             part.received += 1
             part.missed += frame.missed
+            part.changed["frame"] += 1
 
     def take_touch(self, touch: Touch) -> None:
         part = self.parts.get(touch.part)
@@ -120,27 +124,24 @@ class Picture:
             part.contacts.pop(touch.id, None)
         else:
             part.contacts[touch.id] = touch
-        part.contacts_changed += 1
+        part.changed["contacts"] += 1
 
     def take_contact(self, contact: Contact) -> None:
         """Take the contact state of a part; without a touch it has no contacts."""
         part = self.parts.get(contact.part)
-        if part is not None and not contact.touched and part.contacts:
-            part.contacts.clear()
-            part.contacts_changed += 1
+        if part is not None and not contact.touched:
+            part.forget_contacts()
 
     def take_health(self, health: Health) -> None:
         part = self.parts.get(health.part)
         if part is not None:
             part.health = dict(health.record)
-            part.health_changed += 1
+            part.changed["health"] += 1
 
     def forget_contacts(self) -> None:
         """Forget all contacts, which are uncertain after a broken connection."""
         for part in self.parts.values():
-            if part.contacts:
-                part.contacts.clear()
-                part.contacts_changed += 1
+            part.forget_contacts()
 
     def news(self, cursor: Cursor) -> list[bytes | str]:
         """Return the messages that a page has not had (text is JSON), and advance its cursor."""
@@ -148,22 +149,20 @@ class Picture:
         if cursor.layout != self.version and self._layout:
             news.append(self._layout.decode())
             cursor.layout = self.version
-            cursor.frames.clear()
-            cursor.contacts.clear()
-            cursor.health.clear()
+            cursor.parts.clear()
         if cursor.status != self._status_changed:
             news.append(_json({"type": "status"} | self._status))
             cursor.status = self._status_changed
         for name, part in self.parts.items():
-            if part.frame is not None and cursor.frames.get(name) != part.received:
+            had = cursor.parts.get(name)
+            if part.frame is not None and (had is None or had["frame"] != part.changed["frame"]):
                 news.append(self._frame_bytes(part, part.frame))
-                cursor.frames[name] = part.received
-            if cursor.contacts.get(name) != part.contacts_changed:
+            if had is None or had["contacts"] != part.changed["contacts"]:
                 news.append(_contacts_text(name, part))
-                cursor.contacts[name] = part.contacts_changed
-            if part.health is not None and cursor.health.get(name) != part.health_changed:
+            if part.health is not None and (had is None or had["health"] != part.changed["health"]):
                 news.append(_health_text(name, part.health))
-                cursor.health[name] = part.health_changed
+            if had != part.changed or had is None:
+                cursor.parts[name] = part.changed.copy()
         return news
 
     def _lay_out(self, robot: str, nodes: dict[str, NodeInfo]) -> None:

@@ -34,7 +34,7 @@ LEROBOT_VERSION = "v2.1"
 CHUNK = 1000
 TASK = "tactile recording"
 UNITS = {"area_mm2": "mm2", "peak_kpa": "kPa", "mean_kpa": "kPa", "force_n": "N", "sigma_m": "m"}
-TOUCH_COLUMNS = ("t_ns", "part", "event", "id", "x_m", "y_m", "z_m")
+TOUCH_WORDS = ("t_ns", "part", "event", "id")
 
 
 def export(
@@ -98,11 +98,9 @@ def _arrays(series: Series) -> Iterator[tuple[str, Any]]:
             yield f"{name}.raw", part.raw
         if name in series.shapes:
             yield f"{name}.position_m", np.array(series.shapes[name].position_m)
-    records = [msgspec.to_builtins(touch) for touch in series.touches]
-    for key in ("t_ns", "part", "event", "id"):
-        yield f"touch.{key}", np.array([record[key] for record in records])
-    for key in TOUCH_NUMBERS:
-        yield f"touch.{key}", np.array([record[key] for record in records], np.float64)
+    for key in (*TOUCH_WORDS, *TOUCH_NUMBERS):
+        kind = np.float64 if key in TOUCH_NUMBERS else None
+        yield f"touch.{key}", np.array([getattr(touch, key) for touch in series.touches], kind)
     nowhere = (np.nan,) * 3
     yield (
         "touch.centroid_m",
@@ -124,14 +122,19 @@ def _table(part: PartSeries) -> str:
 
 def _touch_table(touches: list[Touch]) -> str:
     text = StringIO()
-    text.write(",".join([*TOUCH_COLUMNS, *TOUCH_NUMBERS, "taxels"]) + "\n")
+    heads = [*TOUCH_WORDS, "x_m", "y_m", "z_m", *TOUCH_NUMBERS, "taxels"]
+    text.write(",".join(heads) + "\n")
     for touch in touches:
-        where = touch.centroid_m or ("", "", "")
-        known = [getattr(touch, key) for key in TOUCH_NUMBERS]
-        numbers = ["" if number is None else number for number in known]
-        taxels = " ".join(map(str, touch.taxels))
-        cells = [touch.t_ns, touch.part, touch.event, touch.id, *where, *numbers, taxels]
-        text.write(",".join(map(str, cells)) + "\n")
+        words, numbers = (
+            [getattr(touch, key) for key in of] for of in (TOUCH_WORDS, TOUCH_NUMBERS)
+        )
+        cells = [
+            *words,
+            *(touch.centroid_m or (None,) * 3),
+            *numbers,
+            " ".join(map(str, touch.taxels)),
+        ]
+        text.write(",".join("" if cell is None else str(cell) for cell in cells) + "\n")
     return text.getvalue()
 
 
@@ -184,7 +187,6 @@ def _frames(pa: Any, part: PartSeries, schema: Any) -> Any:
 
 
 def _touches(pa: Any, series: Series, layout: dict[str, str]) -> Any:
-    records = [msgspec.to_builtins(touch) for touch in series.touches]
     fields = [
         pa.field("t", pa.timestamp("ns", "UTC")),
         pa.field("part", pa.string()),
@@ -194,15 +196,8 @@ def _touches(pa: Any, series: Series, layout: dict[str, str]) -> Any:
         *(pa.field(key, pa.float64(), metadata={"unit": UNITS[key]}) for key in TOUCH_NUMBERS),
         pa.field("taxels", pa.list_(pa.int32())),
     ]
-    columns = [
-        pa.array([record["t_ns"] if one.name == "t" else record[one.name] for record in records])
-        .cast(pa.int64() if one.name == "t" else one.type)
-        .cast(one.type)
-        if records
-        else pa.nulls(0, one.type)
-        for one in fields
-    ]
-    return pa.table(columns, schema=pa.schema(fields, metadata=layout))
+    rows = [{"t": touch.t_ns} | msgspec.to_builtins(touch) for touch in series.touches]
+    return pa.Table.from_pylist(rows, schema=pa.schema(fields, metadata=layout))
 
 
 def _layout(series: Series) -> dict[str, Any]:
