@@ -378,7 +378,8 @@ def _report(arguments: argparse.Namespace) -> int:
 
 def _simulate(arguments: argparse.Namespace) -> int:
     from skin_host.demo import configuration
-    from skin_host.evaluation.simulate.run import coverage, simulate, simulate_all
+    from skin_host.evaluation.simulate import outcome
+    from skin_host.evaluation.simulate.run import simulate, simulate_all
 
     if arguments.seeds < 1 or arguments.hours <= 0 or arguments.seed < 0:
         raise RequestError("wanted --seed of 0 or more, --seeds of 1 or more and --hours above 0")
@@ -406,77 +407,15 @@ def _simulate(arguments: argparse.Namespace) -> int:
             results.append(result)
             if not arguments.json:
                 progress.close()
-                print(_line(result), flush=True)
+                print(outcome.line(result), flush=True)
                 if result.broken:
-                    print(_story(result, arguments, config), flush=True)
+                    print(outcome.story(result, config, arguments.hours), flush=True)
             progress.update(len(results) / arguments.seeds, f"seed {result.seed}")
     finally:
         progress.close()
         logging.disable(logging.NOTSET)
-    broken = [result for result in results if result.broken]
     if arguments.json:
-        print_json(_document(results))
+        print_json(outcome.document(results))
     elif arguments.seeds > 1:
-        print(f"{len(results) - len(broken)} of {len(results)} seeds kept every promise")
-        print(_covered(coverage(results)))
-    return 1 if broken else 0
-
-
-def _line(result: "RunResult") -> str:
-    speed = result.simulated_s / max(result.cpu_s, 1e-9)
-    outcome = "a promise was broken" if result.broken else "every promise held"
-    return (
-        f"seed {result.seed}: {outcome}; {result.simulated_s:.0f} s in {result.cpu_s:.1f} s of CPU "
-        f"({speed:.0f} x), {sum(result.troubles.values())} troubles, {result.touches} touch "
-        f"events, {result.deaths} ends of the daemon; {result.events} events, hash {result.digest}"
-    )
-
-
-def _story(result: "RunResult", arguments: argparse.Namespace, config: Path) -> str:
-    """Return the events before a broken promise, and the command that repeats it."""
-    command = f"skin simulate {config} --seed {result.seed} --hours {arguments.hours:g}"
-    again = max(0.0, result.simulated_s - 1.0)
-    return "\n".join(
-        [
-            *(f"  {line}" for line in result.last),
-            f"  broken at {result.simulated_s:.3f} s: {result.broken}",
-            f"  with logs: {command} --until {again:.1f}",
-        ]
-    )
-
-
-def _covered(kinds: dict[str, list[str]]) -> str:
-    """Return how much of the catalogue came, and was named."""
-    n_injected, n_named = len(kinds["injected"]), len(kinds["named"])
-    came = f"{n_injected} of {n_injected + len(kinds['never_injected'])} kinds of trouble came"
-    named = f"{n_named} of {n_named + len(kinds['never_named'])} that must be named were"
-    return "; ".join(
-        f"{what} (not {', '.join(kinds[missing])})" if kinds[missing] else what
-        for what, missing in ((came, "never_injected"), (named, "never_named"))
-    )
-
-
-def _document(results: "list[RunResult]") -> dict[str, Any]:
-    from skin_host.evaluation.simulate.run import coverage
-
-    return {
-        "seeds": len(results),
-        "kept": sum(result.broken is None for result in results),
-        "simulated_s": round(sum(result.simulated_s for result in results), 3),
-        "cpu_s": round(sum(result.cpu_s for result in results), 3),
-        "coverage": coverage(results),
-        "runs": [
-            {
-                "seed": result.seed,
-                "broken": result.broken,
-                "simulated_s": round(result.simulated_s, 6),
-                "events": result.events,
-                "hash": result.digest,
-                "troubles": result.troubles,
-                "named": result.named,
-                "touches": result.touches,
-                "deaths": result.deaths,
-            }
-            for result in results
-        ],
-    }
+        print(outcome.summary(results))
+    return 1 if any(result.broken for result in results) else 0
