@@ -56,6 +56,7 @@ class AdapterPort(Port):
     """A bus that python-can reads, frame by frame."""
 
     capacity = CAPACITY
+    stamps_late = True
 
     def __init__(
         self, name: str, settings: Bus, bus: can.BusABC | None, clock: Clock = SYSTEM

@@ -104,9 +104,12 @@ class Port(ABC):
         state: of the link, as far as it is known.
         counters: of everything since opening.
         capacity: most frames of one read.
+        stamps_late: time stamps may be those of reading or of another process, so a busy computer
+            moves them; the kernel's are not.
     """
 
     capacity: int
+    stamps_late = False
 
     def __init__(
         self, name: str, settings: Bus, bus: can.BusABC | None, clock: Clock = SYSTEM

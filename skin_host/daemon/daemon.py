@@ -381,7 +381,8 @@ class Daemon:
                 # At once: what was pressed then must be doubted after a crash, too.
                 self._begin_to_keep_zeros()
             now_s = self.clock.monotonic_s()
-            self.health.tick(self.link.read_ns, self.link.ports, self.link.boards)
+            link = self.link
+            self.health.tick(link.read_ns, link.ports, link.boards, link.longest_pause_ns())
             told = self.fingertips.publish_health(self.link.read_ns)
             before, pulse = pulse, self._pulse()
             if pulse != before or now_s - min(said_s.values()) >= HEALTH_S:

@@ -32,6 +32,9 @@ HELD_UP_NS = 25_000_000
 #: What brings the frames may have been held up by the same work. For this long after such a turn
 #: no sweep is closed and no board becomes silent, so that what is on its way is not missed.
 PATIENCE_NS = 100_000_000
+#: It may go on as late as it was held up: it may be as long again until every board that was
+#: received before is received again, up to this.
+LONGEST_PATIENCE_NS = 2_000_000_000
 #: A bus that does not take the set-up of its boards is tried again after this.
 RETRY_S = 2.0
 STOP_S = 1.0
@@ -134,6 +137,10 @@ class Link:
         self._turned_ns = self.read_ns
         self._held_up_ns = max(LONGEST_NS, int(settings.receive.poll_ms * 1e6)) + HELD_UP_NS
         self._held_up_at_ns: int | None = None
+        self._patience_ns = PATIENCE_NS
+        #: How many sweeps of each board had been received when a turn was last held up.
+        self._sweeps_then = engine.ledger.sweeps.copy()
+        self._longest_pause_ns = 0
         try:
             for bus in engine.assemblers:
                 port = open_port(bus, settings.buses[bus], settings.receive, wait=wait, clock=clock)
@@ -203,6 +210,9 @@ class Link:
             now_ns: the time, on the clock of the frames' time stamps.
             deliver, record: see `read`.
         """
+        pause_ns, self._turned_ns = now_ns - self._turned_ns, now_ns
+        if pause_ns > self._held_up_ns:
+            self._note_held_up(now_ns, pause_ns)
         read_ns, is_behind = now_ns, False
         batches: list[tuple[str, FrameBatch]] = []
         for bus, port in self.ports.items():
@@ -234,19 +244,38 @@ class Link:
             self._note(output)
             deliver(output)
 
+    def _note_held_up(self, now_ns: int, pause_ns: int) -> None:
+        """This turn was held up; what waits has not been read yet."""
+        self._longest_pause_ns = max(self._longest_pause_ns, pause_ns)
+        if self._held_up_at_ns is None:
+            self._held_up_at_ns = now_ns
+            self._patience_ns = min(max(pause_ns, PATIENCE_NS), LONGEST_PATIENCE_NS)
+            self._sweeps_then[:] = self._engine.ledger.sweeps
+
     def _is_patient(self, now_ns: int) -> bool:
         """Whether this turn, or one shortly before it, was held up.
 
         Between two such times what has waited too long is closed once, so that a computer that is
         held up all the time closes it too.
         """
-        held_up = now_ns - self._turned_ns > self._held_up_ns
-        self._turned_ns = now_ns
         if self._held_up_at_ns is None:
-            self._held_up_at_ns = now_ns if held_up else None
-        elif not 0 <= now_ns - self._held_up_at_ns < PATIENCE_NS:
-            self._held_up_at_ns = None
-        return self._held_up_at_ns is not None
+            return False
+        waited_ns = now_ns - self._held_up_at_ns
+        if 0 <= waited_ns < PATIENCE_NS:
+            return True
+        ledger = self._engine.ledger
+        back = (ledger.sweeps > self._sweeps_then) | (self._sweeps_then == 0) | ledger.silent
+        if 0 <= waited_ns < self._patience_ns and not back.all():
+            return True
+        self._held_up_at_ns = None
+        return False
+
+    def longest_pause_ns(self) -> int:
+        """Return by how long a turn was held up at most since this was last called; 0: by less
+        than matters.
+        """
+        longest_ns, self._longest_pause_ns = self._longest_pause_ns, 0
+        return longest_ns
 
     def _note(self, output: Output) -> None:
         """Note that the next sweep of a board is one period later."""

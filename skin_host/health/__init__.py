@@ -36,9 +36,11 @@ LATELY_NS = 60_000_000_000
 LINE_S = 60.0
 #: Ports log these faults themselves, at once.
 LOGGED_BY_PORTS = {"bus_down", "bus_gone", "bus_off"}
-#: A fault is logged only after it has lasted for this long.
+#: A fault is logged only after it has lasted for this long ...
 LASTING_S = 2.0
-_ACCUSING = {"board_jitter", "board_period", "bus_loses_frames"}
+#: ... of which a time without a look counts for no more than this.
+LONGEST_LOOK_S = 0.3
+_ACCUSING = {"board_jitter", "board_period", "board_twice", "bus_loses_frames"}
 _PASSING = {
     "board_jitter",
     "board_overflows",
@@ -83,10 +85,26 @@ class HealthWatch:
         """Take in one output of the core."""
         self._watch.note(output)
 
-    def tick(self, now_ns: int, ports: dict[str, "Port"], boards: dict[str, "Boards"]) -> None:
-        """Read all counters; to be called ten times a second."""
+    def tick(
+        self,
+        now_ns: int,
+        ports: dict[str, "Port"],
+        boards: dict[str, "Boards"],
+        held_up_ns: int = 0,
+    ) -> None:
+        """Read all counters; to be called ten times a second.
+
+        Args:
+            now_ns: the time.
+            ports, boards: by name of the bus.
+            held_up_ns: for how long at most the buses were not read since the last call, where
+                that is longer than planned.
+        """
         pause_ns = now_ns - self._ticked_ns
-        if self._ticked_ns and STALL_NS < pause_ns < LATELY_NS:
+        if not (self._ticked_ns and STALL_NS < pause_ns < LATELY_NS):
+            # Shorter pauses only matter where they change time stamps.
+            pause_ns = held_up_ns if any(port.stamps_late for port in ports.values()) else 0
+        if pause_ns:
             self._stall_ns, self._stalled_ns = pause_ns, now_ns
         self._ticked_ns = now_ns
         self._watch.tick(now_ns, ports, boards)
@@ -103,7 +121,7 @@ class HealthWatch:
         """
         engine, watch = self._engine, self._watch
         return (
-            self._stalled_ns,
+            abs(self._ticked_ns - self._stalled_ns) > STALLED_NS,
             engine.calibration,
             tuple(engine.disabled),
             *_pulse_of_boards(engine),
@@ -226,6 +244,8 @@ class FaultLog:
 
     def __init__(self) -> None:
         self._since_s: dict[tuple[str, str], float] = {}
+        self._looked_s = 0.0
+        self._noted_s: float | None = None
         self._logged: set[tuple[str, str]] = set()
         self._line_s = -LINE_S
 
@@ -234,13 +254,16 @@ class FaultLog:
         present = {
             key: sentence for key, sentence in present.items() if key[0] not in LOGGED_BY_PORTS
         }
-        self._since_s = {key: self._since_s.get(key, now_s) for key in present}
+        passed_s = 0.0 if self._noted_s is None else now_s - self._noted_s
+        self._noted_s = now_s
+        self._looked_s += min(passed_s, LONGEST_LOOK_S)
+        self._since_s = {key: self._since_s.get(key, self._looked_s) for key in present}
         if now_s - self._line_s < LINE_S:
             return
         new = [
             key
             for key, since_s in self._since_s.items()
-            if key not in self._logged and now_s - since_s >= LASTING_S
+            if key not in self._logged and self._looked_s - since_s >= LASTING_S
         ]
         over = [key for key in self._logged if key not in present]
         if not new and not over:

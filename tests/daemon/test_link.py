@@ -117,17 +117,36 @@ def test_half_a_sweep_is_closed_in_time_on_a_computer_that_pauses_again_and_agai
     assert reader.now_ns - began_ns <= 400 * MS
 
 
-@pytest.mark.parametrize("pause_ms", [150, 600])
+@pytest.mark.parametrize(
+    ("pause_ms", "more_ms"), [(150, 190), (600, 190), (600, 600), (9000, 1500)]
+)
 def test_no_board_is_silent_because_what_brings_its_frames_was_held_up_too(
-    reader: Reader, pause_ms: int
+    reader: Reader, pause_ms: int, more_ms: int
 ) -> None:
     for _ in range(3):
         reader.period(ALL)
     reader.now_ns += pause_ms * MS
-    reader.wait(190)
+    reader.wait(more_ms)
     assert not reader.engine.ledger.any_silent
     reader.period(ALL)
     assert not reader.engine.ledger.any_silent
+
+
+def test_a_board_that_sent_after_a_stall_and_died_is_silent_in_time(reader: Reader) -> None:
+    for _ in range(3):
+        reader.period(ALL)
+    reader.now_ns += 9000 * MS
+    reader.period(ALL)
+    reader.wait(300)
+    assert reader.engine.ledger.any_silent
+
+
+def test_a_board_that_died_in_a_stall_is_silent_soon_after_it(reader: Reader) -> None:
+    for _ in range(3):
+        reader.period(ALL)
+    reader.now_ns += 9000 * MS
+    reader.wait(2300)
+    assert reader.engine.ledger.any_silent
 
 
 def test_a_silent_board_is_found_on_a_computer_that_pauses_again_and_again(reader: Reader) -> None:
