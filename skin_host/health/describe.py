@@ -55,8 +55,8 @@ class Describer:
         self._engine = engine
         self._layout = engine.layout
         self._watch = watch
-        #: For each part the common shift at the last look.
-        self._common: dict[int, float] = {}
+        #: For each part the shifts of its thermal and of its resting pads at the last look.
+        self._shifts: dict[int, Temperatures] = {}
         #: For each part: the triangles that belong to it, by board.
         self._fitted: dict[int, dict[int, list[int]]] = {part: {} for part in engine.parts}
         for triangle in self._layout.triangles:
@@ -237,11 +237,11 @@ class Describer:
             moved = np.abs(pipeline.baseline[span] - calibration.baseline[span])
             limit = self._engine.settings.processing.drift.limit_units
             found["drifting"] = (moved > DRIFTING_SHARE * limit) & calibration.usable[span]
-        return {
-            kind: np.flatnonzero(mask & pressure).tolist()
-            for kind, mask in found.items()
-            if (mask & pressure).any()
-        }
+        # A temperature pad that fails spoils the correction of its triangle. Out of its range it is
+        # only warm.
+        for kind in found.keys() - {"stuck", "noisy"}:
+            found[kind] &= pressure
+        return {kind: np.flatnonzero(mask).tolist() for kind, mask in found.items() if mask.any()}
 
     def _warmth(self, part: int, pressure: NDArray[np.bool_]) -> Temperatures | None:
         pipeline, calibration = self._engine.pipeline, self._engine.calibration
@@ -256,19 +256,22 @@ class Describer:
         lives = watch.valid.reshape(-1, TAXELS_PER_TRIANGLE).any(axis=1)
         thermal = ~pressure & heard & calibration.usable[span]
         thermal &= np.repeat(lives, TAXELS_PER_TRIANGLE)
-        warmth: Temperatures = {"thermal_units": None, "common_units": 0.0}
+        found: Temperatures = {"thermal_units": None, "common_units": 0.0}
         if thermal.any():
             shift = units[thermal] - calibration.baseline[span][thermal]
-            warmth["thermal_units"] = round(float(np.median(shift)), 1)
+            found["thermal_units"] = round(float(np.median(shift)), 1)
         rests = watch.rests()
         if rests is not None and np.count_nonzero(rests) >= FEWEST_RESTING:
             shift = units - pipeline.baseline[span]
             common = common_shift(shift, rests, self._layout.triangle_of[span])
-            # Noise that the pads of a triangle share passes from one sweep to the next.
-            before, self._common[part] = self._common.get(part, common), common
-            steady: float = min(common, before, key=abs)
-            warmth["common_units"] = round(steady, 1)
-        return warmth
+            found["common_units"] = round(common, 1)
+        # A temperature lasts. Noise that the pads of a triangle share, and what a chip sends that
+        # has just stopped answering, pass from one sweep to the next.
+        before, self._shifts[part] = self._shifts.get(part, found), found
+        return {
+            "thermal_units": _nearer_zero(before["thermal_units"], found["thermal_units"]),
+            "common_units": min(before["common_units"], found["common_units"], key=abs),
+        }
 
     def _verdicts(self, part: int, pressure: NDArray[np.bool_]) -> dict[str, list[int]]:
         calibration = self._engine.calibration
@@ -436,3 +439,8 @@ def _listed(mask: NDArray[np.bool_] | None) -> list[int]:
 
 def _count(present: int, triangles: tuple[int, ...]) -> int:
     return sum(present >> triangle & 1 for triangle in triangles if triangle < TRIANGLES)
+
+
+def _nearer_zero(before: float | None, now: float | None) -> float | None:
+    """Return the shift that two looks agree on; None if one of them had none."""
+    return None if before is None or now is None else min(before, now, key=abs)

@@ -2,10 +2,12 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from emulator.probes.scene import Air, Fault, Scene, load
 from skin_host.health.diagnosis import diagnose
+from skin_host.layout import PadKind
 from tests.support.fault_bench import FaultBench
 
 HELD_SCENE = """
@@ -91,3 +93,39 @@ def test_a_press_on_the_whole_part_is_no_change_of_its_temperature() -> None:
     bench.run(9.0)
     assert bench.touched["left_hand"].sum() > 60
     assert "part_temperature" not in codes(bench, "left_hand")
+
+
+def test_a_temperature_that_one_sweep_shows_is_none(bench: FaultBench) -> None:
+    """What a chip sends that has just stopped answering may look like one."""
+    bench.run(1.0)
+    part = next(i for i, one in enumerate(bench.layout.parts) if one.name == "left_hand")
+    layout = bench.layout.parts[part]
+    thermal = bench.layout.pad_kind[layout.start : layout.stop] == PadKind.THERMAL
+    watch = bench.health._watch.parts[part]
+    assert watch.raw is not None
+
+    def look(shift_units: int) -> set[str]:
+        watch.raw = np.where(thermal, raw - shift_units, raw)
+        return {
+            fault["code"] for fault in bench.health.record(part, bench.now_ns, {}, {})["faults"]
+        }
+
+    raw = watch.raw.astype(np.int64)
+    assert "part_temperature" not in look(0)
+    assert "part_temperature" not in look(12)
+    assert "part_temperature" not in look(0)
+    assert "part_temperature" not in look(12)
+    assert "part_temperature" in look(12)
+
+
+def test_a_temperature_pad_that_is_stuck_is_named(bench: FaultBench) -> None:
+    layout = bench.layout
+    index = int(np.flatnonzero(layout.pad_kind == PadKind.THERMAL)[0])
+    triangle = layout.triangles[int(layout.triangle_of[index])]
+    board = layout.boards[triangle.board]
+    (taxel,) = np.flatnonzero(board.taxel_index[triangle.number] == index).tolist()
+    bench.inject("stuck_taxel", board=board.name, triangle=triangle.number, taxel=taxel)
+    bench.run(10.0)
+    part = layout.parts[triangle.part]
+    assert bench.records[part.name]["taxel_faults"] == {"stuck": [index - part.start]}
+    assert "taxel_stuck" in codes(bench, part.name)

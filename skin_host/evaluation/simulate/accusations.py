@@ -8,6 +8,7 @@ from typing import Any
 
 from skin_host.evaluation.simulate.troubles import Trouble
 from skin_host.evaluation.simulate.world import World
+from skin_host.mqtt.connection import GRACE_S, LAST_RETRY_S, TIMEOUT_S
 
 NS = 1_000_000_000
 #: Health reports these for a minute after they happened; it looks ten times a second.
@@ -20,6 +21,8 @@ LATELY = {
     "touches_dropped",
 }
 LATELY_NS = 62 * NS
+#: Events go on being lost until the daemon has noticed that its broker is back.
+CONNECTED_NS = round((TIMEOUT_S + GRACE_S + LAST_RETRY_S) * NS)
 #: These last until the skin is calibrated at rest, is enabled, or something could be written: their
 #: sentences ask for that.
 LASTING = {
@@ -143,7 +146,7 @@ class Accusations:
         now_ns = self._world.clock.monotonic_ns()
         longest_ns = PASSING_NS
         if code in LATELY:
-            longest_ns = LATELY_NS
+            longest_ns = LATELY_NS + CONNECTED_NS * (where == "broker")
         elif code in SLOW:
             longest_ns = WRONG_NS
         return any(

@@ -79,6 +79,8 @@ FOR_EVER_S = 1e6
 KEEP_ALIVE_S = 10.0
 #: While it lasts, the chip that it names does not measure.
 SILENCING = {"chip_gone"}
+#: Nothing but the chip that it names sends what is wrong.
+ALONE = {"no_acknowledge"}
 _BROKER = {"broker_away", "touches_dropped", "broker_refuses", "node_name_taken", "broker_rejects"}
 
 
@@ -217,10 +219,13 @@ def _emulated(
         spoiled: Mask | None = None
         if spoils and "board" in targets:
             spoiled = taxels_of(world, board=board)
-            if "taxel" in targets:
+            if "taxel" in targets or name in ALONE:
                 number = next(one for one in world.layout.boards if one.name == board)
+                taxels = number.taxel_index[triangle]
+                if "taxel" in targets:
+                    taxels = taxels[[int(str(targets["taxel"]))]]
                 spoiled = np.zeros_like(spoiled)
-                spoiled[number.taxel_index[triangle, int(str(targets["taxel"]))]] = True
+                spoiled[taxels[taxels >= 0]] = True
         elif spoils:
             spoiled = (
                 taxels_of(world, bus=bus)
@@ -497,7 +502,8 @@ KINDS: dict[str, Begin] = {
     "shared_address": _emulated(
         "shared_address", _SWAPPED | {"bus_bit_errors"}, _ELSEWHERE, 1.0, spoils=True
     ),
-    "no_acknowledge": _emulated("no_acknowledge", _CHIPS | _SET_UP, _LINE, 1.0),
+    # It sends bytes of other registers.
+    "no_acknowledge": _emulated("no_acknowledge", _SWAPPED, _LINE, 1.0, spoils=True),
     # It holds for one sweep, which may pass between two looks of health; what follows does not.
     "data_held_low": _emulated(
         "data_held_low", _CHIPS | _SET_UP, _LINE | {"triangle_silenced"}, 1.0, spoils=True
