@@ -230,6 +230,8 @@ class Burst:
         ids = np.repeat((header | self.triangle).astype(np.uint32), 2)
         self._ids = ids if self._order is None else ids[self._order]
         self._dlc = np.full(len(ids), 8, np.uint8)
+        #: What the arithmetic takes for several sweeps, by how many.
+        self._of_sweeps: dict[int, tuple[Ints, Ints, Ints, Ints, NDArray[np.intp]]] = {}
 
     def _sending_order(self) -> NDArray[np.intp] | None:
         parts = []
@@ -256,7 +258,35 @@ class Burst:
         data = encode_values(values, status)
         if self._order is not None:
             data = data[self._order]
+        return self.batch(data, t_ns)
+
+    def batch(self, data: Bytes, t_ns: int) -> FrameBatch:
+        """The frames with some contents, uint8[2 k, 8] in the order in which they are sent."""
         return FrameBatch(self._ids, self._dlc, data, np.full(len(data), t_ns, np.int64))
+
+    def contents(self, raw: Words) -> Bytes | None:
+        """The contents of the frames of m sweeps, uint8[m, 2 k, 8]; None in the test mode, and if
+        a triangle does not acknowledge: its board counts that.
+
+        Args:
+            raw: uint16[m, k, 12].
+        """
+        if self._test_mode is not None:
+            return None
+        m = len(raw)
+        if m not in self._of_sweeps:
+            self._of_sweeps[m] = (
+                np.tile(self._base, (m, 1)),
+                np.tile(self._shift, m),
+                np.tile(self._no_load, m),
+                np.tile(self._gain, (m, 1)),
+                np.tile(self._thermal, m),
+            )
+        values, status = self._arithmetic(raw.reshape(-1, TAXELS), *self._of_sweeps[m])
+        if (status & 1).any():
+            return None
+        data = encode_values(values, status).reshape(m, -1, 8)
+        return data if self._order is None else data[:, self._order]
 
 
 def board_order(board: Mtb, n: int) -> NDArray[np.intp]:

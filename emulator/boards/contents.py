@@ -15,8 +15,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from emulator.boards.arithmetic import ABSENT, TAXELS, Bytes, Words
 from emulator.boards.mtb import Burst, Mtb, join
-from emulator.chips.converters import Converters, read_rows
+from emulator.chips.converters import Converters
+from emulator.chips.signal import Ahead
 from skin_host.bus.logs import read_channels
 from skin_host.bus.wire import FrameBatch, find_skin_frames
 from skin_host.errors import ConfigurationError, LogError
@@ -25,21 +27,41 @@ from skin_host.layout import Layout
 Ints = NDArray[np.intp]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Known:
     """A burst of several boards as they were at `versions`.
 
     Attributes:
         chips: all chips of these boards.
-        row: intp[k], where in `chips` that of each triangle is, -1 for none.
+        row: intp[k], where in `chips` that of each triangle is, -1 for none; None if each is where
+            its triangle is.
         frames_of: which of the frames go to which bus.
+        ahead, revision: the reads that `contents` was made of.
+        contents: uint8[m, 2 k, 8], what the frames of these reads hold, or None.
     """
 
     versions: list[int]
     burst: Burst
     chips: Ints
-    row: Ints
+    row: Ints | None
     frames_of: list[tuple[str, slice]]
+    ahead: Ahead | None = None
+    revision: int = 0
+    contents: Bytes | None = None
+
+    def sent(self, raw: Words) -> Words:
+        """Of what the chips answer, uint16[..., n, 12], that of each triangle."""
+        if self.row is None:
+            return raw
+        nothing = np.full((*raw.shape[:-2], 1, TAXELS), ABSENT, np.uint16)
+        return np.concatenate([raw, nothing], axis=-2)[..., self.row, :]
+
+    def foresee(self, ahead: Ahead) -> Bytes | None:
+        """Return what the frames of a foreseen read hold, or None if that cannot be foreseen."""
+        if self.ahead is not ahead or self.revision != ahead.revision:
+            self.ahead, self.revision = ahead, ahead.revision
+            self.contents = self.burst.contents(self.sent(ahead.results))
+        return None if self.contents is None else self.contents[ahead.row].copy()
 
 
 class Bursts:
@@ -65,8 +87,13 @@ class Bursts:
             t_ns: now.
         """
         known = self._of(numbers)
-        raw = read_rows(self._converters.signal, known.chips, known.row)
-        batch = known.burst.frames(raw, t_ns)
+        raw, ahead = self._converters.signal.read_ahead(known.chips)
+        # The first of some reads may be the only one.
+        data = known.foresee(ahead) if ahead is not None and ahead.row else None
+        if data is None:
+            batch = known.burst.frames(known.sent(raw), t_ns)
+        else:
+            batch = known.burst.batch(data, t_ns)
         if len(known.frames_of) == 1:
             yield known.frames_of[0][0], batch
             return
@@ -90,13 +117,16 @@ class Bursts:
         of_board = np.array(numbers, np.intp)[burst.board]
         sent = [chip_of_slot[board][slot] for board, slot in zip(of_board, burst.slot, strict=True)]
         row = np.array([np.searchsorted(chips, one) if one >= 0 else -1 for one in sent], np.intp)
+        straight = np.array_equal(row, np.arange(len(chips)))
         frames_of: list[tuple[str, slice]] = []
         start = 0
         for bus, of_bus in groupby(self._bus_of[board] for board in of_board):
             stop = start + 2 * len(list(of_bus))
             frames_of.append((bus, slice(start, stop)))
             start = stop
-        made = self._known[tuple(numbers)] = _Known(versions, burst, chips, row, frames_of)
+        made = self._known[tuple(numbers)] = _Known(
+            versions, burst, chips, None if straight else row, frames_of
+        )
         return made
 
 

@@ -221,7 +221,7 @@ class Converters:
 
         0xFFFF is read from pulled-up lines, 0 from a line that is held low.
         """
-        self.signal.forced[chip] = -1 if word is None else word
+        self.signal.force(chip, -1 if word is None else word)
         self._plug(self._layout.triangles[chip].board)
 
     def rewire(self, number: int, chip_of_slot: Ints) -> None:
@@ -386,17 +386,3 @@ class _InTime:
             self._reads = reads
             chip.pointer = reg.DEVICE_ID
         return chip
-
-
-def read_rows(signal: SignalSkin, chips: Ints, row: Ints) -> Words:
-    """Read chips of a `SignalSkin`, and give some of the answers, uint16[k, 12].
-
-    Args:
-        signal: the chips.
-        chips: which of them are read.
-        row: intp[k], indices into `chips`; -1 answers 0xFFFF.
-    """
-    words = signal.read(chips)
-    if len(row) == len(chips) and (row == np.arange(len(chips))).all():
-        return words
-    return np.vstack([words, np.full((1, TAXELS), ABSENT, np.uint16)])[row]

@@ -24,8 +24,8 @@ _NO_SET_UP = np.zeros((reg.N_STAGES, reg.STAGE_WORDS), np.uint16)
 _MOST_CHANGES = 64
 #: A sequence that never comes to its end.
 _STOPPED_NS = 1 << 58
-#: The noise of so many reads is drawn together, of no more chips: of many, a read costs what its
-#: numbers cost and not what its calls do.
+#: The results of so many reads are foreseen together, of no more chips: of many, a read costs what
+#: its numbers cost and not what its calls do.
 _READS_AHEAD = 16
 _MOST_CHIPS_AHEAD = 64
 
@@ -34,22 +34,27 @@ Ints = NDArray[np.intp]
 
 
 @dataclass(slots=True)
-class _Ahead:
-    """The noise of chips that are read together at an interval, at their next reads.
+class Ahead:
+    """What chips that are read together at an interval answer at their next reads.
 
     Attributes:
-        last_ns: when they were last read.
+        results: uint16[m, k, 12], if no input changes.
+        row: of the last read in `results`.
+        revision: changes when inputs have changed, and `results` from `row` on with them.
+        last_ns: when the chips were last read.
         interval_ns: since the read before.
-        version: of what the noise depends on.
-        row: of the last read in `noise`.
-        noise: float64[m, k, 12] (codes).
+        noise_version, ideal_version: of what the noise, and what the results depend on.
+        noise: float64[m, k, 12] (codes); None without any.
     """
 
+    results: Words
+    row: int
+    revision: int
     last_ns: int
     interval_ns: int
-    version: int
-    row: int
-    noise: Floats
+    noise_version: int
+    ideal_version: int
+    noise: Floats | None
 
 
 class SignalSkin:
@@ -74,6 +79,7 @@ class SignalSkin:
         n = len(input_noise_ff)
         self.t_ns = 0
         self.forced = np.full(n, -1, np.int32)
+        self._is_any_forced = False
         self._q_ff = q_ff
         self._noise = noise
         self._noise_ff = input_noise_ff
@@ -109,9 +115,12 @@ class SignalSkin:
         #: The chips whose registers were read last, and when.
         self._settled: set[int] = set()
         self._settled_ns = 0
-        #: By the numbers of chips that are read together; and what changes with their noise.
-        self._ahead: dict[bytes, _Ahead] = {}
+        #: By the numbers of chips that are read together; what changes with their noise and with
+        #: what they convert, and the latter when each chip last changed.
+        self._ahead: dict[bytes, Ahead] = {}
         self._noise_version = 0
+        self._ideal_version = 0
+        self._ideal_versions = np.zeros(n, np.int64)
 
     def set_capacitance_ff(self, chips: Ints, values: Floats) -> None:
         """Change the inputs of some chips from now on: float64[k, 12] (fF).
@@ -126,8 +135,8 @@ class SignalSkin:
                 self._update_ideal(chips)
                 return
             self._changed = chips
-            self._is_changed[chips] = True
             self._place[chips] = np.arange(len(chips))
+        self._is_changed[chips] = True
         self._changed_ns.append(self.t_ns)
         self._changes.append(values.copy())
 
@@ -139,7 +148,7 @@ class SignalSkin:
             ideals = np.concatenate([self._ideal[chips][None], ideals])
             self._take(chips, np.array(self._changed_ns), ideals)
             self._capacitance_ff[chips, :TAXELS] = self._changes[-1]
-            self._ideal[chips] = ideals[-1]
+            self._set_ideal(chips, ideals[-1])
             self._changes = []
             self._changed_ns = []
         self._is_changed[self._changed] = False
@@ -254,89 +263,110 @@ class SignalSkin:
             return int(self._bank_2[chip][divmod(address - reg.BANK_2, reg.STAGE_WORDS)])
         return reg.DEVICE_ID_VALUE if address == reg.DEVICE_ID else 0
 
+    def force(self, chip: int, word: int) -> None:
+        """Let a chip answer `word` whatever it measures; -1 ends that."""
+        self.forced[chip] = word
+        self._is_any_forced = bool((self.forced >= 0).any())
+
     def read(self, chips: Ints) -> Words:
         """The twelve results of some chips, uint16[k, 12]."""
-        forced = self.forced[chips]
-        if forced.max(initial=-1) >= 0:
+        return self.read_ahead(chips)[0]
+
+    def read_ahead(self, chips: Ints) -> tuple[Words, Ahead | None]:
+        """The same, and what holds the next reads if this one was foreseen."""
+        if self._is_any_forced:
+            forced = self.forced[chips]
             # A chip that is gone is not read: its sequencer and its noise go on later.
             there = forced < 0
-            words = np.repeat(forced[:, None], TAXELS, axis=1).astype(np.uint16)
-            if there.any():
-                words[there] = self.read(chips[there])
-            return words
-        self._settle(chips)
+            if not there.all():
+                words = np.repeat(forced[:, None], TAXELS, axis=1).astype(np.uint16)
+                if there.any():
+                    words[there] = self.read(chips[there])
+                return words, None
+        settled = self._settle(chips)
+        if settled is not None:
+            return settled
         results: Words = self._results[chips]
-        return results
+        return results, None
 
-    def _settle(self, chips: Ints) -> None:
-        """Store the results of the conversions that have ended, with their noise."""
-        changed = self._is_changed[chips]
-        is_changed = bool(changed.any())
-        if self._settle_in_step(chips, changed if is_changed else None):
-            return
+    def _settle(self, chips: Ints) -> tuple[Words, Ahead | None] | None:
+        """Store the results of the conversions that have ended, with their noise.
+
+        Returns the results, if all are new, and what holds the next ones if they were foreseen.
+        """
+        changed: NDArray[np.bool_] | None = None
+        if self._changes:
+            changed = self._is_changed[chips]
+            if not changed.any():
+                changed = None
+        settled = self._settle_in_step(chips, changed)
+        if settled is not None:
+            return settled
         # What has changed at other chips can wait, for more of it.
-        if is_changed:
+        if changed is not None:
             self._work_out()
         self._take(chips)
         fresh = self._unseen[chips].any(axis=1)
         if not fresh.any():
-            return
+            return None
         rows = self._rows(chips if fresh.all() else chips[fresh])
         codes = self._clean[rows]
         if self._noise is not None:
             noise = self._noise.at(rows, self._began_ns[rows])
             noise *= self._sigma[rows]
             codes = codes + noise
-        codes = np.minimum(np.maximum(np.rint(codes), 0), reg.FULL_SCALE)
+        words = _rounded(codes)
         unseen = self._unseen[rows]
         self._results[rows] = (
-            codes if unseen.all() else np.where(unseen, codes, self._results[rows])
+            words if unseen.all() else np.where(unseen, words, self._results[rows])
         )
         self._unseen[rows] = False
+        return None
 
-    def _settle_in_step(self, chips: Ints, changed: NDArray[np.bool_] | None) -> bool:
+    def _settle_in_step(
+        self, chips: Ints, changed: NDArray[np.bool_] | None
+    ) -> tuple[Words, Ahead | None] | None:
         """Do the same for chips that convert in step, and all of whose stages are new.
 
         Args:
             chips: which ones.
             changed: bool[k], those of them whose inputs have changed; None if none have.
 
-        Returns whether they are; otherwise nothing was done.
+        Returns None if they are not; then nothing was done.
         """
         pace = self._pace(chips)
         if pace is None:
-            return False
+            return None
         start_ns, stages, stage_ns = pace
         sequences, rest_ns = divmod(self.t_ns - start_ns, stages * stage_ns)
         done = rest_ns // stage_ns
         ended = sequences * stages + done
         if stages < reg.N_STAGES or ended - int(self._taken[chips].max()) < stages:
-            return False
+            return None
         self._taken[chips] = ended
         rows = self._rows(chips)
-        began_ns = start_ns + sequences * stages * stage_ns
-        before_ns = began_ns - stages * stage_ns
-        codes = self._ideal[rows]
+        ahead: Ahead | None = self._foresee(chips, rows, pace)
+        assert ahead is not None
+        results: Words = ahead.results[ahead.row]
         if changed is not None:
+            began_ns = start_ns + sequences * stages * stage_ns
+            before_ns = began_ns - stages * stage_ns
             ended_ns = np.where(done > _STAGES, began_ns, before_ns) + (_STAGES + 1) * stage_ns
             mine = np.flatnonzero(changed)
-            if isinstance(rows, slice):
-                codes = codes.copy()
-            codes[mine] = self._ideal_at(chips[mine], ended_ns)
-        if self._noise is not None:
-            noise = self._noise_in_step(self._noise, chips, rows, pace)
-            noise += codes
-            codes = noise
-        self._results[rows] = np.minimum(np.maximum(np.rint(codes), 0), reg.FULL_SCALE)
+            codes = self._ideal_at(chips[mine], ended_ns)
+            if ahead.noise is not None:
+                codes = codes + ahead.noise[ahead.row, mine]
+            results = results.copy()
+            results[mine] = _rounded(codes)
+            ahead = None
+        self._results[rows] = results
         self._unseen[rows] = False
-        return True
+        return results, ahead
 
-    def _noise_in_step(
-        self, noise: ChipNoise, chips: Ints, rows: Ints | slice, pace: tuple[int, int, int]
-    ) -> Floats:
-        """The noise of chips that convert in step, float64[k, 12] (codes), for the caller to keep.
+    def _foresee(self, chips: Ints, rows: Ints | slice, pace: tuple[int, int, int]) -> Ahead:
+        """What chips that convert in step answer, if their inputs do not change.
 
-        At reads that come at an interval, several are drawn together.
+        At reads that come at an interval, several are foreseen together.
         """
         m, interval_ns = 1, 0
         is_few = len(chips) <= _MOST_CHIPS_AHEAD
@@ -347,21 +377,42 @@ class SignalSkin:
             if interval_ns == ahead.interval_ns:
                 m = _READS_AHEAD
                 ahead.row += 1
-                if ahead.row < len(ahead.noise) and ahead.version == self._noise_version:
+                if ahead.row < len(ahead.results) and ahead.noise_version == self._noise_version:
                     ahead.last_ns = self.t_ns
-                    now: Floats = ahead.noise[ahead.row]
-                    return now
-        start_ns, stages, stage_ns = pace
-        pass_ns = stages * stage_ns
-        passed_ns = [(self.t_ns - start_ns + interval_ns * i) % pass_ns for i in range(m)]
-        began_ns = [self.t_ns + interval_ns * i - passed_ns[i] for i in range(m)]
-        both_ns = np.array([(one_ns, one_ns - pass_ns) for one_ns in began_ns])
-        codes = noise.in_step(rows, both_ns, [one_ns // stage_ns for one_ns in passed_ns])
-        codes *= self._sigma[rows]
+                    if ahead.ideal_version != self._ideal_version:
+                        self._correct(ahead, chips)
+                    return ahead
+        noise = None
+        codes = self._ideal[rows][None]
+        if self._noise is None:
+            codes = np.repeat(codes, m, axis=0)
+        else:
+            start_ns, stages, stage_ns = pace
+            pass_ns = stages * stage_ns
+            passed_ns = [(self.t_ns - start_ns + interval_ns * i) % pass_ns for i in range(m)]
+            began_ns = [self.t_ns + interval_ns * i - passed_ns[i] for i in range(m)]
+            both_ns = np.array([(one_ns, one_ns - pass_ns) for one_ns in began_ns])
+            reached = [one_ns // stage_ns for one_ns in passed_ns]
+            noise = self._noise.in_step(rows, both_ns, reached)
+            noise *= self._sigma[rows]
+            codes = codes + noise
+        versions = self._noise_version, self._ideal_version
+        ahead = Ahead(_rounded(codes), 0, 0, self.t_ns, interval_ns, *versions, noise)
         if is_few:
-            self._ahead[key] = _Ahead(self.t_ns, interval_ns, self._noise_version, 0, codes)
-        first: Floats = codes[0]
-        return first
+            self._ahead[key] = ahead
+        return ahead
+
+    def _correct(self, ahead: Ahead, chips: Ints) -> None:
+        """Foresee the results again of chips whose inputs have changed for good."""
+        mine = np.flatnonzero(self._ideal_versions[chips] > ahead.ideal_version)
+        ahead.ideal_version = self._ideal_version
+        if not len(mine):
+            return
+        codes = self._ideal[chips[mine]][None]
+        if ahead.noise is not None:
+            codes = codes + ahead.noise[ahead.row :, mine]
+        ahead.results[ahead.row :, mine] = _rounded(codes)
+        ahead.revision += 1
 
     def _pace(self, chips: Ints) -> tuple[int, int, int] | None:
         """Return start, stages and time of a stage, if some chips have all of them in common."""
@@ -440,6 +491,16 @@ class SignalSkin:
         ideals = self._ideal_of(
             chips, np.stack([values[place] for values in self._changes[first:last]])
         )
+        if first == len(times_ns) - 1 and ended_ns.min() > times_ns[-1]:
+            # Nothing before the last change matters to these chips any more.
+            self._capacitance_ff[chips, :TAXELS] = self._changes[-1][place]
+            self._set_ideal(chips, ideals[0])
+            self._is_changed[chips] = False
+            if not self._is_changed[self._changed].any():
+                self._changes = []
+                self._changed_ns = []
+            final: Floats = ideals[0]
+            return final
         in_force = np.searchsorted(times_ns[first:last], ended_ns)
         if len(ideals) == 1 and in_force.all():
             only: Floats = ideals[0]
@@ -447,6 +508,12 @@ class SignalSkin:
         ideals = np.concatenate([self._ideal[chips][None], ideals])
         at: Floats = ideals[in_force, np.arange(len(chips))[:, None], _STAGES]
         return at
+
+    def _set_ideal(self, chips: Ints, ideal: Floats) -> None:
+        """Change what chips convert from now on, float64[k, 12] (codes)."""
+        self._ideal[chips] = ideal
+        self._ideal_version += 1
+        self._ideal_versions[chips] = self._ideal_version
 
     def _ideal_of(self, chips: Ints, values: Floats) -> Floats:
         """What plain chips convert such inputs to."""
@@ -461,7 +528,7 @@ class SignalSkin:
             if weights is not None:
                 total_ff = weights @ self._capacitance_ff[chip]
                 difference_ff[row] = total_ff - self._offset_ff[chip]
-        self._ideal[chips] = reg.MID_SCALE + difference_ff / self._q_ff
+        self._set_ideal(chips, reg.MID_SCALE + difference_ff / self._q_ff)
 
     def _update_sigma(self, chip: int) -> None:
         weights = self._weights[chip]
@@ -473,6 +540,11 @@ class SignalSkin:
         sigma = np.sqrt(own**2 + np.square(weights) @ squares)
         self._sigma[chip] = sigma * ~self._held[chip]
         self._noise_version += 1
+
+
+def _rounded(codes: Floats) -> Words:
+    """Codes as a converter gives them."""
+    return np.minimum(np.maximum(np.rint(codes), 0), reg.FULL_SCALE).astype(np.uint16)
 
 
 class SignalChips:
