@@ -62,7 +62,13 @@ SLOW = {
     "lines_swapped",
 }
 #: Codes that need no trouble: pads differ from the start, presses are long, and the skin drifts.
-ALWAYS = {"taxel_decides_late", "taxel_held", "part_not_calibrated", "taxel_drifting"}
+ALWAYS = {
+    "fingertip_not_calibrated",
+    "part_not_calibrated",
+    "taxel_decides_late",
+    "taxel_drifting",
+    "taxel_held",
+}
 #: One pad in twenty of real skin is so noisy that a calibration refuses it.
 NOISE = {"taxel_refused", "taxel_noisy", "taxel_saturates"}
 #: A trouble is plain if nothing else happened for so long before it, nor a start for longer.

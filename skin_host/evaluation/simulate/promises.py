@@ -35,6 +35,8 @@ STALE_PERIODS = 8
 #: Pads that press at least so much and read less than that are felt wrong, and the reverse.
 PRESSED_KPA, FELT_KPA = 25.0, 2.0
 UNTOUCHED_KPA = 25.0
+#: So many standard deviations of a pad's noise, as it was calibrated, are no press either.
+SIGMAS = 4.0
 #: A pad is pressed at all; and so long after it began, a touch may not be decided yet.
 TOUCHING_KPA = 0.2
 DECIDED_NS = NS // 2
@@ -43,6 +45,8 @@ RELAXED_NS = 60 * NS
 #: A calibration at rest began no longer ago when it is noted.
 RESTING_NS = 8 * NS
 MOST_TASKS = 100
+#: Topics of events that are numbered.
+EVENTS = {"touch", "slip", "over"}
 #: So many objects may live more than after the first calm: histories that are bounded.
 MORE_OBJECTS = 60_000
 #: A sweep reaches the end of the core within so many of its periods, and this.
@@ -221,8 +225,8 @@ class Promises:
         self._connected_ns = None
         outbox: Any = life.daemon.publisher._outbox
         outbox.put_state = _after(life, self._retain, outbox.put_state)
-        health: Any = life.daemon.health
-        health.note = _after(life, self._output, health.note)
+        daemon: Any = life.daemon
+        daemon._deliver = _after(life, self._output, daemon._deliver)
         publisher: Any = life.daemon.publisher
         for name, look in (
             ("put_touch", self._touch),
@@ -248,11 +252,11 @@ class Promises:
     # ------------------------------------------------------------------ where things leave the core
 
     def _touch(self, event: FingertipEvent) -> None:
+        self._put[event.part] = self._put.get(event.part, 0) + 1
         if not isinstance(event, Touch):
             return
         now = self._open.setdefault(event.part, set())
         self.touches += 1
-        self._put[event.part] = self._put.get(event.part, 0) + 1
         if event.event == "begin":
             if event.id <= self._last_id.get(event.part, -1):
                 self.break_(f"{event.part}: touch {event.id} begins again")
@@ -262,7 +266,7 @@ class Promises:
             self.break_(f"{event.part}: touch {event.id} has a {event.event} without a begin")
         if event.event == "end":
             now.discard(event.id)
-        elif not event.taxels:
+        elif not event.taxels and event.part in self._parts:
             self.break_(f"{event.part}: touch {event.id} has no taxel")
 
     def _frame(self, frame: PressureFrame) -> None:
@@ -341,6 +345,8 @@ class Promises:
         wrong = self.accusations.note(part, record) or self.accusations.unnamed()
         if wrong is not None:
             self.break_(wrong)
+        if part not in self._parts:
+            return
         touched = np.array(record["taxel_verdicts"].get("touched", []), np.intp)
         false = touched[self._calibrated_touched_ns[touched + self._parts[part].start] < 0]
         if len(false):
@@ -353,7 +359,7 @@ class Promises:
         if topic.endswith("/replies/operator"):
             self._note_answer(payload)
             return
-        if not topic.endswith("/touch"):
+        if topic.rpartition("/")[2] not in EVENTS:
             return
         event = msgspec.json.decode(payload, type=_Event)
         seen = self._counts.setdefault(topic, {})
@@ -525,7 +531,8 @@ class Promises:
                     f"{name}: taxel {taxel} is valid and reads {frame.pressure_kpa[taxel]:.1f} kPa "
                     f"while it is pressed with {truth[part.start + taxel]:.1f} kPa"
                 )
-            false = fit & (most[mine] < 0.01) & (frame.pressure_kpa > UNTOUCHED_KPA)
+            limit_kpa = np.maximum(UNTOUCHED_KPA, self._noise_kpa(life, name))
+            false = fit & (most[mine] < 0.01) & (frame.pressure_kpa > limit_kpa)
             if false.any():
                 taxel = int(np.flatnonzero(false)[0])
                 self.break_(
@@ -539,6 +546,16 @@ class Promises:
             self.break_(unnamed)
         if len(asyncio.all_tasks()) > MOST_TASKS:
             self.break_(f"{len(asyncio.all_tasks())} tasks run")
+
+    def _noise_kpa(self, life: Life, name: str) -> NDArray[np.float64]:
+        """Return how far noise alone may move each taxel [m] of a part."""
+        engine, part = life.daemon.engine, self._parts[name]
+        if engine.calibration is None or engine.pipeline is None:
+            return np.zeros(part.n_taxels)
+        units = SIGMAS * engine.calibration.noise[part.start : part.stop]
+        index = list(self._parts).index(name)
+        found: NDArray[np.float64] = engine.pipeline._parts[index]._curve.kpa(units)
+        return found
 
     def _missed_boards(self, now_ns: int) -> None:
         """A board that nothing keeps silent is received: the daemon itself brings it back."""

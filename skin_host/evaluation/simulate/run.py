@@ -615,13 +615,13 @@ class _Run:
         found = []
         if retained.get(topics.node("status", "main")) != b"online":
             found.append("status is not online")
-        for part in world.layout.parts:
-            if retained.get(topics.part("contact", part.name)) != b"OFF":
-                state = retained.get(topics.part("contact", part.name))
-                found.append(f"{part.name}: contact {state!r}")
-            for fault, where in self._faults(retained.get(topics.part("health", part.name))):
+        for name in [*(part.name for part in world.layout.parts), *world.settings.fingertips]:
+            state = retained.get(topics.part("contact", name))
+            if state != b"OFF":
+                found.append(f"{name}: contact {state!r}")
+            for fault, where in self._faults(retained.get(topics.part("health", name))):
                 if fault not in LATE_FAULTS and not (world.real_noise and fault in NOISE):
-                    found.append(f"{part.name}: {fault} {where}")
+                    found.append(f"{name}: {fault} {where}")
         return found
 
     def _faults(self, payload: bytes | None) -> list[tuple[str, str]]:
@@ -631,5 +631,6 @@ class _Run:
         found = [(fault["code"], fault["where"]) for fault in record["faults"]]
         refused = self.world.real_noise and any(code in NOISE for code, _ in found)
         if record["state"] not in ("ok", "warning") and not refused:
-            found.append((record["state"], f"{record['valid_taxels']} of {record['taxels']}"))
+            taxels = f"{record['valid_taxels']} of {record['taxels']}" if "taxels" in record else ""
+            found.append((record["state"], taxels))
         return found

@@ -57,6 +57,7 @@ _CHIPS = _TAXELS | _TRIANGLES
 #: Verdicts of a calibration that was taken meanwhile.
 _CALIBRATED = {"taxel_refused", "taxel_saturates", "taxel_drifting", "taxel_at_limit"}
 _DAMAGED = {"bus_bit_errors", "bus_stranger", "bus_babbling"}
+_DAMAGED |= {"fingertip_saturated", "fingertip_held", "fingertip_noisy"}
 #: They change which chip answers where: what ends one would undo another.
 WIRING = {
     "chip_gone",
@@ -71,7 +72,10 @@ WIRING = {
     "slow_rise",
     "brown_out",
 }
-_BUS = _TIMING | _SET_UP | _CHIPS | {"bus_silent", "board_overflows"}
+#: A force/torque board that is not received, or not asked yet for its full scales.
+_TIPS = {"fingertip_absent", "fingertip_silent", "fingertip_not_configured"}
+_BUS = _TIMING | _SET_UP | _CHIPS | _TIPS
+_BUS |= {"bus_silent", "board_overflows", "fingertip_loses_frames"}
 _SWAPPED = _CHIPS | _SET_UP | {"part_temperature"}
 #: Until a calibration at rest.
 FOR_EVER_S = 1e6
@@ -150,7 +154,8 @@ def places_of(world: World, *, board: str = "", bus: str = "") -> frozenset[str]
     numbers = {number for number, _ in boards}
     parts = {part.name for part in layout.parts if numbers & set(part.boards)}
     buses = {one.settings.bus for _, one in boards}
-    return frozenset({one.name for _, one in boards} | parts | buses | ({bus} - {""}))
+    tips = {name for name, tip in world.settings.fingertips.items() if tip.bus == bus}
+    return frozenset({one.name for _, one in boards} | parts | tips | buses | ({bus} - {""}))
 
 
 def taxels_of(world: World, *, board: str = "", bus: str = "") -> Mask:
@@ -467,15 +472,20 @@ _ZEROED = {"board_rezeroed", "board_in_doubt", "taxel_unproven"}
 ACTS: dict[str, set[str]] = {
     # What the broker and the boards do not know yet; a board that just stopped must be queried.
     "start": _ZEROED
+    | _TIPS
     | {"broker_away", "bus_silent", "board_absent", "board_silent", "board_lost_set_up"}
     | {"triangle_missing", "bus_loses_frames"},
     "calibrate": _CALIBRATED | {"taxel_pressed"},
-    "configure": _ZEROED | {"bus_silent", "board_silent", "triangle_missing", "bus_loses_frames"},
+    "configure": _ZEROED
+    | _TIPS
+    | {"bus_silent", "board_silent", "triangle_missing", "bus_loses_frames"},
     "disable": {"part_disabled"},
     "power": _SET_UP | _CHIPS | _TIMING | {"bus_silent"},
     "enable": set(),
     "thresholds": set(),
-    "reload": _ZEROED | {"bus_silent", "board_silent", "triangle_missing", "bus_loses_frames"},
+    "reload": _ZEROED
+    | _TIPS
+    | {"bus_silent", "board_silent", "triangle_missing", "bus_loses_frames"},
 }
 
 _LINE = {"line_shorted", "triangle_no_ack", "triangle_not_connected"}
