@@ -582,3 +582,14 @@ def test_where_the_zero_of_a_temperature_pad_is_does_not_matter():
 
     assert followed(50.0) == pytest.approx(followed(0.0), abs=0.01)
     assert followed(0.0) == pytest.approx(3.0, abs=0.3)
+
+
+@pytest.mark.parametrize(("beside", "known"), [(0.9, True), (-0.9, True), (1.2, False)])
+def test_within_a_unit_of_where_it_was_a_taxel_has_returned(beside, known):
+    track = tracker()
+    away = np.arange(N) < 4
+    for _ in range(600):
+        track.step(np.where(away, -30.0, 0.0) - track.baseline, NOBODY, NOBODY, 1.0)
+    back = np.where(away, beside, 0.0)
+    found = [track.step(back - track.baseline, away, NOBODY, 1.0) for _ in range(2)]
+    assert (found[1] is not None) is known
