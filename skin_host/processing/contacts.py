@@ -364,8 +364,10 @@ class ContactTracker:
     def _mean_normal(self, weight: Floats, taxels: NDArray[np.intp], total: float) -> Vector | None:
         direction = weight @ self._normal[taxels]
         length = math.sqrt(direction.dot(direction))
+        if length <= 1e-9 * total:  # all round a finger
+            return None
         x, y, z = (direction / length).tolist()
-        return (x, y, z) if length > 1e-9 * total else None
+        return x, y, z
 
     def _reason(self, name: int, frame: PressureFrame) -> Reason:
         """A contact is released only if all its taxels are valid and none is touched."""
@@ -421,9 +423,8 @@ class _Homes:
         return taxels
 
     def note(self, group: frozenset[int], order: NDArray[np.intp]) -> None:
-        """The taxels of a group in rising order, if they are known already."""
-        if len(group) == len(order):
-            self._orders[group] = order
+        """Take the taxels of a group in rising order, which are known already."""
+        self._orders[group] = order
 
     def order(self, groups: list[frozenset[int]]) -> NDArray[np.intp]:
         """The taxels of groups, one group after the other."""

@@ -257,7 +257,7 @@ class Intake:
         if doubted is not None:
             doubted = doubted[TRIANGLES * row : TRIANGLES * (row + 1)]
         if ledger.flagged[row]:
-            here = self.here(row, raw)
+            here = self._flagged(row, raw)
             self._erring[row] = ledger.error[row]
             received = np.repeat(here[:, None], PADS, axis=1)
             received &= ~ledger.far[row]
@@ -284,17 +284,15 @@ class Intake:
         veto = self.veto.get(row)
         return masks if veto is None else (masks[1] & ~veto.ravel(), masks[1])
 
-    def here(self, row: int, raw: NDArray[np.uint8]) -> Mask:
-        """Return triangles bool[16] that were received, answer, and are in their range, by the
-        ledger.
+    def _flagged(self, row: int, raw: NDArray[np.uint8]) -> Mask:
+        """Return triangles bool[16] of a sweep with status words that were received, answer, and
+        are in their range.
         """
         ledger = self._ledger
-        here: Mask = ledger.present[row]
-        if ledger.flagged[row]:
-            far = ledger.far[row]
-            here = here & (ledger.error[row] == 0) & ~lifted(raw, far)
-            many = np.count_nonzero(far, axis=1) >= FAR_PADS
-            here &= ~(self._unpressable[row] & many)
+        far = ledger.far[row]
+        here: Mask = ledger.present[row] & (ledger.error[row] == 0) & ~lifted(raw, far)
+        many = np.count_nonzero(far, axis=1) >= FAR_PADS
+        here &= ~(self._unpressable[row] & many)
         return here
 
     @property

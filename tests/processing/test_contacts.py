@@ -1,9 +1,15 @@
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skin_host.config.settings import Settings
 from skin_host.evaluation.rig import flat_skin
+from skin_host.layout import build_layout
 from skin_host.processing.contacts import LOST_NS, MERGED_NS, PARTED_NS, ContactTracker
 from skin_host.processing.pipeline import PressureFrame
 
@@ -17,12 +23,12 @@ HERE, THERE = set(range(12)), set(range(120, 132))
 class Skin:
     """Frames of chosen taxels at one pressure, and what the tracker makes of them."""
 
-    def __init__(self):
-        self.tracker = ContactTracker(LAYOUT, 0, SETTINGS)
+    def __init__(self, layout=LAYOUT):
+        self.tracker = ContactTracker(layout, 0, SETTINGS)
         self.seq = 0
 
-    def show(self, *taxels, kpa=20.0, lost=(), felt=()):
-        """`felt` taxels feel something but have too few votes yet."""
+    def show(self, *taxels, kpa=20.0, lost=(), felt=(), unlike=None):
+        """`felt` taxels feel something but have too few votes yet; `unlike` ones differ in kPa."""
         touched = np.zeros(N, bool)
         touched[list(set().union(*taxels))] = True
         valid = np.ones(N, bool)
@@ -30,6 +36,8 @@ class Skin:
         touched &= valid
         pressure = np.where(touched, kpa, 0.0).astype(np.float32)
         pressure[list(felt)] = 4.0
+        for taxel, its_kpa in (unlike or {}).items():
+            pressure[taxel] = its_kpa
         frame = PressureFrame(
             "skin",
             self.seq,
@@ -276,3 +284,94 @@ def test_a_press_of_the_whole_skin_is_one_contact_to_its_end():
     assert begun.taxels == list(range(N))
     assert skin.show(set(range(N))) == []
     assert kinds(skin.show()) == [("end", 1)]
+
+
+@pytest.mark.parametrize(("seconds", "contacts"), [(0.5, 1), (3.0, 2)])
+def test_a_fifth_of_what_a_contact_felt_lately_is_what_makes_its_piece_another(seconds, contacts):
+    """Two seconds after a press of 100 kPa, 37 of them count."""
+    skin = Skin()
+    skin.show(set(range(12)), kpa=100.0)
+    for _ in range(round(seconds * 1e9) // SWEEP_NS):
+        skin.show(set(range(12)), kpa=10.0)
+    begun = {1}
+    for _ in range(PARTED_NS // SWEEP_NS + 2):
+        begun |= {event.id for event in skin.show({0}, {4, 5, 6}, kpa=10.0)}
+    assert len(begun) == contacts
+
+
+def test_the_uncertainty_of_a_place_falls_with_the_root_of_its_taxels():
+    (few,), (many,) = Skin().show({0, 1, 2}), Skin().show(set(range(12)))
+    assert few.sigma_m == pytest.approx(2 * many.sigma_m)
+    assert 0.1e-3 < many.sigma_m < few.sigma_m < 2e-3
+
+
+def test_the_place_of_a_pad_without_neighbours_is_as_certain_as_the_pad():
+    alone = replace(LAYOUT, neighbour_start=np.zeros_like(LAYOUT.neighbour_start))
+    (event,) = Skin(alone).show({0})
+    assert event.sigma_m == 0.0
+
+
+@pytest.mark.parametrize(("kpa", "moves"), [(19.5, False), (17.0, True)])
+def test_a_place_that_moves_by_a_fifth_of_a_millimetre_is_reported(kpa, moves):
+    skin = Skin()
+    skin.show({0, 1})
+    events = skin.show({0, 1}, unlike={1: kpa})
+    assert bool(events) is moves
+
+
+def test_a_touch_that_is_lost_for_less_than_half_a_second_goes_on_whenever_that_is():
+    skin = Skin()
+    for number in range(200):
+        lost = HERE if number % 25 else ()
+        assert {event.event for event in skin.show(HERE, lost=lost)} <= {"begin", "move"}
+    assert skin.tracker.end_all(0, 0)[0].id == 1
+
+
+def test_what_feels_no_pressure_yet_is_a_contact_without_a_place():
+    skin = Skin()
+    (begun,) = skin.show({0}, kpa=0.0)
+    assert (begun.event, begun.centroid_m, begun.normal) == ("begin", None, None)
+    assert skin.show({0}, kpa=0.5) == []
+    (moved,) = skin.show({0}, kpa=2.0)
+    assert moved.centroid_m == pytest.approx(LAYOUT.position_m[0].tolist())
+    assert moved.normal == pytest.approx([0.0, 0.0, 1.0])
+
+
+def test_the_normal_of_a_contact_is_the_mean_of_its_taxels_of_length_one():
+    tilted = LAYOUT.normal.copy()
+    tilted[0], tilted[1] = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+    (event,) = Skin(replace(LAYOUT, normal=tilted)).show({0, 1})
+    assert event.normal == pytest.approx([0.5**0.5, 0.5**0.5, 0.0])
+    tilted[1] = (-1.0, 0.0, 0.0)
+    (event,) = Skin(replace(LAYOUT, normal=tilted)).show({0, 1})
+    assert event.normal is None
+
+
+def test_taxels_of_a_second_part_are_neighbours_as_those_of_the_first():
+    skin = msgspec.convert(
+        {
+            "robot": "two",
+            "buses": {"can0": {}},
+            "boards": {"b0": {"bus": "can0", "address": 1}, "b1": {"bus": "can0", "address": 2}},
+            "parts": {
+                name: {"patches": [{"board": board, "triangles": "0-15"}]}
+                for name, board in (("first", "b0"), ("second", "b1"))
+            },
+        },
+        Settings,
+    )
+    layout = build_layout(skin, Path())
+    tracker = ContactTracker(layout, 1, skin)
+    touched = np.zeros(N, bool)
+    touched[sorted(HERE | THERE)] = True
+    frame = PressureFrame(
+        "second",
+        0,
+        0,
+        np.zeros(N, np.uint8),
+        np.where(touched, 20.0, 0.0).astype(np.float32),
+        touched,
+        np.ones(N, bool),
+        np.zeros(N, bool),
+    )
+    assert [set(event.taxels) for event in tracker.step(frame)] == [HERE, THERE]

@@ -593,3 +593,31 @@ def test_within_a_unit_of_where_it_was_a_taxel_has_returned(beside, known):
     back = np.where(away, beside, 0.0)
     found = [track.step(back - track.baseline, away, NOBODY, 1.0) for _ in range(2)]
     assert (found[1] is not None) is known
+
+
+def test_fewer_than_four_taxels_that_have_not_fallen_do_not_move_the_part():
+    track = tracker()
+    fallen = np.where(np.arange(N) < 3, 0.0, -5.0 - np.arange(N))
+    for _ in range(4):
+        track.step(fallen - track.baseline, NOBODY, NOBODY, 1.0)
+    assert track.baseline == pytest.approx(0.0, abs=0.01)
+
+
+def test_what_temperature_pads_showed_hours_ago_counts_less_than_what_they_show_now():
+    """A pad that was moved follows the temperature by a fifth of a unit a unit, not by one."""
+    thermal = np.arange(N) % 12 >= 10
+    track = tracker(thermal=thermal)
+    warmth = drifted = 0.0
+    for share in (1.0, 0.2, 0.2, 0.2, 0.2, 0.2):
+        for step in range(360):
+            rise = 0.04 if step % 180 < 90 else -0.04
+            warmth += rise
+            drifted += share * rise
+            units = np.where(thermal, warmth, drifted - track.baseline)
+            track.step(units, NOBODY, NOBODY, 10.0)
+    begun = track.baseline[~thermal].copy()
+    for _ in range(100):
+        warmth += 0.04
+        units = np.where(thermal, warmth, 30.0)
+        track.step(units, ~thermal, NOBODY, 10.0)
+    assert (track.baseline[~thermal] - begun) == pytest.approx(0.8, abs=0.3)
