@@ -86,8 +86,8 @@ MUTANTS = [
     Mutant(
         "a change of contact is published once only",
         "mqtt/publisher.py",
-        "if self._outbox.retained.get(topic) != payload:",
-        "if len(self._outbox.retained.get(topic, b'')) < 4:",
+        "if self._states_of_contact.get(part) != state:",
+        "if len(self._states_of_contact.get(part, '')) < 4:",
     ),
     Mutant(
         "frames are not counted",
