@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from emulator.boards.board import join
 from skin_host.bus.port import ERROR_FLAG, LinkState, Port
-from skin_host.bus.wire import HEADER_A, HEADER_B, FrameBatch, MessageClass
+from skin_host.bus.wire import HEADER_A, HEADER_B, TAXELS, FrameBatch, MessageClass
 from skin_host.clock import Clock
 from skin_host.config.settings import Bus
 from skin_host.errors import BusError
@@ -38,6 +38,8 @@ KEPT = 128
 _STREAMS = {int(MessageClass.SKIN_STREAM), int(MessageClass.ANALOG_STREAM)}
 #: First bytes of the frames of a sweep: of 16 triangles at most.
 _HEADERS = bytes([HEADER_A, HEADER_B]) * 16
+#: Where the twelve values are among the 16 bytes of a triangle's two frames.
+_VALUES = np.array([*range(1, 8), *range(9, 14)])
 _NOTHING = FrameBatch.of([])
 
 
@@ -67,6 +69,23 @@ class Mischief:
         return other
 
 
+@dataclass(frozen=True, slots=True)
+class _Sweep:
+    """One whole sweep of a board.
+
+    Attributes:
+        octets: of its frames.
+        values: of its triangles, 12 bytes each.
+        answered: whether all chips did.
+        t_ns: when each frame passed, int64[2 k].
+    """
+
+    octets: bytes
+    values: bytes
+    answered: bool
+    t_ns: NDArray[np.int64]
+
+
 class Sent:
     """The last sweeps of every triangle of a bus, as they passed over it.
 
@@ -82,6 +101,12 @@ class Sent:
         self._half: dict[int, tuple[int, bytes, int]] = {}
         #: By address and triangle: (12 bytes, status, time in ns).
         self._whole: dict[int, deque[tuple[bytes, int, int]]] = {}
+        #: By address, the keys (address and triangle) of its whole sweeps, and those of them that
+        #: are not yet in `_whole`: nearly always nobody asks for a single triangle.
+        self._sweeps: dict[int, tuple[tuple[int, ...], deque[_Sweep]]] = {}
+        #: Identifiers of the last batches, the arrays themselves, and the keys of the sweep that
+        #: they are, if they are one.
+        self._known: dict[int, tuple[NDArray[np.uint32], tuple[int, ...] | None]] = {}
         self.bursts: dict[int, int] = {}
         self._last_ns: dict[int, int] = {}
 
@@ -92,36 +117,62 @@ class Sent:
 
     def _note_sweep(self, batch: FrameBatch) -> bool:
         """Take the frames of one whole sweep of one board; False if they are not that."""
-        ids = batch.id.tolist()
-        keys = ids[::2]
-        if ids[1::2] != keys or len(set(keys)) < len(keys):
+        keys = self._keys_of(batch.id)
+        if keys is None:
+            return False
+        octets = batch.data.tobytes()
+        n = 2 * len(keys)
+        if octets[::8] != _HEADERS[:n] or batch.dlc.tobytes().count(8) < n:
             return False
         address = keys[0] >> 4
-        octets = batch.data.tobytes()
-        if (
-            address >> 4 not in _STREAMS
-            or any(key >> 4 != address for key in keys)
-            or octets[::8] != _HEADERS[: len(ids)]
-            or batch.dlc.tobytes().count(8) < len(ids)
-        ):
+        first_ns, last_ns = int(batch.t_ns[0]), int(batch.t_ns[-1])
+        if first_ns - self._last_ns.get(address, -BURST_NS) < BURST_NS:
             return False
-        address &= 0xF
-        times_ns = batch.t_ns.tolist()
-        if times_ns[0] - self._last_ns.get(address, -BURST_NS) < BURST_NS:
-            return False
-        if times_ns[-1] - times_ns[0] > PAIR_NS:
+        if last_ns - first_ns > PAIR_NS:
             return False
         self.bursts[address] = self.bursts.get(address, 0) + 1
-        self._last_ns[address] = times_ns[-1]
-        for at, (identifier, t_ns) in enumerate(zip(keys, times_ns[1::2], strict=True)):
-            key = identifier & 0xFF
-            pair = octets[16 * at : 16 * at + 16]
-            self._half[key] = HEADER_B, pair[9:], t_ns
-            whole = self._whole.get(key)
-            if whole is None:
-                whole = self._whole[key] = deque(maxlen=KEPT)
-            whole.append((pair[1:8] + pair[9:14], pair[14] << 8 | pair[15], t_ns))
+        self._last_ns[address] = last_ns
+        known = self._sweeps.get(address)
+        if known is None or known[0] != keys:
+            self._spread(address)
+            known = self._sweeps[address] = keys, deque(maxlen=KEPT)
+        values = batch.data.reshape(-1, 16)[:, _VALUES].tobytes()
+        answered = not any(octets[15::16]) or not any(octet & ERROR for octet in octets[15::16])
+        known[1].append(_Sweep(octets, values, answered, batch.t_ns))
         return True
+
+    def _keys_of(self, ids: NDArray[np.uint32]) -> tuple[int, ...] | None:
+        """Return the keys of a sweep with these identifiers, None if they are not of one."""
+        known = self._known.get(id(ids))
+        if known is not None and known[0] is ids:
+            return known[1]
+        if len(self._known) >= KEPT:
+            self._known.clear()
+        numbers = ids.tolist()
+        heads = numbers[::2]
+        is_sweep = (
+            numbers[1::2] == heads
+            and len(set(heads)) == len(heads)
+            and heads[0] >> 8 in _STREAMS
+            and all(head >> 4 == heads[0] >> 4 for head in heads)
+        )
+        keys = tuple(head & 0xFF for head in heads) if is_sweep else None
+        self._known[id(ids)] = ids, keys
+        return keys
+
+    def _spread(self, address: int) -> None:
+        """Take the whole sweeps of a board triangle by triangle."""
+        keys, sweeps = self._sweeps.get(address, ((), ()))
+        for sweep in sweeps:
+            octets = sweep.octets
+            for at, (key, t_ns) in enumerate(zip(keys, sweep.t_ns[1::2].tolist(), strict=True)):
+                pair = octets[16 * at : 16 * at + 16]
+                self._half[key] = HEADER_B, pair[9:], t_ns
+                whole = self._whole.get(key)
+                if whole is None:
+                    whole = self._whole[key] = deque(maxlen=KEPT)
+                whole.append((pair[1:8] + pair[9:14], pair[14] << 8 | pair[15], t_ns))
+        self._sweeps.pop(address, None)
 
     def _note_frames(self, batch: FrameBatch) -> None:
         for seconds, nanoseconds, identifier, dlc, header, payload in batch.frames():
@@ -130,6 +181,7 @@ class Sent:
             key = identifier & 0xFF
             t_ns = seconds * 1_000_000_000 + nanoseconds
             address = key >> 4
+            self._spread(address)
             if t_ns - self._last_ns.get(address, -BURST_NS) >= BURST_NS:
                 self.bursts[address] = self.bursts.get(address, 0) + 1
             self._last_ns[address] = t_ns
@@ -153,9 +205,31 @@ class Sent:
 
     def find(self, address: int, triangle: int, raw: bytes) -> Iterable[tuple[bool, int]]:
         """Yield, newest first, whether the chip answered and when, of sweeps with these bytes."""
+        self._spread(address)
         for sent, status, t_ns in reversed(self._whole.get(address << 4 | triangle, ())):
             if sent == raw:
                 yield not status & ERROR, t_ns
+
+    def find_together(self, keys: tuple[int, ...], raw: bytes) -> int | None:
+        """Return when the newest sweep began that has these bytes at once, of chips that answered.
+
+        Args:
+            keys: address and number of triangles of one board, in the order of its frames.
+            raw: 12 bytes of each.
+
+        Returns None if they may have passed otherwise, see `find`.
+        """
+        sent, sweeps = self._sweeps.get(keys[0] >> 4, ((), ()))
+        if keys[0] not in sent:
+            return None
+        first = sent.index(keys[0])
+        if sent[first : first + len(keys)] != keys:
+            return None
+        mine = slice(TAXELS * first, TAXELS * (first + len(keys)))
+        for sweep in reversed(sweeps):
+            if sweep.answered and sweep.values[mine] == raw:
+                return int(sweep.t_ns[0])
+        return None
 
     def forget(self) -> None:
         """Count from here."""

@@ -9,18 +9,20 @@ import asyncio
 import gc
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.bus.wire import TAXELS, TRIANGLES
 from skin_host.daemon.daemon import Daemon
 from skin_host.evaluation.simulate.accusations import Accusations
 from skin_host.evaluation.simulate.troubles import Trouble
 from skin_host.evaluation.simulate.world import Life, World
 from skin_host.fingertip.events import FingertipEvent
-from skin_host.layout import PadKind
+from skin_host.layout import Layout, PadKind
 from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
 
@@ -63,6 +65,50 @@ class _Event(msgspec.Struct):
     event: str
     id: int
     count: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """Triangles of a part that their board sends one after the other.
+
+    Attributes:
+        bus, period_ns: of the board.
+        keys: address and number of each.
+        start, stop: taxels of the part.
+    """
+
+    bus: str
+    period_ns: int
+    keys: tuple[int, ...]
+    start: int
+    stop: int
+
+
+def _runs(layout: Layout, first: int, last: int) -> list[_Run]:
+    """Return the triangles of the part that has these taxels."""
+    runs: list[_Run] = []
+    for one in layout.triangles:
+        board = layout.boards[one.board]
+        start = int(board.taxel_index[one.number].min())
+        if not first <= start < last:
+            continue
+        own = board.settings
+        key = own.address * TRIANGLES + one.number
+        begin, stop = start - first, start - first + TAXELS
+        before = runs[-1] if runs else None
+        goes_on = (
+            before is not None
+            and before.bus == own.bus
+            and before.stop == begin
+            and before.keys[-1] < key < (own.address + 1) * TRIANGLES
+            and before.keys[-1] // TRIANGLES == own.address
+        )
+        if before is not None and goes_on:
+            keys = (*before.keys, key)
+            runs[-1] = _Run(own.bus, before.period_ns, keys, before.start, stop)
+        else:
+            runs.append(_Run(own.bus, own.period_ms * 1_000_000, (key,), begin, stop))
+    return runs
 
 
 class Promises:
@@ -124,6 +170,15 @@ class Promises:
                 *((part.name, slice(part.start, part.stop)) for part in layout.parts),
             ]
         }
+        #: Of each part, on which bus which identifiers are sent.
+        self._ids = {
+            part.name: [
+                (bus, np.unique(of_bus))
+                for bus, _, of_bus in self._senders[part.name]
+                if of_bus.size
+            ]
+            for part in layout.parts
+        }
         #: Frames in the sweeps of each bus, in this life of the daemon.
         self._swept: dict[str, int] = {}
         self._bus_of_board = [board.settings.bus for board in layout.boards]
@@ -134,20 +189,11 @@ class Promises:
         self._blank_since: dict[str, int] = {}
         self._clock_set_ns = -(1 << 62)
         self._objects: int | None = None
-        #: Of each part its triangles: address, number, first taxel, index of the bus.
-        self._triangles = {
-            part.name: [
-                (
-                    layout.boards[one.board].settings.bus,
-                    layout.boards[one.board].settings.address,
-                    one.number,
-                    int(layout.boards[one.board].taxel_index[one.number].min()),
-                    layout.boards[one.board].settings.period_ms * 1_000_000,
-                )
-                for one in layout.triangles
-                if layout.parts[one.part].name == part.name
-            ]
-            for part in layout.parts
+        #: Of each part the triangles that a board sends one after the other.
+        self._runs = {part.name: _runs(layout, part.start, part.stop) for part in layout.parts}
+        #: The least period of the boards of each part.
+        self._fastest_ns = {
+            part.name: int(self._periods_ns[part.start : part.stop].min()) for part in layout.parts
         }
         #: Of each count of touches that subscribers got, in this life of the daemon.
         self._counts: dict[str, dict[int, bytes]] = {}
@@ -278,18 +324,23 @@ class Promises:
         part = self._parts[name]
         mine = slice(part.start, part.stop)
         pressure = frame.pressure_kpa
-        if not np.isfinite(pressure).all() or pressure.min() < 0:
+        valid = frame.valid.tobytes()
+        # Neither comparison holds for what is no number.
+        if not (pressure.min() >= 0 and pressure.max() < np.inf):
             self.break_(f"{name}: a pressure is negative or no number")
-        if pressure[~frame.valid].any() or (frame.touched & ~frame.valid).any():
+        if b"\0" in valid and (
+            pressure[~frame.valid].any() or (frame.touched & ~frame.valid).any()
+        ):
             self.break_(f"{name}: taxels that are not valid are touched, or have a pressure")
-        age_ns = self._now_ns() - self._heard_ns(name)
-        old = frame.valid & (age_ns > STALE_PERIODS * self._periods_ns[mine])
-        if old.any():
-            taxel = int(np.flatnonzero(old)[0])
-            self.break_(
-                f"{name}: taxel {taxel} is valid, and its board last sent "
-                f"{age_ns[taxel] / NS:.2f} s ago"
-            )
+        if self._now_ns() - self._least_heard_ns(name) > STALE_PERIODS * self._fastest_ns[name]:
+            age_ns = self._now_ns() - self._heard_ns(name)
+            old = frame.valid & (age_ns > STALE_PERIODS * self._periods_ns[mine])
+            if old.any():
+                taxel = int(np.flatnonzero(old)[0])
+                self.break_(
+                    f"{name}: taxel {taxel} is valid, and its board last sent "
+                    f"{age_ns[taxel] / NS:.2f} s ago"
+                )
         for (board, triangle), since_ns in self._blind_since.items():
             if self._now_ns() - since_ns < NS:
                 continue
@@ -297,40 +348,49 @@ class Promises:
             taxels = taxels[(taxels >= part.start) & (taxels < part.stop)] - part.start
             if frame.valid[taxels].any():
                 self.break_(f"{name}: triangle {board}/{triangle} is valid, and has no chip")
-        if frame.valid.any():
+        if b"\1" in valid:
             self._blank_since.pop(name, None)
         else:
             self._blank_since.setdefault(name, self._now_ns())
-        self._trace_back(frame, part.start)
+        self._trace_back(frame, valid)
 
-    def _trace_back(self, frame: PressureFrame, start: int) -> None:
+    def _trace_back(self, frame: PressureFrame, valid: bytes) -> None:
         """What is valid was sent so, lately, in one sweep, by a chip that answers."""
         world = self._world
-        valid, raw = frame.valid.tobytes(), frame.raw.tobytes()
-        clock_was_set = self._now_ns() - self._clock_set_ns < 5 * NS
-        for bus, address, number, first, period_ns in self._triangles[frame.part]:
-            at = first - start
-            if b"\1" not in valid[at : at + 12]:
+        raw = frame.raw.tobytes()
+        now_ns = self._now_ns()
+        clock_was_set = now_ns - self._clock_set_ns < 5 * NS
+        taken_ns = frame.t_ns - (world.clock.now_ns() - now_ns)
+        for run in self._runs[frame.part]:
+            if b"\1" not in valid[run.start : run.stop]:
                 continue
-            cable = world.cables[bus]
+            cable = world.cables[run.bus]
             wrong_ns = max(cable.damaged_ns, cable.blurred_ns)
-            if cable.mischief.damaged or self._now_ns() - wrong_ns < 2 * NS:
+            if cable.mischief.damaged or now_ns - wrong_ns < 2 * NS:
                 continue
-            found = "no sweep of it"
-            for answered, t_ns in cable.sent.find(address, number, raw[at : at + 12]):
-                age_ns = frame.t_ns - (world.clock.now_ns() - world.clock.monotonic_ns()) - t_ns
-                if not answered:
-                    found = "a chip that did not answer"
-                elif age_ns > FRESH_PERIODS * period_ns + FRESH_NS and not clock_was_set:
-                    found = f"a sweep {age_ns / NS:.2f} s before it"
+            longest_ns = FRESH_PERIODS * run.period_ns + FRESH_NS
+            t_ns = cable.sent.find_together(run.keys, raw[run.start : run.stop])
+            if t_ns is not None and (clock_was_set or taken_ns - t_ns <= longest_ns):
+                continue
+            for at, key in zip(range(run.start, run.stop, TAXELS), run.keys, strict=True):
+                address, number = divmod(key, TRIANGLES)
+                if b"\1" not in valid[at : at + TAXELS]:
+                    continue
+                found = "no sweep of it"
+                for answered, t_ns in cable.sent.find(address, number, raw[at : at + TAXELS]):
+                    age_ns = taken_ns - t_ns
+                    if not answered:
+                        found = "a chip that did not answer"
+                    elif age_ns > longest_ns and not clock_was_set:
+                        found = f"a sweep {age_ns / NS:.2f} s before it"
+                    else:
+                        break
                 else:
-                    break
-            else:
-                self.break_(
-                    f"{frame.part}: triangle {address}/{number} of frame {frame.seq} is valid, and "
-                    f"its bytes are of {found}"
-                )
-                return
+                    self.break_(
+                        f"{frame.part}: triangle {address}/{number} of frame {frame.seq} is valid, "
+                        f"and its bytes are of {found}"
+                    )
+                    return
 
     def _output(self, output: Any) -> None:
         for sweep in output.sweeps:
@@ -484,6 +544,11 @@ class Promises:
         for bus, mine, ids in senders:
             found[mine] = self._world.cables[bus].read_ns[ids]
         return found
+
+    def _least_heard_ns(self, part: str) -> int:
+        """Return when any triangle of a part was last received, the one longest ago (ns)."""
+        cables = self._world.cables
+        return min(int(cables[bus].read_ns[ids].min()) for bus, ids in self._ids[part])
 
     def _taxels(self, board: str, triangle: int) -> NDArray[np.intp]:
         layout = self._world.layout

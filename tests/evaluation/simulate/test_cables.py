@@ -49,6 +49,13 @@ def test_a_sweep_that_comes_whole_is_noted_as_its_frames_are(seed: int) -> None:
         at_once.note(batch)
         by_frames._note_frames(batch)
         assert at_once.bursts == by_frames.bursts
+        for keys, sweeps in at_once._sweeps.values():
+            for sweep in sweeps:
+                raw = sweep.values[:24]
+                answered = any(one.answered and one.values[:24] == raw for one in sweeps)
+                assert (at_once.find_together(keys[:2], raw) is not None) is answered
+    for address in range(16):
+        at_once._spread(address)
     assert at_once._whole == by_frames._whole
     assert at_once._half == by_frames._half
     assert any(by_frames._whole.values())
