@@ -21,13 +21,12 @@ from msgspec import structs
 
 from skin_host import emulator_path
 from skin_host.bus.pair import PAIR, PairBus, pair
-from skin_host.cli.common import load_skin
 from skin_host.cli.lines import event_line
 from skin_host.client import SkinClient
 from skin_host.config.settings import Bus, Mqtt, Settings, changed
 from skin_host.daemon.daemon import Daemon
 from skin_host.errors import ConfigurationError, SkinError
-from skin_host.layout import Layout, PadKind, build_layout
+from skin_host.layout import Layout, PadKind, build_layout, load_skin
 from skin_host.mqtt.broker import LocalBroker, local_broker
 from skin_host.tasks import cancel
 from skin_host.viewer.server import Viewer

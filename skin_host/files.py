@@ -77,12 +77,7 @@ def read_document(
 ) -> T:
     """Read a JSON file that names its schema.
 
-    Args:
-        path: of the file.
-        kind: type of its content.
-        schema: the supported one, `name/number`.
-        what: name of the file in messages.
-        wrong: makes an error from a message.
+    `what` names the file in messages, and `wrong` makes an error from a message.
 
     Raises:
         NewerFileError: a newer version has written it: its schema has a larger number, or a field

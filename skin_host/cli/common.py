@@ -69,21 +69,10 @@ def set_up_logging(verbose: bool) -> None:
 
 
 def load_skin(config: Path) -> "tuple[Settings, Layout]":
-    """Return settings and layout of a configuration file.
+    """The same as `layout.load_skin`, which imports numpy."""
+    from skin_host import layout
 
-    Raises:
-        ConfigurationError: see `settings.load` and `layout.build_layout`.
-    """
-    from skin_host.config.settings import load
-    from skin_host.errors import ConfigurationError
-    from skin_host.layout import build_layout
-
-    settings = load(config)
-    try:
-        layout = build_layout(settings, config.parent)
-    except ConfigurationError as error:
-        raise ConfigurationError(f"{config}: {error}") from None
-    return settings, layout
+    return layout.load_skin(config)
 
 
 def print_json(document: object) -> None:

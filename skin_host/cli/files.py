@@ -108,8 +108,7 @@ def _replay(arguments: argparse.Namespace) -> int:
         raise RequestError("the following arguments are required: --config")
     if len(arguments.logs) > 1 or arguments.scheduler is not None:
         return _replay_all(arguments)
-    from skin_host.processing.core import Engine
-    from skin_host.recording.replay import Task, calibration_for, process, write_lines
+    from skin_host.recording.replay import Task, process
 
     (log,) = arguments.logs
     progress = Progress("replay")
@@ -117,15 +116,9 @@ def _replay(arguments: argparse.Namespace) -> int:
     def told(number: int) -> None:
         progress.update(0.0, f"{number} frames")
 
-    seconds = arguments.calibrate_seconds
-    if arguments.output != "-":
-        output = Path(arguments.output)
-        process(Task(log, arguments.config, output, arguments.calibration, seconds), told)
-    else:
-        settings, layout = load_skin(arguments.config)
-        found = calibration_for(log, settings, layout, arguments.calibration, seconds)
-        engine = Engine(settings, layout, list(range(len(layout.parts))), found)
-        write_lines(log, engine, sys.stdout.buffer, told)
+    output = None if arguments.output == "-" else Path(arguments.output)
+    calibrated = arguments.calibration, arguments.calibrate_seconds
+    process(Task(log, arguments.config, output, *calibrated), told)
     progress.close()
     return 0
 

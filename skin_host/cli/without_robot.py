@@ -289,10 +289,7 @@ def take_command(
 
     With a MuJoCo model also `ctrl ACTUATOR VALUE`, which sets what drives an actuator.
 
-    Args:
-        robot: to which it happens.
-        mends: functions that end the given faults, by their lines.
-        model: of the bodies.
+    `mends` are the functions that end the given faults, by their lines.
     """
     from emulator import faults
 

@@ -54,11 +54,7 @@ class Hearer(Protocol):
 class BrokerLink:
     """A connection that is kept up.
 
-    Args:
-        number: of the broker among those of the client.
-        broker: where.
-        identifier: our name at the broker.
-        hearer: receives the messages.
+    `number` is that of the broker among those of the client, `identifier` our name there.
 
     Attributes:
         connection: None before all wanted topics have been subscribed to once.

@@ -25,11 +25,7 @@ def explain(document: Any, error: msgspec.ValidationError, root: Table, named: N
     msgspec's message is "Expected `int`, got `str` - at `$.boards[...].address`": it does not name
     the board, so each named table is checked once more separately.
 
-    Args:
-        document: the decoded file.
-        error: msgspec's error.
-        root: the type of the whole file.
-        named: the sections of the file that hold tables by name, and the type of these.
+    `named` are the sections of the file that hold tables by name, and the type of these.
     """
     for section, table in named.items():
         entries = document.get(section)
@@ -51,14 +47,7 @@ def explain(document: Any, error: msgspec.ValidationError, root: Table, named: N
 
 
 def _readable(message: str, place: str, table: Table, document: Any) -> str:
-    """Put the place first, then the value seen; suggest the probable key for an unknown one.
-
-    Args:
-        message: msgspec's own.
-        place: where in the file `table` is.
-        table: what was checked.
-        document: the same, decoded without its types.
-    """
+    """Put the place first, then the value seen; suggest the probable key for an unknown one."""
     text, _, inner = message.partition(" - at ")
     keys = inner.strip("`").removeprefix("$").removeprefix(".")
     place = f"{place}.{keys}".strip(".") if keys else place

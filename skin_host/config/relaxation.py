@@ -66,9 +66,7 @@ def wrong_parameters(table: RelaxationSettings) -> str | None:
 def with_file(table: RelaxationSettings, configuration: Path) -> RelaxationSettings:
     """Replace the numbers of a table by those of the file that it names.
 
-    Args:
-        table: of this configuration.
-        configuration: the file's name is relative to its folder.
+    The file's name is relative to the folder of `configuration`.
 
     Raises:
         ConfigurationError: the file is missing or not a relaxation file.

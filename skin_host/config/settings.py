@@ -279,10 +279,7 @@ def format_triangles(numbers: list[int]) -> str:
 def read_toml(path: Path, table: type[T], named: Named) -> T:
     """Read a file whose keys are those of a table.
 
-    Args:
-        path: of the file.
-        table: what it must be.
-        named: its sections that hold tables by name, and the type of these.
+    `named` are its sections that hold tables by name, and the type of these.
 
     Raises:
         ConfigurationError: unreadable, not TOML, or wrong; the message names file and key.
@@ -331,15 +328,20 @@ def _check_references(path: Path, settings: Settings) -> None:
         return ConfigurationError(f"{path}: {where}: {what}")
 
     addresses: dict[tuple[str, int], str] = {}
-    for name, board in settings.boards.items():
+    boards: list[tuple[str, str, Board | Fingertip]] = [
+        *((f"boards.{name}", f'board "{name}"', board) for name, board in settings.boards.items()),
+        *(
+            (f"fingertips.{name}", f"fingertips.{name}", tip)
+            for name, tip in settings.fingertips.items()
+        ),
+    ]
+    for where, label, board in boards:
         if board.bus not in settings.buses:
-            raise wrong(f"boards.{name}.bus", f'no bus "{board.bus}"; {_known(settings.buses)}')
-        twin = addresses.setdefault((board.bus, board.address), name)
-        if twin != name:
-            raise wrong(
-                f"boards.{name}.address",
-                f'{board.address} on bus "{board.bus}" is already that of board "{twin}"',
-            )
+            raise wrong(f"{where}.bus", f'no bus "{board.bus}"; {_known(settings.buses)}')
+        twin = addresses.setdefault((board.bus, board.address), label)
+        if twin != label:
+            what = f'{board.address} on bus "{board.bus}" is already that of {twin}'
+            raise wrong(f"{where}.address", what)
     used: dict[tuple[str, int], str] = {}
     if "nodes" in settings.parts:
         raise wrong("parts.nodes", "the name is taken by the topics of the nodes; choose another")
@@ -372,20 +374,11 @@ def _check_references(path: Path, settings: Settings) -> None:
 
 
 def _check_fingertips(settings: Settings, wrong: Callable[[str, str], ConfigurationError]) -> None:
-    addresses = {
-        (board.bus, board.address): f'board "{name}"' for name, board in settings.boards.items()
-    }
     nodes = {part.node for part in settings.parts.values()}
     for name, tip in settings.fingertips.items():
         where = f"fingertips.{name}"
         if name in settings.parts or name == "nodes":
             raise wrong(where, "the name is taken by another's topics; choose another")
-        if tip.bus not in settings.buses:
-            raise wrong(f"{where}.bus", f'no bus "{tip.bus}"; {_known(settings.buses)}')
-        twin = addresses.setdefault((tip.bus, tip.address), where)
-        if twin != where:
-            what = f'{tip.address} on bus "{tip.bus}" is already that of {twin}'
-            raise wrong(f"{where}.address", what)
         if tip.array is not None and tip.array not in settings.parts:
             raise wrong(f"{where}.array", f'no part "{tip.array}"; {_known(settings.parts)}')
         if tip.array is not None and settings.parts[tip.array].node != tip.node:

@@ -84,11 +84,6 @@ class FingertipOutput(NamedTuple):
 class FingertipEngine:
     """Assemblers and contact sensing of a node's fingertips.
 
-    Args:
-        settings: the configuration.
-        layout: its skin.
-        parts: indices of the node's parts.
-
     Attributes:
         tips: by name.
         held_report_ns: a contact that lasts for longer is reported.

@@ -4,13 +4,13 @@ The record is published as `<fingertip>/health`, with the same schema, `state`, 
 `sentences` as that of a part of skin; `docs/operations.md` explains the other keys.
 """
 
-from collections import deque
 from collections.abc import Iterator
 from typing import NotRequired, TypedDict
 
 from skin_host.fingertip.engine import FingertipEngine, TipState
 from skin_host.health.diagnosis import FoundFault
 from skin_host.health.record import FaultName
+from skin_host.health.watch import Window
 
 #: Rates are means over about this time.
 RATE_NS = 2_000_000_000
@@ -54,22 +54,18 @@ class FingertipHealth:
 
     def __init__(self, engine: FingertipEngine) -> None:
         self._engine = engine
-        self._past: dict[str, deque[tuple[int, int, int]]] = {name: deque() for name in engine.tips}
+        self._windows = {name: Window(RATE_NS) for name in engine.tips}
+        self._gained: dict[str, dict[str, float]] = {}
         self._lossy_ns: dict[str, int] = {}
 
     def tick(self, now_ns: int) -> None:
         """Read the counters; to be called several times a second."""
         for name, state in self._engine.tips.items():
-            past = self._past[name]
-            if past and now_ns < past[-1][0]:
-                past.clear()  # the clock was set back
             counters = None if state.assembler is None else state.assembler.counters
             samples, lone = (0, 0) if counters is None else (counters.samples, counters.lone)
-            past.append((now_ns, samples, lone))
-            while len(past) > 2 and now_ns - past[1][0] >= RATE_NS:
-                past.popleft()
-            lone, samples = past[-1][2] - past[0][2], past[-1][1] - past[0][1]
-            if lone >= max(FEW_LONE, LONE_SHARE * samples):
+            totals = {"samples": samples, "lone": lone}
+            gained = self._gained[name] = self._windows[name].note(now_ns, totals)
+            if gained["lone"] >= max(FEW_LONE, LONE_SHARE * gained["samples"]):
                 self._lossy_ns[name] = now_ns
 
     def records(self, now_ns: int | None) -> dict[str, FingertipRecord]:
@@ -80,9 +76,8 @@ class FingertipHealth:
         assembler, table = state.assembler, state.settings
         counters = None if assembler is None else assembler.counters
         faults = list(self._faults(state, now_ns))
-        past = self._past[state.name]
-        span_ns = past[-1][0] - past[0][0] if past else 0
-        rate_hz = (past[-1][1] - past[0][1]) / span_ns * 1e9 if span_ns else 0.0
+        gained = self._gained.get(state.name)
+        rate_hz = gained["samples"] / gained["seconds"] if gained and gained["seconds"] else 0.0
         record: FingertipRecord = {
             "part": state.name,
             "kind": "fingertip",

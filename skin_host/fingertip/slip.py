@@ -93,11 +93,7 @@ class ShearRate:
     The line is the low-pass that the derivative needs: a plain difference has noise
     sd sqrt(2) / dt; through w samples it is sd sqrt(12 / (w (w^2 - 1))) / dt.
 
-    Args:
-        contacts: n.
-        rate_hz: of the samples.
-        window: w, samples in the line.
-        components: d, of a force; 2 in the tangent plane.
+    There are n contacts, w samples in the window, and d components; 2 in the tangent plane.
     """
 
     def __init__(
@@ -148,10 +144,7 @@ class Seen:
 class SlipWatch:
     """Watches one contact.
 
-    Args:
-        settings: of the fingertip.
-        rate_hz: of the samples.
-        noise_n: standard deviation of a component of the force.
+    Forces have the standard deviation `noise_n` in each component.
 
     Attributes:
         threshold_n_s: of the rate; the noise may raise the configured one.

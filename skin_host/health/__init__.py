@@ -115,9 +115,6 @@ class HealthWatch:
         It is taken ten times a second; only when it differs, and once a second, are the records
         made, which cost a hundred times as much. Measures that change slowly (temperature, periods,
         baselines) are left to the records of each second.
-
-        Args:
-            ports, boards: by name of the bus.
         """
         engine, watch = self._engine, self._watch
         return (
@@ -150,12 +147,7 @@ class HealthWatch:
     ) -> Record:
         """Return the health record of a part, with its faults as codes and as sentences.
 
-        Args:
-            part: index in the layout.
-            now_ns: the time.
-            ports, boards: by name of the bus.
-            output: the counters of the publisher, if there is one.
-            unkept: what the daemon could not write to its state directory, and why.
+        `unkept` is what the daemon could not write to its state directory, and why.
         """
         record = self._describer.part(part, now_ns, ports, boards)
         if output is not None:

@@ -140,13 +140,32 @@ class BoardWatch:
             self.events[name] = count
 
 
+class Window:
+    """What counters gain in about the last `span_ns`."""
+
+    def __init__(self, span_ns: int) -> None:
+        self._span_ns = span_ns
+        self._past: deque[tuple[int, dict[str, int]]] = deque()
+
+    def note(self, now_ns: int, totals: dict[str, int]) -> dict[str, float]:
+        """Take in all counters; return their gains, with the true length under "seconds"."""
+        past = self._past
+        if past and now_ns < past[-1][0]:
+            past.clear()  # the clock was set back
+        past.append((now_ns, totals))
+        while len(past) > 2 and now_ns - past[1][0] >= self._span_ns:
+            past.popleft()
+        then_ns, before = past[0]
+        gained: dict[str, float] = {key: totals[key] - before[key] for key in totals}
+        return gained | {"seconds": (now_ns - then_ns) * 1e-9}
+
+
 @dataclass(slots=True)
 class BusWatch:
     """The last frame count of a bus, and what all its counters gained in the last second.
 
     Attributes:
-        gained: in about the last second, with its true length under "seconds"; empty before the
-            first call of `note`.
+        gained: in about the last second, see `Window`; empty before the first call of `note`.
         received_ns: when a frame was last received, on the ledger's clock.
     """
 
@@ -154,7 +173,7 @@ class BusWatch:
     received_ns: int = 0
     silent: bool = False
     gained: dict[str, float] = field(default_factory=dict)
-    _past: deque[tuple[int, dict[str, int]]] = field(default_factory=deque)
+    _window: Window = field(default_factory=lambda: Window(RECENT_NS))
 
     def note(
         self,
@@ -174,15 +193,7 @@ class BusWatch:
             self.frames = totals["frames"]
             self.received_ns = ledger_ns
         self.silent = ledger_ns - self.received_ns > silent_after_ns and not awaited
-        past = self._past
-        if past and now_ns < past[-1][0]:
-            past.clear()  # the clock was set back
-        past.append((now_ns, totals))
-        while len(past) > 2 and now_ns - past[1][0] >= RECENT_NS:
-            past.popleft()
-        then_ns, before = past[0]
-        self.gained = {key: totals[key] - before[key] for key in totals}
-        self.gained["seconds"] = (now_ns - then_ns) * 1e-9
+        self.gained = self._window.note(now_ns, totals)
 
 
 class Watch:

@@ -117,14 +117,9 @@ def import_files(
 ) -> list[Path]:
     """Turn files of the iCub software into the configuration `output`.
 
-    Args:
-        source: the kind of files.
-        files: at least one.
-        output: the configuration to write; the positions files of `robot.toml` go to the folder
-            `robot-positions` beside it.
-        findings: receives every remark, also those made before an error.
-        config: a configuration to add to; may be `output` itself. Its comments are lost.
-        part: the part that a positions file describes.
+    The positions files of `robot.toml` go to the folder `robot-positions` beside it. `findings`
+    receives every remark, also those made before an error. `config` is a configuration to add to;
+    it may be `output` itself. Its comments are lost. `part` is what a positions file describes.
 
     Returns:
         The files written; nothing is written if anything is wrong.

@@ -116,13 +116,9 @@ def import_positions(
 ) -> tuple[Settings, dict[str, bytes]]:
     """Give the triangles of `base` the positions in the files, one file per part.
 
-    Args:
-        files: positions files.
-        base: the configuration whose parts they describe, or None to make one from the files.
-        part: which part, for a single file; by default the part whose name the file name begins
-            with.
-        folder: where the positions files will be, beside the configuration.
-        findings: receives the remarks.
+    Without `base` the configuration is made from the files. `part` is that of a single file; by
+    default the part whose name the file name begins with. Positions files are written to `folder`,
+    beside the configuration.
 
     Returns:
         The settings, and the positions files that they refer to, by name.

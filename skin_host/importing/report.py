@@ -89,12 +89,7 @@ def with_part(
 ) -> Settings:
     """Add a part on a bus of its own, with boards of default set-up.
 
-    Args:
-        settings: to add to.
-        file: that describes the part.
-        name: of the part and its bus.
-        boards: by address, their triangles and the kind of these; some have no triangles.
-        findings: receives what is assumed.
+    `boards` are by address their triangles and the kind of these; some have no triangles.
     """
     channel = f"can{len(settings.buses)}"
     names = {address: f"{name}_{address}" for address in boards}

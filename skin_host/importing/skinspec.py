@@ -179,11 +179,6 @@ class Device:
 def import_boards(files: list[Path], base: Settings | None, findings: Findings) -> Settings:
     """Read skinSpec (or device) files; each gives a part, and a bus for each of its patches.
 
-    Args:
-        files: the XML files.
-        base: a configuration to add to, or None.
-        findings: receives the remarks.
-
     Raises:
         ConfigurationError: a file cannot be read or describes no board.
     """

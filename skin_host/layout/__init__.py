@@ -21,6 +21,7 @@ from skin_host.config.settings import (
     KindSettings,
     Patch,
     Settings,
+    load,
     parse_triangles,
 )
 from skin_host.errors import ConfigurationError
@@ -142,6 +143,19 @@ def builtin_kinds() -> dict[str, KindSettings]:
     """The kinds of sensor unit that come with the project (`kinds.toml`)."""
     text = resources.files("skin_host.layout").joinpath("kinds.toml").read_bytes()
     return msgspec.toml.decode(text, type=dict[str, KindSettings])
+
+
+def load_skin(config: Path) -> tuple[Settings, Layout]:
+    """Return settings and layout of a configuration file.
+
+    Raises:
+        ConfigurationError: see `settings.load` and `build_layout`.
+    """
+    settings = load(config)
+    try:
+        return settings, build_layout(settings, config.parent)
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{config}: {error}") from None
 
 
 def build_layout(settings: Settings, folder: Path) -> Layout:

@@ -96,11 +96,7 @@ def read_samples(
 ) -> Samples:
     """Read a recording whose first `seconds` are untouched.
 
-    Args:
-        log: the recording.
-        settings, layout: of its skin.
-        seconds: how long it is untouched.
-        progress: called now and then with the number of minutes read.
+    `progress` is called now and then with the number of minutes read.
 
     Raises:
         LogError: unreadable, or with too little of this skin in it.
@@ -267,11 +263,7 @@ def fit_curves(
 ) -> tuple[Calibration, Curves]:
     """Fit a curve to every pad, and the foam's memory, from any course of known pressure.
 
-    Args:
-        samples: of the recording.
-        settings, layout: of its skin.
-        load: times in s, and pressures in kPa on all pads alike.
-        path: of the table that they were read from, for messages.
+    `load` are times in s, and pressures in kPa on all pads alike, from the table at `path`.
 
     Raises:
         RequestError: the table is no course of pressure, not of this recording, or nothing is

@@ -93,11 +93,6 @@ def on_clock_of(time_s: Floats, start_s: float, end_s: float, path: Path) -> Flo
 
     A table counts from its recording's start, or has the same clock.
 
-    Args:
-        time_s: of the table.
-        start_s, end_s: of the recording.
-        path: of the table, for messages.
-
     Raises:
         RequestError: the table is of another time, or ends long before the recording does.
     """

@@ -52,11 +52,8 @@ async def play_on_buses(
 ) -> int:
     """Send the data frames of a recording onto CAN; return how many.
 
-    Args:
-        log: a recording of CAN frames, of any format that `skin replay` reads.
-        settings: whose buses the recording's channels are.
-        buses: open buses by their name in the configuration.
-        speed: 2 is twice as fast as recorded.
+    `buses` are open ones by their names in the settings, whose channels are the recording's.
+    `speed` 2 is twice as fast as recorded.
 
     Raises:
         LogError: the recording cannot be read.
@@ -82,11 +79,7 @@ async def play_messages(
 ) -> int:
     """Publish the messages of an MCAP recording again, byte for byte; return how many.
 
-    Args:
-        recording: made from a broker.
-        broker: where.
-        speed: 2 is twice as fast as recorded.
-        robot: a name in place of the recorded one, so that a live robot is not disturbed.
+    `robot` is a name in place of the recorded one, so that a live robot is not disturbed.
 
     Raises:
         LogError: the recording cannot be read, or holds no messages.
@@ -127,11 +120,7 @@ def _renamed(topic: str, robot: str) -> str:
 async def play_processed(log: Path, engine: Engine, settings: Settings, speed: float = 1.0) -> int:
     """Process a recording of CAN frames with the pipeline and publish the results.
 
-    Args:
-        log: any recording that `skin replay` reads.
-        engine: calibrated already.
-        settings: its table `mqtt` gives the broker.
-        speed: 2 is twice as fast as recorded.
+    The engine is calibrated already; the table `mqtt` of the settings gives the broker.
 
     Raises:
         LogError: the recording cannot be read.

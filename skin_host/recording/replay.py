@@ -8,6 +8,7 @@ files; a cluster's workers must find them under the same absolute paths.
 
 import os
 import signal
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -21,12 +22,12 @@ import numpy as np
 
 from skin_host.bus.logs import WINDOW_NS, read_channels
 from skin_host.bus.wire import FrameBatch
-from skin_host.config.settings import Settings, load, skin_hash
-from skin_host.errors import ConfigurationError, LogError, RequestError, SkinError, required
+from skin_host.config.settings import Settings, skin_hash
+from skin_host.errors import LogError, RequestError, SkinError, required
 from skin_host.files import whole_file
 from skin_host.fingertip.events import FingertipEvent
 from skin_host.health import HealthWatch
-from skin_host.layout import Layout, build_layout
+from skin_host.layout import Layout, load_skin
 from skin_host.mqtt.messages import encode_event, health_keys
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration
@@ -102,10 +103,7 @@ def read_buses(
     With one bus in the configuration all frames belong to it, whatever the recording calls its
     channel. With several, channels go by name; others are ignored.
 
-    Args:
-        log: the recording.
-        settings: with its buses.
-        window_ns: a batch of a recording that is no MCAP spans at most this time.
+    A batch of a recording that is no MCAP spans `window_ns` at most.
 
     Raises:
         LogError: see `logs.read_channels`; or several buses, and none of their channels in it.
@@ -135,13 +133,9 @@ def calibration_for(
 ) -> Calibration:
     """Return the calibration with which a recording is processed.
 
-    Args:
-        log: the recording.
-        settings, layout: of its skin.
-        file: a calibration file, or None.
-        seconds: how much of the recording's beginning is untouched and gives the zero; if None, the
-            file's zero is used, or without a file `UNTOUCHED_S`. With both, curves, gains and the
-            foam's memory come from the file, as at the start of a daemon that calibrates.
+    The recording's first `seconds` are untouched and give the zero; if None, the file's zero is
+    used, or without a file `UNTOUCHED_S`. With both, curves, gains and the foam's memory come from
+    the file, as at the start of a daemon that calibrates.
 
     Raises:
         LogError: see `calibrate_from_log`.
@@ -222,13 +216,13 @@ class Task:
     Attributes:
         log: the recording.
         config: of its skin.
-        output: file of JSON lines to write, completely or not at all.
+        output: file of JSON lines to write, completely or not at all; None is standard output.
         calibration, calibrate_seconds: see `replay.calibration_for`.
     """
 
     log: Path
     config: Path
-    output: Path
+    output: Path | None
     calibration: Path | None = None
     calibrate_seconds: float | None = None
 
@@ -238,11 +232,7 @@ def write_lines(
 ) -> int:
     """Write the results of a recording as JSON lines; return the number of frames of pressure.
 
-    Args:
-        log: the recording.
-        engine: calibrated, and not fed yet.
-        output: where to write.
-        progress: called with the number so far.
+    The engine is calibrated, and not fed yet; `progress` is called with the number so far.
 
     Raises:
         LogError: the recording cannot be read, or ends with damage.
@@ -274,13 +264,11 @@ def process(task: Task, progress: Callable[[int], None] = lambda _: None) -> int
     Raises:
         LogError, CalibrationError, ConfigurationError: a file is wrong.
     """
-    settings = load(task.config)
-    try:
-        layout = build_layout(settings, task.config.parent)
-    except ConfigurationError as error:
-        raise ConfigurationError(f"{task.config}: {error}") from None
+    settings, layout = load_skin(task.config)
     found = calibration_for(task.log, settings, layout, task.calibration, task.calibrate_seconds)
     engine = Engine(settings, layout, list(range(len(layout.parts))), found)
+    if task.output is None:
+        return write_lines(task.log, engine, sys.stdout.buffer, progress)
     with whole_file(task.output) as growing, growing.open("wb") as output:
         return write_lines(task.log, engine, output, progress)
 

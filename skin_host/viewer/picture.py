@@ -169,23 +169,24 @@ class Picture:
         old = self.parts
         self.parts = {}
         parts: list[dict[str, Any]] = []
-        for node, info in nodes.items():
-            for name, part in info.parts.items():
-                view = old.get(name)
-                if view is None or view.n_taxels != len(part.pads):
-                    view = PartView(0, node, len(part.pads))
-                view.number, view.node = len(self.parts), node
-                self.parts[name] = view
-                parts.append({"name": name, "node": node} | msgspec.to_builtins(part))
-        # Added last, as parts without taxels, because pages number frames by the parts alone.
-        for node, info in nodes.items():
-            for name in info.fingertips:
-                view = old.get(name)
-                if view is None or view.n_taxels:
-                    view = PartView(0, node, 0)
-                view.number, view.node = len(self.parts), node
-                self.parts[name] = view
-                parts.append({"name": name, "node": node, "fingertip": True} | _NO_TAXELS)
+        described = [
+            (node, name, len(part.pads), msgspec.to_builtins(part))
+            for node, info in nodes.items()
+            for name, part in info.parts.items()
+        ]
+        # Last, as parts without taxels, because pages number frames by the parts alone.
+        described += [
+            (node, name, 0, {"fingertip": True} | _NO_TAXELS)
+            for node, info in nodes.items()
+            for name in info.fingertips
+        ]
+        for number, (node, name, n_taxels, description) in enumerate(described):
+            view = old.get(name)
+            if view is None or view.n_taxels != n_taxels:
+                view = PartView(0, node, n_taxels)
+            view.number, view.node = number, node
+            self.parts[name] = view
+            parts.append({"name": name, "node": node} | description)
         self.version += 1
         self._layout = msgspec.json.encode(
             {

@@ -54,12 +54,7 @@ async def run(
 ) -> None:
     """Show a robot's skin in a viewer until `stop`.
 
-    Args:
-        broker, robot: whose skin, as `SkinClient` takes them.
-        stop: set it to end.
-        serving: `foxglove` or `rerun`.
-        show_url: receives the viewer's URL.
-        clock: gives the time of a record of health.
+    The viewer is `foxglove` or `rerun`; `show_url` receives its URL.
 
     Raises:
         SkinError: no broker, no robot, a port that is taken, or a package that is not installed.

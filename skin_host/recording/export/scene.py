@@ -211,10 +211,7 @@ def _side_by_side(shapes: dict[str, PartInfo]) -> dict[str, tuple[float, float, 
 def write_foxglove(series: Series, recording: Path | None, output: Path) -> None:
     """Write an MCAP file with what Foxglove's 3D, plot and log panels show as they are.
 
-    Args:
-        series: what was recorded.
-        recording: where it was read; if it is MCAP its own messages are taken along.
-        output: the new file.
+    Messages of `recording` itself are taken along if it is MCAP.
 
     Raises:
         SkinError: a package of the extra `foxglove` is not installed, or writing fails.
