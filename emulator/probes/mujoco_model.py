@@ -67,6 +67,8 @@ class MujocoModel:
     def __init__(self, path: Path, layout: Layout) -> None:
         self._mujoco = required("mujoco", "simulations of bodies", "mujoco")
         self._path = path
+        if not path.is_file():  # MuJoCo would wait for a pipe
+            raise ConfigurationError(f"{path}: is no file; wanted a model, MJCF or URDF")
         # Otherwise MuJoCo appends its warnings to a file in the user's working directory.
         warnings: list[str] = []
         self._mujoco.set_mju_user_warning(warnings.append)

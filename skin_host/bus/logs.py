@@ -436,10 +436,18 @@ def _check(path: Path, suffixes: list[str]) -> None:
         known = sorted(can.io.player.MESSAGE_READERS)
         if not any(suffix in known for suffix in suffixes[-2:]):
             raise LogError(f"{path}: unknown format of file name; known are {', '.join(known)}")
+    open_recording(path).close()
+
+
+def open_recording(path: Path) -> BinaryIO:
+    """Open a file to read; a pipe, which would be waited for, is refused.
+
+    Raises:
+        LogError: it cannot be read.
+    """
     try:
-        if path.is_fifo():  # which would be waited for
+        if path.is_fifo():
             raise LogError(f"{path}: not a file; wanted a recording")
-        with path.open("rb"):
-            pass
+        return path.open("rb")
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror or error}") from None

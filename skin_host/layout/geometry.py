@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from skin_host.config.settings import KindSettings, PlaceSettings
 from skin_host.errors import ConfigurationError
+from skin_host.files import read_whole
 
 #: Pads closer than this many pitches touch the same object: they are neighbours.
 NEIGHBOUR_PITCHES = 1.6
@@ -129,10 +130,10 @@ def read_positions(where: str, path: Path, n: int) -> tuple[Floats, Floats]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numpy warns of an empty file; its shape is checked
-            table = np.loadtxt(path, ndmin=2)
+            table = np.loadtxt(read_whole(path).decode().splitlines(), ndmin=2)
     except OSError as error:
-        reason = error.strerror or "not found"
-        raise ConfigurationError(f"{where}.positions: {path}: cannot be read: {reason}") from None
+        what = f"{where}.positions: {path}: cannot be read: {error.strerror}"
+        raise ConfigurationError(what) from None
     except ValueError as error:
         raise ConfigurationError(f"{where}.positions: {path}: {error}") from None
     if table.shape != (n, 6):

@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
+from skin_host.bus.logs import open_recording
 from skin_host.bus.wire import FrameBatch
 from skin_host.errors import LogError, SkinError, required
 from skin_host.files import growing, writing
@@ -250,13 +251,7 @@ def read_can(path: Path) -> Iterator[tuple[str, FrameBatch]]:
 def _messages(path: Path) -> Iterator[tuple[str, int, bytes]]:
     """(topic, time, data) of every message, in order of time."""
     reader = _mcap("mcap.reader")
-    try:
-        if path.is_fifo():  # which would be waited for
-            raise LogError(f"{path}: not a file; wanted a recording")
-        file = path.open("rb")
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read: {error.strerror}") from None
-    with file:
+    with open_recording(path) as file:
         try:
             _check_chunks(path, file)
             for _, channel, message in reader.make_reader(file).iter_messages():

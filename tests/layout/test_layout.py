@@ -1,5 +1,6 @@
 """Where taxels lie, who their neighbours are, and what a bad layout is told."""
 
+import os
 from pathlib import Path
 
 import msgspec
@@ -218,6 +219,13 @@ def test_an_outline_can_be_drawn_where_all_taxels_lie_at_one_place() -> None:
     outline = fitted_outline(kind, np.zeros((12, 3)), np.tile([0.0, 0, 1], (12, 1)))
     assert np.isfinite(outline).all()
     assert np.linalg.norm(outline[0] - outline[1]) == pytest.approx(0.03)
+
+
+@pytest.mark.timeout(60)
+def test_a_pipe_that_nobody_writes_positions_to_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "arm.txt")
+    with pytest.raises(ConfigurationError, match="a pipe that nobody writes to"):
+        build_layout(skin({"triangles": "0", "positions": "arm.txt"}), tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Contacts of a MuJoCo simulation press the foam: with their force, at their place."""
 
+import os
 from pathlib import Path
 
 import msgspec
@@ -414,8 +415,11 @@ def test_a_model_that_is_too_large_or_no_file_leaves_no_file(
     large = tmp_path / "large.xml"
     with large.open("wb") as file:
         file.truncate(3 * 2**30)  # a sparse file
-    for path in (large, here):
-        with pytest.raises(ConfigurationError, match=r"File size over 2GB is not supported"):
+    os.mkfifo(tmp_path / "pipe.xml")
+    with pytest.raises(ConfigurationError, match=r"File size over 2GB is not supported"):
+        MujocoModel(large, LAYOUT)
+    for path in (here, tmp_path / "pipe.xml", tmp_path / "absent.xml"):
+        with pytest.raises(ConfigurationError, match=r"is no file; wanted a model"):
             MujocoModel(path, LAYOUT)
     assert not list(here.iterdir())
     assert capfd.readouterr() == ("", "")
