@@ -229,3 +229,26 @@ def test_the_plain_mean_is_the_default(configured):
     part = configured()[0].parts["palm"]
     assert part.localization == "centroid"
     assert msgspec.to_builtins(part)["probe_mm"] == [6.0, 8.0, 10.0, 12.0]
+
+
+def test_contacts_are_located_by_activations_of_the_parts_median_pad(configured) -> None:
+    settings, layout = configured('localization = "peak"')
+    tracker = ContactTracker(layout, 0, settings)
+    n = layout.n_taxels
+    touched = np.arange(n) == 3
+    pressure = np.where(touched, 20.0, 0.0).astype(np.float32)
+    tracker.step(
+        PressureFrame(
+            "palm",
+            0,
+            0,
+            np.zeros(n, np.uint8),
+            pressure,
+            touched,
+            np.ones(n, bool),
+            np.zeros(n, bool),
+        )
+    )
+    curve = PressureCurve(float(np.median(layout.unit_ff / layout.sensitivity)))
+    assert tracker._places is not None
+    assert tracker._places._units[3] == pytest.approx(curve.units(np.full(1, 20.0))[0])

@@ -334,3 +334,79 @@ def test_a_triangle_that_was_absent_when_calibrated_may_be_as_noisy_as_it_is() -
         liveness.step(raw, HERE, NO)
     assert liveness.spikes.sum() == 0
     assert not liveness.noisy.any()
+
+
+def test_a_pad_that_was_pressed_to_its_end_for_a_minute_is_known_as_well_as_before() -> None:
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.0)
+    liveness = Liveness(K, np.full((K, 12), 0.4), PERIOD_S)
+    for _ in range(1200):
+        raw = noisy_bytes(rng, 0.4, centre)
+        raw[3, 1:] = 0
+        liveness.step(raw, HERE, NO)
+    raw[3] = [0, 240] + [0] * 10
+    for _ in range(100):
+        others = noisy_bytes(rng, 0.4, centre)
+        others[3] = raw[3]
+        liveness.step(others, HERE, NO)
+    assert liveness.frozen.tolist() == [False, False, False, True]
+
+
+def test_the_first_sweep_of_a_board_is_compared_with_nothing_whichever_came_before() -> None:
+    rng = np.random.default_rng(3)
+    liveness = Liveness(K, np.zeros((K, 12)), PERIOD_S, boards=2)
+    centre = np.full((K, 12), 240.3)
+    first = np.arange(K) < K // 2
+    liveness.step(noisy_bytes(rng, 0.8, centre), first, NO, came=np.array([True, False]))
+    for changes in range(4):
+        assert liveness.unproven.tolist() == [changes < 3] * 2 + [changes < 4] * 2
+        liveness.step(noisy_bytes(rng, 0.8, centre), HERE, NO)
+
+
+def test_a_pad_whose_joint_is_mended_is_calm_again_after_some_sweeps() -> None:
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+    liveness = calibrated(rng, 0.4, centre)
+    for number in range(100):
+        raw = noisy_bytes(rng, 0.4, centre)
+        raw[1, 4] -= 40 * (number % 2)
+        liveness.step(raw, HERE, NO)
+    assert liveness.noisy[1, 4]
+    for _ in range(40):
+        liveness.step(noisy_bytes(rng, 0.4, centre), HERE, NO)
+    assert not liveness.noisy.any()
+    assert liveness.doubted is None
+
+
+def test_a_frozen_triangle_was_not_silenced_by_an_error_and_one_with_an_error_was() -> None:
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+    liveness = calibrated(rng, 0.8, centre)
+    erring = np.array([True, False, False, False])
+    for number in range(40):
+        raw = noisy_bytes(rng, 0.8, centre)
+        raw[:3] = 240
+        liveness.step(raw, HERE & ~erring, erring & (number == 0))
+    assert liveness.unproven.tolist() == [True, True, True, False]
+    assert liveness.silenced.tolist() == [True, False, False, False]
+    for _ in range(6):
+        liveness.step(noisy_bytes(rng, 0.8, centre), HERE, NO)
+    assert not liveness.silenced.any()
+
+
+def test_what_changes_in_every_conversion_is_known_to_and_only_conversions_count() -> None:
+    """Of a board that sends four times as often as its chips convert, a sweep is a quarter."""
+    for sends_per_conversion in (1, 4):
+        period_s = CONVERSION_S / sends_per_conversion
+        liveness = Liveness(K, np.full((K, 12), 0.8), period_s)
+        seen = liveness._seen[0]
+        for sweep in range(1 + 100 * sends_per_conversion):
+            raw = np.full((K, 12), 200 + sweep // sends_per_conversion % 2, np.uint8)
+            liveness.step(raw, HERE, NO)
+        assert liveness._seen == pytest.approx(np.full(K, seen + 100.0))
+        changes = 1 / sends_per_conversion
+        for _ in range(20):
+            for sweep in range(100 * sends_per_conversion):
+                raw = np.full((K, 12), 200 + sweep // sends_per_conversion % 2, np.uint8)
+                liveness.step(raw, HERE, NO)
+        assert liveness._rate == pytest.approx(np.full((K, 12), changes), rel=0.02)
