@@ -240,9 +240,17 @@ class Boards:
         It never sends a discovery to all boards, because that would stop the MTB3s that work.
         """
         now_ns = self._ledger.now_ns
+        at_ease = self._ledger.at_ease(WRONG_PERIOD)
         for record in self.records.values():
             if not record.started or record.busy is not None:
                 continue
+            if (
+                at_ease[record.row]
+                and record.alive
+                and record.configurations
+                and not (record.wrong or record.wrong_tries)
+            ):
+                continue  # the usual case, checked for all boards at once
             if self._ledger.overdue(record.row, record.configured_ns):
                 self._note_silence(record, now_ns)
             elif self._ledger.since_set_up(record.row):

@@ -189,6 +189,20 @@ class BoardLedger:
         quiet_ns = self.now_ns - max(int(self.received_ns[row]), since_ns)
         return quiet_ns > int(self.silent_after_ns[row])
 
+    def at_ease(self, share: float) -> list[bool]:
+        """Return by row whether a board sends all that it was set up to send, each of its last
+        sweeps within this share of its period. One that does not may do so within other limits.
+        """
+        period_ns = self._period_ns[:, None]
+        near = np.abs(self._intervals_ns - period_ns) < share * period_ns
+        sends = near.all(axis=1) & ~self.silent
+        return [
+            sends and complete and since > 0
+            for sends, complete, since in zip(
+                sends.tolist(), self._complete, self._since_set_up, strict=True
+            )
+        ]
+
     def missing(self, row: int) -> int:
         """Return a mask of the enabled triangles that a board has not sent since it was set up, or
         has stopped sending.

@@ -244,6 +244,8 @@ def _line_of(board: BoardHealth, triangle: int) -> int:
 
 
 def _triangles(record: Record, silent: set[str]) -> Iterator[FoundFault]:
+    if not (record["triangles"] or record.get("other_triangles")):
+        return
     boards = {board["name"]: board for board in record["boards"]}
     of_line: dict[tuple[str, int], dict[int, str]] = defaultdict(dict)
     own: dict[tuple[str, int], dict[int, str]] = defaultdict(dict)

@@ -212,6 +212,7 @@ class Watch:
         self.parts = {part: PartWatch(late_samples) for part in engine.parts}
         self.boards = {board: BoardWatch() for board in engine.boards}
         self.buses = {bus: BusWatch() for bus in engine.assemblers}
+        self._noted: tuple[object, ...] = ()
         ledger_row = engine.ledger.row
         self._rows = {
             bus: np.array([ledger_row[i] for i in self._boards_of(bus)], np.intp)
@@ -239,10 +240,23 @@ class Watch:
                 silent_after_ns=int(ledger.silent_after_ns[rows].max()) if len(rows) else ALONE_NS,
                 awaited=bus in boards and boards[bus].awaits_all,
             )
+        counts = self._counts()
+        if counts == self._noted:
+            return
+        self._noted = counts
         for index, watch in self.boards.items():
             watch.note(self._events(index, watch, boards), now_ns)
             bus = self._engine.layout.boards[index].settings.bus
             watch.note_crowded(self._engine.assemblers[bus].crowded[index], now_ns)
+
+    def _counts(self) -> tuple[object, ...]:
+        """Return all that the boards are watched for: it rarely changes."""
+        ledger = self._engine.ledger
+        events = (ledger.rezeros, ledger.resets, ledger.lost_set_ups, ledger.tx_overflows)
+        return (
+            *(counts.tobytes() for counts in events),
+            *(dict(assembler.crowded) for assembler in self._engine.assemblers.values()),
+        )
 
     def _totals(self, bus: str, port: "Port | None") -> dict[str, int]:
         counters = self._engine.assemblers[bus].counters
