@@ -12,8 +12,9 @@ taken one by one, with the same result.
 """
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,8 @@ from skin_host.bus.wire import (
 )
 from skin_host.layout import BoardLayout
 
+_T = TypeVar("_T", bound=np.generic)
+
 #: A board sends the frames of a sweep in a burst; a pause of this share of the period, measured on
 #: one board, separates two sweeps.
 PAUSE_PERIODS = 0.5
@@ -47,6 +50,7 @@ _NOTHING = bytes(_PAYLOAD)
 _HALF = np.dtype((np.uint8, _PAYLOAD))
 _SWEEP = 2 * TRIANGLES * _PAYLOAD
 _NO_STATUS = bytes(2 * TRIANGLES)
+_ALL_TRIANGLES = (1 << TRIANGLES) - 1
 #: The status words of a sweep without any.
 NO_STATUS = np.zeros(TRIANGLES, np.uint16)
 NO_STATUS.flags.writeable = False
@@ -56,6 +60,8 @@ _SMALLEST_DLC_B = 6
 _SHORTEST_RUN = 5
 #: Where a frame's head has its length.
 _DLC_AT = 4
+#: Up to here heads identify a frame; then follows what nobody reads, and the header.
+_PAD_AT = 5
 #: After so many sweeps in another order than the known one, which lost frames cause too, the order
 #: is learnt again, after a pause of so many sweeps.
 _MOST_STRAY_SWEEPS = 4
@@ -140,12 +146,56 @@ class _Order(NamedTuple):
         places: of each frame, its place among the board's values.
         rows: the same as an array, or None if they rise from 0 by 1.
         missing: masks of the halves that are missing before each frame, and after the last.
+        keys: what of the heads identifies the frames: identifier, DLC, and the data's header.
+        triangles: those that it sends, in rising order; None for all.
+        gathers: by the size of a record and the place of its head, the places of the keys of all
+            frames, and of the values and then the status words of all triangles, among the octets
+            of a sweep.
     """
 
     heads: bytes
     places: list[int]
     rows: NDArray[np.intp] | None
     missing: list[int]
+    keys: bytes
+    triangles: NDArray[np.intp] | None
+    gathers: dict[tuple[int, int], NDArray[np.intp]]
+
+    @classmethod
+    def of(cls, heads: Sequence[bytes], places: Sequence[int], missing: Sequence[int]) -> "_Order":
+        n = len(places)
+        rows = None if list(places) == list(range(n)) else np.array(places, np.intp)
+        triangles = np.unique(np.array(places, np.intp) // 2)
+        return cls(
+            b"".join(heads),
+            list(places),
+            rows,
+            [*missing, 0],
+            b"".join(head[:_PAD_AT] + head[-1:] for head in heads),
+            None if len(triangles) == TRIANGLES else triangles,
+            {},
+        )
+
+    def gather(self, size: int, head: int) -> NDArray[np.intp]:
+        """Return the one of `gathers` for records of this form."""
+        found = self.gathers.get((size, head))
+        if found is None:
+            data = head + HEAD_BYTES
+            begins = {place: number * size for number, place in enumerate(self.places)}
+            triangles = sorted({place // 2 for place in self.places})
+            places: list[int] = []
+            for number in range(len(self.places)):
+                begin = number * size + head
+                places += [*range(begin, begin + _PAD_AT), begin + HEAD_BYTES - 1]
+            for triangle in triangles:
+                for half, count in enumerate((VALUES_A, TAXELS - VALUES_A)):
+                    begin = begins[2 * triangle + half] + data
+                    places += range(begin, begin + count)
+            for triangle in triangles:
+                begin = begins[2 * triangle + 1] + data + TAXELS - VALUES_A
+                places += begin, begin + 1
+            found = self.gathers[size, head] = np.array(places, np.intp)
+        return found
 
 
 @dataclass(slots=True)
@@ -183,6 +233,7 @@ class _BoardState:
     last_place: int = -1
     values: list[bytes] = field(default_factory=lambda: [_NOTHING] * 2 * TRIANGLES)
     absent_for: list[int] = field(default_factory=lambda: [0] * TRIANGLES)
+    any_absent: bool = False
     order: _Order | None = None
     came: list[tuple[bytes, int, int]] | None = None
     done: int = 0
@@ -252,18 +303,24 @@ class Assembler:
         self.counters.frames += n
         slots = self._slots
         records = batch.records()
-        heads = records.octets[:, records.head : records.head + HEAD_BYTES].tobytes()
+        octets, form, head_at = records
+        text = octets.tobytes()
+        size = form.size
+        heads = b""
         rising = batch.rising
         at = 0
         while at < n:
             if rising:
-                known = self._first.get(heads[at * HEAD_BYTES : (at + 1) * HEAD_BYTES])
+                begin = at * size + head_at
+                known = self._first.get(text[begin : begin + HEAD_BYTES])
                 if known is not None:
-                    taken = self._take_sweep(known, records, heads, at, sweeps)
+                    taken = self._take_sweep(known, records, text, at, sweeps)
                     if taken:
                         at += taken
                         continue
-            left = records.form.iter_unpack(records.octets[at:].data)
+            if not heads:
+                heads = octets[:, head_at : head_at + HEAD_BYTES].tobytes()
+            left = form.iter_unpack(memoryview(text)[at * size :])
             for seconds, nanoseconds, identifier, dlc, header, payload in left:
                 at += 1
                 slot = slots.get(identifier << 8 | header)
@@ -387,11 +444,18 @@ class Assembler:
             state.came = []
 
     def _take_sweep(
-        self, state: _BoardState, records: Records, heads: bytes, at: int, sweeps: list[Sweep]
+        self, state: _BoardState, records: Records, text: bytes, at: int, sweeps: list[Sweep]
     ) -> int:
         """Take a whole sweep that begins at `at` in the board's order; return its frames' number.
 
         It is taken if the sweep before was whole, too, and no frame would need a closer look alone.
+
+        Args:
+            state: of the board.
+            records: of the batch.
+            text: their octets.
+            at: number of the first frame.
+            sweeps: what is extended by the sweep.
         """
         order = state.order
         if (
@@ -399,34 +463,55 @@ class Assembler:
             or state.missing
             or state.sent != state.awaited
             or order.missing[0] != state.awaited
-            or not heads.startswith(order.heads, at * HEAD_BYTES)
         ):
             return 0
-        n = len(order.places)
-        size, unpack_from = records.form.size, records.form.unpack_from
-        frames = records.octets.data
-        seconds, nanoseconds, *_ = unpack_from(frames, at * size)
+        octets, form, head = records
+        places, size = order.places, form.size
+        n = len(places)
+        begin, end = at * size, (at + n) * size
+        if end > len(text):
+            return 0
+        seconds, nanoseconds, *_ = form.unpack_from(text, begin)
         first_ns = seconds * NS_PER_S + nanoseconds
-        seconds, nanoseconds, _, _, _, payload = unpack_from(frames, (at + n - 1) * size)
+        seconds, nanoseconds, _, _, _, payload = form.unpack_from(text, end - size)
         last_ns = seconds * NS_PER_S + nanoseconds
         if (
             last_ns - first_ns > min(state.pause_ns, state.close_ns)
             or 0 < 2 * (first_ns - state.sent_first_ns) < state.period_ns
-            or state.last_place == order.places[0]
+            or state.last_place == places[0]
         ):
             return 0
-        data = records.octets[at : at + n, records.head + HEAD_BYTES : size]
-        if order.rows is None and n == 2 * TRIANGLES:
-            values = data.copy()
-        else:
-            values = np.zeros((2 * TRIANGLES, _PAYLOAD), np.uint8)
-            values[slice(n) if order.rows is None else order.rows] = data
-        state.values[order.places[-1]] = payload
-        state.last_place = order.places[-1]
-        state.first_ns = first_ns
-        state.last_ns = last_ns
+        # One call of numpy for all that is needed of the frames.
+        got = octets.reshape(-1)[begin:end][order.gather(size, head)]
+        line = got.tobytes()
+        if not line.startswith(order.keys):
+            return 0
+        values = len(order.keys)
+        raw = got[values : values + n // 2 * TAXELS].reshape(-1, TAXELS)
+        status = NO_STATUS
+        if not line.endswith(_NO_STATUS[:n]):
+            status = got[-n:].view(">u2").astype(np.uint16)
+        if order.triangles is not None:
+            raw = _spread(raw, order.triangles)
+            if status is not NO_STATUS:
+                status = _spread(status, order.triangles)
+        state.values[places[-1]] = payload
+        state.last_place = places[-1]
         state.stray = 0
-        self._close(state, sweeps, values)
+        missed = 0
+        if state.sent_last_ns:
+            apart = round((last_ns - state.sent_last_ns) / state.period_ns)
+            missed = max(0, apart - 1)
+        counters = self.counters
+        counters.sweeps += 1
+        counters.missed += missed
+        if state.any_absent:
+            state.absent_for = [0] * TRIANGLES
+            state.any_absent = False
+        present = state.awaited & _ALL_TRIANGLES
+        sweeps.append(Sweep(state.index, raw, status, present, last_ns, missed))
+        state.first_ns = state.sent_first_ns = first_ns
+        state.last_ns = state.sent_last_ns = last_ns
         return n
 
     def _take_run(
@@ -552,8 +637,9 @@ class Assembler:
             triangles[[not present >> triangle & 1 for triangle in range(TRIANGLES)]] = 0
             self._note_absent(state, present)
         else:
-            if any(state.absent_for):
+            if state.any_absent:
                 state.absent_for = [0] * TRIANGLES
+                state.any_absent = False
             if state.came is not None:
                 self._learn_order(state, state.came)
         if present:
@@ -573,8 +659,7 @@ class Assembler:
         if len(places) < _SHORTEST_RUN or any(head[_DLC_AT] < 8 for head in heads):
             state.learn_after = _LEARN_AFTER_SWEEPS
             return
-        rows = None if places == tuple(range(len(places))) else np.array(places, np.intp)
-        state.order = _Order(b"".join(heads), list(places), rows, [*missing, 0])
+        state.order = _Order.of(heads, places, missing)
         self._first[heads[0]] = state
 
     @staticmethod
@@ -584,7 +669,15 @@ class Assembler:
                 state.absent_for[triangle] = 0
             elif state.wanted >> triangle & 1:
                 state.absent_for[triangle] += 1
+                state.any_absent = True
                 if state.absent_for[triangle] >= PATIENCE_SWEEPS:
                     state.awaited &= ~(_BOTH << triangle)
         if not state.awaited:
             state.awaited = state.wanted
+
+
+def _spread(array: NDArray[_T], triangles: NDArray[np.intp]) -> NDArray[_T]:
+    """Return the rows of some triangles [m, ...] among those of all, [16, ...]; others are 0."""
+    spread = np.zeros((TRIANGLES, *array.shape[1:]), array.dtype)
+    spread[triangles] = array
+    return spread
