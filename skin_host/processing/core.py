@@ -171,6 +171,8 @@ class Engine:
         #: Whether each taxel was touched when it was last valid. A board that restarts in a touch
         #: is silent before it is zeroed: its touches have ended as lost, and may still be there.
         self._last_touched = np.zeros(layout.n_taxels, np.bool_)
+        #: By part: which of its taxels were touched and valid in its last frame.
+        self._noted: dict[int, tuple[Mask, Mask]] = {}
         self._run: _CalibrationRun | None = None
         #: Between `collected` and `use`: the boards that were zeroed, and `believed` of each.
         self._zeroed_since: dict[int, bool] | None = None
@@ -521,6 +523,10 @@ class Engine:
 
     def _note_touched(self, index: int, frame: PressureFrame) -> None:
         """Pass the touched pads to the liveness decision, but only when they change."""
+        noted = self._noted.get(index)
+        if noted is not None and noted[0] is frame.touched and noted[1] is frame.valid:
+            return
+        self._noted[index] = frame.touched, frame.valid
         part = self.layout.parts[index]
         touched = self._touched[part.start : part.stop]
         np.copyto(self._last_touched[part.start : part.stop], frame.touched, where=frame.valid)

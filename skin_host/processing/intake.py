@@ -122,18 +122,21 @@ class Intake:
         # The last sweep of each board, by its row.
         shape = (n, TRIANGLES * TAXELS)
         self._raw = np.zeros(shape, np.uint8)
+        self._bytes = self._raw.reshape(-1)
         self._present = np.zeros(shape, np.bool_)
         self._received = np.zeros(shape, np.bool_)
         #: The masks that were copied there.
         self._masks: list[tuple[Mask, Mask] | None] = [None] * n
-        #: By row: of a sweep without status words, what was received and is in doubt, as bytes, and
-        #: the masks made of that.
-        self._usual: list[tuple[bytes, tuple[Mask, Mask]] | None] = [None] * n
+        #: By row: of a sweep without status words, the triangles that were received and, as bytes,
+        #: what is in doubt, and the masks made of that.
+        self._usual: list[tuple[int, bytes | None, tuple[Mask, Mask]] | None] = [None] * n
         # What is not judged yet.
         self._waiting = np.zeros(n, np.bool_)
         self._n_waiting = 0
+        #: Triangles of each board's last sweep.
         self._here = np.zeros((n, TRIANGLES), np.bool_)
-        self._erring = np.zeros((n, TRIANGLES), np.bool_)
+        self._none = np.zeros(n * TRIANGLES, np.bool_)
+        self._erring: dict[int, NDArray[np.uint8]] = {}
         self._felt: dict[int, Mask] = {}
         self.liveness = self._new_liveness(None)
         self._states = [self._new_state(part, silent_periods) for part in parts]
@@ -162,9 +165,9 @@ class Intake:
         self.liveness = before.liveness
         self.veto = before.veto
         self.touched = before.touched
-        self._raw = before._raw
+        self._raw, self._bytes = before._raw, before._bytes
         self._present, self._received = before._present, before._received
-        self._masks, self._usual = before._masks, before._usual
+        self._masks, self._usual, self._here = before._masks, before._usual, before._here
         self._states, self._of_board = before._states, before._of_board
 
     def take(self, sweep: Sweep, row: int) -> list[PartSample]:
@@ -176,11 +179,14 @@ class Intake:
         """
         if self._waiting[row]:
             self.judge()
-        masks = self._valid(row, sweep.raw)
+        masks = self._valid(row, sweep)
         board, t_ns = sweep.board, sweep.t_ns
         states = self._of_board[board]
         # Samples that the board's second sweep completes, before it replaces the first.
-        completed = [self._sample(state) if board not in state.waits else None for state in states]
+        completed: dict[int, PartSample] = {}
+        for state in states:
+            if board not in state.waits:
+                completed[state.index] = self._sample(state)
         self._raw[row] = sweep.raw.reshape(-1)
         if masks is not self._masks[row]:
             self._masks[row] = masks
@@ -188,15 +194,16 @@ class Intake:
             for state in states:
                 state.present = None
         samples: list[PartSample] = []
-        for state, sample in zip(states, completed, strict=True):
-            if sample is not None:
-                samples.append(sample)
+        for state in states:
+            if completed and state.index in completed:
+                samples.append(completed[state.index])
             if not state.pending:
                 state.first_ns = t_ns
                 state.last_ns = t_ns
                 state.pending = True
+            elif t_ns > state.last_ns:
+                state.last_ns = t_ns
             del state.waits[board]
-            state.last_ns = max(state.last_ns, t_ns)
             if not state.waits or (
                 self._ledger.any_silent and all(map(self._ledger.is_silent, state.waits.values()))
             ):
@@ -242,43 +249,44 @@ class Intake:
         """Return all samples in progress, at the end of a recording."""
         return [self._sample(state) for state in self._states if state.pending]
 
-    def _valid(self, row: int, raw: NDArray[np.uint8]) -> tuple[Mask, Mask]:
+    def _valid(self, row: int, sweep: Sweep) -> tuple[Mask, Mask]:
         """Return which taxels of a noted sweep are valid, and which would be without `veto`.
 
         Args:
             row: of the board.
-            raw: uint8[16, 12].
+            sweep: of the board.
         """
         ledger = self._ledger
-        last = ledger.last[row]
-        if last is not None and last.missed:
+        if sweep.missed:
             self.note_gap(row)
         doubted = self.liveness.doubted
         if doubted is not None:
             doubted = doubted[TRIANGLES * row : TRIANGLES * (row + 1)]
         if ledger.flagged[row]:
-            here = self._flagged(row, raw)
+            here = self._flagged(row, sweep.raw)
             self._erring[row] = ledger.error[row]
             received = np.repeat(here[:, None], PADS, axis=1)
             received &= ~ledger.far[row]
             if doubted is not None:
                 received &= ~doubted
             masks = received.ravel(), received.ravel()
+            self._here[row] = here
+            self._usual[row] = None
         else:
             # Most sweeps have nothing but the triangles of the one before.
-            here = ledger.present[row]
-            key = here.tobytes() if doubted is None else here.tobytes() + doubted.tobytes()
+            key = None if doubted is None else doubted.tobytes()
             usual = self._usual[row]
-            if usual is None or usual[0] != key:
+            if usual is None or usual[0] != sweep.present or usual[1] != key:
+                here = ledger.present[row]
                 received = np.repeat(here, PADS)
                 if doubted is not None:
                     received &= ~doubted.ravel()
                 received.flags.writeable = False
-                self._usual[row] = usual = key, (received, received)
-            masks = usual[1]
+                self._here[row] = here
+                self._usual[row] = usual = sweep.present, key, (received, received)
+            masks = usual[2]
         self._waiting[row] = True
         self._n_waiting += 1
-        self._here[row] = here
         if row in self.touched:
             self._felt[row] = self.touched[row]
         veto = self.veto.get(row)
@@ -319,16 +327,22 @@ class Intake:
             felt = np.zeros((TRIANGLES * len(waiting), PADS), np.bool_)
             for row, pads in self._felt.items():
                 felt[TRIANGLES * row : TRIANGLES * (row + 1)] = pads
+        every = self._n_waiting == len(waiting)
+        here = self._here if every else self._here & waiting[:, None]
+        erring = self._none
+        if self._erring:
+            erring = np.zeros(erring.shape, np.bool_)
+            for row, errors in self._erring.items():
+                erring[TRIANGLES * row : TRIANGLES * (row + 1)] = errors
         self.liveness.step(
             self._raw.reshape(-1, PADS),
-            self._here.ravel(),
-            self._erring.ravel(),
+            here.ravel(),
+            erring,
             felt,
-            None if self._n_waiting == len(waiting) else waiting.copy(),
+            None if every else waiting.copy(),
         )
         self._felt.clear()
-        self._here[:] = False
-        self._erring[:] = False
+        self._erring.clear()
         waiting[:] = False
         self._n_waiting = 0
 
@@ -385,10 +399,11 @@ class Intake:
     def _sample(self, state: _PartState) -> PartSample:
         """Return a part's sample in progress, and begin the next."""
         source = state.source
-        raw = self._raw.take(source)
+        raw = self._bytes[source]
         present, received = state.present, state.received
         if present is None or received is None:
-            present, received = self._present.take(source), self._received.take(source)
+            present = self._present.reshape(-1)[source]
+            received = self._received.reshape(-1)[source]
             state.present, state.received = present, received
         if state.waits:
             lost = np.isin(source // self._raw.shape[1], list(state.waits.values()))
