@@ -203,7 +203,8 @@ class Calibrator:
         if t_ns is not None:
             before, self._at_ns[part_index] = self._at_ns[part_index], t_ns
             dt_s = 0.0 if before is None else max((t_ns - before) * 1e-9, 0.0)
-            new = present & ~self._conversions[part_index].step(raw.copy(), dt_s)
+            repeated = self._conversions[part_index].step(raw.copy(), dt_s)
+            new = present if repeated is None else present & ~repeated
         self._counts[taxels[new], raw[new]] += 1
 
     def forget(self, taxels: NDArray[np.intp]) -> None:

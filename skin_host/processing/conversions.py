@@ -30,14 +30,23 @@ class Conversions:
         self._age_s = np.full(n, LONG_AGO_S)
         self._repeated: Mask = np.empty(n, np.bool_)
         self._young: Mask = np.empty(n, np.bool_)
+        #: Whether every byte of the last sweep was new.
+        self._all_new = False
 
-    def step(self, raw: NDArray[np.uint8], dt_s: float) -> Mask:
+    def step(self, raw: NDArray[np.uint8], dt_s: float) -> Mask | None:
         """Take the bytes [n] of a sweep that comes dt_s after the last.
 
         Returns:
-            bool[n], which repeat a measurement; the array is reused.
+            bool[n], which repeat a measurement, or None if none can; the array is reused.
         """
+        if np.float32(dt_s) >= YOUNG_S:
+            self._all_new = True
+            self._last = raw
+            return None
         repeated, age_s = self._repeated, self._age_s
+        if self._all_new:
+            self._all_new = False
+            age_s.fill(0.0)
         np.add(age_s, np.float32(dt_s), out=age_s)
         np.equal(raw, self._last, out=repeated)
         np.less(age_s, YOUNG_S, out=self._young)
@@ -48,4 +57,5 @@ class Conversions:
 
     def forget(self) -> None:
         """Sweeps were left out: the next one is new."""
+        self._all_new = False
         self._age_s.fill(LONG_AGO_S)

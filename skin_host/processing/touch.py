@@ -131,7 +131,7 @@ class TouchDetector:
     Attributes:
         touched: bool[n]; see `step`.
         any: whether any is.
-        repeated: bool[n], which taxels only repeated a measurement in the last step.
+        repeated: bool[n], which taxels only repeated a measurement in the last step; None if none.
     """
 
     def __init__(self, found: Levels, votes: int = 2) -> None:
@@ -147,7 +147,7 @@ class TouchDetector:
         self.touched: Mask = np.zeros(n, np.bool_)
         self._bits = self.touched.tobytes()
         self._reads: Mask = np.empty(n, np.bool_)
-        self.repeated: Mask = np.zeros(n, np.bool_)
+        self.repeated: Mask | None = None
         self.any = False
         self._clear = True
         self._skipped = True
@@ -207,7 +207,8 @@ class TouchDetector:
         np.subtract(self._limit, raw, out=gain)
         np.minimum(gain, self._vote, out=gain)
         np.maximum(gain, self._veto, out=gain)
-        np.putmask(gain, repeated, 0.0)  # in a third of the time of a copy with a mask
+        if repeated is not None:
+            np.putmask(gain, repeated, 0.0)  # in a third of the time of a copy with a mask
         if unheard is not None:
             gain[unheard] = 0.0
         np.add(evidence, gain, out=evidence)
@@ -267,7 +268,7 @@ class Residuals:
         self._any_fallen = False
         self._reported: Mask = np.zeros(n, dtype=np.bool_)
         self._seen = self._reported
-        self._which: NDArray[np.intp] = np.zeros(0, np.intp)
+        self._which: NDArray[np.intp] | slice = np.zeros(0, np.intp)
         self.any = False
         self._undecided = False
 
@@ -314,15 +315,16 @@ class Residuals:
     def _end_fallen(self, signal: Array, repeated: Mask | None) -> None:
         """End touches that have fallen from a firm press to its residual."""
         which = self._which
-        now, felt = signal.take(which), self._felt.take(which)
-        pressed = np.fmax(self._pressed.take(which), now)
+        # Of all taxels, or some; views of the state are not written to.
+        now, felt = signal[which], self._felt[which]
+        pressed = np.fmax(self._pressed[which], now)
         self._pressed[which] = pressed
-        bar = self._on.take(which) + RESIDUAL_SHARE * pressed
-        fallen = (now < bar) & (felt >= bar + self._firmer.take(which))
+        bar = self._on[which] + RESIDUAL_SHARE * pressed
+        fallen = (now < bar) & (felt >= bar + self._firmer[which])
         if not self._any_fallen and not any_of(fallen):
             mean = felt + MEAN_SHARE * (now - felt)
             if repeated is not None:
-                np.copyto(mean, felt, where=repeated.take(which))
+                np.copyto(mean, felt, where=repeated[which])
             self._felt[which] = mean
             return
         counts = np.where(fallen, self._fallen[which] + 1, 0)
@@ -335,8 +337,10 @@ class Residuals:
         self._fallen[which] = counts
         self._any_fallen = any_of(counts > 0)
         self._felt[which] = felt
-        ended = which[counts >= self._votes[which]]
+        ended = np.flatnonzero(counts >= self._votes[which])
         if len(ended):
+            if not isinstance(which, slice):
+                ended = which[ended]
             self._felt[ended] = signal[ended]
             reported = self._reported.copy()
             reported[ended] = False
@@ -347,8 +351,9 @@ class Residuals:
         if not np.array_equal(reported, self._reported):
             self._fallen[reported & ~self._reported] = 0
             self._reported = reported
-            self._which = np.flatnonzero(reported)
-            self.any = bool(len(self._which))
+            found = np.flatnonzero(reported)
+            self._which = found if len(found) < len(reported) else slice(None)
+            self.any = bool(len(found))
 
     def fade(self, dt_s: float) -> None:
         """Let the residuals of earlier presses fade for this time."""
