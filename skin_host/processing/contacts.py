@@ -308,7 +308,8 @@ class ContactTracker:
             known = self._contacts.get(name)
             before = None
             if known is not None:
-                known.taxels, known.order = taxels, found.order[found.span(number)]
+                if known.taxels is not taxels:
+                    known.taxels, known.order = taxels, found.order[found.span(number)]
                 if all_heard[number]:
                     known.heard_ns = frame.t_ns
                 before = known.said
@@ -395,12 +396,19 @@ class _Homes:
             self._names[contact.order] = name
         self._listed: list[int] = self._names.tolist()
         self._orders: dict[frozenset[int], NDArray[np.intp]] = {}
+        self._overlaps: dict[frozenset[int], list[tuple[int, int]]] = {}
 
     def overlaps(self, group: frozenset[int]) -> list[tuple[int, int]]:
         """Contacts that a group shares taxels with, and how many.
 
         Those with most come first; of equal ones that with the lowest taxel.
         """
+        found = self._overlaps.get(group)
+        if found is None:
+            found = self._overlaps[group] = self._overlaps_of(group)
+        return found
+
+    def _overlaps_of(self, group: frozenset[int]) -> list[tuple[int, int]]:
         if len(group) <= self._MANY:
             names = [name for one in group if (name := self._listed[one])]
             if not names or names.count(names[0]) == len(names):

@@ -23,7 +23,7 @@ from skin_host.bus.ledger import BoardLedger
 from skin_host.bus.wire import TAXELS, TRIANGLES
 from skin_host.layout import Layout
 from skin_host.processing.liveness import PADS, Liveness
-from skin_host.processing.masks import Mask
+from skin_host.processing.masks import Mask, any_of, count_of
 from skin_host.processing.stuck import Encoding, Repeats
 
 #: A silent part reports its silence at once and then once a second.
@@ -299,8 +299,8 @@ class Intake:
         ledger = self._ledger
         far = ledger.far[row]
         here: Mask = ledger.present[row] & (ledger.error[row] == 0) & ~lifted(raw, far)
-        many = np.count_nonzero(far, axis=1) >= FAR_PADS
-        here &= ~(self._unpressable[row] & many)
+        if any_of(self._unpressable[row]):
+            here &= ~(self._unpressable[row] & (count_of(far) >= FAR_PADS))
         return here
 
     @property
@@ -441,8 +441,9 @@ def below_zero(raw: NDArray[np.uint8], far: Mask) -> Mask:
         raw: uint8[k, 12].
         far: bool[k, 12], pads that their status words mark as far out of range.
     """
-    few = np.count_nonzero(far, axis=1) < FAR_PADS
-    found: Mask = far & (raw == 255) & few[:, None]
+    found: Mask = far & (raw == 255)
+    if any_of(found):
+        found &= (count_of(far) < FAR_PADS)[:, None]
     return found
 
 
@@ -456,7 +457,7 @@ def lifted(raw: NDArray[np.uint8], far: Mask) -> Mask:
         raw: uint8[k, 12].
         far: bool[k, 12], pads that their status words mark as far out of range.
     """
-    below = np.count_nonzero(far & (raw == 255), axis=-1)
-    torn = (below > 0) & (np.count_nonzero(far, axis=-1) >= FAR_PADS)
+    below = count_of(far & (raw == 255))
+    torn = (below > 0) & (count_of(far) >= FAR_PADS)
     found: Mask = (below >= LIFTED_PADS) | torn
     return found

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.bus.compensation import NO_GAIN
-from skin_host.processing.masks import Mask, all_of, any_of
+from skin_host.processing.masks import Mask, all_of, any_of, count_of
 from skin_host.processing.stuck import (
     MOST_RATE,
     TOUCHED_PACE,
@@ -179,6 +179,10 @@ class Liveness:
         self._now_alive = np.zeros(k, np.bool_)
         self._size, self._least = (np.zeros(shape, np.uint8) for _ in range(2))
         self._far = np.zeros(shape, np.bool_)
+        #: Which pads' last step was far, if that is known.
+        self._was_far = np.zeros(shape, np.bool_)
+        self._knows_far = False
+        self._both_far = np.zeros(shape, np.bool_)
         self._to_show = np.where(constant, PROBATION_CHANGES, 0)
         self.frozen: Mask = np.zeros(k, np.bool_)
         self.unproven: Mask = constant.copy()
@@ -258,7 +262,8 @@ class Liveness:
 
     def note_gap(self, board: int) -> None:
         """Sweeps of a board (its row) were lost: the next step does not follow the last one."""
-        self._settle()
+        self._settle_step()
+        self._knows_far = False
         triangles = len(self._step) // self._boards
         self._step[triangles * board : triangles * (board + 1)] = 0
 
@@ -290,6 +295,10 @@ class Liveness:
     def _settle(self) -> None:
         """Compute what was left until somebody needs it."""
         self._pads.settle()
+        self._knows_far = False
+        self._settle_step()
+
+    def _settle_step(self) -> None:
         if self._owes_step:
             self._owes_step = False
             np.subtract(self._raw, self._earlier, out=self._step, dtype=np.int16)
@@ -356,11 +365,19 @@ class Liveness:
         far = np.greater(size, self._jump_units, out=self._far)
         if not whole:
             far &= changed
-        if whole and not self._any_jumping and not any_of(far):
-            self._owes_step = True
-            return
-        if self._owes_step:
-            self._settle()
+        if whole:
+            # A jump takes two far steps.
+            knew, self._knows_far = self._knows_far, True
+            self._far, self._was_far = self._was_far, far
+            if not self._any_jumping and (
+                not any_of(far)
+                or (knew and not any_of(np.logical_and(far, self._far, out=self._both_far)))
+            ):
+                self._owes_step = True
+                return
+        else:
+            self._knows_far = False
+        self._settle_step()
         step = np.subtract(raw, self._raw, dtype=np.int16)
         if not whole:
             step *= changed
@@ -370,8 +387,8 @@ class Liveness:
             return
         both = np.minimum(np.abs(step), np.abs(self._step))
         spike = jump & (both > self._spike) & (np.abs(step + self._step) <= self._jump_units)
-        alone = np.count_nonzero(spike & (self._jumping < LATELY_MEAN), axis=1) == 1
-        self.spikes += np.count_nonzero(alone.reshape(self._boards, -1), axis=1)
+        alone = count_of(spike & (self._jumping < LATELY_MEAN)) == 1
+        self.spikes += count_of(alone.reshape(self._boards, -1))
         np.copyto(self._step, step, where=compared[:, None])
         jumped = jump * np.minimum(both / self._jump, MOST_JUMP)
         self._jumping += compared[:, None] * (jumped - self._jumping) / NOISE_MEMORY_SAMPLES

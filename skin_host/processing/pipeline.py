@@ -319,6 +319,8 @@ class _PartPipeline:
         decides = curve.kpa(np.where(usable, rules.levels.decides, 0.0))
         self.decides_kpa = float(decides.max(initial=0.0))
         self._always_valid = _constant(usable.copy())
+        self._always_bytes = self._always_valid.tobytes()
+        self._far_taxels: tuple[bytes, NDArray[np.intp], Curve] | None = None
         self._renew_limits()
 
     def _set_model(self, rules: _Rules) -> None:
@@ -429,7 +431,8 @@ class _PartPipeline:
         self._reader.kpa(self._last_raw, momentary)
         beyond = self._beyond()
         if beyond is not self._nowhere:
-            momentary[beyond] = self._beyond_kpa(beyond)
+            taxels, curve = self._beyond_curve(beyond)
+            momentary[taxels] = self._beyond_kpa(taxels, curve)
         if not self._every_sample:
             np.add(momentary, self._relaxation_kpa, out=momentary)
         np.fmax(momentary, self._zeros, out=momentary)
@@ -449,7 +452,7 @@ class _PartPipeline:
         valid: Mask = present & self._usable
         # Values that were not received are taken as unchanged: the foam does not forget.
         self._last_raw = np.where(valid, raw, self._last_raw)
-        if np.array_equal(valid, self._always_valid):
+        if valid.tobytes() == self._always_bytes:
             return self._always_valid
         np.logical_or(self._was_missing, ~valid, out=self._was_missing)
         return valid
@@ -480,12 +483,14 @@ class _PartPipeline:
         self._reader.kpa(self._last_raw, row)
         if self._own is not None:
             if beyond is not self._nowhere and not isinstance(self._curve, TableCurve):
-                row[beyond] = self._curve.part(beyond).kpa(self._activations(beyond))
+                taxels, curve = self._beyond_curve(beyond)
+                row[taxels] = curve.kpa(self._activations(taxels))
             reported = self._own.step(row, dt_s, touched, self._relaxation_kpa)
             np.subtract(row, self._relaxation_kpa, out=row)
             return row, reported
         if beyond is not self._nowhere:
-            row[beyond] = self._beyond_kpa(beyond)
+            taxels, curve = self._beyond_curve(beyond)
+            row[taxels] = self._beyond_kpa(taxels, curve)
         if self._every_sample and self._relaxation is not None:
             # Foam is not pulled: a taxel with too low a reading has nothing to relax from.
             pressed = np.fmax(row, self._zeros, out=self._part_kpa)
@@ -493,12 +498,21 @@ class _PartPipeline:
             np.subtract(row, self._relaxation_kpa, out=row)
         return row, np.fmax(row, self._zeros)
 
-    def _beyond_kpa(self, beyond: Mask) -> NDArray[np.float64]:
-        """Return the common curve beyond its calibrated range."""
-        kpa = self._curve.part(beyond).kpa(self._activations(beyond))
-        return kpa if self._every_sample else kpa - self._relaxation_kpa[beyond]
+    def _beyond_curve(self, beyond: Mask) -> tuple[NDArray[np.intp], Curve]:
+        """Return some taxels [m] by number, and their curve; mostly those of the last sweep."""
+        key = beyond.tobytes()
+        known = self._far_taxels
+        if known is None or known[0] != key:
+            taxels = np.flatnonzero(beyond)
+            self._far_taxels = known = key, taxels, self._curve.part(taxels)
+        return known[1:]
 
-    def _activations(self, taxels: Mask) -> Floats:
+    def _beyond_kpa(self, taxels: NDArray[np.intp], curve: Curve) -> NDArray[np.float64]:
+        """Return the common curve of some taxels beyond their calibrated range."""
+        kpa = curve.kpa(self._activations(taxels))
+        return kpa if self._every_sample else kpa - self._relaxation_kpa[taxels]
+
+    def _activations(self, taxels: NDArray[np.intp]) -> Floats:
         """Return the activations of some taxels, in units."""
         activations: Floats = self._offset[taxels] - self._last_raw[taxels]
         return activations

@@ -58,7 +58,7 @@ class PressureCurve:
         self.tail_slope: Array = self.linear.copy()
         self.tail_slope[bent] += 2.0 * self.square[bent] * self.beyond_units[bent]
 
-    def part(self, taxels: slice | NDArray[np.bool_]) -> "PressureCurve":
+    def part(self, taxels: slice | NDArray[np.bool_] | NDArray[np.intp]) -> "PressureCurve":
         chosen = copy(self)
         chosen.square = self.square[taxels]
         chosen.linear = self.linear[taxels]
@@ -69,7 +69,7 @@ class PressureCurve:
     def kpa(self, units: ArrayLike) -> Array:
         """Return the pressure [..., n] in kPa of activations [..., n] in units."""
         x = np.asarray(units, dtype=np.float64)
-        inside = np.clip(x, 0.0, self.beyond_units)
+        inside = np.minimum(np.maximum(x, 0.0), self.beyond_units)
         beyond = np.where(x > self.beyond_units, x - inside, 0.0)
         below = np.minimum(x, 0.0)
         result: Array = (

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.bus.compensation import NO_GAIN, THERMAL_TAXEL, drift_of
-from skin_host.processing.masks import Mask, all_of, any_of
+from skin_host.processing.masks import Mask, all_of, any_of, count_of
 
 Floats = NDArray[np.float64]
 
@@ -257,12 +257,13 @@ class TouchedPads(NamedTuple):
 
     @classmethod
     def of(cls, touched: Mask, key: bytes, boards: int) -> "TouchedPads":
-        of_triangles = np.count_nonzero(touched, axis=1).reshape(boards, -1)
-        of_boards = of_triangles.sum(axis=1, keepdims=True)
+        of_triangles = count_of(touched).reshape(boards, -1)
+        of_boards = np.add.reduce(of_triangles, axis=1, keepdims=True)
         triangles = of_triangles.shape[1]
-        calm = np.repeat(of_boards == 0, triangles)
+        of_board = of_boards.repeat(triangles)
+        calm = of_board == 0
         # A touch that only the pad itself feels does not count: the pad may be stuck there.
-        slow = np.repeat(of_boards, triangles)[:, None] > touched
+        slow = of_board[:, None] > touched
         weight = np.where(slow, 1.0 / TOUCHED_PACE, 1.0)
         # A chip that died can look touched itself; only a touch on other triangles counts.
         elsewhere = (of_boards > of_triangles).ravel()
