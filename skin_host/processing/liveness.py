@@ -369,11 +369,13 @@ class Liveness:
             # A jump takes two far steps.
             knew, self._knows_far = self._knows_far, True
             self._far, self._was_far = self._was_far, far
-            if not self._any_jumping and (
-                not any_of(far)
-                or (knew and not any_of(np.logical_and(far, self._far, out=self._both_far)))
+            if not any_of(far) or (
+                knew and not any_of(np.logical_and(far, self._far, out=self._both_far))
             ):
                 self._owes_step = True
+                if self._any_jumping:
+                    self._jumping -= self._jumping / NOISE_MEMORY_SAMPLES
+                    self._note_noise()
                 return
         else:
             self._knows_far = False
@@ -392,6 +394,9 @@ class Liveness:
         np.copyto(self._step, step, where=compared[:, None])
         jumped = jump * np.minimum(both / self._jump, MOST_JUMP)
         self._jumping += compared[:, None] * (jumped - self._jumping) / NOISE_MEMORY_SAMPLES
+        self._note_noise()
+
+    def _note_noise(self) -> None:
         self._jumping[self._jumping < 1e-3] = 0.0
         self._any_jumping = any_of(self._jumping > 0.0)
         self.noisy = self._jumping > np.where(self.noisy, CALM_MEAN, NOISY_MEAN)

@@ -94,6 +94,7 @@ class Repeats:
         self._possible = np.zeros(shape, self._of_bits)
         # Work arrays. In a step of two thousand pads, arrays of one shape that are written in place
         # cost a third of masks and broadcasts.
+        self._all_bits = int(np.iinfo(self._of_bits).max)
         self._zeros = np.zeros(shape, of_words)
         self._none = np.zeros(shape, self._of_bits)
         self._lowered, self._up, self._left = (np.empty(shape, of_words) for _ in range(3))
@@ -159,7 +160,7 @@ class Repeats:
         if told is not None:
             untold = ~told
             np.putmask(lowest, untold, self._base)
-            np.putmask(words, untold, np.iinfo(self._of_bits).max)
+            np.putmask(words, untold, self._all_bits)
         # Bits are moved down or up by the way of the lowest word; numpy moves all of them out by as
         # many as there are and more.
         np.subtract(self._base, lowest, out=up)
