@@ -39,6 +39,12 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("config", metavar="CONFIG", type=Path, help="configuration file (TOML)")
 
 
+def add_broker(parser: argparse.ArgumentParser) -> None:
+    """Add the options to find the robot."""
+    parser.add_argument("--broker", default="mqtt://localhost", metavar="URL", help="MQTT broker")
+    parser.add_argument("--robot", help="whose skin, if the broker knows several robots")
+
+
 def positive(text: str) -> float:
     """A number above 0, for argparse."""
     try:

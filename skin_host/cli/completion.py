@@ -9,13 +9,12 @@ import asyncio
 import contextlib
 import os
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 from skin_host.bus.interfaces import can_interfaces
 from skin_host.cli.common import Commands, add_command
-
-if TYPE_CHECKING:
-    from skin_host.config.settings import Settings
 
 Completer = Callable[..., Iterable[str]]
 
@@ -68,10 +67,10 @@ def _completers() -> dict[str, Completer]:
         "pressure": recording,
         "recording": FilesCompleter((*RECORDINGS, "json")),
         "calibration": FilesCompleter(("json",)),
-        "part": _parts,
-        "board": _boards,
-        "node": _nodes,
-        "channel": _channels,
+        "part": partial(_names, "parts"),
+        "board": partial(_names, "boards"),
+        "node": partial(_names, "nodes"),
+        "channel": lambda **_: can_interfaces(),
     }
 
 
@@ -84,48 +83,30 @@ def _attach(parser: argparse.ArgumentParser, completers: dict[str, Completer]) -
             action.completer = completers[action.dest]  # type: ignore[attr-defined]
 
 
-def _parts(parsed_args: argparse.Namespace, **_: Any) -> set[str]:
-    settings = _settings(parsed_args)
-    return set(settings.parts) if settings is not None else _names_at(parsed_args, "parts")
+def _names(what: str, parsed_args: argparse.Namespace, **_: Any) -> set[str]:
+    """Return names from what is already on the command line: the configuration, or a broker."""
+    from skin_host.errors import SkinError
+
+    with contextlib.suppress(SkinError):
+        if getattr(parsed_args, "config", None) is not None:
+            return _names_in(parsed_args.config, what)
+        if hasattr(parsed_args, "broker"):
+            return _names_at(parsed_args, what)
+    return set()
 
 
-def _boards(parsed_args: argparse.Namespace, **_: Any) -> set[str]:
-    settings = _settings(parsed_args)
-    return set(settings.boards) if settings is not None else _names_at(parsed_args, "boards")
-
-
-def _nodes(parsed_args: argparse.Namespace, **_: Any) -> set[str]:
-    settings = _settings(parsed_args)
-    if settings is None:
-        return _names_at(parsed_args, "nodes")
-    return {part.node for part in settings.parts.values()}
-
-
-def _channels(**_: Any) -> list[str]:
-    """Return the CAN interfaces of this machine."""
-    return can_interfaces()
-
-
-def _settings(parsed_args: argparse.Namespace) -> "Settings | None":
-    """Return the settings of the configuration that is already on the command line."""
+def _names_in(config: Path, what: str) -> set[str]:
     from skin_host.config.settings import load
-    from skin_host.errors import ConfigurationError
 
-    config = getattr(parsed_args, "config", None)
-    if config is None:
-        return None
-    with contextlib.suppress(ConfigurationError):
-        return load(config)
-    return None
+    settings = load(config)
+    if what == "nodes":
+        return {part.node for part in settings.parts.values()}
+    return set(settings.parts if what == "parts" else settings.boards)
 
 
 def _names_at(parsed_args: argparse.Namespace, what: str) -> set[str]:
-    """Return names that the nodes of a robot publish at the broker given on the command line."""
+    """Return names that the nodes of a robot publish."""
     from skin_host.client import SkinClient
-    from skin_host.errors import SkinError
-
-    if not hasattr(parsed_args, "broker"):
-        return set()
 
     async def ask() -> set[str]:
         robot = getattr(parsed_args, "robot", None)
@@ -138,6 +119,4 @@ def _names_at(parsed_args: argparse.Namespace, what: str) -> set[str]:
             return set(parts)
         return {triangle.board for part in parts.values() for triangle in part.triangles}
 
-    with contextlib.suppress(SkinError):
-        return asyncio.run(ask())
-    return set()
+    return asyncio.run(ask())

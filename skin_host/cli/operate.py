@@ -13,6 +13,7 @@ import msgspec
 
 from skin_host.cli.common import (
     Commands,
+    add_broker,
     add_command,
     add_config,
     add_log_level,
@@ -77,8 +78,7 @@ def add_commands(commands: Commands) -> None:
     )
     about = "; ".join(f"{name}: {text}" for name, text in COMMANDS.items())
     command.add_argument("name", choices=list(COMMANDS), metavar="NAME", help=about)
-    command.add_argument("--broker", default="mqtt://localhost", metavar="URL", help="MQTT broker")
-    command.add_argument("--robot", help="whose skin, if the broker knows several robots")
+    add_broker(command)
     command.add_argument("--node", help="which daemon, if the robot has several")
     command.add_argument("--part", help="calibrate, disable, enable: this part")
     command.add_argument("--board", help="calibrate, configure: this board only")

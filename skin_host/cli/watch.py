@@ -9,6 +9,7 @@ import msgspec
 
 from skin_host.cli.common import (
     Commands,
+    add_broker,
     add_command,
     add_log_level,
     print_json,
@@ -74,12 +75,6 @@ def add_commands(commands: Commands) -> None:
     )
     add_log_level(view)
     view.set_defaults(run=_view)
-
-
-def add_broker(parser: argparse.ArgumentParser) -> None:
-    """Add the options to find the robot."""
-    parser.add_argument("--broker", default="mqtt://localhost", metavar="URL", help="MQTT broker")
-    parser.add_argument("--robot", help="whose skin, if the broker knows several robots")
 
 
 def _listen(arguments: argparse.Namespace) -> int:

@@ -195,6 +195,11 @@ def candump_lines(channel: str, batch: FrameBatch) -> bytes:
     return "".join(lines).encode()
 
 
+def _check_room(folder: Path, names: str) -> None:
+    if sum(1 for _ in folder.glob(names)) >= MAX_RECORDINGS:
+        raise RequestError(f"{folder}: holds {MAX_RECORDINGS} recordings already; move some away")
+
+
 class FrameRecorder:
     """One recording, from now until it is stopped, is long enough, or fails.
 
@@ -226,10 +231,7 @@ class FrameRecorder:
         self._queue: queue.Queue[tuple[str, FrameBatch] | None] = queue.Queue(WAITING_BATCHES)
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            if sum(1 for _ in path.parent.iterdir()) >= MAX_RECORDINGS:
-                raise SkinError(
-                    f"{path.parent}: holds {MAX_RECORDINGS} recordings already; move some away"
-                )
+            _check_room(path.parent, "*")
             self._file = path.open("xb", buffering=0)
         self._thread = clock.thread(self._write, "recorder")
 
@@ -337,10 +339,7 @@ class PageRecording:
         """
         if self._recorder is not None:
             raise RequestError(f"{self._path.name} is being recorded already; stop it")
-        if sum(1 for _ in self._folder.glob(f"*{SUFFIX}")) >= MAX_RECORDINGS:
-            raise RequestError(
-                f"{self._folder}: holds {MAX_RECORDINGS} recordings already; move some away"
-            )
+        _check_room(self._folder, f"*{SUFFIX}")
         self._path = self._folder / self._clock.today().strftime(f"%Y%m%dT%H%M%SZ{SUFFIX}")
         if self._path.exists():
             raise RequestError(f"{self._path.name}: is there already; try again")

@@ -12,7 +12,7 @@ import pytest
 from paho.mqtt import publish
 
 from skin_host.bus import interfaces
-from skin_host.cli import completion, main
+from skin_host.cli import main
 from skin_host.config.settings import load
 from skin_host.layout import build_layout
 from skin_host.mqtt.info import encode_info, node_info
@@ -151,7 +151,7 @@ def test_channels_are_the_can_interfaces_of_the_machine(
         (tmp_path / name).mkdir()
         (tmp_path / name / "type").write_text(kind + "\n")
     monkeypatch.setattr(interfaces, "NETWORKS", tmp_path)
-    assert set(completion._channels()) == {"can0", "vcan0"}
+    assert set(interfaces.can_interfaces()) == {"can0", "vcan0"}
 
 
 def test_who_asks_for_no_completion_does_not_pay_for_it() -> None:
