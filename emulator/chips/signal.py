@@ -136,7 +136,12 @@ class SignalSkin:
                 return
             self._changed = chips
             self._place[chips] = np.arange(len(chips))
-        self._is_changed[chips] = True
+        # Of those that are looked at, only some may really change.
+        before = self._changes[-1] if self._changes else self._capacitance_ff[chips, :TAXELS]
+        moved = chips[(values != before).any(axis=1)]
+        if not len(moved):
+            return
+        self._is_changed[moved] = True
         self._changed_ns.append(self.t_ns)
         self._changes.append(values.copy())
 
