@@ -50,6 +50,8 @@ from skin_host.mqtt.packets import KEPT_BYTES, unfit
 #: A broker that does not answer for this long is lost.
 TIMEOUT_S = 3.0
 GRACE_S = 0.2
+#: At most this many publications are unacknowledged, or fewer if the broker allows no more.
+MAX_IN_FLIGHT = 20
 #: Waiting times between attempts double from the first to the last.
 FIRST_RETRY_S = 0.2
 LAST_RETRY_S = 3.0
@@ -95,7 +97,7 @@ class Connection(aiomqtt.Client):
         packet_limit: the longest packet that the broker takes, in bytes, if it has a limit.
         taken_over: another client of the same name has replaced this one.
         ended_by_broker: the broker ended the connection, and may have done so because of what
-            was published last.
+            was published last; `without_reason` if it gave none.
         when_clear: called when the socket takes frames again after `write_now` left some.
     """
 
@@ -137,7 +139,7 @@ class Connection(aiomqtt.Client):
         self.refused = 0
         self.refusal = ""
         self.discarded = 0
-        self.ended_by_broker = False
+        self.ended_by_broker = self.without_reason = False
         self.taken_over = False
         self.packet_limit: int | None = None
         self._v5 = broker.v5
@@ -369,6 +371,10 @@ class Connection(aiomqtt.Client):
         properties: Properties | None = None,
     ) -> None:
         self.packet_limit = getattr(properties, "MaximumPacketSize", None)
+        # paho knows no receive maximum of the broker's; what is above it waits in paho.
+        self._paho._max_inflight_messages = min(
+            MAX_IN_FLIGHT, getattr(properties, "ReceiveMaximum", MAX_IN_FLIGHT)
+        )
         super()._on_connect(client, userdata, flags, reason_code, properties)
 
     def _on_disconnect(
@@ -383,6 +389,9 @@ class Connection(aiomqtt.Client):
         accused = flags.is_disconnect_packet_from_server and reason_code.value not in _INNOCENT
         closed = reason_code.value == _CLOSED
         self.ended_by_broker = not self._cut and (accused or closed)
+        self.without_reason = not self._cut and closed
+        if self._connected.cancelled():
+            return  # the attempt was given up; aiomqtt would raise
         super()._on_disconnect(client, userdata, flags, reason_code, properties)
 
     def _bounded_read(self) -> MQTTErrorCode:
@@ -575,6 +584,8 @@ _HINTS = {
     "Not authorised": "check mqtt.username and its password",
     "Bad user name or password": "check mqtt.username and its password",
     "Session taken over": "does a second daemon run as the same node?",
+    "QoS not supported": "this node needs a broker that takes QoS 1",
+    "Retain not supported": "this node needs a broker that retains messages",
     "Unsupported protocol version": 'for an old broker set mqtt.protocol = "3.1.1"',
     "CERTIFICATE_VERIFY_FAILED": "check mqtt.ca_file, mqtt.host and the broker's certificate",
 }

@@ -24,6 +24,7 @@ from skin_host.mqtt.commands import CommandHandler, Handler
 from skin_host.mqtt.connection import (
     FIRST_RETRY_S,
     GOOD_S,
+    TIMEOUT_S,
     Connection,
     Message,
     MessageProperties,
@@ -34,6 +35,7 @@ from skin_host.mqtt.connection import (
     explain,
     first_error,
     message_properties,
+    within,
 )
 from skin_host.mqtt.courier import Courier, FrameForm
 from skin_host.mqtt.frames import load_cbor2
@@ -136,6 +138,7 @@ class Publisher:
         self._pieces = 0
         self._name_taken_until_s = 0.0
         self._was_ended = False
+        self._is_brief = False  # the last connection did not last
         self._closed_in_a_row = 0
         self._closing = asyncio.Event()
         self._connection: Connection | None = None
@@ -269,7 +272,6 @@ class Publisher:
                     clock=clock,
                 ) as link:
                     since_s = clock.monotonic_s()
-                    said = ""
                     await self._talk(link)
                     properties = self._state_properties(self._status, OFFLINE)
                     await link.publish(
@@ -277,6 +279,9 @@ class Publisher:
                     )
             except* Exception as group:
                 # No error may end the publishing.
+                self._is_brief = since_s is not None and clock.monotonic_s() - since_s < GOOD_S
+                if since_s is not None and not self._is_brief:
+                    said = ""
                 why = self._note_loss(first_error(group), said, was_connected=since_s is not None)
             finally:
                 self._forget_connection()
@@ -329,7 +334,11 @@ class Publisher:
         await self._subscribe(connection)
         self._outbox.counters.connected = True
         self._outbox.counters.connections += 1
-        _log.info("broker %s: connected", self._broker)
+        if self._is_brief:
+            # A broker that ends every connection would fill the log.
+            self._clock.call_later(GOOD_S, self._note_connected, connection)
+        else:
+            self._note_connected(connection)
         self._publish_info()
         self._outbox.repeat_states()
         if self._last_broker not in (None, str(self._broker)):
@@ -346,12 +355,16 @@ class Publisher:
             for worker in workers:
                 worker.cancel()
 
+    def _note_connected(self, connection: Connection) -> None:
+        if connection is self._connection:
+            _log.info("broker %s: connected", self._broker)
+
     def _forget_connection(self) -> None:
         counters, connection = self._outbox.counters, self._connection
         counters.connected = False
         if connection is None:
             return
-        self._was_ended = connection.taken_over or connection.ended_by_broker
+        self._was_ended = connection.taken_over or connection.without_reason
         counters.refused += connection.refused
         counters.commands_refused += connection.discarded
         self._connection = None
@@ -383,7 +396,23 @@ class Publisher:
         if self._command_handler is not None:
             wanted.append(self.topics.command(self._node, "+"))
         for topic in wanted:
-            if not await connection.listen_to(topic):
+            try:
+                allowed = await connection.listen_to(topic)
+            except MqttError:
+                # A broker that is frozen does not answer this either.
+                properties = self._state_properties(self._status, ONLINE)
+                await within(
+                    TIMEOUT_S,
+                    connection.send(
+                        self._status, ONLINE, qos=1, retain=True, properties=properties
+                    ),
+                )
+                _log.warning(
+                    "broker %s: no commands are received: it does not acknowledge the subscription",
+                    self._broker,
+                )
+                return
+            if not allowed:
                 _log.warning("broker %s: may not subscribe to %s", self._broker, topic)
 
     async def _listen(self, connection: Connection) -> None:
