@@ -14,6 +14,7 @@ import difflib
 import os
 import resource
 import shutil
+import signal
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -46,6 +47,10 @@ OPTIONS = [
 ]
 #: Tests that take so much more CPU time than without a change hang.
 SLOWER, SLOWER_S = 2.0, 3.0
+#: They are interrupted then, so that they end what they started, and killed so much later.
+INTERRUPTED_S = 5
+#: So do tests that wait for so long.
+LONGEST_S = 600
 #: They make the same of what is only ever compared with None.
 SAME = ("ReplaceComparisonOperator_Is_Eq", "ReplaceComparisonOperator_IsNot_NotEq")
 
@@ -171,8 +176,12 @@ def passes(tests: list[str], times: Path, limit_s: float | None = None) -> bool:
         silence = os.open(os.devnull, os.O_WRONLY)
         os.dup2(silence, 1)
         os.dup2(silence, 2)
+        for number in (signal.SIGXCPU, signal.SIGALRM):
+            signal.signal(number, signal.default_int_handler)
         if limit_s is not None:
-            resource.setrlimit(resource.RLIMIT_CPU, (int(limit_s) + 1,) * 2)
+            soft_s = int(limit_s) + 1
+            resource.setrlimit(resource.RLIMIT_CPU, (soft_s, soft_s + INTERRUPTED_S))
+            signal.alarm(LONGEST_S)
         os._exit(pytest.main([*OPTIONS, *tests], plugins=[Quickest(times)]))
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
