@@ -360,7 +360,6 @@ class Courier:
         """
         outbox, in_flight = self._outbox, self._events_out
         until_s = self._clock.monotonic_s() + TIMEOUT_S
-        news = False
         while len(in_flight) < min(len(outbox.events), TOUCH_WINDOW):
             event = outbox.events[len(in_flight)]
             if not self._fits(connection, event.topic, event.payload):
@@ -369,9 +368,7 @@ class Courier:
             done = connection.send(event.topic, event.payload, qos=1, properties=event.properties)
             done.add_done_callback(self._note_acknowledged)
             in_flight.append(_InFlight(done, until_s))
-            news = True
-        if news:
-            connection.flush()  # a touch must not wait for the encoding of frames
+        connection.flush()  # a touch must not wait for the encoding of frames
 
     def _note_acknowledged(self, _done: "asyncio.Future[None]") -> None:
         """The first events in the queue may have arrived; others take their places."""

@@ -570,3 +570,21 @@ def test_once_a_boards_order_is_known_its_frames_are_taken_as_a_whole(taken: lis
         # Four sweeps that differ, a pause of 64, and one that shows the order.
         assert run(range(first, first + 69), order) == []
         assert run(range(first + 69, first + 79), order) == [8] * 10
+
+
+@pytest.mark.parametrize("at_once", [1, 8])
+def test_a_triangle_that_returns_is_late_in_its_first_sweep_however_that_is_read(
+    at_once: int,
+) -> None:
+    assembler = learnt("0-3", 4)
+    for period in range(5, 9):
+        feed(assembler, frames(values(3, period), period * PERIOD))
+        assembler.expire((period + 1) * PERIOD - 1)
+    sent = frames(values(4), 9 * PERIOD)
+    sweeps = [
+        sweep for at in range(0, 8, at_once) for sweep in feed(assembler, sent[at : at + at_once])
+    ]
+    assert [sweep.present for sweep in sweeps] == [0b0111]
+    assert assembler.counters.late == 2
+    (sweep,) = feed(assembler, frames(values(4), 10 * PERIOD))
+    assert sweep.present == 0b1111
