@@ -4,6 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import accumulate, chain, pairwise
 from statistics import median
 
@@ -65,36 +66,41 @@ class ContactTracker:
     contact at its mean weighted by force. With any other, a patch with several clear maxima is
     several contacts, and each is located from activations. The template's table of a pad is
     computed when the pad is first the strongest, which takes some 30 ms once.
+
+    Args:
+        layout: the skin.
+        part_index: which part.
+        settings: how contacts are found.
+        before: the tracker of this part that this one replaces: it continues with its contacts.
     """
 
-    def __init__(self, layout: Layout, part_index: int, settings: Settings) -> None:
+    def __init__(
+        self,
+        layout: Layout,
+        part_index: int,
+        settings: Settings,
+        before: "ContactTracker | None" = None,
+    ) -> None:
         part = layout.parts[part_index]
         mine = slice(part.start, part.stop)
         self._name = part.name
-        start = layout.neighbour_start[part.start : part.stop + 1].tolist()
-        neighbour = (layout.neighbour - part.start).tolist()
-        self._neighbours = [neighbour[begin:end] for begin, end in pairwise(start)]
-        self._patches = Patches(self._neighbours)
+        near = _Near.of(layout, mine)
+        if before is not None and before._near.is_same(near):
+            near = before._near
+        self._near: _Near = near
+        self._neighbours, self._patches, self._pitch_m = near.lists, near.patches, near.pitch_m
         self._position_m = layout.position_m[mine]
         self._normal = layout.normal[mine]
         self._area_mm2 = layout.area_mm2[mine]
         self._shortest_ns = int(1e9 / settings.processing.touch.move_hz)
-        self._pitch_m = _pitch_m(self._position_m, self._neighbours)
         self._places: _Places | None = None
         if settings.parts[part.name].localization != "centroid":
             self._places = _Places(layout, part_index, settings)
-        self._contacts: dict[int, _Contact] = {}
-        self._next_id = 1
-        self._t_ns = 0
+        self._contacts: dict[int, _Contact] = {} if before is None else before._contacts
+        self._next_id: int = 1 if before is None else before._next_id
+        self._t_ns: int = 0 if before is None else before._t_ns
         self._known = _Grouping.of([], [], _Homes({}, 0), self._area_mm2, self._position_m)
         self._seen: bytes | None = None
-
-    def go_on(self, before: "ContactTracker") -> None:
-        """Continue with the contacts of another tracker of this part, which ends."""
-        self._contacts = before._contacts
-        self._next_id = before._next_id
-        self._t_ns = before._t_ns
-        self._seen = None
 
     def step(self, frame: PressureFrame) -> list[Touch]:
         """Return the events since the last frame: ends first, then moves and begins."""
@@ -566,11 +572,55 @@ class _Places:
         return (x, y, z), location.sigma_m
 
 
-def _pitch_m(position_m: Floats, neighbours: Sequence[Sequence[int]]) -> float:
-    """Median distance of taxels to their nearest neighbour; 0 where none has any."""
-    nearest = [
-        float(np.linalg.norm(position_m[near] - position_m[taxel], axis=1).min())
-        for taxel, near in enumerate(neighbours)
-        if near
-    ]
-    return median(nearest) if nearest else 0.0
+class _Near:
+    """Which taxels of a part are next to each other: what takes long to make is made when needed.
+
+    Attributes:
+        start, neighbour: as in `Layout`, of the part alone.
+        position_m: [m, 3].
+    """
+
+    def __init__(
+        self,
+        start: NDArray[np.int32],
+        neighbour: NDArray[np.int32],
+        position_m: Floats,
+    ) -> None:
+        self.start = start
+        self.neighbour = neighbour
+        self.position_m = position_m
+
+    @classmethod
+    def of(cls, layout: Layout, mine: slice) -> "_Near":
+        start = layout.neighbour_start[mine.start : mine.stop + 1]
+        neighbour = layout.neighbour[start[0] : start[-1]] - np.int32(mine.start)
+        return cls(start - start[0], neighbour, layout.position_m[mine])
+
+    def is_same(self, other: "_Near") -> bool:
+        return (
+            np.array_equal(self.start, other.start)
+            and np.array_equal(self.neighbour, other.neighbour)
+            and np.array_equal(self.position_m, other.position_m, equal_nan=True)
+        )
+
+    @cached_property
+    def lists(self) -> list[list[int]]:
+        """The neighbours of each taxel."""
+        flat = self.neighbour.tolist()
+        return [flat[begin:end] for begin, end in pairwise(self.start.tolist())]
+
+    @cached_property
+    def patches(self) -> Patches:
+        return Patches(self.lists)
+
+    @cached_property
+    def pitch_m(self) -> float:
+        """Median distance of taxels to their nearest neighbour; 0 where none has any."""
+        count = np.diff(self.start)
+        if not count.any():
+            return 0.0
+        taxel = np.repeat(np.arange(len(count)), count)
+        steps = self.position_m[self.neighbour] - self.position_m[taxel]
+        apart_m = np.linalg.norm(steps, axis=1)
+        nearest_m = np.minimum.reduceat(apart_m, self.start[:-1][count > 0])
+        return float(median(nearest_m.tolist()))

@@ -132,18 +132,22 @@ class Engine:
         buses = {layout.boards[i].settings.bus for i in self.boards}
         if self.fingertips is not None:
             buses |= self.fingertips.buses
-        self.assemblers = {
-            bus: Assembler(
-                [
-                    (i, layout.boards[i])
-                    for i in self.boards
-                    if layout.boards[i].settings.bus == bus
-                ],
-                settings.receive.close_periods,
-                frozenset() if self.fingertips is None else self.fingertips.identifiers(bus),
-            )
-            for bus in sorted(buses)
-        }
+        self.assemblers = (
+            {}
+            if after is not None
+            else {
+                bus: Assembler(
+                    [
+                        (i, layout.boards[i])
+                        for i in self.boards
+                        if layout.boards[i].settings.bus == bus
+                    ],
+                    settings.receive.close_periods,
+                    frozenset() if self.fingertips is None else self.fingertips.identifiers(bus),
+                )
+                for bus in sorted(buses)
+            }
+        )
         #: Contacts of fingertips that a new zero ended; they are part of the next output.
         self._ended: list[FingertipEvent] = []
         self.disabled: set[int] = set()
@@ -177,7 +181,12 @@ class Engine:
         #: Between `collected` and `use`: the boards that were zeroed, and `believed` of each.
         self._zeroed_since: dict[int, bool] | None = None
         self._pipeline: Pipeline | None = None
-        self._trackers = {part: ContactTracker(layout, part, settings) for part in parts}
+        self._trackers: dict[int, ContactTracker] = {
+            part: ContactTracker(
+                layout, part, settings, None if after is None else after._trackers[part]
+            )
+            for part in parts
+        }
         if after is not None:
             self._go_on(after)
         elif calibration is not None:
@@ -201,8 +210,6 @@ class Engine:
         self._last_touched = after._last_touched
         self._run = after._run
         self._zeroed_since = after._zeroed_since
-        for part, tracker in self._trackers.items():
-            tracker.go_on(after._trackers[part])
         self.calibration = after.calibration
         self._pipeline = after._pipeline
         if self.calibration is not None:

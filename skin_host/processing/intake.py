@@ -138,6 +138,7 @@ class Intake:
         self._none = np.zeros(n * TRIANGLES, np.bool_)
         self._erring: dict[int, NDArray[np.uint8]] = {}
         self._felt: dict[int, Mask] = {}
+        self._encodings = _encodings(layout, boards)
         self.liveness = self._new_liveness(None)
         self._states = [self._new_state(part, silent_periods) for part in parts]
         self._of_board: dict[int, list[_PartState]] = {board: [] for board in boards}
@@ -347,39 +348,19 @@ class Intake:
         self._n_waiting = 0
 
     def _new_liveness(self, noise: NDArray[np.float64] | None) -> Liveness:
-        encodings = []
-        of_pads = None if noise is None else np.zeros((len(self._boards), TRIANGLES, PADS))
-        for row, board in enumerate(self._boards):
-            layout = self._layout.boards[board]
-            if noise is not None and of_pads is not None:
-                taxels = layout.taxel_index
-                of_pads[row] = np.where(taxels >= 0, noise[taxels], 0.0)
-            settings = layout.settings
-            shifts = dict.fromkeys(range(TRIANGLES), 0)
-            mine = (triangle for triangle in self._layout.triangles if triangle.board == board)
-            shifts |= {triangle.number: triangle.shift for triangle in mine}
-            encodings += [
-                Encoding(
-                    thermal_gains(settings.skin_type, number)[0],
-                    shifts[number],
-                    settings.no_load,
-                    settings.model == "mtb3",
-                )
-                for number in range(TRIANGLES)
-            ]
-        periods_s = [self._layout.boards[board].settings.period_ms * 1e-3 for board in self._boards]
+        boards = [self._layout.boards[board] for board in self._boards]
+        of_pads: NDArray[np.float64] | None = None
+        if noise is not None:
+            taxels = np.array([board.taxel_index for board in boards]).reshape(-1, PADS)
+            of_pads = np.where(taxels >= 0, noise[taxels], 0.0)
         return Liveness(
-            len(encodings),
-            None if of_pads is None else of_pads.reshape(-1, PADS),
-            np.array(periods_s),
-            Repeats(encodings),
-            len(self._boards),
+            len(self._encodings),
+            of_pads,
+            np.array([board.settings.period_ms * 1e-3 for board in boards]),
+            Repeats(self._encodings),
+            len(boards),
             np.array(
-                [
-                    number in self._layout.boards[board].triangles
-                    for board in self._boards
-                    for number in range(TRIANGLES)
-                ]
+                [number in board.triangles for board in boards for number in range(TRIANGLES)]
             ),
         )
 
@@ -419,6 +400,22 @@ class Intake:
         state.pending = False
         state.reported_ns = -1
         return PartSample(state.index, raw, present, received, state.last_ns)
+
+
+def _encodings(layout: Layout, boards: list[int]) -> list[Encoding]:
+    """How each triangle of some boards makes bytes of capacitances, 16 of each board."""
+    shifts = {(triangle.board, triangle.number): triangle.shift for triangle in layout.triangles}
+    return [
+        Encoding(
+            thermal_gains(settings.skin_type, number)[0],
+            shifts.get((board, number), 0),
+            settings.no_load,
+            settings.model == "mtb3",
+        )
+        for board in boards
+        for settings in (layout.boards[board].settings,)
+        for number in range(TRIANGLES)
+    ]
 
 
 def unpressable(layout: Layout, board: int, full_ff: float) -> Mask:
