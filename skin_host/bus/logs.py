@@ -386,11 +386,15 @@ class _Lines(io.TextIOWrapper):
 
 
 def _reader(path: Path) -> "can.io.generic.MessageReader":
-    """python-can's reader, which would read a line of any length."""
+    """python-can's reader, which would read a line of any length and a container of any size."""
     import can
+
+    from skin_host.bus.blf import BoundedBlfReader
 
     zipped = path.suffix.lower() == ".gz"
     kind = can.io.player.MESSAGE_READERS[path.suffixes[-2 if zipped else -1].lower()]
+    if kind is can.BLFReader:
+        return BoundedBlfReader(path)
     if not issubclass(kind, can.io.generic.TextIOMessageReader):
         return can.LogReader(path)
     file = gzip.open(path) if zipped else path.open("rb")  # noqa: SIM115  # the reader closes it

@@ -1,17 +1,21 @@
 """Small messages and files that unfold into hours or gigabytes are refused at once."""
 
 import struct
+import zlib
 from pathlib import Path
 
+import can
 import cbor2
 import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
 
+from skin_host.config.settings import load
 from skin_host.errors import LogError
 from skin_host.mqtt.frames import decode_frame
 from skin_host.mqtt.payload import MessageError
 from skin_host.recording.mcap import read_messages_of
+from skin_host.recording.replay import read_buses
 
 
 def shared_key(depth: int) -> bytes:
@@ -75,3 +79,53 @@ def test_a_recording_that_unfolds_is_refused_in_a_line(
     with pytest.raises(LogError, match="decompresses to more than") as refused:
         list(read_messages_of(path))
     assert len(str(refused.value).splitlines()) == 1
+
+
+def blf(tmp_path: Path, content: bytes, claims: int, length: int | None = None) -> Path:
+    """A BLF file of one container."""
+    path = tmp_path / "x.blf"
+    with can.BLFWriter(path):
+        pass
+    body = struct.pack("<H6xL4x", 2, claims) + content
+    length = 16 + len(body) if length is None else length
+    container = struct.pack("<4sHHLL", b"LOBJ", 16, 1, length, 10) + body
+    path.write_bytes(path.read_bytes()[:144] + container + bytes(len(body) % 4))
+    return path
+
+
+def blf_bomb() -> bytes:
+    pack = zlib.compressobj(9)
+    return b"".join([*(pack.compress(bytes(10_000_000)) for _ in range(40)), pack.flush()])
+
+
+def blf_objects(length: int) -> bytes:
+    one = struct.pack("<4sHHLL", b"LOBJ", 32, 1, length, 86) + bytes(100)
+    return zlib.compress(one * 100)
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize(
+    ("content", "claims", "length"),
+    [
+        (blf_bomb(), 400_000_000, None),
+        (blf_bomb(), 100, None),
+        (blf_objects(0), 20_000, None),
+        (blf_objects(31), 20_000, None),
+        (b"", 100, 0),
+        (b"", 100, 0xFFFFFFFF),
+    ],
+    ids=["bomb", "bomb that claims little", "no length", "short", "container 0", "container 4 GB"],
+)
+def test_a_blf_recording_that_unfolds_or_never_ends_is_refused(
+    tmp_path: Path, content: bytes, claims: int, length: int | None
+) -> None:
+    path = blf(tmp_path, content, claims, length)
+    settings = load(Path(__file__).parents[2] / "config" / "demo.toml")
+    with pytest.raises(LogError) as refused:
+        list(read_buses(path, settings))
+    assert len(str(refused.value).splitlines()) == 1
+    assert (
+        "MiB" in str(refused.value)
+        or "object of" in str(refused.value)
+        or "short" in str(refused.value)
+    )
