@@ -4,6 +4,7 @@ Boards have short queues. What does not fit is lost: an MTB4 drops the newest fr
 drops its whole stack and reports that.
 """
 
+from collections import deque
 from collections.abc import Callable
 from itertools import pairwise
 
@@ -23,6 +24,7 @@ QUEUE_FRAMES = 48
 #: A board's bursts have the same identifiers, the same array, until it is set up again; of so many
 #: it is remembered how long they take.
 _MOST_PASSED = 64
+NEVER_NS = 1 << 62
 _NOTHING = FrameBatch.of([])
 
 Ints = NDArray[np.int64]
@@ -112,14 +114,18 @@ class Wire:
             self._waiting = _NOTHING
             self._arbitrate(waiting, int(times_ns[0]))
             return
-        turns = np.flatnonzero(times_ns[1:] != times_ns[:-1]) + 1
-        taken = 0
-        for start, stop in pairwise([0, *turns.tolist(), len(waiting)]):
-            ready_ns = int(times_ns[start])
-            if ready_ns > t_ns:
-                break
-            self._arbitrate(_rows(waiting, slice(start, stop)), ready_ns)
-            taken = stop
+        taken = int(np.searchsorted(times_ns, t_ns, side="right"))
+        turns = np.flatnonzero(times_ns[1:taken] != times_ns[: max(0, taken - 1)]) + 1
+        urgent = waiting.id[:taken].tolist()
+        first = last = 0
+        for start, stop in pairwise([0, *turns.tolist(), taken]):
+            if stop - start == 1 and not urgent[start] >> 4:
+                last = stop
+                continue
+            self._let_first(_rows(waiting, slice(first, last)))
+            self._arbitrate(_rows(waiting, slice(start, stop)), int(times_ns[start]))
+            first = last = stop
+        self._let_first(_rows(waiting, slice(first, last)))
         _, self._waiting = _split(waiting, taken)
 
     def _spoil(self, sent: FrameBatch) -> FrameBatch:
@@ -174,6 +180,47 @@ class Wire:
                 self._passed[id(group.id)] = group.id, group.dlc, passed_ns
         group.t_ns = max(free_ns, ready_ns) + passed_ns
         self._under_way = join([ended, group]) if n else group
+
+    def _let_first(self, urgent: FrameBatch) -> None:
+        """Do what `_arbitrate` does for frames of the highest priority, ready one after the other.
+
+        They come by the thousand, so this is done in plain numbers.
+        """
+        if not len(urgent):
+            return
+        under_way = self._under_way
+        both = join([under_way, urgent])
+        bits = (OVERHEAD_BITS + STUFF_BITS + 8 * both.dlc.astype(np.int64)).tolist()
+        is_urgent = (both.id >> 4 == 0).tolist()
+        ready_ns = urgent.t_ns.tolist()
+        n = int(np.searchsorted(under_way.t_ns, ready_ns[0], side="right"))
+        order = list(range(n))
+        ends_ns: list[int] = under_way.t_ns[:n].tolist()
+        free_ns = ends_ns[-1] if n else self._free_ns
+        left = deque(range(n, len(under_way)))
+        waits = 0  # urgent ones among the first of those that are left
+        while waits < len(left) and is_urgent[left[waits]]:
+            waits += 1
+        for number, (now_ns, next_ns) in enumerate(
+            zip(ready_ns, [*ready_ns[1:], NEVER_NS], strict=True), len(under_way)
+        ):
+            left.insert(waits, number)
+            waits += 1
+            begin_ns = max(free_ns, now_ns)
+            passed_bits = 0
+            while left:
+                passed_bits += bits[left[0]]
+                end_ns = begin_ns + round(passed_bits * self._bit_ns)
+                if end_ns > next_ns:
+                    break
+                order.append(left.popleft())
+                ends_ns.append(end_ns)
+                waits -= waits > 0
+                free_ns = end_ns
+        rows = np.array(order, np.intp)
+        self._under_way = FrameBatch(
+            both.id[rows], both.dlc[rows], both.data[rows], np.array(ends_ns, np.int64)
+        )
 
 
 def _split(batch: FrameBatch, n: int) -> tuple[FrameBatch, FrameBatch]:

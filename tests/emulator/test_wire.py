@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from emulator.wire import Wire
+from emulator.wire import Wire, _rows
 from skin_host.bus.wire import FrameBatch
 
 MS = 1_000_000
@@ -57,3 +57,36 @@ def test_how_often_one_looks_changes_no_frame(bitrate: int) -> None:
         sent.append((frames, wire.lost))
     assert all(one == sent[0] for one in sent)
     assert (sent[0][1] > 0) == (bitrate == 125_000)
+
+
+class FrameByFrame(Wire):
+    """Arbitrates for each frame of a babbling node, as for all others."""
+
+    def _let_first(self, urgent: FrameBatch) -> None:
+        for row in range(len(urgent)):
+            self._arbitrate(_rows(urgent, slice(row, row + 1)), int(urgent.t_ns[row]))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_frames_of_a_babbling_node_pass_as_if_arbitrated_one_by_one(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    bitrate, share = int(rng.choice([125_000, 500_000, 1_000_000])), float(rng.uniform(0.3, 1.0))
+
+    def stack_size(address: int) -> int | None:
+        return 16 if address == 3 else None
+
+    wires = [kind(bitrate, stack_size, np.random.default_rng(1)) for kind in (Wire, FrameByFrame)]
+    for wire in wires:
+        wire.babble(share, 0)
+    t_ns = 0
+    for _ in range(40):
+        t_ns += int(rng.integers(1, 30 * MS))
+        for _ in range(int(rng.integers(0, 3))):
+            address, n = int(rng.integers(1, 5)), int(rng.integers(1, 33))
+            ready_ns = int(rng.integers(max(0, t_ns - 20 * MS), t_ns + 5 * MS))
+            frames = [(0x400 | address << 4 | i // 2, bytes([i] * 8), ready_ns) for i in range(n)]
+            for wire in wires:
+                wire.put(FrameBatch.of(frames))
+        at_once, one_by_one = (list(wire.until(t_ns).frames()) for wire in wires)
+        assert at_once == one_by_one
+    assert wires[0].lost == wires[1].lost
