@@ -73,10 +73,7 @@ def visible(text: str, longest: int = 1000) -> str:
 def required(module: str, what: str, extra: str) -> Any:
     """Import a module of an extra.
 
-    Args:
-        module: to import.
-        what: needs it, in the plural: "MCAP recordings".
-        extra: of the project that brings it.
+    `what` needs it, in the plural: "MCAP recordings"; `extra` of the project brings it.
 
     Raises:
         SkinError: it is not installed; the message gives the command that installs it.

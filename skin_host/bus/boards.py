@@ -48,6 +48,7 @@ from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Bus, Receive
 from skin_host.errors import BusError
 from skin_host.layout import BoardLayout, TriangleLayout
+from skin_host.tasks import cancel
 
 log = logging.getLogger(__name__)
 
@@ -378,10 +379,7 @@ class Boards:
         Raises:
             BusError: the bus does not take frames.
         """
-        busy = [record.busy for record in self.records.values() if record.busy is not None]
-        for task in busy:
-            task.cancel()
-        await asyncio.gather(*busy, return_exceptions=True)
+        await cancel(*(one.busy for one in self.records.values() if one.busy is not None))
         for address, record in self.records.items():
             record.started = False
             await self._port.send([command_frame(SetTxMode(TxMode.STOP), address)])

@@ -17,6 +17,7 @@ from skin_host.layout import Layout
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration
 from skin_host.processing.core import Engine
+from skin_host.tasks import cancel
 
 log = logging.getLogger(__name__)
 
@@ -62,9 +63,7 @@ async def take_calibration(
         ) from None
     finally:
         await link.stop()
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await cancel(*tasks)
         link.close()
 
 

@@ -32,6 +32,7 @@ from skin_host.mqtt.publisher import Connect, Publisher
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration
 from skin_host.processing.core import Engine, Output
+from skin_host.tasks import cancel
 
 log = logging.getLogger(__name__)
 
@@ -170,9 +171,7 @@ class Daemon:
             await _first_failure(tasks, stopping)
         finally:
             service.notify("STOPPING=1")
-            for task in [*tasks, stopping]:
-                task.cancel()
-            await asyncio.gather(*tasks, stopping, return_exceptions=True)
+            await cancel(*tasks, stopping)
             # Nothing is felt from now on, however long the disk takes.
             for part in self.engine.parts:
                 self._end_contacts(part)

@@ -48,6 +48,7 @@ from skin_host.mqtt.order import run_of, stamp_of
 from skin_host.mqtt.publisher import Publisher
 from skin_host.mqtt.topics import ONLINE
 from skin_host.processing.events import Touch
+from skin_host.tasks import cancel
 
 TRAFFIC = Path(__file__).parent / "fleet_traffic.jsonl"
 BASE = "skin"
@@ -213,9 +214,7 @@ async def _conduct(brokers: Brokers, plan: FleetPlan, pipes: list[Pipe]) -> dict
     for pipe in pipes:
         told |= await asyncio.to_thread(pipe.recv)
     await ear.settled({name: said.events for name, said in told.items()})
-    for task in tasks:
-        task.cancel()
-    await asyncio.gather(*tasks, return_exceptions=True)
+    await cancel(*tasks)
     verdict = ear.judge(told)
     return {
         "engine": brokers.name,

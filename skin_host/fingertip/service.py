@@ -34,11 +34,7 @@ class _Known:
 class StrainBoards:
     """Sets up and supervises the force/torque boards of one bus.
 
-    Args:
-        bus: its name, for messages.
-        port: where commands are sent.
-        tips: the fingertips whose boards are on this bus.
-        clock: time in ns that stands still while the bus is not read.
+    Commands go to `port`. `clock` gives ns and stands still while the bus is not read.
     """
 
     def __init__(

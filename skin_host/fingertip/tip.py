@@ -122,11 +122,7 @@ _VERDICTS: dict[int, Told] = {
 class Tip:
     """Contact sensing of one fingertip.
 
-    Args:
-        name: of its topics.
-        settings: its table of the configuration.
-        move_hz: `move` events are sent at most this often.
-        array_period_ns: between two frames of the skin on it.
+    At most `move_hz` events `move` are sent; `array_period_ns` is that of the skin on it.
 
     Attributes:
         threshold_n: least force of a contact; noise may raise the configured one.

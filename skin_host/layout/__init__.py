@@ -161,9 +161,7 @@ def load_skin(config: Path) -> tuple[Settings, Layout]:
 def build_layout(settings: Settings, folder: Path) -> Layout:
     """Lay out the skin that `settings` describe.
 
-    Args:
-        settings: checked settings.
-        folder: where relative file names in them start, the configuration's own folder.
+    Relative file names in them start in `folder`, the configuration's own.
 
     Raises:
         ConfigurationError: an unknown kind, wrong numbers of places, a bad positions file.

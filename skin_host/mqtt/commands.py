@@ -17,6 +17,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 
 from skin_host.errors import SkinError
 from skin_host.mqtt.payload import MessageError, decode, one_line
+from skin_host.tasks import cancel
 
 RESULT_SCHEMA = "skin.result/1"
 MAX_REQUEST_BYTES = 64 * 1024
@@ -129,10 +130,7 @@ class CommandHandler:
 
     async def close(self) -> None:
         """Cancel what is still running."""
-        running = list(self._running)
-        for task in running:
-            task.cancel()
-        await asyncio.gather(*running, return_exceptions=True)
+        await cancel(*self._running)
 
     async def _run(
         self, name: str, payload: bytes, identity: str | int | UnsetType, answer: Answer

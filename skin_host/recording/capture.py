@@ -203,11 +203,7 @@ def _check_room(folder: Path, names: str) -> None:
 class FrameRecorder:
     """One recording, from now until it is stopped, is long enough, or fails.
 
-    Args:
-        path: a new file.
-        seconds: how long at most.
-        max_bytes: how large at most.
-        clock: by which the time ends.
+    It takes `seconds` at most, by `clock`, and `max_bytes`.
 
     Attributes:
         frames: recorded.
@@ -304,9 +300,7 @@ class FrameRecorder:
 class PageRecording:
     """The robot's messages, as pages start, mark and stop them: at most one recording at a time.
 
-    Args:
-        folder: the files go there; it is made when the first recording begins.
-        clock: by which the time ends.
+    The folder is made when the first recording begins; recordings end by `clock`.
     """
 
     def __init__(self, folder: Path, clock: Clock = SYSTEM) -> None:

@@ -290,10 +290,8 @@ def fit_curves(
 def plateaus(pressure_kpa: Floats, dt_s: float) -> list[slice]:
     """Return where a pressed skin is steady.
 
-    Args:
-        pressure_kpa: float64[t], pressure on a typical taxel, corrected for relaxation; otherwise
-            the residual of a high pressure would be taken for a low one.
-        dt_s: distance of the samples.
+    The pressure [t] is that on a typical taxel, corrected for relaxation; otherwise the residual of
+    a high pressure would be taken for a low one.
 
     Returns:
         The plateaus in their order, without the settling time at the beginning of each.

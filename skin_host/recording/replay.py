@@ -278,9 +278,8 @@ def process_all(
 ) -> Iterator[tuple[Task, int | SkinError]]:
     """Do many tasks in parallel; yield each with its result when it ends.
 
-    Args:
-        tasks: with different outputs.
-        scheduler: address of a Dask scheduler; without it, processes on all cores of this computer.
+    The tasks have different outputs. Without the address of a Dask scheduler they are done by
+    processes on all cores of this computer.
 
     Raises:
         RequestError: the scheduler cannot be used.

@@ -92,11 +92,8 @@ class _Visit(ServerConnection):
 class Viewer:
     """The page of one robot.
 
-    Args:
-        broker: URL or `Broker`, see `SkinClient`.
-        robot: its name; without one the only robot that the broker knows.
-        commands: whether pages may calibrate, ask for raw values, and record.
-        recordings: a folder for recordings that pages ask for.
+    Pages may calibrate, ask for raw values and record if `commands` is true; what they record is
+    kept in `recordings`.
     """
 
     def __init__(

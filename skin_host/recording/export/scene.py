@@ -84,9 +84,7 @@ Item = Points | Arrows | HealthLine
 class SkinScene:
     """Items for a viewer, made from frames and touches as they come.
 
-    Args:
-        shapes: of the parts, by name.
-        top_kpa: pressure at the end of the colour scale; higher ones raise it.
+    The colour scale ends at `top_kpa`; higher pressures raise it.
 
     Attributes:
         origins_m: where the frame of each part lies in the robot's.

@@ -13,11 +13,12 @@ from skin_host.errors import LogError
 from skin_host.layout import Layout
 from skin_host.mqtt.frames import decode_frame
 from skin_host.mqtt.info import PartInfo, decode_info, node_info
-from skin_host.mqtt.messages import decode_health, decode_touch
+from skin_host.mqtt.messages import Frame, decode_health, decode_touch
 from skin_host.mqtt.payload import MessageError
 from skin_host.processing.calibration import Calibration
 from skin_host.processing.core import Engine
 from skin_host.processing.events import Touch
+from skin_host.processing.pipeline import PressureFrame
 from skin_host.recording.mcap import read_messages_of
 from skin_host.recording.replay import steps
 
@@ -85,20 +86,12 @@ class _Growing:
     beyond: list[Mask] = field(default_factory=list)
     raw: list[NDArray[np.uint8] | None] = field(default_factory=list)
 
-    def add(
-        self,
-        seq: int,
-        t_ns: int,
-        kpa: NDArray[np.floating[Any]],
-        valid: Mask,
-        beyond: Mask,
-        raw: NDArray[np.uint8] | None,
-    ) -> None:
-        self.seq.append(seq)
-        self.t_ns.append(t_ns)
-        self.kpa.append(np.where(valid, kpa, np.nan).astype(np.float32))
-        self.beyond.append(beyond.copy())
-        self.raw.append(None if raw is None else raw.copy())
+    def add(self, frame: Frame | PressureFrame) -> None:
+        self.seq.append(frame.seq)
+        self.t_ns.append(frame.t_ns)
+        self.kpa.append(np.where(frame.valid, frame.pressure_kpa, np.nan).astype(np.float32))
+        self.beyond.append(frame.beyond_range.copy())
+        self.raw.append(None if frame.raw is None else frame.raw.copy())
 
     def series(self, name: str) -> PartSeries:
         raw = [one for one in self.raw if one is not None]
@@ -134,14 +127,7 @@ def read_messages(recording: Path) -> Series:
                         f"{recording}: {name} changes from {len(growing.kpa[0])} to "
                         f"{len(frame.valid)} taxels; export the recordings of one skin"
                     )
-                growing.add(
-                    frame.seq,
-                    frame.t_ns,
-                    frame.pressure_kpa,
-                    frame.valid,
-                    frame.beyond_range,
-                    frame.raw,
-                )
+                growing.add(frame)
             elif kind == "touch":
                 touches.append(decode_touch(said.payload))
             elif kind == "health":
@@ -176,10 +162,7 @@ def read_frames(log: Path, settings: Settings, layout: Layout, calibration: Cali
     touches: list[Touch] = []
     counts = dict.fromkeys(parts, 0)
     for step in steps(log, engine):
-        frame = step.frame
-        parts[frame.part].add(
-            frame.seq, frame.t_ns, frame.pressure_kpa, frame.valid, frame.beyond_range, frame.raw
-        )
+        parts[step.frame.part].add(step.frame)
         for event in step.events:
             counts[event.part] += 1
             touches.append(event.published(counts[event.part]))
