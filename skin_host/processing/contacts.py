@@ -150,10 +150,13 @@ class ContactTracker:
         """
         if all_of(frame.valid):
             return np.flatnonzero(frame.touched)
-        touched = frame.touched.copy()
+        touched = frame.touched
         for contact in self._contacts.values():
             if 0 <= frame.t_ns - contact.heard_ns < LOST_NS:
-                touched[contact.order[~frame.valid[contact.order]]] = True
+                valid = frame.valid[contact.order]
+                if not all_of(valid):
+                    touched = touched.copy() if touched is frame.touched else touched
+                    touched[contact.order[~valid]] = True
         return np.flatnonzero(touched)
 
     def _joined(self, groups: list[frozenset[int]], frame: PressureFrame) -> list[frozenset[int]]:
@@ -315,7 +318,7 @@ class ContactTracker:
             before = None
             if known is not None:
                 if known.taxels is not taxels:
-                    known.taxels, known.order = taxels, found.order[found.span(number)]
+                    known.taxels, known.order = taxels, found.order[found.spans[number]]
                 if all_heard[number]:
                     known.heard_ns = frame.t_ns
                 before = known.said
@@ -342,7 +345,7 @@ class ContactTracker:
                 continue
             normal = before.normal if before is not None and kept else None
             if not kept and totals[number] > 0.0:
-                span = found.span(number)
+                span = found.spans[number]
                 normal = self._mean_normal(weight[span], found.order[span], totals[number])
             area_mm2 = found.area_mm2[number]
             event = Touch(
@@ -362,7 +365,7 @@ class ContactTracker:
             )
             events.append(event)
             if known is None:
-                own = found.order[found.span(number)]
+                own = found.order[found.spans[number]]
                 self._contacts[name] = _Contact(taxels, own, event, frame.t_ns, peak)
             else:
                 known.said = event
@@ -463,6 +466,7 @@ class _Grouping:
         groups: the taxels of each.
         taxels: the same, in order.
         order, starts: intp, all taxels contact by contact, and the index of the first of each.
+        spans: which of `order` are of each contact.
         pad_mm2, position_m: of the taxels in this order: area, and position [.., 3].
         area_mm2: of each contact.
     """
@@ -472,6 +476,7 @@ class _Grouping:
     taxels: list[list[int]]
     order: NDArray[np.intp]
     starts: NDArray[np.intp]
+    spans: list[slice]
     pad_mm2: Floats
     position_m: Floats
     area_mm2: list[float]
@@ -488,15 +493,12 @@ class _Grouping:
         taxels = [home.sorted(group) for group in groups]
         order = home.order(groups)
         ends = list(accumulate(map(len, taxels)))
-        starts = np.array([0, *ends[:-1]] if ends else [], np.intp)
+        begins = [0, *ends[:-1]] if ends else []
+        starts = np.array(begins, np.intp)
+        spans = list(map(slice, begins, ends))
         pads = area_mm2[order]
         areas = np.add.reduceat(pads, starts).tolist() if ends else []
-        return cls(names, groups, taxels, order, starts, pads, position_m[order], areas)
-
-    def span(self, number: int) -> slice:
-        """Return the slice of `order` with the taxels of a contact."""
-        start = int(self.starts[number])
-        return slice(start, start + len(self.taxels[number]))
+        return cls(names, groups, taxels, order, starts, spans, pads, position_m[order], areas)
 
 
 def _worth_reporting(
