@@ -22,7 +22,7 @@ from skin_host.processing.contacts import ContactTracker
 from skin_host.processing.events import Touch
 from skin_host.processing.intake import Intake, PartSample, below_zero
 from skin_host.processing.liveness import PADS
-from skin_host.processing.masks import Mask
+from skin_host.processing.masks import Mask, any_of
 from skin_host.processing.pipeline import Pipeline, PressureFrame
 from skin_host.processing.pressure import PressureCurve, vertex
 from skin_host.processing.rezero import BELOW_SWEEPS, JUMPS_NS, Rezero
@@ -455,11 +455,11 @@ class Engine:
         """
         now = self.ledger.error[row] & StatusError.NO_ACK != 0
         before = self._unanswered.get(sweep.board)
-        if now.any():
+        if any_of(now):
             self._unanswered[sweep.board] = now
         else:
             self._unanswered.pop(sweep.board, None)
-        if before is not None and (before & ~now & self.ledger.present[row]).any():
+        if before is not None and any_of(before & ~now & self.ledger.present[row]):
             self.rezero(sweep.board)
 
     def _note_below_zero(self, sweep: Sweep, row: int) -> None:
@@ -473,16 +473,16 @@ class Engine:
             if sweep.board in self._rezeros:
                 # What is known to have been pressed comes back when it is pressed again.
                 back &= ~self._rezeros[sweep.board].doubted.reshape(TRIANGLES, PADS)
-            if (back & (sweep.raw < (no_load + 255) / 2)).any():
+            if any_of(back & (sweep.raw < (no_load + 255) / 2)):
                 # What was pressed and lifts stays below zero; what a bad wire brings does not.
                 self._jumped_ns[sweep.board] = sweep.t_ns
         jumps = 0 <= sweep.t_ns - self._jumped_ns.get(sweep.board, -JUMPS_NS) < JUMPS_NS
-        if self.calibration is None or jumps or not below.any():
+        if self.calibration is None or jumps or not any_of(below):
             return
         lasted = below.astype(np.int64) if before is None else (before + 1) * below
         self._below[sweep.board] = lasted
         sure = lasted >= BELOW_SWEEPS
-        if sure.any():
+        if any_of(sure):
             if sweep.board not in self._rezeros:
                 self._rezeros[sweep.board] = Rezero.over(np.full(sure.size, no_load), sweep.t_ns)
             self._rezeros[sweep.board].doubted |= sure.ravel()
@@ -544,14 +544,14 @@ class Engine:
             taxels = self._taxels_of(board)
             pads = self._touched[taxels] & (taxels >= 0)
             row = self.ledger.row[board]
-            if pads.any():
+            if any_of(pads):
                 self.intake.touched[row] = pads
             else:
                 self.intake.touched.pop(row, None)
 
     @staticmethod
     def _collect(run: _CalibrationRun, sample: PartSample) -> None:
-        if not sample.received.any():
+        if not any_of(sample.received):
             return
         interval_ns = 0 if run.last_ns is None else sample.t_ns - run.last_ns
         if 0 < interval_ns <= LONGEST_INTERVAL_NS:

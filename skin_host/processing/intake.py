@@ -130,6 +130,10 @@ class Intake:
         #: By row: of a sweep without status words, the triangles that were received and, as bytes,
         #: what is in doubt, and the masks made of that.
         self._usual: list[tuple[int, bytes | None, tuple[Mask, Mask]] | None] = [None] * n
+        #: By row: the masks of the last sweep with status words; and of which masks, and with which
+        #: veto, others were made.
+        self._last: list[tuple[Mask, Mask] | None] = [None] * n
+        self._vetoed: dict[int, tuple[tuple[Mask, Mask], bytes, tuple[Mask, Mask]]] = {}
         # What is not judged yet.
         self._waiting = np.zeros(n, np.bool_)
         self._n_waiting = 0
@@ -270,7 +274,13 @@ class Intake:
             received &= ~ledger.far[row]
             if doubted is not None:
                 received &= ~doubted
-            masks = received.ravel(), received.ravel()
+            received = received.ravel()
+            before = self._last[row]
+            # The same arrays as before are known to be the same further on.
+            if before is not None and before[0].tobytes() == received.tobytes():
+                masks = before
+            else:
+                masks = self._last[row] = received, received
             self._here[row] = here
             self._usual[row] = None
         else:
@@ -291,7 +301,13 @@ class Intake:
         if row in self.touched:
             self._felt[row] = self.touched[row]
         veto = self.veto.get(row)
-        return masks if veto is None else (masks[1] & ~veto.ravel(), masks[1])
+        if veto is None:
+            return masks
+        key = veto.tobytes()
+        known = self._vetoed.get(row)
+        if known is None or known[0] is not masks or known[1] != key:
+            self._vetoed[row] = known = masks, key, (masks[1] & ~veto.ravel(), masks[1])
+        return known[2]
 
     def _flagged(self, row: int, raw: NDArray[np.uint8]) -> Mask:
         """Return triangles bool[16] of a sweep with status words that were received, answer, and

@@ -320,6 +320,9 @@ class _PartPipeline:
         self.decides_kpa = float(decides.max(initial=0.0))
         self._always_valid = _constant(usable.copy())
         self._always_bytes = self._always_valid.tobytes()
+        #: Which taxels were received last, as bytes, and which of them are valid.
+        self._received = b""
+        self._valid = self._always_valid
         self._far_taxels: tuple[bytes, NDArray[np.intp], Curve] | None = None
         self._renew_limits()
 
@@ -382,8 +385,8 @@ class _PartPipeline:
             touched = self._residuals.step(touched, corrected, repeated)
         if valid is not self._always_valid:
             pressure = np.where(valid, pressure, self._zeros)
-            touched = touched & valid
-            beyond = beyond & valid
+            touched = touched if touched is self._nowhere else touched & valid
+            beyond = beyond if beyond is self._nowhere else beyond & valid
         return self._frame(t_ns, raw, valid, pressure, touched, beyond, True)
 
     def begin_anew(self, taxels: Mask) -> None:
@@ -446,15 +449,20 @@ class _PartPipeline:
 
     def _receive(self, raw: NDArray[np.uint8], present: Mask) -> Mask:
         """Take in the bytes; return which are valid."""
-        if b"\0" not in present.tobytes():
+        received = present.tobytes()
+        if b"\0" not in received:
             self._last_raw = raw
             return self._always_valid
-        valid: Mask = present & self._usable
+        if received != self._received:
+            self._received = received
+            self._valid = present & self._usable
+            if self._valid.tobytes() == self._always_bytes:
+                self._valid = self._always_valid
+        valid = self._valid
         # Values that were not received are taken as unchanged: the foam does not forget.
         self._last_raw = np.where(valid, raw, self._last_raw)
-        if valid.tobytes() == self._always_bytes:
-            return self._always_valid
-        np.logical_or(self._was_missing, ~valid, out=self._was_missing)
+        if valid is not self._always_valid:
+            np.logical_or(self._was_missing, ~valid, out=self._was_missing)
         return valid
 
     def _untouched_raw(self) -> NDArray[np.uint8]:
