@@ -204,6 +204,8 @@ class Spot:
         self._chance = chance
         self._probe: LiveProbe = world.robot.touch(
             Probe(
+                # Skin without its cover feels only what is earthed.
+                kind="disc" if part.covered else "grounded",
                 part=part.name,
                 at=Place(taxel=self.taxel),
                 diameter_mm=diameter_mm,
