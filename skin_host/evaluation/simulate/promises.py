@@ -655,11 +655,15 @@ class Promises:
                 felt = record.configurations > 0 or boards._is_in_use(record)
                 last_ns = int(self._felt_ns[taxels].max()) if felt else -(1 << 62)
                 self._unfelt_ns[taxels] = last_ns - DECIDED_NS
-            self._exempt[taxels] |= pressed[taxels] & (
-                self._pressed_ns[taxels] > self._unfelt_ns[taxels]
-            )
-            if not rezero.settled(0):
-                self._exempt[taxels] |= spoiled[taxels]
+            # Whatever presses later is felt.
+            wall_ns = self._world.clock.now_ns()
+            finds = np.ones(len(taxels), np.bool_)
+            if rezero.settled(wall_ns):
+                unsettled = rezero.unsettled(wall_ns)
+                fitted = (layout.boards[board].taxel_index >= 0).ravel()
+                finds = np.zeros_like(finds) if unsettled is None else unsettled[fitted]
+            unfelt = pressed[taxels] & (self._pressed_ns[taxels] > self._unfelt_ns[taxels])
+            self._exempt[taxels] |= finds & (unfelt | spoiled[taxels])
         self._felt_ns = self._heard_ns()
 
     def contacts(self) -> None:
