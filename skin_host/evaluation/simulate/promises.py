@@ -37,7 +37,7 @@ STALE_PERIODS = 8
 #: Pads that press at least so much and read less than that are felt wrong, and the reverse.
 PRESSED_KPA, FELT_KPA = 25.0, 2.0
 UNTOUCHED_KPA = 25.0
-#: So many standard deviations of a pad's noise, as it was calibrated, are no press either.
+#: So many standard deviations of the noise of sums of a pad's readings are no press either.
 SIGMAS = 4.0
 #: A pad is pressed at all; and so long after it began, a touch may not be decided yet.
 TOUCHING_KPA = 0.2
@@ -617,7 +617,7 @@ class Promises:
         engine, part = life.daemon.engine, self._parts[name]
         if engine.calibration is None or engine.pipeline is None:
             return np.zeros(part.n_taxels)
-        units = SIGMAS * engine.calibration.noise[part.start : part.stop]
+        units = SIGMAS * engine.calibration.spread[part.start : part.stop]
         index = list(self._parts).index(name)
         found: NDArray[np.float64] = engine.pipeline._parts[index]._curve.kpa(units)
         return found
@@ -691,6 +691,10 @@ class Promises:
             return
         lately = np.array([values for _, values in list(self._truth)[-6:]])
         pads = (world.layout.pad_kind == PadKind.PRESSURE) & ~self._exempt & ~self._spoiled()
+        calibration = life.daemon.engine.calibration
+        if calibration is not None:
+            # A part whose other pads are valid has a contact, and health names those without one.
+            pads &= calibration.usable
         pressed = (lately.min(axis=0) > PRESSED_KPA) & pads
         for name, part in self._parts.items():
             topic = life.daemon.publisher.topics.part("contact", name)
