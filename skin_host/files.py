@@ -58,14 +58,16 @@ def read_whole(path: Path, most_bytes: int = MAX_DOCUMENT_BYTES) -> bytes:
         raise OSError(errno.EINVAL, str(error), str(path)) from None
     with file:
         os.set_blocking(file.fileno(), True)
-        mode = os.fstat(file.fileno()).st_mode
-        if not stat.S_ISREG(mode):
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode):
             most_bytes = min(most_bytes, MAX_DOCUMENT_BYTES)
-        pieces, left = [], most_bytes + 1
+        # What states its size is refused unread; the rest is read up to the limit.
+        left = most_bytes + 1 if status.st_size <= most_bytes else 0
+        pieces = []
         while left and (piece := file.read(min(left, _PIECE_BYTES))):
             pieces.append(piece)
             left -= len(piece)
-    if stat.S_ISFIFO(mode) and not pieces:
+    if stat.S_ISFIFO(status.st_mode) and not pieces:
         raise OSError(errno.ENODATA, "a pipe that nobody writes to", str(path))
     if not left:
         raise OSError(errno.EFBIG, f"larger than {most_bytes} bytes", str(path))
