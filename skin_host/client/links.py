@@ -4,6 +4,7 @@ A short connection finds out which robot is meant when none is named.
 """
 
 import asyncio
+import contextlib
 import logging
 from collections.abc import Iterable
 from typing import Protocol
@@ -27,8 +28,10 @@ MAX_INCOMING = 10_000
 #: The broker keeps touch events for this long while we are disconnected (MQTT 5).
 SESSION_S = 60
 
-#: Retained messages come within this time of a subscription.
+#: Retained messages come within this time of a subscription, or of the first of them.
 RETAINED_S = 0.5
+#: The first may take longer: a broker or a network can be slow, and no robot at all is rare.
+FIRST_RETAINED_S = 3.0
 _log = logging.getLogger(__name__)
 
 
@@ -163,23 +166,20 @@ async def only_robot(connection: Connection, broker: Broker, base: str) -> str:
         RequestError: there is none, or more than one.
     """
     prefix = f"{base}/"
-    known: set[str] = set()
-    online: set[str] = set()
-
-    async def listen() -> None:
-        async for message in connection.messages:
-            robot = message.topic.value.removeprefix(prefix).partition("/")[0]
-            known.add(robot)
-            if message.payload == ONLINE:
-                online.add(robot)
-
+    # By topic: of two statuses of a node the later one is true.
+    statuses: dict[str, object] = {}
     everybody = f"{prefix}+/nodes/+/status"
     await connection.subscribe(everybody, qos=1)
-    try:
-        await asyncio.wait_for(listen(), RETAINED_S)
-    except TimeoutError:
-        await connection.unsubscribe(everybody)
-    meant = online or known
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(FIRST_RETAINED_S) as waiting:
+            async for message in connection.messages:
+                if not statuses:
+                    waiting.reschedule(asyncio.get_running_loop().time() + RETAINED_S)
+                statuses[message.topic.value] = message.payload
+    await connection.unsubscribe(everybody)
+    robots = {topic: topic.removeprefix(prefix).partition("/")[0] for topic in statuses}
+    known = set(robots.values())
+    meant = {robots[topic] for topic, status in statuses.items() if status == ONLINE} or known
     if not meant:
         raise RequestError(
             f'broker {broker}: no robot has published below "{base}"; is `skin run` running?'

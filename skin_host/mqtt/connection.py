@@ -25,7 +25,6 @@ import re
 import socket
 import ssl
 import struct
-import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any
@@ -151,7 +150,8 @@ class Connection(aiomqtt.Client):
         self.when_clear: Callable[[], None] = lambda: None
         self._is_refusing = False
         self._cut = False
-        self._thread = threading.get_ident()
+        # From then on the socket is the event loop's; until then it is the opening thread's.
+        self._is_open = False
         self._client.connect_timeout = TIMEOUT_S
         # Retrieved in any case, or asyncio logs an exception that was never retrieved.
         self._disconnected.add_done_callback(
@@ -289,7 +289,9 @@ class Connection(aiomqtt.Client):
         """End at once, without a message to the broker, which will publish the last will."""
         self._cut = True
         raw = self._client.socket()
-        if isinstance(raw, socket.socket):
+        if not self._is_open:
+            self._close_unopened()
+        elif isinstance(raw, socket.socket):
             with contextlib.suppress(OSError):
                 # Data that still waits in the kernel is out of date: drop it with the connection.
                 raw.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
@@ -305,12 +307,35 @@ class Connection(aiomqtt.Client):
             await clock.in_thread(self._open)
         except OSError as error:
             raise MqttError(str(error)) from None
+        self._is_open = True
+        sock: Any = self._client.socket()
+        if sock is not None:
+            super()._on_socket_open(self._client, None, sock)
+            self._loop.call_soon(self._write, self._client, sock)
 
     def _open(self) -> None:
-        # Runs in a thread that cannot be cancelled.
+        # Runs in a thread that cannot be cancelled. It leaves the loop alone, which may have ended
+        # meanwhile: a reader or a task of a loop that ends would stay behind, with the socket.
         super()._client_connect()
         if self._cut:
-            self.cut()
+            self._close_unopened()
+
+    def _close_unopened(self) -> None:
+        """Close the socket of a connection that was given up while it was made."""
+        sock = self._client.socket()
+        if sock is not None:
+            sock.close()
+
+    def _on_socket_open(self, client: Any, userdata: Any, sock: Any) -> None:
+        """Do nothing: `open` registers the socket with the loop, in the loop's thread."""
+
+    def _on_socket_close(self, client: Any, userdata: Any, sock: Any) -> None:
+        if self._is_open:
+            super()._on_socket_close(client, userdata, sock)
+
+    def _on_socket_unregister_write(self, client: Any, userdata: Any, sock: Any) -> None:
+        if self._is_open:
+            super()._on_socket_unregister_write(client, userdata, sock)
 
     def _client_connect(self) -> None:
         """Do nothing, where aiomqtt would connect in a thread that the program's end waits for."""
@@ -327,10 +352,8 @@ class Connection(aiomqtt.Client):
         super()._on_publish(client, userdata, mid, reason_code, properties)
 
     def _on_socket_register_write(self, client: Any, userdata: Any, sock: Any) -> None:
-        if threading.get_ident() == self._thread:
+        if self._is_open:
             self._loop.call_soon(self._write, client, sock)
-        else:  # while connecting
-            self._loop.call_soon_threadsafe(self._write, client, sock)
 
     def _write(self, client: Any, sock: Any) -> None:
         """Write at once: mostly the socket takes it, and asking the kernel first costs as much."""
