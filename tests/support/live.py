@@ -55,7 +55,7 @@ class Live:
         end_s = clock.monotonic_s() + PATIENCE_S
         while not condition():
             assert clock.monotonic_s() < end_s, f"after {PATIENCE_S:g} s: {self.faults()}"
-            await clock.sleep(0.02)
+            await clock.sleep(0.1)
 
     def _well(self, but: frozenset[str]) -> bool:
         records = self.daemon.records().values()
@@ -131,5 +131,5 @@ def _counting(bus: can.BusABC, name: str) -> Counter[str]:
         send(message, timeout)
         counts[name] += 1
 
-    bus.send = counted  # type: ignore[method-assign]
+    bus.send = counted  # type: ignore[method-assign, assignment]
     return counts

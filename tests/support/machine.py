@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parents[2]
 LANE = ROOT / "tools/lane"
@@ -112,7 +113,7 @@ class Machine:
         """The end of the journal, for whoever reads that a test has failed."""
         return self.run("journalctl --no-pager -o short-monotonic -n 60").output
 
-    def _send(self, request: dict[str, object]) -> None:
+    def _send(self, request: dict[str, Any]) -> None:
         if self._unanswered:
             # A test whose time was up left before its answer came, which is not that of this one.
             self._answer(LATE_S)
@@ -121,7 +122,7 @@ class Machine:
         self._process.stdin.write(json.dumps(request).encode() + b"\n")
         self._process.stdin.flush()
 
-    def _answer(self, timeout_s: float) -> dict[str, object]:
+    def _answer(self, timeout_s: float) -> dict[str, Any]:
         assert self._process.stdout is not None
         end_s = time.monotonic() + timeout_s
         while b"\n" not in self._unread:
@@ -133,7 +134,7 @@ class Machine:
                 raise MachineEndedError(f"the machine has ended\n{self._last_words()}")
             self._unread += some
         line, _, self._unread = self._unread.partition(b"\n")
-        answer: dict[str, object] = json.loads(line)
+        answer: dict[str, Any] = json.loads(line)
         self._unanswered = False
         return answer
 

@@ -36,6 +36,7 @@ def emulate(arguments: list[str], stop: threading.Event) -> None:
         running.cancel()
         (result,) = await asyncio.gather(running, return_exceptions=True)
         if failed:
+            assert result is not None
             raise result
         for bus in buses.values():
             bus.shutdown()

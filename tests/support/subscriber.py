@@ -7,6 +7,7 @@ import uuid
 from typing import Any
 
 import paho.mqtt.client as mqtt
+from paho.mqtt.enums import CallbackAPIVersion
 
 from tests.support.waiting import PATIENCE_S
 
@@ -21,7 +22,7 @@ class Subscriber:
         self._subscribed = threading.Event()
         self._caught_up = threading.Event()
         self._marker = f"caught-up/{uuid.uuid4().hex}"
-        self._client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2, protocol=mqtt.MQTTv5)
+        self._client = mqtt.Client(CallbackAPIVersion.VERSION2, protocol=mqtt.MQTTv5)
         self._client.on_message = self._take
         self._client.on_connect = lambda client, *_: client.subscribe(
             [(topic, 1), (self._marker, 1)]
@@ -36,7 +37,7 @@ class Subscriber:
             self._caught_up.set()
             return
         with self._lock:
-            self._messages.append((message.topic, message.payload))
+            self._messages.append((message.topic, bytes(message.payload)))
 
     def catch_up(self) -> None:
         """Wait until everything has arrived that the broker has taken so far.

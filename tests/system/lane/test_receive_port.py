@@ -66,6 +66,10 @@ def opened(vcan: Vcan) -> Iterator[Callable[[Receive], Port]]:
         port.close()
 
 
+def is_in(port: Port, state: LinkState) -> Callable[[], bool]:
+    return lambda: port.state is state
+
+
 def read_until(port: Port, done: Callable[[], bool]) -> int:
     """Read until something is so; return the number of frames that came."""
     deadline = time.monotonic() + WAIT_S
@@ -223,7 +227,7 @@ def test_error_frames_of_the_controller_are_counted_and_change_the_state(sender,
         (0x100, 0x00, LinkState.UP),
     ):
         sender.send(can_frame(0x20000000 | error, bytes([0, detail, 0, 0, 0, 0, 0, 0])))
-        read_until(port, lambda state=state: port.state is state)
+        read_until(port, is_in(port, state))
     assert port.counters.error_frames == 4
     assert port.counters.bus_offs == 1
 

@@ -59,7 +59,7 @@ class Load:
             kind = "begin" if step == 0 else "end" if step == 9 else "move"
             contact = self.sweeps // 10
             self.publisher.put_touch(
-                touch_event(kind, contact, self.sweeps, t_ns, part, [1], None, None, 1, 1, 1, 0.1)  # type: ignore[arg-type]
+                touch_event(kind, contact, self.sweeps, t_ns, part, [1], None, None, 1, 1, 1, 0.1)
             )
             self.touches += 1
 

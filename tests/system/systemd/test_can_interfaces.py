@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator
 from contextlib import closing
+from functools import partial
 
 import pytest
 
@@ -102,7 +103,7 @@ def test_a_cards_controllers_come_up_and_pass_frames(
     for name in ("can0", "can1"):
         assert "kvaser_pci" in computer.do(f"readlink /sys/class/net/{name}/device/driver")
         set_up_again(computer, name)
-        computer.until(lambda name=name: works(computer, name), f"{name} is not up")
+        computer.until(partial(works, computer, name), f"{name} is not up")
         shown = link(computer, name)
         assert "qlen 128" in shown
         assert ("restart-ms 100" in shown) == bool(drop_ins)

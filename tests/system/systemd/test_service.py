@@ -1,6 +1,7 @@
 """The service under a real systemd: started, hung, killed, set otherwise, without what it needs."""
 
 import time
+from collections.abc import Callable
 
 import pytest
 
@@ -9,6 +10,11 @@ from tests.support.machine import Done, Machine, now
 from tests.support.service import CONFIGURATION, DROP_INS, PIP, UNIT, Service
 
 pytestmark = pytest.mark.timeout(900)
+
+
+def reports(service: Service, since: str, says: str) -> Callable[[], bool]:
+    """Whether the service has reported an error of this text since then."""
+    return lambda: says in service.journal(since, "-p err")
 
 
 def test_an_answer_that_nobody_waited_for_is_not_taken_for_the_next(
@@ -95,7 +101,7 @@ def test_a_reload_that_would_be_refused_fails_and_changes_nothing(service: Servi
         service.configure(more=wrong)
         assert service.machine.run(f"systemctl reload {UNIT}").status != 0
         service.machine.until(
-            lambda since=since, says=says: says in service.journal(since, "-p err"),
+            reports(service, since, says),
             f"no error in the journal: {says}",
         )
         assert "read again" not in service.journal(since)
