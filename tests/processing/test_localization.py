@@ -112,14 +112,15 @@ def test_the_template_reaches_its_goal_and_beats_the_published_methods(diameter,
 
 
 def test_a_template_that_leaves_the_size_open_suits_probes_of_any_size():
-    for diameter in (6.0, 8.0, 10.0, 12.0):
-        open_size = rms(errors_mm("template", diameter, probe_mm=(6.0, 8.0, 10.0, 12.0))[0])
-        assert open_size < rms(errors_mm("centroid", diameter)[0])
+    sizes = (6.0, 8.0, 10.0, 12.0)
+    for diameter in sizes:
+        open_size = rms(errors_mm("template", diameter, 120, probe_mm=sizes)[0])
+        assert open_size < rms(errors_mm("centroid", diameter, 120)[0])
 
 
 def test_a_template_of_the_wrong_size_is_worse_than_one_that_leaves_it_open():
-    wrong = rms(errors_mm("template", 6.0, probe_mm=10.0)[0])
-    assert wrong > rms(errors_mm("template", 6.0, probe_mm=(6.0, 8.0, 10.0, 12.0))[0])
+    wrong = rms(errors_mm("template", 6.0, 120, probe_mm=10.0)[0])
+    assert wrong > rms(errors_mm("template", 6.0, 120, probe_mm=(6.0, 8.0, 10.0, 12.0))[0])
 
 
 @pytest.mark.parametrize("method", METHODS)

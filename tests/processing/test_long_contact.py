@@ -13,7 +13,7 @@ TEN_MINUTES_S, TWO_HOURS_S, EIGHT_HOURS_S = 600.0, 7200.0, 28800.0
 @pytest.mark.parametrize("truth", ["A", "S"])
 @pytest.mark.parametrize("pressed", [FEW, ALL])
 def test_a_hold_of_ten_minutes_is_told_to_its_end_and_no_longer(truth, pressed):
-    hz = 10.0
+    hz = 4.0
     held = hold(truth, TEN_MINUTES_S, hz=hz, drift=0.004, pressed=pressed)
     assert not held.before.any()
     assert held.during.all()
@@ -38,7 +38,7 @@ def test_a_hold_of_hours_is_neither_absorbed_nor_left_behind(pressed, drift, sec
 
 def ghost_s(kind):
     """For how long a touch is told after a hold of all pads, while it grew warmer."""
-    hz = 10.0
+    hz = 4.0
     rig = Rig(1, 0.3, seed=23, hz=hz, kind=kind, processing={"relaxation": {"model": "none"}})
     thermal = rig.layout.pad_kind == PadKind.THERMAL
     felt = np.where(thermal, 1.0, 0.6)
@@ -61,7 +61,7 @@ def test_a_part_that_grew_warm_while_all_of_it_was_pressed_is_not_touched_afterw
 
 @pytest.mark.parametrize("left_units", [1.0, 2.0, 3.0, 3.4])
 def test_no_drift_of_a_few_units_under_a_contact_latches_it(left_units):
-    hz = 10.0
+    hz = 4.0
     rig = Rig(1, 0.4, seed=22, hz=hz, processing={"relaxation": {"model": "none"}})
     sweeps = round(TEN_MINUTES_S * hz)
     for sweep in range(sweeps):

@@ -10,7 +10,10 @@ from tests.support.looks import one_run, put, words
 SEQUENCE_S = 12 * 0.768e-3
 
 
-@pytest.mark.parametrize("seed", range(120))
+@pytest.mark.parametrize(
+    "seed",
+    [*range(40), *(pytest.param(seed, marks=pytest.mark.long) for seed in range(40, 120))],
+)
 def test_registers_interrupts_and_conversions_are_the_same_however_one_looked(seed: int) -> None:
     one_run(seed)
 
