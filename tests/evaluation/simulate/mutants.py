@@ -164,7 +164,7 @@ MUTANTS = [
         "PERIOD_SHARE = 5.0",
     ),
     Mutant(
-        "single frames' losses are told of any bus",
+        "single frames' losses are named for any bus",
         "health/diagnosis.py",
         'if recent["halves"] >= FEW_HALVES:',
         'if recent["frames_hz"] > 0 and recent["halves"] >= 0:',
