@@ -220,7 +220,7 @@ class Daemon:
             else:
                 self.unkept.pop("calibration", None)
                 log.info("calibration %s kept in %s", found.id, path)
-            self.publisher.put_info(self._info())
+            self.publisher.put_info(await self.clock.in_thread(self._info))
             return found
 
     def disable(self, part: int) -> None:
@@ -266,7 +266,7 @@ class Daemon:
         self._swap(settings, layout)
         log.info("%s read again; the boards are set up again", self._configuration)
         await self.configure()
-        self.publisher.put_info(self._info())
+        self.publisher.put_info(await self.clock.in_thread(self._info))
 
     def keep(self, state: NodeState) -> None:
         """Write what operators changed to the state directory.

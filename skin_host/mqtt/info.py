@@ -245,11 +245,10 @@ def _part_info(layout: "Layout", number: int, part: "PartLayout") -> PartInfo:
     from skin_host.layout import PadKind
 
     mine = slice(part.start, part.stop)
+    is_thermal = layout.pad_kind[mine] == PadKind.THERMAL
     return PartInfo(
         period_ms=max(layout.boards[board].settings.period_ms for board in part.boards),
-        pads=[
-            "thermal" if kind == PadKind.THERMAL else "pressure" for kind in layout.pad_kind[mine]
-        ],
+        pads=["thermal" if thermal else "pressure" for thermal in is_thermal.tolist()],
         position_m=_vectors(layout.position_m[mine], _M),
         normal=_vectors(layout.normal[mine], _NORMAL),
         radius_mm=_rounded(layout.radius_mm[mine], _MM),
