@@ -27,6 +27,7 @@ from skin_host.evaluation.simulate.promises import SAMPLE_S, Promises
 from skin_host.evaluation.simulate.troubles import ACTS, KINDS, WIRING, Trouble, act
 from skin_host.evaluation.simulate.world import Life, Spot, World
 from skin_host.layout import Layout
+from skin_host.mqtt.commands import MAX_RUNNING
 
 #: How long a storm lasts, how long the calm after it may take to be well, and after what time an
 #: operator calibrates again.
@@ -583,8 +584,10 @@ class _Run:
         world = self.world
         if first:
             world.note("the operator sets everything up")
-            for part in world.layout.parts:
+            for number, part in enumerate(world.layout.parts, 1):
                 self._ask("enable", f'{{"part": "{part.name}"}}')
+                if number % MAX_RUNNING == 0:  # it would refuse the next one
+                    await world.clock.sleep(0.5)
             self._ask("thresholds", '{"reset": true}')
             for board in sorted(world.unpowered):
                 self._promises.begin(act("power"))
