@@ -196,7 +196,7 @@ class Line:
         self.refused = 0
         self.discarded = 0
         self.taken_over = False
-        self.ended_by_broker = False
+        self.ended_by_broker = self.without_reason = False
         self._broker = broker
         self._topics: list[str] = []
         self._loop = asyncio.get_running_loop()
@@ -314,7 +314,7 @@ class Line:
 
     def end(self, why: str, *, accusing: bool) -> None:
         """The broker ends the connection."""
-        self.ended_by_broker = accusing
+        self.ended_by_broker = self.without_reason = accusing
         if not self._ended.done():
             self._end(why)
 
