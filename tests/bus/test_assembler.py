@@ -588,3 +588,15 @@ def test_a_triangle_that_returns_is_late_in_its_first_sweep_however_that_is_read
     assert assembler.counters.late == 2
     (sweep,) = feed(assembler, frames(values(4), 10 * PERIOD))
     assert sweep.present == 0b1111
+
+
+def test_what_a_board_of_known_order_lost_is_counted_though_whole_sweeps_follow() -> None:
+    assembler = learnt("0-3", 4)
+    for period in range(5, 10):
+        sent = frames(values(4, period), period * PERIOD)
+        if period % 2:
+            del sent[3]
+        feed(assembler, sent)
+        if not period % 2:
+            assert assembler.counters.halves == assembler.counters.incomplete == period // 2 - 2
+        assembler.expire((period + 1) * PERIOD - 1)

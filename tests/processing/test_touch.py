@@ -317,6 +317,7 @@ def test_more_noise_takes_more_evidence_and_never_less_pressure(above, spread, f
     assert found.hold == pytest.approx(
         np.clip(2 * (found.span - band), found.span, 1.5 * found.span), rel=0.02
     )
+    assert found.leave == pytest.approx(found.enter * (1 + band / found.span) / 2, rel=0.02)
     wanted = np.clip(np.ceil(found.span / found.enter), 2, 14)
     assert found.votes.tolist() == wanted.tolist()
     assert found.fall == pytest.approx(4.0 * spread * np.array([1, factor]) * np.sqrt(2 / wanted))
@@ -397,3 +398,23 @@ def test_a_firm_press_that_ends_makes_a_soft_one_beside_it_no_firmer() -> None:
     for firm, soft in [(100.0, 5.0)] * 20 + [(3.0, 5.0)] * 4 + [(3.0, 2.1)] * 10:
         reported = residuals.step(both, np.array([firm, soft]))
     assert reported.tolist() == [False, True]
+
+
+def test_a_reset_of_one_taxel_leaves_the_touch_of_another() -> None:
+    detector = detector_of(levels_of(*np.repeat([[1.75], [1.75], [0.5], [0.5]], 2, axis=1)), 1)
+    assert pressed(detector, [5, 5]).all()
+    detector.reset(np.array([0]))
+    assert detector.any
+    detector.reset(np.array([1]))
+    assert not detector.any
+
+
+@pytest.mark.parametrize(("reading", "reported"), [(3.0, False), (3.2, True)])
+def test_of_the_three_units_of_a_hard_press_one_is_left_after_five_seconds(
+    reading: float, reported: bool
+) -> None:
+    residuals = residuals_of()
+    residuals.step(np.array([True]), np.array([100.0]))
+    residuals.step(np.array([False]), np.zeros(1))
+    residuals.fade(5.0)
+    assert bool(residuals.step(np.array([True]), np.array([reading]))[0]) is reported
