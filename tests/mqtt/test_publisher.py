@@ -111,6 +111,19 @@ async def test_everything_put_arrives_as_the_contract_says(
         assert properties.MessageExpiryInterval == 1
 
 
+async def test_frames_have_the_boards_bytes_for_as_long_as_they_are_asked_for(
+    mosquitto: Mosquitto,
+) -> None:
+    async with listening(mosquitto, "skin/+/palm/frame") as seen:
+        async with Publisher(settings(mosquitto), "robot") as publisher:
+            await until(lambda: publisher.counters.connected)
+            for number, seconds in enumerate((0.0, 3600.0, 0.0)):
+                publisher.show_raw(seconds)
+                publisher.put_frame(frame(number))
+                await until(lambda sent=number + 1: len(seen.messages) == sent)  # type: ignore[misc]
+    assert ["raw" in json.decode(one) for one in seen.payloads("frame")] == [False, True, False]
+
+
 async def test_frames_tell_their_run_also_when_it_changes_within_a_connection(
     mosquitto: Mosquitto,
 ) -> None:
