@@ -297,3 +297,23 @@ def test_an_mtb3_may_pause_for_six_periods_and_another_board_as_long_as_is_set(
     assert known.silent_after_ns.tolist() == wanted
     known.expect_pauses(1)
     assert known.silent_after_ns.tolist() == [wanted[0]] * 2
+
+
+@pytest.mark.parametrize(
+    ("interval_ms", "share", "at_ease"),
+    [
+        (50.0, 0.1, True),
+        (54.0, 0.1, True),
+        (56.0, 0.1, False),
+        (46.0, 0.1, True),
+        (44.0, 0.1, False),
+    ],
+)
+def test_a_board_is_at_ease_while_each_of_its_last_sweeps_is_near_its_period(
+    interval_ms: float, share: float, at_ease: bool
+) -> None:
+    known = after([50.0] * 16 + [interval_ms])
+    assert known.at_ease(share)[HAND] is at_ease
+    assert not known.at_ease(share)[OUTER]
+    known.set_up(HAND)
+    assert not known.at_ease(share)[HAND]
