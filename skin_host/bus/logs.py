@@ -255,7 +255,9 @@ def code_of(name: str, names: list[str]) -> int:
     return names.index(name)
 
 
-def read_channels(path: Path, window_ns: int = WINDOW_NS) -> Iterator[tuple[str, FrameBatch]]:
+def read_channels(
+    path: Path, window_ns: int = WINDOW_NS, *, merged: bool = False
+) -> Iterator[tuple[str, FrameBatch]]:
     """Yield channel and frames of a recording at full speed, in batches as from a live bus.
 
     Times are exact to the microsecond. They count from the epoch where the format has a
@@ -265,6 +267,7 @@ def read_channels(path: Path, window_ns: int = WINDOW_NS) -> Iterator[tuple[str,
     Args:
         path: file; its suffix gives the format.
         window_ns: a batch spans at most this time.
+        merged: take the frames of all channels for those of one, in the recording's order.
 
     Raises:
         LogError: absent, of unknown format, empty, or damaged; everything before the damage has
@@ -277,7 +280,8 @@ def read_channels(path: Path, window_ns: int = WINDOW_NS) -> Iterator[tuple[str,
     with contextlib.closing(_blocks(path)) as blocks:
         for block in blocks:
             n += block.messages
-            batch, channel = block.batch, block.channel
+            batch = block.batch
+            channel = np.zeros_like(block.channel) if merged else block.channel
             if rest is not None and len(rest):
                 batch, channel = rest.joined(batch), np.concatenate((rest_channel, channel))
             begin = 0

@@ -108,8 +108,12 @@ def read_buses(
     Raises:
         LogError: see `logs.read_channels`; or several buses, and none of their channels in it.
     """
-    channels = read_can(log) if log.suffix == SUFFIX else read_channels(log, window_ns)
-    if len(settings.buses) == 1:
+    merged = len(settings.buses) == 1
+    if log.suffix == SUFFIX:
+        channels = read_can(log)
+    else:
+        channels = read_channels(log, window_ns, merged=merged)
+    if merged:
         (only,) = settings.buses
         for _, batch in channels:
             yield only, batch

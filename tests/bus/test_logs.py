@@ -6,12 +6,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import can
+import msgspec
 import numpy as np
 import pytest
 
 from skin_host.bus.logs import WINDOW_NS, read_channels
 from skin_host.bus.wire import FrameBatch
+from skin_host.config.settings import Settings
 from skin_host.errors import LogError
+from skin_host.recording.replay import read_buses
 
 GRASP = Path(__file__).parents[2].parent / "shared/data/icub_grasp.log"
 MS = 1_000_000
@@ -68,6 +71,23 @@ def test_channels_are_kept_apart(tmp_path):
         ("can0", [0x4E0, 0x4E2]),
         ("can1", [0x4E1]),
     ]
+
+
+def test_channels_that_are_taken_for_one_bus_keep_their_order(tmp_path):
+    lines = [f"({1 + n * 0.0005:.4f}) can{n % 3 % 2} {0x4E0 + n:X}#40" for n in range(16)]
+    path = candump(tmp_path / "a.log", lines)
+    settings = msgspec.convert(
+        {
+            "robot": "one",
+            "buses": {"left": {}},
+            "boards": {"arm": {"bus": "left", "address": 14}},
+            "parts": {"arm": {"patches": [{"board": "arm", "triangles": "0-15"}]}},
+        },
+        Settings,
+    )
+    for window_ns in (WINDOW_NS, 25 * MS):
+        batches = [batch for _, batch in read_buses(path, settings, window_ns)]
+        assert np.concatenate([batch.id for batch in batches]).tolist() == [*range(0x4E0, 0x4F0)]
 
 
 @pytest.mark.parametrize("suffix", [".log", ".asc", ".blf", ".csv", ".trc", ".log.gz", ".asc.gz"])
