@@ -1,6 +1,5 @@
 """What all tests share: which CAN bus they run on, and a real broker."""
 
-import gc
 import itertools
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
@@ -98,12 +97,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if BROKERS & set(getattr(item, "fixturenames", ())):
             item.add_marker("mosquitto")
     items.sort(key=lambda item: _place(item.nodeid.partition("::")[0]))
-
-
-def pytest_collection_finish() -> None:
-    """Leave what was collected out of every later collection of garbage: it stays to the end."""
-    gc.collect()
-    gc.freeze()
 
 
 def _place(file: str) -> int:
