@@ -49,6 +49,7 @@ class BoardRecord:
     wrong_retry_ns: int = 0
     retry_at_ns: int = 0
     retries: int = 0
+    warned_at_ns: int | None = None
     commands: list[Message] = field(default_factory=list)
     busy: "asyncio.Task[None] | None" = None
 

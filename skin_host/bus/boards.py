@@ -73,6 +73,8 @@ WRONG_S = 1.0
 WRONG_RETRY_S = (5.0, 10.0, 20.0, 60.0)
 #: A period that differs by more than this share is not the one that was set.
 WRONG_PERIOD = 0.25
+#: What a board reports of itself is logged no oftener than this.
+WARN_S = 60.0
 #: A scan listens for so long before it asks, and again after.
 SCAN_S = 0.5
 
@@ -410,22 +412,24 @@ class Boards:
             if record.is_mtb3:
                 self._ledger.expect_pauses(record.row)
             if answer.board_type not in SKIN_BOARD_TYPES:
-                log.warning(
-                    "bus %s: board %s is of type %d, which is no skin board",
-                    self.bus,
-                    record.layout.name,
-                    answer.board_type,
-                )
+                self._warn(record, f"is of type {answer.board_type}, which is no skin board")
         elif isinstance(answer, DiscoveredBootloader):
             record.board_type = answer.board_type
             record.in_bootloader = True
-            log.warning("bus %s: board %s is in its bootloader", self.bus, record.layout.name)
+            self._warn(record, "is in its bootloader")
         elif isinstance(answer, TimeOfLife):
             record.life_s = answer.seconds
         elif isinstance(answer, TxOverflow):
             # A board that must answer in the middle of a sweep drops the rest of it: no fault.
             is_queried = not record.started or record.busy is not None
             self._ledger.tx_overflows[record.row] += not is_queried
+
+    def _warn(self, record: BoardRecord, what: str) -> None:
+        """Log what a board reports of itself, rarely: anybody on the bus can send its answers."""
+        now_ns = self._clock.monotonic_ns()
+        if record.warned_at_ns is None or now_ns - record.warned_at_ns > WARN_S * 1e9:
+            record.warned_at_ns = now_ns
+            log.warning("bus %s: board %s %s", self.bus, record.layout.name, what)
 
 
 @dataclass(slots=True)

@@ -40,7 +40,7 @@ LOGGED_BY_PORTS = {"bus_down", "bus_gone", "bus_off"}
 LASTING_S = 2.0
 #: ... of which a time without a look counts for no more than this.
 LONGEST_LOOK_S = 0.3
-_ACCUSING = {"board_jitter", "board_period", "board_twice", "bus_loses_frames"}
+_ACCUSING = {"board_jitter", "board_period", "bus_loses_frames"}
 _PASSING = {
     "board_jitter",
     "board_overflows",
@@ -105,7 +105,9 @@ class HealthWatch:
             # Shorter pauses only matter where they change time stamps.
             pause_ns = held_up_ns if any(port.stamps_late for port in ports.values()) else 0
         if pause_ns:
-            self._stall_ns, self._stalled_ns = pause_ns, now_ns
+            lately = abs(now_ns - self._stalled_ns) <= STALLED_NS
+            self._stall_ns = max(pause_ns, self._stall_ns * lately)
+            self._stalled_ns = now_ns
         self._ticked_ns = now_ns
         self._watch.tick(now_ns, ports, boards)
 
@@ -189,18 +191,25 @@ class HealthWatch:
         }
 
     def _without_own_stalls(self, faults: list[FoundFault], now_ns: int) -> list[FoundFault]:
-        """Drop the faults that a stall of this computer can cause, and add the stall itself."""
+        """Drop the faults that a stall of this computer can cause, and add the stall itself.
+
+        A short one is only added where it is the reason that a fault is not reported.
+        """
         if abs(now_ns - self._stalled_ns) > STALLED_NS:
             return faults
+        kept = [fault for fault in faults if fault.code not in _ACCUSING]
+        dropped = len(kept) < len(faults)
+        for held in self._held.values():
+            for key in [key for key in held if key[0] in _ACCUSING]:
+                del held[key]
+                dropped = True
+        if not dropped and self._stall_ns <= STALL_NS:
+            return kept
         sentence = (
             f"this computer did not look at the buses for {self._stall_ns / 1e6:.0f} ms: other "
             "work held it up, or its clock was set; for some seconds neither periods "
             "nor losses are judged"
         )
-        for held in self._held.values():
-            for key in [key for key in held if key[0] in _ACCUSING]:
-                del held[key]
-        kept = [fault for fault in faults if fault.code not in _ACCUSING]
         return [FoundFault("host_stalls", "host", sentence), *kept]
 
     def _hold(self, part: int, faults: list[FoundFault], now_ns: int) -> list[FoundFault]:

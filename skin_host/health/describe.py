@@ -338,7 +338,7 @@ class Describer:
                 for name, at_ns in watch.event_ns.items()
                 if abs(now_ns - at_ns) < LATELY_NS
             }
-            record["twice"] = watch.is_twice(now_ns)
+            record["twice"] = watch.is_twice(now_ns, board.settings.period_ms * 1_000_000)
         return record
 
     def _is_new(self, index: int) -> bool:

@@ -132,3 +132,11 @@ async def test_no_board_is_set_up_while_the_bus_is_being_discovered(clock: Stepp
     assert beginning.done()
     (discovered_s,) = (s for s, kind in port.sent if kind == MessageClass.MANAGEMENT)
     assert min(s for s, kind in port.sent if kind != MessageClass.MANAGEMENT) > discovered_s + 0.4
+
+
+def test_forged_answers_fill_no_log(heard: Heard, caplog: pytest.LogCaptureFixture) -> None:
+    for number in range(100):
+        kind = BoardType.STRAIN2 if number % 2 else BoardType.MTB4
+        heard.answer(Discovered(kind, 1, 25, 0), HAND)
+        heard.answer(DiscoveredBootloader(BoardType.MTB4, 4, 0), HAND)
+    assert len(caplog.records) == 1
