@@ -267,7 +267,7 @@ def test_the_last_sixteen_intervals_are_kept() -> None:
 def test_a_period_is_regular_within_a_tenth(spread_ms: float, regular: bool) -> None:
     """All but the longest and shortest fifth of the intervals count."""
     low, high = 50.0 - spread_ms / 2, 50.0 + spread_ms / 2
-    known = after([10.0] * 3 + [low] * 2 + [50.0] * 5 + [high] * 2 + [300.0] * 3)
+    known = after([10.0] * 3 + [low] + [50.0] * 7 + [high] + [300.0] * 3)
     found = known.regular_period_ns(HAND)
     assert found == (50 * MS if regular else None)
 
@@ -317,3 +317,5 @@ def test_a_board_is_at_ease_while_each_of_its_last_sweeps_is_near_its_period(
     assert not known.at_ease(share)[OUTER]
     known.set_up(HAND)
     assert not known.at_ease(share)[HAND]
+    known.note(sweep(HAND, T0 + 900 * MS))
+    assert known.at_ease(share)[HAND] is at_ease
