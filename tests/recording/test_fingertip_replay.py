@@ -27,7 +27,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
             robot.receive("can0", can_id, data)
     lines = []
     while robot.t_ns < 12_480_000_000:
-        batch = robot.step(0.02)["can0"]
+        batch = robot.step(0.12)["can0"]
         for row in range(len(batch)):
             t_ns = 1_763_700_000_000_000_000 + int(batch.t_ns[row])
             payload = batch.data[row, : batch.dlc[row]].tobytes().hex().upper()
