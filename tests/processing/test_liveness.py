@@ -410,3 +410,26 @@ def test_what_changes_in_every_conversion_is_known_to_and_only_conversions_count
                 raw = np.full((K, 12), 200 + sweep // sends_per_conversion % 2, np.uint8)
                 liveness.step(raw, HERE, NO)
         assert liveness._rate == pytest.approx(np.full((K, 12), changes), rel=0.02)
+
+
+def test_triangles_that_are_not_fitted_are_in_no_doubt_and_change_no_verdict() -> None:
+    rng = np.random.default_rng(8)
+    noise = np.full((K, 12), 0.8)
+    fitted = np.array([True, True, True, False])
+    some = Liveness(K, np.where(fitted[:, None], noise, 0.0), PERIOD_S, fitted=fitted)
+    three = Liveness(K - 1, noise[:-1], PERIOD_S)
+    centre = rng.uniform(200, 240, (K, 12))
+    for sweep in range(300):
+        raw = noisy_bytes(rng, 0.8, centre)
+        raw[3] = 0
+        raw[1, 4] = 222
+        if sweep > 200:
+            raw[2] = 230
+        some.step(raw, fitted, NO)
+        three.step(raw[:3], HERE[:3], NO[:3])
+        np.testing.assert_array_equal(some.frozen[:3], three.frozen)
+        np.testing.assert_array_equal(some.stuck[:3], three.stuck)
+    assert some.stuck[1, 4]
+    assert some.frozen.tolist() == [False, False, True, False]
+    assert some.doubted is not None
+    assert not some.doubted[3].any()

@@ -268,3 +268,32 @@ def test_a_stuck_pad_is_found_though_the_noise_of_the_thermal_pad_moves_its_byte
         changes += np.count_nonzero((watched.raw != before)[2, [0, 1, 9]])
     assert changes > 30
     assert np.argwhere(watched.pads.stuck).tolist() == [[2, 0], [2, 1], [2, 9]]
+
+
+@pytest.mark.parametrize("gain", [GAIN, GAIN_V2], ids=["type 0", "type 8"])
+@pytest.mark.parametrize("shift", range(stuck.MOST_SHIFT + 1))
+def test_a_pad_has_moved_when_no_word_explains_all_its_bytes(
+    shift: int, gain: tuple[int, ...]
+) -> None:
+    rng = np.random.default_rng(shift)
+    lowest, pattern = stuck._words(gain, shift, NO_LOAD, True)
+    repeats = Repeats([Encoding(gain, shift, NO_LOAD, True)])
+    words: list[set[int]] = [set() for _ in range(12)]
+    raw = np.full((1, 12), 240, np.uint8)
+    for _ in range(400):
+        before, raw = raw, np.clip(raw + rng.integers(-1, 2, (1, 12)), 0, 255).astype(np.uint8)
+        if rng.random() < 0.1:
+            raw[0, rng.integers(12)] = rng.integers(256)
+        within = inside(raw) & inside(before)
+        every = within.all()
+        moved, _ = repeats.step(raw, raw != before, None if every else within)
+        thermal = int(raw[0, THERMAL_TAXEL])
+        for pad in range(12):
+            if not within[0, pad] or not 0 < thermal < 255:
+                assert not moved[0, pad]
+                continue
+            base = int(lowest[thermal, pad]) - (int(raw[0, pad]) << shift)
+            bits = int(pattern[thermal, pad])
+            now = {base + bit for bit in range(bits.bit_length()) if bits >> bit & 1}
+            assert moved[0, pad] == words[pad].isdisjoint(now)
+            words[pad] = words[pad] & now or now
