@@ -46,7 +46,9 @@ DECIDED_NS = NS // 2
 RELAXED_NS = 60 * NS
 #: A calibration at rest began no longer ago when it is noted.
 RESTING_NS = 8 * NS
-MOST_TASKS = 100
+#: A board that is set up has so many tasks, and all else no more than this.
+TASKS_OF_BOARD = 2
+MOST_TASKS = 60
 #: Topics of events that are numbered.
 EVENTS = {"touch", "slip", "over"}
 #: So many objects may live more than after the first calm: histories that are bounded.
@@ -609,7 +611,7 @@ class Promises:
         unnamed = self.accusations.unnamed()
         if unnamed is not None:
             self.break_(unnamed)
-        if len(asyncio.all_tasks()) > MOST_TASKS:
+        if len(asyncio.all_tasks()) > MOST_TASKS + TASKS_OF_BOARD * len(world.layout.boards):
             self.break_(f"{len(asyncio.all_tasks())} tasks run")
 
     def _noise_kpa(self, life: Life, name: str) -> NDArray[np.float64]:
