@@ -489,6 +489,8 @@ ACTS: dict[str, set[str]] = {
 }
 
 _LINE = {"line_shorted", "triangle_no_ack", "triangle_not_connected"}
+_WRONG_BITS = _LINE | {"board_rezeroed", "bus_bit_errors", "taxel_out_of_range"}
+_WRONG_BITS |= {"triangle_out_of_range", "triangle_silenced"}
 _ELSEWHERE = {"triangle_not_connected", "triangle_out_of_range", "taxel_out_of_range"}
 
 KINDS: dict[str, Begin] = {
@@ -519,8 +521,13 @@ KINDS: dict[str, Begin] = {
         "data_held_low", _CHIPS | _SET_UP, _LINE | {"triangle_silenced"}, 1.0, spoils=True
     ),
     "clock_stretched": _emulated("clock_stretched", _SWAPPED, _ELSEWHERE | _LINE, 1.0, spoils=True),
-    "bit_flipped": _emulated("bit_flipped", _SWAPPED | {"bus_bit_errors"}, set(), spoils=True),
-    "slow_rise": _emulated("slow_rise", _SWAPPED | {"bus_bit_errors"}, set(), spoils=True),
+    # What a wrong bit does to a reading, or to the board that takes it for a missing chip.
+    "bit_flipped": _emulated(
+        "bit_flipped", _SWAPPED | {"bus_bit_errors"}, _WRONG_BITS, 4.0, spoils=True
+    ),
+    "slow_rise": _emulated(
+        "slow_rise", _SWAPPED | {"bus_bit_errors"}, _WRONG_BITS, 4.0, spoils=True
+    ),
     "brown_out": _emulated(
         "brown_out",
         _SWAPPED,
