@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from smbus2 import i2c_msg
 
+from emulator.chips import signal
 from emulator.clock import SteppedTime
 from emulator.probes import scene as scenes
-from emulator.probes.scene import Place, Probe, Scene
+from emulator.probes.scene import Fault, Place, Probe, Scene
 from emulator.robot import Robot
 from skin_host.bus.answers import Discovered, parse_answer
 from skin_host.bus.board import configuration
@@ -132,6 +133,29 @@ def test_signal_and_chip_fidelity_send_the_same_bytes() -> None:
         robot.bring_up()
         runs.append(bytes_of(robot, 9.0))
     assert runs[0] == runs[1] == runs[2]
+
+
+def test_sweeps_that_are_computed_ahead_are_those_that_are_computed_one_by_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    runs = []
+    for reads_ahead in (16, 1):
+        monkeypatch.setattr(signal, "_READS_AHEAD", reads_ahead)
+        robot = Robot(*load(), scenes.load(CONFIG / "scenes" / "demo.toml"))
+        probe = robot.touch(Probe(part="left_forearm", at=Place(taxel=30), force_n=[(0.0, 0.0)]))
+        robot.bring_up()
+        sent = bytes_of(robot, 3.0)
+        probe.press(2.0)
+        sent += bytes_of(robot, 1.0, 0.017)
+        mend = robot.inject(Fault(name="chip_gone", board="hand", triangle=2))
+        probe.lift()
+        sent += bytes_of(robot, 2.0)
+        mend()
+        robot.inject(Fault(name="temperature_step", value=2.0))
+        sent += bytes_of(robot, 1.0)
+        robot.inject(Fault(name="late_period", board="forearm_inner", value=7.0))
+        runs.append(sent + bytes_of(robot, 3.0))
+    assert runs[0] == runs[1]
 
 
 def test_the_size_of_a_step_does_not_change_the_bytes() -> None:
