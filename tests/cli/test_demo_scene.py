@@ -69,3 +69,22 @@ def test_a_robot_of_the_demo_is_healthy_before_and_while_it_is_pressed(config: s
         bench.run(1.0)
         wrong = {part: record["sentences"] for part, record in bench.records.items()}
         assert wrong == {part: [] for part in wrong}
+
+
+@pytest.mark.parametrize("seed", [1, 8])
+def test_pads_that_are_refused_are_as_bad_in_the_emulator(seed: int) -> None:
+    """Their own noise drives them against the end of the scale; pads with less are kept."""
+    scene = replace(load_scene(CONFIG / "scenes" / "demo.toml"), quiet=False, seed=seed)
+    bench = FaultBench(scene=scene, settle_s=0.0)
+    calibration = bench.engine.calibration
+    noise = bench.robot.skin.noise
+    assert calibration is not None
+    assert noise is not None
+    rms_units = noise.rms_units.ravel()
+    refused = ~calibration.usable
+    assert refused.any()
+    highest_raw = bench.layout.boards[0].settings.no_load - calibration.baseline + 2 * rms_units
+    assert (highest_raw[refused] > 255).all()
+    assert (rms_units[refused] > 2).all()
+    named = {where for record in bench.records.values() for where in record["taxel_verdicts"]}
+    assert named <= {"noisy", "out_of_range"}
