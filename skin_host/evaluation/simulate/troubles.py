@@ -495,7 +495,10 @@ _ELSEWHERE = {"triangle_not_connected", "triangle_out_of_range", "taxel_out_of_r
 
 KINDS: dict[str, Begin] = {
     "chip_gone": _emulated("chip_gone", _CHIPS | _SET_UP, {"triangle_not_connected"}, 1.0),
-    "stuck_taxel": _emulated("stuck_taxel", {"taxel_stuck", "taxel_unproven"}, {"taxel_stuck"}, 20),
+    # It may stay as it was pressed, until repeats are no chance any more.
+    "stuck_taxel": _emulated(
+        "stuck_taxel", {"taxel_stuck", "taxel_unproven"}, {"taxel_stuck"}, 20, spoils=True
+    ),
     "noisy_taxel": _emulated(
         "noisy_taxel",
         {"taxel_noisy", "taxel_unproven", "bus_bit_errors", *_CALIBRATED},
