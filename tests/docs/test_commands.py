@@ -26,9 +26,12 @@ MENTIONED = [
 ]
 
 
+PARSER = build_parser()
+
+
 def parsers() -> dict[str, argparse.ArgumentParser]:
     """The parser of each command."""
-    for action in build_parser()._actions:
+    for action in PARSER._actions:
         if isinstance(action, argparse._SubParsersAction):
             return dict(action.choices)
     raise AssertionError("no commands")
@@ -36,7 +39,7 @@ def parsers() -> dict[str, argparse.ArgumentParser]:
 
 @pytest.mark.parametrize("words", OURS)
 def test_a_shown_command_can_be_parsed(words: list[str]) -> None:
-    build_parser().parse_args(words[1:])
+    PARSER.parse_args(words[1:])
 
 
 @pytest.mark.parametrize("words", MENTIONED)
@@ -46,7 +49,7 @@ def test_a_mentioned_command_and_its_options_exist(words: list[str]) -> None:
     assert {word for word in words[2:] if word.startswith("-")} <= known
     # One with a file can be typed as it stands; placeholders are in capitals.
     if any(re.search(r"[a-z]\.[a-z]+$", word) for word in words[2:]):
-        build_parser().parse_args(words[1:])
+        PARSER.parse_args(words[1:])
 
 
 @pytest.mark.parametrize("command", parsers())
@@ -54,7 +57,7 @@ def test_the_example_of_a_command_can_be_parsed(command: str) -> None:
     example = (parsers()[command].epilog or "").partition("Example: ")[2]
     words = example.partition(", in ")[0].split()
     assert words[:2] == ["skin", command]
-    build_parser().parse_args(words[1:])
+    PARSER.parse_args(words[1:])
 
 
 @pytest.mark.parametrize("words", MADE)
