@@ -26,7 +26,7 @@ from skin_host.config.settings import (
 from skin_host.errors import ConfigurationError
 from skin_host.importing.report import Findings, read_source, with_part
 from skin_host.layout import TAXELS_PER_TRIANGLE, builtin_kinds
-from skin_host.layout.geometry import fit_unit
+from skin_host.layout.geometry import LARGEST_NUMBER, fit_unit
 
 LARGEST_FILE = 20_000_000
 TAXELS_PER_BOARD = TAXELS_PER_TRIANGLE * TRIANGLES_PER_BOARD
@@ -104,7 +104,7 @@ def _row(path: Path, number: int, words: list[str], findings: Findings) -> list[
         row = [float(word) for word in words]
     except ValueError:
         row = []
-    if len(row) != 6 or not np.isfinite(row).all():
+    if len(row) != 6 or not (np.abs(row) <= LARGEST_NUMBER).all():
         seen = " ".join(words)[:60]
         findings.odd((path, number), f'seen "{seen}", wanted x y z nx ny nz; taken as no place')
         return [0.0] * 6

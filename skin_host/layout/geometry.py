@@ -15,6 +15,8 @@ from skin_host.files import read_whole
 NEIGHBOUR_PITCHES = 1.6
 #: A tiled patch without places has at most this many triangles in a row.
 TILED_IN_A_ROW = 8
+#: Larger numbers in a table of positions are refused: their squares may not be finite.
+LARGEST_NUMBER = 1e6
 
 Floats = NDArray[np.float64]
 
@@ -143,6 +145,11 @@ def read_positions(where: str, path: Path, n: int) -> tuple[Floats, Floats]:
         )
     if not np.isfinite(table).all():
         raise ConfigurationError(f"{where}.positions: {path}: holds a number that is not finite")
+    if np.abs(table).max() > LARGEST_NUMBER:
+        raise ConfigurationError(
+            f"{where}.positions: {path}: seen {table.flat[np.abs(table).argmax()]:g}, wanted "
+            f"numbers between -{LARGEST_NUMBER:g} and {LARGEST_NUMBER:g}"
+        )
     length = np.linalg.norm(table[:, 3:], axis=1, keepdims=True)
     normal = np.where(length > 0, table[:, 3:] / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
     return table[:, :3], normal

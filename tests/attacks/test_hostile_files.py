@@ -154,3 +154,34 @@ def test_a_device_without_end_is_not_read_to_its_end(capsys: pytest.CaptureFixtu
 def test_a_name_with_a_zero_byte_is_a_file_that_cannot_be_read() -> None:
     with pytest.raises(OSError, match="null byte"):
         read_whole(Path("a\0b"))
+
+
+@pytest.mark.parametrize("number", ["1e308", "-1e200", "1e7"])
+def test_positions_beyond_all_bounds_are_refused_in_lines(
+    tmp_path: Path, number: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = tmp_path / "rows.txt"
+    rows.write_text(f"{number} {number} 0 0 0 {number}\n" * 384)
+    (tmp_path / "x.toml").write_text(
+        """
+        robot = "x"
+        [buses.can0]
+        [boards.b]
+        bus = "can0"
+        address = 1
+        [[parts.p.patches]]
+        board = "b"
+        triangles = "0-15"
+        positions = "rows.txt"
+        """
+    )
+    rows_of_one = tmp_path / "places.txt"
+    rows_of_one.write_text(rows.read_text())
+    arguments = ["import", "positions", str(rows_of_one), "--output", str(tmp_path / "y.toml")]
+    assert main(arguments) == 2
+    assert "Traceback" not in capsys.readouterr().err
+    rows.write_text(f"{number} {number} 0 0 0 {number}\n" * 192)
+    assert main(["check", str(tmp_path / "x.toml")]) == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert "rows.txt" in said
+    assert "1e+06" in said
