@@ -85,8 +85,11 @@ def test_a_triangle_that_stops_is_found_within_0_7_s(value: int) -> None:
     assert liveness.doubted.all(axis=1).tolist() == [False, False, True, False]
 
 
+@pytest.mark.parametrize("here", [HERE, np.array([True, True, True, False])])
 @pytest.mark.parametrize("sigma", [0.21, 0.25, 0.8])
-def test_a_triangle_is_frozen_by_the_first_repeat_beyond_what_chance_allows(sigma: float) -> None:
+def test_a_triangle_is_frozen_by_the_first_repeat_beyond_what_chance_allows(
+    sigma: float, here: np.ndarray
+) -> None:
     """Of which the calibration knows as much as from five seconds."""
     rng = np.random.default_rng(3)
     liveness = Liveness(K, np.full((K, 12), sigma), PERIOD_S)
@@ -94,10 +97,10 @@ def test_a_triangle_is_frozen_by_the_first_repeat_beyond_what_chance_allows(sigm
     (allowed,) = longest_run(np.array([changes]), 5.0 / PERIOD_S, 1e9)
     raw = noisy_bytes(rng, 3.0, np.full((K, 12), 200.0))
     # The last triangle does not change together with the others.
-    liveness.step(raw + np.array([[1], [1], [1], [0]], np.uint8), HERE, NO)
-    liveness.step(raw, HERE, NO)
+    liveness.step(raw + np.array([[1], [1], [1], [0]], np.uint8), here, NO)
+    liveness.step(raw, here, NO)
     for repeats in range(1, int(allowed) + 2):
-        liveness.step(raw, HERE, NO)
+        liveness.step(raw, here, NO)
         assert liveness.frozen[:3].tolist() == [repeats > allowed] * 3
 
 
@@ -433,3 +436,85 @@ def test_triangles_that_are_not_fitted_are_in_no_doubt_and_change_no_verdict() -
     assert some.frozen.tolist() == [False, False, True, False]
     assert some.doubted is not None
     assert not some.doubted[3].any()
+
+
+def test_a_pad_that_was_noisy_when_another_board_was_calibrated_calms_down() -> None:
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+
+    def new() -> Liveness:
+        return Liveness(K, np.full((K, 12), 0.4), PERIOD_S, boards=2)
+
+    before, after = new(), new()
+    for number in range(100):
+        raw = noisy_bytes(rng, 0.4, centre)
+        raw[3, 4] -= 40 * (number % 2)
+        before.step(raw, HERE, NO)
+    for _ in range(2):
+        before.step(noisy_bytes(rng, 0.4, centre), HERE, NO)
+    after.keep(before, np.array([False, True]))
+    assert after.noisy[3, 4]
+    for _ in range(40):
+        after.step(noisy_bytes(rng, 0.4, centre), HERE, NO)
+    assert after.doubted is None
+
+
+def test_steps_of_four_units_up_and_down_are_noise_at_the_third() -> None:
+    """Each counts as four thirds of the limit, with an eighth of the weight."""
+    liveness = Liveness(K, np.full((K, 12), 0.4), PERIOD_S)
+    found = []
+    for number in range(6):
+        raw = np.full((K, 12), 240, np.uint8)
+        raw[1, 4] -= 4 * (number % 2)
+        liveness.step(raw, HERE, NO)
+        found.append(bool(liveness.noisy[1, 4]))
+    # The first sweep is compared with nothing, and a jump is two steps.
+    assert found == [False] * 4 + [True] * 2
+
+
+def test_a_triangle_of_which_little_came_or_that_is_touched_teaches_no_rate() -> None:
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+    liveness = Liveness(K, np.full((K, 12), 0.4), PERIOD_S)
+    before = liveness._triangle_rate.copy()
+    for number in range(300):
+        here = HERE.copy()
+        here[2] = number % 4 == 0
+        liveness.step(noisy_bytes(rng, 3.0, centre), here, NO)
+    assert liveness._triangle_rate[2] == before[2]
+    assert (liveness._triangle_rate[[0, 1, 3]] != before[[0, 1, 3]]).all()
+    before = liveness._triangle_rate.copy()
+    for _ in range(300):
+        liveness.step(noisy_bytes(rng, 3.0, centre), HERE, NO, np.ones((K, 12), bool))
+    assert (liveness._triangle_rate == before).all()
+
+
+def test_a_frozen_triangle_that_reports_an_error_is_silenced_and_no_longer_frozen() -> None:
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+    liveness = calibrated(rng, 0.8, centre)
+    frozen = np.array([True, False, False, False])
+    for _ in range(40):
+        raw = noisy_bytes(rng, 0.8, centre)
+        raw[0] = 240
+        liveness.step(raw, HERE, NO)
+    assert liveness.frozen.tolist() == frozen.tolist()
+    liveness.step(raw, ~frozen, frozen)
+    assert liveness.silenced.tolist() == frozen.tolist()
+    assert not liveness.frozen.any()
+
+
+def test_after_an_error_repeats_count_from_nothing() -> None:
+    sigma = 0.21
+    liveness = Liveness(K, np.full((K, 12), sigma), PERIOD_S)
+    changes = 1.0 - (1.0 - 2.0 * sigma**2) ** 12
+    (allowed,) = longest_run(np.array([changes]), 5.0 / PERIOD_S, 1e9)
+    raw = np.full((K, 12), 240, np.uint8)
+    erring = np.array([True, False, False, False])
+    for _ in range(3):
+        liveness.step(raw, HERE, NO)
+    liveness.step(raw, ~erring, erring)
+    liveness.step(raw, HERE, NO)
+    for repeats in range(1, int(allowed) + 2):
+        liveness.step(raw, HERE, NO)
+        assert bool(liveness.frozen[0]) is bool(repeats > allowed)
