@@ -17,6 +17,8 @@ from skin_host.daemon.daemon import Daemon
 from skin_host.layout import build_layout
 from tests.support.waiting import PATIENCE_S
 
+#: How often health is looked at: a look makes that of all parts.
+HEALTH_S = 0.1
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
 
 
@@ -39,7 +41,7 @@ class Live:
 
     async def until(self, *codes: str) -> set[tuple[str, str]]:
         """Wait until all these codes are told."""
-        await self.wait(lambda: set(codes) <= {code for code, _ in self.faults()})
+        await self.wait(lambda: set(codes) <= {code for code, _ in self.faults()}, HEALTH_S)
         return self.faults()
 
     async def until_well(self, *, but: frozenset[str] = frozenset()) -> None:
@@ -47,15 +49,15 @@ class Live:
 
         A calibration of a second or two leaves the odd taxel that decides late.
         """
-        await self.wait(lambda: self._well(but))
+        await self.wait(lambda: self._well(but), HEALTH_S)
 
-    async def wait(self, condition: Callable[[], bool]) -> None:
+    async def wait(self, condition: Callable[[], bool], every_s: float = 0.02) -> None:
         """Wait until a condition holds; else say which faults there are."""
         clock = self.daemon.clock
         end_s = clock.monotonic_s() + PATIENCE_S
         while not condition():
             assert clock.monotonic_s() < end_s, f"after {PATIENCE_S:g} s: {self.faults()}"
-            await clock.sleep(0.1)
+            await clock.sleep(every_s)
 
     def _well(self, but: frozenset[str]) -> bool:
         records = self.daemon.records().values()
