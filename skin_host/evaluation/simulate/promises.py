@@ -243,8 +243,13 @@ class Promises:
         wrong[trouble.spoils] = np.maximum(wrong[trouble.spoils], until_ns)
 
     def _spoiled(self) -> Mask:
-        """Return the taxels bool[n] whose values may be wrong now."""
+        """Return the taxels bool[n] whose values may be wrong now.
+
+        A pad of real skin that has been stuck since before its calibration cannot be distinguished
+        from a quiet one.
+        """
         spoiled: Mask = self._spoiled_until_ns > self._now_ns()
+        spoiled |= ~np.isnan(self._world.robot.skin.held_ff)
         for trouble in self._spoiling:
             assert trouble.spoils is not None
             spoiled |= trouble.spoils
