@@ -1,6 +1,6 @@
 """BLF recordings, read by python-can within bounds.
 
-python-can decompresses a container to whatever it says, and reads objects of length 0 for ever.
+python-can decompresses a container to whatever size it has, and reads objects of length 0 for ever.
 Here containers are read and decompressed up to a size, and python-can gets their content.
 """
 

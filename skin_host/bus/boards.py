@@ -19,7 +19,7 @@ Properties of the firmware decide the order (reference of the wire, sections 3 a
 
 import asyncio
 import logging
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import Callable, Coroutine, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -202,13 +202,20 @@ class Boards:
         address = record.layout.settings.address
         gap_s = record.gap_s
         frames = [command_frame(command, address) for command in record.commands]
+
         believed = not self._ledger.missing(record.row) and (
             record.configurations > 0 or self._is_in_use(record)
         )
-        self._zeroed(record.index, believed)
-        await self._port.send(frames, gap_s)
+
+        def announced(zeroing: list[tuple[int, bytes]]) -> Iterator[tuple[int, bytes]]:
+            # Drawn when this board's turn on the bus comes. Set-ups of others take seconds; until
+            # then the board sends with the zero that it has.
+            self._zeroed(record.index, believed)
+            yield from zeroing
+
+        await self._port.send(announced(frames), gap_s)
         await self._clock.sleep(max(gap_s, NEW_OFFSET_S))
-        await self._port.send([frames[-1]])
+        await self._port.send(announced(frames[-1:]))
         await self._clock.sleep(max(gap_s, NEW_OFFSET_S))
         await self._port.send([command_frame(SetTxMode(TxMode.START), address)])
         record.configurations += 1

@@ -7,7 +7,7 @@ import pytest
 
 from skin_host.bus.answers import Discovered, DiscoveredBootloader, answer_frame
 from skin_host.bus.boards import Boards
-from skin_host.bus.commands import BoardType, Message
+from skin_host.bus.commands import BoardType, Message, SetTriangleConfig, parse_command
 from skin_host.bus.wire import FrameBatch, MessageClass, identifier
 from skin_host.clock import SteppedClock
 from skin_host.config.settings import load
@@ -132,6 +132,48 @@ async def test_no_board_is_set_up_while_the_bus_is_being_discovered(clock: Stepp
     assert beginning.done()
     (discovered_s,) = (s for s, kind in port.sent if kind == MessageClass.MANAGEMENT)
     assert min(s for s, kind in port.sent if kind != MessageClass.MANAGEMENT) > discovered_s + 0.4
+
+
+class Taken:
+    """A bus that takes the commands of one sender after another's, as a port does."""
+
+    def __init__(self, clock: SteppedClock) -> None:
+        self._clock = clock
+        self._lock = asyncio.Lock()
+        self.taken: list[tuple[int, Message | None]] = []
+
+    async def send(self, frames: Iterable[tuple[int, bytes]], gap_s: float = 0.0) -> None:
+        async with self._lock:
+            for frame in frames:
+                command = parse_command(*frame)
+                assert command is not None
+                self.taken.append(command)
+                await self._clock.sleep(gap_s)
+
+
+@stepped
+async def test_a_zero_is_announced_when_the_bus_is_free_for_it(clock: SteppedClock) -> None:
+    """Earlier, the board still sends with the old zero, for seconds where a bus has ten boards."""
+    heard, port = Heard(), Taken(clock)
+    listed = [(i, heard.engine.layout.boards[i]) for i in heard.engine.boards]
+    layout, ledger = heard.engine.layout, heard.engine.ledger
+
+    def announce(index: int, _: bool) -> None:
+        port.taken.append((layout.boards[index].settings.address, None))
+
+    boards = Boards("can0", port, listed, layout.triangles, ledger, zeroed=announce, clock=clock)
+    addresses = list(boards.records)
+    await asyncio.gather(*(boards.set_up(address) for address in addresses))
+    announced, zeroed = 0, []
+    for address, command in port.taken:
+        if command is None:
+            announced = address
+        elif address != announced:
+            announced = 0
+        if isinstance(command, SetTriangleConfig):
+            assert announced == address
+            zeroed.append(address)
+    assert set(zeroed) == set(addresses)
 
 
 def test_forged_answers_fill_no_log(heard: Heard, caplog: pytest.LogCaptureFixture) -> None:

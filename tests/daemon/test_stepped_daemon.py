@@ -16,6 +16,7 @@ from skin_host.mqtt.messages import ContactState
 from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.events import Touch
 from tests.support.live import Live, living
+from tests.support.stack import ROOT
 from tests.support.stepped import stepped
 
 PRESS = Probe(
@@ -27,6 +28,7 @@ PRESS = Probe(
     repeat_s=2.0,
 )
 LATELY = frozenset({"board_rezeroed"})
+KASPAR = ROOT / "config" / "kaspar.toml"
 
 
 @asynccontextmanager
@@ -203,3 +205,18 @@ async def test_health_that_does_not_change_is_worked_out_once_a_second(
         live.robot.inject(Fault(name="board_silent", board="hand"))
         await clock.sleep(0.9)
         assert recorded.count(0) >= 2
+
+
+@stepped
+async def test_boards_that_are_set_up_one_after_the_other_feel_nothing_new(
+    clock: SteppedClock, tmp_path: Path
+) -> None:
+    """Ten boards on one bus: the last one is zeroed seconds after the command."""
+    bus = Bus(interface="virtual", channel="stepped-ten")
+    async with living(bus, tmp_path, config=KASPAR, calibrate_s=3.0, clock=clock) as live:
+        await live.until_well(but=LATELY)
+        said: list[Touch] = []
+        live.daemon.publisher.put_touch = said.append  # type: ignore[method-assign]
+        await live.daemon.configure()
+        await clock.sleep(6.0)
+        assert not said
