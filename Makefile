@@ -22,7 +22,7 @@ demo: .venv/demo.stamp  ## emulator, daemon, broker and page together; DURATION=
 AGAIN := --reruns=1 -rR
 
 # What comes in files stays in one process with its fixtures; the order is that of tests/conftest.py.
-BY_FILE := --numprocesses=3 --dist=loadfile --no-loadscope-reorder
+BY_FILE := --numprocesses=4 --dist=loadfile --no-loadscope-reorder
 
 # In a fresh clone mypy takes as long as a fifth of the tests: it runs beside them.
 test: .venv/dev.stamp  ## all that needs no root, no hardware and no broker, and takes no minutes
