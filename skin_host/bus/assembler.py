@@ -498,13 +498,7 @@ class Assembler:
         state.values[places[-1]] = payload
         state.last_place = places[-1]
         state.stray = 0
-        missed = 0
-        if state.sent_last_ns:
-            apart = round((last_ns - state.sent_last_ns) / state.period_ns)
-            missed = max(0, apart - 1)
-        counters = self.counters
-        counters.sweeps += 1
-        counters.missed += missed
+        missed = self._count_sweep(state, last_ns)
         if state.any_absent:
             state.absent_for = [0] * TRIANGLES
             state.any_absent = False
@@ -617,13 +611,7 @@ class Assembler:
         """End a sweep; `values` uint8[32 * 7] are given if they are not those of the state."""
         got = state.awaited & ~state.missing
         present = got & got >> TRIANGLES
-        missed = 0
-        if state.sent_last_ns:
-            apart = round((state.last_ns - state.sent_last_ns) / state.period_ns)
-            missed = max(0, apart - 1)
-        counters = self.counters
-        counters.sweeps += 1
-        counters.missed += missed
+        missed = self._count_sweep(state, state.last_ns)
         if values is None:
             values = np.frombuffer(bytearray().join(state.values), np.uint8)
         triangles = values.reshape(TRIANGLES, 2 * _PAYLOAD)
@@ -632,7 +620,7 @@ class Assembler:
             self._note_stray(state)
             state.expected = -1
         if got != state.wanted:
-            counters.incomplete += state.missing != 0
+            self.counters.incomplete += state.missing != 0
             state.lone = got ^ present * _BOTH
             triangles[[not present >> triangle & 1 for triangle in range(TRIANGLES)]] = 0
             self._note_absent(state, present)
@@ -651,6 +639,16 @@ class Assembler:
         state.sent_first_ns = state.first_ns
         state.sent_last_ns = state.last_ns
         state.missing = 0
+
+    def _count_sweep(self, state: _BoardState, last_ns: int) -> int:
+        """Count a sweep and those missed since the board's last one; return the latter."""
+        missed = 0
+        if state.sent_last_ns:
+            apart = round((last_ns - state.sent_last_ns) / state.period_ns)
+            missed = max(0, apart - 1)
+        self.counters.sweeps += 1
+        self.counters.missed += missed
+        return missed
 
     def _learn_order(self, state: _BoardState, came: list[tuple[bytes, int, int]]) -> None:
         """Note the order of a complete sweep, if its frames are of full length."""
