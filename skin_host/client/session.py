@@ -481,8 +481,6 @@ class SkinClient:
             return
         item = read(kind, part, payload)
         now_s = _now_s()
-        stamp = None if message.retain else stamp_of(message.properties)
-        sent_s = None if stamp is None else stamp.sent_s
         if isinstance(item, Touch | Slip | Over):
             run = run_of(message.properties)
             for event in self._order.take(item, run, now_s):
@@ -498,11 +496,11 @@ class SkinClient:
                 state = None if item is None else item.state
                 again = newness is None
                 self._presence.take_state(
-                    part, state, now_s, link.number, again=again, sent_s=sent_s
+                    part, state, now_s, link.number, again=again, sent_s=_sent_s(message)
                 )
         elif self._newness(kind, part, message):
             if not message.retain:
-                self._presence.take_sign(part, now_s, sent_s)
+                self._presence.take_sign(part, now_s, _sent_s(message))
             if item is None:
                 self._latest.pop(part, None)
             else:
@@ -551,6 +549,12 @@ def _check_several(brokers: list[Broker], robot: str | None) -> None:
         raise RequestError(
             "several brokers need MQTT 5, which distinguishes new messages from old ones"
         )
+
+
+def _sent_s(message: Message) -> float | None:
+    """When a state was published, by the node's clock; None: it was stored, or does not show."""
+    stamp = None if message.retain else stamp_of(message.properties)
+    return None if stamp is None else stamp.sent_s
 
 
 def _now_s() -> float:
