@@ -228,6 +228,14 @@ class Daemon:
         self.engine.disabled.add(part)
         self._end_contacts(part)
 
+    def enable(self, part: int) -> None:
+        """Publish everything of a part again."""
+        self.engine.disabled.discard(part)
+        here = self.layout.parts[part]
+        # A board may have been zeroed meanwhile while something pressed the part.
+        doubted = self.engine.zero_at_risk(touched=False)
+        self._contacts[part].doubt(doubted[here.start : here.stop])
+
     def set_thresholds(self, thresholds: Thresholds) -> None:
         """Apply these changes to the configured touch thresholds; baselines are kept."""
         self.thresholds = thresholds

@@ -110,7 +110,9 @@ class PartContact:
         self._jump_ns = max(0, self._jump_ns + jump_ns)
 
     def doubt(self, taxels: NDArray[np.bool_]) -> None:
-        """Something may touch these taxels [m], as it did when an earlier daemon ended."""
+        """Something may touch these taxels [m], as it did when an earlier daemon ended, or while
+        the part was disabled.
+        """
         self._lost[taxels & self._usable] = SURE_FRAMES
         self._is_unsure = True
 

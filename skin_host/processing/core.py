@@ -513,7 +513,13 @@ class Engine:
         for sample in samples:
             if self._run is not None:
                 self._collect(self._run, sample)
-            if self._pipeline is not None and sample.part not in self.disabled:
+            if self._pipeline is None:
+                continue
+            if sample.part in self.disabled:
+                # What touches it is not published, but must not become a zero, and it drifts.
+                frame = self._pipeline.follow(sample.part, sample.raw, sample.present, sample.t_ns)
+                self._note_touched(sample.part, frame)
+            else:
                 frame = self._pipeline.step(
                     sample.part,
                     sample.raw,

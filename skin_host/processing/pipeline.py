@@ -150,6 +150,20 @@ class Pipeline:
         """
         return self._parts[part_index].step(raw, present, t_ns, pressures)
 
+    def follow(
+        self, part_index: int, raw: NDArray[np.uint8], present: Mask, t_ns: int
+    ) -> PressureFrame:
+        """Process one sweep of a part of which nothing is published: it takes no number.
+
+        Args:
+            part_index, raw, present, t_ns: see `step`.
+        """
+        part = self._parts[part_index]
+        number = part.seq
+        frame = part.step(raw, present, t_ns, pressures=False)
+        part.seq = number
+        return frame
+
     def set_zero(self, taxels: NDArray[np.int32], baseline: NDArray[np.float64]) -> None:
         """Continue from new baselines, because a board was zeroed.
 

@@ -6,8 +6,8 @@ calibration is then off by some units, and whatever pressed at that moment has b
 the host observes the taxels for a while and moves the baselines by their new readings. The zero of
 a taxel that was touched just before is unknown; it is in doubt until it is calibrated again.
 
-A press that nobody felt begin (the daemon was not running, the part was disabled) becomes the zero
-too. It shows when it lifts: the pad then reads far below zero, which nothing can press it to.
+A press that nobody felt begin (the daemon was not running) becomes the zero too. It shows when it
+lifts: the pad then reads far below zero, which nothing can press it to.
 """
 
 import numpy as np

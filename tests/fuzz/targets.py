@@ -144,6 +144,7 @@ class Commands:
             configure=nothing,
             reload=nothing,
             disable=engine.disabled.add,
+            enable=engine.disabled.discard,
             thresholds=load_kept(folder() / "none", NodeState).thresholds,
             set_thresholds=lambda new: setattr(daemon, "thresholds", new),
             keep=lambda _: None,

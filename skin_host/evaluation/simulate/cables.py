@@ -33,8 +33,8 @@ PAIR_NS = 12_000_000
 BURST_NS = 16_000_000
 #: The part of a status word that names an error.
 ERROR = 0xF
-#: Sweeps of a triangle that are kept.
-KEPT = 128
+#: Sweeps of a triangle that are kept: those of two boards at one address while the computer stalls.
+KEPT = 256
 _STREAMS = {int(MessageClass.SKIN_STREAM), int(MessageClass.ANALOG_STREAM)}
 #: First bytes of the frames of a sweep: of 16 triangles at most.
 _HEADERS = bytes([HEADER_A, HEADER_B]) * 16

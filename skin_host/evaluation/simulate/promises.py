@@ -189,7 +189,7 @@ class Promises:
         self._connected_ns: int | None = None
         self._connection = 0
         self._blank_since: dict[str, int] = {}
-        self._clock_set_ns = -(1 << 62)
+        self._clock_set_ns = self._stalled_ns = -(1 << 62)
         self._objects: int | None = None
         #: Of each part the triangles that a board sends one after the other.
         self._runs = {part.name: _runs(layout, part.start, part.stop) for part in layout.parts}
@@ -226,6 +226,8 @@ class Promises:
                 self._recover(trouble)
         if trouble.name == "clock_set":
             self._clock_set_ns = now_ns
+        if trouble.name == "stall":
+            self._stalled_ns = now_ns
 
     def end(self, trouble: Trouble) -> None:
         """A trouble ends."""
@@ -511,6 +513,8 @@ class Promises:
         waiting = sum(
             (state.awaited & ~state.missing).bit_count() for state in states if state.missing
         )
+        # A lone frame of the last sweep waits for its other half.
+        waiting += sum(state.lone.bit_count() for state in states)
         told = (
             counters.other
             + counters.force_torque
@@ -716,7 +720,8 @@ class Promises:
         """The broker keeps what the daemon wants it to keep."""
         assert self._connected_ns is not None
         for topic, (payload, put_ns) in self._said.items():
-            if now_ns - max(put_ns, self._connected_ns) < RETAINED_NS:
+            # What was put just before a stall leaves after it.
+            if now_ns - max(put_ns, self._connected_ns, self._stalled_ns) < RETAINED_NS:
                 continue
             kept = self._world.broker.retained.get(topic)
             if kept != payload:

@@ -517,9 +517,12 @@ KINDS: dict[str, Begin] = {
     "shared_address": _emulated(
         "shared_address", _SWAPPED | {"bus_bit_errors"}, _ELSEWHERE, 1.0, spoils=True
     ),
-    # It sends bytes of other registers.
-    "no_acknowledge": _emulated("no_acknowledge", _SWAPPED, _LINE, 1.0, spoils=True),
-    # It holds for one sweep, which may pass between two looks of health; what follows does not.
+    # Each of these two shows as an error in one sweep, which may pass between two looks of health:
+    # then its board zeroes itself, and what follows does not. The first sends bytes of other
+    # registers.
+    "no_acknowledge": _emulated(
+        "no_acknowledge", _SWAPPED, _LINE | {"triangle_silenced"}, 1.0, spoils=True
+    ),
     "data_held_low": _emulated(
         "data_held_low", _CHIPS | _SET_UP, _LINE | {"triangle_silenced"}, 1.0, spoils=True
     ),

@@ -59,3 +59,14 @@ def test_a_sweep_that_comes_whole_is_noted_as_its_frames_are(seed: int) -> None:
     assert at_once._whole == by_frames._whole
     assert at_once._half == by_frames._half
     assert any(by_frames._whole.values())
+
+
+def test_what_two_boards_at_one_address_send_in_the_longest_stall_is_known() -> None:
+    """It waits to be read all that time, and may then be reported as valid."""
+    sent = Sent()
+    rng = np.random.default_rng(1)
+    values = rng.integers(0, 256, (200, 1, 12)).astype(np.uint8)
+    for number, raw in enumerate(values):
+        ids, data = encode_sweep(1, np.array([0]), raw, np.zeros(1, np.uint16))
+        sent.note(FrameBatch(ids, np.full(2, 8, np.uint8), data, np.full(2, 25 * MS * number)))
+    assert list(sent.find(1, 0, values[0].tobytes()))

@@ -1,6 +1,7 @@
 """Bugs that seeds of `skin simulate` found, each as a claim."""
 
 import asyncio
+import random
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,7 +15,9 @@ from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus
 from skin_host.demo import configuration
 from skin_host.evaluation.simulate.cables import Cable, Sent, SimulatedPort
+from skin_host.evaluation.simulate.promises import Promises
 from skin_host.evaluation.simulate.trace import Trace
+from skin_host.evaluation.simulate.troubles import KINDS
 from skin_host.evaluation.simulate.world import Life, World
 
 DEMO = configuration("demo.toml")
@@ -200,6 +203,39 @@ def test_a_board_that_restarts_in_a_press_does_not_zero_it_away(world: World, nu
         runner.run(live())
 
 
+def test_a_board_that_is_set_up_while_a_disabled_part_is_pressed_does_not_zero_that_away(
+    world: World,
+) -> None:
+    """Nothing is published of a disabled part, and it is felt all the same."""
+
+    async def live() -> None:
+        life = start(world)
+        await world.clock.sleep(8.0)
+        spot = world.spots[0]
+        index = [part.name for part in world.layout.parts].index(spot.part)
+        part = world.layout.parts[index]
+        life.daemon.disable(index)
+        pipeline = life.daemon.engine.pipeline
+        assert pipeline is not None
+        number = pipeline.seq(index)
+        pressing = asyncio.create_task(spot.press(9.0, 50.0), name="press")
+        await world.clock.sleep(2.0)
+        await life.daemon.configure()
+        await world.clock.sleep(4.0)
+        assert pipeline.seq(index) == number
+        life.daemon.enable(index)
+        await world.clock.sleep(1.0)
+        assert not pressing.done()
+        board = world.layout.triangles[int(world.layout.triangle_of[part.start + spot.taxel])].board
+        assert life.daemon.engine.in_doubt(board).any()
+        topic = life.daemon.publisher.topics.part("contact", spot.part)
+        assert world.broker.retained[topic] == b"UNKNOWN"
+        life.kill()
+
+    with world.clock.runner() as runner:
+        runner.run(live())
+
+
 def test_a_shorted_data_line_that_two_parts_share_is_named_by_both(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -223,6 +259,60 @@ def test_a_shorted_data_line_that_two_parts_share_is_named_by_both(
 
     with world.clock.runner() as runner:
         runner.run(live())
+
+
+def test_a_frame_whose_other_half_was_lost_just_before_the_end_is_accounted_for(
+    world: World,
+) -> None:
+    """It is counted as lone when the next sweep begins, and none does."""
+
+    async def live() -> str | None:
+        promises = Promises(world)
+        life = world.life = Life(world)
+        life.start(promises.watch)
+        await world.clock.sleep(6.0)
+        for lost, seconds in ((0.3, 0.2), (1.0, 0.15)):
+            for wire in world.cables.values():
+                wire.mischief.lost = lost
+            await world.clock.sleep(seconds)
+        await world.end()
+        assert any(
+            state.lone
+            for assembler in life.daemon.engine.assemblers.values()
+            for state in assembler._states.values()
+        )
+        promises.broken = None  # health names losses that nobody noted
+        promises.over(life, whole=True)
+        return promises.broken
+
+    with world.clock.runner() as runner:
+        assert runner.run(live()) is None
+
+
+def test_what_is_retained_just_before_a_stall_is_at_the_broker_after_it(world: World) -> None:
+    """It was on its way: seconds have passed when it arrives, and nobody was late."""
+
+    async def live() -> str | None:
+        promises = Promises(world)
+        life = world.life = Life(world)
+        life.start(promises.watch)
+        await world.clock.sleep(8.0)
+        promises.sample()
+        promises.contacts()
+        put_ns = max(put_ns for _, put_ns in promises._said.values())
+        while put_ns == max(put_ns for _, put_ns in promises._said.values()):
+            await world.clock.sleep(0.0005)
+        stall = KINDS["stall"](world, random.Random(7), True)
+        assert stall.about == "stall 4.72 s"
+        promises.begin(stall)
+        promises.contacts()
+        await world.clock.sleep(3.0)
+        promises.contacts()
+        life.kill()
+        return promises.broken
+
+    with world.clock.runner() as runner:
+        assert runner.run(live()) is None
 
 
 def test_halves_of_sweeps_that_a_full_bus_held_up_are_paired_though_one_was_lost() -> None:
