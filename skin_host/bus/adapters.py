@@ -21,6 +21,8 @@ from skin_host.errors import BusError, ConfigurationError
 CAPACITY = 1024
 #: A time stamp farther from now than this is an uptime or a counter, not a time of day.
 _PLAUSIBLE_S = 3600.0
+#: A controller that still has many errors reports one within this time.
+CALM_S = 10.0
 MULTICAST = "udp_multicast"
 #: Stands for a frame that the adapter's library could not read.
 _UNREADABLE = can.Message()
@@ -64,6 +66,7 @@ class AdapterPort(Port):
         super().__init__(name, settings, bus, clock)
         self._opener: Executor | None = None
         self._opening: Future[can.BusABC] | None = None
+        self._calm_at_s = 0.0
         self._id = np.zeros(CAPACITY, np.uint32)
         self._dlc = np.zeros(CAPACITY, np.uint8)
         self._data = np.zeros((CAPACITY, 8), np.uint8)
@@ -89,11 +92,21 @@ class AdapterPort(Port):
         batch = FrameBatch(self._id[:n], self._dlc[:n], self._data[:n], self._t_ns[:n])
         if errors:
             self._note_errors(batch)
-        elif n and self.state is LinkState.BUS_OFF:
-            self._enter(LinkState.UP)  # it receives
+            self._calm_at_s = self._clock.monotonic_s() + CALM_S
+        elif n and self._is_over():
+            self._enter(LinkState.UP)
         if self.state is not self._logged_state:
             self._log_state()
         return batch
+
+    def _is_over(self) -> bool:
+        """Whether a bus that receives has left the state that error frames reported.
+
+        Not every adapter reports the end, and over multicast anybody can send an error frame.
+        """
+        if self.state is LinkState.ERROR_PASSIVE:
+            return self._clock.monotonic_s() > self._calm_at_s
+        return self.state is LinkState.BUS_OFF
 
     def close(self) -> None:
         super().close()

@@ -253,6 +253,7 @@ class Assembler:
     Attributes:
         stranger_id: the most frequent identifier among motor frames, when these were last more than
             half of a batch; otherwise None.
+        unconfigured: frames of the skin stream by address of a board that is not configured.
         crowded: per board, sweeps that began within half a period of the previous one with a frame
             that was already in it: no board sends like that, but two at one address do.
     """
@@ -265,6 +266,7 @@ class Assembler:
     ) -> None:
         self.counters = AssemblerCounters()
         self.stranger_id: int | None = None
+        self.unconfigured: Counter[int] = Counter()
         self.crowded: Counter[int] = Counter()
         self._force_torque = force_torque
         self._states: dict[int, _BoardState] = {}
@@ -414,10 +416,12 @@ class Assembler:
         return False
 
     def _count_stranger(self, identifier: int) -> None:
-        if identifier >> 4 & 0xF in self._states:
+        address = identifier >> 4 & 0xF
+        if address in self._states:
             self.counters.unknown_triangle += 1
         else:
             self.counters.unknown_board += 1
+            self.unconfigured[address] += 1
 
     def _is_doubled(self, state: _BoardState, bit: int, payload: bytes, t_ns: int) -> bool:
         """Count the frame that the board sent last, if it comes once more.

@@ -25,6 +25,8 @@ class BoardRecord:
         started: it has been set up and commanded to send.
         alive: it sends.
         configurations: how often it was set up.
+        unanswered: queries in a row to which it sent no answer.
+        claimed_ns: when it last answered that it is in its bootloader, or reads no skin.
 
     Times ending in `_at_ns`, and `answered_ns`, are monotonic; the others are on the clock of
     the ledger, which stands still while the bus is not read.
@@ -43,6 +45,8 @@ class BoardRecord:
     configured_at_ns: int = 0
     life_s: float | None = None
     answered_ns: int = 0
+    unanswered: int = 0
+    claimed_ns: int = 0
     wrong: str = ""
     wrong_since_ns: int = 0
     wrong_tries: int = 0
@@ -64,6 +68,17 @@ class BoardRecord:
     def is_wrong_type(self) -> bool:
         """Whether it has answered that it reads no skin."""
         return self.board_type is not None and self.board_type not in SKIN_BOARD_TYPES
+
+    @property
+    def claims(self) -> bool:
+        """Whether its last answer was that it cannot send skin values."""
+        return self.in_bootloader or self.is_wrong_type
+
+    def disclaim(self) -> None:
+        """That answer is not valid any more."""
+        self.in_bootloader = False
+        if self.is_wrong_type:
+            self.board_type = None
 
     @property
     def gap_s(self) -> float:

@@ -18,9 +18,11 @@ Properties of the firmware decide the order (reference of the wire, sections 3 a
 """
 
 import asyncio
+import contextlib
 import logging
-from collections.abc import Callable, Coroutine, Iterable, Iterator
+from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Protocol
 
 from skin_host.bus.answers import (
@@ -32,7 +34,6 @@ from skin_host.bus.answers import (
 )
 from skin_host.bus.board import GAP_S, BoardRecord, configuration
 from skin_host.bus.commands import (
-    SKIN_BOARD_TYPES,
     BoardType,
     Discover,
     GetTimeOfLife,
@@ -75,6 +76,11 @@ WRONG_RETRY_S = (5.0, 10.0, 20.0, 60.0)
 WRONG_PERIOD = 0.25
 #: What a board reports of itself is logged no oftener than this.
 WARN_S = 60.0
+#: An answer counts until so many queries after it were not answered.
+UNANSWERED = 2
+#: A board that sends for so long after it answered that it is in its bootloader, or reads no skin,
+#: did not send that answer, or is another one by now.
+CLAIM_S = 5.0
 #: A scan listens for so long before it asks, and again after.
 SCAN_S = 0.5
 
@@ -84,6 +90,15 @@ class Sender(Protocol):
 
     async def send(self, frames: Iterable[tuple[int, bytes]], gap_s: float = ...) -> None:
         """Send (identifier, data) frames, `gap_s` apart. Raises BusError."""
+
+
+@dataclass(slots=True)
+class _Unconfigured:
+    """A board that answered and is not configured: it is present while it answers or sends."""
+
+    ask_at_ns: int
+    frames: int
+    unanswered: int = 0
 
 
 class Boards:
@@ -98,6 +113,10 @@ class Boards:
         zeroed: called just before a board is zeroed, with its index and whether the values that it
             sent until then were those that it had been set up to send.
         clock: for waiting.
+        unconfigured: frames by address of boards that are not configured, see `Assembler`.
+
+    Attributes:
+        strangers: the types of the boards that are not configured, by address.
     """
 
     def __init__(
@@ -109,6 +128,7 @@ class Boards:
         ledger: BoardLedger,
         zeroed: Callable[[int, bool], object] = lambda *_: None,
         clock: Clock = SYSTEM,
+        unconfigured: Mapping[int, int] = MappingProxyType({}),
     ) -> None:
         self.bus = bus
         self._zeroed = zeroed
@@ -119,6 +139,9 @@ class Boards:
             board.settings.address: BoardRecord(i, ledger.row[i], board) for i, board in boards
         }
         self.strangers: dict[int, int] = {}
+        self._sent_by = unconfigured
+        self._unconfigured: dict[int, _Unconfigured] = {}
+        self._asking: asyncio.Task[None] | None = None
         self._failed = False
         for record in self.records.values():
             mine = [triangle for triangle in triangles if triangle.board == record.index]
@@ -258,13 +281,43 @@ class Boards:
                 at_ease[record.row]
                 and record.alive
                 and record.configurations
-                and not (record.wrong or record.wrong_tries)
+                and not (record.wrong or record.wrong_tries or record.claims)
             ):
                 continue  # the usual case, checked for all boards at once
             if self._ledger.overdue(record.row, record.configured_ns):
                 self._note_silence(record, now_ns)
             elif self._ledger.since_set_up(record.row):
                 self._note_sending(record, now_ns)
+        self._ask_unconfigured(now_ns)
+
+    def _ask_unconfigured(self, now_ns: int) -> None:
+        """Query the boards that are not configured again, to forget those that are gone.
+
+        One that sends is not queried: that would stop an MTB3.
+        """
+        asked = []
+        for address in self.strangers:
+            known = self._unconfigured[address]
+            if now_ns < known.ask_at_ns:
+                continue
+            known.ask_at_ns = now_ns + int(RETRY_S[-1] * 1e9)
+            frames, known.frames = known.frames, self._sent_by.get(address, 0)
+            if known.frames != frames:
+                known.unanswered = 0
+            else:
+                asked.append(address)
+        for address in asked:
+            if self._unconfigured[address].unanswered >= UNANSWERED:
+                del self.strangers[address]
+        asked = [address for address in asked if address in self.strangers]
+        if asked and (self._asking is None or self._asking.done()):
+            self._asking = asyncio.create_task(self._ask(asked), name=f"query {self.bus}")
+
+    async def _ask(self, addresses: list[int]) -> None:
+        with contextlib.suppress(BusError):  # they are queried again
+            await self._port.send([command_frame(Discover(), address) for address in addresses])
+            for address in addresses:
+                self._unconfigured[address].unanswered += 1
 
     def _note_silence(self, record: BoardRecord, now_ns: int) -> None:
         if record.alive:
@@ -283,6 +336,8 @@ class Boards:
         if not record.alive:
             record.alive = True
             log.debug("bus %s: board %s is sending", self.bus, record.layout.name)
+        if record.claims and now_ns - record.claimed_ns > CLAIM_S * 1e9:
+            record.disclaim()
         self._judge(record, now_ns)
         if not record.wrong or now_ns - record.wrong_since_ns < WRONG_S * 1e9:
             if not record.wrong and now_ns - record.wrong_retry_ns > WRONG_RETRY_S[-1] * 1e9:
@@ -370,6 +425,9 @@ class Boards:
             if tells_age and self._ledger.sweeps[record.row] > sweeps and sent_before:
                 return  # it only paused
             await self._clock.sleep(GAP_S)
+        record.unanswered = 0 if record.answered_ns else record.unanswered + 1
+        if record.unanswered >= UNANSWERED:
+            record.disclaim()
         mute = record.board_type is None and record.retries % MUTE_QUESTIONS == 0
         if record.in_bootloader or not (record.answered_ns or mute):
             return
@@ -388,7 +446,8 @@ class Boards:
         Raises:
             BusError: the bus does not take frames.
         """
-        await cancel(*(one.busy for one in self.records.values() if one.busy is not None))
+        busy = [self._asking, *(record.busy for record in self.records.values())]
+        await cancel(*(task for task in busy if task is not None))
         for address, record in self.records.items():
             record.started = False
             await self._port.send([command_frame(SetTxMode(TxMode.STOP), address)])
@@ -405,6 +464,9 @@ class Boards:
         if record is None:
             if isinstance(answer, Discovered):
                 self.strangers[address] = answer.board_type
+                ask_at_ns = self._ledger.now_ns + int(RETRY_S[-1] * 1e9)
+                frames = self._sent_by.get(address, 0)
+                self._unconfigured[address] = _Unconfigured(ask_at_ns, frames)
             return
         if isinstance(answer, Discovered | DiscoveredBootloader | TimeOfLife):
             record.answered_ns = self._clock.monotonic_ns()
@@ -418,11 +480,13 @@ class Boards:
             record.in_bootloader = False
             if record.is_mtb3:
                 self._ledger.expect_pauses(record.row)
-            if answer.board_type not in SKIN_BOARD_TYPES:
+            if record.is_wrong_type:
+                record.claimed_ns = self._ledger.now_ns
                 self._warn(record, f"is of type {answer.board_type}, which is no skin board")
         elif isinstance(answer, DiscoveredBootloader):
             record.board_type = answer.board_type
             record.in_bootloader = True
+            record.claimed_ns = self._ledger.now_ns
             self._warn(record, "is in its bootloader")
         elif isinstance(answer, TimeOfLife):
             record.life_s = answer.seconds

@@ -59,11 +59,15 @@ class FullScale(Analog):
     value: int
 
 
+def scale_queries(board: int) -> list[tuple[int, bytes]]:
+    """Return the frames that query all full scales of a board."""
+    return [command_frame(GetFullScale(channel), board) for channel in range(CHANNELS)]
+
+
 def start_frames(board: int, period_ms: int) -> list[tuple[int, bytes]]:
     """Return the frames that set a board up: query all full scales, set the period, start it."""
-    asked: list[Analog] = [GetFullScale(channel) for channel in range(CHANNELS)]
-    asked += [SetTransmissionPeriod(period_ms), SetTxMode(StrainMode.CALIBRATED)]
-    return [command_frame(command, board) for command in asked]
+    commands: list[Analog] = [SetTransmissionPeriod(period_ms), SetTxMode(StrainMode.CALIBRATED)]
+    return scale_queries(board) + [command_frame(command, board) for command in commands]
 
 
 def parse_full_scale(can_id: int, payload: bytes) -> tuple[int, FullScale] | None:

@@ -158,6 +158,7 @@ class Link:
                     engine.ledger,
                     self._zeroed,
                     clock,
+                    engine.assemblers[bus].unconfigured,
                 )
                 if fingertips is not None and (tips := fingertips.on_bus(bus)):
                     self.force_torque[bus] = StrainBoards(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from skin_host.bus.board import GAP_S
 from skin_host.bus.boards import RETRY_S, Sender
 from skin_host.bus.commands import SetTxMode, command_frame
-from skin_host.bus.strain import SILENT_NS, StrainMode, start_frames
+from skin_host.bus.strain import SILENT_NS, StrainMode, scale_queries, start_frames
 from skin_host.errors import BusError
 from skin_host.fingertip.engine import FingertipEngine, TipState
 from skin_host.fingertip.events import FingertipEvent
@@ -78,8 +78,8 @@ class StrainBoards:
             well = now_ns - board.heard_ns <= SILENT_NS and board.state.assembler is not None
             due = board.started and now_ns >= board.retry_at_ns
             board.state.awaited &= not (due or board.frames)
-            if due and not well and self._busy is None:
-                self._busy = asyncio.create_task(self._mend(board))
+            if due and self._busy is None and not (well and not board.state.scale_differs):
+                self._busy = asyncio.create_task(self._mend(board, well=well))
 
     async def stop(self) -> None:
         """Command every board to stop sending.
@@ -104,10 +104,17 @@ class StrainBoards:
         board.started = True
         board.retry_at_ns = self._clock() + int(pause_s * 1e9)
 
-    async def _mend(self, board: _Known) -> None:
-        log.debug("bus %s: the board of %s is set up again", self._bus, board.state.name)
+    async def _mend(self, board: _Known, *, well: bool) -> None:
+        """Set a board up again; one that works and reported other full scales is only queried for
+        them again: another board may be there by now, and anybody on the bus can answer.
+        """
         try:
-            await self._set_up(board)
+            if well:
+                board.retry_at_ns = self._clock() + int(RETRY_S[-1] * 1e9)
+                await self._port.send(scale_queries(board.state.settings.address), GAP_S)
+            else:
+                log.debug("bus %s: the board of %s is set up again", self._bus, board.state.name)
+                await self._set_up(board)
         except BusError as error:
             board.retry_at_ns = self._clock() + int(RETRY_S[-1] * 1e9)
             log.debug("%s", error)

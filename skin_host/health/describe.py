@@ -200,6 +200,9 @@ class Describer:
             return "no ack"
         liveness = self._engine.intake.liveness
         triangle = TRIANGLES * row + number
+        if liveness.silenced[triangle] and any_of(ledger.far[row, number]):
+            # A board sends the zero for a chip that does not answer.
+            return "answers again"
         if liveness.frozen[triangle]:
             return "silenced" if liveness.silenced[triangle] else "frozen"
         if liveness.unproven[triangle]:

@@ -55,6 +55,10 @@ _TRIANGLE_SENTENCES = {
     "not connected": "is not connected: its chip does not answer; check cable and address",
     "no ack": "does not acknowledge on I2C: its chip or its data line is dead",
     "silenced": ("stopped answering; its board was zeroed since then and sends a constant for it"),
+    "answers again": (
+        "answers again, but its board was zeroed while it did not; set the board up again while "
+        "nothing touches it: skin command configure --board {board}"
+    ),
     "frozen": "repeats the same bytes for longer than chance allows: its chip has stopped",
     "constant": "did not change during the calibration and has not changed since",
     "out of range": "reads far outside its range on all pads",
@@ -292,7 +296,7 @@ def _triangles(record: Record, silent: set[str]) -> Iterator[FoundFault]:
         if (name, line) in reported:
             continue
         for triangle, fault in sorted(faults.items()):
-            sentence = _TRIANGLE_SENTENCES[fault]
+            sentence = _TRIANGLE_SENTENCES[fault].format(board=name)
             if fault == "not connected" and len(of_line[name, line]) > 1:
                 sentence += " (another one on its line reads wrong too: does it have this address?)"
             code = "triangle_" + fault.replace(" ", "_")

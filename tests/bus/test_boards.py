@@ -57,6 +57,33 @@ class Heard:
         self.now_ns += S // 10
         self.health.tick(self.now_ns, {}, {"can0": self.boards})
 
+    def supervised(self, port: "Kept", clock: SteppedClock) -> None:
+        """From now on boards are queried over a port of their own."""
+        layout, ledger = self.engine.layout, self.engine.ledger
+        boards = [(i, layout.boards[i]) for i in self.engine.boards]
+        sent_by = self.engine.assemblers["can0"].unconfigured
+        self.boards = Boards(
+            "can0", port, boards, layout.triangles, ledger, clock=clock, unconfigured=sent_by
+        )
+
+    async def pass_time(self, clock: SteppedClock) -> None:
+        """A tenth of a second passes, and boards are supervised."""
+        await clock.sleep(0.1)
+        self.look()
+        self.engine.ledger.look(self.now_ns)
+        self.boards.supervise()
+
+    def send_sweep(self) -> None:
+        """The hand sends its triangles."""
+        (hand,) = (one for one in self.engine.layout.boards if one.name == "hand")
+        self.say(
+            *(
+                (identifier(MessageClass.SKIN_STREAM, HAND, triangle), header + bytes([230] * 7))
+                for triangle in hand.triangles
+                for header in (b"\x40", b"\xc0")
+            )
+        )
+
     def record(self) -> Record:
         return self.health.record(0, self.now_ns, {}, {"can0": self.boards})
 
@@ -86,6 +113,71 @@ def test_a_board_of_another_kind_at_the_address_is_told(heard: Heard) -> None:
 def test_a_board_that_nobody_configured_is_told(heard: Heard) -> None:
     heard.answer(Discovered(BoardType.MTB4, 1, 25, 0), 7)
     assert ("bus_stranger", "can0/7") in heard.told()
+
+
+@pytest.mark.parametrize("answers", [True, False])
+@stepped
+async def test_a_board_that_nobody_configured_is_told_for_as_long_as_it_answers(
+    clock: SteppedClock, answers: bool
+) -> None:
+    """Its answer may be forged, or it may be unplugged; both stay in no record until a restart."""
+    heard, port = Heard(), Kept(clock)
+    heard.supervised(port, clock)
+    heard.answer(Discovered(BoardType.MTB4, 1, 25, 0), 7)
+    for _ in range(300):
+        asked = len(port.sent)
+        await heard.pass_time(clock)
+        if answers and len(port.sent) > asked:
+            heard.answer(Discovered(BoardType.MTB4, 1, 25, 0), 7)
+    assert (("bus_stranger", "can0/7") in heard.told()) == answers
+    assert 2 <= len(port.sent) <= 4
+    await heard.boards.stop()
+
+
+@stepped
+async def test_a_board_that_nobody_configured_and_that_sends_is_not_queried(
+    clock: SteppedClock,
+) -> None:
+    """An MTB3 would stop, which another host may have started."""
+    heard, port = Heard(), Kept(clock)
+    heard.supervised(port, clock)
+    heard.answer(Discovered(BoardType.SKIN, 3, 0, 0), 7)
+    for _ in range(300):
+        heard.say((identifier(MessageClass.SKIN_STREAM, 7, 0), b"\x40" + bytes(7)))
+        await heard.pass_time(clock)
+    assert ("bus_stranger", "can0/7") in heard.told()
+    assert not port.sent
+    for _ in range(300):
+        await heard.pass_time(clock)
+    assert ("bus_stranger", "can0/7") not in heard.told()
+    await heard.boards.stop()
+
+
+@pytest.mark.parametrize("code", ["board_in_bootloader", "board_wrong_type"])
+@pytest.mark.parametrize("sends", [True, False])
+@stepped
+async def test_what_a_board_answered_is_told_until_it_sends_or_answers_no_more(
+    clock: SteppedClock, code: str, sends: bool
+) -> None:
+    """The answer may be forged; or the board has been updated, replaced or unplugged since."""
+    heard, port = Heard(), Kept(clock)
+    heard.supervised(port, clock)
+    record = heard.boards.records[HAND]
+    heard.answer(Discovered(BoardType.MTB4, 1, 25, 0), HAND)
+    record.started, record.configurations = True, 1
+    if code == "board_in_bootloader":
+        heard.answer(DiscoveredBootloader(BoardType.MTB4, 4, 0), HAND)
+    else:
+        heard.answer(Discovered(BoardType.STRAIN2, 2, 0, 0), HAND)
+    assert (code, "hand") in heard.told()
+    for step in range(250):
+        if sends and step % 2:
+            heard.send_sweep()
+        await heard.pass_time(clock)
+    told = {told for told, _ in heard.told()}
+    assert code not in told
+    assert ("bus_silent" in told) != sends
+    await heard.boards.stop()
 
 
 def test_a_board_that_must_answer_while_it_sends_is_not_told_to_overflow(heard: Heard) -> None:

@@ -9,6 +9,7 @@ import pytest
 from skin_host.bus.adapters import CAPACITY, AdapterPort, nanoseconds
 from skin_host.bus.opening import open_bus, open_port
 from skin_host.bus.port import LinkState, Port
+from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus, Receive
 from tests.support.waiting import PATIENCE_S
 
@@ -112,6 +113,23 @@ def test_a_bus_that_receives_is_not_off(virtual):
     other.send(message(0x410))
     port.read()
     assert port.state is LinkState.UP
+
+
+def test_errors_on_the_wire_are_over_when_a_bus_receives_without_any():
+    """Over multicast anybody can send an error frame; none may be believed for ever."""
+    channel, clock = f"adapters-{next(_numbers)}", SteppedClock()
+    settings = Bus(interface="virtual", channel=channel)
+    port = open_port("left", settings, Receive(), clock=clock)
+    with can.Bus(interface="virtual", channel=channel) as other:
+        other.send(message(0x004, bytes([0, 0x20, 0, 0, 0, 0, 0, 0]), is_error_frame=True))
+        port.read()
+        for passed_s, state in ((9.0, LinkState.ERROR_PASSIVE), (2.0, LinkState.UP)):
+            clock.advance(passed_s)
+            assert port.state is LinkState.ERROR_PASSIVE
+            other.send(message(0x410))
+            port.read()
+            assert port.state is state
+    port.close()
 
 
 def test_microseconds_survive_pythons_floats():

@@ -15,6 +15,8 @@ from hypothesis import strategies as st
 from emulator.faults import parse
 from emulator.probes.scene import Probe, Scene
 from emulator.robot import Robot
+from skin_host.bus.answers import answer_frame
+from skin_host.bus.strain import FullScale
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import changed, load
 from skin_host.daemon import metrics
@@ -95,7 +97,7 @@ async def test_a_board_is_asked_for_its_full_scales_set_up_and_zeroed() -> None:
 
 async def test_a_board_that_never_sends_is_absent_once_it_has_had_its_time() -> None:
     bench = Bench()
-    bench.robot.inject(parse("board_silent board=index"))
+    mend = bench.robot.inject(parse("board_silent board=index"))
     await bench.boards.bring_up()
     await bench.run(0.2)
     assert "absent" not in bench.codes()
@@ -103,6 +105,9 @@ async def test_a_board_that_never_sends_is_absent_once_it_has_had_its_time() -> 
     assert "absent" in bench.codes()
     assert bench.record()["state"] == "no data"
     assert "absent" not in bench.codes("thumb")
+    mend()
+    await bench.run(5.0)
+    assert "absent" not in bench.codes()
 
 
 async def test_metrics_tell_of_fingertips() -> None:
@@ -133,6 +138,20 @@ async def test_a_board_that_falls_silent_is_told_of_and_set_up_again() -> None:
     assert bench.record()["silences"] == 1
 
 
+async def test_full_scales_that_somebody_else_reported_are_told_until_the_board_is_asked() -> None:
+    bench = Bench(full_scale=(50.0, 50.0, 50.0, 1.0, 1.0, 1.0))
+    await bench.boards.bring_up()
+    await bench.calibrate()
+    address = bench.tips.tips["index"].settings.address
+    forged = answer_frame(FullScale(0, 7), address)
+    bench.engine.feed("can0", FrameBatch.of([(*forged, bench.robot.t_ns)]))
+    assert bench.codes() == ["scale"]
+    before = bench.record()["samples"]
+    await bench.run(9.0)
+    assert bench.codes() == []
+    assert bench.record()["samples"] - before > 2500  # it went on sending
+
+
 async def test_full_scales_that_are_given_are_used_and_compared() -> None:
     bench = Bench(full_scale=(50.0, 50.0, 50.0, 1.0, 1.0, 1.0))
     await bench.boards.bring_up()
@@ -150,6 +169,22 @@ async def test_a_board_that_does_not_tell_its_full_scales_is_not_configured() ->
     state.assembler = None
     state.reported_scale[:] = 0.0
     assert (bench.record()["state"], bench.codes()) == ("not configured", ["not_configured"])
+    await bench.run(5.0)
+    assert "not_configured" not in bench.codes()
+
+
+async def test_lost_frames_are_told_until_none_is_lost() -> None:
+    bench = Bench()
+    await bench.boards.bring_up()
+    await bench.calibrate()
+    await bench.run(1.0)
+    assembler = bench.tips.tips["index"].assembler
+    assert assembler is not None
+    assembler.counters.lone += 50
+    await bench.run(0.1)
+    assert bench.codes() == ["loses_frames"]
+    await bench.run(6.0)
+    assert bench.codes() == []
 
 
 async def test_load_beyond_the_range_is_told_and_has_no_place() -> None:
@@ -166,7 +201,7 @@ async def test_load_beyond_the_range_is_told_and_has_no_place() -> None:
 
 
 async def test_a_contact_without_end_makes_its_zero_uncertain() -> None:
-    bench = Bench({"part": "index", "force_n": [[2.5, 0], [2.6, 1], [600, 1]]})
+    bench = Bench({"part": "index", "force_n": [[2.5, 0], [2.6, 1], [6.5, 1], [6.6, 0]]})
     await bench.boards.bring_up()
     await bench.calibrate()
     bench.tips.held_report_ns = 2_000_000_000
@@ -174,6 +209,8 @@ async def test_a_contact_without_end_makes_its_zero_uncertain() -> None:
     assert bench.codes() == []
     await bench.run(2.5)
     assert bench.codes() == ["held"]
+    await bench.run(3.0)
+    assert bench.codes() == []
 
 
 frames = st.lists(

@@ -49,6 +49,7 @@ WRONG_NS = 75 * NS
 SLOW = {
     "board_period",
     "triangle_missing",
+    "triangle_answers_again",
     "triangle_silenced",
     "triangle_frozen",
     "triangle_constant",

@@ -33,6 +33,7 @@ _TAXELS = {
     "taxel_unproven",
 }
 _TRIANGLES = {
+    "triangle_answers_again",
     "triangle_not_connected",
     "triangle_no_ack",
     "triangle_silenced",
@@ -490,7 +491,8 @@ ACTS: dict[str, set[str]] = {
 
 _LINE = {"line_shorted", "triangle_no_ack", "triangle_not_connected"}
 _WRONG_BITS = _LINE | {"board_rezeroed", "bus_bit_errors", "taxel_out_of_range"}
-_WRONG_BITS |= {"triangle_out_of_range", "triangle_silenced"}
+_SILENCED = {"triangle_silenced", "triangle_answers_again"}
+_WRONG_BITS |= {"triangle_out_of_range", *_SILENCED}
 _ELSEWHERE = {"triangle_not_connected", "triangle_out_of_range", "taxel_out_of_range"}
 
 KINDS: dict[str, Begin] = {
@@ -524,7 +526,7 @@ KINDS: dict[str, Begin] = {
         "no_acknowledge", _SWAPPED, _LINE | {"triangle_silenced"}, 1.0, spoils=True
     ),
     "data_held_low": _emulated(
-        "data_held_low", _CHIPS | _SET_UP, _LINE | {"triangle_silenced"}, 1.0, spoils=True
+        "data_held_low", _CHIPS | _SET_UP, _LINE | _SILENCED, 1.0, spoils=True
     ),
     "clock_stretched": _emulated("clock_stretched", _SWAPPED, _ELSEWHERE | _LINE, 1.0, spoils=True),
     # What a wrong bit does to a reading, or to the board that takes it for a missing chip.
