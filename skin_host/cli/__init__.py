@@ -11,10 +11,11 @@ import io
 import logging
 import os
 import re
+import select
 import signal
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from skin_host import __version__, emulator_path
 from skin_host.cli import (
@@ -66,6 +67,32 @@ def _complain(line: str) -> None:
     print(line, file=sys.stderr)
 
 
+class _Complaints(io.RawIOBase):
+    """Standard error. What it does not take, because its disk is full or its reader is gone, is
+    lost: a complaint that cannot be written changes neither the work nor the exit status.
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        super().__init__()
+        self._descriptor = descriptor
+
+    def fileno(self) -> int:
+        return self._descriptor
+
+    def isatty(self) -> bool:
+        return os.isatty(self._descriptor)
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:
+        left = memoryview(data)
+        with contextlib.suppress(OSError):
+            while left:
+                left = left[os.write(self._descriptor, left) :]
+        return len(data)
+
+
 def _make_printable() -> None:
     """What is printed where nobody can read it goes nowhere, and never ends a command.
 
@@ -79,6 +106,24 @@ def _make_printable() -> None:
         elif mode == "w" and isinstance(stream, io.TextIOWrapper):
             with contextlib.suppress(OSError):  # a stream that changed under our feet
                 stream.reconfigure(errors="replace")
+    own = sys.__stderr__
+    if own is not None and sys.stderr is own:
+        sys.stderr = io.TextIOWrapper(
+            io.BufferedWriter(_Complaints(own.fileno())),
+            encoding=own.encoding,
+            errors="replace",
+            line_buffering=True,
+        )
+
+
+def _reader_left() -> bool:
+    """Whether standard output is a pipe that nobody reads any more."""
+    poll = select.poll()
+    try:
+        poll.register(sys.stdout.fileno(), 0)
+    except (OSError, ValueError):  # it is no file
+        return False
+    return bool(poll.poll(0))
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -114,13 +159,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SkinError as error:
         _complain(f"{name}: {error}")
         return error.exit_status
-    except BrokenPipeError:
-        # The reader of our output has closed it (`| head`). Keep Python from reporting that at
-        # exit.
-        with contextlib.suppress(OSError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
     except OSError as error:
+        if isinstance(error, BrokenPipeError) and _reader_left():
+            # It has read enough (`| head`). Keep Python from reporting that at exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
         where = f"{error.filename}: " if error.filename else ""
         _complain(f"{name}: {where}{error.strerror or error}")
         return 1

@@ -1,6 +1,7 @@
 """What a user sees who asks for the wrong thing: one clear line and the right status."""
 
 import contextlib
+import errno
 import io
 import os
 import re
@@ -200,6 +201,38 @@ def test_a_reader_that_leaves_early_is_no_error():
         check, shell=True, check=False, capture_output=True, text=True, cwd=ROOT
     )
     assert result.stderr == ""
+
+
+@pytest.mark.parametrize("stderr", ["2>&-", "2>/dev/full", "2>&1 >/dev/null | true"])
+@pytest.mark.parametrize(
+    ("words", "status"), [("check nope.toml", 2), ("fly", 2), (f"check {DEMO}", 0)]
+)
+def test_a_complaint_that_nobody_can_read_changes_no_status(words, status, stderr):
+    # The reader of the last one is gone before anything is written.
+    command, *reader = stderr.split(" | ")
+    wait = "sleep 0.2; " if reader else ""
+    line = f"({wait}exec {sys.executable} -m skin_host {words} {command})"
+    line = " | ".join([line, *reader]) + "; exit ${PIPESTATUS[0]}"
+    ended = subprocess.run(
+        ["bash", "-c", line], check=False, cwd=ROOT, capture_output=True, text=True
+    )
+    assert ended.returncode == status, ended.stderr
+
+
+def test_results_that_cannot_be_written_are_a_failure():
+    line = f"{sys.executable} -m skin_host check {DEMO} >/dev/full"
+    ended = subprocess.run(
+        ["bash", "-c", line], check=False, cwd=ROOT, capture_output=True, text=True
+    )
+    refused(ended, 1, "No space left")
+
+
+def test_a_connection_that_ended_is_not_taken_for_a_reader_that_read_enough(monkeypatch):
+    def broken(_):
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+    monkeypatch.setattr("skin_host.cli.files._check", broken)
+    refused(asked("check", str(DEMO)), 1, "Broken pipe")
 
 
 def test_a_kept_calibration_of_another_skin_stops_the_daemon_before_it_begins(tmp_path):
