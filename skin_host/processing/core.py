@@ -4,7 +4,7 @@ One engine serves both the daemon and the replay of recordings. It has no clock 
 takes frames and times, and returns frames of pressure and events.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -326,6 +326,14 @@ class Engine:
         sweeps, answers = self.assemblers[bus].feed(batch)
         steps = self._process(self._take(sweeps)) if sweeps else []
         return Output(sweeps, steps, samples, grasps, answers)
+
+    def feed_long(self, bus: str, batch: FrameBatch) -> Iterator[Output]:
+        """Process a batch that spans many sweeps; yield a result for each, as if it came alone.
+
+        For skins without fingertips, whose results would have to be put between them.
+        """
+        for sweep in self.assemblers[bus].feed(batch).sweeps:
+            yield Output([sweep], self._process(self._take([sweep])), [], [], [])
 
     def judge(self) -> None:
         """Do deferred work, if there is any, so that the next sweep does not wait for it."""

@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 UNTOUCHED_S = 5.0
 #: A scheduler that does not answer within this time counts as absent.
 SCHEDULER_S = 10.0
+#: The frames of an only bus are in the recording's order, however long its batches are.
+LONG_WINDOW_NS = 200_000_000
 _encoder = msgspec.json.Encoder()
 
 
@@ -165,13 +167,10 @@ def calibrate_from_log(
     engine = Engine(settings, layout, list(range(len(layout.parts))))
     engine.begin_calibration(seconds)
     last_ns = 0
-    for bus, batch in read_buses(log, settings):
-        engine.feed(bus, batch)
-        last_ns = int(batch.t_ns[-1])
+    for output in replay(log, engine):
+        last_ns = output.sweeps[-1].t_ns if output.sweeps else last_ns
         if engine.calibration_progress() >= 1.0:
             break
-    else:
-        engine.flush()
     counters = [assembler.counters for assembler in engine.assemblers.values()]
     if not sum(one.sweeps for one in counters):
         raise LogError(
@@ -185,22 +184,18 @@ def calibrate_from_log(
 
 
 def replay(log: Path, engine: Engine) -> Iterator[Output]:
-    """Yield the results of a recording, batch by batch.
+    """Yield the results of a recording, sweep by sweep or batch by batch.
 
     Raises:
         LogError: the recording cannot be read, or ends with damage.
     """
-    for bus, batch in read_buses(log, engine.settings, _window_ns(engine)):
-        yield engine.feed(bus, batch)
+    if len(engine.settings.buses) == 1 and engine.fingertips is None:
+        for bus, batch in read_buses(log, engine.settings, LONG_WINDOW_NS):
+            yield from engine.feed_long(bus, batch)
+    else:
+        for bus, batch in read_buses(log, engine.settings):
+            yield engine.feed(bus, batch)
     yield engine.flush()
-
-
-def _window_ns(engine: Engine) -> int:
-    """How long batches may be, for fewer of them: no board of an only bus sends twice in one."""
-    boards = [board.settings for board in engine.layout.boards]
-    if len(engine.settings.buses) > 1 or engine.fingertips is not None or not boards:
-        return WINDOW_NS
-    return max(WINDOW_NS, min(board.period_ms for board in boards) * 1_000_000 // 2)
 
 
 def steps(log: Path, engine: Engine) -> Iterator[Step]:

@@ -70,7 +70,7 @@ def test_a_candump_log_is_replayed_without_what_it_does_not_need(tmp_path: Path)
 
 
 def test_how_many_frames_are_taken_at_once_changes_no_byte(output: bytes, monkeypatch) -> None:
-    monkeypatch.setattr(processing, "_window_ns", lambda engine: WINDOW_NS)
+    monkeypatch.setattr(processing, "LONG_WINDOW_NS", WINDOW_NS)
     settings = load(ROOT / "config/icub_hand.toml")
     layout = build_layout(settings, ROOT / "config")
     found = processing.calibration_for(LOG, settings, layout, None, None)
