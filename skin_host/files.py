@@ -5,7 +5,6 @@ import errno
 import logging
 import os
 import stat
-import tempfile
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from pathlib import Path
@@ -13,7 +12,6 @@ from typing import Protocol, TypeVar
 
 import msgspec
 
-from skin_host.clock import SYSTEM
 from skin_host.errors import NewerFileError, SkinError
 
 log = logging.getLogger(__name__)
@@ -143,6 +141,8 @@ def _newer(path: Path, what: str, why: str) -> NewerFileError:
 
 def set_aside(path: Path) -> None:
     """Give a damaged file another name, so that nothing overwrites it."""
+    from skin_host.clock import SYSTEM
+
     aside = path.with_name(f"{path.name}.damaged-{SYSTEM.today():%Y%m%dT%H%M%SZ}")
     try:
         os.replace(path, aside)
@@ -159,6 +159,8 @@ class Disk:
 
     def create(self, path: Path, data: bytes) -> Path:
         """Write a temporary file beside `path`; return its name."""
+        import tempfile  # which imports every way of compression
+
         descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
         try:
             with os.fdopen(descriptor, "wb") as file:

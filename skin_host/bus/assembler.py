@@ -165,7 +165,7 @@ class _Order(NamedTuple):
     def of(cls, heads: Sequence[bytes], places: Sequence[int], missing: Sequence[int]) -> "_Order":
         n = len(places)
         rows = None if list(places) == list(range(n)) else np.array(places, np.intp)
-        triangles = np.unique(np.array(places, np.intp) // 2)
+        triangles = np.array(sorted({place // 2 for place in places}), np.intp)
         return cls(
             b"".join(heads),
             list(places),

@@ -4,7 +4,6 @@ Recordings give the foam's relaxation and the pressure curve of each taxel.
 """
 
 import argparse
-import asyncio
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
@@ -96,6 +95,8 @@ def _add_fits(calibrate: argparse.ArgumentParser) -> None:
 
 
 def _calibrate(arguments: argparse.Namespace) -> int:
+    import asyncio
+
     from skin_host.daemon.calibrate import calibration_path, take_calibration
     from skin_host.files import refuse_newer
     from skin_host.layout import parts_of

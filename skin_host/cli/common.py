@@ -1,7 +1,6 @@
 """Helpers shared by several commands."""
 
 import argparse
-import asyncio
 import json
 import logging
 import os
@@ -14,6 +13,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from skin_host.daemon import service
 
 if TYPE_CHECKING:
+    import asyncio
+
     from skin_host.config.settings import Settings
     from skin_host.layout import Layout
 
@@ -114,13 +115,15 @@ class Progress:
 
 
 def run(
-    work: Callable[[asyncio.Event], Coroutine[Any, Any, T]], duration_s: float | None = None
+    work: "Callable[[asyncio.Event], Coroutine[Any, Any, T]]", duration_s: float | None = None
 ) -> T:
     """Work, and return the result.
 
     The event is set by SIGTERM and SIGINT, a second one of which ends at once, and after
     `duration_s`.
     """
+
+    import asyncio
 
     async def working() -> T:
         stop, loop = asyncio.Event(), asyncio.get_running_loop()

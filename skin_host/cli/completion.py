@@ -5,7 +5,6 @@ shell asks, or by the command `completion`.
 """
 
 import argparse
-import asyncio
 import contextlib
 import os
 from collections.abc import Callable, Iterable
@@ -106,6 +105,8 @@ def _names_in(config: Path, what: str) -> set[str]:
 
 def _names_at(parsed_args: argparse.Namespace, what: str) -> set[str]:
     """Return names that the nodes of a robot publish."""
+    import asyncio
+
     from skin_host.client import SkinClient
 
     async def ask() -> set[str]:

@@ -1,7 +1,6 @@
 """Commands that work on the real skin: run, scan, command."""
 
 import argparse
-import asyncio
 import gc
 import json
 import logging
@@ -109,6 +108,8 @@ COMMANDS = {
 
 def reload_on_hangup(daemon: "Daemon") -> None:
     """Read the configuration again on SIGHUP; a wrong one is reported and changes nothing."""
+    import asyncio
+
     reloading: set[asyncio.Task[None]] = set()
 
     async def reload() -> None:
@@ -129,6 +130,8 @@ def reload_on_hangup(daemon: "Daemon") -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    import asyncio
+
     from skin_host.config.settings import Settings
     from skin_host.daemon.calibrate import stored_calibration
     from skin_host.daemon.daemon import Daemon
@@ -184,6 +187,8 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _run_workers(arguments: argparse.Namespace, settings: "Settings") -> int:
+    import asyncio
+
     from skin_host.daemon import workers
     from skin_host.daemon.workers import share_name, share_out
 
@@ -211,6 +216,8 @@ def _run_workers(arguments: argparse.Namespace, settings: "Settings") -> int:
 
 
 def _scan(arguments: argparse.Namespace) -> int:
+    import asyncio
+
     from skin_host.bus.boards import scan, scan_table
     from skin_host.config.settings import Bus
 
@@ -224,6 +231,8 @@ def _scan(arguments: argparse.Namespace) -> int:
 
 
 def _command(arguments: argparse.Namespace) -> int:
+    import asyncio
+
     from skin_host.cli.watch import status_table
     from skin_host.client import SkinClient
 

@@ -1,7 +1,6 @@
 """Commands around recordings: record, export, plot, dbc, urdf; and replay onto CAN or a broker."""
 
 import argparse
-import asyncio
 import contextlib
 import sys
 from functools import partial
@@ -20,6 +19,8 @@ from skin_host.cli.common import (
 from skin_host.errors import BrokerError, RequestError
 
 if TYPE_CHECKING:
+    import asyncio
+
     from skin_host.mqtt.address import Broker
     from skin_host.recording.export import Series
 
@@ -114,13 +115,15 @@ def play(arguments: argparse.Namespace) -> int:
     Raises:
         RequestError: the options do not go together.
     """
-    from skin_host.recording.mcap import SUFFIX
+    import asyncio
+
+    from skin_host.recording import MCAP_SUFFIX
 
     if arguments.onto == "can":
         if arguments.config is None:
             raise RequestError("--onto can needs --config, which gives the buses")
         return asyncio.run(_play_on_buses(arguments))
-    if arguments.config is None and arguments.log.suffix != SUFFIX:
+    if arguments.config is None and arguments.log.suffix != MCAP_SUFFIX:
         raise RequestError(f"{arguments.log}: CAN frames need --config to be processed")
     if arguments.config is not None:
         return asyncio.run(_play_processed(arguments))
@@ -155,13 +158,14 @@ def _numbers(text: str) -> list[int]:
 
 
 def _record(arguments: argparse.Namespace) -> int:
+    from skin_host.recording import MCAP_SUFFIX
     from skin_host.recording.capture import CanLog
-    from skin_host.recording.mcap import SUFFIX, Recorder
+    from skin_host.recording.mcap import Recorder
 
     file: Path = arguments.file
     if file.exists():
         raise RequestError(f"{file}: is there already; remove it or choose another name")
-    if file.suffix == SUFFIX:
+    if file.suffix == MCAP_SUFFIX:
         with Recorder(file) as recorder:
             told = run(partial(_capture, arguments, recorder, None), arguments.seconds)
         told |= {"messages": recorder.messages, "unreadable": recorder.unreadable}
@@ -191,9 +195,11 @@ def _plain(value: Any) -> str:
 
 
 async def _capture(
-    arguments: argparse.Namespace, recorder: Any, log: Any, stop: asyncio.Event
+    arguments: argparse.Namespace, recorder: Any, log: Any, stop: "asyncio.Event"
 ) -> dict[str, Any]:
     """Record until `stop` is set; report what was lost."""
+    import asyncio
+
     from skin_host.recording.capture import capture_broker, capture_buses
 
     told: dict[str, Any] = {}
@@ -230,12 +236,12 @@ async def _robot(url: str, robot: str | None) -> tuple["Broker", str, str]:
 
 
 def _series(arguments: argparse.Namespace) -> "Series":
+    from skin_host.recording import MCAP_SUFFIX
     from skin_host.recording.export import read_frames, read_messages
-    from skin_host.recording.mcap import SUFFIX
     from skin_host.recording.replay import calibration_for
 
     if arguments.config is None:
-        if arguments.recording.suffix != SUFFIX:
+        if arguments.recording.suffix != MCAP_SUFFIX:
             raise RequestError(f"{arguments.recording}: CAN frames need --config to be processed")
         return read_messages(arguments.recording)
     settings, layout = load_skin(arguments.config)

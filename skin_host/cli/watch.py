@@ -1,7 +1,6 @@
 """Commands that subscribe: listen, status, view."""
 
 import argparse
-import asyncio
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +77,8 @@ def add_commands(commands: Commands) -> None:
 
 
 def _listen(arguments: argparse.Namespace) -> int:
+    import asyncio
+
     from skin_host.cli.lines import event_line, missed_line
     from skin_host.client import SkinClient
 
@@ -108,6 +109,8 @@ async def health_of_all(broker: str, robot: str | None) -> dict[str, dict[str, A
 
     A retained record of a part whose node has gone does not describe its present state.
     """
+    import asyncio
+
     from skin_host.client import SkinClient
 
     async with SkinClient(broker, robot=robot, patience_s=PATIENCE_S) as skin:
@@ -159,6 +162,8 @@ def status_table(records: dict[str, dict[str, Any]]) -> str:
 
 
 def _status(arguments: argparse.Namespace) -> int:
+    import asyncio
+
     records = asyncio.run(health_of_all(arguments.broker, arguments.robot))
     if arguments.json:
         print_json(records)

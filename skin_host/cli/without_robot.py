@@ -1,7 +1,6 @@
 """Commands that need no robot: emulate, demo, bench, report, simulate."""
 
 import argparse
-import asyncio
 import contextlib
 import logging
 import sys
@@ -23,7 +22,6 @@ from skin_host.cli.common import (
     set_up_logging,
 )
 from skin_host.errors import RequestError
-from skin_host.tasks import until
 
 if TYPE_CHECKING:
     import can
@@ -213,6 +211,8 @@ def _emulate(arguments: argparse.Namespace) -> int:
     if arguments.i2c:
         only = settings.boards[arguments.board].bus
         wanted = {only: settings.buses[only]}
+    from skin_host.tasks import until
+
     with contextlib.ExitStack() as opened:
         work = (
             _on_real_chips(arguments, settings, opened)
@@ -271,6 +271,8 @@ def _on_emulated_chips(
             devices.append(opened.enter_context(CuseBus(arguments.i2c_dev + i, line)))
 
     async def work(buses: "dict[str, can.BusABC]") -> None:
+        import asyncio
+
         loop = asyncio.get_running_loop()
         for device in devices:
             loop.add_reader(device.fileno(), device.handle)
@@ -295,6 +297,8 @@ def take_command(
 
     line = sys.stdin.readline()
     if not line:
+        import asyncio
+
         asyncio.get_running_loop().remove_reader(sys.stdin.fileno())
         return
     text = " ".join(line.split())

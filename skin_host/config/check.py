@@ -200,7 +200,7 @@ def _part_warnings(layout: Layout) -> list[str]:
                 f"parts.{part.name}: {alone} taxel(s) have no neighbour; look at their places"
             )
         cells = np.round(layout.position_m[taxels][pressure] / SAME_PLACE_M).astype(np.int64)
-        shared = len(cells) - len(np.unique(cells, axis=0))
+        shared = len(cells) - len(set(map(tuple, cells.tolist())))
         if shared:
             warnings.append(
                 f"parts.{part.name}: {shared} taxel(s) lie where another one lies; "

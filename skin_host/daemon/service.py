@@ -2,11 +2,12 @@
 
 import logging
 import os
-import socket
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from skin_host.clock import SYSTEM, Clock
+if TYPE_CHECKING:
+    from skin_host.clock import Clock
 
 #: Python's levels, highest first, and the priorities of syslog(3).
 _PRIORITIES = (
@@ -23,6 +24,8 @@ def notify(message: str) -> None:
     address = os.environ.get("NOTIFY_SOCKET")
     if not address:
         return
+    import socket
+
     if address.startswith("@"):
         address = "\0" + address[1:]
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sock:
@@ -33,7 +36,7 @@ def notify(message: str) -> None:
             return
 
 
-def notify_reloading(clock: Clock = SYSTEM) -> None:
+def notify_reloading(clock: "Clock") -> None:
     """Report to systemd that a reload has begun; READY=1 ends it."""
     notify(f"RELOADING=1\nMONOTONIC_USEC={clock.monotonic_ns() // 1000}")
 

@@ -287,7 +287,7 @@ class Describer:
         verdict = np.where(pressure, calibration.verdict[mine], Verdict.OK)
         return {
             kind.name.lower(): np.flatnonzero(verdict == kind).tolist()
-            for kind in map(Verdict, np.unique(verdict).tolist())
+            for kind in map(Verdict, sorted(set(verdict.tolist())))
             if kind != Verdict.OK
         }
 
@@ -400,7 +400,10 @@ def common_shift(
     """
     common = _middle(shift[rests])
     # Most parts rest: then one of the first triangles has not moved like the others.
-    own = (_middle(shift[rests & (triangle_of == one)]) for one in np.unique(triangle_of[rests]))
+    own = (
+        _middle(shift[rests & (triangle_of == one)])
+        for one in sorted(set(triangle_of[rests].tolist()))
+    )
     together = all(one * common > 0.0 and abs(one) >= abs(common) / 2 for one in own)
     return common if together else 0.0
 

@@ -7,7 +7,6 @@ their triangles, twelve a triangle. All other packages index by this order.
 from dataclasses import dataclass, fields
 from enum import IntEnum
 from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -141,7 +140,7 @@ class Layout:
 @cache
 def builtin_kinds() -> dict[str, KindSettings]:
     """The kinds of sensor unit that come with the project (`kinds.toml`)."""
-    text = resources.files("skin_host.layout").joinpath("kinds.toml").read_bytes()
+    text = Path(__file__).with_name("kinds.toml").read_bytes()
     return msgspec.toml.decode(text, type=dict[str, KindSettings])
 
 

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from pathlib import Path
+from statistics import median
 
 import msgspec
 import numpy as np
@@ -296,7 +297,7 @@ class Calibrator:
         for part in self._layout.parts:
             mine = slice(part.start, part.stop)
             if known[mine].any():
-                common = np.median(found[mine][known[mine]])
+                common = median(found[mine][known[mine]].tolist())
                 lasting[mine] = np.maximum(lasting[mine], common)
         return lasting
 
@@ -351,11 +352,11 @@ class Calibrator:
         order = np.argsort(triangles, kind="stable")
         ends = np.flatnonzero(np.diff(triangles[order])) + 1
         for mine in np.split(np.flatnonzero(known)[order], ends) if len(order) else ():
-            found[mine] = baseline[mine] - np.median(baseline[mine]) > limit[mine]
+            found[mine] = baseline[mine] - median(baseline[mine].tolist()) > limit[mine]
         for part in layout.parts:
             span = slice(part.start, part.stop)
             if known[span].any():
-                usual = np.median(baseline[span][known[span]])
+                usual = median(baseline[span][known[span]].tolist())
                 found[span] &= baseline[span] - usual > limit[span]
         return found
 

@@ -35,7 +35,8 @@ from skin_host.files import growing, writing
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import Retry, connect, explain, first_error
 from skin_host.mqtt.payload import MAX_PACKET_BYTES
-from skin_host.recording.mcap import SUFFIX, Recorder, recorded_topics
+from skin_host.recording import MCAP_SUFFIX
+from skin_host.recording.mcap import Recorder, recorded_topics
 from skin_host.tasks import until
 
 #: Takes a batch of a channel.
@@ -88,7 +89,7 @@ class CanLog:
 
     def __init__(self, path: Path) -> None:
         if path.suffix not in CAN_SUFFIXES:
-            known = ", ".join([*CAN_SUFFIXES, SUFFIX])
+            known = ", ".join([*CAN_SUFFIXES, MCAP_SUFFIX])
             raise RequestError(f'{path}: suffix "{path.suffix}"; wanted one of {known}')
         self.frames = 0
         self._path = path
@@ -333,8 +334,8 @@ class PageRecording:
         """
         if self._recorder is not None:
             raise RequestError(f"{self._path.name} is being recorded already; stop it")
-        _check_room(self._folder, f"*{SUFFIX}")
-        self._path = self._folder / self._clock.today().strftime(f"%Y%m%dT%H%M%SZ{SUFFIX}")
+        _check_room(self._folder, f"*{MCAP_SUFFIX}")
+        self._path = self._folder / self._clock.today().strftime(f"%Y%m%dT%H%M%SZ{MCAP_SUFFIX}")
         if self._path.exists():
             raise RequestError(f"{self._path.name}: is there already; try again")
         self._recorder = Recorder(self._path)

@@ -29,7 +29,6 @@ from skin_host.mqtt.topics import PartTopic, Topics
 from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
 
-SUFFIX = ".mcap"
 CAN = "can/"
 MARKS = "marks"
 #: Nothing that is worth recording is longer.

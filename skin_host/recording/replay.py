@@ -34,7 +34,7 @@ from skin_host.processing.calibration import Calibration
 from skin_host.processing.core import Engine, Output, Step
 from skin_host.processing.events import KPA_DECIMALS
 from skin_host.processing.pipeline import PressureFrame
-from skin_host.recording.mcap import SUFFIX, read_can
+from skin_host.recording import MCAP_SUFFIX
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -111,7 +111,9 @@ def read_buses(
         LogError: see `logs.read_channels`; or several buses, and none of their channels in it.
     """
     merged = len(settings.buses) == 1
-    if log.suffix == SUFFIX:
+    if log.suffix == MCAP_SUFFIX:
+        from skin_host.recording.mcap import read_can
+
         channels = read_can(log)
     else:
         channels = read_channels(log, window_ns, merged=merged)

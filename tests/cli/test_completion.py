@@ -156,7 +156,7 @@ def test_channels_are_the_can_interfaces_of_the_machine(
 
 def test_who_asks_for_no_completion_does_not_pay_for_it() -> None:
     script = "import sys; from skin_host.cli import build_parser; build_parser(); "
-    script += "print(*{'argcomplete', 'numpy', 'can', 'aiomqtt'} & set(sys.modules))"
+    script += "print(*{'argcomplete', 'asyncio', 'numpy', 'can', 'aiomqtt'} & set(sys.modules))"
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT
     )

@@ -13,7 +13,7 @@ import pytest
 
 from skin_host.bus.logs import read_channels
 from skin_host.bus.wire import FrameBatch, encode_sweep
-from skin_host.clock import SteppedClock
+from skin_host.clock import SYSTEM, SteppedClock
 from skin_host.config.settings import Bus, TouchSettings, changed
 from skin_host.daemon import metrics, service
 from skin_host.daemon.state import NodeState, Thresholds, load_kept
@@ -149,7 +149,7 @@ def test_systemd_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         monkeypatch.setenv("NOTIFY_SOCKET", str(path))
         service.notify("READY=1")
         assert systemd.recv(100) == b"READY=1"
-        service.notify_reloading()
+        service.notify_reloading(SYSTEM)
         assert systemd.recv(100).startswith(b"RELOADING=1\nMONOTONIC_USEC=")
 
 

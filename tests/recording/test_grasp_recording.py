@@ -61,7 +61,7 @@ def recorded() -> tuple[np.ndarray, np.ndarray]:
 
 def test_a_candump_log_is_replayed_without_what_it_does_not_need(tmp_path: Path) -> None:
     script = "import sys; from skin_host.cli import main; main(sys.argv[1:]); "
-    script += "print(*{'can', 'aiomqtt', 'multiprocessing'} & set(sys.modules))"
+    script += "print(*{'can', 'aiomqtt', 'asyncio', 'multiprocessing'} & set(sys.modules))"
     command = [sys.executable, "-c", script, "replay", str(LOG)]
     command += ["--config", str(ROOT / "config/icub_hand.toml")]
     command += ["--output", str(tmp_path / "grasp.jsonl")]
