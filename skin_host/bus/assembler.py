@@ -275,6 +275,8 @@ class Assembler:
         self._slots: dict[int, tuple[_BoardState, int, int]] = {}
         #: By the head of the frame with which they usually begin a sweep: boards of known order.
         self._first: dict[bytes, _BoardState] = {}
+        #: No sweep in progress is too old up to here, on the clock of the frames.
+        self._none_old_until_ns = -(1 << 62)
         for index, board in boards:
             period_ns = board.settings.period_ms * 1_000_000
             wanted = 0
@@ -502,6 +504,8 @@ class Assembler:
         state.values[places[-1]] = payload
         state.last_place = places[-1]
         state.stray = 0
+        if first_ns > self._none_old_until_ns:
+            self._close_old(first_ns, sweeps)
         missed = self._count_sweep(state, last_ns)
         if state.any_absent:
             state.absent_for = [0] * TRIANGLES
@@ -600,11 +604,25 @@ class Assembler:
                 self.crowded[state.index] += 1
             if state.lone:
                 self._count_lone(state)
+            if t_ns > self._none_old_until_ns:
+                self._close_old(t_ns, sweeps)
             state.missing = state.awaited
             state.first_ns = t_ns
             self._expect_order(state)
         state.certain_until_ns = min(t_ns + state.pause_ns, state.first_ns + state.close_ns)
         return True
+
+    def _close_old(self, now_ns: int, sweeps: list[Sweep]) -> None:
+        """End sweeps whose time has passed when another begins, which may be read much later.
+
+        A bus keeps the order of its frames. So what began before a pause of the reader, or of the
+        bus, comes before what began after it.
+        """
+        sweeps += self.expire(now_ns)
+        self._none_old_until_ns = min(
+            (state.first_ns if state.missing else now_ns) + state.close_ns
+            for state in self._states.values()
+        )
 
     def _count_lone(self, state: _BoardState) -> None:
         """Count the lone frames of the last sweep: what was held up has come by now."""

@@ -142,7 +142,8 @@ class Daemon:
         self._clock_ahead_ns = self._clock_against_ns()
 
     async def run(self, stop: asyncio.Event, *, calibrate: bool = False) -> None:
-        """Run until `stop` is set; then end every touch, stop the boards and disconnect.
+        """Run until `stop` is set and what was received by then is processed; then end every touch,
+        stop the boards and disconnect.
 
         Args:
             stop: set it to end.
@@ -166,7 +167,7 @@ class Daemon:
         if self.settings.service.metrics_port:
             serving = metrics.serve(self.settings.service.metrics_port, self.status, self.clock)
             tasks.append(asyncio.create_task(serving, name="metrics"))
-        stopping = asyncio.create_task(stop.wait(), name="stop")
+        stopping = asyncio.create_task(self._stopped(stop), name="stop")
         try:
             await _first_failure(tasks, stopping)
         finally:
@@ -180,6 +181,11 @@ class Daemon:
                 await asyncio.wait([self._keeping], timeout=KEEPING_S)
             await self._keep_zeros(touched=True)
             await self.link.stop()
+
+    async def _stopped(self, stop: asyncio.Event) -> None:
+        """Wait for the stop request, and until what came before it was read and counted."""
+        await stop.wait()
+        await self.link.catch_up()
 
     async def calibrate(self, seconds: float, boards: list[int] | None = None) -> Calibration:
         """Take a calibration, use it from then on, and store it.
@@ -505,7 +511,7 @@ def _touch_only(settings: Settings, layout: Layout, parts: list[int]) -> set[int
     return {i for i in parts if not settings.parts[layout.parts[i].name].frames}
 
 
-async def _first_failure(tasks: list[asyncio.Task[None]], stopping: "asyncio.Task[bool]") -> None:
+async def _first_failure(tasks: list[asyncio.Task[None]], stopping: asyncio.Task[None]) -> None:
     """Wait for the stop request. A task that fails before it ends the daemon."""
     done, _ = await asyncio.wait([*tasks, stopping], return_when=asyncio.FIRST_COMPLETED)
     for task in done:

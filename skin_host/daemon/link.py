@@ -14,7 +14,7 @@ from skin_host.bus.boards import Boards
 from skin_host.bus.opening import open_port
 from skin_host.bus.port import Port
 from skin_host.bus.wake import LONGEST_NS, WakeUp
-from skin_host.bus.wire import FrameBatch, RecordBatch
+from skin_host.bus.wire import NS_PER_S, FrameBatch, RecordBatch
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Bus, Receive
 from skin_host.errors import BusError, SkinError
@@ -35,6 +35,8 @@ PATIENCE_NS = 100_000_000
 #: It may go on as late as it was held up: it may be as long again until every board that was
 #: received before is received again, up to this.
 LONGEST_PATIENCE_NS = 2_000_000_000
+#: The end waits in steps of this until what came before it has been read.
+CATCH_UP_S = 0.005
 #: A bus that does not take the set-up of its boards is tried again after this.
 RETRY_S = 2.0
 STOP_S = 1.0
@@ -244,6 +246,20 @@ class Link:
             output = self._engine.expire(read_ns)
             self._note(output)
             deliver(output)
+
+    async def catch_up(self) -> None:
+        """Wait until `read` has read what came before now.
+
+        After a turn that was held up this lasts until every board was received again, or has had
+        the time for it: what a buffer had no room for shows in the boards' next sweeps.
+        """
+        asked_ns = self._clock.now_ns()
+        end_s = self._clock.monotonic_s() + LONGEST_PATIENCE_NS / NS_PER_S
+        while self.read_ns < asked_ns or self._held_up_at_ns is not None:
+            if self._clock.monotonic_s() >= end_s:
+                log.warning("ends with frames unread: they come faster than they are processed")
+                return
+            await self._clock.sleep(CATCH_UP_S)
 
     def _note_held_up(self, now_ns: int, pause_ns: int) -> None:
         """This turn was held up; what waits has not been read yet."""

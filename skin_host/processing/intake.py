@@ -26,6 +26,8 @@ from skin_host.processing.liveness import PADS, Liveness
 from skin_host.processing.masks import Mask, any_of, count_of
 from skin_host.processing.stuck import Encoding, Repeats
 
+#: Sweeps that are further apart, in periods, are of no one sample, however they were read.
+APART_PERIODS = 2
 #: A silent part reports its silence at once and then once a second.
 SILENCE_REPEAT_NS = 1_000_000_000
 #: This many pads far below zero pressure are not an accident.
@@ -190,7 +192,9 @@ class Intake:
         # Samples that the board's second sweep completes, before it replaces the first.
         completed: dict[int, PartSample] = {}
         for state in states:
-            if board not in state.waits:
+            if board not in state.waits or (
+                state.pending and abs(t_ns - state.first_ns) > APART_PERIODS * state.period_ns
+            ):
                 completed[state.index] = self._sample(state)
         self._raw[row] = sweep.raw.reshape(-1)
         if masks is not self._masks[row]:

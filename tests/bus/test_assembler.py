@@ -415,6 +415,20 @@ def test_a_sweep_expires_once_it_is_older_than_its_share_of_a_period() -> None:
     assert assembler.expire(10 * PERIOD) == []
 
 
+def test_what_began_before_a_pause_comes_before_what_began_after_it() -> None:
+    """A reader that was held up reads both at once, and joins boards' sweeps as they come."""
+    assembler = make(boards=2)
+    for number in range(1, 4):
+        for board in (1, 2):
+            feed(assembler, frames(values(4), number * PERIOD, board))
+    before, after = 4 * PERIOD, 24 * PERIOD
+    sent = [*frames(values(4), before, 1)[:5], *frames(values(4), after, 2)]
+    sent += frames(values(4), after + 5 * MS, 1)
+    sweeps = feed(assembler, sent)
+    assert [(one.board, one.t_ns // PERIOD) for one in sweeps] == [(0, 4), (1, 24), (0, 24)]
+    assert [one.present for one in sweeps] == [0b0011, 0b1111, 0b1111]
+
+
 def test_two_boards_at_one_address_crowd_it_and_one_that_is_early_does_not() -> None:
     def crowded(apart_ms: float) -> int:
         assembler = make("0")

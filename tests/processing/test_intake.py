@@ -72,6 +72,19 @@ def test_a_dead_board_is_waited_for_no_longer_than_its_second_turn():
     assert not sample.present[16 * 12 :].any()
 
 
+def test_sweeps_from_before_and_after_a_pause_are_no_one_sample():
+    """Nothing of the time between was received, and both are read at once."""
+    parts = intake()
+    assert parts.feed([sweep(OUTER, 2 * PERIOD)]) == []
+    (before,) = parts.feed([sweep(INNER, 22 * PERIOD)])
+    assert before.t_ns == 2 * PERIOD
+    assert before.present[: 16 * 12].all()
+    assert not before.present[16 * 12 :].any()
+    (after,) = parts.feed([sweep(OUTER, 22 * PERIOD + 3 * MS)])
+    assert after.t_ns == 22 * PERIOD + 3 * MS
+    assert after.present.all()
+
+
 @pytest.mark.parametrize("direction", [1, -1])
 def test_a_sample_waits_for_a_whole_period_of_a_clock_that_may_be_set_back(direction: int):
     parts = intake()

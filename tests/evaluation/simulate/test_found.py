@@ -177,6 +177,29 @@ def test_a_slow_disk_does_not_make_touches_last_when_the_daemon_ends(world: Worl
         assert runner.run(live()) == b"UNKNOWN"
 
 
+@pytest.mark.parametrize("seconds", [0.5, 4.0], ids=["buffered", "beyond the buffer"])
+def test_a_daemon_that_is_asked_to_end_right_after_a_stall_counts_what_was_sent_in_it(
+    world: World, seconds: float
+) -> None:
+    """It waits in the socket, or was dropped there, which the boards' next sweeps show."""
+
+    async def live() -> None:
+        life = start(world)
+        await world.clock.sleep(8.0)
+        world.clock.advance(seconds)
+        await world.end()
+        assert life.sent_before_end is not None
+        for bus, sent in life.sent_before_end.items():
+            counters = life.daemon.engine.assemblers[bus].counters
+            under_way = len(sent)
+            assert counters.sweeps + counters.missed >= sum(sent.values()) - under_way
+            port = life.daemon.link.ports[bus]
+            assert (port.counters.dropped > 0) == (seconds > 1.0)
+
+    with world.clock.runner() as runner:
+        runner.run(live())
+
+
 @pytest.mark.parametrize("number", range(2))
 def test_a_board_that_restarts_in_a_press_does_not_zero_it_away(world: World, number: int) -> None:
     """It is silent before it is set up again; its touches have ended as lost by then."""
