@@ -303,7 +303,7 @@ class Cable:
         self._port: SimulatedPort | None = None
         self._waiting: list[FrameBatch] = []
         self._n_waiting = 0
-        self._late: list[tuple[int, FrameBatch]] = []
+        self._late: list[FrameBatch] = []
         self._twin: list[FrameBatch] = []
         #: When a frame of each standard identifier was last read (ns, stepped time).
         self.read_ns = np.full(0x800, -(1 << 62), np.int64)
@@ -349,15 +349,10 @@ class Cable:
             self.blurred_ns = self._clock.monotonic_ns()
         if n:
             self.sent.note(batch)
-        if self._late:
-            now_ns = self._clock.monotonic_ns()
-            due = [one for at_ns, one in self._late if at_ns <= now_ns]
-            if due:
-                self._late = [one for one in self._late if one[0] > now_ns]
-                batch = join([*due, batch])
-                batch = _rows(batch, np.argsort(batch.t_ns, kind="stable"))
         if n and self.mischief.any():
             batch = self._spoil(batch)
+        if self._late:
+            batch = self._with_late(batch)
         if not len(batch):
             return
         batch.t_ns = batch.t_ns + (self._clock.now_ns() - self._clock.monotonic_ns())
@@ -373,6 +368,16 @@ class Cable:
         """Frames that passed while this computer was suspended."""
         self.fate.sent += len(batch)
         self.fate.unheard += len(batch)
+
+    def _with_late(self, batch: FrameBatch) -> FrameBatch:
+        """Add the frames that come late and have come by now."""
+        others = join(self._late)
+        due = others.t_ns <= self._clock.monotonic_ns()
+        if not due.any():
+            return batch
+        self._late = [] if due.all() else [_rows(others, ~due)]
+        batch = join([_rows(others, due), batch])
+        return _rows(batch, np.argsort(batch.t_ns, kind="stable"))
 
     def _with_twin(self, batch: FrameBatch) -> FrameBatch:
         """Add what a second board at one address sends, in the order of time."""
@@ -414,10 +419,9 @@ class Cable:
             late = rng.random(n) < what.late
             if late.any():
                 # They come by then, whenever somebody reads what came.
-                at_ns = self._clock.monotonic_ns() + what.late_ns
                 others = _rows(batch, late)
-                others.t_ns = np.full(len(others), at_ns, np.int64)
-                self._late.append((at_ns, others))
+                others.t_ns = others.t_ns + what.late_ns
+                self._late.append(others)
                 batch = _rows(batch, ~late)
                 n = len(batch)
         if what.lost:
