@@ -39,8 +39,8 @@ class Life(Living):
         self.world = world
         self.ports: list[SimulatedPort] = []
         self.began_ns = world.clock.monotonic_ns()
-        #: By bus, how many sweeps each address had sent when the daemon was asked to end: it need not
-        #: read what comes later, whatever it has to finish.
+        #: By bus, how many sweeps each address had sent when the daemon was asked to end: it need
+        #: not read what comes later, whatever it has to finish.
         self.sent_before_end: dict[str, dict[int, int]] | None = None
         self.disk = SimulatedDisk(
             world.chance, world.clock.monotonic_ns, world.trace, world.power_cut
