@@ -13,8 +13,9 @@ from skin_host.mqtt.messages import (
     decode_slip,
     decode_touch,
 )
+from skin_host.mqtt.order import Stamp
 from skin_host.mqtt.payload import MessageError
-from skin_host.mqtt.topics import PartTopic
+from skin_host.mqtt.topics import ONLINE, PartTopic
 from skin_host.processing.events import Touch
 
 if TYPE_CHECKING:
@@ -43,6 +44,18 @@ class Health(NamedTuple):
     @property
     def sentences(self) -> list[str]:
         return self.record.get("sentences", [])
+
+
+def says_online(payload: bytes, stamp: Stamp | None, *, is_only_broker: bool) -> bool | None:
+    """Return what a status says of its node; None: nothing.
+
+    A last will says that a connection has ended. Where there are several brokers, the node may have
+    another connection by then, of which we have not heard yet.
+    """
+    if payload == ONLINE:
+        return True
+    is_will = stamp is not None and stamp.is_last_will
+    return None if not payload or (is_will and not is_only_broker) else False
 
 
 _EVENTS: dict[str, Callable[[bytes], Touch | Slip | Over]] = {

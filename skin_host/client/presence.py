@@ -1,8 +1,10 @@
-"""Contact state of the parts, and whether it is still known. Pure: takes times.
+"""Contact state of the parts and status of the nodes, and whether they are still known. Pure: takes
+times.
 
 Fails safe: a part whose node is offline or silent, or whose broker is lost, is UNKNOWN, whatever
 was received from it last. So is a part whose messages come much later than before: a broker that
-was frozen, or has too much to do, delivers what was true then.
+was frozen, or has too much to do, delivers what was true then. By the same rule nothing is known of
+a node of which no part is received in time.
 """
 
 import math
@@ -14,7 +16,8 @@ from skin_host.mqtt.messages import ContactState
 from skin_host.processing.events import Touch
 
 #: Why a contact state is unknown: the node cannot feel all of the part; the node, or only this
-#: part, has not been received for too long; the node has stopped; the broker is lost.
+#: part, has not been received for too long; the node has stopped; the broker is lost, or the
+#: connection of the node, which may have another one by now.
 Why = Literal["not_felt", "stale", "offline", "disconnected"]
 
 
@@ -81,8 +84,16 @@ class _Part:
         self.alive_s = max(self.alive_s, now_s - self.late_s)
 
 
+@dataclass(slots=True)
+class _Node:
+    #: As it or its last will said last; None: that is not known any more.
+    online: bool | None
+    #: Brokers from which that came.
+    over: set[int]
+
+
 class Presence:
-    """Follows contact states, touches and signs of life.
+    """Follows contact states, touches, signs of life, and nodes.
 
     Args:
         stale_s: a part not received for this long is UNKNOWN. Its health is sent once a second.
@@ -92,7 +103,7 @@ class Presence:
         self._stale_s = stale_s
         self._parts: dict[str, _Part] = {}
         self._node_of: dict[str, str] = {}
-        self._offline: set[str] = set()
+        self._nodes: dict[str, _Node] = {}
 
     def take_state(
         self,
@@ -137,11 +148,19 @@ class Presence:
         else:
             part.touches[touch.id] = touch, now_s
 
-    def take_node(self, node: str, online: bool | None) -> None:
-        if online is False:
-            self._offline.add(node)
-        else:
-            self._offline.discard(node)
+    def take_node(
+        self, node: str, online: bool | None, broker: int = 0, *, again: bool = False
+    ) -> None:
+        """Take the newest status of a node; None: its connection ended, or the status was deleted.
+
+        Args:
+            node: whose.
+            online: what it says, see `heard.says_online`.
+            broker: from which it came.
+            again: it came from another broker before.
+        """
+        over = self._nodes[node].over if again and node in self._nodes else set()
+        self._nodes[node] = _Node(online, over | {broker})
 
     def take_info(self, node: str, parts: Iterable[str]) -> None:
         self._node_of |= dict.fromkeys(parts, node)
@@ -152,19 +171,44 @@ class Presence:
             part.over.discard(broker)
             if not part.over:
                 part.received = None
+        for node in self._nodes.values():
+            node.over.discard(broker)
+            if not node.over:
+                node.online = None
 
     def forget(self) -> None:
         self._parts.clear()
+
+    def online(self, node: str, now_s: float) -> bool | None:
+        """Return whether a node is online; None: not known.
+
+        Not while all of its parts that are followed are silent, or are received too late.
+        """
+        known = self._nodes.get(node)
+        if known is None or not known.online:
+            return None if known is None else known.online
+        parts = [
+            part
+            for name, part in self._parts.items()
+            if part.received is not None and self._node_of.get(name) == node
+        ]
+        stale = all(now_s - part.alive_s > self._stale_s for part in parts)
+        return None if parts and stale else True
+
+    def brokers(self, node: str) -> set[int]:
+        """Return the brokers from which the newest status of a node came."""
+        return self._nodes[node].over if node in self._nodes else set()
 
     def contact(self, part: str, now_s: float) -> Contact | None:
         """Return the present state of a part; None if nothing was received of it."""
         known = self._parts.get(part)
         if known is None or (known.received is None and known.reported is None):
             return None
+        node = self._nodes.get(self._node_of.get(part, ""))
         why: Why | None = None
-        if known.received is None:
+        if known.received is None or (node is not None and node.online is None):
             why = "disconnected"
-        elif self._node_of.get(part) in self._offline:
+        elif node is not None and not node.online:
             why = "offline"
         elif now_s - known.alive_s > self._stale_s:
             why = "stale"

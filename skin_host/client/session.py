@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Self, TypeVar
 from weakref import WeakSet
 
-from skin_host.client.heard import Health, read
+from skin_host.client.heard import Health, read, says_online
 from skin_host.client.links import RETAINED_S, BrokerLink, only_robot
 from skin_host.client.order import EventOrder, Newest
 from skin_host.client.presence import Contact, Presence
@@ -30,7 +30,7 @@ from skin_host.mqtt.info import NodeInfo, decode_info, join_pieces
 from skin_host.mqtt.messages import Frame
 from skin_host.mqtt.order import run_of, stamp_of
 from skin_host.mqtt.payload import JSON_TYPE
-from skin_host.mqtt.topics import ONLINE, PartTopic, Topics
+from skin_host.mqtt.topics import PartTopic, Topics
 from skin_host.processing.events import Touch
 from skin_host.tasks import cancel
 
@@ -54,12 +54,15 @@ class CommandError(SkinError):
 
 @dataclass
 class Node:
-    """A daemon of the robot. `online` is None until its status was received."""
+    """A daemon of the robot. `online` is None while that is not known.
+
+    So it is until its status was received; without a broker; while the messages of all its parts
+    that are followed come too late or not at all; and, with several brokers, after its connection
+    ended without a word: it may have another one by then.
+    """
 
     online: bool | None = None
     info: NodeInfo | None = None
-    #: Brokers from which its newest status came.
-    over: set[int] = field(default_factory=set, repr=False)
     #: Pieces of its info, by number.
     pieces: dict[int, NodeInfo] = field(default_factory=dict, repr=False)
 
@@ -334,7 +337,8 @@ class SkinClient:
         # By then all retained messages have been received: there are no more nodes than these.
         age_s = _now_s() - max(link.since_s for link in self._links)
         await asyncio.sleep(max(0.0, RETAINED_S - age_s))
-        online = sorted(name for name, node in self.nodes.items() if node.online)
+        known = sorted(name for name, node in self.nodes.items() if node.online is not False)
+        online = [name for name in known if self.nodes[name].online] or known
         if len(online) == 1:
             return online[0]
         names = ", ".join(online) or "none"
@@ -355,7 +359,7 @@ class SkinClient:
 
     def _way_to(self, node: str) -> Connection | None:
         """Return the connection to a broker where a node is; a request must not reach it twice."""
-        over = self.nodes[node].over if node in self.nodes else set()
+        over = self._presence.brokers(node)
         for link in self._links:
             if link.connection and (link.number in over or len(self._links) == 1):
                 return link.connection
@@ -371,10 +375,9 @@ class SkinClient:
             self.last_error = link.last_error
         if link.connection is None:
             self._presence.take_loss(link.number)
-            for node in self.nodes.values():
-                node.over.discard(link.number)
             if not self._stopping:
                 self._report_contacts()
+                self._note_nodes()
         self._news.set()
 
     def unfollow(self, topic: str) -> None:
@@ -420,7 +423,7 @@ class SkinClient:
         kind, name, piece = place
         try:
             if kind == "status":
-                self._take_status(name, payload, link, self._newness(kind, name, message))
+                self._take_status(name, payload, link, message)
             elif kind == "info":
                 if self._newness(kind, f"{name}/{piece}", message) is not False:
                     self._take_info(name, piece, payload)
@@ -442,17 +445,23 @@ class SkinClient:
             return True
         return self._newest.take(kind, name, stamp_of(message.properties))
 
-    def _take_status(
-        self, name: str, payload: bytes, link: BrokerLink, newness: bool | None
-    ) -> None:
+    def _take_status(self, name: str, payload: bytes, link: BrokerLink, message: Message) -> None:
+        newness = self._newness("status", name, message)
         if newness is False:
             return
-        node = self.nodes.setdefault(name, Node())
-        node.over = {link.number} if newness else node.over | {link.number}
-        node.online = payload == ONLINE if payload else None
-        self._presence.take_node(name, node.online)
+        said = says_online(
+            payload, stamp_of(message.properties), is_only_broker=len(self._links) == 1
+        )
+        self._presence.take_node(name, said, link.number, again=newness is None)
+        self.nodes.setdefault(name, Node())
         self._report_contacts()
+        self._note_nodes()
         self._news.set()
+
+    def _note_nodes(self) -> None:
+        now_s = _now_s()
+        for name, node in self.nodes.items():
+            node.online = self._presence.online(name, now_s)
 
     def _take_info(self, name: str, piece: int, payload: bytes) -> None:
         node = self.nodes.setdefault(name, Node())
@@ -536,6 +545,7 @@ class SkinClient:
             for event in self._order.expire(_now_s()):
                 self._pass_on(event)
             self._report_contacts()
+            self._note_nodes()
 
 
 def _check_several(brokers: list[Broker], robot: str | None) -> None:

@@ -6,7 +6,8 @@ hand; with `--full` nine of ten are `fleet_sockets.PlainRobot`, for more message
 Python can send on a computer that also has the brokers and the subscribers. At each broker a
 subscriber receives all robots, and orders their messages by number as `SkinClient` does. What is
 counted: events that a broker acknowledged and that were not passed on, or twice, or out of order;
-and states that differ from all that the robot has sent within 5 s.
+and states that differ from all that the robot has sent within 5 s. UNKNOWN is no such state; how
+long states were UNKNOWN while the robots ran is counted, too.
 """
 
 import asyncio
@@ -33,6 +34,7 @@ from typing import Any, NamedTuple, Protocol
 import msgspec
 import numpy as np
 
+from skin_host.client.heard import says_online
 from skin_host.client.links import BrokerLink
 from skin_host.client.order import EventOrder, Newest
 from skin_host.client.presence import Presence
@@ -46,13 +48,13 @@ from skin_host.mqtt.connection import Connection, Message
 from skin_host.mqtt.messages import decode_contact, decode_touch
 from skin_host.mqtt.order import run_of, stamp_of
 from skin_host.mqtt.publisher import Publisher
-from skin_host.mqtt.topics import ONLINE
 from skin_host.processing.events import Touch
 from skin_host.tasks import cancel
 
 TRAFFIC = Path(__file__).parent / "fleet_traffic.jsonl"
 BASE = "skin"
 PART = "left_hand"
+NODE = "main"
 STALE_S = 3.0
 #: A client's state may lag by this much.
 ALLOWED_S = 5.0
@@ -208,6 +210,7 @@ async def _conduct(brokers: Brokers, plan: FleetPlan, pipes: list[Pipe]) -> dict
             ear.end_phase(phase, took_s)
             | {"brokers_cpu": round(max(0.0, brokers.cpu_s() - cpu_s) / took_s, 3)}
         )
+    ended_s = time.time()
     for pipe in pipes:
         pipe.send("end")
     told: dict[str, RobotSent] = {}
@@ -215,7 +218,7 @@ async def _conduct(brokers: Brokers, plan: FleetPlan, pipes: list[Pipe]) -> dict
         told |= await asyncio.to_thread(pipe.recv)
     await ear.settled({name: said.events for name, said in told.items()})
     await cancel(*tasks)
-    verdict = ear.judge(told)
+    verdict = ear.judge(told, ended_s)
     return {
         "engine": brokers.name,
         "machine": machine(),
@@ -231,6 +234,9 @@ def _broker(address: str, brokers: Brokers) -> Broker:
     return Broker(host, int(port), username=brokers.username, password=brokers.password)
 
 
+_STATUSES = {True: "online", False: "offline", None: "UNKNOWN"}
+
+
 @dataclass
 class _Received:
     """One robot, as assembled from its messages."""
@@ -242,10 +248,17 @@ class _Received:
     contacts: list[tuple[float, str]] = field(default_factory=list)
     status: list[tuple[float, str]] = field(default_factory=list)
 
-    def note_contact(self) -> None:
+    def __post_init__(self) -> None:
+        self.presence.take_info(NODE, [PART])
+
+    def note(self) -> None:
         """Store what a client would show."""
-        for contact in self.presence.changes(time.monotonic()):
+        now_s = time.monotonic()
+        for contact in self.presence.changes(now_s):
             self.contacts.append((time.time(), contact.state))
+        status = _STATUSES[self.presence.online(NODE, now_s)]
+        if not self.status or self.status[-1][1] != status:
+            self.status.append((time.time(), status))
 
 
 class _FullEar(BrokerLink):
@@ -300,7 +313,7 @@ class _Receiver:
         """The connection to a broker is lost."""
         for robot in self._robots.values():
             robot.presence.take_loss(number)
-            robot.note_contact()
+            robot.note()
 
     def take(self, link: BrokerLink, message: Message) -> None:
         """Process a message of the client's library."""
@@ -332,11 +345,10 @@ class _Receiver:
             robot.presence.take_state(PART, state, at_s, number, again=again, sent_s=sent_s)
         elif kind == "health" and newness and not heard.retained:
             robot.presence.take_sign(PART, at_s, sent_s)
-        elif kind == "status" and newness:
-            online = heard.payload == ONLINE
-            robot.presence.take_node("main", online)
-            robot.status.append((now_s, heard.payload.decode()))
-        robot.note_contact()
+        elif kind == "status" and newness is not False:
+            online = says_online(heard.payload, heard.stamp, is_only_broker=False)
+            robot.presence.take_node(NODE, online, number, again=newness is None)
+        robot.note()
 
     def _pass_on(self, robot: _Received, events: Sequence[Any], now_s: float) -> None:
         for event in events:
@@ -344,7 +356,7 @@ class _Receiver:
             robot.counts.append(event.count)
             self._delays_s.append(now_s - event.t_ns * 1e-9)
             robot.presence.take_touch(event, time.monotonic())
-        robot.note_contact()
+        robot.note()
 
     async def watch(self) -> None:
         """Release events whose predecessors never came."""
@@ -380,10 +392,10 @@ class _Receiver:
             "worst_ms": round(float(np.max(delays_ms)), 1),
         }
 
-    def judge(self, told: dict[str, RobotSent]) -> dict[str, Any]:
-        """Compare with what the robots sent."""
-        lost = twice = disordered = wrong = offline = events = 0
-        unknown_s = 0.0
+    def judge(self, told: dict[str, RobotSent], ended_s: float) -> dict[str, Any]:
+        """Compare with what the robots sent, which ended at a time."""
+        lost = twice = disordered = wrong = offline = events = changes = 0
+        contact_s = status_s = 0.0
         for name, said in told.items():
             heard = self._robots[name]
             events += said.events
@@ -392,8 +404,9 @@ class _Receiver:
             twice += sum(n - 1 for n in passed.values())
             disordered += sum(b < a for a, b in zip(heard.counts, heard.counts[1:], strict=False))
             wrong += _wrong(said.contacts, heard.contacts)
-            spans = zip(heard.contacts, heard.contacts[1:], strict=False)
-            unknown_s += sum(b[0] - a[0] for a, b in spans if a[1] == "UNKNOWN")
+            contact_s += _unknown_s(heard.contacts, ended_s)
+            status_s += _unknown_s(heard.status, ended_s)
+            changes += sum(at_s < ended_s for at_s, _ in heard.status[1:])
             offline += _wrong([(0.0, "online")], heard.status)
         return {
             "events": events,
@@ -403,7 +416,9 @@ class _Receiver:
             "lost": lost,
             "passed_on_twice": twice,
             "out_of_order": disordered,
-            "unknown_s_a_robot": round(unknown_s / len(told), 2),
+            "unknown_s_a_robot": round(contact_s / len(told), 2),
+            "status_unknown_s_a_robot": round(status_s / len(told), 2),
+            "status_changes_a_robot": round(changes / len(told), 2),
             "robots_with_wrong_contact": wrong,
             "robots_falsely_offline": offline,
         }
@@ -434,6 +449,17 @@ def _wrong(said: list[tuple[float, str]], heard: list[tuple[float, str]]) -> boo
             return True
     known = [state for _, state in heard if state != "UNKNOWN"]
     return known[-1:] != [said[-1][1]]
+
+
+def _unknown_s(heard: list[tuple[float, str]], end_s: float) -> float:
+    """How long a state was UNKNOWN until `end_s`, after it was first known."""
+    known = next((i for i, (_, state) in enumerate(heard) if state != "UNKNOWN"), len(heard))
+    spans = zip(heard[known:], [*heard[known + 1 :], (end_s, "")], strict=False)
+    return sum(
+        max(0.0, min(to_s, end_s) - from_s)
+        for (from_s, state), (to_s, _) in spans
+        if state == "UNKNOWN"
+    )
 
 
 def _work(
@@ -581,7 +607,10 @@ def describe(document: dict[str, Any]) -> str:
     lines.append(
         f"robots of which a state was wrong for more than {ALLOWED_S:g} s: contact "
         f"{document['robots_with_wrong_contact']} (UNKNOWN for "
-        f"{document['unknown_s_a_robot']:g} s a robot), status {document['robots_falsely_offline']}"
+        f"{document['unknown_s_a_robot']:g} s a robot), status "
+        f"{document['robots_falsely_offline']} (UNKNOWN for "
+        f"{document['status_unknown_s_a_robot']:g} s a robot, "
+        f"{document['status_changes_a_robot']:g} changes)"
     )
     return "\n".join(lines)
 

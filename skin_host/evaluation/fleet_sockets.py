@@ -131,7 +131,7 @@ class PlainRobot(asyncio.Protocol):
         try:
             async with asyncio.timeout(TIMEOUT_S):
                 transport, _ = await loop.create_connection(lambda: self, broker.host, broker.port)
-                will = self._status, OFFLINE, self._numbers.offline
+                will = self._status, OFFLINE, self._numbers.last_will
                 transport.write(_connect(broker, self._identifier, will))
                 await self._accepted
         except (OSError, TimeoutError):

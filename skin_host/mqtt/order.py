@@ -6,7 +6,7 @@ order:
 
 - `run`, of events and frames: the number of this run of the node; within it `count` or `seq` rises.
 - `stamp`, of retained messages: two numbers with a dot between, that of the connection and that of
-  the message in it.
+  the message in it, which is 1 for the last will only.
 
 Runs and connections have rising numbers: nanoseconds since 1970, by the clock of the node. Those of
 messages rise with the nanoseconds since the connection began: a subscriber that sees the distance
@@ -27,6 +27,7 @@ RUN = "run"
 _MAX_DIGITS = 19
 #: A run that comes after a later one than this would have a longer number.
 _LAST_RUN = 10**_MAX_DIGITS - 10**9
+_ONLINE, _LAST_WILL = 0, 1
 
 
 class Stamp(NamedTuple):
@@ -39,6 +40,11 @@ class Stamp(NamedTuple):
     def sent_s(self) -> float:
         """When it was published, by the node's clock."""
         return (self.connection + self.message) * 1e-9
+
+    @property
+    def is_last_will(self) -> bool:
+        """Whether the broker said it: the connection has ended, but perhaps not the node."""
+        return self.message == _LAST_WILL
 
 
 class Numbers:
@@ -64,21 +70,21 @@ class Numbers:
     def connect(self) -> None:
         """Continue with the numbers of the next connection."""
         self.connection = self._next()
-        self._message = len(("online", "offline")) - 1
+        self._message = _LAST_WILL
         self._began_ns = self._monotonic_ns()
 
     @property
     def online(self) -> Stamp:
         """Return the stamp of the status while the connection lasts."""
-        return Stamp(self.connection, 0)
+        return Stamp(self.connection, _ONLINE)
 
     @property
-    def offline(self) -> Stamp:
-        """Return the stamp of the status at its end."""
-        return Stamp(self.connection, 1)
+    def last_will(self) -> Stamp:
+        """Return the stamp of what the broker says when the connection ends without a word."""
+        return Stamp(self.connection, _LAST_WILL)
 
     def state(self) -> Stamp:
-        """Return the stamp of any other retained message."""
+        """Return the stamp of any other retained message, also of the node's own `offline`."""
         self._message = max(self._message + 1, self._monotonic_ns() - self._began_ns)
         return Stamp(self.connection, self._message)
 

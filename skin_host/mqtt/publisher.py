@@ -263,7 +263,7 @@ class Publisher:
                 )
                 self._broker = self._brokers[self._turn % len(self._brokers)]
                 self._numbers.connect()
-                stamp = self._numbers.offline if self._broker.v5 else None
+                stamp = self._numbers.last_will if self._broker.v5 else None
                 async with self._connect(
                     self._broker,
                     identifier=self._identifier,
@@ -384,11 +384,8 @@ class Publisher:
     def _state_properties(self, topic: str, payload: bytes) -> MessageProperties | None:
         kind = JSON_TYPE if payload.startswith(b"{") else "text/plain"
         properties = message_properties(self._broker, kind)
-        if topic != self._status:
-            put_stamp(properties, self._numbers.state())
-        else:
-            online = payload == ONLINE
-            put_stamp(properties, self._numbers.online if online else self._numbers.offline)
+        is_online = topic == self._status and payload == ONLINE
+        put_stamp(properties, self._numbers.online if is_online else self._numbers.state())
         return properties
 
     async def _subscribe(self, connection: Connection) -> None:

@@ -118,13 +118,27 @@ async def test_what_the_broker_that_failed_still_holds_is_history(
                     await anext(contacts)
 
 
-async def test_a_node_that_dies_is_offline_by_the_will_of_its_last_connection(
+async def test_a_node_that_dies_may_be_anywhere_and_one_that_says_so_is_offline(
     brokers: list[Mosquitto],
 ) -> None:
-    async with publishing(brokers) as publisher, hearing(brokers) as skin:
-        await until(lambda: skin.nodes and skin.nodes["main"].online)
-        publisher._task.cancel()  # type: ignore[union-attr]  # its connection is cut
+    async with hearing(brokers) as skin:
+        async with publishing(brokers) as publisher:
+            await until(lambda: skin.nodes and skin.nodes["main"].online)
+            publisher._task.cancel()  # type: ignore[union-attr]  # its connection is cut
+            await until(lambda: skin.nodes["main"].online is None)
+        async with publishing(brokers):
+            await until(lambda: skin.nodes["main"].online)
         await until(lambda: skin.nodes["main"].online is False)
+
+
+async def test_a_node_is_unknown_while_no_broker_is_left(brokers: list[Mosquitto]) -> None:
+    async with publishing(brokers), hearing(brokers) as skin:
+        await until(lambda: skin.nodes and skin.nodes["main"].online)
+        for broker in brokers:
+            broker.kill()
+        await until(lambda: skin.nodes["main"].online is None)
+        brokers[1].restart()
+        await until(lambda: skin.nodes["main"].online)
 
 
 async def test_a_command_reaches_the_robot_where_it_is_and_once(brokers: list[Mosquitto]) -> None:

@@ -86,7 +86,7 @@ def test_numbers_rise_while_the_clock_is_set_back() -> None:
     for _ in range(3):
         numbers.connect()
         given.append(numbers.connection)
-        assert numbers.online < numbers.offline < numbers.state() < numbers.state()
+        assert numbers.online < numbers.last_will < numbers.state() < numbers.state()
     assert given == [100, 101, 102, 200]
 
 

@@ -9,11 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skin_host.client import Contact, SkinCallbacks
+from skin_host.client.heard import says_online
+from skin_host.client.order import Newest
 from skin_host.client.presence import DISTANCE_S, Lateness, Presence
 from skin_host.config.settings import load
 from skin_host.layout import build_layout
 from skin_host.mqtt.info import node_info
+from skin_host.mqtt.order import Stamp
 from skin_host.mqtt.publisher import Publisher
+from skin_host.mqtt.topics import OFFLINE, ONLINE
 from skin_host.processing.events import Touch
 from tests.client.test_client import hearing, publishing, take, touch
 from tests.support.broker import Mosquitto
@@ -115,6 +119,76 @@ def test_a_node_that_stops_takes_its_parts_with_it() -> None:
     presence.changes(0.0)
     presence.take_node("arm", False)
     assert presence.changes(0.1) == [Contact("palm", "UNKNOWN", "offline")]
+
+
+def test_a_last_will_says_nothing_of_a_node_that_may_be_at_another_broker() -> None:
+    # The will of its old connection comes first; what it says over the new one comes 26 s late.
+    newest, presence = Newest(), Presence(stale_s=3.0)
+    presence.take_info("main", ["palm"])
+
+    def take(payload: bytes, stamp: Stamp, broker: int) -> None:
+        newness = newest.take("status", "main", stamp)
+        if newness is not False:
+            said = says_online(payload, stamp, is_only_broker=False)
+            presence.take_node("main", said, broker, again=newness is None)
+
+    take(ONLINE, Stamp(100, 0), 0)
+    presence.take_state("palm", "OFF", 0.0)
+    assert presence.online("main", 0.0)
+    assert presence.changes(0.0) == [Contact("palm", "OFF")]
+    take(OFFLINE, Stamp(100, 1), 0)
+    assert presence.online("main", 26.0) is None
+    assert presence.changes(0.1) == [Contact("palm", "UNKNOWN", "disconnected")]
+    take(ONLINE, Stamp(200, 0), 1)
+    presence.take_state("palm", "ON", 26.0, 1)
+    assert presence.online("main", 26.0)
+    assert presence.changes(26.0) == [Contact("palm", "ON")]
+    take(OFFLINE, Stamp(100, 1), 2)  # the same will by a broker that was frozen
+    assert presence.online("main", 26.1)
+    take(OFFLINE, Stamp(200, 77), 1)  # its own word
+    assert presence.online("main", 26.2) is False
+    take(OFFLINE, Stamp(200, 1), 2)  # adds nothing to that
+    assert presence.online("main", 26.3) is False
+
+
+def test_with_one_broker_the_last_will_is_believed() -> None:
+    assert says_online(OFFLINE, Stamp(100, 1), is_only_broker=True) is False
+    assert says_online(OFFLINE, None, is_only_broker=True) is False
+    assert says_online(b"", None, is_only_broker=True) is None
+
+
+def test_a_node_whose_parts_all_fall_silent_or_come_late_is_not_said_to_be_online() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_info("main", ["palm", "foot"])
+    presence.take_node("main", True)
+    presence.take_touch(seen("begin"), 0.0)
+    assert presence.online("main", 60.0)  # who does not follow states cannot tell
+    presence.take_state("palm", "OFF", 60.0, sent_s=60.0)
+    presence.take_state("foot", "OFF", 60.0, sent_s=60.0)
+    assert presence.online("main", 62.9)
+    assert presence.online("main", 63.1) is None
+    presence.take_sign("foot", 64.0, 64.0)  # one part is enough
+    assert presence.online("main", 64.0)
+    for second in range(70, 90):  # the broker is held up: what comes now was true 6 s ago
+        presence.take_sign("foot", float(second), second - 6.0)
+        presence.take_sign("palm", float(second), second - 6.0)
+        assert presence.online("main", float(second)) is None
+    presence.take_sign("palm", 90.0, 89.5)
+    assert presence.online("main", 90.0)
+
+
+def test_a_node_is_unknown_when_no_broker_is_left_that_named_its_status() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_node("main", True, 0)
+    presence.take_node("main", True, 1, again=True)
+    presence.take_loss(0)
+    assert presence.online("main", 0.0)
+    assert presence.brokers("main") == {1}
+    presence.take_loss(1)
+    assert presence.online("main", 0.0) is None
+    presence.take_node("main", True, 0, again=True)
+    assert presence.online("main", 0.0)
+    assert presence.online("arm", 0.0) is None
 
 
 def test_after_a_lost_broker_the_state_before_is_history() -> None:

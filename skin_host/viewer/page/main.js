@@ -120,7 +120,7 @@ function step(by) {
 function nodesShown() { return [...new Set(map.parts.map((part) => part.node))]; }
 
 function mayCommand() {
-  return store.status.commands && nodesShown().some((node) => store.nodes[node]?.commands && store.status.nodes[node]);
+  return store.status.commands && nodesShown().some((node) => store.nodes[node]?.commands && store.status.nodes[node] !== false);
 }
 
 function setRaw(on) {
@@ -271,14 +271,16 @@ function staleText(stale) {
 
 function showStatus(nowMs) {
   const status = $("status");
-  const offline = Object.entries(store.status.nodes ?? {}).filter(([, online]) => !online).map(([node]) => node);
+  const nodes = Object.entries(store.status.nodes ?? {});
+  const [offline, unknown] = [false, null].map((state) => nodes.filter(([, online]) => online === state).map(([node]) => node).join(", "));
   const stale = store.parts.filter((part) => part.stale(nowMs));
   let [text, level] = ["", "ok"];
   if (link !== "open") [text, level] = [link === "lost" ? "this page has lost its server; trying again" : "connecting", link === "lost" ? "alarm" : "wait"];
   else if (!store.status.connected) [text, level] = [store.status.error || "connecting", "alarm"];
   else if (!store.parts.length) [text, level] = ["waiting for a node to say what it is", "wait"];
-  else if (offline.length) [text, level] = [`node ${offline.join(", ")} is offline`, "alarm"];
+  else if (offline) [text, level] = [`node ${offline} is offline`, "alarm"];
   else if (stale.length) [text, level] = [staleText(stale), "alarm"];
+  else if (unknown) [text, level] = [`not known whether node ${unknown} is online`, "wait"];
   else text = `live, ${store.parts.reduce((sum, part) => sum + part.n, 0)} taxels`;
   status.dataset.level = level;
   if (status.textContent !== text) status.textContent = text;
