@@ -441,6 +441,7 @@ class _PartPipeline:
         """Advance the foam's model through a gap, under the readings after it."""
         self._residuals.fade(gap_s)
         self.drift.pass_gap(gap_s)
+        self._detector.lose(self._detector.touched)
         if self._relaxation is None:
             return
         if self._samples:

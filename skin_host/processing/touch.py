@@ -33,6 +33,8 @@ DECIDE_S = 1.0
 #: A touch accumulates at most this many spans of evidence. Fewer make noisy taxels flicker, more
 #: make them release late.
 HOLD_SPANS = 1.5
+#: A touched taxel that was not received for this long must show again that it is touched.
+LOST_S = 0.5
 #: A firm press ends after at most this many measurements.
 RELEASE_MEASUREMENTS = 14
 #: No threshold and no span is less, whatever the settings: rounding is not evidence.
@@ -145,6 +147,9 @@ class TouchDetector:
         self._over: Mask = np.empty(n, np.bool_)
         self._limit = np.empty(n, np.float32)
         self._near = np.zeros(n, np.uint8)
+        #: For how long touched taxels were not received, and whether any was not.
+        self._unheard_s = np.zeros(n, np.float32)
+        self._is_unheard = False
         self.touched: Mask = np.zeros(n, np.bool_)
         self._bits = self.touched.tobytes()
         self._reads: Mask = np.empty(n, np.bool_)
@@ -199,7 +204,8 @@ class TouchDetector:
         Args:
             raw: uint8[n]; must not be written to afterwards.
             dt_s: time since the sweep before.
-            unheard: bool[n], taxels that were not received: their evidence does not change.
+            unheard: bool[n], taxels that were not received: their evidence does not change until
+                they are lost.
         """
         if self._skipped:
             self._skipped = False
@@ -213,6 +219,13 @@ class TouchDetector:
             np.putmask(gain, repeated, 0.0)  # in a third of the time of a copy with a mask
         if unheard is not None:
             gain[unheard] = 0.0
+            self._unheard_s += np.float32(dt_s)
+            self._unheard_s[~unheard] = 0.0
+            self._is_unheard = True
+            self.lose(self.touched & (self._unheard_s > LOST_S))
+        elif self._is_unheard:
+            self._unheard_s.fill(0.0)
+            self._is_unheard = False
         np.add(evidence, gain, out=evidence)
         np.maximum(evidence, self._none, out=evidence)
         np.minimum(evidence, self._hold, out=evidence)
@@ -225,6 +238,17 @@ class TouchDetector:
             self._set_limits()
         self._clear = False
         return self.touched
+
+    def lose(self, taxels: Mask) -> None:
+        """Some touched taxels, bool[n], were not received for long, and may have been released.
+
+        One vote of the next measurements makes them touched again: what still presses is felt at
+        once, and what has lifted meanwhile is no touch.
+        """
+        if any_of(taxels):
+            evidence = np.where(taxels, self._span - self._vote, self._evidence)
+            self.reset(taxels)
+            np.copyto(self._evidence, evidence)
 
     def reset(self, taxels: NDArray[np.intp] | Mask) -> None:
         """Forget that some taxels, by number or mask [n], were touched."""

@@ -418,3 +418,26 @@ def test_of_the_three_units_of_a_hard_press_one_is_left_after_five_seconds(
     residuals.step(np.array([False]), np.zeros(1))
     residuals.fade(5.0)
     assert bool(residuals.step(np.array([True]), np.array([reading]))[0]) is reported
+
+
+def after_an_outage(seconds: float, units: int) -> list[bool]:
+    """Press firmly, lose the taxel for some time, then read so many units; return the decisions."""
+    detector = detector_of()
+    for _ in range(10):
+        pressed(detector, [20])
+    raw = np.full(1, REST - 20, np.uint8)
+    for _ in range(round(seconds / SWEEP_S)):
+        detector.step(raw, SWEEP_S, np.ones(1, np.bool_))
+    return [bool(pressed(detector, [units])[0]) for _ in range(3)]
+
+
+def test_what_lifted_while_it_was_not_received_for_long_is_no_touch_when_it_is_back() -> None:
+    assert after_an_outage(1.0, 0) == [False, False, False]
+
+
+def test_what_still_presses_after_it_was_not_received_is_touched_at_once() -> None:
+    assert after_an_outage(1.0, 20) == [True, True, True]
+
+
+def test_a_few_sweeps_that_do_not_come_end_no_touch() -> None:
+    assert after_an_outage(0.2, 0) == [True, False, False]

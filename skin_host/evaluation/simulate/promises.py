@@ -8,7 +8,7 @@ ends the run.
 import asyncio
 import gc
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,6 +42,9 @@ SIGMAS = 4.0
 #: A pad is pressed at all; and so long after it began, a touch may not be decided yet.
 TOUCHING_KPA = 0.2
 DECIDED_NS = NS // 2
+#: A press is felt after so many samples, and is not for so many more where a chip has just come
+#: back.
+FELT_SAMPLES, DEAF_SAMPLES = 6, 3
 #: Foam that was pressed still relaxes for so long.
 RELAXED_NS = 60 * NS
 #: A calibration at rest began no longer ago when it is noted.
@@ -132,6 +135,10 @@ class Promises:
         layout = world.layout
         self._parts = {part.name: part for part in layout.parts}
         self._open: dict[str, set[int]] = {}
+        #: Of each part, which taxels its last frame has as touched; and for how many samples each
+        #: taxel has been pressed without that.
+        self._felt: dict[str, Mask] = {}
+        self._deaf = np.zeros(layout.n_taxels, np.int64)
         self._last_id: dict[str, int] = {}
         self._seq: dict[str, int] = {}
         #: Taxels whose values may be wrong: now, and until when.
@@ -186,6 +193,8 @@ class Promises:
         self._bus_of_board = [board.settings.bus for board in layout.boards]
         #: Retained topics as the daemon puts them, and when.
         self._said: dict[str, tuple[bytes, int]] = {}
+        #: Topics of contacts, and of what.
+        self._contacts: dict[str, str] = {}
         self._connected_ns: int | None = None
         self._connection = 0
         self._blank_since: dict[str, int] = {}
@@ -268,6 +277,7 @@ class Promises:
     def watch(self, life: Life) -> None:
         """Look at what a daemon puts out from its start on."""
         self._open.clear()
+        self._felt.clear()
         self._last_id.clear()
         self._seq.clear()
         self._counts.clear()
@@ -276,6 +286,11 @@ class Promises:
         self.accusations.restarted()
         self._swept = dict.fromkeys(self._world.cables, 0)
         self._said = {}
+        topics = life.daemon.publisher.topics
+        self._contacts = {
+            topics.part("contact", name): name
+            for name in (*self._parts, *self._world.settings.fingertips)
+        }
         self._blank_since.clear()
         self._connected_ns = None
         outbox: Any = life.daemon.publisher._outbox
@@ -317,12 +332,29 @@ class Promises:
                 self.break_(f"{event.part}: touch {event.id} begins again")
             self._last_id[event.part] = event.id
             now.add(event.id)
+            if event.part in self._parts and not self._has_cause(event.part, event.taxels).any():
+                self.break_(
+                    f"{event.part}: touch {event.id} begins at taxels {event.taxels} with "
+                    f"{event.peak_kpa:.1f} kPa, and nothing presses there"
+                )
         elif event.id not in now:
             self.break_(f"{event.part}: touch {event.id} has a {event.event} without a begin")
         if event.event == "end":
             now.discard(event.id)
         elif not event.taxels and event.part in self._parts:
             self.break_(f"{event.part}: touch {event.id} has no taxel")
+
+    def _has_cause(self, part: str, taxels: Sequence[int] | NDArray[np.intp]) -> Mask:
+        """Return whether each of some taxels of a part may be touched, bool[k]: something presses
+        it, or its foam still recovers from that, or its value may be wrong without anybody being
+        able to know.
+        """
+        mine = np.asarray(taxels, np.intp) + self._parts[part].start
+        caused: Mask = self._now_ns() - self._touched_ns[mine] < RELAXED_NS
+        if not caused.all():
+            caused |= self._world.robot.skin.true_pressure_kpa()[mine] > TOUCHING_KPA
+            caused |= (self._exempt | self._spoiled())[mine]
+        return caused
 
     def _frame(self, frame: PressureFrame) -> None:
         name = frame.part
@@ -357,6 +389,12 @@ class Promises:
             taxels = taxels[(taxels >= part.start) & (taxels < part.stop)] - part.start
             if frame.valid[taxels].any():
                 self.break_(f"{name}: triangle {board}/{triangle} is valid, and has no chip")
+        if frame.touched is not self._felt.get(name):
+            begun = np.flatnonzero(frame.touched & ~self._felt.get(name, False))
+            self._felt[name] = frame.touched
+            without = begun[~self._has_cause(name, begun)]
+            if len(without):
+                self.break_(f"{name}: taxels {without.tolist()} are touched, and nothing presses")
         if b"\1" in valid:
             self._blank_since.pop(name, None)
         else:
@@ -409,6 +447,8 @@ class Promises:
         before = self._said.get(topic)
         if before is None or before[0] != payload:
             self._said[topic] = payload, self._now_ns()
+        if payload == b"ON" and not self._open.get(self._contacts.get(topic, topic)):
+            self.break_(f"{topic}: ON without a touch")
 
     def _health(self, part: str, record: Any) -> None:
         wrong = self.accusations.note(part, record) or self.accusations.unnamed()
@@ -589,17 +629,34 @@ class Promises:
         if life is None or life.dead or len(self._truth) < SAMPLES:
             return
         spoiled = self._spoiled()
-        lately = np.array([values for _, values in list(self._truth)[-4:]])
         longer = np.array([values for _, values in self._truth])
-        least, most = lately.min(axis=0), longer.max(axis=0)
+        least, most = longer[-4:].min(axis=0), longer.max(axis=0)
+        pressed = longer[-FELT_SAMPLES:].min(axis=0) > PRESSED_KPA
+        rested = now_ns - self._touched_ns > RELAXED_NS
         pads = world.layout.pad_kind == PadKind.PRESSURE
         for name, frame in self._frames.items():
             part = self._parts[name]
             mine = slice(part.start, part.stop)
             wall_ns = world.clock.now_ns()
-            if abs(wall_ns - frame.t_ns) > NS // 2 or not frame.computed:
+            if abs(wall_ns - frame.t_ns) > NS // 2:
                 continue
             fit = frame.valid & pads[mine] & ~self._exempt[mine] & ~spoiled[mine]
+            lasts = fit & frame.touched & rested[mine]
+            if lasts.any():
+                taxels = np.flatnonzero(lasts).tolist()
+                self.break_(f"{name}: taxels {taxels} are still touched, and nothing presses")
+            deaf = fit & pressed[mine] & ~frame.touched
+            if deaf.any():
+                deaf &= self._decides_kpa(life, name) < PRESSED_KPA
+            self._deaf[mine] = np.where(deaf, self._deaf[mine] + 1, 0)
+            if self._deaf[mine].max() > DEAF_SAMPLES:
+                taxel = int(self._deaf[mine].argmax())
+                self.break_(
+                    f"{name}: taxel {taxel} is valid and not touched while it is pressed with "
+                    f"{truth[part.start + taxel]:.1f} kPa"
+                )
+            if not frame.computed:
+                continue
             missed = fit & (least[mine] > PRESSED_KPA) & (frame.pressure_kpa < FELT_KPA)
             if missed.any():
                 taxel = int(np.flatnonzero(missed)[0])
@@ -631,6 +688,17 @@ class Promises:
         units = SIGMAS * engine.calibration.spread[part.start : part.stop]
         index = list(self._parts).index(name)
         found: NDArray[np.float64] = engine.pipeline._parts[index]._curve.kpa(units)
+        return found
+
+    def _decides_kpa(self, life: Life, name: str) -> NDArray[np.float64]:
+        """Return what pressure each taxel [m] of a part detects within a second."""
+        pipeline = life.daemon.engine.pipeline
+        if pipeline is None:
+            return np.full(self._parts[name].n_taxels, np.inf)
+        rules = pipeline._parts[list(self._parts).index(name)]._rules
+        found: NDArray[np.float64] = rules.curve.kpa(
+            np.where(rules.usable, rules.levels.decides, 0.0)
+        )
         return found
 
     def _missed_boards(self, now_ns: int) -> None:

@@ -1,4 +1,4 @@
-"""Twenty faults planted into the daemon, and how many seeds `skin simulate` needs to find each.
+"""Faults planted into the daemon, and how many seeds `skin simulate` needs to find each.
 
     python -m tests.evaluation.simulate.mutants [--seeds 200] [--results FILE] [--only NAME ...]
 
@@ -25,6 +25,7 @@ import numpy as np  # noqa: F401
 
 ROOT = Path(__file__).parents[3]
 SMALL = Path(__file__).with_name("small.toml")
+KASPAR = ROOT / "config" / "kaspar.toml"
 PACKAGES = ("skin_host", "emulator", "config")
 
 
@@ -36,12 +37,14 @@ class Mutant(NamedTuple):
         file: in `skin_host`.
         line: what stands there, once.
         planted: what stands there instead.
+        config: the robot in which it is searched.
     """
 
     name: str
     file: str
     line: str
     planted: str
+    config: Path = SMALL
 
 
 MUTANTS = [
@@ -113,6 +116,13 @@ MUTANTS = [
         "bus/boards.py",
         "self._zeroed(record.index, believed)",
         "self._zeroed(record.index, False)",
+    ),
+    Mutant(
+        "boards are taken for zeroed when that is asked, not when their turn comes",
+        "bus/boards.py",
+        "            self._zeroed(record.index, believed)\n            yield from zeroing\n",
+        "            yield from zeroing\n\n        self._zeroed(record.index, believed)\n",
+        KASPAR,  # its boards share a bus
     ),
     Mutant(
         "a board that was reset is only started again",
@@ -191,6 +201,7 @@ class Run(msgspec.Struct, frozen=True):
         seed, seconds: of the run.
         broken: the promise that was broken, or an empty text.
         cpu_s: what it took, start and end included.
+        config: name of the robot's file.
     """
 
     tree: str
@@ -199,6 +210,7 @@ class Run(msgspec.Struct, frozen=True):
     seconds: int
     broken: str
     cpu_s: float
+    config: str = SMALL.name
 
 
 def tree_digest() -> str:
@@ -212,7 +224,7 @@ def tree_digest() -> str:
     return digest.hexdigest()
 
 
-def outcome(folder: Path, seed: int, seconds: int) -> str:
+def outcome(folder: Path, seed: int, seconds: int, config: Path = SMALL) -> str:
     """Return what a seed breaks in the daemon of a folder; nothing is an empty text.
 
     It runs in a child of this process, which has loaded what does not belong to the project.
@@ -221,7 +233,7 @@ def outcome(folder: Path, seed: int, seconds: int) -> str:
     child = os.fork()
     if not child:
         os.close(answer)
-        os.write(said, _simulate(folder, seed, seconds).encode())
+        os.write(said, _simulate(folder, seed, seconds, config).encode())
         os._exit(0)
     os.close(said)
     with open(answer, "rb") as pipe:
@@ -230,7 +242,7 @@ def outcome(folder: Path, seed: int, seconds: int) -> str:
     return broken or (f"it ended with {status}" if status else "")
 
 
-def _simulate(folder: Path, seed: int, seconds: int) -> str:
+def _simulate(folder: Path, seed: int, seconds: int, config: Path) -> str:
     os.chdir(folder)
     sys.path.insert(0, str(folder))
     assert "skin_host" not in sys.modules, "this process has the daemon as it is"
@@ -239,8 +251,8 @@ def _simulate(folder: Path, seed: int, seconds: int) -> str:
         from skin_host.cli.common import load_skin
         from skin_host.evaluation.simulate.run import simulate
 
-        settings, layout = load_skin(SMALL)
-        return simulate(settings, layout, SMALL, seed, seconds).broken or ""
+        settings, layout = load_skin(config)
+        return simulate(settings, layout, config, seed, seconds).broken or ""
     except BaseException as error:
         return f"{type(error).__name__}: {error}"
 
@@ -259,12 +271,12 @@ class Search:
         self._seconds = seconds
         self._results = results
         self._tree = tree_digest()
-        self._runs: dict[tuple[str, int], Run] = {}
+        self._runs: dict[tuple[str, str, int], Run] = {}
         if results is not None and results.exists():
             for line in results.read_bytes().splitlines():
                 run = msgspec.json.decode(line, type=Run)
                 if (run.tree, run.seconds) == (self._tree, seconds):
-                    self._runs[run.mutant, run.seed] = run
+                    self._runs[run.mutant, run.config, run.seed] = run
 
     def find(self, seeds: Iterable[int]) -> Iterator[tuple[Mutant, Run, float]]:
         """Yield each mutant that is found, the run that finds it, and the CPU time of all its runs.
@@ -280,30 +292,31 @@ class Search:
                 plant(mutant, folder)
             for seed in seeds:
                 for mutant, folder in list(left.items()):
-                    run = self._run(mutant.name, folder, seed)
+                    run = self._run(mutant.name, folder, mutant.config, seed)
                     spent_s[mutant] += run.cpu_s
                     if not run.broken:
                         continue
-                    plain = self._run("", ROOT, seed)
+                    plain = self._run("", ROOT, mutant.config, seed)
                     if plain.broken:
                         print(f"seed {seed} does not count: {plain.broken}", flush=True)
-                        break
+                        continue
                     del left[mutant]
                     yield mutant, run, spent_s[mutant]
 
-    def _run(self, name: str, folder: Path, seed: int) -> Run:
-        if (name, seed) not in self._runs:
+    def _run(self, name: str, folder: Path, config: Path, seed: int) -> Run:
+        key = name, config.name, seed
+        if key not in self._runs:
             before = os.times()
-            broken = outcome(folder, seed, self._seconds)
+            broken = outcome(folder, seed, self._seconds, config)
             after = os.times()
             cpu_s = after.children_user + after.children_system
             cpu_s -= before.children_user + before.children_system
-            run = Run(self._tree, name, seed, self._seconds, broken, round(cpu_s, 2))
-            self._runs[name, seed] = run
+            run = Run(self._tree, name, seed, self._seconds, broken, round(cpu_s, 2), config.name)
+            self._runs[key] = run
             if self._results is not None:
                 with self._results.open("ab") as file:
                     file.write(msgspec.json.encode(run) + b"\n")
-        return self._runs[name, seed]
+        return self._runs[key]
 
 
 def main() -> int:

@@ -19,6 +19,8 @@ from skin_host.evaluation.simulate.promises import Promises
 from skin_host.evaluation.simulate.trace import Trace
 from skin_host.evaluation.simulate.troubles import KINDS
 from skin_host.evaluation.simulate.world import Life, World
+from skin_host.fingertip.events import FingertipEvent
+from skin_host.processing.events import Touch
 
 DEMO = configuration("demo.toml")
 
@@ -367,3 +369,40 @@ def test_a_frame_that_comes_late_is_stamped_when_it_came_not_when_it_was_read() 
     since_ns = batch.t_ns - (clock.now_ns() - clock.monotonic_ns()) - began_ns
     assert since_ns.tolist() == [cable.mischief.late_ns, 20_000_000]
     assert batch.data[:, 0].tolist() == [HEADER_B, HEADER_A]
+
+
+def test_a_press_that_lifted_while_its_bus_was_off_is_no_touch_when_it_is_back(
+    world: World,
+) -> None:
+    """What is touched stayed so until a measurement denied it, and none came meanwhile."""
+
+    async def live() -> list[str]:
+        life = start(world)
+        await world.clock.sleep(8.0)
+        spot = world.spots[0]
+        triangle = int(world.layout.triangle_of[world.layout.part(spot.part).start + spot.taxel])
+        board = world.layout.boards[world.layout.triangles[triangle].board]
+        seen: list[str] = []
+        put_touch = life.daemon.publisher.put_touch
+
+        def look(event: FingertipEvent) -> None:
+            assert isinstance(event, Touch)
+            if event.event != "move":
+                seen.append(event.event)
+            put_touch(event)
+
+        life.daemon.publisher.put_touch = look  # type: ignore[method-assign]
+        pressing = asyncio.create_task(spot.press(3.0))
+        await world.clock.sleep(2.0)
+        world.move()
+        mend = world.robot.inject(Fault(name="bus_off", bus=board.settings.bus))
+        await pressing
+        await world.clock.sleep(2.0)
+        world.move()
+        mend()
+        await world.clock.sleep(3.0)
+        life.kill()
+        return seen
+
+    with world.clock.runner() as runner:
+        assert runner.run(live()) == ["begin", "end"]
