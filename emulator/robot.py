@@ -161,7 +161,10 @@ class Robot:
         """
         end_ns = self.t_ns + round(dt_s * NS)
         while True:
-            self._move_to(self._next_ns(end_ns))
+            next_ns = min(end_ns, self._skin_due_ns, self._boards_due_ns, self._tips_due_ns)
+            if self._agenda and self._agenda[0][0] < next_ns:
+                next_ns = self._agenda[0][0]
+            self._move_to(max(self.t_ns, next_ns))
             while self._agenda and self._agenda[0][0] <= self.t_ns:
                 heappop(self._agenda)[2]()
                 self._look_ahead()
@@ -176,19 +179,15 @@ class Robot:
                 break
         return {name: wire.until(self.t_ns) for name, wire in self.wires.items()}
 
-    def _next_ns(self, end_ns: int) -> int:
-        next_ns = min(end_ns, self._skin_due_ns, self._boards_due_ns, self._tips_due_ns)
-        if self._agenda:
-            next_ns = min(next_ns, self._agenda[0][0])
-        return max(self.t_ns, next_ns)
-
     def _look_ahead(self) -> None:
         """Find out when the next board is due; after anything that may have changed it."""
-        self._due_ns = [board.due_ns for board in self._boards]
+        self._due_ns = [
+            NEVER_NS if due_ns is None else -(-due_ns // TICK_NS) * TICK_NS
+            for due_ns in [board.due_ns for board in self._boards]
+        ]
         for number in self.hung:
-            self._due_ns[number] = None
-        due_ns = [due for due in self._due_ns if due is not None]
-        self._boards_due_ns = _next_tick_ns(min(due_ns)) if due_ns else NEVER_NS
+            self._due_ns[number] = NEVER_NS
+        self._boards_due_ns = min(self._due_ns, default=NEVER_NS)
         self._tips_due_ns = self.fingertips.due_ns
 
     def _move_to(self, t_ns: int) -> None:
@@ -225,8 +224,7 @@ class Robot:
         """Let every board that is due read its chips and send."""
         together: dict[object, list[int]] = {}
         for number in self._in_bus_order:
-            due_ns = self._due_ns[number]
-            if due_ns is None or _next_tick_ns(due_ns) > self.t_ns:
+            if self._due_ns[number] > self.t_ns:
                 continue
             board = self._boards[number]
             bus = self._bus_of[number]
@@ -460,10 +458,6 @@ class Robot:
         return _StackSizes(
             [board for number, board in enumerate(self._boards) if self._bus_of[number] == bus]
         )
-
-
-def _next_tick_ns(t_ns: int) -> int:
-    return -(-t_ns // TICK_NS) * TICK_NS
 
 
 class LiveProbe:

@@ -90,11 +90,11 @@ class Wire:
             self._waiting = self._under_way = _NOTHING
         if len(self._waiting):
             self._hand_over(t_ns)
-        if not len(self._under_way):
-            return self._under_way
-        n = int(np.searchsorted(self._under_way.t_ns, t_ns, side="right"))
-        sent, self._under_way = _split(self._under_way, n)
-        if not n:
+        under_way = self._under_way
+        if not len(under_way):
+            return under_way
+        sent, self._under_way = _split(under_way, _ended(under_way, t_ns))
+        if not len(sent):
             return sent
         self._free_ns = int(sent.t_ns[-1])
         return self._spoil(sent) if self.loss_share or self.error_share else sent
@@ -159,7 +159,7 @@ class Wire:
     def _arbitrate(self, group: FrameBatch, ready_ns: int) -> None:
         """Find out when these frames, and those that they delay, are transmitted."""
         under_way = self._under_way
-        n = int(np.searchsorted(under_way.t_ns, ready_ns, side="right")) if len(under_way) else 0
+        n = _ended(under_way, ready_ns)
         ended, backlog = _split(under_way, n)
         free_ns = int(ended.t_ns[-1]) if n else self._free_ns
         group = self._admit(backlog, group)
@@ -193,7 +193,7 @@ class Wire:
         bits = (OVERHEAD_BITS + STUFF_BITS + 8 * both.dlc.astype(np.int64)).tolist()
         is_urgent = (both.id >> 4 == 0).tolist()
         ready_ns = urgent.t_ns.tolist()
-        n = int(np.searchsorted(under_way.t_ns, ready_ns[0], side="right"))
+        n = _ended(under_way, ready_ns[0])
         order = list(range(n))
         ends_ns: list[int] = under_way.t_ns[:n].tolist()
         free_ns = ends_ns[-1] if n else self._free_ns
@@ -221,6 +221,15 @@ class Wire:
         self._under_way = FrameBatch(
             both.id[rows], both.dlc[rows], both.data[rows], np.array(ends_ns, np.int64)
         )
+
+
+def _ended(under_way: FrameBatch, t_ns: int) -> int:
+    """How many of the frames have been transmitted by `t_ns`."""
+    ends_ns = under_way.t_ns
+    # Nearly always all of them, or none.
+    if not len(ends_ns) or ends_ns[0] > t_ns:
+        return 0
+    return len(ends_ns) if ends_ns[-1] <= t_ns else int(ends_ns.searchsorted(t_ns, side="right"))
 
 
 def _split(batch: FrameBatch, n: int) -> tuple[FrameBatch, FrameBatch]:

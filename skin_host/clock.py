@@ -24,6 +24,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
+from heapq import heappop
 from typing import Any, Protocol, TypeVar, TypeVarTuple, Unpack
 
 T = TypeVar("T")
@@ -32,6 +33,8 @@ Ts = TypeVarTuple("Ts")
 NS_PER_S = 1_000_000_000
 #: Stepped time begins at a plausible time of day.
 EPOCH_NS = 1_700_000_000 * NS_PER_S
+#: A loop with more timers sorts out those that were cancelled, as asyncio's does.
+MANY_TIMERS = 100
 #: A stepped loop without any timer waits this long at a time for a thread or for outside input.
 OUTSIDE_S = 0.01
 
@@ -202,6 +205,36 @@ class _SteppedLoop(asyncio.SelectorEventLoop):
         super().__init__(_Jumping(clock))
         # Asked for several times in each turn.
         self.time = clock.monotonic_s  # type: ignore[method-assign]
+        self._clock = clock
+        #: The same with what asyncio's types do not tell.
+        self._own: Any = self
+
+    def _run_once(self) -> None:
+        """One turn, as asyncio's; where nothing but timers can come, without asking the system."""
+        own = self._own
+        timers, ready = own._scheduled, own._ready
+        is_plain = len(own._selector._fd_to_key) <= 1 and not (own._stopping or own._debug)
+        if not is_plain or not (timers or ready) or len(timers) > MANY_TIMERS:
+            super()._run_once()  # type: ignore[misc]
+            return
+        while timers and timers[0]._cancelled:
+            own._timer_cancelled_count -= 1
+            heappop(timers)._scheduled = False
+        if timers:
+            now_s = self.time()
+            wait_s = timers[0]._when - now_s
+            if not ready and wait_s > 0:
+                self._clock._t_ns += int(wait_s * NS_PER_S) + 1
+                now_s = self.time()
+            end_s = now_s + own._clock_resolution
+            while timers and timers[0]._when < end_s:
+                timer = heappop(timers)
+                timer._scheduled = False
+                ready.append(timer)
+        for _ in range(len(ready)):
+            handle = ready.popleft()
+            if not handle._cancelled:
+                handle._run()
 
     def run_in_executor(  # type: ignore[override]
         self, executor: Any, func: Any, *args: Any

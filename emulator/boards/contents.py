@@ -33,8 +33,9 @@ class _Known:
 
     Attributes:
         chips: all chips of these boards.
-        row: intp[k], where in `chips` that of each triangle is, -1 for none; None if each is where
-            its triangle is.
+        row: intp[k], where in `chips` that of each triangle is, `len(chips)` for none; None if each
+            is where its triangle is.
+        is_whole: no triangle is without a chip.
         frames_of: which of the frames go to which bus.
         ahead, revision: the reads that `contents` was made of.
         contents: uint8[m, 2 k, 8], what the frames of these reads hold, or None.
@@ -44,6 +45,7 @@ class _Known:
     burst: Burst
     chips: Ints
     row: Ints | None
+    is_whole: bool
     frames_of: list[tuple[str, slice]]
     ahead: Ahead | None = None
     revision: int = 0
@@ -53,6 +55,8 @@ class _Known:
         """Of what the chips answer, uint16[..., n, 12], that of each triangle."""
         if self.row is None:
             return raw
+        if self.is_whole:
+            return raw[..., self.row, :]
         nothing = np.full((*raw.shape[:-2], 1, TAXELS), ABSENT, np.uint16)
         return np.concatenate([raw, nothing], axis=-2)[..., self.row, :]
 
@@ -116,8 +120,10 @@ class Bursts:
         chips = np.sort(wired[wired >= 0])
         of_board = np.array(numbers, np.intp)[burst.board]
         sent = [chip_of_slot[board][slot] for board, slot in zip(of_board, burst.slot, strict=True)]
-        row = np.array([np.searchsorted(chips, one) if one >= 0 else -1 for one in sent], np.intp)
-        straight = np.array_equal(row, np.arange(len(chips)))
+        n = len(chips)
+        row = np.array([np.searchsorted(chips, one) if one >= 0 else n for one in sent], np.intp)
+        is_whole = not (row == n).any()
+        straight = np.array_equal(row, np.arange(n))
         frames_of: list[tuple[str, slice]] = []
         start = 0
         for bus, of_bus in groupby(self._bus_of[board] for board in of_board):
@@ -125,7 +131,7 @@ class Bursts:
             frames_of.append((bus, slice(start, stop)))
             start = stop
         made = self._known[tuple(numbers)] = _Known(
-            versions, burst, chips, None if straight else row, frames_of
+            versions, burst, chips, None if straight else row, is_whole, frames_of
         )
         return made
 

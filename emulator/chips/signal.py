@@ -22,6 +22,8 @@ _STAGES = np.arange(reg.N_STAGES)
 _NO_SET_UP = np.zeros((reg.N_STAGES, reg.STAGE_WORDS), np.uint16)
 #: So many changes of the inputs are remembered before they are worked out.
 _MOST_CHANGES = 64
+#: Of so many sets of chips it is remembered how they are indexed.
+_MOST_SETS = 4096
 #: A sequence that never comes to its end.
 _STOPPED_NS = 1 << 58
 #: The results of so many reads are foreseen together, of no more chips: of many, a read costs what
@@ -112,6 +114,8 @@ class SignalSkin:
         #: By the numbers of chips that are read together: the start, the stages and the time of a
         #: stage that all of them have, or None.
         self._pace_of: dict[bytes, tuple[int, int, int] | None] = {}
+        #: By the same numbers: as an index.
+        self._rows_of: dict[bytes, Ints | slice] = {}
         #: The chips whose registers were read last, and when.
         self._settled: set[int] = set()
         self._settled_ns = 0
@@ -357,7 +361,7 @@ class SignalSkin:
             began_ns = start_ns + sequences * stages * stage_ns
             before_ns = began_ns - stages * stage_ns
             ended_ns = np.where(done > _STAGES, began_ns, before_ns) + (_STAGES + 1) * stage_ns
-            mine = np.flatnonzero(changed)
+            mine = changed.nonzero()[0]
             codes = self._ideal_at(chips[mine], ended_ns)
             if ahead.noise is not None:
                 codes = codes + ahead.noise[ahead.row, mine]
@@ -409,7 +413,7 @@ class SignalSkin:
 
     def _correct(self, ahead: Ahead, chips: Ints) -> None:
         """Foresee the results again of chips whose inputs have changed for good."""
-        mine = np.flatnonzero(self._ideal_versions[chips] > ahead.ideal_version)
+        mine = (self._ideal_versions[chips] > ahead.ideal_version).nonzero()[0]
         ahead.ideal_version = self._ideal_version
         if not len(mine):
             return
@@ -431,10 +435,16 @@ class SignalSkin:
         return self._pace_of[key]
 
     def _rows(self, chips: Ints) -> Ints | slice:
-        """The same chips; all of them in their order as a slice, which costs no copies."""
-        if len(chips) == len(self.forced) and (chips[1:] > chips[:-1]).all():
-            return slice(None)
-        return chips
+        """The same chips; those that follow each other as a slice, which costs no copies."""
+        key = chips.tobytes()
+        rows = self._rows_of.get(key)
+        if rows is None:
+            follow = len(chips) > 0 and bool((np.diff(chips) == 1).all())
+            rows = slice(int(chips[0]), int(chips[-1]) + 1) if follow else chips.copy()
+            if len(self._rows_of) >= _MOST_SETS:
+                self._rows_of.clear()
+            self._rows_of[key] = rows
+        return rows
 
     def _take(
         self,
@@ -488,31 +498,27 @@ class SignalSkin:
         """What changed chips converted in stages that ended then, int64[12]: float64[k, 12]."""
         times_ns = self._changed_ns
         # Those in force at all of these times: the last one before, and those amid them.
-        first = max(0, bisect_left(times_ns, int(ended_ns.min())) - 1)
+        first = bisect_left(times_ns, int(ended_ns.min())) - 1
         last = bisect_left(times_ns, int(ended_ns.max()))
         if not last:
             return self._ideal[chips]
         place = self._place[chips]
-        ideals = self._ideal_of(
-            chips, np.stack([values[place] for values in self._changes[first:last]])
-        )
-        if first == len(times_ns) - 1 and ended_ns.min() > times_ns[-1]:
-            # Nothing before the last change matters to these chips any more.
-            self._capacitance_ff[chips, :TAXELS] = self._changes[-1][place]
-            self._set_ideal(chips, ideals[0])
-            self._is_changed[chips] = False
-            if not self._is_changed[self._changed].any():
-                self._changes = []
-                self._changed_ns = []
-            final: Floats = ideals[0]
-            return final
-        in_force = np.searchsorted(times_ns[first:last], ended_ns)
-        if len(ideals) == 1 and in_force.all():
-            only: Floats = ideals[0]
-            return only
-        ideals = np.concatenate([self._ideal[chips][None], ideals])
-        at: Floats = ideals[in_force, np.arange(len(chips))[:, None], _STAGES]
-        return at
+        if first < 0:
+            ideal = self._ideal[chips]
+        else:
+            ideal = self._ideal_of(chips, self._changes[first][place])
+            if first == len(times_ns) - 1:
+                # Nothing before the last change matters to these chips any more.
+                self._capacitance_ff[chips, :TAXELS] = self._changes[-1][place]
+                self._set_ideal(chips, ideal)
+                self._is_changed[chips] = False
+                if not self._is_changed[self._changed].any():
+                    self._changes = []
+                    self._changed_ns = []
+        for number in range(first + 1, last):
+            later = self._ideal_of(chips, self._changes[number][place])
+            np.copyto(ideal, later, where=ended_ns > times_ns[number])
+        return ideal
 
     def _set_ideal(self, chips: Ints, ideal: Floats) -> None:
         """Change what chips convert from now on, float64[k, 12] (codes)."""
@@ -549,7 +555,10 @@ class SignalSkin:
 
 def _rounded(codes: Floats) -> Words:
     """Codes as a converter gives them."""
-    return np.minimum(np.maximum(np.rint(codes), 0), reg.FULL_SCALE).astype(np.uint16)
+    codes = np.rint(codes)
+    np.maximum(codes, 0.0, out=codes)
+    np.minimum(codes, reg.FULL_SCALE, out=codes)
+    return codes.astype(np.uint16)
 
 
 class SignalChips:

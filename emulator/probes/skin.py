@@ -222,7 +222,7 @@ class Skin:
             return self._t_ns + MOVING_NS
         quiet = not len(self._active) and self._idle and self._t_ns * 1e-9 >= self._warmed_s
         due_ns = NEVER_NS if quiet else self._t_ns + self._holding_ns
-        if np.isfinite(self._still_until_s):
+        if self._still_until_s < np.inf:
             change_ns = round(self._still_until_s * 1e9)
             due_ns = min(due_ns, max(change_ns, self._t_ns + 1))
         due_ns = min(due_ns, self._air_due_ns)
@@ -231,6 +231,8 @@ class Skin:
     @property
     def _air_due_ns(self) -> int:
         """When air has to be worked out again."""
+        if not self._air:
+            return NEVER_NS
         t_s = self._t_ns * 1e-9
         if self._air_shows or any(course.start_s <= t_s < course.end_s for course, _ in self._air):
             return self._t_ns + AIR_NS

@@ -162,7 +162,7 @@ class Sent:
 
     def _spread(self, address: int) -> None:
         """Take the whole sweeps of a board triangle by triangle."""
-        keys, sweeps = self._sweeps.get(address, ((), ()))
+        keys, sweeps = self._sweeps.pop(address, ((), ()))
         for sweep in sweeps:
             octets = sweep.octets
             for at, (key, t_ns) in enumerate(zip(keys, sweep.t_ns[1::2].tolist(), strict=True)):
@@ -172,7 +172,6 @@ class Sent:
                 if whole is None:
                     whole = self._whole[key] = deque(maxlen=KEPT)
                 whole.append((pair[1:8] + pair[9:14], pair[14] << 8 | pair[15], t_ns))
-        self._sweeps.pop(address, None)
 
     def _note_frames(self, batch: FrameBatch) -> None:
         for seconds, nanoseconds, identifier, dlc, header, payload in batch.frames():
@@ -181,7 +180,8 @@ class Sent:
             key = identifier & 0xFF
             t_ns = seconds * 1_000_000_000 + nanoseconds
             address = key >> 4
-            self._spread(address)
+            if address in self._sweeps:
+                self._spread(address)
             if t_ns - self._last_ns.get(address, -BURST_NS) >= BURST_NS:
                 self.bursts[address] = self.bursts.get(address, 0) + 1
             self._last_ns[address] = t_ns
@@ -340,6 +340,8 @@ class Cable:
         if self.mischief.twin is not None or self._twin:
             batch = self._with_twin(batch)
         n = len(batch)
+        if not (n or self._late or self.mischief.twin is not None):
+            return
         fate = self.fate
         fate.sent += n
         if self._port is None or self.state in (LinkState.GONE, LinkState.DOWN):
@@ -353,15 +355,17 @@ class Cable:
             batch = self._spoil(batch)
         if self._late:
             batch = self._with_late(batch)
-        if not len(batch):
+        n = len(batch)
+        if not n:
             return
         batch.t_ns = batch.t_ns + (self._clock.now_ns() - self._clock.monotonic_ns())
         room = BUFFER_FRAMES - self._n_waiting
-        if len(batch) > room:
-            fate.dropped += len(batch) - room
-            self._port.counters.dropped += len(batch) - room
+        if n > room:
+            fate.dropped += n - room
+            self._port.counters.dropped += n - room
             batch = _rows(batch, slice(0, room))
-        self._n_waiting += len(batch)
+            n = room
+        self._n_waiting += n
         self._waiting.append(batch)
 
     def sleep_through(self, batch: FrameBatch) -> None:
@@ -435,17 +439,17 @@ class Cable:
         if not self._waiting:
             return _NOTHING
         batch = self._waiting[0] if len(self._waiting) == 1 else join(self._waiting)
-        if len(batch) > CAPACITY:
+        if self._n_waiting > CAPACITY:
             self._waiting = [_rows(batch, slice(CAPACITY, None))]
             batch = _rows(batch, slice(0, CAPACITY))
         else:
             self._waiting = []
-        self._n_waiting -= len(batch)
-        self.fate.read += len(batch)
-        self.read_ns[batch.id & 0x7FF] = self._clock.monotonic_ns()
-        self._trace.data(
-            self._clock.monotonic_ns(), self.name, batch.id.tobytes(), batch.data.tobytes()
-        )
+        n = len(batch)
+        self._n_waiting -= n
+        self.fate.read += n
+        now_ns = self._clock.monotonic_ns()
+        self.read_ns[batch.id & 0x7FF] = now_ns
+        self._trace.data(now_ns, self.name, batch.id.tobytes(), batch.data.tobytes())
         return batch
 
     def send(self, can_id: int, data: bytes) -> bool:
@@ -484,8 +488,10 @@ class SimulatedPort(Port):
         if self.state is not self._logged_state:
             self._log_state()
         batch = cable.take()
+        if batch is _NOTHING:
+            return batch
         self.counters.frames += len(batch)
-        if len(batch) and int(batch.id.max()) & ERROR_FLAG:
+        if int(batch.id.max()) & ERROR_FLAG:
             self._note_errors(batch)
         return batch
 

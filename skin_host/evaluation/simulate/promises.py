@@ -664,8 +664,9 @@ class Promises:
                     f"{name}: taxel {taxel} is valid and reads {frame.pressure_kpa[taxel]:.1f} kPa "
                     f"while it is pressed with {truth[part.start + taxel]:.1f} kPa"
                 )
-            limit_kpa = np.maximum(UNTOUCHED_KPA, self._noise_kpa(life, name))
-            false = fit & (most[mine] < 0.01) & (frame.pressure_kpa > limit_kpa)
+            false = fit & (most[mine] < 0.01) & (frame.pressure_kpa > UNTOUCHED_KPA)
+            if false.any():
+                false &= frame.pressure_kpa > self._noise_kpa(life, name)
             if false.any():
                 taxel = int(np.flatnonzero(false)[0])
                 self.break_(

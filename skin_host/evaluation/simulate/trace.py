@@ -27,9 +27,8 @@ class Trace:
     def data(self, t_ns: int, kind: str, *values: bytes) -> None:
         """An event that is only hashed: frames on a bus, publications."""
         self.count += 1
-        self._hash.update(b"%d %s" % (t_ns, kind.encode()))
-        for value in values:
-            self._hash.update(value.replace(self.unnamed, b"") if self.unnamed else value)
+        event = b"%d %b%b" % (t_ns, kind.encode(), b"".join(values))
+        self._hash.update(event.replace(self.unnamed, b"") if self.unnamed else event)
 
     def note(self, t_ns: int, text: str) -> None:
         """An event that is hashed and shown."""
