@@ -367,7 +367,8 @@ class Describer:
     ) -> BusHealth:
         bus = self._engine.settings.buses[name]
         counters = msgspec.to_builtins(self._engine.assemblers[name].counters)
-        record = cast(BusHealth, {"name": name, "channel": bus.channel} | counters)
+        about = {"name": name, "interface": bus.interface, "channel": bus.channel}
+        record = cast(BusHealth, about | counters)
         port = ports.get(name)
         if port is not None:
             record["state"] = str(port.state)

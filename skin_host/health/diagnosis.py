@@ -28,6 +28,8 @@ THERMAL_UNITS = 8.0
 #: Limit of the median shift of all untouched taxels from their baselines, in units; used without
 #: temperature pads.
 COMMON_UNITS = 1.5
+#: Kinds of interface that no real board is on; the kernel's are named vcan.
+EMULATED = {"virtual", "socketpair"}
 #: Number of chips that share one data line.
 LINE = 4
 #: Order of the triangles of an ergoCub hand (skin type 3) along the data lines.
@@ -154,9 +156,10 @@ def _bus(bus: BusHealth) -> Iterator[FoundFault]:
         code, sentence = _BUS_STATES[state]
         yield fault(code, " " + sentence.format(channel=bus.get("channel", name)))
     elif bus.get("silent"):
-        yield fault(
-            "bus_silent", ": no frames are received; check its plug, the boards' power and bit rate"
-        )
+        why = "check its plug, the boards' power and bit rate"
+        if bus["interface"] in EMULATED or bus["channel"].startswith("vcan"):
+            why = "the emulator has ended, or other work on this computer holds it up"
+        yield fault("bus_silent", f": no frames are received; {why}")
     recent = bus.get("last_second")
     if recent is None:
         return

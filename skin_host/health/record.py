@@ -36,6 +36,7 @@ class BusHealth(TypedDict):
     """
 
     name: str
+    interface: str
     channel: str
     frames: int
     other: int

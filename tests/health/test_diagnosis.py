@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from skin_host.bus.pair import PAIR
 from skin_host.health.diagnosis import FoundFault, diagnose
 from tests.support.fault_bench import FaultBench
 
@@ -35,6 +36,23 @@ def test_a_bus_that_does_not_work_is_named_with_its_remedy(
     fault = found(calibrated, bus_state=state)[code]
     assert fault.where == "can0"
     assert remedy in fault.sentence
+
+
+@pytest.mark.parametrize(
+    ("interface", "channel", "words"),
+    [
+        ("socketcan", "can0", "check its plug"),
+        ("socketcan", "vcan0", "the emulator"),
+        ("virtual", "x", "other work on this computer"),
+        (PAIR, "5", "other work on this computer"),
+    ],
+)
+def test_a_bus_of_an_emulated_robot_has_no_plug_to_check(
+    calibrated: FaultBench, interface: str, channel: str, words: str
+) -> None:
+    record: Any = copy.deepcopy(calibrated.records["left_hand"])
+    record["buses"][0] |= {"interface": interface, "channel": channel, "silent": True}
+    assert words in next(one for one in diagnose(record) if one.code == "bus_silent").sentence
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from skin_host.mqtt.outbox import PublisherCounters
 PAGE = (Path(__file__).parents[2] / "docs/operations.md").read_text()
 WORDS = set(re.findall("[a-z_]+", " ".join(re.findall("`([^`\n]+)`", PAGE.replace("```", "")))))
 #: What needs no explanation where it stands.
-PLAIN = {"part", "name", "bus", "address", "channel", "skin_type"}
+PLAIN = {"part", "name", "bus", "address", "interface", "channel", "skin_type"}
 
 
 @pytest.mark.parametrize("kind", [Record, BusHealth, BoardHealth])
