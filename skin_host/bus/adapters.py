@@ -11,7 +11,15 @@ from importlib.util import find_spec
 import can
 import numpy as np
 
-from skin_host.bus.port import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, SKIN_CLASSES, LinkState, Port
+from skin_host.bus.port import (
+    ERROR_FLAG,
+    EXTENDED_FLAG,
+    PLAUSIBLE_S,
+    REMOTE_FLAG,
+    SKIN_CLASSES,
+    LinkState,
+    Port,
+)
 from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SYSTEM, Clock, Executor
 from skin_host.config.settings import Bus
@@ -19,8 +27,6 @@ from skin_host.errors import BusError, ConfigurationError
 
 #: One read takes at most this many frames, so that a flood cannot block the event loop.
 CAPACITY = 1024
-#: A time stamp farther from now than this is an uptime or a counter, not a time of day.
-_PLAUSIBLE_S = 3600.0
 #: A controller that still has many errors reports one within this time.
 CALM_S = 10.0
 MULTICAST = "udp_multicast"
@@ -150,7 +156,7 @@ class AdapterPort(Port):
             return False
         now_s = self._clock.now_ns() * 1e-9
         stamp_s = message.timestamp
-        if not abs(stamp_s - now_s) <= _PLAUSIBLE_S:
+        if not abs(stamp_s - now_s) <= PLAUSIBLE_S:
             stamp_s = now_s
         self._t_ns[row] = nanoseconds(stamp_s)
         return True

@@ -36,6 +36,10 @@ _SEND_RETRY_S = 0.002
 _QUIET_S = 1.0
 _LONGEST_QUIET_S = 60.0
 
+#: A time stamp farther from now than this is none: an uptime or a counter of an adapter, or what
+#: whoever sent the frame on this computer asked the kernel for (SO_TXTIME).
+PLAUSIBLE_S = 3600
+
 EXTENDED_FLAG = 0x80000000
 REMOTE_FLAG = 0x40000000
 ERROR_FLAG = 0x20000000

@@ -23,7 +23,7 @@ from can.typechecking import CanFilter
 from numpy.typing import NDArray
 
 from skin_host.bus.interfaces import can_interfaces
-from skin_host.bus.port import SKIN_CLASSES, LinkState, Port
+from skin_host.bus.port import PLAUSIBLE_S, SKIN_CLASSES, LinkState, Port
 from skin_host.bus.wire import NS_PER_S, FrameBatch, Records
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Bus, Receive
@@ -162,6 +162,7 @@ class BatchReceiver:
         self._capacity = capacity
         sock.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
         self._dropped = 0
+        self._is_stamped = True
 
         records = np.zeros(capacity, _RECORD_ARRAY)
         vectors = np.zeros(capacity, _VECTOR)
@@ -193,6 +194,7 @@ class BatchReceiver:
                 raise OSError(code, os.strerror(code))
             n = 0
         dropped = self._newly_dropped(n)
+        self._is_stamped = n == 0 or int(self._control_length[n - 1]) >= _STAMP_SIZE
         # The kernel wrote the lengths it used; reset them to the whole buffer for the next read.
         self._control_length[:n] = _CONTROL_SIZE
         return _ReceivedBatch(n, self._records, self._octets, dropped)
@@ -200,6 +202,18 @@ class BatchReceiver:
     def saw_flags(self, n: int) -> bool:
         """Return whether any of the `n` frames just read is not a standard data frame."""
         return any(self._flags[:n])
+
+    def replace_stamps(self, n: int, now_ns: int) -> None:
+        """Give those of the `n` frames just read the time `now_ns` that have no plausible one."""
+        now_s, rest_ns = divmod(now_ns, NS_PER_S)
+        seconds = self._records["seconds"][:n]
+        if not self._is_stamped:
+            seconds[:] = 0
+        elif now_s - PLAUSIBLE_S <= seconds.min() and seconds.max() <= now_s + PLAUSIBLE_S:
+            return
+        wrong = (seconds < now_s - PLAUSIBLE_S) | (seconds > now_s + PLAUSIBLE_S)
+        seconds[wrong] = now_s
+        self._records["nanoseconds"][:n][wrong] = rest_ns
 
     def _newly_dropped(self, n: int) -> int:
         """Return newly dropped frames; the kernel sends its counter only with frames after a loss,
@@ -289,6 +303,7 @@ class SocketCanPort(Port):
         self.counters.frames += n
         self.counters.dropped += batch.dropped
         if n:
+            self._receiver.replace_stamps(n, self._clock.now_ns())
             if self.state is LinkState.DOWN:
                 self._enter(LinkState.UP)
             if self._receiver.saw_flags(n):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from can.interfaces.socketcan.socketcan import build_can_frame
 
+from skin_host.bus import socketcan
 from skin_host.bus.adapters import AdapterPort
 from skin_host.bus.opening import open_port
 from skin_host.bus.port import LinkState, Port
@@ -22,6 +23,8 @@ from skin_host.errors import BusError, ConfigurationError
 from skin_host.evaluation.stand_in import StandInBus, pair, register
 from tests.support.waiting import PATIENCE_S
 
+#: Of asm-generic/socket.h; Python does not name it.
+SO_TIMESTAMPNS = 35
 SMALL = Receive(buffer_bytes=65536)
 
 
@@ -134,6 +137,40 @@ def test_error_frames_are_counted_and_move_the_state(ends):
     assert state_after(0x080, 0) is LinkState.UP
     counters = port.counters
     assert (counters.error_frames, counters.bus_offs, counters.controller_overflows) == (6, 1, 1)
+
+
+@pytest.mark.parametrize("forged_s", [0, -1, 2**63 // 10**9, 1, 4_000_000_000])
+def test_a_stamp_that_is_far_from_now_is_replaced_by_the_time(ends, monkeypatch, forged_s):
+    """A program on this computer may ask the kernel for any stamp of what it sends (SO_TXTIME)."""
+    ours, theirs = ends
+    port = port_on(ours)
+    for number in range(3):
+        theirs.socket.send(can_frame(number, b""))
+    receive = socketcan._recvmmsg
+
+    def forging(*arguments):
+        n = receive(*arguments)
+        port._receiver._records["seconds"][1] = forged_s
+        return n
+
+    monkeypatch.setattr(socketcan, "_recvmmsg", forging)
+    before_ns = time.time_ns()
+    batch = port.read()
+    assert batch.id.tolist() == [0, 1, 2]
+    assert np.abs(batch.t_ns - before_ns).max() < 10**10
+    assert batch.t_ns[1] >= before_ns
+
+
+def test_frames_without_stamps_have_the_time_at_which_they_are_read(ends):
+    ours, theirs = ends
+    port = port_on(ours)
+    theirs.socket.send(can_frame(1, b""))
+    port.read()
+    ours.socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 0)
+    for number in range(2):
+        theirs.socket.send(can_frame(number, b""))
+    before_ns = time.time_ns()
+    assert (port.read().t_ns >= before_ns).all()
 
 
 def test_the_error_bit_of_an_extended_identifier_is_no_error(ends):
