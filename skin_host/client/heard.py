@@ -34,7 +34,7 @@ class Health(NamedTuple):
     @property
     def state(self) -> str:
         """Return `ok`, `warning`, `degraded`, ...; reasons for any but `ok` are in `sentences`."""
-        return self.record["state"]
+        return self.record.get("state", "")
 
     @property
     def codes(self) -> set[str]:

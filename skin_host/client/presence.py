@@ -38,6 +38,8 @@ class Contact(NamedTuple):
         return self.state != "OFF"
 
 
+#: At most this many touches of a part are kept: of more, the oldest are forgotten.
+MAX_TOUCHES = 1000
 #: A distance between two clocks is the least one that was seen for this long, or twice as long.
 DISTANCE_S = 120.0
 
@@ -147,6 +149,8 @@ class Presence:
             part.touches.pop(touch.id, None)
         else:
             part.touches[touch.id] = touch, now_s
+            if len(part.touches) > MAX_TOUCHES:
+                del part.touches[next(iter(part.touches))]
 
     def take_node(
         self, node: str, online: bool | None, broker: int = 0, *, again: bool = False

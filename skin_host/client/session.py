@@ -29,7 +29,7 @@ from skin_host.mqtt.connection import (
 from skin_host.mqtt.info import NodeInfo, decode_info, join_pieces
 from skin_host.mqtt.messages import Frame
 from skin_host.mqtt.order import run_of, stamp_of
-from skin_host.mqtt.payload import JSON_TYPE
+from skin_host.mqtt.payload import JSON_TYPE, MessageError
 from skin_host.mqtt.topics import PartTopic, Topics
 from skin_host.processing.events import Touch
 from skin_host.tasks import cancel
@@ -37,6 +37,8 @@ from skin_host.tasks import cancel
 #: An event waits this long for an earlier one, which may come from another broker: as long as a
 #: robot sends events again there (`mqtt.outbox.REPEAT_S`). Only after an earlier one is missing.
 HOLD_S = 10.0
+#: No robot has so many parts, nor so many nodes; messages of more than these are passed over.
+MAX_NAMES = 256
 #: Timeouts are checked this often.
 WATCH_S = 0.25
 #: Further topics that a stream needs: a contact state is valid only while its part lives.
@@ -121,6 +123,8 @@ class SkinClient:
         self._asked: dict[str, asyncio.Future[Result]] = {}
         self._streams: WeakSet[Stream[Any]] = WeakSet()
         self._latest: dict[str, Health] = {}
+        #: Names that were received: of parts, and of nodes.
+        self._names: tuple[set[str], set[str]] = (set(), set())
         self._presence = Presence(stale_s)
         self._order = EventOrder(HOLD_S if len(brokers) > 1 else 0.0)
         self._newest = Newest()
@@ -422,6 +426,8 @@ class SkinClient:
             return
         kind, name, piece = place
         try:
+            if kind != "answer":
+                self._admit(kind in ("status", "info"), name)
             if kind == "status":
                 self._take_status(name, payload, link, message)
             elif kind == "info":
@@ -435,6 +441,19 @@ class SkinClient:
             self.unreadable += 1
             if self.unreadable == 1:
                 _log.warning("%s: %s; such messages are passed over", message.topic, error)
+
+    def _admit(self, is_node: bool, name: str) -> None:
+        """Remember a name, so that what is known of names stays bounded: anybody may publish.
+
+        Raises:
+            MessageError: there are too many.
+        """
+        names = self._names[is_node]
+        if name not in names:
+            if len(names) >= MAX_NAMES:
+                what = "nodes" if is_node else "parts"
+                raise MessageError(f"more than {MAX_NAMES} {what} of one robot")
+            names.add(name)
 
     def _newness(self, kind: str, name: str, message: Message) -> bool | None:
         """Return whether a retained message is newer than the known one; None: the same again."""

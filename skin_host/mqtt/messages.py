@@ -60,6 +60,19 @@ _over_decoder = msgspec.json.Decoder(Over)
 _health_decoder = msgspec.json.Decoder(dict[str, Any])
 
 
+class _Fault(Struct):
+    code: str
+    where: str
+
+
+class _HealthHead(Struct):
+    """The keys of a health record that subscribers rely on, and their types."""
+
+    state: str = ""
+    faults: list[_Fault] = []
+    sentences: list[str] = []
+
+
 def encode_event(event: FingertipEvent, count: int) -> bytes:
     """Write the payload of `<part>/touch`, `slip` or `over`; `count` as in the events."""
     return _encoder.encode(event.published(count))
@@ -121,4 +134,8 @@ def decode_health(payload: bytes) -> dict[str, Any]:
     record = decode(_health_decoder, payload, "health")
     if record.get("schema") != HEALTH_SCHEMA:
         raise MessageError(f"health: wanted the schema {HEALTH_SCHEMA}")
+    try:
+        msgspec.convert(record, _HealthHead)
+    except msgspec.ValidationError as error:
+        raise MessageError(f"health: {error}") from None
     return record

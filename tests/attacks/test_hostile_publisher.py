@@ -1,0 +1,64 @@
+"""Whoever may publish below a robot's topics makes no client grow without end, or fail."""
+
+import json
+
+import aiomqtt
+import pytest
+
+from skin_host.client.presence import MAX_TOUCHES, Presence
+from skin_host.client.session import MAX_NAMES
+from skin_host.mqtt.messages import decode_health
+from skin_host.mqtt.payload import MessageError
+from tests.client.test_client import hearing, publishing, take, touch
+from tests.client.test_presence import seen
+from tests.support.broker import Mosquitto
+from tests.support.waiting import until
+
+HEALTH = {"schema": "skin.health/1", "part": "palm", "state": "ok"}
+
+
+@pytest.mark.parametrize(
+    "record",
+    [
+        HEALTH | {"state": ["ok"]},
+        HEALTH | {"state": 5},
+        HEALTH | {"faults": 5},
+        HEALTH | {"faults": [5]},
+        HEALTH | {"faults": [{"code": 1, "where": "x"}]},
+        HEALTH | {"sentences": "all is well"},
+        HEALTH | {"sentences": [None]},
+    ],
+)
+def test_a_health_record_of_other_types_is_not_passed_on(record: object) -> None:
+    """A program that looks for a state among some would fail on a list."""
+    with pytest.raises(MessageError, match="health: "):
+        decode_health(json.dumps(record).encode())
+    assert decode_health(json.dumps(HEALTH).encode())["state"] == "ok"
+
+
+async def test_more_parts_and_nodes_than_a_robot_has_are_passed_over(mosquitto: Mosquitto) -> None:
+    many = 2 * MAX_NAMES
+    async with publishing(mosquitto) as publisher, hearing(mosquitto) as skin:
+        touches, contacts = skin.touches(), skin.contacts()
+        await skin.ready()
+        publisher.put_touch(touch(1))
+        await take(touches, 1)
+        async with aiomqtt.Client(mosquitto.host, mosquitto.port) as stranger:
+            for number in range(many):
+                await stranger.publish(f"skin/robot/nodes/n{number}/status", b"online", qos=1)
+                await stranger.publish(f"skin/robot/p{number}/contact", b"ON", qos=1)
+        await until(lambda: skin.unreadable >= 2 * (many - MAX_NAMES))
+        assert len(skin.nodes) == MAX_NAMES
+        assert len(skin._presence.reported()) <= MAX_NAMES
+        # Those that were known before go on.
+        publisher.put_touch(touch(2))
+        assert (await take(touches, 1))[0].count == 2
+        contacts.close()
+
+
+def test_touches_that_never_end_are_forgotten_from_the_oldest_on() -> None:
+    presence = Presence(stale_s=3.0)
+    for number in range(MAX_TOUCHES + 10):
+        presence.take_touch(seen("begin", number), 1.0)
+    known = [one.id for one in presence.touches("palm", 1.0)]
+    assert known == list(range(10, MAX_TOUCHES + 10))
