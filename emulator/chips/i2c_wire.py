@@ -239,7 +239,7 @@ class DataLine:
         held_ns = 0
         if self._state is not _State.IDLE:
             held_ns = self._listen() if self._state is _State.LISTENING else self._send()
-        self._settle(clock=False)
+        self.level = self._master and self._own and not self._held_clocks
         return held_ns
 
     # ------------------------------------------------------------------ a byte at once
@@ -291,7 +291,7 @@ class DataLine:
                 taken = byte << 1 | self._sample(free & 1, 1)
                 self.asleep = self.seen and not self.faulty
         self._master = bool(out & 1)
-        self._settle(clock=False)
+        self.level = self._master and self._own and not self._held_clocks
         return taken, held_ns
 
     def _sample(self, levels: int, n: int) -> int:
@@ -447,7 +447,7 @@ class I2cWire:
         if self._clock or self.t_ns < self._held_until_ns:
             return None
         for line in self.lines:
-            if not line.takes_bytes:
+            if not (line.asleep or line.takes_bytes):
                 return None
         self.t_ns += 2 * CLOCKS_OF_A_BYTE * half_ns
         self._released = False
@@ -456,8 +456,30 @@ class I2cWire:
             line.clock_byte(out if lines >> number & 1 else _RELEASED)
             for number, line in enumerate(self.lines)
         ]
-        self._held_until_ns = self.t_ns + max(held_ns for _, held_ns in taken)
+        self._held_until_ns = self.t_ns + max([held_ns for _, held_ns in taken])
         return [bits for bits, _ in taken]
+
+    def clock(self, levels: int, half_ns: int) -> int:
+        """Do what a master that does not look at the clock does with its pins in one clock.
+
+        Args:
+            levels: what it outputs, see `set_sda`; the clock is low before and after.
+            half_ns: half a period of the clock.
+
+        Returns:
+            The levels that were sampled in the middle.
+        """
+        if levels != self._levels:
+            self.set_sda(levels)
+        self.t_ns += half_ns
+        if not self._clock and self.t_ns >= self._held_until_ns:
+            self._rise()
+        sampled = self.sda
+        self.t_ns += half_ns
+        if not self._clock and self.t_ns >= self._held_until_ns:
+            self._rise()
+        self.set_scl(False)
+        return sampled
 
     def set_sda(self, levels: int) -> None:
         """Release data lines (1) or hold them low (0)."""
@@ -540,8 +562,7 @@ class BitMaster:
             acknowledged = sum((~bits & 1) << number for number, bits in enumerate(taken))
             return acknowledged & self._lines
         for bit in range(7, -1, -1):
-            self._rise(high=bool(byte >> bit & 1))
-            self._fall()
+            self._clocked(high=bool(byte >> bit & 1))
         return ~self._clocked(high=True) & self._lines
 
     def get(self, *, acknowledge: bool) -> list[int]:
@@ -551,8 +572,7 @@ class BitMaster:
         if taken is not None:
             return [bits >> 1 for bits in taken]
         samples = [self._clocked(high=True) for _ in range(8)]
-        self._rise(high=not acknowledge)
-        self._fall()
+        self._clocked(high=not acknowledge)
         values = []
         for number in range(len(self._wire.lines)):
             value = 0
@@ -569,21 +589,15 @@ class BitMaster:
 
     def _clocked(self, *, high: bool) -> int:
         """One clock; the levels that were sampled meanwhile."""
-        self._rise(high=high)
-        levels = self._wire.sda
-        self._fall()
-        return levels
-
-    def _rise(self, *, high: bool) -> None:
-        """The first half of a clock."""
+        if self._patience_ns is None:
+            return self._wire.clock(-1 if high else ~self._lines, self._half_ns)
         self._sda(high=high)
         self._wire.wait(self._half_ns)
         self._up()
-
-    def _fall(self) -> None:
-        """The second half."""
+        levels = self._wire.sda
         self._wire.wait(self._half_ns)
         self._wire.set_scl(False)
+        return levels
 
     def _up(self) -> None:
         self._wire.set_scl(True)
