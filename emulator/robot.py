@@ -239,7 +239,7 @@ class Robot:
             self._answer(bus, board.answers())
         for numbers in together.values():
             for bus, batch in self._bursts.frames(numbers, self.t_ns):
-                self.wires[bus].put(batch)
+                self.wires[bus].put(batch, self.t_ns)
 
     def _sample_alone(self, number: int, board: Mtb) -> FrameBatch:
         jitter_ns = self.jitter_ns.get(number, 0.0)
@@ -264,7 +264,7 @@ class Robot:
     def _answer(self, bus: str, answers: list[tuple[int, bytes]]) -> None:
         if answers:
             frames = [(can_id, data, self.t_ns) for can_id, data in answers]
-            self.wires[bus].put(FrameBatch.of(frames))
+            self.wires[bus].put(FrameBatch.of(frames), self.t_ns)
 
     def bring_up(self) -> None:
         """Configure and start all boards as a careful host does, for use without one.

@@ -54,6 +54,8 @@ class Wire:
         #: Frames that their boards have made, `t_ns` when; and those that they have handed over to
         #: the bus, `t_ns` when their transmission ends unless more urgent ones come.
         self._waiting = self._under_way = _NOTHING
+        #: When all that wait became ready, if that is known to be one moment.
+        self._ready_ns: int | None = None
         #: By the object of identifiers in the order of the bus: they, the lengths, and when after
         #: its beginning the transmission of each ends.
         self._passed: dict[int, tuple[NDArray[np.uint32], NDArray[np.uint8], Ints]] = {}
@@ -71,10 +73,18 @@ class Wire:
         self._babble_every_ns = round(frame_ns / share) if share else 0
         self._babbled_ns = t_ns
 
-    def put(self, batch: FrameBatch) -> None:
-        """Frames that became ready at their `t_ns`, in the order their board sends them."""
-        if len(batch):
-            self._waiting = join([self._waiting, batch]) if len(self._waiting) else batch
+    def put(self, batch: FrameBatch, ready_ns: int | None = None) -> None:
+        """Frames that became ready at their `t_ns`, in the order their board sends them.
+
+        Args:
+            batch: the frames.
+            ready_ns: their `t_ns`, where it is known that all have the same.
+        """
+        if not len(batch):
+            return
+        alone = not len(self._waiting)
+        self._waiting = batch if alone else join([self._waiting, batch])
+        self._ready_ns = ready_ns if alone else None
 
     @property
     def idle(self) -> bool:
@@ -107,6 +117,10 @@ class Wire:
     def _hand_over(self, t_ns: int) -> None:
         """Take what is ready by `t_ns` to the bus, one moment after the other."""
         waiting = self._waiting
+        if self._ready_ns is not None and self._ready_ns <= t_ns:
+            self._waiting = _NOTHING
+            self._arbitrate(waiting, self._ready_ns)
+            return
         if not waiting.rising:
             waiting = _rows(waiting, np.argsort(waiting.t_ns, kind="stable"))
         times_ns = waiting.t_ns

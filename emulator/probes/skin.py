@@ -4,6 +4,7 @@ Mechanics runs for contacts and for foam that still recovers; a pad that nobody 
 its capacitance and costs nothing.
 """
 
+from bisect import bisect_right
 from collections.abc import Collection
 from pathlib import Path
 
@@ -104,9 +105,9 @@ class Skin:
             foam = foam.infinergy()
         self._foam = FoamLayer(foam, truth)
         self._draw_flaws(scene, rng)
-        self._times_s = np.array([t_s for t_s, _ in scene.temperature.keyframes_c])
-        self._degrees_c = np.array([c for _, c in scene.temperature.keyframes_c])
-        self._warmed_s = float(self._times_s[-1])
+        self._times_s = [float(t_s) for t_s, _ in scene.temperature.keyframes_c]
+        self._degrees_c = [float(c) for _, c in scene.temperature.keyframes_c]
+        self._warmed_s = self._times_s[-1]
         self._shift_c = 0.0
         self._none = self._touched = self._felt = self._jumping = np.zeros(0, np.intp)
         self._is_left = False
@@ -319,10 +320,15 @@ class Skin:
         return before or self._air_shows
 
     def _warm(self, t_s: float) -> bool:
-        # Beyond the last keyframe, as nearly always, there is nothing to look up.
-        now_c = float(self._degrees_c[-1])
+        now_c = self._degrees_c[-1]
         if t_s < self._warmed_s:
-            now_c = float(np.interp(t_s, self._times_s, self._degrees_c))
+            times_s, degrees_c = self._times_s, self._degrees_c
+            after = bisect_right(times_s, t_s)
+            now_c = degrees_c[0]
+            if after:
+                began_s, began_c = times_s[after - 1], degrees_c[after - 1]
+                slope = (degrees_c[after] - began_c) / (times_s[after] - began_s)
+                now_c = slope * (t_s - began_s) + began_c
         shift_c = now_c + self.temperature_step_c - REFERENCE_C
         if abs(shift_c - self._shift_c) < STEP_C:
             return False
