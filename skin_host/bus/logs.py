@@ -194,16 +194,17 @@ def _decode_alike(
         channel = code_of(str(int(name)) if name.isdigit() else name, names)  # as in python-can
         seconds, decimals, _, identifier, data = (slice(*found.span(i)) for i in range(1, 6))
         digits = np.concatenate((lines[:, seconds], lines[:, decimals]), axis=1) - ord("0")
-        nibbles = _HEX[np.concatenate((lines[:, identifier], lines[:, data]), axis=1)]
+        nibbles = _HEX.take(np.concatenate((lines[:, identifier], lines[:, data]), axis=1))
         fixed = np.ones(len(first), np.bool_)
         for varying in (seconds, decimals, identifier, data):
             fixed[varying] = False
-        alike = (lines[:, fixed] == lines[0, fixed]).all(axis=1)
-        alike &= (digits < 10).all(axis=1) & (nibbles != _INVALID).all(axis=1)
-        if not alike.all():
-            digits, nibbles, into = digits[alike], nibbles[alike], at[alike]
-        else:
-            into = at
+        fits = lines[:, fixed] == lines[0, fixed], digits < 10, nibbles != _INVALID
+        into, left = at, at[:0]
+        # Whole arrays are looked through in a twentieth of the time that their rows take.
+        if not all(flags.all() for flags in fits):
+            alike = np.logical_and.reduce([flags.all(axis=1) for flags in fits])
+            digits, nibbles, into, left = digits[alike], nibbles[alike], at[alike], at[~alike]
+            lines = lines[~alike]
         # In float64, which is exact for so few digits, products of matrices are much faster.
         whole_s = _number(digits[:, : found.end(1) - found.start(1)])
         microseconds = whole_s * 1_000_000 + _number(digits[:, found.end(1) - found.start(1) :])
@@ -214,7 +215,7 @@ def _decode_alike(
         rows.dlc[into] = octets.shape[1]
         rows.data[into, : octets.shape[1]] = octets
         rows.t_ns[into] = microseconds * 1000
-        lines, at = lines[~alike], at[~alike]
+        at = left
 
 
 def _number(digits: NDArray[np.uint8]) -> NDArray[np.int64]:

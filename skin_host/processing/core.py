@@ -38,8 +38,7 @@ FEWEST_SAMPLES = 20
 LONGEST_INTERVAL_NS = 1_000_000_000
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
+class Step(NamedTuple):
     """Result of one sample of a part.
 
     Attributes:

@@ -13,6 +13,7 @@ for all boards at once: when every board that sends has sent, or before one send
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,8 +39,7 @@ FAR_PADS = 7
 FAR_SHARE = 1.5
 
 
-@dataclass(frozen=True, slots=True)
-class PartSample:
+class PartSample(NamedTuple):
     """One part at one instant.
 
     Attributes:

@@ -45,6 +45,8 @@ UNTOUCHED_S = 5.0
 SCHEDULER_S = 10.0
 #: The frames of an only bus are in the recording's order, however long its batches are.
 LONG_WINDOW_NS = 200_000_000
+#: Written at a time: a frame of some hundred taxels has several thousand bytes.
+_BUFFER_BYTES = 1 << 18
 _encoder = msgspec.json.Encoder()
 
 
@@ -270,7 +272,7 @@ def process(task: Task, progress: Callable[[int], None] = lambda _: None) -> int
     engine = Engine(settings, layout, list(range(len(layout.parts))), found)
     if task.output is None:
         return write_lines(task.log, engine, sys.stdout.buffer, progress)
-    with whole_file(task.output) as growing, growing.open("wb") as output:
+    with whole_file(task.output) as growing, growing.open("wb", _BUFFER_BYTES) as output:
         return write_lines(task.log, engine, output, progress)
 
 
