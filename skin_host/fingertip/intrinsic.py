@@ -5,8 +5,8 @@ surface at the contact (Bicchi and Dario; Son et al.). Forces in N, torques in N
 the origin of the frame in which the surface is given, lengths in mm. Rows are samples.
 """
 
-from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,8 +25,7 @@ class ContactVerdict(IntEnum):
     SEVERAL_CONTACTS = 3  # a twist about the force that one point cannot carry
 
 
-@dataclass(frozen=True, slots=True)
-class Quadric:
+class Quadric(NamedTuple):
     """Sphere, cylinder or ellipsoid: sum of ((x - centre) / semi_axis)^2 = 1.
 
     Attributes:
@@ -83,8 +82,7 @@ def ellipsoid(a_mm: float, b_mm: float, c_mm: float) -> Quadric:
     return Quadric((a_mm, b_mm, c_mm))
 
 
-@dataclass(frozen=True, slots=True)
-class Plane:
+class Plane(NamedTuple):
     """A flat face: outward unit normal, a point on it, and how far the face reaches."""
 
     outward: tuple[float, float, float] = (0.0, 0.0, 1.0)
@@ -111,8 +109,7 @@ class Plane:
 Surface = Quadric | Plane
 
 
-@dataclass(frozen=True, slots=True)
-class IntrinsicContact:
+class IntrinsicContact(NamedTuple):
     """Contacts located from force and torque, one row per sample; NaN where there is none.
 
     Attributes:

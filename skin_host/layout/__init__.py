@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 from enum import IntEnum
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -43,8 +43,7 @@ class PadKind(IntEnum):
     THERMAL = 1
 
 
-@dataclass(frozen=True, slots=True)
-class TriangleLayout:
+class TriangleLayout(NamedTuple):
     """One triangle: `number` on its board (index into `Layout.boards`), first flat taxel."""
 
     part: int
@@ -57,8 +56,7 @@ class TriangleLayout:
     outline_m: Floats
 
 
-@dataclass(frozen=True, slots=True)
-class BoardLayout:
+class BoardLayout(NamedTuple):
     """One board. `taxel_index` int32[16, 12] is the flat index of each value, -1 where unused."""
 
     name: str
@@ -69,8 +67,7 @@ class BoardLayout:
     parts: tuple[int, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class PartLayout:
+class PartLayout(NamedTuple):
     """One part: flat taxels `start:stop`, and its boards."""
 
     name: str

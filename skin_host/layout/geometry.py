@@ -1,8 +1,8 @@
 """Positions of a unit's pads: tiled, placed manually, or read from a file."""
 
 import warnings
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,8 +77,7 @@ def _rotation_from_z(normal: Floats) -> Floats:
     return np.array([[1 - k * u * u, -k * u * v, x], [-k * u * v, 1 - k * v * v, y], [-x, -y, z]])
 
 
-@dataclass(frozen=True, slots=True)
-class PlaneFit:
+class PlaneFit(NamedTuple):
     """Position of a flat unit: `origin_m` [3], its x and y `axes` [3, 2], and how well it fits."""
 
     origin_m: Floats

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, chain, pairwise
 from statistics import median
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -457,8 +458,7 @@ class _Homes:
         return order
 
 
-@dataclass(frozen=True, slots=True)
-class _Grouping:
+class _Grouping(NamedTuple):
     """The k contacts of a frame, as lists and as flat arrays.
 
     Attributes:

@@ -16,8 +16,7 @@ equally probable.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal, assert_never
+from typing import Literal, NamedTuple, assert_never
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,8 +57,7 @@ MOST_TABLES = 128
 SHARP_MM = 0.5
 
 
-@dataclass(frozen=True, slots=True)
-class _Table:
+class _Table(NamedTuple):
     """Patterns around one pad, of all candidate places and the pads that any of them covers.
 
     `pattern` and twice its square are [pads, places]: BLAS is faster over long rows. `moments`

@@ -1,8 +1,7 @@
 """The three ways of Son et al., section 2.2, to locate a contact, for any lattice."""
 
 import math
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +17,7 @@ GEOMETRY_PITCHES = 0.36
 PEAK_PITCHES = 1.6
 
 
-@dataclass(frozen=True, slots=True)
-class Location:
+class Location(NamedTuple):
     """A contact's position float64[3] in the part's frame, m, and its radial standard error."""
 
     position_m: Floats

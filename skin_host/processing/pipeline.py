@@ -8,7 +8,7 @@ recognised as untouched by one comparison of bytes.
 """
 
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -197,8 +197,7 @@ class Pipeline:
         return self._parts[part_index].drift.at_limit
 
 
-@dataclass(frozen=True, slots=True)
-class _Rules:
+class _Rules(NamedTuple):
     """Values derived from settings and calibration, over the whole skin."""
 
     settings: Processing

@@ -11,7 +11,7 @@ a noisy one an average over as many as its noise requires, and a firm press alwa
 """
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,8 +52,7 @@ MEAN_SHARE = 0.25
 FALL_DEVIATIONS = 4.0
 
 
-@dataclass(frozen=True, slots=True)
-class Levels:
+class Levels(NamedTuple):
     """Where n taxels begin and end to be touched, float64[n] in units above the baseline.
 
     Attributes:

@@ -71,7 +71,7 @@ def test_a_noisy_taxel_is_named_and_used():
 
 def test_a_pad_in_finer_units_is_judged_by_the_same_pressure():
     fine = replace(
-        LAYOUT, triangles=tuple(replace(triangle, shift=0) for triangle in LAYOUT.triangles)
+        LAYOUT, triangles=tuple(triangle._replace(shift=0) for triangle in LAYOUT.triangles)
     )
     for layout, verdict in ((LAYOUT, Verdict.NOISY), (fine, Verdict.OK)):
         calibrator = Calibrator(layout)

@@ -1,5 +1,4 @@
 import math
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -197,7 +196,7 @@ def test_noise_reaches_its_span_as_rarely_as_it_was_made_for(spread):
     n, steps = 400, 5000
     found = levels(np.full(n, 0.5), np.full(n, spread), TouchSettings())
     less = np.log(1e4) / np.log(1e9)
-    fewer = replace(found, span=found.span * less)
+    fewer = found._replace(span=found.span * less)
     detector = detector_of(fewer)
     begun, before = 0, detector.touched
     for _ in range(steps):
