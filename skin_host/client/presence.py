@@ -79,11 +79,16 @@ class _Part:
     reported: Contact | None = None
     touches: dict[int, tuple[Touch, float]] = field(default_factory=dict)
 
-    def hear(self, now_s: float, sent_s: float | None) -> None:
-        """Take a sign of life: it shows that the part lived when it was sent."""
+    def hear(self, now_s: float, sent_s: float | None, stale_s: float) -> None:
+        """Take a sign of life: it shows that the part lived when it was sent.
+
+        A stale part comes back with a message that is half as late as one that makes it stale, so
+        that it does not flap where messages come about as late as that.
+        """
         if sent_s is not None:
             self.late_s = self.lateness.of(sent_s, now_s)
-        self.alive_s = max(self.alive_s, now_s - self.late_s)
+        if now_s - self.alive_s <= stale_s or self.late_s <= stale_s / 2:
+            self.alive_s = max(self.alive_s, now_s - self.late_s)
 
 
 @dataclass(slots=True)
@@ -132,7 +137,7 @@ class Presence:
             return
         known = self._parts.setdefault(part, _Part(state, now_s))
         known.received = state
-        known.hear(now_s, sent_s)
+        known.hear(now_s, sent_s, self._stale_s)
         known.over = known.over | {broker} if again else {broker}
         if state == "OFF":
             known.touches.clear()
@@ -140,11 +145,11 @@ class Presence:
     def take_sign(self, part: str, now_s: float, sent_s: float | None = None) -> None:
         """Take any other message of a part that was not a retained one."""
         if part in self._parts:
-            self._parts[part].hear(now_s, sent_s)
+            self._parts[part].hear(now_s, sent_s, self._stale_s)
 
     def take_touch(self, touch: Touch, now_s: float) -> None:
         part = self._parts.setdefault(touch.part, _Part(None, now_s))
-        part.hear(now_s, None)
+        part.hear(now_s, None, self._stale_s)
         if touch.event == "end":
             part.touches.pop(touch.id, None)
         else:

@@ -79,6 +79,18 @@ def test_a_part_of_which_all_comes_late_is_stale() -> None:
     assert presence.changes(11.0) == [Contact("palm", "ON")]
 
 
+def test_a_part_whose_messages_come_about_too_late_does_not_flap() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_state("palm", "OFF", 0.0, sent_s=0.0)
+    shown = presence.changes(0.0)
+    for second in range(10, 60):
+        presence.take_sign("palm", float(second), second - (3.2 if second % 2 else 2.8))
+        shown += presence.changes(float(second))
+    assert shown == [Contact("palm", "OFF"), Contact("palm", "UNKNOWN", "stale")]
+    presence.take_sign("palm", 60.0, 58.6)
+    assert presence.changes(60.0) == [Contact("palm", "OFF")]
+
+
 def test_a_late_sign_of_life_takes_nothing_from_an_earlier_one() -> None:
     presence = Presence(stale_s=3.0)
     presence.take_state("palm", "OFF", 0.0, sent_s=0.0)
