@@ -45,6 +45,8 @@ DECIDED_NS = NS // 2
 #: A press is felt after so many samples, and is not for so many more where a chip has just come
 #: back.
 FELT_SAMPLES, DEAF_SAMPLES = 6, 3
+#: A press that began longer ago must be felt.
+PAUSE_NS = round(0.75 * NS)
 #: Foam that was pressed still relaxes for so long.
 RELAXED_NS = 60 * NS
 #: A calibration at rest began no longer ago when it is noted.
@@ -212,6 +214,9 @@ class Promises:
         #: Calibrations in the order in which they were taken, and the last that was surely kept.
         self._calibrations: list[str] = []
         self.kept = -1
+        #: When each taxel was last seen not to be pressed between two samples.
+        self._paused_ns = np.full(layout.n_taxels, -(1 << 62), np.int64)
+        world.before_press = self._note_pause
         world.broker.listeners.append(self._hear)
 
     # ------------------------------------------------------------------  its input
@@ -658,6 +663,7 @@ class Promises:
             if not frame.computed:
                 continue
             missed = fit & (least[mine] > PRESSED_KPA) & (frame.pressure_kpa < FELT_KPA)
+            missed &= now_ns - self._paused_ns[mine] > PAUSE_NS
             if missed.any():
                 taxel = int(np.flatnonzero(missed)[0])
                 self.break_(
@@ -680,6 +686,11 @@ class Promises:
             self.break_(unnamed)
         if len(asyncio.all_tasks()) > MOST_TASKS + TASKS_OF_BOARD * len(world.layout.boards):
             self.break_(f"{len(asyncio.all_tasks())} tasks run")
+
+    def _note_pause(self) -> None:
+        """Something is about to be pressed; what was lifted just before has not been sampled."""
+        rests = self._world.robot.skin.true_pressure_kpa() <= PRESSED_KPA
+        self._paused_ns[rests] = self._now_ns()
 
     def _noise_kpa(self, life: Life, name: str) -> NDArray[np.float64]:
         """Return how far noise alone may move each taxel [m] of a part."""

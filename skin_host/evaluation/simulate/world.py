@@ -135,6 +135,8 @@ class World:
         #: By how much the robot's time is ahead of the computer's, which was suspended.
         self.slept_ns = 0
         self.spots = [Spot(self, self.chance) for _ in range(SPOTS)]
+        #: Looks at the skin just before a place is pressed: pauses may be shorter than samples.
+        self.before_press: Callable[[], object] = lambda: None
         self.power_failed = asyncio.Event()
         self._disk_refuses: int | None = None
 
@@ -222,6 +224,8 @@ class Spot:
             kpa = self._chance.uniform(20.0, 80.0)
         world.note(f"press {self.part}/{self.taxel} {kpa:.0f} kPa for {seconds:.1f} s")
         self.pressed = True
+        world.move()
+        world.before_press()
         try:
             for share in (0.25, 0.5, 0.75, 1.0):
                 world.move()

@@ -340,6 +340,36 @@ def test_what_is_retained_just_before_a_stall_is_at_the_broker_after_it(world: W
         assert runner.run(live()) is None
 
 
+def test_a_pause_between_two_presses_that_no_sample_saw_is_known(world: World) -> None:
+    """The last frame before the bus went off may be of that pause."""
+
+    async def live() -> str | None:
+        promises = Promises(world)
+        life = world.life = Life(world)
+        life.start(promises.watch)
+        await world.clock.sleep(8.0)
+        spot = world.spots[0]
+        first = asyncio.create_task(spot.press(2.0, 60.0))
+        for _ in range(8):
+            await world.clock.sleep(0.25)
+            promises.sample()
+        await first
+        await world.clock.sleep(0.06)
+        second = asyncio.create_task(spot.press(2.0, 60.0))
+        await world.clock.sleep(0.0)
+        promises.begin(KINDS["link_down"](world, random.Random(1), False))
+        for _ in range(2):
+            await world.clock.sleep(0.13)
+            promises.sample()
+        broken = promises.broken
+        await second
+        life.kill()
+        return broken
+
+    with world.clock.runner() as runner:
+        assert runner.run(live()) is None
+
+
 def test_halves_of_sweeps_that_a_full_bus_held_up_are_paired_though_one_was_lost() -> None:
     """Sweeps follow each other within a millisecond then; what is left of the first is one half."""
     sent = Sent()
