@@ -419,6 +419,25 @@ def test_of_the_three_units_of_a_hard_press_one_is_left_after_five_seconds(
     assert bool(residuals.step(np.array([True]), np.array([reading]))[0]) is reported
 
 
+@pytest.mark.parametrize(("reading", "reported"), [(3.9, False), (6.5, True)])
+def test_what_a_press_left_when_it_fell_is_no_touch_while_it_slowly_goes(
+    reading: float, reported: bool
+) -> None:
+    """Foam whose model is not fitted keeps more than 3 % of the press, for more than 5 s."""
+    residuals = residuals_of()
+    on = np.array([True])
+    for _ in range(20):
+        residuals.step(on, np.array([70.0]))
+    seen = []
+    for _ in range(15):
+        seen += [bool(residuals.step(on, np.array([3.9]))[0]) for _ in range(20)]
+        residuals.fade(1.0)
+    assert not any(seen[20:])
+    for _ in range(20):
+        found = residuals.step(on, np.array([reading]))
+    assert bool(found[0]) is reported
+
+
 def after_an_outage(seconds: float, units: int) -> list[bool]:
     """Press firmly, lose the taxel for some time, then read so many units; return the decisions."""
     detector = detector_of()
