@@ -46,12 +46,15 @@ def transmit_32(
         value = change - (size >> 5)
     shift, no_load = shift[:, None], no_load[:, None]
     sent = no_load - (value >> shift)
-    if (sent - 1).view(np.uint32).max(initial=0) < 254 and _all_there(raw):
+    is_there = _all_there(raw)
+    if is_there and (sent - 1).view(np.uint32).max(initial=0) < 254:
         # Nothing is clipped, so nothing is as far out as that takes: nearly always.
         return sent.astype(np.uint8), np.zeros(len(raw), np.uint16)
     values = np.minimum(np.maximum(sent, 0), 255).astype(np.uint8)
     up, bottom = (255 - no_load) << shift, no_load << shift
     far = (value <= -2 * up) | (value >= 2 * bottom)
+    if is_there and not far.any():
+        return values, np.zeros(len(raw), np.uint16)
     return values, _status(far, raw, base)
 
 
@@ -61,9 +64,7 @@ def _all_there(raw: Words) -> bool:
 
 
 def _status(far: NDArray[np.bool_], raw: Words, base: Ints) -> Words:
-    """Status words of an MTB4, nearly always 0."""
-    if _all_there(raw) and not far.any():
-        return np.zeros(len(raw), np.uint16)
+    """Status words of an MTB4."""
     silent = ((raw == 0) & (base != 0)).any(axis=1)
     absent = (raw == ABSENT).all(axis=1)
     error = StatusError.NO_ACK * silent | StatusError.NOT_CONNECTED * absent

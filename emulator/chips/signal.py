@@ -261,16 +261,21 @@ class SignalSkin:
         if reg.CDC_RESULT <= address < reg.DEVICE_ID:
             if self.forced[chip] >= 0:
                 return int(self.forced[chip])
-            if self._settled_ns != self.t_ns:
-                self._settled.clear()
-                self._settled_ns = self.t_ns
-            if chip not in self._settled:
-                self._settle(np.array([chip]))
-                self._settled.add(chip)
+            if self._settled_ns != self.t_ns or chip not in self._settled:
+                one = np.array([chip])
+                self._settle(one)
+                self.note_settled(one)
             return int(self._results[chip, address - reg.CDC_RESULT])
         if reg.BANK_2 <= address < reg.BANK_3:
             return int(self._bank_2[chip][divmod(address - reg.BANK_2, reg.STAGE_WORDS)])
         return reg.DEVICE_ID_VALUE if address == reg.DEVICE_ID else 0
+
+    def note_settled(self, chips: Ints) -> None:
+        """The registers of these chips are as they are at the present."""
+        if self._settled_ns != self.t_ns:
+            self._settled.clear()
+            self._settled_ns = self.t_ns
+        self._settled.update(chips.tolist())
 
     def force(self, chip: int, word: int) -> None:
         """Let a chip answer `word` whatever it measures; -1 ends that."""
@@ -589,7 +594,9 @@ class SignalChips:
         words = np.full((SLOTS, TAXELS), ABSENT, np.uint16)
         fitted = self.chip_of_slot >= 0
         if fitted.any():
-            words[fitted] = self._skin.read(self.chip_of_slot[fitted])
+            chips = self.chip_of_slot[fitted]
+            words[fitted] = self._skin.read(chips)
+            self._skin.note_settled(chips)
         return words
 
 
@@ -619,8 +626,10 @@ class SignalPort:
 
     def read(self, length: int) -> bytes:
         """Answer one read message, as `AD7147.read` does."""
+        first = self.pointer
         words = [
-            self._skin.read_register(self._chip, self.pointer + at) for at in range(-(-length // 2))
+            self._skin.read_register(self._chip, first + at).to_bytes(2)
+            for at in range(-(-length // 2))
         ]
-        self.pointer = max(self.pointer, min(self.pointer + length // 2, reg.END_OF_MAP))
-        return b"".join(word.to_bytes(2) for word in words)[:length]
+        self.pointer = max(first, min(first + length // 2, reg.END_OF_MAP))
+        return b"".join(words)[:length]
