@@ -43,7 +43,7 @@ THERMAL_UNITS = (0.5, 0.9)
 DRAWS = 1 << 18
 _STAGES = np.arange(TAXELS)
 #: For each number of stages that a pass has reached: which stages are of the one before.
-_PASS_OF = (np.arange(TAXELS + 1)[:, None] <= _STAGES).astype(np.intp)
+_IS_BEFORE = np.arange(TAXELS + 1)[:, None] <= _STAGES
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -140,14 +140,11 @@ class ChipNoise:
         ends_ns = began_ns[:, :: TAXELS - 1]
         first = began_ns == ends_ns[:, :1]
         if (first | (began_ns == ends_ns[:, 1:])).all():
-            mixed = _mixed((keys + ends_ns).astype(np.uint64))
-            normal_at, wave_at = (
-                np.where(first, at[:, :1], at[:, 1:]) for at in (_normal_at(mixed), _wave_at(mixed))
-            )
+            ends = _mixed((keys + ends_ns).astype(np.uint64))
+            mixed = np.where(first, ends[:, :1], ends[:, 1:])
         else:
             mixed = _mixed((keys + began_ns).astype(np.uint64))
-            normal_at, wave_at = _normal_at(mixed), _wave_at(mixed)
-        return self._drawn(chips, normal_at + _STAGES, wave_at + _STAGES)
+        return self._drawn(chips, mixed)
 
     def in_step(
         self, chips: Ints | slice, began_ns: NDArray[np.int64], stages: Sequence[int]
@@ -159,27 +156,18 @@ class ChipNoise:
             began_ns: int64[m, 2], when the pass began that goes on, and the one before.
             stages: [m], how many stages the first of them has converted.
         """
-        mixed = _mixed((self._keys[chips][:, None] + began_ns[:, None]).astype(np.uint64))
-        normal_at, wave_at = (
-            _of_passes(at, stages) + _STAGES for at in (_normal_at(mixed), _wave_at(mixed))
-        )
-        return self._drawn(chips, normal_at, wave_at)
+        passes = _mixed((self._keys[chips][:, None] + began_ns[:, None]).astype(np.uint64))
+        is_before = _IS_BEFORE[list(stages)][:, None]
+        return self._drawn(chips, np.where(is_before, passes[:, :, 1:], passes[:, :, :1]))
 
-    def _drawn(self, chips: Ints | slice, normal_at: Ints, wave_at: Ints) -> Floats:
+    def _drawn(self, chips: Ints | slice, mixed: NDArray[np.uint64]) -> Floats:
+        """The draws of stages whose passes have these numbers, [..., k, 12]."""
         normals, waves = _tables()
-        noise: Floats = normals[normal_at]
+        noise: Floats = normals[_normal_at(mixed) + _STAGES]
         if self._has_wave:
             noise *= self._normal[chips]
-            noise += self._pads.wave[chips] * waves[wave_at]
+            noise += self._pads.wave[chips] * waves[_wave_at(mixed) + _STAGES]
         return noise
-
-
-def _of_passes(at: Ints, stages: Sequence[int]) -> Ints:
-    """Of the two passes of each chip, intp[m, k, 2], the one of each stage: intp[m, k, 12]."""
-    if len(at) == 1:
-        now: Ints = at[:, :, _PASS_OF[stages[0]]]
-        return now
-    return np.take_along_axis(at, _PASS_OF[list(stages)][:, None], axis=2)
 
 
 def _normal_at(mixed: NDArray[np.uint64]) -> Ints:
