@@ -2,6 +2,7 @@
 
 import json
 
+from skin_host.errors import visible
 from skin_host.fingertip.events import Over, Slip
 from skin_host.processing.events import Touch
 
@@ -31,7 +32,7 @@ def event_line(event: Touch | Slip | Over) -> str:
 
 
 def _line(part: str, kind: str, number: int, told: str) -> str:
-    return f"{part:<14} {kind:<5} #{number:<4} {told}".rstrip()
+    return f"{visible(part):<14} {kind:<5} #{number:<4} {told}".rstrip()
 
 
 def _touch_line(touch: Touch) -> str:
@@ -53,4 +54,4 @@ def missed_line(event: Touch | Slip | Over, *, as_json: bool) -> str:
     kind = type(event).__name__.lower()
     if as_json:
         return json.dumps({"missed": event.missed, "part": event.part, "kind": kind})
-    return f"({event.missed} {kind} events of {event.part} were missed)"
+    return f"({event.missed} {kind} events of {visible(event.part)} were missed)"

@@ -15,6 +15,7 @@ from skin_host.cli.common import (
     run,
     set_up_logging,
 )
+from skin_host.errors import visible
 
 #: `skin status` looks for the broker for this long; a reachable one answers at once.
 PATIENCE_S = 1.5
@@ -156,8 +157,9 @@ def status_table(records: dict[str, dict[str, Any]]) -> str:
         age_ms = record.get("age_ms")
         age = "-" if age_ms is None else f"{age_ms:.0f} ms"
         rate = record.get("rate_hz", 0.0)
-        lines.append(f"{part:<16} {record.get('state', '?'):<14} {rate:>6.1f} {valid:>11} {age:>9}")
-        lines += [f"    {sentence}" for sentence in record.get("sentences", ())]
+        state = visible(record.get("state", "?"))
+        lines.append(f"{visible(part):<16} {state:<14} {rate:>6.1f} {valid:>11} {age:>9}")
+        lines += [f"    {visible(sentence)}" for sentence in record.get("sentences", ())]
     return "\n".join(lines)
 
 

@@ -132,12 +132,13 @@ async def serve(port: int, records: Callable[[], Records], clock: Clock = SYSTEM
                     writer.write(_response(await reader.readuntil(b"\r\n\r\n"), records))
                     await writer.drain()
         except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
-            pass  # an invalid request gets no answer
+            # An invalid request gets no answer, and who reads none is not waited for.
+            writer.transport.abort()
         finally:
-            busy -= 1
             writer.close()
             with contextlib.suppress(OSError):
                 await writer.wait_closed()
+            busy -= 1
 
     said = False
     while True:

@@ -69,6 +69,11 @@ class _HealthHead(Struct):
     """The keys of a health record that subscribers rely on, and their types."""
 
     state: str = ""
+    kind: str = ""
+    taxels: int = 0
+    valid_taxels: int = 0
+    rate_hz: float = 0.0
+    age_ms: float | None = None
     faults: list[_Fault] = []
     sentences: list[str] = []
 

@@ -4,7 +4,10 @@ import json
 
 import aiomqtt
 import pytest
+from msgspec.structs import replace
 
+from skin_host.cli.lines import event_line, missed_line
+from skin_host.cli.watch import status_table
 from skin_host.client.presence import MAX_TOUCHES, Presence
 from skin_host.client.session import MAX_NAMES
 from skin_host.mqtt.messages import decode_health
@@ -27,6 +30,8 @@ HEALTH = {"schema": "skin.health/1", "part": "palm", "state": "ok"}
         HEALTH | {"faults": [{"code": 1, "where": "x"}]},
         HEALTH | {"sentences": "all is well"},
         HEALTH | {"sentences": [None]},
+        HEALTH | {"rate_hz": "fast"},
+        HEALTH | {"age_ms": "old"},
     ],
 )
 def test_a_health_record_of_other_types_is_not_passed_on(record: object) -> None:
@@ -62,3 +67,14 @@ def test_touches_that_never_end_are_forgotten_from_the_oldest_on() -> None:
         presence.take_touch(seen("begin", number), 1.0)
     known = [one.id for one in presence.touches("palm", 1.0)]
     assert known == list(range(10, MAX_TOUCHES + 10))
+
+
+def test_what_is_received_does_not_steer_the_terminal() -> None:
+    """Escapes move the cursor and hide what was printed; others turn the text around."""
+    evil = "\x1b[2J\x9b2Jpalm\u202e"
+    table = status_table({evil: HEALTH | {"state": evil, "sentences": [evil + "\nall is well"]}})
+    line = event_line(replace(seen("begin"), part=evil))
+    missed = missed_line(replace(seen("begin"), part=evil, missed=3), as_json=False)
+    for text in (*table.split("\n"), line, missed):
+        assert text.isprintable()
+    assert len(table.split("\n")) == 3
