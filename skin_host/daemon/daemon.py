@@ -110,6 +110,7 @@ class Daemon:
         if calibration is not None and calibration.id == self._zeros.calibration:
             doubted = _taxels(layout, self._zeros)
             self.engine.doubt(doubted)
+        self.engine.hold(self.engine.boards)
         self.health = HealthWatch(self.engine)
         self.control = Control(self)
         self.publisher = Publisher(

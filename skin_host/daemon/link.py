@@ -362,4 +362,7 @@ class Link:
                 if str(error) != told:
                     log.warning("%s", error)
                     told = str(error)
+                if isinstance(boards, Boards):
+                    # What sends all the same keeps the zero that it has.
+                    self._engine.release([one.index for one in boards.records.values()])
                 await self._clock.sleep(RETRY_S)

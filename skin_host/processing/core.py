@@ -5,7 +5,7 @@ takes frames and times, and returns frames of pressure and events.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -176,6 +176,8 @@ class Engine:
         self._last_touched = np.zeros(layout.n_taxels, np.bool_)
         #: By part: which of its taxels were touched and valid in its last frame.
         self._noted: dict[int, tuple[Mask, Mask]] = {}
+        #: Taxels of boards that have not been zeroed yet, see `hold`; None if there are none.
+        self._held: Mask | None = None
         self._run: _CalibrationRun | None = None
         #: Between `collected` and `use`: the boards that were zeroed, and `believed` of each.
         self._zeroed_since: dict[int, bool] | None = None
@@ -207,6 +209,7 @@ class Engine:
         self._jumped_ns = after._jumped_ns
         self._touched = after._touched
         self._last_touched = after._last_touched
+        self._held = after._held
         self._run = after._run
         self._zeroed_since = after._zeroed_since
         self.calibration = after.calibration
@@ -238,6 +241,7 @@ class Engine:
             self._rezeros.pop(board, None)
         if self.fingertips is not None and boards == self.boards:
             self._ended += self.fingertips.use(calibration.zeros)
+        self.release(boards)
         zeroed = self.taxels_of(boards)
         self._last_touched[zeroed] = self._touched[zeroed]
         self._renew_pipeline(zeroed)
@@ -361,6 +365,21 @@ class Engine:
         steps = self._process(self._take(sweeps) + self.intake.flush())
         return Output(sweeps, steps, [], grasps, [])
 
+    def hold(self, boards: list[int]) -> None:
+        """Report no taxel of some boards as valid until they are zeroed.
+
+        Their zero may be another than the calibration's: since that was taken, an earlier start of
+        the daemon may have zeroed them. What seems to touch them is noted all the same.
+        """
+        held = self.taxels_of(boards)
+        self._held = held if self._held is None else self._held | held
+
+    def release(self, boards: list[int]) -> None:
+        """Report taxels of some boards as valid again: they are zeroed, or cannot be."""
+        if self._held is not None:
+            left: Mask = self._held & ~self.taxels_of(boards)
+            self._held = left if any_of(left) else None
+
     def rezero(self, board: int, believed: bool = True) -> int:
         """Find the new untouched readings after a board was zeroed.
 
@@ -376,6 +395,7 @@ class Engine:
             How many taxels were touched.
         """
         taxels = self._taxels_of(board)
+        self.release([board])
         if self._zeroed_since is not None:
             self._zeroed_since[board] = believed
         if self._run is not None:
@@ -534,12 +554,26 @@ class Engine:
                     sample.t_ns,
                     pressures=sample.part not in self.touch_only,
                 )
+                self._note_touched(sample.part, frame)
+                if self._held is not None:
+                    frame = self._without(frame, sample.part, self._held)
                 events = self._trackers[sample.part].step(frame)
                 if self.fingertips is not None:
                     self.fingertips.note_skin(sample.part, events, frame.t_ns)
-                self._note_touched(sample.part, frame)
                 steps.append(Step(sample.part, frame, events))
         return steps
+
+    def _without(self, frame: PressureFrame, index: int, held: Mask) -> PressureFrame:
+        """Return a frame of a part in which taxels bool[n] of the skin are not valid."""
+        part = self.layout.parts[index]
+        fit = ~held[part.start : part.stop]
+        return replace(
+            frame,
+            pressure_kpa=frame.pressure_kpa * fit,
+            touched=frame.touched & fit,
+            valid=frame.valid & fit,
+            beyond_range=frame.beyond_range & fit,
+        )
 
     def _note_touched(self, index: int, frame: PressureFrame) -> None:
         """Pass the touched pads to the liveness decision, but only when they change."""

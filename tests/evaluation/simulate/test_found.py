@@ -261,6 +261,39 @@ def test_a_board_that_is_set_up_while_a_disabled_part_is_pressed_does_not_zero_t
         runner.run(live())
 
 
+def test_a_daemon_that_starts_reports_no_touch_before_its_boards_are_zeroed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The daemon before it has zeroed them since the calibration; ten boards take seconds."""
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
+    kaspar = DEMO.with_name("kaspar.toml")
+    settings, layout = load_skin(kaspar)
+    world = World(settings, layout, kaspar, 2, Scene(quiet=False))
+
+    async def live() -> list[str]:
+        life = start(world)
+        await world.clock.sleep(10.0)
+        await life.daemon.configure()
+        await world.clock.sleep(3.0)
+        life.kill()
+        await world.clock.sleep(0.5)
+        seen: list[str] = []
+
+        def hear(topic: str, payload: bytes) -> None:
+            if topic.endswith("/touch"):
+                seen.append(topic)
+
+        world.broker.listeners.append(hear)
+        life = start(world)
+        await world.clock.sleep(6.0)
+        assert all(record["valid_taxels"] for record in life.daemon.records().values())
+        life.kill()
+        return seen
+
+    with world.clock.runner() as runner:
+        assert runner.run(live()) == []
+
+
 def test_a_shorted_data_line_that_two_parts_share_is_named_by_both(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
