@@ -8,9 +8,10 @@ import asyncio
 import logging
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from itertools import islice
 from typing import NamedTuple
+
+from msgspec import Struct
 
 from skin_host.clock import SYSTEM, Clock
 from skin_host.fingertip.events import FingertipEvent
@@ -32,8 +33,7 @@ MOVE_SHARE = 0.5
 _log = logging.getLogger(__name__)
 
 
-@dataclass(slots=True)
-class PublisherCounters:
+class PublisherCounters(Struct):
     """Results of everything that was put.
 
     Attributes:
@@ -63,7 +63,7 @@ class PublisherCounters:
     retained_sent: int = 0
     refused: int = 0
     rejected: int = 0
-    withheld: list[str] = field(default_factory=list)
+    withheld: list[str] = []
     name_taken: bool = False
     answers_dropped: int = 0
     commands_taken: int = 0

@@ -8,7 +8,6 @@ import asyncio
 import logging
 from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager, AbstractContextManager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Self
@@ -173,7 +172,7 @@ class Publisher:
     @property
     def counters(self) -> PublisherCounters:
         known, handler, connection = self._outbox.counters, self._command_handler, self._connection
-        return replace(
+        return msgspec.structs.replace(
             known,
             touches_waiting=self._outbox.touches_waiting(),
             withheld=[*self._outbox.trials.withheld, *self._courier.too_large][:MAX_NAMED],
