@@ -18,7 +18,7 @@ from skin_host.health.record import (
 )
 from skin_host.health.watch import Watch
 from skin_host.layout import TAXELS_PER_TRIANGLE, PadKind
-from skin_host.processing.calibration import Verdict
+from skin_host.processing.calibration import Calibration, Verdict
 from skin_host.processing.core import Engine
 from skin_host.processing.intake import FAR_PADS, lifted
 from skin_host.processing.masks import Mask, any_of
@@ -57,6 +57,8 @@ class Describer:
         self._watch = watch
         #: For each part the shifts of its thermal and of its resting pads at the last look.
         self._shifts: dict[int, Temperatures] = {}
+        #: For each part: a calibration, and its verdicts that are not "ok".
+        self._judged: dict[int, tuple[Calibration, dict[str, list[int]]]] = {}
         #: For each part: the triangles that belong to it, by board.
         self._fitted: dict[int, dict[int, list[int]]] = {part: {} for part in engine.parts}
         for triangle in self._layout.triangles:
@@ -282,14 +284,18 @@ class Describer:
         calibration = self._engine.calibration
         if calibration is None:
             return {}
-        layout = self._layout.parts[part]
-        mine = slice(layout.start, layout.stop)
-        verdict = np.where(pressure, calibration.verdict[mine], Verdict.OK)
-        return {
-            kind.name.lower(): np.flatnonzero(verdict == kind).tolist()
-            for kind in map(Verdict, sorted(set(verdict.tolist())))
-            if kind != Verdict.OK
-        }
+        known = self._judged.get(part)
+        if known is None or known[0] is not calibration:
+            layout = self._layout.parts[part]
+            mine = slice(layout.start, layout.stop)
+            verdict = np.where(pressure, calibration.verdict[mine], Verdict.OK)
+            found = {
+                kind.name.lower(): np.flatnonzero(verdict == kind).tolist()
+                for kind in map(Verdict, sorted(set(verdict.tolist())))
+                if kind != Verdict.OK
+            }
+            self._judged[part] = known = calibration, found
+        return known[1]
 
     def _decides_kpa(self, part: int) -> float | None:
         """Return the pressure above which every usable taxel decides within a second."""

@@ -12,6 +12,7 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from functools import cached_property
 from pathlib import Path
 from statistics import median
 
@@ -142,11 +143,14 @@ class Calibration:
     zeros: dict[str, Zero] = field(default_factory=dict)
     curves: Curves | None = None
 
-    @property
+    @cached_property
     def usable(self) -> NDArray[np.bool_]:
-        """Return which taxels [n] are usable."""
+        """Which taxels [n] are usable; not to be written to."""
         usable: NDArray[np.bool_] = self.verdict < Verdict.STUCK
-        return usable if self.curves is None else usable & self.curves.usable
+        if self.curves is not None:
+            usable &= self.curves.usable
+        usable.flags.writeable = False
+        return usable
 
 
 class Calibrator:
