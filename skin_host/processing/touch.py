@@ -55,6 +55,9 @@ LEAST_RESIDUAL = 0.05
 MEAN_SHARE = 0.25
 #: A repeated fall by this many standard deviations of a measurement is not noise.
 FALL_DEVIATIONS = 4.0
+#: Nor is a rise of the mean by so many of its own, which are those of a measurement times the root
+#: of `MEAN_SHARE` / (2 - `MEAN_SHARE`).
+RISE_DEVIATIONS = 5.0
 
 
 class Levels(NamedTuple):
@@ -281,7 +284,8 @@ class Residuals:
     the residual: that of any press, or what was felt when this one fell. A firm press ends when it
     has fallen to its residual: by evidence alone that takes long, because the residual is nearly
     enough to keep a touch. The baselines still follow the decision before: what is left may be
-    drift, and then it lasts.
+    drift, and then it lasts. While that decision holds on to a residual it is no new evidence: a
+    taxel is touched again when its mean rises further than noise carries it.
 
     Attributes:
         any: whether any is reported.
@@ -297,6 +301,10 @@ class Residuals:
         self._left = np.zeros(n, np.float32)
         self._felt = np.zeros(n, np.float32)
         self._fallen = np.zeros(n, np.int64)
+        #: What noise adds to the mean at most; and which taxels have fallen to their residual and
+        #: are still touched by the decision before.
+        self._rise = np.zeros(n, np.float32)
+        self._held = np.zeros(n, np.bool_)
         #: Whether any reported taxel has fallen in its last measurement.
         self._any_fallen = False
         self._reported: Mask = np.zeros(n, dtype=np.bool_)
@@ -317,6 +325,9 @@ class Residuals:
         with np.errstate(invalid="ignore"):  # both are infinite where nothing is touched
             np.copyto(self._firmer, np.fmax(firm - on, on), casting="same_kind")
         self._votes = votes
+        own = RISE_DEVIATIONS * math.sqrt(MEAN_SHARE / (2.0 - MEAN_SHARE))
+        rise = self._firmer * np.sqrt(votes / 2) * (own / FALL_DEVIATIONS)
+        np.copyto(self._rise, rise, casting="same_kind")
 
     def step(self, touched: Mask, signal: Array, repeated: Mask | None = None) -> Mask:
         """Take one decision [n] and the signal [n] that it was based on, in kPa.
@@ -341,7 +352,9 @@ class Residuals:
         np.copyto(self._felt, felt, where=~self._reported, casting="same_kind")
         self._seen = touched
         left = np.fmax(RESIDUAL_SHARE * self._pressed, self._left)
-        enough = (left < LEAST_RESIDUAL * self._on) | (self._felt >= self._on + left)
+        self._held &= touched
+        enough = (left < LEAST_RESIDUAL * self._on) & ~self._held
+        enough |= self._felt >= self._on + left + np.where(self._held, self._rise, 0.0)
         self._report(touched & (self._reported | enough))
         self._undecided = not np.array_equal(self._reported, touched)
 
@@ -375,6 +388,7 @@ class Residuals:
             if not isinstance(which, slice):
                 ended = which[ended]
             self._felt[ended] = signal[ended]
+            self._held[ended] = True
             self._left[ended] = np.clip(signal[ended], 0.0, LARGEST_SHARE * self._pressed[ended])
             reported = self._reported.copy()
             reported[ended] = False
@@ -398,5 +412,6 @@ class Residuals:
         """Forget the presses on some taxels [n]."""
         self._pressed[taxels] = 0.0
         self._left[taxels] = 0.0
+        self._held[taxels] = False
         self._report(self._reported & ~taxels)
         self._undecided = True

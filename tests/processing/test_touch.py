@@ -459,3 +459,28 @@ def test_what_still_presses_after_it_was_not_received_is_touched_at_once() -> No
 
 def test_a_few_sweeps_that_do_not_come_end_no_touch() -> None:
     assert after_an_outage(0.2, 0) == [True, False, False]
+
+
+def held_at_a_residual(noise_units: float, seconds: float) -> list[bool]:
+    """Press hard, fall to what the foam keeps for long, with noise; what is reported after that."""
+    rng = np.random.default_rng(3)
+    found = levels(np.zeros(1), np.full(1, noise_units), TouchSettings())
+    on = found.enter + 0.25
+    residuals = Residuals(1)
+    residuals.configure(on, on + found.fall, found.votes)
+    touched = np.ones(1, np.bool_)
+    reported = []
+    n = round(seconds / SWEEP_S)
+    for units in [60.0] * 20 + [float(0.9 * on[0])] * n:
+        signal = np.full(1, units + noise_units * rng.standard_normal())
+        reported.append(bool(residuals.step(touched, signal)[0]))
+        residuals.fade(SWEEP_S)
+    return reported[20:]
+
+
+@pytest.mark.parametrize("noise_units", [0.0, 0.8, 1.5])
+def test_a_residual_that_the_decision_holds_on_to_is_no_touch_again(noise_units: float) -> None:
+    reported = held_at_a_residual(noise_units, 30.0)
+    begins = sum(now and not before for before, now in pairwise([True, *reported]))
+    assert not reported[-1]
+    assert begins == 0
