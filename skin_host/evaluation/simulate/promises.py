@@ -47,6 +47,8 @@ DECIDED_NS = NS // 2
 FELT_SAMPLES, DEAF_SAMPLES = 6, 3
 #: A press that began longer ago must be felt.
 PAUSE_NS = round(0.75 * NS)
+#: A touch that begins is of something that presses, or did no longer ago.
+CAUSE_NS = 3 * NS
 #: Foam that was pressed still relaxes for so long.
 RELAXED_NS = 60 * NS
 #: A calibration at rest began no longer ago when it is noted.
@@ -337,9 +339,10 @@ class Promises:
                 self.break_(f"{event.part}: touch {event.id} begins again")
             self._last_id[event.part] = event.id
             now.add(event.id)
-            if event.part in self._parts and not self._has_cause(event.part, event.taxels).any():
+            part = event.part
+            if part in self._parts and not self._has_cause(part, event.taxels, CAUSE_NS).any():
                 self.break_(
-                    f"{event.part}: touch {event.id} begins at taxels {event.taxels} with "
+                    f"{part}: touch {event.id} begins at taxels {event.taxels} with "
                     f"{event.peak_kpa:.1f} kPa, and nothing presses there"
                 )
         elif event.id not in now:
@@ -349,17 +352,33 @@ class Promises:
         elif not event.taxels and event.part in self._parts:
             self.break_(f"{event.part}: touch {event.id} has no taxel")
 
-    def _has_cause(self, part: str, taxels: Sequence[int] | NDArray[np.intp]) -> Mask:
+    def _has_cause(
+        self, part: str, taxels: Sequence[int] | NDArray[np.intp], lately_ns: int
+    ) -> Mask:
         """Return whether each of some taxels of a part may be touched, bool[k]: something presses
-        it, or its foam still recovers from that, or its value may be wrong without anybody being
-        able to know.
+        it or did so lately, or its value may be wrong without anybody being able to know.
         """
         mine = np.asarray(taxels, np.intp) + self._parts[part].start
-        caused: Mask = self._now_ns() - self._touched_ns[mine] < RELAXED_NS
+        caused: Mask = self._now_ns() - self._touched_ns[mine] < lately_ns
         if not caused.all():
             caused |= self._world.robot.skin.true_pressure_kpa()[mine] > TOUCHING_KPA
-            caused |= (self._exempt | self._spoiled())[mine]
+            caused |= (self._exempt | self._spoiled() | self._not_set_up())[mine]
         return caused
+
+    def _not_set_up(self) -> Mask:
+        """Return taxels bool[n] of boards that this start of the daemon has not set up yet.
+
+        Their zeros may be of a set-up after the calibration, which an earlier start knew.
+        """
+        found = np.zeros(self._world.layout.n_taxels, np.bool_)
+        life = self._world.life
+        assert life is not None
+        for boards in life.daemon.link.boards.values():
+            for record in boards.records.values():
+                if not record.configurations:
+                    taxels = record.layout.taxel_index
+                    found[taxels[taxels >= 0]] = True
+        return found
 
     def _frame(self, frame: PressureFrame) -> None:
         name = frame.part
@@ -397,7 +416,7 @@ class Promises:
         if frame.touched is not self._felt.get(name):
             begun = np.flatnonzero(frame.touched & ~self._felt.get(name, False))
             self._felt[name] = frame.touched
-            without = begun[~self._has_cause(name, begun)]
+            without = begun[~self._has_cause(name, begun, RELAXED_NS)]
             if len(without):
                 self.break_(f"{name}: taxels {without.tolist()} are touched, and nothing presses")
         if b"\1" in valid:
@@ -647,6 +666,8 @@ class Promises:
                 continue
             fit = frame.valid & pads[mine] & ~self._exempt[mine] & ~spoiled[mine]
             lasts = fit & frame.touched & rested[mine]
+            if lasts.any():
+                lasts &= ~self._not_set_up()[mine]
             if lasts.any():
                 taxels = np.flatnonzero(lasts).tolist()
                 self.break_(f"{name}: taxels {taxels} are still touched, and nothing presses")
