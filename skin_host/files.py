@@ -4,6 +4,7 @@ import contextlib
 import errno
 import logging
 import os
+import secrets
 import stat
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
@@ -229,8 +230,14 @@ def write_atomic(path: Path, data: bytes) -> None:
 
 
 def growing(path: Path) -> Path:
-    """Return the name of a file that takes its own name when it is complete."""
-    return path.with_name(f".{path.stem}.growing{path.suffix}")
+    """Make an empty file that takes the name `path` when it is complete; return its name.
+
+    No other program has it: of two that write the same file, the last one's is whole. And nobody
+    who may write to the folder, as everybody to /tmp, can have put a link there.
+    """
+    name = path.with_name(f".{path.stem}.growing-{secrets.token_hex(4)}{path.suffix}")
+    os.close(os.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+    return name
 
 
 @contextlib.contextmanager
@@ -253,9 +260,9 @@ def whole_file(path: Path) -> Iterator[Path]:
     Raises:
         SkinError: it cannot be written.
     """
-    temporary = growing(path)
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = growing(path)
         try:
             yield temporary
             os.replace(temporary, path)

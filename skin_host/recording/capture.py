@@ -93,9 +93,9 @@ class CanLog:
             raise RequestError(f'{path}: suffix "{path.suffix}"; wanted one of {known}')
         self.frames = 0
         self._path = path
-        self._growing = growing(path)
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
+            self._growing = growing(path)
             self._logger = can.Logger(self._growing)
 
     def __enter__(self) -> Self:

@@ -94,9 +94,9 @@ class Recorder:
         self.unreadable = 0
         self.gaps = 0
         self._path = path
-        self._growing = growing(path)
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
+            self._growing = growing(path)
             self._file: IO[bytes] = self._growing.open("wb")
         self._writer = mcap_writer.Writer(self._file)
         self._writer.start(profile="", library="skin-host")
