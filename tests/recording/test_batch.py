@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from skin_host.bus.logs import WINDOW_NS
 from skin_host.bus.wire import TAXELS, TRIANGLES, encode_sweep
 from skin_host.cli import main
+from skin_host.recording import replay
 
 PERIODS = 140
 
@@ -56,6 +58,19 @@ def alone(logs: list[Path], config: Path, tmp_path: Path) -> dict[str, bytes]:
         found[f"{log.stem}.jsonl"] = output.read_bytes()
     assert all(lines.count(b'"event":"begin"') == 1 for lines in found.values())
     return found
+
+
+def test_how_long_batches_are_changes_no_byte(
+    logs: list[Path],
+    config: Path,
+    alone: dict[str, bytes],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(replay, "LONG_WINDOW_NS", WINDOW_NS)
+    output = tmp_path / "short.jsonl"
+    replay.process(replay.Task(logs[0], config, output))
+    assert output.read_bytes() == alone[f"{logs[0].stem}.jsonl"]
 
 
 def written(folder: Path) -> dict[str, bytes]:
