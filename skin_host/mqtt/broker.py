@@ -12,7 +12,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -78,8 +78,10 @@ async def mosquitto_broker(program: str) -> AsyncIterator[LocalBroker]:
     Raises:
         BrokerError: it did not start.
     """
-    port = free_port()
-    with tempfile.TemporaryDirectory(prefix="skin-broker-") as folder:
+    with (
+        reserved_port() as port,
+        tempfile.TemporaryDirectory(prefix="skin-broker-") as folder,
+    ):
         process = _start_mosquitto(program, port, Path(folder))
         try:
             if not await _answers(process, port):
@@ -103,6 +105,7 @@ async def embedded_broker() -> AsyncIterator[LocalBroker]:
     try:
         from amqtt.broker import Broker
         from amqtt.contexts import BrokerConfig, ListenerConfig
+        from amqtt.errors import BrokerError as AmqttError
     except ImportError:
         raise BrokerError(
             "no MQTT broker: neither mosquitto nor the package amqtt is installed; mend it with: "
@@ -136,14 +139,14 @@ async def embedded_broker() -> AsyncIterator[LocalBroker]:
         ) -> None:
             self._connected(reader, writer)
 
-    port = free_port()
     everybody = {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}}
-    broker = TidyBroker(
-        BrokerConfig(
-            listeners={"default": ListenerConfig(bind=f"{HOST}:{port}")}, plugins=everybody
-        )
-    )
-    await broker.start()
+    with reserved_port() as port:
+        listener = ListenerConfig(bind=f"{HOST}:{port}")
+        broker = TidyBroker(BrokerConfig(listeners={"default": listener}, plugins=everybody))
+        try:
+            await broker.start()
+        except AmqttError as error:
+            raise BrokerError(f"amqtt did not start on port {port}: {error}") from None
     try:
         yield LocalBroker(HOST, port, "amqtt")
     finally:
@@ -183,6 +186,19 @@ async def _answers(process: "subprocess.Popen[bytes]", port: int) -> bool:
             writer.close()
             return True
     return False
+
+
+@contextmanager
+def reserved_port(host: str = HOST) -> Iterator[int]:
+    """Yield a port that no other program gets as a free one while the block lasts.
+
+    A server can listen there nevertheless, as servers permit the reuse of addresses. Without that,
+    another program could listen there first, and be taken for the broker.
+    """
+    with socket.socket() as holder:
+        holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        holder.bind((host, 0))
+        yield holder.getsockname()[1]
 
 
 def free_port(host: str = HOST) -> int:

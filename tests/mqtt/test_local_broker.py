@@ -1,6 +1,7 @@
 """The demo finds a broker on every machine."""
 
 import asyncio
+import contextlib
 import socket
 import sys
 from typing import Any
@@ -90,6 +91,31 @@ async def test_a_mosquitto_that_does_not_start_is_an_error_that_says_so() -> Non
     with pytest.raises(BrokerError, match="did not start"):
         async with local.mosquitto_broker("/bin/false"):
             pass
+
+
+def test_a_reserved_port_is_free_for_a_server_and_for_nobody_else() -> None:
+    """Between finding a port and listening there another program could take it."""
+    with local.reserved_port() as port:
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection((local.HOST, port))
+        assert port not in {local.free_port() for _ in range(2000)}
+        with (
+            socket.create_server((local.HOST, port)),
+            socket.create_connection((local.HOST, port)),
+        ):
+            pass
+
+
+async def test_a_port_that_another_program_took_is_an_error_of_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pytest.importorskip("amqtt")
+    with socket.create_server((local.HOST, 0)) as taken:
+        port = taken.getsockname()[1]
+        monkeypatch.setattr(local, "reserved_port", lambda: contextlib.nullcontext(port))
+        with pytest.raises(BrokerError, match=f"amqtt did not start on port {port}"):
+            async with local.embedded_broker():
+                pass
 
 
 def test_a_connection_that_is_left_when_the_program_ends_is_no_failure() -> None:
