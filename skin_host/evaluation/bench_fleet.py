@@ -24,7 +24,7 @@ import subprocess
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection as Pipe
@@ -60,6 +60,8 @@ STALE_S = 3.0
 ALLOWED_S = 5.0
 DRAIN_S = 30.0
 WORKERS = 2
+#: With plain robots, so many connections at each broker receive them.
+EARS = 4
 #: With `--full`, one robot in so many is a publisher as the daemon has it.
 PLAIN_SHARE = 10
 
@@ -177,10 +179,12 @@ async def _conduct(brokers: Brokers, plan: FleetPlan, pipes: list[Pipe]) -> dict
     for number, address in enumerate(brokers.addresses):
         broker, name = _broker(address, brokers), f"ear-{os.getpid()}-{number}"
         if plan.plain:
-            # Some brokers have one message on its way to a subscriber at a time.
+            # Some brokers have one message on its way to a subscriber at a time. All of a robot
+            # comes over one connection, as to a client of one robot: in order.
+            names = [f"robot{i}" for i in range(plan.robots)]
             links += [
-                _Ear(number, broker, f"{name}-{kind}", ear, topic)
-                for kind, topic in enumerate(ear.wanted())
+                _Ear(number, broker, f"{name}-{share}", ear, names[share::EARS])
+                for share in range(min(EARS, plan.robots))
             ]
         else:
             links.append(_FullEar(number, broker, name, ear))
@@ -271,17 +275,17 @@ class _FullEar(BrokerLink):
 
 
 class _Ear(PlainEar):
-    """One that costs little, of one kind of message."""
+    """One that costs little, of some robots."""
 
     def __init__(
-        self, number: int, broker: Broker, name: str, receiver: "_Receiver", topic: str
+        self, number: int, broker: Broker, name: str, receiver: "_Receiver", robots: list[str]
     ) -> None:
         super().__init__(
             broker,
             name,
-            [topic],
+            [f"{BASE}/{robot}/#" for robot in robots],
             lambda heard: receiver.hear(number, heard),
-            lambda: None if self.connected else receiver.lose(number),
+            lambda: None if self.connected else receiver.lose(number, robots),
         )
 
 
@@ -307,11 +311,11 @@ class _Receiver:
     def note(self, link: BrokerLink) -> None:
         """Links come and go."""
         if link.connection is None:
-            self.lose(link.number)
+            self.lose(link.number, self._robots)
 
-    def lose(self, number: int) -> None:
-        """The connection to a broker is lost."""
-        for robot in self._robots.values():
+    def lose(self, number: int, robots: Iterable[str]) -> None:
+        """The connection to a broker is lost, over which these robots were received."""
+        for robot in [self._robots[name] for name in robots]:
             robot.presence.take_loss(number)
             robot.note()
 
@@ -492,8 +496,8 @@ class _FullRobot(Publisher):
 
     @property
     def waiting(self) -> int:
-        """How many events and states are not acknowledged."""
-        return self.counters.touches_waiting + len(self._outbox.pending)
+        """How many events are not acknowledged."""
+        return self.counters.touches_waiting
 
     def sent(self, contacts: list[tuple[float, str]]) -> RobotSent:
         """What it has sent."""
@@ -531,7 +535,6 @@ async def _be(pipe: Pipe, names: list[str], settings: Mqtt, plan: FleetPlan, pla
     pipe.send("connected")
     await asyncio.to_thread(pipe.recv)
     stop.set()
-    await asyncio.gather(*tasks)
     until_s = time.monotonic() + DRAIN_S
     while time.monotonic() < until_s and any(  # noqa: ASYNC110
         one.waiting for one in robots.values()
@@ -550,7 +553,10 @@ async def _play(
     plan: FleetPlan,
     stop: asyncio.Event,
 ) -> None:
-    """Publish the recording in a loop, from a random place in it, until `stop` is set."""
+    """Publish the recording in a loop, from a random place in it, until `stop` is set.
+
+    Health goes on: without it the robot's last states would never be known again.
+    """
     health = traffic[0]["said"]
     said = traffic[1:]
     length_s = said[-1]["at_s"] + 1.0
@@ -558,16 +564,16 @@ async def _play(
     due = [one for one in said if one["at_s"] >= now_s] or list(said)
     health_due_s = time.monotonic() + random.uniform(0.0, plan.health_s)
     began_s = time.monotonic() - now_s / plan.pace
-    while not stop.is_set():
+    while True:
         if not due:
             due, began_s = list(said), began_s + length_s / plan.pace
         at_s = began_s + due[0]["at_s"] / plan.pace
-        wait_s = min(at_s, health_due_s) - time.monotonic()
+        ended = stop.is_set()
+        wait_s = (health_due_s if ended else min(at_s, health_due_s)) - time.monotonic()
         if wait_s > 0:
             await asyncio.sleep(wait_s)
-            if stop.is_set():
-                return
-        if health_due_s <= at_s:
+            continue
+        if ended or health_due_s <= at_s:
             publisher.put_health(PART, health)
             health_due_s += plan.health_s
             continue

@@ -79,8 +79,8 @@ class PlainRobot(asyncio.Protocol):
 
     @property
     def waiting(self) -> int:
-        """How many events and states are not acknowledged."""
-        return len(self.events) + len(self._pending)
+        """How many events are not acknowledged."""
+        return len(self.events)
 
     def put_touch(self, event: Touch) -> None:
         """Send an event."""
