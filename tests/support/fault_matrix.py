@@ -41,7 +41,12 @@ class Bound:
 SWEEP = Bound(
     "the next sweep shows it: a period, a conversion, the end of the sweep, a look", 0.3, 0.3
 )
-SILENT = Bound("four periods without a frame (`silent_periods`), and two looks", 0.4, 0.4)
+SILENT = Bound(
+    "four periods without a frame (`silent_periods`), of an MTB3 six (`MTB3_PERIODS`), "
+    "and two looks",
+    0.5,
+    0.5,
+)
 INTERVALS = Bound("16 intervals between sweeps (`INTERVALS`), and two looks", 1.0, 1.0)
 LOAD = Bound("the load of the last second (`RECENT_NS`), and a look", 1.1, 1.1)
 CHANCE = Bound(
