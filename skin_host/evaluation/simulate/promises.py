@@ -25,6 +25,7 @@ from skin_host.fingertip.events import FingertipEvent
 from skin_host.layout import Layout, PadKind
 from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
+from skin_host.processing.rezero import Rezero
 
 NS = 1_000_000_000
 #: Truth is sampled this often, and so many samples are looked back on.
@@ -155,10 +156,12 @@ class Promises:
         self._pressed_ns = np.zeros(layout.n_taxels, np.int64)
         self._felt_ns = np.zeros(layout.n_taxels, np.int64)
         self._unfelt_ns = np.zeros(layout.n_taxels, np.int64)
+        #: When each taxel was last valid.
+        self._valid_ns = np.full(layout.n_taxels, -(1 << 62), np.int64)
         #: When each taxel was last pressed, and when a calibration may last have seen it pressed.
         self._touched_ns = np.full(layout.n_taxels, -(1 << 62), np.int64)
         self._calibrated_touched_ns = np.full(layout.n_taxels, -(1 << 62), np.int64)
-        self._zeros: dict[int, object] = {}
+        self._zeros: dict[int, Rezero] = {}
         self._wrong_since_ns: dict[str, int] = {}
         self._truth: deque[tuple[int, NDArray[np.float64]]] = deque(maxlen=SAMPLES)
         self._frames: dict[str, PressureFrame] = {}
@@ -647,6 +650,9 @@ class Promises:
             relaxing = now_ns - self._touched_ns < RELAXED_NS
             self._calibrated_touched_ns[self._exempt | relaxing] = now_ns
         if life is not None:
+            for name, frame in self._frames.items():
+                part = self._parts[name]
+                self._valid_ns[part.start : part.stop][frame.valid] = now_ns
             self._exempt_zeroed(life, truth)
             if life.daemon.engine.calibration is not None:
                 self._note_calibration(life.daemon.engine.calibration.id)
@@ -749,7 +755,7 @@ class Promises:
 
     def _exempt_zeroed(self, life: Life, truth: NDArray[np.float64]) -> None:
         """What its board did not feel before it took a zero is in that zero: nobody can know."""
-        now_ns = self._now_ns()
+        now_ns, wall_ns = self._now_ns(), self._world.clock.now_ns()
         spoiled = self._spoiled()
         pressed = truth > TOUCHING_KPA
         self._pressed_ns[pressed & ~self._pressed] = now_ns
@@ -759,7 +765,8 @@ class Promises:
         for board, rezero in engine._rezeros.items():
             taxels = layout.boards[board].taxel_index
             taxels = taxels[taxels >= 0]
-            if self._zeros.get(board) is not rezero:
+            before = self._zeros.get(board)
+            if before is not rezero:
                 self._zeros[board] = rezero
                 own = layout.boards[board].settings
                 boards = life.daemon.link.boards[own.bus]
@@ -767,8 +774,11 @@ class Promises:
                 felt = record.configurations > 0 or boards._is_in_use(record)
                 last_ns = int(self._felt_ns[taxels].max()) if felt else -(1 << 62)
                 self._unfelt_ns[taxels] = last_ns - DECIDED_NS
+                if before is None or before.settled(wall_ns):
+                    # Its chip has sent nothing valid since, and not because of the zero before.
+                    valid_ns = self._valid_ns[taxels] - DECIDED_NS
+                    self._unfelt_ns[taxels] = np.minimum(self._unfelt_ns[taxels], valid_ns)
             # Whatever presses later is felt.
-            wall_ns = self._world.clock.now_ns()
             finds = np.ones(len(taxels), np.bool_)
             if rezero.settled(wall_ns):
                 unsettled = rezero.unsettled(wall_ns)
