@@ -6,6 +6,8 @@ A trouble that must be reported is, within its bound, when nothing else can hide
 
 from typing import Any
 
+import numpy as np
+
 from skin_host.evaluation.simulate.troubles import Trouble
 from skin_host.evaluation.simulate.world import World
 from skin_host.mqtt.connection import GRACE_S, LAST_RETRY_S, TIMEOUT_S
@@ -97,6 +99,11 @@ class Accusations:
         self.named: set[str] = set()
         self.troubles: list[tuple[Trouble, int, int | None]] = []
         self._faults: dict[str, set[tuple[str, str]]] = {}
+        #: Parts with pads of real skin that have been stuck from the first.
+        held = ~np.isnan(world.robot.skin.held_ff)
+        self._stuck = {
+            part.name for part in world.layout.parts if held[part.start : part.stop].any()
+        }
         #: Troubles, and when they began, for which it is known whether they were named in time.
         self._settled: set[tuple[str, int]] = set()
 
@@ -149,6 +156,8 @@ class Accusations:
 
     def _has_cause(self, code: str, where: str) -> bool:
         if code in ALWAYS or (code in NOISE and self._world.real_noise):
+            return True
+        if code == "taxel_stuck" and where in self._stuck:
             return True
         now_ns = self._world.clock.monotonic_ns()
         longest_ns = PASSING_NS
