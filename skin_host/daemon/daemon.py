@@ -108,6 +108,7 @@ class Daemon:
         self._zeros = load_kept(self._path("zeros"), Zeros)
         doubted = np.zeros(layout.n_taxels, np.bool_)
         if calibration is not None and calibration.id == self._zeros.calibration:
+            self._use_baselines()
             doubted = _taxels(layout, self._zeros)
             self.engine.doubt(doubted)
         self.engine.hold(self.engine.boards)
@@ -140,6 +141,8 @@ class Daemon:
         self._status_s = 0.0
         self._fault_log = FaultLog()
         self._keeping: asyncio.Task[None] | None = None
+        #: How many of the zeros found are kept.
+        self._zeros_kept = 0
         self._clock_ahead_ns = self._clock_against_ns()
 
     async def run(self, stop: asyncio.Event, *, calibrate: bool = False) -> None:
@@ -436,8 +439,28 @@ class Daemon:
         if self._keeping is None or self._keeping.done():
             self._keeping = asyncio.create_task(self._keep_zeros(), name="keep zeros")
 
+    def _use_baselines(self) -> None:
+        """Continue from the baselines that were kept: boards send with these zeros."""
+        pipeline = self.engine.pipeline
+        assert pipeline is not None
+        for part in self.layout.parts:
+            kept = self._zeros.baselines.get(part.name, ())
+            if len(kept) == part.n_taxels:
+                taxels = np.arange(part.start, part.stop, dtype=np.int32)
+                pipeline.set_zero(taxels, np.array(kept))
+
+    def _baselines(self) -> dict[str, list[float]]:
+        pipeline = self.engine.pipeline
+        assert pipeline is not None
+        return {
+            part.name: np.round(pipeline.baseline[part.start : part.stop], 2).tolist()
+            for part in map(self.layout.parts.__getitem__, self.engine.parts)
+        }
+
     async def _keep_zeros(self, *, touched: bool = False) -> None:
-        """Write which zeros are not known, or with `touched` will not be, if that has changed."""
+        """Write which zeros are not known, or with `touched` will not be, and new baselines, if
+        that has changed.
+        """
         engine, found = self.engine, self.engine.calibration
         if found is None:
             return
@@ -448,8 +471,13 @@ class Daemon:
                 mine = np.flatnonzero(at_risk[part.start : part.stop]).tolist()
                 if mine:
                     unknown[part.name] = mine
-        zeros = Zeros(calibration=found.id, unknown=unknown)
-        if zeros == self._zeros or not (unknown or self._zeros.unknown):
+        n_found = engine.zeros_found
+        baselines = self._zeros.baselines if self._zeros.calibration == found.id else {}
+        if touched or n_found != self._zeros_kept:
+            baselines = self._baselines()
+        zeros = Zeros(calibration=found.id, unknown=unknown, baselines=baselines)
+        if zeros == self._zeros or not (unknown or baselines or self._zeros.unknown):
+            self._zeros_kept = n_found
             return
         path = self._path("zeros")
         try:
@@ -461,6 +489,7 @@ class Daemon:
             return
         self.unkept.pop("zeros", None)
         self._zeros = zeros
+        self._zeros_kept = n_found
 
     def _record_of(self, part: int) -> Record:
         link = self.link

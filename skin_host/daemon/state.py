@@ -1,5 +1,5 @@
-"""State that a node keeps over a restart, besides its calibration: changes by operators, and
-taxels whose zero will not be known.
+"""State that a node keeps over a restart, besides its calibration: changes by operators, and the
+zeros of its taxels.
 
 Each is a file of the state directory, written completely or not at all. A damaged one is set aside
 and reported, so that the service can always start.
@@ -50,14 +50,19 @@ class NodeState(Struct, forbid_unknown_fields=True):
 
 
 class Zeros(Struct, forbid_unknown_fields=True):
-    """Taxels whose zero is not known, or will not be after the next start.
+    """What has become of the zeros since the calibration.
 
     A start sets the boards up, and their set-up takes what touches them into the zero. So taxels
-    that were touched when the daemon ended are not valid after it, until they are calibrated.
+    that were touched when the daemon ended are not valid after it, until they are calibrated. What
+    touches a board before its set-up is judged by the zero that it has by then, which is not the
+    calibration's if the board was zeroed since.
 
     Attributes:
-        calibration: id of the calibration in use; a later one has measured their zero.
-        unknown: numbers of taxels by part.
+        calibration: id of the calibration in use; a later one has measured the zeros.
+        unknown: numbers of taxels by part whose zero is not known, or will not be after the next
+            start.
+        baselines: by part, activation of each untouched taxel in units, as found after the last
+            set-up, or as it had drifted by the end. Empty: the calibration's.
     """
 
     WITHOUT: ClassVar = "calibrate when nothing touches the skin"
@@ -65,6 +70,7 @@ class Zeros(Struct, forbid_unknown_fields=True):
     schema: str = "skin.zeros/1"
     calibration: str = ""
     unknown: dict[Name, list[int]] = {}
+    baselines: dict[Name, list[Annotated[float, Meta(ge=-255, le=255)]]] = {}
 
 
 Kept = TypeVar("Kept", NodeState, Zeros)

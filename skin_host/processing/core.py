@@ -164,6 +164,8 @@ class Engine:
             receive.silent_periods,
             float(vertex(curve.a_kpa_per_ff2, curve.b_kpa_per_ff)),
         )
+        #: How often new zeros have been found.
+        self.zeros_found = 0
         self._rezeros: dict[int, Rezero] = {}
         self._unanswered: dict[int, Mask] = {}
         #: For how many sweeps pads int64[16, 12] of a board have read far below zero, where any do.
@@ -203,6 +205,7 @@ class Engine:
             self.fingertips.renew(self.settings)
         self._ended = after._ended
         self.disabled = after.disabled
+        self.zeros_found = after.zeros_found
         self._rezeros = after._rezeros
         self._unanswered = after._unanswered
         self._below = after._below
@@ -525,6 +528,7 @@ class Engine:
             baseline = np.where(taxels >= 0, self._pipeline.baseline[taxels], 0.0)
             found, baseline = rezero.finish(baseline, self.calibration.noise[taxels])
             self._pipeline.set_zero(taxels[found], baseline[found])
+            self.zeros_found += 1
         if rezero.settled(sweep.t_ns):
             veto = self.in_doubt(sweep.board)
             unsettled = rezero.unsettled(sweep.t_ns)

@@ -16,8 +16,10 @@ from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus, Mqtt, changed, load
 from skin_host.daemon import metrics
 from skin_host.daemon.calibrate import calibration_path, stored_calibration
-from skin_host.daemon.state import NodeState, load_kept
+from skin_host.daemon.daemon import Daemon
+from skin_host.daemon.state import NodeState, Zeros, load_kept
 from skin_host.errors import NewerFileError, OtherSkinError
+from skin_host.files import write_document
 from skin_host.layout import build_layout
 from skin_host.mqtt.publisher import Publisher
 from skin_host.processing import calibration as calibrations
@@ -192,3 +194,22 @@ async def test_what_was_pressed_when_its_board_was_zeroed_is_in_a_file_at_once(
         await clock.sleep(0.2)
         assert set(json.loads(file.read_bytes())["unknown"]["left_hand"]) >= set(touched.tolist())
         await configuring
+
+
+def test_baselines_of_another_skin_are_not_used(kept: tuple[Any, Any, Path]) -> None:
+    settings, layout, path = kept
+    calibration = stored_calibration(settings, layout, "main")
+    assert calibration is not None
+    hand = layout.part("left_hand").n_taxels
+    arm = layout.part("left_forearm").n_taxels
+    zeros = Zeros(
+        calibration=calibration.id,
+        baselines={"left_hand": [7.0] * hand, "left_forearm": [7.0] * (arm - 1), "tail": [7.0]},
+    )
+    write_document(path.with_name("demo-main.zeros.json"), zeros)
+    pipeline = Daemon(settings, layout, calibration=calibration).engine.pipeline
+    assert pipeline is not None
+    part = layout.part("left_hand")
+    mine = np.zeros(layout.n_taxels, np.bool_)
+    mine[part.start : part.stop] = True
+    assert (pipeline.baseline == np.where(mine, 7.0, calibration.baseline)).all()

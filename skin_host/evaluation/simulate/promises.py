@@ -365,23 +365,8 @@ class Promises:
         caused: Mask = self._now_ns() - self._touched_ns[mine] < lately_ns
         if not caused.all():
             caused |= self._world.robot.skin.true_pressure_kpa()[mine] > TOUCHING_KPA
-            caused |= (self._exempt | self._spoiled() | self._not_set_up())[mine]
+            caused |= (self._exempt | self._spoiled())[mine]
         return caused
-
-    def _not_set_up(self) -> Mask:
-        """Return taxels bool[n] of boards that this start of the daemon has not set up yet.
-
-        Their zeros may be of a set-up after the calibration, which an earlier start knew.
-        """
-        found = np.zeros(self._world.layout.n_taxels, np.bool_)
-        life = self._world.life
-        assert life is not None
-        for boards in life.daemon.link.boards.values():
-            for record in boards.records.values():
-                if not record.configurations:
-                    taxels = record.layout.taxel_index
-                    found[taxels[taxels >= 0]] = True
-        return found
 
     def _frame(self, frame: PressureFrame) -> None:
         name = frame.part
@@ -672,8 +657,6 @@ class Promises:
                 continue
             fit = frame.valid & pads[mine] & ~self._exempt[mine] & ~spoiled[mine]
             lasts = fit & frame.touched & rested[mine]
-            if lasts.any():
-                lasts &= ~self._not_set_up()[mine]
             if lasts.any():
                 taxels = np.flatnonzero(lasts).tolist()
                 self.break_(f"{name}: taxels {taxels} are still touched, and nothing presses")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from emulator.probes.scene import Fault, Scene
 from skin_host.bus.wire import HEADER_A, HEADER_B, FrameBatch
@@ -261,6 +262,13 @@ def test_a_board_that_is_set_up_while_a_disabled_part_is_pressed_does_not_zero_t
         runner.run(live())
 
 
+def baselines(life: Life) -> NDArray[np.float64]:
+    """Return a copy of the baselines [n] in use, in units."""
+    pipeline = life.daemon.engine.pipeline
+    assert pipeline is not None
+    return pipeline.baseline.copy()
+
+
 def test_a_daemon_that_starts_reports_no_touch_before_its_boards_are_zeroed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -275,6 +283,7 @@ def test_a_daemon_that_starts_reports_no_touch_before_its_boards_are_zeroed(
         await world.clock.sleep(10.0)
         await life.daemon.configure()
         await world.clock.sleep(3.0)
+        zeroed, calibrated = baselines(life), life.daemon.engine.calibration
         life.kill()
         await world.clock.sleep(0.5)
         seen: list[str] = []
@@ -285,6 +294,10 @@ def test_a_daemon_that_starts_reports_no_touch_before_its_boards_are_zeroed(
 
         world.broker.listeners.append(hear)
         life = start(world)
+        # Until they are set up again, boards send with the zero that the daemon before gave them.
+        assert calibrated is not None
+        assert np.abs(calibrated.baseline - zeroed).max() > 5.0
+        assert np.abs(baselines(life) - zeroed).max() < 0.5
         await world.clock.sleep(6.0)
         assert all(record["valid_taxels"] for record in life.daemon.records().values())
         life.kill()
