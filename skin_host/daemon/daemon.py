@@ -471,9 +471,9 @@ class Daemon:
                 mine = np.flatnonzero(at_risk[part.start : part.stop]).tolist()
                 if mine:
                     unknown[part.name] = mine
-        n_found = engine.zeros_found
-        baselines = self._zeros.baselines if self._zeros.calibration == found.id else {}
-        if touched or n_found != self._zeros_kept:
+        baselines, n_found = self._zeros.baselines, engine.zeros_found
+        calibrated = bool(baselines) and self._zeros.calibration != found.id
+        if touched or calibrated or n_found != self._zeros_kept:
             baselines = self._baselines()
         zeros = Zeros(calibration=found.id, unknown=unknown, baselines=baselines)
         if zeros == self._zeros or not (unknown or baselines or self._zeros.unknown):

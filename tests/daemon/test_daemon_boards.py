@@ -18,6 +18,7 @@ from skin_host.bus.commands import (
 from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus
+from skin_host.daemon.state import Zeros, load_kept
 from tests.support.live import living
 from tests.support.stepped import stepped
 
@@ -123,6 +124,27 @@ async def test_one_board_is_calibrated_and_the_others_keep_theirs(
         hand = engine.taxels_of([0])
         assert np.array_equal(after.baseline[~hand], before.baseline[~hand])
         assert not np.array_equal(after.baseline[hand], before.baseline[hand])
+
+
+@stepped
+async def test_zeros_of_boards_that_are_not_calibrated_are_kept_for_the_next_start(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    async with living(can_bus_settings, tmp_path, clock=clock) as live:
+        await live.until_well(but=LATELY)
+        daemon = live.daemon
+        await daemon.configure([1])
+        await clock.sleep(3.0)
+        await daemon.calibrate(1.0, [0])
+        await clock.sleep(2.0)
+        kept = load_kept(tmp_path / "demo-main.zeros.json", Zeros)
+        calibration, pipeline = daemon.engine.calibration, daemon.engine.pipeline
+        assert calibration is not None
+        assert pipeline is not None
+        assert kept.calibration == calibration.id
+        arm = daemon.layout.part("left_forearm")
+        used = pipeline.baseline[arm.start : arm.stop]
+        assert np.abs(np.array(kept.baselines["left_forearm"]) - used).max() < 0.5
 
 
 @stepped
