@@ -107,7 +107,7 @@ class Daemon:
         self.engine.touch_only = _touch_only(settings, layout, self.engine.parts)
         self._zeros = load_kept(self._path("zeros"), Zeros)
         doubted = np.zeros(layout.n_taxels, np.bool_)
-        if calibration is not None and calibration.id == self._zeros.calibration:
+        if calibration is not None and self._zeros.are_of(calibration.id):
             self._use_baselines()
             doubted = _taxels(layout, self._zeros)
             self.engine.doubt(doubted)
@@ -217,10 +217,17 @@ class Daemon:
                 found = await self.clock.in_thread(
                     calibrations.with_gains_of, found, path, self.layout
                 )
+            doubted = self.engine.zero_at_risk(touched=False)
             self.engine.use(found, boards)
             for index, contact in self._contacts.items():
                 part = self.layout.parts[index]
                 contact.use(found.usable[part.start : part.stop])
+            if known is not None and boards is not None:
+                # The other boards keep their zeros, whichever of the two a start finds.
+                await self._kept()
+                keeping = self._keep_zeros(before=known, doubted=doubted)
+                self._keeping = asyncio.create_task(keeping, name="keep zeros")
+                await self._kept()
             try:
                 await self.clock.in_thread(calibrations.save, path, found, self.layout)
             except OSError as error:
@@ -439,6 +446,11 @@ class Daemon:
         if self._keeping is None or self._keeping.done():
             self._keeping = asyncio.create_task(self._keep_zeros(), name="keep zeros")
 
+    async def _kept(self) -> None:
+        """Wait until the zeros are not being written."""
+        while self._keeping is not None and not self._keeping.done():
+            await asyncio.wait([self._keeping])
+
     def _use_baselines(self) -> None:
         """Continue from the baselines that were kept: boards send with these zeros."""
         pipeline = self.engine.pipeline
@@ -457,15 +469,29 @@ class Daemon:
             for part in map(self.layout.parts.__getitem__, self.engine.parts)
         }
 
-    async def _keep_zeros(self, *, touched: bool = False) -> None:
+    async def _keep_zeros(
+        self,
+        *,
+        touched: bool = False,
+        before: Calibration | None = None,
+        doubted: NDArray[np.bool_] | None = None,
+    ) -> None:
         """Write which zeros are not known, or with `touched` will not be, and new baselines, if
         that has changed.
+
+        Args:
+            touched: the daemon ends, and what is touched now will not be known.
+            before: the calibration of which that in use has renewed some boards, while its file may
+                still be the one that a start finds.
+            doubted: bool[n], taxels whose zero was not known by that one.
         """
         engine, found = self.engine, self.engine.calibration
         if found is None:
             return
         unknown: dict[str, list[int]] = {}
         at_risk = engine.zero_at_risk(touched)
+        if doubted is not None:
+            at_risk = at_risk | doubted
         if at_risk.any():
             for part in map(self.layout.parts.__getitem__, engine.parts):
                 mine = np.flatnonzero(at_risk[part.start : part.stop]).tolist()
@@ -475,7 +501,12 @@ class Daemon:
         calibrated = bool(baselines) and self._zeros.calibration != found.id
         if touched or calibrated or n_found != self._zeros_kept:
             baselines = self._baselines()
-        zeros = Zeros(calibration=found.id, unknown=unknown, baselines=baselines)
+        zeros = Zeros(
+            calibration=found.id,
+            before="" if before is None else before.id,
+            unknown=unknown,
+            baselines=baselines,
+        )
         if zeros == self._zeros or not (unknown or baselines or self._zeros.unknown):
             self._zeros_kept = n_found
             return

@@ -59,6 +59,8 @@ class Zeros(Struct, forbid_unknown_fields=True):
 
     Attributes:
         calibration: id of the calibration in use; a later one has measured the zeros.
+        before: id of the one before, while a calibration of some boards is being written: until its
+            file has its name, a start finds that one.
         unknown: numbers of taxels by part whose zero is not known, or will not be after the next
             start.
         baselines: by part, activation of each untouched taxel in units, as found after the last
@@ -69,8 +71,13 @@ class Zeros(Struct, forbid_unknown_fields=True):
 
     schema: str = "skin.zeros/1"
     calibration: str = ""
+    before: str = ""
     unknown: dict[Name, list[int]] = {}
     baselines: dict[Name, list[Annotated[float, Meta(ge=-255, le=255)]]] = {}
+
+    def are_of(self, calibration: str) -> bool:
+        """Return whether these zeros hold with the calibration of this id."""
+        return bool(calibration) and calibration in (self.calibration, self.before)
 
 
 Kept = TypeVar("Kept", NodeState, Zeros)

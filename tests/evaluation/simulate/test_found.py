@@ -14,6 +14,8 @@ from skin_host.bus.wire import HEADER_A, HEADER_B, FrameBatch
 from skin_host.cli.common import load_skin
 from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus
+from skin_host.daemon.calibrate import calibration_path, stored_calibration
+from skin_host.daemon.daemon import Daemon
 from skin_host.demo import configuration
 from skin_host.evaluation.simulate.cables import Cable, Sent, SimulatedPort
 from skin_host.evaluation.simulate.promises import Promises
@@ -21,6 +23,7 @@ from skin_host.evaluation.simulate.trace import Trace
 from skin_host.evaluation.simulate.troubles import KINDS
 from skin_host.evaluation.simulate.world import Life, World
 from skin_host.fingertip.events import FingertipEvent
+from skin_host.processing import calibration as calibrations
 from skin_host.processing.events import Touch
 
 DEMO = configuration("demo.toml")
@@ -305,6 +308,40 @@ def test_a_daemon_that_starts_reports_no_touch_before_its_boards_are_zeroed(
 
     with world.clock.runner() as runner:
         assert runner.run(live()) == []
+
+
+def test_a_calibration_of_one_board_keeps_the_zeros_of_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also if the power fails before the calibration has its name, or right after."""
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
+    settings, layout = load_skin(DEMO)
+    world = World(settings, layout, DEMO, 1, Scene(quiet=False))
+
+    async def live() -> None:
+        life = start(world)
+        await world.clock.sleep(8.0)
+        await life.daemon.configure()
+        await world.clock.sleep(4.0)
+        first, *_ = life.daemon.engine.boards
+        others = ~life.daemon.engine.taxels_of([first])
+        calibrated = life.daemon.engine.calibration
+        assert calibrated is not None
+        assert np.abs(calibrated.baseline - baselines(life))[others].max() > 2.0
+        await life.daemon.calibrate(0.5, [first])
+        zeroed = baselines(life)
+        life.kill()
+        path = calibration_path(settings, "main")
+        for known in (life.daemon.engine.calibration, calibrated):
+            assert known is not None
+            calibrations.save(path, known, layout)
+            after = stored_calibration(settings, layout, "main")
+            pipeline = Daemon(settings, layout, calibration=after).engine.pipeline
+            assert pipeline is not None
+            assert np.abs(pipeline.baseline - zeroed)[others].max() < 0.5
+
+    with world.clock.runner() as runner:
+        runner.run(live())
 
 
 def test_a_shorted_data_line_that_two_parts_share_is_named_by_both(
