@@ -484,3 +484,74 @@ def test_a_residual_that_the_decision_holds_on_to_is_no_touch_again(noise_units:
     begins = sum(now and not before for before, now in pairwise([True, *reported]))
     assert not reported[-1]
     assert begins == 0
+
+
+def rising_again(
+    press: float, rest: float, reading: float, *, votes: int = 2, lifts: bool = False
+) -> bool:
+    """Press, fall to a rest that ends the press, then read more; return whether that is reported.
+
+    The decision before holds on to the taxel all the time, or lets go of it once, if it lifts.
+    """
+    residuals = residuals_of(votes)
+    on = np.array([True])
+    for value in [press] * 20 + [rest] * votes:
+        reported = residuals.step(on, np.array([value]))
+    assert not reported[0]
+    if lifts:
+        residuals.step(np.array([False]), np.array([rest]))
+    for _ in range(60):
+        reported = residuals.step(on, np.array([reading]))
+    return bool(reported[0])
+
+
+@pytest.mark.parametrize(("votes", "rise"), [(2, 1.89), (8, 3.78)])
+def test_a_held_taxel_is_touched_again_by_five_deviations_of_its_mean(
+    votes: int, rise: float
+) -> None:
+    """Four deviations of a measurement are 4 units, times the root of half the votes; those of a
+    mean with a weight of a quarter are 0.378 of that.
+    """
+    threshold = 2.0 + 3.9
+    assert not rising_again(70.0, 3.9, threshold + rise - 0.1, votes=votes)
+    assert rising_again(70.0, 3.9, threshold + rise + 0.1, votes=votes)
+
+
+def test_a_taxel_that_was_let_go_is_touched_again_above_what_its_press_left() -> None:
+    assert not rising_again(70.0, 3.9, 5.8, lifts=True)
+    assert rising_again(70.0, 3.9, 6.0, lifts=True)
+
+
+def test_no_more_than_six_hundredths_of_a_press_are_taken_for_what_it_left() -> None:
+    """40 units end at less than 3.2; 2.4 of these are the foam's."""
+    assert not rising_again(40.0, 3.1, 4.3, lifts=True)
+    assert rising_again(40.0, 3.1, 4.5, lifts=True)
+
+
+def test_a_press_that_fell_below_its_zero_left_as_much_as_any() -> None:
+    """3 % of 70 units."""
+    assert not rising_again(70.0, -5.0, 4.0, lifts=True)
+    assert rising_again(70.0, -5.0, 4.2, lifts=True)
+
+
+def test_a_reset_forgets_what_a_press_left_and_that_its_taxel_is_held() -> None:
+    residuals = Residuals(2)
+    residuals.configure(np.full(2, 2.0), np.full(2, 6.0), np.array([2, 2]))
+    both = np.ones(2, bool)
+    for value in [70.0] * 20 + [3.9] * 2:
+        residuals.step(both, np.full(2, value))
+    residuals.reset(np.array([True, False]))
+    assert residuals.step(both, np.full(2, 0.5)).tolist() == [True, False]
+
+
+def test_what_a_press_left_falls_to_a_third_in_thirty_seconds() -> None:
+    """3.9 units of 70 become 1.43; a held taxel rises by 1.89 above the threshold of 2 and that."""
+    for reading, wanted in ((5.2, False), (5.5, True)):
+        residuals = residuals_of()
+        on = np.array([True])
+        for value in [70.0] * 20 + [3.9] * 2:
+            residuals.step(on, np.array([value]))
+        residuals.fade(30.0)
+        for _ in range(60):
+            reported = residuals.step(on, np.array([reading]))
+        assert bool(reported[0]) is wanted
