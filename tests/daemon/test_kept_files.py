@@ -213,3 +213,79 @@ def test_baselines_of_another_skin_are_not_used(kept: tuple[Any, Any, Path]) -> 
     mine = np.zeros(layout.n_taxels, np.bool_)
     mine[part.start : part.stop] = True
     assert (pipeline.baseline == np.where(mine, 7.0, calibration.baseline)).all()
+
+
+def doubted(daemon: Daemon) -> list[int]:
+    """Numbers of the taxels whose zero is not known."""
+    return np.flatnonzero(daemon.engine.zero_at_risk(touched=False)).tolist()
+
+
+def test_zeros_that_are_not_known_are_in_doubt_from_the_start(kept: tuple[Any, Any, Path]) -> None:
+    settings, layout, path = kept
+    calibration = stored_calibration(settings, layout, "main")
+    assert calibration is not None
+    arm = layout.part("left_forearm")
+    beyond = [-1, arm.n_taxels]  # of a skin that was larger
+    zeros = Zeros(
+        calibration=calibration.id, unknown={"left_forearm": [3, 17, *beyond], "tail": [1]}
+    )
+    file = path.with_name("demo-main.zeros.json")
+    write_document(file, zeros)
+    daemon = Daemon(settings, layout, calibration=calibration)
+    assert doubted(daemon) == [arm.start + 3, arm.start + 17]
+    # A later calibration has measured them.
+    write_document(file, Zeros(calibration="an older one", unknown={"left_forearm": [3]}))
+    assert doubted(Daemon(settings, layout, calibration=calibration)) == []
+
+
+def test_baselines_of_an_older_calibration_are_not_used(kept: tuple[Any, Any, Path]) -> None:
+    settings, layout, path = kept
+    calibration = stored_calibration(settings, layout, "main")
+    assert calibration is not None
+    hand = layout.part("left_hand").n_taxels
+    zeros = Zeros(calibration="an older one", baselines={"left_hand": [7.0] * hand})
+    write_document(path.with_name("demo-main.zeros.json"), zeros)
+    pipeline = Daemon(settings, layout, calibration=calibration).engine.pipeline
+    assert pipeline is not None
+    assert (pipeline.baseline == calibration.baseline).all()
+
+
+@stepped
+async def test_a_daemon_that_ends_keeps_the_baselines_that_it_used(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    file = tmp_path / "demo-main.zeros.json"
+    async with living(can_bus_settings, tmp_path, clock=clock) as live:
+        await live.until_well()
+        daemon = live.daemon
+        assert not file.exists()  # the calibration has just measured them
+    kept, pipeline = load_kept(file, Zeros), daemon.engine.pipeline
+    assert pipeline is not None
+    assert set(kept.baselines) == {part.name for part in daemon.layout.parts}
+    for part in daemon.layout.parts:
+        used = pipeline.baseline[part.start : part.stop]
+        assert np.abs(np.array(kept.baselines[part.name]) - used).max() < 0.01
+
+
+@stepped
+async def test_zeros_that_cannot_be_kept_are_a_fault_until_they_are(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = tmp_path / "demo-main.zeros.json"
+    async with living(can_bus_settings, tmp_path, clock=clock) as live:
+        await live.until_well()
+        file.mkdir()
+        (file / "in the way").touch()
+        await live.daemon.configure([1])
+        assert ("state_not_kept", "zeros") in await live.until("state_not_kept")
+        await clock.sleep(5.0)
+        said = [r.getMessage() for r in caplog.records if "zeros not kept" in r.getMessage()]
+        assert len(said) == 1, said
+        (file / "in the way").unlink()
+        file.rmdir()
+        await live.wait(lambda: ("state_not_kept", "zeros") not in live.faults())
+        assert set(load_kept(file, Zeros).baselines) == {p.name for p in live.daemon.layout.parts}
+        # Nothing is written again without need.
+        written = file.stat().st_ino
+        await clock.sleep(5.0)
+        assert file.stat().st_ino == written

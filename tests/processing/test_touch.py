@@ -555,3 +555,19 @@ def test_what_a_press_left_falls_to_a_third_in_thirty_seconds() -> None:
         for _ in range(60):
             reported = residuals.step(on, np.array([reading]))
         assert bool(reported[0]) is wanted
+
+
+def test_a_second_press_ends_by_as_many_measurements_as_the_first() -> None:
+    residuals = Residuals(3)
+    residuals.configure(np.full(3, 2.0), np.full(3, 6.0), np.array([2, 2, 2]))
+    first, both = np.array([True, False, False]), np.array([True, False, True])
+
+    def over(touched: np.ndarray, *readings: float) -> list[bool]:
+        """What is reported of the last taxel, while something soft touches the first."""
+        signals = [np.array([5.0, 0.0, reading]) for reading in readings]
+        return [bool(residuals.step(touched, signal)[2]) for signal in signals]
+
+    assert over(both, 100, 100, 100, 3, 3)[-3:] == flags(1, 1, 0)
+    over(first, 0, 0, 0)
+    assert over(both, 100, 100, 100, 3, 100)[-2:] == flags(1, 1)
+    assert over(both, 3, 3) == flags(1, 0)
