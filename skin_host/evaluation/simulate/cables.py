@@ -409,7 +409,10 @@ class Cable:
                 self.damaged_ns = self._clock.monotonic_ns()
         if what.swapped:
             order = np.arange(n)
-            for row in np.flatnonzero(rng.random(max(n - 1, 0)) < what.swapped).tolist():
+            swapped = rng.random(max(n - 1, 0)) < what.swapped
+            # After a stall, sweeps that passed one after the other come in one batch.
+            swapped &= np.diff(batch.t_ns) < PAIR_NS
+            for row in np.flatnonzero(swapped).tolist():
                 order[[row, row + 1]] = order[[row + 1, row]]
             t_ns = batch.t_ns
             batch = _rows(batch, order)

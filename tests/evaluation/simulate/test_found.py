@@ -484,6 +484,25 @@ def test_a_frame_that_comes_late_is_stamped_when_it_came_not_when_it_was_read() 
     assert batch.data[:, 0].tolist() == [HEADER_B, HEADER_A]
 
 
+def test_frames_of_different_sweeps_do_not_change_places() -> None:
+    """Sweeps that wait together after a stall came 50 ms apart."""
+    clock = SteppedClock(seed=1)
+    rng = np.random.default_rng(1)
+    cable = Cable("can0", clock, lambda: None, lambda *_: None, lambda: True, rng, Trace())
+    port = SimulatedPort(cable, Bus(interface="virtual", channel="stall"), clock)
+    cable.mischief.swapped = 1.0
+    frames = [
+        (0x411, bytes([header, *[sweep] * 7]), sweep * 50_000_000 + at_ns)
+        for sweep in range(8)
+        for header, at_ns in ((HEADER_A, 0), (HEADER_B, 116_000))
+    ]
+    cable.arrive(FrameBatch.of(frames))
+    batch = port.read()
+    assert batch.data[:, 0].tolist() == [HEADER_B, HEADER_A] * 8
+    since_ns = batch.t_ns - (clock.now_ns() - clock.monotonic_ns())
+    assert (since_ns // 50_000_000).tolist() == batch.data[:, 1].tolist()
+
+
 def test_a_press_that_lifted_while_its_bus_was_off_is_no_touch_when_it_is_back(
     world: World,
 ) -> None:
