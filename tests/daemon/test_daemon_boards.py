@@ -135,6 +135,10 @@ async def test_zeros_of_boards_that_are_not_calibrated_are_kept_for_the_next_sta
         daemon = live.daemon
         await daemon.configure([1])
         await clock.sleep(3.0)
+        # What lies on the hand from now on is in its new zero.
+        weight = Probe(part="left_hand", at=Place(taxel=3), diameter_mm=4, force_n=[(0, 1)])
+        live.robot.touch(weight).press(2.0)
+        await clock.sleep(1.0)
         await daemon.calibrate(1.0, [0])
         await clock.sleep(2.0)
         kept = load_kept(tmp_path / "demo-main.zeros.json", Zeros)
@@ -142,9 +146,10 @@ async def test_zeros_of_boards_that_are_not_calibrated_are_kept_for_the_next_sta
         assert calibration is not None
         assert pipeline is not None
         assert kept.calibration == calibration.id
-        arm = daemon.layout.part("left_forearm")
-        used = pipeline.baseline[arm.start : arm.stop]
-        assert np.abs(np.array(kept.baselines["left_forearm"]) - used).max() < 0.5
+        for name in ("left_forearm", "left_hand"):
+            part = daemon.layout.part(name)
+            used = pipeline.baseline[part.start : part.stop]
+            assert np.abs(np.array(kept.baselines[name]) - used).max() < 0.5
 
 
 @stepped
