@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from skin_host.client import Contact, SkinCallbacks
 from skin_host.client.heard import says_online
 from skin_host.client.order import Newest
-from skin_host.client.presence import DISTANCE_S, Lateness, Presence
+from skin_host.client.presence import DISTANCE_S, MAX_TOUCHES, Lateness, Presence
 from skin_host.config.settings import load
 from skin_host.layout import build_layout
 from skin_host.mqtt.info import node_info
@@ -231,6 +231,84 @@ def test_a_contact_whose_end_was_lost_goes_while_its_part_is_received() -> None:
     presence.take_touch(seen("begin", 2), 11.0)
     presence.take_state("palm", "OFF", 11.0)
     assert presence.touches("palm", 11.0) == []
+
+
+def test_of_too_many_contacts_the_oldest_are_forgotten() -> None:
+    presence = Presence(stale_s=3.0)
+    for number in range(MAX_TOUCHES + 2):
+        presence.take_touch(seen("begin", number), 0.0)
+    assert [one.id for one in presence.touches("palm", 0.0)] == list(range(2, MAX_TOUCHES + 2))
+
+
+def test_a_contact_that_moves_is_present_until_it_has_not_moved_for_too_long() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_touch(seen("begin"), 0.0)
+    presence.take_touch(seen("move"), 2.0)
+    presence.take_sign("palm", 5.0)
+    assert presence.touches("palm", 5.0)
+    presence.take_sign("palm", 5.1)
+    assert presence.touches("palm", 5.0)  # what is not yet past does not count
+    assert presence.touches("palm", 5.1) == []
+    assert presence.touches("palm", 5.0) == []
+
+
+def test_touches_alone_tell_no_contact_state() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_sign("palm", 0.0)
+    presence.take_touch(seen("begin"), 0.0)
+    assert presence.contact("palm", 0.0) is None
+    assert presence.contact("foot", 0.0) is None
+    assert presence.changes(0.0) == []
+    assert presence.reported() == []
+
+
+def test_a_part_that_is_not_felt_is_unknown_though_its_node_lives() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_state("palm", "UNKNOWN", 0.0)
+    assert presence.contact("palm", 3.0) == Contact("palm", "UNKNOWN", "not_felt")
+    # Who has not heard of it for too long cannot tell even that.
+    assert presence.contact("palm", 3.1) == Contact("palm", "UNKNOWN", "stale")
+
+
+def test_a_state_that_was_deleted_or_forgotten_is_told_no_more() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_state("foot", None, 0.0)
+    for part in ("palm", "foot"):
+        presence.take_state(part, "OFF", 0.0)
+    assert presence.changes(0.0) == presence.reported()
+    assert [one.part for one in presence.reported()] == ["palm", "foot"]
+    presence.take_state("palm", None, 1.0)
+    assert presence.contact("palm", 1.0) is None
+    assert [one.part for one in presence.reported()] == ["foot"]
+    presence.forget()
+    assert presence.reported() == []
+    assert presence.contact("foot", 1.0) is None
+
+
+def test_a_state_is_known_while_a_broker_is_left_that_told_it() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_state("palm", "OFF", 0.0, 0)
+    presence.take_state("palm", "OFF", 0.0, 1, again=True)
+    presence.take_loss(0)
+    assert presence.contact("palm", 0.0) == Contact("palm", "OFF")
+    # A newer one of broker 0 alone makes that of broker 1 out of date.
+    presence.take_state("palm", "ON", 1.0, 0)
+    presence.take_loss(1)
+    assert presence.contact("palm", 1.0) == Contact("palm", "ON")
+    presence.take_loss(0)
+    presence.take_state("foot", "OFF", 1.0, 0)
+    assert presence.contact("foot", 1.0) == Contact("foot", "OFF")
+    assert presence.changes(1.0) == [Contact("foot", "OFF")]
+
+
+def test_a_status_of_one_broker_replaces_that_of_another() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_node("main", True, 0)
+    presence.take_node("main", True, 1)
+    assert presence.brokers("main") == {1}
+    assert presence.brokers("arm") == set()
+    presence.take_loss(0)
+    assert presence.online("main", 0.0)
 
 
 async def announced(publisher: Publisher) -> None:
