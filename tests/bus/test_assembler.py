@@ -63,6 +63,12 @@ def test_a_whole_sweep_is_handed_on_with_its_last_frame():
     assert sweep.t_ns == sent[-1][2]
 
 
+def test_the_first_sweep_of_a_clock_that_begins_at_zero_is_not_late() -> None:
+    assembler = make()
+    assert len(feed(assembler, frames(values(4), t_ns=0))) == 1
+    assert assembler.counters.late == 0
+
+
 @given(order=st.permutations(range(8)), cut=st.integers(1, 8))
 @settings(max_examples=60)
 def test_the_order_of_frames_and_the_size_of_batches_do_not_matter(order, cut):
