@@ -404,6 +404,11 @@ class Daemon:
             if zeroed != (zeroed := int(self.engine.ledger.rezeros.sum())):
                 # At once: what was pressed then must be doubted after a crash, too.
                 self._begin_to_keep_zeros()
+                # A contact that began before boards were held has not been published.
+                doubted = self.engine.zero_at_risk(touched=False)
+                for index, contact in self._contacts.items():
+                    here = self.layout.parts[index]
+                    contact.doubt(doubted[here.start : here.stop])
             now_s = self.clock.monotonic_s()
             link = self.link
             self.health.tick(link.read_ns, link.ports, link.boards, link.longest_pause_ns())

@@ -180,6 +180,8 @@ class Engine:
         self._noted: dict[int, tuple[Mask, Mask]] = {}
         #: Taxels of boards that have not been zeroed yet, see `hold`; None if there are none.
         self._held: Mask | None = None
+        #: Boards that were zeroed since they were held: until then what came before is under way.
+        self._releasing: set[int] = set()
         self._run: _CalibrationRun | None = None
         #: Between `collected` and `use`: the boards that were zeroed, and `believed` of each.
         self._zeroed_since: dict[int, bool] | None = None
@@ -213,6 +215,7 @@ class Engine:
         self._touched = after._touched
         self._last_touched = after._last_touched
         self._held = after._held
+        self._releasing = after._releasing
         self._run = after._run
         self._zeroed_since = after._zeroed_since
         self.calibration = after.calibration
@@ -369,11 +372,12 @@ class Engine:
         return Output(sweeps, steps, [], grasps, [])
 
     def hold(self, boards: list[int]) -> None:
-        """Report no taxel of some boards as valid until they are zeroed.
+        """Report no taxel of some boards as valid until they are zeroed and their zero is found.
 
         Their zero may be another than the calibration's: since that was taken, an earlier start of
         the daemon may have zeroed them. What seems to touch them is noted all the same.
         """
+        self._releasing.difference_update(boards)
         held = self.taxels_of(boards)
         self._held = held if self._held is None else self._held | held
 
@@ -398,7 +402,7 @@ class Engine:
             How many taxels were touched.
         """
         taxels = self._taxels_of(board)
-        self.release([board])
+        self._releasing.add(board)
         if self._zeroed_since is not None:
             self._zeroed_since[board] = believed
         if self._run is not None:
@@ -530,6 +534,9 @@ class Engine:
             self._pipeline.set_zero(taxels[found], baseline[found])
             self.zeros_found += 1
         if rezero.settled(sweep.t_ns):
+            if sweep.board in self._releasing:
+                self._releasing.discard(sweep.board)
+                self.release([sweep.board])
             veto = self.in_doubt(sweep.board)
             unsettled = rezero.unsettled(sweep.t_ns)
             if unsettled is not None:
