@@ -289,3 +289,23 @@ async def test_zeros_that_cannot_be_kept_are_a_fault_until_they_are(
         written = file.stat().st_ino
         await clock.sleep(5.0)
         assert file.stat().st_ino == written
+
+
+@stepped
+async def test_what_is_pressed_is_in_doubt_only_if_the_daemon_ends_then(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    file = tmp_path / "demo-main.zeros.json"
+    press = Probe(
+        part="left_hand", at=Place(triangle=4), diameter_mm=10, pressure_kpa=PRESSED, start_s=4.0
+    )
+    scene = Scene(probe=[press], quiet=True)
+    async with living(can_bus_settings, tmp_path, scene=scene, clock=clock) as live:
+        engine = live.daemon.engine
+        await live.wait(lambda: bool(engine.zero_at_risk(touched=True).any()))
+        await live.daemon.configure([1])  # the arm's, which is not pressed
+        await clock.sleep(3.0)
+        assert load_kept(file, Zeros).unknown == {}
+        touched = np.flatnonzero(engine.zero_at_risk(touched=True)).tolist()  # the hand begins at 0
+        assert touched
+    assert set(load_kept(file, Zeros).unknown["left_hand"]) >= set(touched)
