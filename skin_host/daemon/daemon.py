@@ -397,15 +397,16 @@ class Daemon:
         said_s = dict.fromkeys(self.engine.parts, 0.0)
         of_parts: dict[tuple[str, str], str] = {}
         pulse: tuple[object, ...] = ()
-        zeroed = 0
+        zeroed = 0, 0
         while True:
             await self.clock.sleep(LOOK_S)
             self.link.supervise()
-            if zeroed != (zeroed := int(self.engine.ledger.rezeros.sum())):
+            engine = self.engine
+            if zeroed != (zeroed := (int(engine.ledger.rezeros.sum()), engine.zeros_found)):
                 # At once: what was pressed then must be doubted after a crash, too.
                 self._begin_to_keep_zeros()
-                # A contact that began before boards were held has not been published.
-                doubted = self.engine.zero_at_risk(touched=False)
+                # Something may press a pad whose zero was not found, or did before it was held.
+                doubted = engine.zero_at_risk(touched=False)
                 for index, contact in self._contacts.items():
                     here = self.layout.parts[index]
                     contact.doubt(doubted[here.start : here.stop])

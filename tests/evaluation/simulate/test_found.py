@@ -344,6 +344,39 @@ def test_a_calibration_of_one_board_keeps_the_zeros_of_the_others(
         runner.run(live())
 
 
+def test_a_part_with_a_pad_whose_new_zero_is_not_known_is_not_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing presses. The noise of some pads reaches the end of the scale, and gives no zero."""
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
+    kaspar = DEMO.with_name("kaspar.toml")
+    settings, layout = load_skin(kaspar)
+    world = World(settings, layout, kaspar, 2, Scene(quiet=False))
+
+    async def live() -> tuple[set[str], set[str]]:
+        life = start(world)
+        await world.clock.sleep(10.0)
+        await life.daemon.configure()
+        await world.clock.sleep(5.0)
+        engine, topics = life.daemon.engine, life.daemon.publisher.topics
+        assert engine.calibration is not None
+        doubted = engine.zero_at_risk(touched=False) & engine.calibration.usable
+        states = {
+            part.name: world.broker.retained[topics.part("contact", part.name)]
+            for part in layout.parts
+        }
+        life.kill()
+        return (
+            {part.name for part in layout.parts if doubted[part.start : part.stop].any()},
+            {name for name, state in states.items() if state == b"UNKNOWN"},
+        )
+
+    with world.clock.runner() as runner:
+        doubted, unknown = runner.run(live())
+    assert doubted
+    assert unknown == doubted
+
+
 def test_a_shorted_data_line_that_two_parts_share_is_named_by_both(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
