@@ -39,6 +39,8 @@ SIGMA = 1.4826
 FEWEST_RESTING = 12
 #: A triangle is missing when it was absent from this many sweeps in a row.
 ABSENT_SWEEPS = 3
+#: That a triangle has not changed since its calibration is known after this.
+CONSTANT_NS = 1_000_000_000
 #: A baseline counts as drifting when it has moved by more than this share of its limit.
 DRIFTING_SHARE = 0.25
 _COUNTS = ("wrong", "halves", "missed", "unknown", "spikes", "dropped", "error_frames")
@@ -57,6 +59,9 @@ class Describer:
         self._watch = watch
         #: For each part the shifts of its thermal and of its resting pads at the last look.
         self._shifts: dict[int, Temperatures] = {}
+        #: Since when triangles, by board and number, have not changed after a calibration in which
+        #: they did not either, or which has not seen them.
+        self._unproven_ns: dict[tuple[int, int], int] = {}
         #: For each part: a calibration, and its verdicts that are not "ok".
         self._judged: dict[int, tuple[Calibration, dict[str, list[int]]]] = {}
         #: For each part: the triangles that belong to it, by board.
@@ -208,7 +213,11 @@ class Describer:
         if liveness.frozen[triangle]:
             return "silenced" if liveness.silenced[triangle] else "frozen"
         if liveness.unproven[triangle]:
-            return "silenced" if liveness.silenced[triangle] else "constant"
+            if liveness.silenced[triangle]:
+                return "silenced"
+            since_ns = self._unproven_ns.setdefault((board, number), ledger.now_ns)
+            return "constant" if ledger.now_ns - since_ns >= CONSTANT_NS else None
+        self._unproven_ns.pop((board, number), None)
         # Single pads are listed with the taxels; only a whole triangle counts here. Pads that were
         # pressed while their board was zeroed are reported as `board_in_doubt`.
         far = ledger.far[row, number] & ~self._engine.in_doubt(board)[number]
