@@ -206,7 +206,7 @@ class _SteppedLoop(asyncio.SelectorEventLoop):
         # Asked for several times in each turn.
         self.time = clock.monotonic_s  # type: ignore[method-assign]
         self._clock = clock
-        #: The same with what asyncio's types do not tell.
+        #: The same with what asyncio's types do not declare.
         self._own: Any = self
 
     def _run_once(self) -> None:

@@ -114,9 +114,6 @@ class Boards:
             sent until then were those that it had been set up to send.
         clock: for waiting.
         unconfigured: frames by address of boards that are not configured, see `Assembler`.
-
-    Attributes:
-        strangers: the types of the boards that are not configured, by address.
     """
 
     def __init__(
@@ -138,6 +135,7 @@ class Boards:
         self.records = {
             board.settings.address: BoardRecord(i, ledger.row[i], board) for i, board in boards
         }
+        #: The types of the boards that are not configured, by address.
         self.strangers: dict[int, int] = {}
         self._sent_by = unconfigured
         self._unconfigured: dict[int, _Unconfigured] = {}

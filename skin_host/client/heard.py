@@ -46,11 +46,11 @@ class Health(NamedTuple):
         return self.record.get("sentences", [])
 
 
-def says_online(payload: bytes, stamp: Stamp | None, *, is_only_broker: bool) -> bool | None:
-    """Return what a status says of its node; None: nothing.
+def is_online(payload: bytes, stamp: Stamp | None, *, is_only_broker: bool) -> bool | None:
+    """Return whether a node is online by its status; None: that does not show it.
 
-    A last will says that a connection has ended. Where there are several brokers, the node may have
-    another connection by then, of which we have not heard yet.
+    A last will means that a connection has ended. Where there are several brokers, the node may
+    have another connection by then, of which nothing has been received yet.
     """
     if payload == ONLINE:
         return True

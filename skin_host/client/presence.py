@@ -93,7 +93,7 @@ class _Part:
 
 @dataclass(slots=True)
 class _Node:
-    #: As it or its last will said last; None: that is not known any more.
+    #: By its newest status; None: that is not known any more.
     online: bool | None
     #: Brokers from which that came.
     over: set[int]
@@ -164,7 +164,7 @@ class Presence:
 
         Args:
             node: whose.
-            online: what it says, see `heard.says_online`.
+            online: whether it is, see `is_online`.
             broker: from which it came.
             again: it came from another broker before.
         """

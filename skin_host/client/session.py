@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Self, TypeVar
 from weakref import WeakSet
 
-from skin_host.client.heard import Health, read, says_online
+from skin_host.client.heard import Health, is_online, read
 from skin_host.client.links import RETAINED_S, BrokerLink, only_robot
 from skin_host.client.order import EventOrder, Newest
 from skin_host.client.presence import Contact, Presence
@@ -468,7 +468,7 @@ class SkinClient:
         newness = self._newness("status", name, message)
         if newness is False:
             return
-        said = says_online(
+        said = is_online(
             payload, stamp_of(message.properties), is_only_broker=len(self._links) == 1
         )
         self._presence.take_node(name, said, link.number, again=newness is None)

@@ -34,7 +34,7 @@ from typing import Any, NamedTuple, Protocol
 import msgspec
 import numpy as np
 
-from skin_host.client.heard import says_online
+from skin_host.client.heard import is_online
 from skin_host.client.links import BrokerLink
 from skin_host.client.order import EventOrder, Newest
 from skin_host.client.presence import Presence
@@ -350,7 +350,7 @@ class _Receiver:
         elif kind == "health" and newness and not heard.retained:
             robot.presence.take_sign(PART, at_s, sent_s)
         elif kind == "status" and newness is not False:
-            online = says_online(heard.payload, heard.stamp, is_only_broker=False)
+            online = is_online(heard.payload, heard.stamp, is_only_broker=False)
             robot.presence.take_node(NODE, online, number, again=newness is None)
         robot.note()
 

@@ -43,7 +43,7 @@ class Stamp(NamedTuple):
 
     @property
     def is_last_will(self) -> bool:
-        """Whether the broker said it: the connection has ended, but perhaps not the node."""
+        """Whether the broker published it: the connection has ended, but perhaps not the node."""
         return self.message == _LAST_WILL
 
 
@@ -80,7 +80,7 @@ class Numbers:
 
     @property
     def last_will(self) -> Stamp:
-        """Return the stamp of what the broker says when the connection ends without a word."""
+        """Return the stamp of what the broker publishes when the connection breaks."""
         return Stamp(self.connection, _LAST_WILL)
 
     def state(self) -> Stamp:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skin_host.client import Contact, SkinCallbacks
-from skin_host.client.heard import says_online
+from skin_host.client.heard import is_online
 from skin_host.client.order import Newest
 from skin_host.client.presence import DISTANCE_S, MAX_TOUCHES, Lateness, Presence
 from skin_host.config.settings import load
@@ -141,7 +141,7 @@ def test_a_last_will_says_nothing_of_a_node_that_may_be_at_another_broker() -> N
     def take(payload: bytes, stamp: Stamp, broker: int) -> None:
         newness = newest.take("status", "main", stamp)
         if newness is not False:
-            said = says_online(payload, stamp, is_only_broker=False)
+            said = is_online(payload, stamp, is_only_broker=False)
             presence.take_node("main", said, broker, again=newness is None)
 
     take(ONLINE, Stamp(100, 0), 0)
@@ -164,9 +164,9 @@ def test_a_last_will_says_nothing_of_a_node_that_may_be_at_another_broker() -> N
 
 
 def test_with_one_broker_the_last_will_is_believed() -> None:
-    assert says_online(OFFLINE, Stamp(100, 1), is_only_broker=True) is False
-    assert says_online(OFFLINE, None, is_only_broker=True) is False
-    assert says_online(b"", None, is_only_broker=True) is None
+    assert is_online(OFFLINE, Stamp(100, 1), is_only_broker=True) is False
+    assert is_online(OFFLINE, None, is_only_broker=True) is False
+    assert is_online(b"", None, is_only_broker=True) is None
 
 
 def test_a_node_whose_parts_all_fall_silent_or_come_late_is_not_said_to_be_online() -> None:
