@@ -129,9 +129,9 @@ class Daemon:
             part = layout.parts[i]
             if calibration is not None:
                 self._contacts[i].use(calibration.usable[part.start : part.stop])
-            self._contacts[i].doubt(doubted[part.start : part.stop])
             # The state that the broker retained from an earlier start is no longer known.
             self.publisher.put_contact(part.name, "UNKNOWN")
+        self._doubt_contacts(doubted, self.engine.parts)
         self.fingertips = FingertipPublisher(self.engine.fingertips, self.publisher)
         self.link = Link(self.engine, wait=True, open_port=open_port, clock=clock)
         self.unkept: dict[str, str] = {}
@@ -248,10 +248,8 @@ class Daemon:
     def enable(self, part: int) -> None:
         """Publish everything of a part again."""
         self.engine.disabled.discard(part)
-        here = self.layout.parts[part]
         # A board may have been zeroed meanwhile while something pressed the part.
-        doubted = self.engine.zero_at_risk(touched=False)
-        self._contacts[part].doubt(doubted[here.start : here.stop])
+        self._doubt_contacts(self.engine.zero_at_risk(touched=False), [part])
 
     def set_thresholds(self, thresholds: Thresholds) -> None:
         """Apply these changes to the configured touch thresholds; baselines are kept."""
@@ -323,6 +321,12 @@ class Daemon:
         self.settings, self.layout, self.engine = settings, layout, engine
         self.link.use(engine)
         self.health.use(engine)
+
+    def _doubt_contacts(self, taxels: NDArray[np.bool_], parts: list[int]) -> None:
+        """Something may touch these taxels of some parts, bool[n], whose zero is not known."""
+        for index in parts:
+            part = self.layout.parts[index]
+            self._contacts[index].doubt(taxels[part.start : part.stop])
 
     def _end_contacts(self, part: int) -> None:
         events = self.engine.end_part(part, self.clock.now_ns())
@@ -406,10 +410,7 @@ class Daemon:
                 # At once: what was pressed then must be doubted after a crash, too.
                 self._begin_to_keep_zeros()
                 # Something may press a pad whose zero was not found, or did before it was held.
-                doubted = engine.zero_at_risk(touched=False)
-                for index, contact in self._contacts.items():
-                    here = self.layout.parts[index]
-                    contact.doubt(doubted[here.start : here.stop])
+                self._doubt_contacts(engine.zero_at_risk(touched=False), engine.parts)
             now_s = self.clock.monotonic_s()
             link = self.link
             self.health.tick(link.read_ns, link.ports, link.boards, link.longest_pause_ns())
@@ -497,7 +498,7 @@ class Daemon:
         unknown: dict[str, list[int]] = {}
         at_risk = engine.zero_at_risk(touched)
         if doubted is not None:
-            at_risk = at_risk | doubted
+            at_risk |= doubted
         if at_risk.any():
             for part in map(self.layout.parts.__getitem__, engine.parts):
                 mine = np.flatnonzero(at_risk[part.start : part.stop]).tolist()

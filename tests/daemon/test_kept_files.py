@@ -61,6 +61,14 @@ def test_a_damaged_state_is_set_aside(tmp_path: Path, content: bytes) -> None:
     assert aside.read_bytes() == content
 
 
+def pressed_hand() -> Scene:
+    """The hand is pressed from 4 s on."""
+    press = Probe(
+        part="left_hand", at=Place(triangle=4), diameter_mm=10, pressure_kpa=PRESSED, start_s=4.0
+    )
+    return Scene(probe=[press], quiet=True)
+
+
 @pytest.fixture
 def kept(calibrated: FaultBench, tmp_path: Path) -> tuple[Any, Any, Path]:
     """Settings, layout and the file of the robot's calibration."""
@@ -178,11 +186,7 @@ async def test_what_was_pressed_when_its_board_was_zeroed_is_in_a_file_at_once(
     clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
 ) -> None:
     """A crash a moment later must not make a pressed taxel look untouched."""
-    press = Probe(
-        part="left_hand", at=Place(triangle=4), diameter_mm=10, pressure_kpa=PRESSED, start_s=4.0
-    )
-    scene = Scene(probe=[press], quiet=True)
-    async with living(can_bus_settings, tmp_path, scene=scene, clock=clock) as live:
+    async with living(can_bus_settings, tmp_path, scene=pressed_hand(), clock=clock) as live:
         engine = live.daemon.engine
         await live.wait(lambda: bool(engine.zero_at_risk(touched=True).any()))
         touched = np.flatnonzero(engine.zero_at_risk(touched=True))  # the hand begins at 0
@@ -296,11 +300,7 @@ async def test_what_is_pressed_is_in_doubt_only_if_the_daemon_ends_then(
     clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
 ) -> None:
     file = tmp_path / "demo-main.zeros.json"
-    press = Probe(
-        part="left_hand", at=Place(triangle=4), diameter_mm=10, pressure_kpa=PRESSED, start_s=4.0
-    )
-    scene = Scene(probe=[press], quiet=True)
-    async with living(can_bus_settings, tmp_path, scene=scene, clock=clock) as live:
+    async with living(can_bus_settings, tmp_path, scene=pressed_hand(), clock=clock) as live:
         engine = live.daemon.engine
         await live.wait(lambda: bool(engine.zero_at_risk(touched=True).any()))
         await live.daemon.configure([1])  # the arm's, which is not pressed

@@ -36,10 +36,26 @@ def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
     yield World(settings, layout, DEMO, 1, Scene(quiet=True))
 
 
+@pytest.fixture
+def worn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> World:
+    """Ten boards on one bus, with noise as on real skin: a start takes seconds to set them up."""
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
+    kaspar = DEMO.with_name("kaspar.toml")
+    settings, layout = load_skin(kaspar)
+    return World(settings, layout, kaspar, 2, Scene(quiet=False))
+
+
 def start(world: World) -> Life:
     world.life = Life(world)
     world.life.start(lambda _: None)
     return world.life
+
+
+def start_watched(world: World) -> tuple[Promises, Life]:
+    promises = Promises(world)
+    life = world.life = Life(world)
+    life.start(promises.watch)
+    return promises, life
 
 
 def test_a_daemon_that_died_in_a_touch_does_not_call_it_untouched_when_it_is_back(
@@ -273,40 +289,36 @@ def baselines(life: Life) -> NDArray[np.float64]:
 
 
 def test_a_daemon_that_starts_reports_no_touch_before_its_boards_are_zeroed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    worn: World,
 ) -> None:
     """The daemon before it has zeroed them since the calibration; ten boards take seconds."""
-    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
-    kaspar = DEMO.with_name("kaspar.toml")
-    settings, layout = load_skin(kaspar)
-    world = World(settings, layout, kaspar, 2, Scene(quiet=False))
 
     async def live() -> list[str]:
-        life = start(world)
-        await world.clock.sleep(10.0)
+        life = start(worn)
+        await worn.clock.sleep(10.0)
         await life.daemon.configure()
-        await world.clock.sleep(3.0)
+        await worn.clock.sleep(3.0)
         zeroed, calibrated = baselines(life), life.daemon.engine.calibration
         life.kill()
-        await world.clock.sleep(0.5)
+        await worn.clock.sleep(0.5)
         seen: list[str] = []
 
         def hear(topic: str, payload: bytes) -> None:
             if topic.endswith("/touch"):
                 seen.append(topic)
 
-        world.broker.listeners.append(hear)
-        life = start(world)
+        worn.broker.listeners.append(hear)
+        life = start(worn)
         # Until they are set up again, boards send with the zero that the daemon before gave them.
         assert calibrated is not None
         assert np.abs(calibrated.baseline - zeroed).max() > 5.0
         assert np.abs(baselines(life) - zeroed).max() < 0.5
-        await world.clock.sleep(6.0)
+        await worn.clock.sleep(6.0)
         assert all(record["valid_taxels"] for record in life.daemon.records().values())
         life.kill()
         return seen
 
-    with world.clock.runner() as runner:
+    with worn.clock.runner() as runner:
         assert runner.run(live()) == []
 
 
@@ -345,33 +357,29 @@ def test_a_calibration_of_one_board_keeps_the_zeros_of_the_others(
 
 
 def test_a_part_with_a_pad_whose_new_zero_is_not_known_is_not_off(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    worn: World,
 ) -> None:
     """Nothing presses. The noise of some pads reaches the end of the scale, and gives no zero."""
-    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
-    kaspar = DEMO.with_name("kaspar.toml")
-    settings, layout = load_skin(kaspar)
-    world = World(settings, layout, kaspar, 2, Scene(quiet=False))
 
     async def live() -> tuple[set[str], set[str]]:
-        life = start(world)
-        await world.clock.sleep(10.0)
+        life = start(worn)
+        await worn.clock.sleep(10.0)
         await life.daemon.configure()
-        await world.clock.sleep(5.0)
+        await worn.clock.sleep(5.0)
         engine, topics = life.daemon.engine, life.daemon.publisher.topics
         assert engine.calibration is not None
         doubted = engine.zero_at_risk(touched=False) & engine.calibration.usable
         states = {
-            part.name: world.broker.retained[topics.part("contact", part.name)]
-            for part in layout.parts
+            part.name: worn.broker.retained[topics.part("contact", part.name)]
+            for part in worn.layout.parts
         }
         life.kill()
         return (
-            {part.name for part in layout.parts if doubted[part.start : part.stop].any()},
+            {part.name for part in worn.layout.parts if doubted[part.start : part.stop].any()},
             {name for name, state in states.items() if state == b"UNKNOWN"},
         )
 
-    with world.clock.runner() as runner:
+    with worn.clock.runner() as runner:
         doubted, unknown = runner.run(live())
     assert doubted
     assert unknown == doubted
@@ -408,9 +416,7 @@ def test_a_frame_whose_other_half_was_lost_just_before_the_end_is_accounted_for(
     """It is counted as lone when the next sweep begins, and none does."""
 
     async def live() -> str | None:
-        promises = Promises(world)
-        life = world.life = Life(world)
-        life.start(promises.watch)
+        promises, life = start_watched(world)
         await world.clock.sleep(6.0)
         for lost, seconds in ((0.3, 0.2), (1.0, 0.15)):
             for wire in world.cables.values():
@@ -434,9 +440,7 @@ def test_what_is_retained_just_before_a_stall_is_at_the_broker_after_it(world: W
     """It was on its way: seconds have passed when it arrives, and nobody was late."""
 
     async def live() -> str | None:
-        promises = Promises(world)
-        life = world.life = Life(world)
-        life.start(promises.watch)
+        promises, life = start_watched(world)
         await world.clock.sleep(8.0)
         promises.sample()
         promises.contacts()
@@ -460,9 +464,7 @@ def test_a_pause_between_two_presses_that_no_sample_saw_is_known(world: World) -
     """The last frame before the bus went off may be of that pause."""
 
     async def live() -> str | None:
-        promises = Promises(world)
-        life = world.life = Life(world)
-        life.start(promises.watch)
+        promises, life = start_watched(world)
         await world.clock.sleep(8.0)
         spot = world.spots[0]
         first = asyncio.create_task(spot.press(2.0, 60.0))
