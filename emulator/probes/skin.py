@@ -141,7 +141,9 @@ class Skin:
             thermal = self._layout.pad_kind == PadKind.THERMAL
             calm = [unit.kind.startswith("fingertip") for unit in self._layout.triangles]
             self.noise = PadNoise.drawn(thermal.reshape(-1, TAXELS), rng, np.array(calm))
-            self.noise_ff = SENT_UNIT_FF * self.noise.rms_units.reshape(-1)
+            # Fingertips were measured in their own units, which are finer than those of others.
+            unit_ff = np.where(np.repeat(calm, TAXELS), self._layout.unit_ff, SENT_UNIT_FF)
+            self.noise_ff = unit_ff * self.noise.rms_units.reshape(-1)
             self._jumps = Jumps.drawn(thermal.reshape(-1, TAXELS), rng)
             self._dead = draw_dead(n, rng) & ~thermal
 

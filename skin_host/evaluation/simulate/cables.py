@@ -27,10 +27,12 @@ BUFFER_FRAMES = 4000
 CAPACITY = 1024
 #: A second board at an address sends this long after the first.
 TWIN_NS = 20_000_000
-#: Frames of one sweep are no further apart; sweeps of a board are.
+#: Two halves of which the second came first, those of two sweeps, are taken for one if they are no
+#: further apart: a bus that was full passes sweeps close together.
 PAIR_NS = 12_000_000
-#: A longer pause separates two sweeps of a board.
-BURST_NS = 16_000_000
+#: A longer pause separates two sweeps of a board, half of its period as for the daemon. Boards of
+#: more urgent identifiers may hold up the rest of a sweep for nearly as long.
+PAUSE_NS = 24_000_000
 #: The part of a status word that names an error.
 ERROR = 0xF
 #: Sweeps of a triangle that are kept: those of two boards at one address while the computer stalls.
@@ -126,7 +128,7 @@ class Sent:
             return False
         address = keys[0] >> 4
         first_ns, last_ns = int(batch.t_ns[0]), int(batch.t_ns[-1])
-        if first_ns - self._last_ns.get(address, -BURST_NS) < BURST_NS:
+        if first_ns - self._last_ns.get(address, -PAUSE_NS) < PAUSE_NS:
             return False
         if last_ns - first_ns > PAIR_NS:
             return False
@@ -182,19 +184,19 @@ class Sent:
             address = key >> 4
             if address in self._sweeps:
                 self._spread(address)
-            if t_ns - self._last_ns.get(address, -BURST_NS) >= BURST_NS:
+            if t_ns - self._last_ns.get(address, -PAUSE_NS) >= PAUSE_NS:
                 self.bursts[address] = self.bursts.get(address, 0) + 1
             self._last_ns[address] = t_ns
             half = self._half.get(key)
-            if half is None or half[0] == header or t_ns - half[2] > PAIR_NS:
-                self._half[key] = header, payload, t_ns
-                continue
             # A bus that was full passes sweeps close together, and one may have lost its first
             # half: this frame may be the first of the next.
             self._half[key] = header, payload, t_ns
-            if header == HEADER_B and half[0] == HEADER_A:
+            if half is None:
+                continue
+            apart_ns = t_ns - half[2]
+            if (half[0], header) == (HEADER_A, HEADER_B) and apart_ns <= PAUSE_NS:
                 first, second = half[1], payload
-            elif header == HEADER_A and half[0] == HEADER_B:
+            elif (half[0], header) == (HEADER_B, HEADER_A) and apart_ns <= PAIR_NS:
                 first, second = payload, half[1]
             else:
                 continue

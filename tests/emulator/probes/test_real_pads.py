@@ -12,7 +12,9 @@ from emulator.probes.pads import Jumps
 from emulator.probes.scene import Place, Probe, Scene
 from emulator.robot import Robot
 from skin_host.bus.wire import find_skin_frames
+from skin_host.cli.common import load_skin
 from skin_host.config.settings import Settings
+from skin_host.demo import configuration
 from skin_host.evaluation.rig import wired
 from skin_host.layout import TAXELS_PER_TRIANGLE, build_layout
 
@@ -69,6 +71,17 @@ def test_pads_are_as_noisy_as_recorded_ones(fidelity: str) -> None:
         [0.69, 0.82, 1.04, 1.41], rel=0.12
     )
     assert np.percentile(deviation[live], 95) == pytest.approx(5.3, rel=0.2)
+
+
+def test_fingertips_are_as_noisy_in_their_own_finer_units_as_recorded_ones() -> None:
+    """Not four times as noisy, which brought some pads to the end of their scale."""
+    settings, layout = load_skin(configuration("icub.toml"))
+    tips = [unit.kind.startswith("fingertip") for unit in layout.triangles]
+    skin = Robot(settings, layout, Scene(quiet=False)).skin
+    units = (skin.noise_ff / layout.unit_ff).reshape(-1, TAXELS_PER_TRIANGLE)[tips]
+    assert layout.unit_ff.reshape(-1, TAXELS_PER_TRIANGLE)[tips].max() < SENT_UNIT_FF
+    assert units.min() > 0.2
+    assert units.max() < 1.8
 
 
 def test_both_fidelities_send_the_same_noise() -> None:

@@ -499,6 +499,23 @@ def test_halves_of_sweeps_that_a_full_bus_held_up_are_paired_though_one_was_lost
     assert not list(sent.find(1, 1, bytes([*range(7), *[98] * 5])))
 
 
+def test_the_rest_of_a_sweep_that_more_urgent_boards_hold_up_is_of_that_sweep() -> None:
+    """`icub.toml`, seed 2: six boards between the two halves of the last triangle take 12.1 ms."""
+    sent = Sent()
+    urgent_ns = 12_100_000
+    halves = bytes([HEADER_A, *range(7)]), bytes([HEADER_B, *range(7, 12), 0, 0])
+    for begin_ns in (0, 50_000_000):
+        frames = [
+            (0x4E0 | number, half, begin_ns + number * 232_000 + at_ns)
+            for number, pause_ns in ((0, 116_000), (1, urgent_ns))
+            for half, at_ns in zip(halves, (0, pause_ns), strict=True)
+        ]
+        sent.note(FrameBatch.of(frames))
+    for number in (0, 1):
+        assert len(list(sent.find(14, number, bytes(range(12))))) == 2
+    assert sent.bursts == {14: 2}
+
+
 def test_a_frame_that_comes_late_is_stamped_when_it_came_not_when_it_was_read() -> None:
     """Read much later, it would stand between the halves of a sweep that came meanwhile."""
     clock = SteppedClock(seed=1)
