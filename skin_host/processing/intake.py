@@ -273,7 +273,8 @@ class Intake:
             doubted = doubted[TRIANGLES * row : TRIANGLES * (row + 1)]
         if ledger.flagged[row]:
             here = self._flagged(row, sweep.raw)
-            self._erring[row] = ledger.error[row]
+            # A copy: it may be judged after the ledger has noted the next sweep.
+            self._erring[row] = ledger.error[row].copy()
             received = np.repeat(here[:, None], PADS, axis=1)
             received &= ~ledger.far[row]
             if doubted is not None:

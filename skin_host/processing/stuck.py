@@ -81,9 +81,12 @@ class Repeats:
         of_words: type[np.signedinteger[Any]] = np.int32 if short else np.int64
         self._of_bits: type[np.unsignedinteger[Any]] = np.uint32 if short else np.uint64
         self._lowest, self._pattern = lowest.astype(of_words), pattern.astype(self._of_bits)
-        # At an end of its scale the temperature pad does not show what was subtracted.
+        # At an end of its scale the temperature pad does not show what was subtracted, if anything
+        # was.
         scale = np.arange(256)
-        self._tells = np.tile((scale > 0) & (scale < 255), len(kinds))
+        self._tells = np.concatenate(
+            [(scale > 0) & (scale < 255) | (not any(kind.gain)) for kind in kinds]
+        )
         self._kind = np.array([256 * kinds.index(one) for one in encodings])
         shape = self._gain.shape
         cells = np.array([1 << one.shift for one in encodings], of_words)
@@ -179,9 +182,6 @@ class Repeats:
         self._base, self._lowered = lowest, self._base
         if self._any_plain:
             moved[self._plain] = changed[self._plain]
-            if told is not None and within is not None:
-                told = told.copy()
-                told[self._plain] = within[self._plain]
         return moved, told
 
 

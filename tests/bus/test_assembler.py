@@ -1,5 +1,6 @@
 """Frames to sweeps: pairing, completeness, and an account of everything that went wrong."""
 
+import struct
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 
 from skin_host.bus import wire
 from skin_host.bus.assembler import PATIENCE_SWEEPS, Assembler, Sweep
-from skin_host.bus.wire import FrameBatch
+from skin_host.bus.wire import FrameBatch, Records
 from skin_host.config.settings import Board, Bus, Part, Patch, Settings
 from skin_host.layout import build_layout
 
@@ -38,18 +39,37 @@ def values(n: int, seed: int = 0) -> np.ndarray:
 
 
 def frames(
-    raw: np.ndarray, t_ns: int, board: int = 1, spacing_ns: int = 125_000
+    raw: np.ndarray,
+    t_ns: int,
+    board: int = 1,
+    spacing_ns: int = 125_000,
+    status: np.ndarray | None = None,
 ) -> list[tuple[int, bytes, int]]:
     n = len(raw)
-    ids, data = wire.encode_sweep(board, np.arange(n), raw, np.zeros(n, np.uint16))
+    words = np.zeros(n, np.uint16) if status is None else status
+    ids, data = wire.encode_sweep(board, np.arange(n), raw, words)
     return [
         (int(can_id), row.tobytes(), t_ns + i * spacing_ns)
         for i, (can_id, row) in enumerate(zip(ids, data, strict=True))
     ]
 
 
-def feed(assembler: Assembler, sent: list[tuple[int, bytes, int]]) -> list[Sweep]:
-    return assembler.feed(FrameBatch.of(sent)).sweeps
+def feed(
+    assembler: Assembler,
+    sent: list[tuple[int, bytes, int]],
+    batch: type[FrameBatch] = FrameBatch,
+) -> list[Sweep]:
+    return assembler.feed(batch.of(sent)).sweeps
+
+
+class PaddedBatch(FrameBatch):
+    """Frames of which more lies in memory, as it does where the kernel wrote them."""
+
+    def records(self) -> Records:
+        octets, form, head = FrameBatch.records(self)
+        padding = np.full((len(octets), 1), 0xAA, np.uint8)
+        padded = struct.Struct(f"=x{form.format.removeprefix('=')}x")
+        return Records(np.hstack([padding, octets, padding]), padded, head + 1)
 
 
 def test_a_whole_sweep_is_handed_on_with_its_last_frame():
@@ -254,7 +274,9 @@ def test_frames_in_the_usual_order_are_taken_together_with_the_same_result(data)
     sent: list[tuple[int, bytes, int]] = []
     for number in range(30):
         for board in range(1, n_boards + 1):
-            swept = frames(values(8, number), number * PERIOD + board * 3 * MS, board=board)
+            words = rng.integers(0, 2, 8, np.uint16) if rng.random() < 0.5 else None
+            start = number * PERIOD + board * 3 * MS
+            swept = frames(values(8, number), start, board=board, status=words)
             times = [t_ns for _, _, t_ns in swept]
             if rng.random() < harm:
                 times[rng.integers(16)] += int(rng.integers(-60, 60)) * MS
@@ -290,17 +312,26 @@ def learnt(triangles: str, n: int, order: list[int] | None = None) -> Assembler:
     return assembler
 
 
-@pytest.mark.parametrize("order", [list(range(32)), [*range(16, 32), *range(16)]])
-def test_a_whole_board_of_known_order_keeps_every_byte_in_its_place(order: list[int]) -> None:
-    assembler = learnt("0-15", 16, order)
-    for period in range(5, 8):
-        raw = values(16, period)
-        swept = frames(raw, period * PERIOD)
+@pytest.mark.parametrize("batch", [FrameBatch, PaddedBatch])
+@pytest.mark.parametrize("n", [4, 16])
+@pytest.mark.parametrize("reverse", [False, True])
+def test_a_whole_board_of_known_order_keeps_every_byte_in_its_place(
+    batch: type[FrameBatch], n: int, reverse: bool
+) -> None:
+    order = [*range(n, 2 * n), *range(n)] if reverse else list(range(2 * n))
+    assembler = learnt(f"0-{n - 1}", n, order)
+    rng = np.random.default_rng(n)
+    for period in range(5, 9):
+        raw = values(n, period)
+        words = rng.integers(0, 1 << 16, n, np.uint16) if period % 2 else np.zeros(n, np.uint16)
+        swept = frames(raw, period * PERIOD, status=words)
         times = [t_ns for _, _, t_ns in swept]
         sent = [(*swept[i][:2], t_ns) for i, t_ns in zip(order, times, strict=True)]
-        (sweep,) = feed(assembler, sent)
-        np.testing.assert_array_equal(sweep.raw, raw)
-        assert (sweep.present, sweep.t_ns, sweep.missed) == (0xFFFF, times[-1], 0)
+        (sweep,) = feed(assembler, sent, batch)
+        np.testing.assert_array_equal(sweep.raw[:n], raw)
+        assert sweep.status.tolist() == [*words, *[0] * (16 - n)]
+        assert not sweep.raw[n:].any()
+        assert (sweep.present, sweep.t_ns, sweep.missed) == ((1 << n) - 1, times[-1], 0)
 
 
 @pytest.mark.parametrize("first", [0, 1])
@@ -421,8 +452,9 @@ def test_a_sweep_expires_once_it_is_older_than_its_share_of_a_period() -> None:
     assert assembler.expire(10 * PERIOD) == []
 
 
-def test_what_began_before_a_pause_comes_before_what_began_after_it() -> None:
-    """A reader that was held up reads both at once, and joins boards' sweeps as they come."""
+@pytest.mark.parametrize("first", [0, 5])
+def test_what_began_before_a_pause_comes_before_what_began_after_it(first: int) -> None:
+    """A reader that was held up joins boards' sweeps as they come, whatever it reads at once."""
     assembler = make(boards=2)
     for number in range(1, 4):
         for board in (1, 2):
@@ -430,7 +462,7 @@ def test_what_began_before_a_pause_comes_before_what_began_after_it() -> None:
     before, after = 4 * PERIOD, 24 * PERIOD
     sent = [*frames(values(4), before, 1)[:5], *frames(values(4), after, 2)]
     sent += frames(values(4), after + 5 * MS, 1)
-    sweeps = feed(assembler, sent)
+    sweeps = feed(assembler, sent[:first]) + feed(assembler, sent[first:])
     assert [(one.board, one.t_ns // PERIOD) for one in sweeps] == [(0, 4), (1, 24), (0, 24)]
     assert [one.present for one in sweeps] == [0b0011, 0b1111, 0b1111]
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from skin_host.bus.assembler import Sweep
 from skin_host.cli.common import load_skin
 from skin_host.processing.core import Engine
-from skin_host.processing.intake import PartSample, below_zero, unpressable
+from skin_host.processing.intake import PartSample, below_zero, lifted, unpressable
 
 MS = 1_000_000
 PERIOD = 50 * MS
@@ -188,20 +188,56 @@ def test_chips_are_judged_as_soon_as_every_board_that_sends_has_sent() -> None:
     assert inner.is_whole
 
 
-def test_while_a_board_is_touched_its_other_chips_may_repeat_for_longer() -> None:
+@pytest.mark.parametrize("row", [0, 1])
+def test_while_a_board_is_touched_its_other_chips_may_repeat_for_longer(row: int) -> None:
     parts = intake()
     touched = np.zeros((16, 12), np.bool_)
     touched[1, 0] = True
-    parts.engine.intake.touched[0] = touched
+    parts.engine.intake.touched[row] = touched
     for turn in range(1, 25):
         samples = parts.feed([sweep(OUTER, turn * PERIOD), sweep(INNER, turn * PERIOD)])
     parts.engine.intake.judge()
-    frozen = parts.engine.intake.liveness.frozen
+    frozen = np.flatnonzero(parts.engine.intake.liveness.frozen).tolist()
     # The touch may be the dead chip's own.
-    assert np.flatnonzero(frozen[:16]).tolist() == [1]
-    assert np.flatnonzero(frozen[16:]).tolist() == list(range(8))
+    of_boards = [list(range(16)), list(range(16, 24))]
+    of_boards[row] = [16 * row + 1]
+    assert frozen == of_boards[0] + of_boards[1]
     present = samples[-1].present.reshape(-1, 12).all(axis=1)
-    assert present.tolist() == [triangle < 16 and triangle != 1 for triangle in range(24)]
+    assert np.flatnonzero(~present).tolist() == frozen
+
+
+def test_a_chip_that_reports_an_error_is_not_said_to_repeat_itself() -> None:
+    """Its bytes do not change because it does not answer, and its board says so."""
+    parts = intake()
+    for turn in range(1, 60):
+        inner = sweep(INNER, turn * PERIOD)
+        inner.status[3] = 2
+        outer = sweep(OUTER, turn * PERIOD)
+        outer.status[5] = 1
+        parts.feed([outer, inner])
+    parts.engine.intake.judge()
+    frozen = parts.engine.intake.liveness.frozen
+    assert np.flatnonzero(~frozen[:24]).tolist() == [5, 16 + 3]
+
+
+@pytest.mark.parametrize("eager", [False, True])
+def test_a_chip_that_reported_an_error_in_one_sweep_is_invalid_until_its_bytes_change(
+    eager: bool,
+) -> None:
+    """And is so whether that is judged at once or when the next sweep comes."""
+    parts = intake()
+    sent = [(1, 0), (2, 0), (2, 0), (None, 0), (None, 1), (None, 2), (None, 3), (None, 4)]
+    invalid = []
+    for turn, (erring, change) in enumerate(sent, start=1):
+        outer = sweep(OUTER, turn * PERIOD)
+        outer.raw[1] += change
+        if erring is not None:
+            outer.status[erring] = 2
+        (sample,) = parts.feed([outer, sweep(INNER, turn * PERIOD)])
+        invalid.append(np.flatnonzero(~sample.present.reshape(-1, 12).all(axis=1)).tolist())
+        if eager:
+            parts.engine.intake.judge()
+    assert invalid == [[1], [1, 2], [1, 2], [1, 2], [1, 2], [1, 2], [1, 2], [2]]
 
 
 def test_a_veto_makes_a_taxel_invalid_that_was_received() -> None:
@@ -214,12 +250,58 @@ def test_a_veto_makes_a_taxel_invalid_that_was_received() -> None:
     assert sample.received.all()
 
 
+def test_a_veto_holds_for_as_long_as_it_is_there_whatever_was_vetoed_before() -> None:
+    parts = intake()
+    for turn, pad in enumerate((5, 7, 7, 5, 190), start=1):
+        vetoed = np.zeros((16, 12), np.bool_)
+        vetoed.flat[pad] = True
+        parts.engine.intake.veto[0] = vetoed
+        (sample,) = parts.feed([sweep(OUTER, turn * PERIOD), sweep(INNER, turn * PERIOD)])
+        assert np.flatnonzero(~sample.present).tolist() == [pad]
+    erring = sweep(OUTER, 6 * PERIOD)
+    erring.status[2] = 2
+    (sample,) = parts.feed([erring, sweep(INNER, 6 * PERIOD)])
+    assert np.flatnonzero(~sample.present).tolist() == [*range(24, 36), 190]
+    assert np.flatnonzero(~sample.received).tolist() == [*range(24, 36)]
+    del parts.engine.intake.veto[0]
+    (sample,) = parts.feed([sweep(OUTER, 7 * PERIOD), sweep(INNER, 7 * PERIOD)])
+    assert np.flatnonzero(~sample.present).tolist() == [*range(24, 36)]
+
+
+def test_a_pad_that_its_board_marks_as_far_out_of_range_is_invalid_in_those_sweeps() -> None:
+    parts = intake()
+    for turn, pad in enumerate((3, 5, 5, 3, 0, 11), start=1):
+        outer = sweep(OUTER, turn * PERIOD)
+        outer.status[1] = 1 << 4 + pad
+        (sample,) = parts.feed([outer, sweep(INNER, turn * PERIOD)])
+        assert np.flatnonzero(~sample.present).tolist() == [12 + pad]
+
+
+def test_a_sample_in_progress_goes_on_with_changed_settings() -> None:
+    parts = intake()
+    assert parts.feed([sweep(OUTER, PERIOD, fill=230)]) == []
+    configuration, layout = skin()
+    parts.engine = Engine(configuration, layout, [1], after=parts.engine)
+    (sample,) = parts.feed([sweep(INNER, PERIOD + 3 * MS)])
+    assert sample.present.all()
+    assert (sample.raw[: 16 * 12] == 230).all()
+    assert sample.t_ns == PERIOD + 3 * MS
+
+
 def test_single_pads_far_below_zero_are_named_and_those_of_another_chip_are_not() -> None:
     raw = np.full((3, 12), 255, np.uint8)
     raw[0, 0] = 254
     far_pads = np.arange(12) < np.array([[6], [7], [0]])
     found = below_zero(raw, far_pads)
     assert np.argwhere(found).tolist() == [[0, pad] for pad in range(1, 6)]
+
+
+def test_pads_are_lifted_off_by_another_chip_if_two_are_or_one_among_seven_far_ones() -> None:
+    raw = np.zeros((4, 12), np.uint8)
+    raw[[0, 1, 2], 0] = 255
+    raw[2, 1] = 255
+    far_pads = np.arange(12) < np.array([[6], [7], [2], [12]])
+    assert lifted(raw, far_pads).tolist() == [False, True, True, False]
 
 
 def far(pads: int) -> int:

@@ -247,6 +247,25 @@ def test_nothing_shows_where_the_thermal_pad_is_at_an_end_of_its_scale(end: int)
     assert told[others].all()
 
 
+def test_of_triangles_without_compensation_only_the_end_of_a_pads_own_scale_hides_its_moves() -> (
+    None
+):
+    """They may be of a board whose other triangles are compensated."""
+    plain, compensated = Encoding(NO_GAIN, 2, NO_LOAD, False), Encoding(GAIN, 2, NO_LOAD, False)
+    repeats = Repeats([compensated, plain, compensated, plain])
+    before = np.full((4, 12), NO_LOAD, np.uint8)
+    before[:, THERMAL_TAXEL] = 255
+    repeats.step(before, np.ones((4, 12), bool), inside(before))
+    raw = before.copy()
+    raw[:, :3] -= 40
+    moved, told = repeats.step(raw, raw != before, inside(raw))
+    assert not told[[0, 2]].any()
+    assert not moved[[0, 2]].any()
+    for triangle in (1, 3):
+        assert np.flatnonzero(moved[triangle]).tolist() == [0, 1, 2]
+        assert np.flatnonzero(~told[triangle]).tolist() == [THERMAL_TAXEL]
+
+
 def test_a_stuck_pad_is_found_though_the_noise_of_the_thermal_pad_moves_its_byte() -> None:
     rng = np.random.default_rng(3)
     repeats = Repeats([Encoding(GAIN, 2, NO_LOAD, False)] * K)
