@@ -23,8 +23,9 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextvars import Context
 from datetime import UTC, datetime
-from heapq import heappop
+from heapq import heapify, heappop, heappush
 from typing import Any, Protocol, TypeVar, TypeVarTuple, Unpack
 
 T = TypeVar("T")
@@ -33,7 +34,7 @@ Ts = TypeVarTuple("Ts")
 NS_PER_S = 1_000_000_000
 #: Stepped time begins at a plausible time of day.
 EPOCH_NS = 1_700_000_000 * NS_PER_S
-#: A loop with more timers sorts out those that were cancelled, as asyncio's does.
+#: A loop with more cancelled timers sorts them out, as asyncio's does.
 MANY_TIMERS = 100
 #: A stepped loop without any timer waits this long at a time for a thread or for outside input.
 OUTSIDE_S = 0.01
@@ -177,6 +178,10 @@ class SteppedClock(Clock):
         """Move time on, as if the process had been stopped."""
         self._t_ns += round(seconds * NS_PER_S)
 
+    def jump(self, seconds: float) -> None:
+        """Move time on until a timer is surely due."""
+        self._t_ns += int(seconds * NS_PER_S) + 1
+
     def set(self, jump_s: float) -> None:
         """Set the time of day forward or back."""
         self._epoch_ns += round(jump_s * NS_PER_S)
@@ -198,43 +203,85 @@ class SteppedClock(Clock):
         return asyncio.Runner(loop_factory=lambda: _SteppedLoop(self))
 
 
+class _When(float):
+    """When a timer is due. Numbers are compared at less cost than asyncio's timers."""
+
+    __slots__ = ("timer",)
+    timer: Any
+
+
 class _SteppedLoop(asyncio.SelectorEventLoop):
-    """An event loop whose time is a stepped clock's."""
+    """An event loop whose time is a stepped clock's, and that wakes up at little cost."""
 
     def __init__(self, clock: SteppedClock) -> None:
         super().__init__(_Jumping(clock))
         # Asked for several times in each turn.
         self.time = clock.monotonic_s  # type: ignore[method-assign]
         self._clock = clock
+        #: The timers that are set, a heap.
+        self._timers: list[_When] = []
+        self._n_cancelled = 0
         #: The same with what asyncio's types do not declare.
         self._own: Any = self
 
+    def call_at(
+        self,
+        when: float,
+        callback: Callable[[Unpack[Ts]], object],
+        *args: *Ts,
+        context: Context | None = None,
+    ) -> asyncio.TimerHandle:
+        timer: Any = asyncio.TimerHandle(when, callback, args, self, context)
+        timer._scheduled = True
+        at = _When(when)
+        at.timer = timer
+        heappush(self._timers, at)
+        return timer  # type: ignore[no-any-return]
+
+    def call_later(
+        self,
+        delay: float,
+        callback: Callable[[Unpack[Ts]], object],
+        *args: *Ts,
+        context: Context | None = None,
+    ) -> asyncio.TimerHandle:
+        return self.call_at(self.time() + delay, callback, *args, context=context)
+
+    def _timer_handle_cancelled(self, timer: Any) -> None:
+        self._n_cancelled += timer._scheduled
+
     def _run_once(self) -> None:
         """One turn, as asyncio's; where nothing but timers can come, without asking the system."""
-        own = self._own
-        timers, ready = own._scheduled, own._ready
-        is_plain = len(own._selector._fd_to_key) <= 1 and not (own._stopping or own._debug)
-        if not is_plain or not (timers or ready) or len(timers) > MANY_TIMERS:
-            super()._run_once()  # type: ignore[misc]
-            return
-        while timers and timers[0]._cancelled:
-            own._timer_cancelled_count -= 1
-            heappop(timers)._scheduled = False
+        own, ready = self._own, self._own._ready
+        timers = self._timers
+        if len(timers) > MANY_TIMERS and 2 * self._n_cancelled > len(timers):
+            timers[:] = [when for when in timers if not when.timer._cancelled]
+            heapify(timers)
+            self._n_cancelled = 0
+        while timers and timers[0].timer._cancelled:
+            heappop(timers)
+            self._n_cancelled -= 1
+        wait_s = timers[0] - self.time() if timers and not ready else 0.0
+        if len(own._selector._fd_to_key) > 1 or not (timers or ready) or own._stopping:
+            is_idle = not (ready or own._stopping)
+            longest_s = max(wait_s, 0.0) if timers else None
+            own._process_events(own._selector.select(longest_s if is_idle else 0.0))
+        elif wait_s > 0:
+            self._clock.jump(wait_s)
         if timers:
-            now_s = self.time()
-            wait_s = timers[0]._when - now_s
-            if not ready and wait_s > 0:
-                self._clock._t_ns += int(wait_s * NS_PER_S) + 1
-                now_s = self.time()
-            end_s = now_s + own._clock_resolution
-            while timers and timers[0]._when < end_s:
-                timer = heappop(timers)
+            end_s = self.time() + own._clock_resolution
+            while timers and timers[0] < end_s:
+                timer = heappop(timers).timer
                 timer._scheduled = False
                 ready.append(timer)
         for _ in range(len(ready)):
             handle = ready.popleft()
             if not handle._cancelled:
                 handle._run()
+
+    def close(self) -> None:
+        self._timers.clear()
+        super().close()
 
     def run_in_executor(  # type: ignore[override]
         self, executor: Any, func: Any, *args: Any
@@ -264,7 +311,7 @@ class _Jumping(selectors.DefaultSelector):
             return ready
         if timeout is None:
             return super().select(OUTSIDE_S)
-        self._clock._t_ns += int(timeout * NS_PER_S) + 1
+        self._clock.jump(timeout)
         return ready
 
 
