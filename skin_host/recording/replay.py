@@ -9,32 +9,24 @@ files; a cluster's workers must find them under the same absolute paths.
 import os
 import signal
 import sys
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
-
-import msgspec
-import numpy as np
 
 from skin_host.bus.logs import WINDOW_NS, read_channels
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import Settings, skin_hash
 from skin_host.errors import LogError, RequestError, SkinError, required
 from skin_host.files import whole_file
-from skin_host.fingertip.events import FingertipEvent
 from skin_host.health import HealthWatch
 from skin_host.layout import Layout, load_skin
-from skin_host.mqtt.messages import encode_event, health_keys
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration
 from skin_host.processing.core import Engine, Output, Step
-from skin_host.processing.events import KPA_DECIMALS
-from skin_host.processing.pipeline import PressureFrame
 from skin_host.recording import MCAP_SUFFIX
+from skin_host.recording.lines import LineWriter, health_line
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -45,58 +37,6 @@ UNTOUCHED_S = 5.0
 SCHEDULER_S = 10.0
 #: The frames of an only bus are in the recording's order, however long its batches are.
 LONG_WINDOW_NS = 200_000_000
-#: Written at a time: a frame of some hundred taxels has several thousand bytes.
-_BUFFER_BYTES = 1 << 18
-_encoder = msgspec.json.Encoder()
-
-
-def frame_line(frame: PressureFrame) -> bytes:
-    """Write a frame as a line: arrays of all taxels, kPa with three decimals."""
-    # Adding 0 turns a rounded -0.0 into 0.0.
-    pressure = frame.pressure_kpa.astype(np.float64).round(KPA_DECIMALS) + 0.0
-    return _line(
-        "frame",
-        {
-            "part": frame.part,
-            "seq": frame.seq,
-            "t_ns": frame.t_ns,
-            "raw": frame.raw.tolist(),
-            "pressure_kpa": pressure.tolist(),
-            "touched": _flags(frame.touched.tobytes()),
-            "valid": _flags(frame.valid.tobytes()),
-        },
-    )
-
-
-@lru_cache(maxsize=64)
-def _flags(bits: bytes) -> msgspec.Raw:
-    """A mask, given as its bytes, in JSON: that of most frames is that of the frame before."""
-    return msgspec.Raw(_encoder.encode(np.frombuffer(bits, np.bool_).tolist()))
-
-
-def health_line(record: Any) -> bytes:
-    """Write a health record as a line: the payload as published, and its type."""
-    return _line("health", health_keys(record))
-
-
-class EventLines:
-    """Events as lines: the payload as published, and its type; numbered."""
-
-    def __init__(self) -> None:
-        self._counts: Counter[tuple[str, type]] = Counter()
-
-    def line(self, event: FingertipEvent) -> bytes:
-        """A touch, slip, or excess as a line."""
-        key = event.part, type(event)
-        self._counts[key] += 1
-        count = self._counts[key]
-        kind = type(event).__name__.lower()
-        # The message has keys of its own, so a comma follows the type.
-        return b'{"type":"%b",%b\n' % (kind.encode(), encode_event(event, count)[1:])
-
-
-def _line(kind: str, keys: dict[str, Any]) -> bytes:
-    return _encoder.encode({"type": kind} | keys) + b"\n"
 
 
 def read_buses(
@@ -241,16 +181,16 @@ def write_lines(
         LogError: the recording cannot be read, or ends with damage.
     """
     health = HealthWatch(engine)
-    lines = EventLines()
+    lines = LineWriter(output)
     number = 0
-    for result in replay(log, engine):
-        health.note(result)
-        for step in result.steps:
-            output.write(frame_line(step.frame))
-            output.writelines(map(lines.line, step.events))
-        output.writelines(map(lines.line, result.grasps))
-        number += len(result.steps)
-        progress(number)
+    try:
+        for result in replay(log, engine):
+            health.note(result)
+            lines.write(result)
+            number += len(result.steps)
+            progress(number)
+    finally:
+        lines.flush()
     for part in engine.parts:
         output.write(health_line(health.replayed(part)))
     if engine.fingertips is not None:
@@ -272,7 +212,7 @@ def process(task: Task, progress: Callable[[int], None] = lambda _: None) -> int
     engine = Engine(settings, layout, list(range(len(layout.parts))), found)
     if task.output is None:
         return write_lines(task.log, engine, sys.stdout.buffer, progress)
-    with whole_file(task.output) as growing, growing.open("wb", _BUFFER_BYTES) as output:
+    with whole_file(task.output) as growing, growing.open("wb") as output:
         return write_lines(task.log, engine, output, progress)
 
 
