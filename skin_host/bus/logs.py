@@ -11,7 +11,6 @@ only for them and for the other formats: that takes longer than ten seconds of a
 """
 
 import contextlib
-import gzip
 import io
 import re
 from bisect import bisect_left
@@ -35,7 +34,7 @@ WINDOW_NS = 4_000_000
 #: Frames that are read one by one make a block of so many.
 _BLOCK = 4096
 #: Number of bytes that are read at a time.
-BLOCK_BYTES = 1 << 20
+BLOCK_BYTES = 1 << 19
 #: Longer lines are damage.
 _LONGEST_LINE = 1 << 16
 #: Lines of this length and more are decoded one by one.
@@ -368,6 +367,8 @@ def _blocks(path: Path) -> Generator[Block, None, None]:
         with path.open("rb") as file:
             yield from read_blocks(file, _frame)
     elif suffixes[-2:] == [".log", ".gz"]:
+        import gzip
+
         with gzip.open(path) as zipped:
             yield from read_blocks(cast(BinaryIO, zipped), _frame)
     else:
@@ -392,6 +393,8 @@ class _Lines(io.TextIOWrapper):
 
 def _reader(path: Path) -> "can.io.generic.MessageReader":
     """python-can's reader, which would read a line of any length and a container of any size."""
+    import gzip
+
     import can
 
     from skin_host.bus.blf import BoundedBlfReader

@@ -1,6 +1,7 @@
 """Commands that work on files: check, replay, import."""
 
 import argparse
+import gc
 import sys
 from pathlib import Path
 
@@ -108,6 +109,8 @@ def _replay(arguments: argparse.Namespace) -> int:
         raise RequestError("the following arguments are required: --config")
     if len(arguments.logs) > 1 or arguments.scheduler is not None:
         return _replay_all(arguments)
+    # The collector looks through what is imported again and again, and finds nothing.
+    gc.set_threshold(100_000)
     from skin_host.recording.replay import Task, process
 
     (log,) = arguments.logs

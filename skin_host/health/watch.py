@@ -102,7 +102,7 @@ class PartWatch:
 
     def _note_lost(self, frame: PressureFrame) -> None:
         # Where nothing was received there is 0. A sample of nothing reports silence.
-        if b"\0" not in frame.raw.tobytes() or not frame.raw.any() or self.valid is None:
+        if 0 not in frame.raw.tobytes() or not frame.raw.any() or self.valid is None:
             self.lost = self.late = None
             return
         lost = np.logical_not(frame.raw.reshape(-1, TAXELS_PER_TRIANGLE).any(axis=1))

@@ -228,7 +228,7 @@ class Liveness:
         if not whole:
             changed &= compared[:, None]
         text = (raw if self._rows is None else raw.take(self._rows, 0)).tobytes()
-        all_inside = b"\0" not in text and b"\xff" not in text
+        all_inside = 0 not in text and 255 not in text
         self._note_jumps(raw, changed, compared, whole)
         felt = None if touched is None else self._what_is_felt(touched)
         self._note_triangles(raw, compared, erring, felt, whole, all_inside)

@@ -390,7 +390,7 @@ class _PartPipeline:
             self._skipped += 1
             return self._frame(t_ns, raw, valid, self._zeros, self._nowhere, self._nowhere, False)
         self._since_glance_s = 0.0
-        cut_off = b"\xff" in self._last_raw.tobytes()
+        cut_off = 255 in self._last_raw.tobytes()
         beyond = self._beyond(cut_off) if cut_off or not (idle and quiet) else self._nowhere
         corrected, pressure = self._pressures(beyond, touched, dt_s)
         self._gather(touched, dt_s)
@@ -465,7 +465,7 @@ class _PartPipeline:
     def _receive(self, raw: NDArray[np.uint8], present: Mask) -> Mask:
         """Take in the bytes; return which are valid."""
         received = present.tobytes()
-        if b"\0" not in received:
+        if 0 not in received:
             self._last_raw = raw
             return self._always_valid
         if received != self._received:
@@ -806,7 +806,7 @@ class _OwnCurves:
     def without_rails(self, raw: NDArray[np.uint8], present: Mask, offset: Floats) -> Mask:
         """Leave out bytes at the ends of the range: 0, and 255 far from rest, are not readings."""
         data = raw.tobytes()
-        if b"\0" not in data and b"\xff" not in data:
+        if 0 not in data and 255 not in data:
             return present
         rail = (raw == 0) | ((raw == 255) & (offset < RESTING_NEAR_RAIL))
         left: Mask = present & ~(rail & self._own)

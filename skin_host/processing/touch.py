@@ -240,7 +240,7 @@ class TouchDetector:
         bits = self._over.tobytes()
         if bits != self._bits:
             self._bits = bits
-            self.any = bits.find(1) >= 0
+            self.any = 1 in bits
             self.touched = self._over.copy()
             self._set_limits()
         self._clear = False
@@ -263,7 +263,7 @@ class TouchDetector:
         self.touched[taxels] = False
         self._evidence[taxels] = 0.0
         self._bits = self.touched.tobytes()
-        self.any = self._bits.find(1) >= 0
+        self.any = 1 in self._bits
         self._set_limits()
 
     def _set_limits(self) -> None:
