@@ -53,8 +53,7 @@ def frame_lines(frames: Sequence[PressureFrame]) -> list[bytes]:
     else:
         word = 2 * _WORD
         kpas = [
-            _text(kpa[begin * word : end * word])
-            for begin, end in zip(begins, ends, strict=True)
+            _text(kpa[begin * word : end * word]) for begin, end in zip(begins, ends, strict=True)
         ]
     return [
         b'{"type":"frame","part":%b,"seq":%d,"t_ns":%d,"raw":[%b],"pressure_kpa":[%b],'

@@ -17,10 +17,11 @@ from tests.support.said import make_event, make_frame
 
 def test_a_line_of_a_frame_holds_every_taxel() -> None:
     frame = make_frame([0.12345, -0.0001], valid=np.array([True, False]))
-    assert frame_lines([frame]) == [
+    (line,) = frame_lines([frame])
+    assert line == (
         b'{"type":"frame","part":"palm","seq":7,"t_ns":1763700000123456789,"raw":[0,1],'
         b'"pressure_kpa":[0.123,0.0],"touched":[false,false],"valid":[true,false]}\n'
-    ]
+    )
 
 
 def _plainly(frame: PressureFrame) -> bytes:
