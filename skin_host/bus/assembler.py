@@ -28,7 +28,6 @@ from skin_host.bus.wire import (
     TAXELS,
     TRIANGLES,
     VALUES_A,
-    Bytes,
     FrameBatch,
     MessageClass,
     Records,
@@ -47,8 +46,6 @@ _BOTH = 1 << TRIANGLES | 1
 #: The bytes of a frame after its header.
 _PAYLOAD = 7
 _NOTHING = bytes(_PAYLOAD)
-_HALF = np.dtype((np.uint8, _PAYLOAD))
-_SWEEP = 2 * TRIANGLES * _PAYLOAD
 _NO_STATUS = bytes(2 * TRIANGLES)
 _ALL_TRIANGLES = (1 << TRIANGLES) - 1
 #: The status words of a sweep without any.
@@ -144,7 +141,6 @@ class _Order(NamedTuple):
     Attributes:
         heads: of all frames, `HEAD_BYTES` each.
         places: of each frame, its place among the board's values.
-        rows: the same as an array, or None if they rise from 0 by 1.
         missing: masks of the halves that are missing before each frame, and after the last.
         keys: what of the heads identifies the frames: identifier, DLC, and the data's header.
         triangles: those that it sends, in rising order; None for all.
@@ -155,7 +151,6 @@ class _Order(NamedTuple):
 
     heads: bytes
     places: list[int]
-    rows: NDArray[np.intp] | None
     missing: list[int]
     keys: bytes
     triangles: NDArray[np.intp] | None
@@ -163,13 +158,10 @@ class _Order(NamedTuple):
 
     @classmethod
     def of(cls, heads: Sequence[bytes], places: Sequence[int], missing: Sequence[int]) -> "_Order":
-        n = len(places)
-        rows = None if list(places) == list(range(n)) else np.array(places, np.intp)
         triangles = np.array(sorted({place // 2 for place in places}), np.intp)
         return cls(
             b"".join(heads),
             list(places),
-            rows,
             [*missing, 0],
             b"".join(head[:_PAD_AT] + head[-1:] for head in heads),
             None if len(triangles) == TRIANGLES else triangles,
@@ -212,6 +204,8 @@ class _BoardState:
         lone: halves of the last sweep of which the other has not come.
         done: frames of the sweep that came in this order; the next has the place `expected`, which
             is -1 while runs are not looked for.
+        begun: the frames so far, as records, of a sweep that batches divide and that came in this
+            order from its first frame; their payloads are not among `values` yet.
         stray: sweeps in succession with frames in another order.
         learn_after: so many sweeps pass before the order is learnt.
     """
@@ -238,8 +232,17 @@ class _BoardState:
     came: list[tuple[bytes, int, int]] | None = None
     done: int = 0
     expected: int = -1
+    begun: bytes = b""
     stray: int = 0
     learn_after: int = 1
+
+    def unpack(self) -> None:
+        """Take the payloads of the frames in `begun`."""
+        if self.order is not None and self.begun:
+            size = len(self.begun) // self.done
+            for number, place in enumerate(self.order.places[: self.done], 1):
+                self.values[place] = self.begun[number * size - _PAYLOAD : number * size]
+        self.begun = b""
 
 
 class Assembler:
@@ -275,6 +278,8 @@ class Assembler:
         self._slots: dict[int, tuple[_BoardState, int, int]] = {}
         #: By the head of the frame with which they usually begin a sweep: boards of known order.
         self._first: dict[bytes, _BoardState] = {}
+        #: The board whose sweep in known order the last batch has cut.
+        self._cut: _BoardState | None = None
         #: No sweep in progress is too old up to here, on the clock of the frames.
         self._none_old_until_ns = -(1 << 62)
         for index, board in boards:
@@ -301,13 +306,13 @@ class Assembler:
         sweeps: list[Sweep] = []
         answers: list[tuple[int, bytes]] = []
         motors: list[int] = []
-        n = len(batch)
-        if not n:
+        if not batch:
             return Assembled(sweeps, answers)
-        self.counters.frames += n
         slots = self._slots
         records = batch.records()
         octets, form, head_at = records
+        n = len(octets)
+        self.counters.frames += n
         text = octets.tobytes()
         size = form.size
         heads = b""
@@ -315,13 +320,18 @@ class Assembler:
         at = 0
         while at < n:
             if rising:
-                begin = at * size + head_at
-                known = self._first.get(text[begin : begin + HEAD_BYTES])
-                if known is not None:
-                    taken = self._take_sweep(known, records, text, at, sweeps)
-                    if taken:
-                        at += taken
-                        continue
+                taken = 0
+                cut, self._cut = self._cut, None
+                if cut is not None:
+                    taken = self._take_sweep(cut, records, text, at, sweeps)
+                if not taken:
+                    begin = at * size + head_at
+                    known = self._first.get(text[begin : begin + HEAD_BYTES])
+                    if known is not None:
+                        taken = self._take_sweep(known, records, text, at, sweeps)
+                if taken:
+                    at += taken
+                    continue
             if not heads:
                 heads = octets[:, head_at : head_at + HEAD_BYTES].tobytes()
             left = form.iter_unpack(memoryview(text)[at * size :])
@@ -340,6 +350,8 @@ class Assembler:
                     # Old firmware sends no status; the bytes after the DLC are not defined.
                     payload = payload[: TAXELS - VALUES_A] + b"\0\0"  # noqa: PLW2901
                 state, place, bit = slot
+                if state.begun:
+                    state.unpack()
                 if place == state.expected and rising:
                     taken = self._take_run(state, records, heads, at - 1, sweeps)
                     if taken:
@@ -452,9 +464,11 @@ class Assembler:
     def _take_sweep(
         self, state: _BoardState, records: Records, text: bytes, at: int, sweeps: list[Sweep]
     ) -> int:
-        """Take a whole sweep that begins at `at` in the board's order; return its frames' number.
+        """Take frames of a sweep that begins at `at` in the board's order, or continues after the
+        frames in `begun`, up to its end or that of the batch; return their number.
 
-        It is taken if the sweep before was whole, too, and no frame would need a closer look alone.
+        They are taken if the sweep before was whole, too, and no frame would need a closer look
+        alone.
 
         Args:
             state: of the board.
@@ -464,39 +478,65 @@ class Assembler:
             sweeps: what is extended by the sweep.
         """
         order = state.order
-        if (
-            order is None
-            or state.missing
-            or state.sent != state.awaited
-            or order.missing[0] != state.awaited
-        ):
+        if order is None:
             return 0
         octets, form, head = records
         places, size = order.places, form.size
-        n = len(places)
+        done = state.done if state.begun else 0
+        n = len(places) - done
         begin, end = at * size, (at + n) * size
         if end > len(text):
-            return 0
-        seconds, nanoseconds, *_ = form.unpack_from(text, begin)
-        first_ns = seconds * NS_PER_S + nanoseconds
+            end = len(text)
+            n = end // size - at
         seconds, nanoseconds, _, _, _, payload = form.unpack_from(text, end - size)
         last_ns = seconds * NS_PER_S + nanoseconds
-        if (
-            last_ns - first_ns > min(state.pause_ns, state.close_ns)
-            or 0 < 2 * (first_ns - state.sent_first_ns) < state.period_ns
-            or state.last_place == places[0]
-        ):
-            return 0
+        if done:
+            if last_ns > state.certain_until_ns or len(state.begun) != done * size:
+                return 0
+            first_ns = state.first_ns
+        else:
+            seconds, nanoseconds, *_ = form.unpack_from(text, begin)
+            first_ns = seconds * NS_PER_S + nanoseconds
+            if (
+                state.missing
+                or state.sent != state.awaited
+                or order.missing[0] != state.awaited
+                or last_ns - first_ns > min(state.pause_ns, state.close_ns)
+                or 0 < 2 * (first_ns - state.sent_first_ns) < state.period_ns
+                or state.last_place == places[0]
+            ):
+                return 0
+        if done + n < len(places):
+            heads = octets[at:, head : head + HEAD_BYTES].tobytes()
+            if heads != order.heads[done * HEAD_BYTES : (done + n) * HEAD_BYTES]:
+                return 0
+            if not done:
+                if first_ns > self._none_old_until_ns:
+                    self._close_old(first_ns, sweeps)
+                state.first_ns = first_ns
+                state.certain_until_ns = first_ns + min(state.pause_ns, state.close_ns)
+            done += n
+            state.begun += text[begin:]
+            state.done, state.expected = done, places[done]
+            state.missing = order.missing[done]
+            state.last_place, state.last_ns = places[done - 1], last_ns
+            state.stray = 0
+            self._cut = state
+            return n
+        if done:
+            frames = np.frombuffer(state.begun + text[begin:end], np.uint8)
+        else:
+            frames = np.frombuffer(text, np.uint8, end - begin, begin)
         # One call of numpy for all that is needed of the frames.
-        got = octets.reshape(-1)[begin:end][order.gather(size, head)]
+        got = frames[order.gather(size, head)]
         line = got.tobytes()
         if not line.startswith(order.keys):
             return 0
-        values = len(order.keys)
-        raw = got[values : values + n // 2 * TAXELS].reshape(-1, TAXELS)
+        n_values, values = len(places) // 2 * TAXELS, len(order.keys)
+        raw = got[values : values + n_values].reshape(-1, TAXELS)
         status = NO_STATUS
-        if not line.endswith(_NO_STATUS[:n]):
-            status = got[-n:].view(">u2").astype(np.uint16)
+        if not line.endswith(_NO_STATUS[: len(places)]):
+            status = got[-len(places) :].view(">u2").astype(np.uint16)
         if order.triangles is not None:
             raw = _spread(raw, order.triangles)
             if status is not NO_STATUS:
@@ -504,7 +544,9 @@ class Assembler:
         state.values[places[-1]] = payload
         state.last_place = places[-1]
         state.stray = 0
-        if first_ns > self._none_old_until_ns:
+        if done:
+            state.begun, state.missing, state.expected = b"", 0, -1
+        elif first_ns > self._none_old_until_ns:
             self._close_old(first_ns, sweeps)
         missed = self._count_sweep(state, last_ns)
         if state.any_absent:
@@ -544,18 +586,8 @@ class Assembler:
             return 0
         payload = records.octets[at : at + n, records.head + HEAD_BYTES : size].tobytes()
         places = order.places[done : done + n]
-        whole = None
-        if n == len(order.places) - 1:
-            payload = state.values[order.places[0]] + payload
-            if order.rows is None:
-                whole = np.frombuffer(bytearray(payload.ljust(_SWEEP, b"\0")), np.uint8)
-            else:
-                whole = np.zeros((2 * TRIANGLES, _PAYLOAD), np.uint8)
-                whole[order.rows] = np.frombuffer(payload, _HALF)
-            state.values[places[-1]] = payload[-_PAYLOAD:]
-        else:
-            for number, place in enumerate(places):
-                state.values[place] = payload[number * _PAYLOAD : (number + 1) * _PAYLOAD]
+        for number, place in enumerate(places):
+            state.values[place] = payload[number * _PAYLOAD : (number + 1) * _PAYLOAD]
         done += n
         state.last_place = places[-1]
         state.last_ns = t_ns
@@ -564,7 +596,7 @@ class Assembler:
         if state.missing:
             state.done, state.expected = done, order.places[done]
         else:
-            self._close(state, sweeps, whole)
+            self._close(state, sweeps)
         return n
 
     @staticmethod
@@ -629,13 +661,14 @@ class Assembler:
         self.counters.halves += state.lone.bit_count()
         state.lone = 0
 
-    def _close(self, state: _BoardState, sweeps: list[Sweep], values: Bytes | None = None) -> None:
-        """End a sweep; `values` uint8[32 * 7] are given if they are not those of the state."""
+    def _close(self, state: _BoardState, sweeps: list[Sweep]) -> None:
+        """End a sweep."""
+        if state.begun:
+            state.unpack()
         got = state.awaited & ~state.missing
         present = got & got >> TRIANGLES
         missed = self._count_sweep(state, state.last_ns)
-        if values is None:
-            values = np.frombuffer(bytearray().join(state.values), np.uint8)
+        values = np.frombuffer(bytearray().join(state.values), np.uint8)
         triangles = values.reshape(TRIANGLES, 2 * _PAYLOAD)
         if state.expected >= 0:
             # The second frame of the known order came first, or not at all.
