@@ -144,6 +144,8 @@ class Intake:
         self._none = np.zeros(n * TRIANGLES, np.bool_)
         self._erring: dict[int, NDArray[np.uint8]] = {}
         self._felt: dict[int, Mask] = {}
+        #: What it was at the last judgement with any, and the same over all boards.
+        self._felt_before: tuple[dict[int, Mask], Mask] = {}, np.zeros((0, PADS), np.bool_)
         self._encodings = _encodings(layout, boards)
         self.liveness = self._new_liveness(None)
         self._states = [self._new_state(part, silent_periods) for part in parts]
@@ -256,6 +258,7 @@ class Intake:
 
     def flush(self) -> list[PartSample]:
         """Return all samples in progress, at the end of a recording."""
+        self.liveness.catch_up()
         return [self._sample(state) for state in self._states if state.pending]
 
     def _valid(self, row: int, sweep: Sweep) -> tuple[Mask, Mask]:
@@ -344,11 +347,7 @@ class Intake:
         if not self._n_waiting:
             return
         waiting = self._waiting
-        felt: Mask | None = None
-        if self._felt:
-            felt = np.zeros((TRIANGLES * len(waiting), PADS), np.bool_)
-            for row, pads in self._felt.items():
-                felt[TRIANGLES * row : TRIANGLES * (row + 1)] = pads
+        felt = self._felt_by_all() if self._felt else None
         every = self._n_waiting == len(waiting)
         here = self._here if every else self._here & waiting[:, None]
         erring = self._none
@@ -367,6 +366,16 @@ class Intake:
         self._erring.clear()
         waiting[:] = False
         self._n_waiting = 0
+
+    def _felt_by_all(self) -> Mask:
+        """Return the touched pads of the sweeps that are judged, mostly those of the last time."""
+        felt, (before, found) = self._felt, self._felt_before
+        if len(felt) != len(before) or any(before.get(row) is not felt[row] for row in felt):
+            found = np.zeros((TRIANGLES * len(self._waiting), PADS), np.bool_)
+            for row, pads in felt.items():
+                found[TRIANGLES * row : TRIANGLES * (row + 1)] = pads
+            self._felt_before = felt.copy(), found
+        return found
 
     def _new_liveness(self, noise: NDArray[np.float64] | None) -> Liveness:
         boards = [self._layout.boards[board] for board in self._boards]

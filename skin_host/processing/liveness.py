@@ -19,6 +19,9 @@ fingertip for 19), so repeats count for less while the board feels a touch.
 
 Single pads are judged in `stuck`.
 
+Much of what a step costs is that its code is found cold. So a sweep by which no decision can change
+waits until the second or third one after it, and then they are taken one after the other.
+
 Only conversions count: a chip needs 36.9 ms for its twelve stages (AD7147, decimation 256),
 and a board that sends more often repeats its values.
 """
@@ -75,6 +78,8 @@ CALM_MEAN = 0.1
 NOISE_MEMORY_SAMPLES = 8
 #: A pad has jumped lately while that mean is above this: for some 25 samples.
 LATELY_MEAN = 0.01
+#: So many sweeps may wait where no step is far: a jump takes two far steps, and noise two jumps.
+MOST_WAITING = 2
 #: A spike is one sweep off by more than this many units, and this multiple of the noise, and back
 #: where it was but for the noise: a press after a release ends elsewhere. A spike of a pad that has
 #: jumped lately is a fault of the pad, not of the bus.
@@ -114,7 +119,8 @@ class Liveness:
         noisy: bool[k, 12], pads that jump up and down much more than when calibrated.
         doubted: bool[k, 12], pads that are not valid, or None if all are.
         spikes: int64[boards], how often a single pad of a triangle was off for one sweep and
-            back in the next: a damaged frame does that, a sensor does not.
+            back in the next: a damaged frame does that, a sensor does not. Those of sweeps that
+            wait are not counted yet.
     """
 
     def __init__(
@@ -141,6 +147,8 @@ class Liveness:
         self._repeats = repeats
         self._pads = StuckPads(noise_units, self._share, period_s, repeats, boards, fitted)
         fitted = np.ones(k, np.bool_) if fitted is None else fitted
+        self._every = fitted.copy()
+        self._none = np.zeros(k, np.bool_)
         self._fitted = fitted.tobytes()
         self._rows = None if all_of(fitted) else np.flatnonzero(fitted)
         self._rate: Floats = np.minimum(change_rate(noise_units), MOST_RATE)
@@ -192,6 +200,9 @@ class Liveness:
         self._any_noisy = False
         self.doubted: Mask | None = None
         self.spikes = np.zeros(boards, np.int64)
+        #: Sweeps of all boards that wait, with the touched pads; and how many may wait.
+        self._waiting: list[tuple[NDArray[np.uint8], Mask | None]] = []
+        self._room = 0
         self._pad_expected = np.zeros(shape)
         self._expected = np.zeros(k)
         self._renew_limits(slice(None))
@@ -220,6 +231,47 @@ class Liveness:
             came: bool[boards], boards whose sweep this is, all by default. Nothing of the others is
                 present.
         """
+        if (
+            len(self._waiting) < self._room
+            and came is None
+            and present.tobytes() == self._fitted
+            and not any_of(erring)
+        ):
+            self._waiting.append((raw.copy(), touched))
+            return
+        self.catch_up()
+        self._take(raw, present, erring, touched, came)
+        self._room = self._room_left()
+
+    def catch_up(self) -> None:
+        """Take the sweeps that wait."""
+        for raw, touched in self._waiting:
+            self._take(raw, self._every, self._none, touched, None)
+        self._waiting.clear()
+        self._room = 0
+
+    def _room_left(self) -> int:
+        """Return how many sweeps of all boards may now wait: whatever they are, if no status word
+        has an error, none of them causes a doubt.
+        """
+        if self.doubted is not None or self._any_jumping or not self._all_present:
+            return 0
+        calm = self._knows_far and not any_of(self._was_far)
+        room = min(MOST_WAITING if calm else 1, self._pads.steps_without_decision)
+        if room > 0 and self._any_surprise:
+            most = float((self._surprise + room * self._expected).max())
+            return room if most < math.log(TRIANGLE_ODDS) else 0
+        return room
+
+    def _take(
+        self,
+        raw: NDArray[np.uint8],
+        present: Mask,
+        erring: Mask,
+        touched: Mask | None,
+        came: Mask | None,
+    ) -> None:
+        """Take one sweep; see `step`."""
         #: Usually every triangle came, now and before.
         all_present = present.tobytes() == self._fitted
         whole = all_present and self._all_present
@@ -262,6 +314,7 @@ class Liveness:
 
     def note_gap(self, board: int) -> None:
         """Sweeps of a board (its row) were lost: the next step does not follow the last one."""
+        self.catch_up()
         self._settle_step()
         self._knows_far = False
         triangles = len(self._step) // self._boards
@@ -294,6 +347,7 @@ class Liveness:
 
     def _settle(self) -> None:
         """Compute what was left until somebody needs it."""
+        self.catch_up()
         self._pads.settle()
         self._knows_far = False
         self._settle_step()

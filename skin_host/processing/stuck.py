@@ -395,6 +395,11 @@ class StuckPads:
         self.stuck = self._to_show > 0
         self.any_stuck = any_of(self.stuck)
 
+    @property
+    def steps_without_decision(self) -> int:
+        """Return in how many more steps no pad can become stuck, and no rate is learnt."""
+        return 0 if self.any_stuck else min(self._slack, self._until_learning - 1)
+
     def settle(self) -> None:
         """Bring the arrays of state up to date."""
         if self._common_samples:

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skin_host.processing.liveness import CONVERSION_S, Liveness, change_rate
+from skin_host.processing.masks import Mask
 from skin_host.processing.stuck import longest_run
 
 K = 4
@@ -406,6 +407,7 @@ def test_what_changes_in_every_conversion_is_known_to_and_only_conversions_count
         for sweep in range(1 + 100 * sends_per_conversion):
             raw = np.full((K, 12), 200 + sweep // sends_per_conversion % 2, np.uint8)
             liveness.step(raw, HERE, NO)
+        liveness.catch_up()
         assert liveness._seen == pytest.approx(np.full(K, seen + 100.0))
         changes = 1 / sends_per_conversion
         for _ in range(20):
@@ -518,3 +520,56 @@ def test_after_an_error_repeats_count_from_nothing() -> None:
     for repeats in range(1, int(allowed) + 2):
         liveness.step(raw, HERE, NO)
         assert bool(liveness.frozen[0]) is bool(repeats > allowed)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.data())
+def test_sweeps_that_wait_change_no_decision_and_nothing_that_is_learnt(
+    data: st.DataObject,
+) -> None:
+    """Whether pads jump, stick, die, err, are touched or are not received."""
+    rng = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
+    harm = data.draw(st.sampled_from([0.0, 0.02, 0.1]))
+    k, boards = 6, 2
+    sigma = rng.uniform(0.15, 1.2, (k, 12))
+    centre = rng.uniform(235.0, 250.0, (k, 12))
+    waits, takes = (Liveness(k, sigma, 0.05, boards=boards) for _ in range(2))
+    takes._room_left = lambda: 0  # type: ignore[method-assign]
+    stuck, wild = np.zeros((k, 12), np.bool_), np.zeros((k, 12), np.bool_)
+    dead = np.zeros(k, np.bool_)
+    touched: Mask | None = None
+    raw = np.zeros((k, 12), np.uint8)
+    waited = 0
+    for _ in range(300):
+        if rng.random() < harm:
+            stuck = rng.random((k, 12)) < data.draw(st.sampled_from([0.0, 0.03]))
+            wild = rng.random((k, 12)) < data.draw(st.sampled_from([0.0, 0.1]))
+            dead = rng.random(k) < data.draw(st.sampled_from([0.0, 0.2]))
+            touched = rng.random((k, 12)) < 0.2 if rng.random() < 0.5 else None
+        noise = rng.normal(0.0, sigma) + wild * rng.choice([-12.0, 0.0, 12.0], (k, 12))
+        pressed = 0.0 if touched is None else 25.0 * rng.random() * touched
+        now = np.clip(np.rint(centre + noise - pressed), 0, 255).astype(np.uint8)
+        raw = np.where(stuck | dead[:, None], raw, now)
+        present, erring, came = np.ones(k, np.bool_), np.zeros(k, np.bool_), None
+        if rng.random() < harm:
+            erring = rng.random(k) < 0.2
+            present = ~erring & (rng.random(k) < 0.9)
+        if rng.random() < harm:
+            came = np.array([True, False])
+            present[k // boards :] = erring[k // boards :] = False
+        if rng.random() < harm:
+            board = int(rng.integers(boards))
+            for one in (waits, takes):
+                one.note_gap(board)
+        for one in (waits, takes):
+            one.step(raw, present, erring, touched, came)
+        waited += len(waits._waiting)
+        for name in ("frozen", "unproven", "silenced", "noisy", "stuck"):
+            assert np.array_equal(getattr(waits, name), getattr(takes, name)), name
+        assert (waits.doubted is None) == (takes.doubted is None)
+        assert waits.doubted is None or np.array_equal(waits.doubted, takes.doubted)
+    waits.catch_up()
+    assert np.array_equal(waits.spikes, takes.spikes)
+    assert np.array_equal(waits._rate, takes._rate)
+    assert np.array_equal(waits._pads.longest, takes._pads.longest)
+    assert waited or harm
