@@ -48,6 +48,10 @@ _INVALID = 255
 _HEX = np.full(256, _INVALID, np.uint8)
 _HEX[list(b"0123456789")] = range(10)
 _HEX[list(b"abcdef")] = _HEX[list(b"ABCDEF")] = range(10, 16)
+#: The octet of two digits as they lie in memory; more than 255 where one is none.
+_VALUE = np.where(_HEX == _INVALID, 1 << 8, _HEX.astype(np.uint16))
+_PAIRS = np.arange(1 << 16, dtype=np.uint16).view(np.uint8).reshape(-1, 2)
+_OCTET = _VALUE[_PAIRS[:, 0]] << 4 | _VALUE[_PAIRS[:, 1]]
 _NEWLINE = ord("\n")
 
 #: A classic frame as (identifier with flags, data, t_ns); None for any other message.
@@ -193,33 +197,42 @@ def _decode_alike(
         channel = code_of(str(int(name)) if name.isdigit() else name, names)  # as in python-can
         seconds, decimals, _, identifier, data = (slice(*found.span(i)) for i in range(1, 6))
         digits = np.concatenate((lines[:, seconds], lines[:, decimals]), axis=1) - ord("0")
-        nibbles = _HEX.take(np.concatenate((lines[:, identifier], lines[:, data]), axis=1))
+        nibbles = _HEX.take(lines[:, identifier])
+        octets = _OCTET.take(np.ascontiguousarray(lines[:, data]).view(np.uint16))
         fixed = np.ones(len(first), np.bool_)
         for varying in (seconds, decimals, identifier, data):
             fixed[varying] = False
-        fits = lines[:, fixed] == lines[0, fixed], digits < 10, nibbles != _INVALID
-        into, left = at, at[:0]
+        fits = (
+            lines[:, fixed] == lines[0, fixed],
+            digits < 10,
+            nibbles != _INVALID,
+            octets <= 255,
+        )
+        into: slice | NDArray[np.intp] = at if len(at) < len(rows.kind) else slice(None)
+        left = at[:0]
         # Whole arrays are looked through in a twentieth of the time that their rows take.
         if not all(flags.all() for flags in fits):
             alike = np.logical_and.reduce([flags.all(axis=1) for flags in fits])
-            digits, nibbles, into, left = digits[alike], nibbles[alike], at[alike], at[~alike]
-            lines = lines[~alike]
-        # In float64, which is exact for so few digits, products of matrices are much faster.
-        whole_s = _number(digits[:, : found.end(1) - found.start(1)])
-        microseconds = whole_s * 1_000_000 + _number(digits[:, found.end(1) - found.start(1) :])
-        octets = nibbles[:, 3::2] << 4 | nibbles[:, 4::2]
+            digits, nibbles, octets = digits[alike], nibbles[alike], octets[alike]
+            into, left, lines = at[alike], at[~alike], lines[~alike]
+        whole_s, micros = _numbers(digits, found.end(1) - found.start(1))
         rows.kind[into] = _FRAME
         rows.channel[into] = channel
-        rows.id[into] = nibbles[:, :3] @ np.array([256, 16, 1], np.uint32)
+        high, middle, low = nibbles.T.astype(np.uint32)
+        rows.id[into] = high << 8 | middle << 4 | low
         rows.dlc[into] = octets.shape[1]
         rows.data[into, : octets.shape[1]] = octets
-        rows.t_ns[into] = microseconds * 1000
+        rows.t_ns[into] = (whole_s * 1_000_000 + micros) * 1000
         at = left
 
 
-def _number(digits: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """The numbers int64[n] of up to 15 decimal digits [n, m]."""
-    return (digits @ 10.0 ** np.arange(digits.shape[1])[::-1]).astype(np.int64)
+def _numbers(digits: NDArray[np.uint8], n: int) -> NDArray[np.int64]:
+    """The numbers int64[2, k] of the first n and of the other digits [k, m], up to 15 each."""
+    place = np.zeros((digits.shape[1], 2))
+    place[:n, 0] = 10.0 ** np.arange(n)[::-1]
+    place[n:, 1] = 10.0 ** np.arange(len(place) - n)[::-1]
+    # In float64, which is exact for so few digits, products of matrices are much faster.
+    return (digits @ place).astype(np.int64).T
 
 
 def _decode_one(line: bytes, row: int, rows: _Rows, names: list[str], convert: Convert) -> None:
