@@ -124,7 +124,9 @@ class ContactTracker:
     def _grouping(self, frame: PressureFrame) -> "_Grouping":
         """Return the contacts of this frame, or those of the last frame if nothing has changed."""
         seen = frame.touched.tobytes()
-        if seen == self._seen and all_of(frame.valid.take(self._known.order)):
+        if seen == self._seen and (
+            all_of(frame.valid) or all_of(frame.valid.take(self._known.order))
+        ):
             return self._known
         touched = self._touched(frame)
         groups = self._patches.find(touched)
@@ -301,12 +303,11 @@ class ContactTracker:
         pressure = frame.pressure_kpa.take(order).astype(np.float64)
         weight = pressure * found.pad_mm2
         total = np.add.reduceat(weight, starts)
-        moment = np.add.reduceat(weight[:, None] * found.position_m, starts)
-        centroids = (moment / np.maximum(total, 1e-300)[:, None]).tolist()
+        moments = np.add.reduceat(weight[:, None] * found.position_m, starts).tolist()
         peaks = np.maximum.reduceat(pressure, starts).tolist()
         heard = all_heard = [True] * len(starts)
-        valid = frame.valid.take(order)
-        if not all_of(valid):
+        if not all_of(frame.valid):
+            valid = frame.valid.take(order)
             heard = np.logical_or.reduceat(valid, starts).tolist()
             all_heard = np.logical_and.reduceat(valid, starts).tolist()
         totals = total.tolist()
@@ -336,8 +337,9 @@ class ContactTracker:
                 if self._places is not None:
                     centroid, sigma = self._places.locate(index)
                 else:
-                    x, y, z = centroids[number]
-                    centroid = x, y, z
+                    x, y, z = moments[number]
+                    whole = totals[number]
+                    centroid = x / whole, y / whole, z / whole
                     # Noise adds little to the uncertainty from the coarse pads.
                     sigma = GEOMETRY_PITCHES * self._pitch_m / math.sqrt(len(index))
             if before is not None and not _worth_reporting(
