@@ -321,7 +321,7 @@ def _windows(
     batch: RecordBatch, channel: NDArray[np.uint16], window_ns: int
 ) -> Iterator[tuple[int, int]]:
     """Where windows begin and end: at the first frame that is too late for one, or too many."""
-    times = memoryview(batch.t_ns)  # unlike a list, it makes numbers only of those looked at
+    times = batch.t_ns.data  # unlike a list, it makes numbers only of those looked at
     n = len(times)
     rising = bool((np.diff(batch.t_ns) >= 0).all())
     begin = 0
