@@ -141,8 +141,10 @@ class Daemon:
         self._status_s = 0.0
         self._fault_log = FaultLog()
         self._keeping: asyncio.Task[None] | None = None
-        #: How many of the zeros found are kept.
+        #: How many of the zeros found are kept; and which change of what is known of zeros the
+        #: contacts know.
         self._zeros_kept = 0
+        self._zero_changes = self.engine.zero_changes
         self._clock_ahead_ns = self._clock_against_ns()
 
     async def run(self, stop: asyncio.Event, *, calibrate: bool = False) -> None:
@@ -367,6 +369,12 @@ class Daemon:
                     self.publisher.put_touch(event)
             self.health.note(output)
             self._follow_clock()
+            if self._zero_changes != self.engine.zero_changes:
+                # Something may press a pad whose zero was not found, did before it was held, or
+                # was zeroed away and has shown that when it lifted.
+                self._zero_changes = self.engine.zero_changes
+                at_risk = self.engine.zero_at_risk(touched=False)
+                self._doubt_contacts(at_risk, self.engine.parts)
             for step in output.steps:
                 state = self._contacts[step.part].step(step.frame, step.events)
                 self.publisher.put_contact(step.frame.part, state)
@@ -401,16 +409,15 @@ class Daemon:
         said_s = dict.fromkeys(self.engine.parts, 0.0)
         of_parts: dict[tuple[str, str], str] = {}
         pulse: tuple[object, ...] = ()
-        zeroed = 0, 0
+        zeroed = self.engine.zero_changes
         while True:
             await self.clock.sleep(LOOK_S)
             self.link.supervise()
             engine = self.engine
-            if zeroed != (zeroed := (int(engine.ledger.rezeros.sum()), engine.zeros_found)):
+            if zeroed != engine.zero_changes:
+                zeroed = engine.zero_changes
                 # At once: what was pressed then must be doubted after a crash, too.
                 self._begin_to_keep_zeros()
-                # Something may press a pad whose zero was not found, or did before it was held.
-                self._doubt_contacts(engine.zero_at_risk(touched=False), engine.parts)
             now_s = self.clock.monotonic_s()
             link = self.link
             self.health.tick(link.read_ns, link.ports, link.boards, link.longest_pause_ns())

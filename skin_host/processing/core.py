@@ -164,8 +164,9 @@ class Engine:
             receive.silent_periods,
             float(vertex(curve.a_kpa_per_ff2, curve.b_kpa_per_ff)),
         )
-        #: How often new zeros have been found.
+        #: How often new zeros have been found, and how often what is known of zeros has changed.
         self.zeros_found = 0
+        self.zero_changes = 0
         self._rezeros: dict[int, Rezero] = {}
         self._unanswered: dict[int, Mask] = {}
         #: For how many sweeps pads int64[16, 12] of a board have read far below zero, where any do.
@@ -208,6 +209,7 @@ class Engine:
         self._ended = after._ended
         self.disabled = after.disabled
         self.zeros_found = after.zeros_found
+        self.zero_changes = after.zero_changes
         self._rezeros = after._rezeros
         self._unanswered = after._unanswered
         self._below = after._below
@@ -420,6 +422,7 @@ class Engine:
         no_load = np.full(taxels.size, float(self.layout.boards[board].settings.no_load))
         self._rezeros[board] = Rezero(touched.ravel(), no_load, (taxels >= 0).ravel())
         self.intake.veto[self.ledger.row[board]] = np.ones((TRIANGLES, PADS), np.bool_)
+        self.zero_changes += 1
         return int(np.count_nonzero(touched))
 
     def doubt(self, taxels: Mask) -> None:
@@ -519,7 +522,10 @@ class Engine:
         if any_of(sure):
             if sweep.board not in self._rezeros:
                 self._rezeros[sweep.board] = Rezero.over(np.full(sure.size, no_load), sweep.t_ns)
-            self._rezeros[sweep.board].doubted |= sure.ravel()
+            doubted = self._rezeros[sweep.board].doubted
+            if any_of(sure.ravel() & ~doubted):
+                doubted |= sure.ravel()
+                self.zero_changes += 1
 
     def _find_zero(self, sweep: Sweep, row: int, rezero: Rezero) -> None:
         if self._pipeline is None or self.calibration is None:
@@ -533,6 +539,7 @@ class Engine:
             found, baseline = rezero.finish(baseline, self.calibration.noise[taxels])
             self._pipeline.set_zero(taxels[found], baseline[found])
             self.zeros_found += 1
+            self.zero_changes += 1
         if rezero.settled(sweep.t_ns):
             if sweep.board in self._releasing:
                 self._releasing.discard(sweep.board)

@@ -1,12 +1,16 @@
 """What is known of a board's zero: pads that were pressed when it was taken, and what looks so."""
 
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from skin_host.bus.wire import FrameBatch, encode_sweep
 from skin_host.config.settings import load
+from skin_host.daemon.daemon import Daemon
 from skin_host.layout import build_layout
-from skin_host.processing.core import Engine
+from skin_host.processing.core import Engine, Output
 from tests.support.stack import ROOT
 
 CONFIG = ROOT / "config" / "demo.toml"
@@ -26,6 +30,8 @@ class Hand:
         self._board = layout.boards[0]
         self._rng = np.random.default_rng(1)
         self._t_ns = 1_000_000_000
+        #: Takes the outputs.
+        self.deliver: Callable[[Output], None] = lambda output: None
         self.engine.begin_calibration(2.0)
         self.send(50)
         self.engine.use(self.engine.end_calibration("2026-01-01T00:00:00+00:00"))
@@ -45,7 +51,7 @@ class Hand:
             )
             self._t_ns += PERIOD_NS
             frames = [(int(i), bytes(d), self._t_ns) for i, d in zip(ids, data, strict=True)]
-            self.engine.feed(self._board.settings.bus, FrameBatch.of(frames))
+            self.deliver(self.engine.feed(self._board.settings.bus, FrameBatch.of(frames)))
 
     @property
     def in_doubt(self) -> list[int]:
@@ -77,3 +83,29 @@ def test_a_pad_in_doubt_that_is_pressed_again_and_again_does_not_jump(hand: Hand
     hand.send(1, p3=NO_LOAD)
     hand.send(10, p4=FAR_BELOW)
     assert hand.in_doubt == [3, 4]
+
+
+def test_a_part_is_not_off_when_a_pad_shows_that_it_was_pressed_when_zeroed(
+    hand: Hand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not with the next frame already: the other pads of its triangle are valid and untouched."""
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
+    settings, layout = load(CONFIG), hand.engine.layout
+    daemon = Daemon(settings, layout, calibration=hand.engine.calibration)
+    hand.engine, hand.deliver = daemon.engine, daemon._deliver
+    hand.engine.release(hand.engine.boards)
+    states: list[str] = []
+    monkeypatch.setattr(
+        daemon.publisher,
+        "put_contact",
+        lambda part, state: states.append(state) if part == "left_hand" else None,
+    )
+    hand.send(20)
+    assert states[-1] == "OFF"
+    hand.send(20, p3=FAR_BELOW)
+    assert hand.in_doubt == [3]
+    assert states[-1] == "UNKNOWN"
+    # As it was pressed when zeroed, it reads zero: nobody knows that it is untouched.
+    hand.send(20)
+    assert states[-1] == "UNKNOWN"
+    daemon.link.close()
