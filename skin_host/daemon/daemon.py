@@ -125,12 +125,10 @@ class Daemon:
         )
         self.publisher.put_info(self._info())
         self._contacts = {i: PartContact(layout, i) for i in self.engine.parts}
+        self._use_usable()
         for i in self.engine.parts:
-            part = layout.parts[i]
-            if calibration is not None:
-                self._contacts[i].use(calibration.usable[part.start : part.stop])
             # The state that the broker retained from an earlier start is no longer known.
-            self.publisher.put_contact(part.name, "UNKNOWN")
+            self.publisher.put_contact(layout.parts[i].name, "UNKNOWN")
         self._doubt_contacts(doubted, self.engine.parts)
         self.fingertips = FingertipPublisher(self.engine.fingertips, self.publisher)
         self.link = Link(self.engine, wait=True, open_port=open_port, clock=clock)
@@ -221,9 +219,7 @@ class Daemon:
                 )
             doubted = self.engine.zero_at_risk(touched=False)
             self.engine.use(found, boards)
-            for index, contact in self._contacts.items():
-                part = self.layout.parts[index]
-                contact.use(found.usable[part.start : part.stop])
+            self._use_usable()
             if known is not None and boards is not None:
                 # The other boards keep their zeros, whichever of the two a start finds.
                 await self._kept()
@@ -251,7 +247,7 @@ class Daemon:
         """Publish everything of a part again."""
         self.engine.disabled.discard(part)
         # A board may have been zeroed meanwhile while something pressed the part.
-        self._doubt_contacts(self.engine.zero_at_risk(touched=False), [part])
+        self._doubt_contacts(self.engine.may_be_touched(), [part])
 
     def set_thresholds(self, thresholds: Thresholds) -> None:
         """Apply these changes to the configured touch thresholds; baselines are kept."""
@@ -324,6 +320,15 @@ class Daemon:
         self.link.use(engine)
         self.health.use(engine)
 
+    def _use_usable(self) -> None:
+        """Let contacts wait only for taxels that can be valid again."""
+        calibration = self.engine.calibration
+        if calibration is not None:
+            usable = calibration.usable & ~self.engine.cut_off()
+            for index, contact in self._contacts.items():
+                part = self.layout.parts[index]
+                contact.use(usable[part.start : part.stop])
+
     def _doubt_contacts(self, taxels: NDArray[np.bool_], parts: list[int]) -> None:
         """Something may touch these taxels of some parts, bool[n], whose zero is not known."""
         for index in parts:
@@ -373,8 +378,8 @@ class Daemon:
                 # Something may press a pad whose zero was not found, did before it was held, or
                 # was zeroed away and has shown that when it lifted.
                 self._zero_changes = self.engine.zero_changes
-                at_risk = self.engine.zero_at_risk(touched=False)
-                self._doubt_contacts(at_risk, self.engine.parts)
+                self._use_usable()
+                self._doubt_contacts(self.engine.may_be_touched(), self.engine.parts)
             for step in output.steps:
                 state = self._contacts[step.part].step(step.frame, step.events)
                 self.publisher.put_contact(step.frame.part, state)

@@ -230,7 +230,7 @@ def _pulse_of_boards(engine: Engine) -> tuple[object, ...]:
         ledger.silent.tobytes(),
         (ledger.sweeps > 0).tobytes(),
         np.minimum(ledger.absent, ABSENT_SWEEPS).tobytes(),
-        engine.doubts(),
+        (engine.doubts(), engine.zero_changes),
         *(counts.tobytes() for counts in events),
     )
     if any(ledger.flagged):

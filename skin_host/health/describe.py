@@ -63,7 +63,7 @@ class Describer:
         #: they did not either, or which has not seen them.
         self._unproven_ns: dict[tuple[int, int], int] = {}
         #: For each part: a calibration, and its verdicts that are not "ok".
-        self._judged: dict[int, tuple[Calibration, dict[str, list[int]]]] = {}
+        self._judged: dict[int, tuple[Calibration, int, dict[str, list[int]]]] = {}
         #: For each part: the triangles that belong to it, by board.
         self._fitted: dict[int, dict[int, list[int]]] = {part: {} for part in engine.parts}
         for triangle in self._layout.triangles:
@@ -293,18 +293,21 @@ class Describer:
         calibration = self._engine.calibration
         if calibration is None:
             return {}
-        known = self._judged.get(part)
-        if known is None or known[0] is not calibration:
+        known, changes = self._judged.get(part), self._engine.zero_changes
+        if known is None or known[0] is not calibration or known[1] != changes:
             layout = self._layout.parts[part]
             mine = slice(layout.start, layout.stop)
-            verdict = np.where(pressure, calibration.verdict[mine], Verdict.OK)
+            # A set-up may leave a pad as near to the end of the scale as a calibration may find it.
+            cut_off = (self._engine.cut_off() & calibration.usable)[mine]
+            verdict = np.where(cut_off, Verdict.OUT_OF_RANGE, calibration.verdict[mine])
+            verdict = np.where(pressure, verdict, Verdict.OK)
             found = {
                 kind.name.lower(): np.flatnonzero(verdict == kind).tolist()
                 for kind in map(Verdict, sorted(set(verdict.tolist())))
                 if kind != Verdict.OK
             }
-            self._judged[part] = known = calibration, found
-        return known[1]
+            self._judged[part] = known = calibration, changes, found
+        return known[2]
 
     def _decides_kpa(self, part: int) -> float | None:
         """Return the pressure above which every usable taxel decides within a second."""

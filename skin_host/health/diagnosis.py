@@ -343,7 +343,7 @@ def _taxels(record: Record) -> Iterator[FoundFault]:
         yield fault(
             "taxel_refused",
             refused,
-            f"{reasons} when calibrated; not valid until a better calibration",
+            f"{reasons} when calibrated or set up; not valid until a better one",
         )
     if record["baseline_at_limit"]:
         yield fault(

@@ -25,7 +25,7 @@ from skin_host.processing.liveness import PADS
 from skin_host.processing.masks import Mask, any_of
 from skin_host.processing.pipeline import Pipeline, PressureFrame
 from skin_host.processing.pressure import PressureCurve, vertex
-from skin_host.processing.rezero import BELOW_SWEEPS, JUMPS_NS, Rezero
+from skin_host.processing.rezero import BELOW_SWEEPS, JUMPS_NS, Rezero, look_s
 
 if TYPE_CHECKING:
     from skin_host.fingertip.engine import FingertipEngine
@@ -392,8 +392,9 @@ class Engine:
     def rezero(self, board: int, believed: bool = True) -> int:
         """Find the new untouched readings after a board was zeroed.
 
-        For two seconds, longer for slow boards, none of its taxels is valid. Taxels that were
-        touched just before stay invalid until they are calibrated.
+        For two seconds, longer for slow boards, none of its taxels is valid, and noisy ones are not
+        for up to six. Taxels that were touched just before stay invalid until they are calibrated,
+        and those whose noise reaches the end of the scale until they are zeroed again.
 
         Args:
             board: its index.
@@ -419,8 +420,14 @@ class Engine:
         before = self._rezeros.get(board)
         if before is not None:
             touched |= before.doubted.reshape(TRIANGLES, PADS)
-        no_load = np.full(taxels.size, float(self.layout.boards[board].settings.no_load))
-        self._rezeros[board] = Rezero(touched.ravel(), no_load, (taxels >= 0).ravel())
+        own = self.layout.boards[board].settings
+        no_load = np.full(taxels.size, float(own.no_load))
+        wanted = None
+        if self._pipeline is not None:
+            seconds = look_s(self.calibration.spread, self._pipeline.enter)[taxels.ravel()]
+            wanted = np.ceil(seconds * 1e3 / own.period_ms).astype(np.int64)
+        fitted = (taxels >= 0).ravel()
+        self._rezeros[board] = Rezero(touched.ravel(), no_load, fitted, wanted)
         self.intake.veto[self.ledger.row[board]] = np.ones((TRIANGLES, PADS), np.bool_)
         self.zero_changes += 1
         return int(np.count_nonzero(touched))
@@ -436,12 +443,29 @@ class Engine:
                     self._rezeros[board].doubted |= doubted.ravel()
 
     def zero_at_risk(self, touched: bool) -> Mask:
-        """Return taxels bool[n] whose zero is not known; with `touched`, also those which are
+        """Return taxels bool[n] whose zero will not be known; with `touched`, also those which are
         touched: after another zero, theirs would not be.
         """
         found = self._last_touched.copy() if touched else np.zeros_like(self._touched)
         for board, rezero in self._rezeros.items():
             found[self._taxels_of(board).ravel()[rezero.doubted]] = True
+        return found
+
+    def may_be_touched(self) -> Mask:
+        """Return taxels bool[n] that something may touch, because their zero is not known, or not
+        yet while their board is in use again.
+        """
+        found = self.zero_at_risk(touched=False)
+        for board, rezero in self._rezeros.items():
+            if rezero.late is not None:
+                found[self._taxels_of(board).ravel()[rezero.late]] = True
+        return found
+
+    def cut_off(self) -> Mask:
+        """Return taxels bool[n] whose noise reaches the end of the scale since they were zeroed."""
+        found = np.zeros(self.layout.n_taxels, np.bool_)
+        for board, rezero in self._rezeros.items():
+            found[self._taxels_of(board).ravel()[rezero.cut_off]] = True
         return found
 
     def in_doubt(self, board: int) -> NDArray[np.bool_]:
@@ -533,7 +557,8 @@ class Engine:
         ledger = self.ledger
         here = np.repeat(ledger.present[row] & (ledger.error[row] == 0), PADS)
         ledger.rezeros[row] += not rezero.begun
-        if rezero.step(sweep.raw.ravel(), here, ledger.far[row].ravel(), sweep.t_ns):
+        far, touched = ledger.far[row].ravel(), row in self.intake.touched
+        if rezero.step(sweep.raw.ravel(), here, far, sweep.t_ns, touched):
             taxels = self._taxels_of(sweep.board).ravel()
             baseline = np.where(taxels >= 0, self._pipeline.baseline[taxels], 0.0)
             found, baseline = rezero.finish(baseline, self.calibration.noise[taxels])
@@ -545,6 +570,7 @@ class Engine:
                 self._releasing.discard(sweep.board)
                 self.release([sweep.board])
             veto = self.in_doubt(sweep.board)
+            veto |= rezero.cut_off.reshape(TRIANGLES, PADS)
             unsettled = rezero.unsettled(sweep.t_ns)
             if unsettled is not None:
                 veto |= unsettled.reshape(TRIANGLES, PADS)

@@ -98,6 +98,7 @@ class Pipeline:
     Attributes:
         baseline: float64[n], activation of the untouched taxels in units, drift included.
         relaxation_kpa: float32[n], pressure that the foam has lost by now.
+        enter: float64[n], the threshold of touch, in units, see `touch.Levels`.
     """
 
     def __init__(self, layout: Layout, settings: Processing, calibration: Calibration) -> None:
@@ -105,6 +106,7 @@ class Pipeline:
         self.baseline = calibration.baseline.copy()
         self.relaxation_kpa = np.zeros(layout.n_taxels, np.float32)
         rules = _Rules.of(layout, settings, calibration)
+        self.enter = rules.levels.enter
         self._parts = [_PartPipeline(self, layout, part, rules) for part in layout.parts]
 
     def renew(
@@ -127,6 +129,7 @@ class Pipeline:
         self._layout = layout or self._layout
         np.copyto(self.baseline, calibration.baseline, where=zeroed)
         rules = _Rules.of(self._layout, settings, calibration)
+        self.enter = rules.levels.enter
         for part in self._parts:
             part.renew(rules, zeroed)
 

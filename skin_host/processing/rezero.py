@@ -8,10 +8,18 @@ a taxel that was touched just before is unknown; it is in doubt until it is cali
 
 A press that nobody felt begin (the daemon was not running) becomes the zero too. It shows when it
 lifts: the pad then reads far below zero, which nothing can press it to.
+
+The threshold of touch is that of a zero which is known. So a noisy taxel is observed until what its
+noise leaves in the mean is a small part of its threshold. While another taxel of its board is
+touched, what it reads does not count. A board's zero, one reading, may leave a noisy pad so near to
+the end of the scale that its noise is cut off: it is refused, as a calibration would refuse it.
 """
 
 import numpy as np
 from numpy.typing import NDArray
+
+from skin_host.processing.calibration import SATURATED_SHARE
+from skin_host.processing.conversions import CONVERSION_S
 
 #: The new zero is observed for this long, and for this many sweeps if the board is slow; then the
 #: pipeline needs the third time to use it.
@@ -20,39 +28,61 @@ LOOK_SWEEPS = 20
 SETTLE_NS = 1_100_000_000
 #: Fewer samples than this are not used.
 FEWEST = 10
+#: A zero is known when its standard error is this share of the threshold of touch. One second of a
+#: pad with much noise leaves a third, which drift takes away as slowly as it is a false touch.
+ERROR_SHARE = 1 / 7
 #: A pad that reads far below zero in so many sweeps in a row was pressed when it was zeroed.
 BELOW_SWEEPS = 5
 #: One that comes back sooner jumps: for so long, none of its board is taken for a lifted press.
 JUMPS_NS = 2_000_000_000
 #: A zero that has moved by more than this was not that of an untouched pad.
 LARGEST_UNITS = 30.0
-#: Noise of this many standard deviations must fit between the mean and the end of the scale.
-SIGMAS_TO_END = 2.0
+#: Noise explains that a board's zero, one reading, is off by so many of its standard deviations.
+SNAPSHOT_SIGMAS = 3.0
+#: The byte at the end of the scale, of a pad far below zero.
+END = 255
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
+def look_s(spread: Floats, enter: Floats) -> Floats:
+    """Return how long [n] a zero is to be observed, in seconds, by `ERROR_SHARE`: at most 4.8.
+
+    Args:
+        spread: float64[n], standard deviation of a measurement derived from sums of measurements.
+        enter: float64[n], the threshold of touch, see `touch.levels`, which grows with the spread.
+    """
+    found: Floats = np.square(spread / (ERROR_SHARE * enter)) * CONVERSION_S
+    return found
+
+
 class Rezero:
     """Observes the n taxels of a board after the board was zeroed.
 
-    A taxel of which too few bytes came, because frames were lost, is observed for longer: its old
-    zero is wrong, and its new one is not known.
+    A taxel of which too few bytes came, because it is noisy or frames were lost, is observed for
+    longer: its old zero is wrong, and its new one is not known.
 
     Args:
         touched: bool[n], taxels that were touched just before.
         no_load: float64[n], the byte of an untouched pad as the board was set up.
         fitted: bool[n], taxels that there are.
+        wanted: int[n], how many bytes of each are wanted; `FEWEST` by default.
 
     Attributes:
         doubted: bool[n], taxels whose zero is not known.
+        cut_off: bool[n], taxels whose noise reaches the end of the scale: they are refused.
     """
 
-    def __init__(self, touched: Mask, no_load: Floats, fitted: Mask) -> None:
+    def __init__(
+        self, touched: Mask, no_load: Floats, fitted: Mask, wanted: NDArray[np.int64] | None = None
+    ) -> None:
         self._no_load = no_load
+        self._wanted = np.maximum(FEWEST, 0 if wanted is None else wanted)
         self._sum = np.zeros(len(no_load))
         self._count = np.zeros(len(no_load), np.int64)
         self._n_far = np.zeros(len(no_load), np.int64)
+        self._n_end = np.zeros(len(no_load), np.int64)
         self._sweeps = 0
         self._since_ns: int | None = None
         self._t_ns = 0
@@ -64,6 +94,7 @@ class Rezero:
         self._first_ns: int | None = None
         self._last_ns = 0
         self.doubted: Mask = touched.copy()
+        self.cut_off: Mask = np.zeros(len(no_load), np.bool_)
 
     @classmethod
     def over(cls, no_load: Floats, t_ns: int) -> "Rezero":
@@ -73,7 +104,9 @@ class Rezero:
         rezero._since_ns = rezero._first_ns = rezero._last_ns = t_ns - SETTLE_NS
         return rezero
 
-    def step(self, raw: NDArray[np.uint8], present: Mask, far: Mask, t_ns: int) -> bool:
+    def step(
+        self, raw: NDArray[np.uint8], present: Mask, far: Mask, t_ns: int, touched: bool = False
+    ) -> bool:
         """Take one sweep; return whether `finish` has new zeros.
 
         Args:
@@ -82,6 +115,8 @@ class Rezero:
             far: bool[n], pads that their board marks as far out of range. Such a byte is no
                 reading: boards send it while a data line is shorted, and for some sweeps after.
             t_ns: time of the sweep.
+            touched: whether any taxel whose zero is known is touched: then what noisy ones read
+                does not count, for it may press them too.
         """
         if self._since_ns is None:
             self._since_ns = t_ns
@@ -92,18 +127,26 @@ class Rezero:
         observed = present & self._sought
         if not looks:
             observed &= ~self._enough
+            if touched:
+                observed &= self._count < FEWEST
         read = observed & ~far
         self._sum += np.where(read, self._no_load - raw, 0.0)
         self._count += read
         self._n_far += observed & far
+        self._n_end += observed & (raw == END)
         self._sweeps += 1
         return not looks and bool((self._sought & self._enough).any())
 
     @property
     def _enough(self) -> Mask:
         """Return which taxels [n] have been observed often enough, at their rest or far off."""
-        enough: Mask = (self._count >= FEWEST) | (self._n_far >= FEWEST)
+        enough: Mask = (self._count >= self._wanted) | (self._n_far >= self._wanted)
         return enough
+
+    @property
+    def late(self) -> Mask | None:
+        """Return the taxels bool[n] that are sought while the others have been found."""
+        return self._sought if self._seeks and self._first_ns is not None else None
 
     @property
     def begun(self) -> bool:
@@ -136,13 +179,13 @@ class Rezero:
         if self._first_ns is None:
             self._first_ns = self._t_ns
         mean = self._sum / np.maximum(self._count, 1)
-        enough = self._count >= FEWEST
-        # What was far out of range all the time may have another zero when it is back.
-        self.doubted |= found & ~enough
+        # What was far out of range mostly may have another zero when it is back.
+        self.doubted |= found & (self._count < self._wanted)
         known = found & ~self.doubted
-        far = known & (np.abs(mean - baseline) > LARGEST_UNITS)
         # Noise that is cut off at the end of the scale gives a wrong mean.
-        highest = self._no_load - mean + SIGMAS_TO_END * noise
-        far |= known & (highest > 255.0)
+        ends = known & (self._n_end > SATURATED_SHARE * (self._count + self._n_far))
+        far = known & (np.abs(mean - baseline) > LARGEST_UNITS)
+        far |= ends & (np.abs(mean) > SNAPSHOT_SIGMAS * noise)
         self.doubted |= far
-        return found, np.where(known & ~far, mean, baseline)
+        self.cut_off |= ends & ~far
+        return found, np.where(known & ~far & ~ends, mean, baseline)

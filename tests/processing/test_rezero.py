@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from skin_host.processing.rezero import LARGEST_UNITS, LOOK_SWEEPS, Rezero
+from skin_host.config.settings import TouchSettings
+from skin_host.processing.rezero import LARGEST_UNITS, LOOK_SWEEPS, Rezero, look_s
+from skin_host.processing.touch import levels
 
 N = 192
 NO_LOAD = np.full(N, 240.0)
@@ -34,6 +36,88 @@ def test_a_slow_boards_zero_is_known_as_well_as_that_of_a_quick_one(period_s: fl
     # A baseline that is off by half a unit makes noise look like a touch.
     assert np.std(found - offset) < 0.2
     assert not rezero.doubted.any()
+
+
+PERIOD_S = 0.05
+NOISY_UNITS = 4.0
+#: One pad in four is noisy.
+NOISY = np.arange(N) % 4 == 0
+SPREAD = np.where(NOISY, NOISY_UNITS, NOISE_UNITS)
+ENTER = levels(np.full(N, 0.5), SPREAD, TouchSettings()).enter
+
+
+def look_at_noisy(
+    rest_units: float = 0.0, pressed: slice = slice(0, 0)
+) -> tuple[Rezero, list[np.ndarray], np.ndarray]:
+    """Observe a board with noisy pads for 10 s; return the observer, which pads were found in each
+    sweep, and the zeros.
+
+    Args:
+        rest_units: where the noisy pads rest.
+        pressed: sweeps in which they are pressed with 8 units, and others feel that.
+    """
+    wanted = np.ceil(look_s(SPREAD, ENTER) / PERIOD_S).astype(np.int64)
+    rezero = Rezero(NONE, NO_LOAD, ~NONE, wanted)
+    rng = np.random.default_rng(3)
+    zeros, found = np.zeros(N), []
+    presses = range(10_000)[pressed]
+    for number in range(200):
+        presses_now = number in presses
+        units = np.where(NOISY, rest_units + 8.0 * presses_now, 0.0)
+        raw = np.rint(NO_LOAD - units + SPREAD * rng.standard_normal(N))
+        sent = np.clip(raw, 0, 255).astype(np.uint8)
+        t_ns = round(number * PERIOD_S * S)
+        new = NONE
+        if rezero.step(sent, ~NONE, NONE, t_ns, touched=presses_now):
+            new, zeros = rezero.finish(zeros, SPREAD)
+        found.append(new)
+    return rezero, found, zeros
+
+
+def test_the_zero_of_noisy_pads_is_known_as_well_as_they_decide() -> None:
+    """What noise leaves in it is far below the threshold that this noise sets."""
+    rezero, found, zeros = look_at_noisy()
+    seen = [number for number, new in enumerate(found) if new.any()]
+    # The others do not wait for them.
+    assert np.array_equal(found[seen[0]], ~NOISY)
+    assert np.array_equal(found[seen[1]], NOISY)
+    assert len(seen) == 2
+    assert not rezero.doubted.any()
+    for pads in (NOISY, ~NOISY):
+        assert np.std(zeros[pads]) < ENTER[pads][0] / 5
+
+
+def test_a_press_while_noisy_pads_are_observed_is_not_in_their_zero() -> None:
+    _, found, zeros = look_at_noisy(pressed=slice(30, 120))
+    assert np.abs(zeros[NOISY]).max() < ENTER[NOISY][0] / 2
+    assert [number > 120 for number, new in enumerate(found) if new[NOISY].any()] == [True]
+
+
+def test_noise_that_reaches_the_end_of_the_scale_is_refused_and_in_no_doubt() -> None:
+    """A board's zero is one reading: it leaves noisy pads anywhere within their noise."""
+    rezero, _, zeros = look_at_noisy(rest_units=-9.0)
+    assert (rezero.cut_off & NOISY).sum() > 0.5 * NOISY.sum()
+    assert not (rezero.cut_off & ~NOISY).any()
+    assert not rezero.doubted.any()
+    assert (zeros[rezero.cut_off] == 0.0).all()
+    believed = NOISY & ~rezero.cut_off
+    assert np.abs(zeros[believed] + 9.0).max() < ENTER[NOISY][0] / 2
+
+
+def test_noise_that_nearly_reaches_the_end_of_the_scale_gives_a_zero() -> None:
+    rezero, _, zeros = look_at_noisy(rest_units=-6.0)
+    believed = NOISY & ~rezero.cut_off
+    assert believed.sum() > 0.9 * NOISY.sum()
+    assert np.abs(zeros[believed] + 6.0).max() < ENTER[NOISY][0] / 2
+
+
+def test_a_quiet_pad_at_the_end_of_the_scale_was_pressed_when_zeroed() -> None:
+    """Its noise does not explain where it rests."""
+    rezero = Rezero(NONE, NO_LOAD, ~NONE)
+    look(rezero, np.where(np.arange(N) == 7, -20.0, 0.0), PERIOD_S)
+    rezero.finish(np.zeros(N), np.full(N, NOISE_UNITS))
+    assert np.flatnonzero(rezero.doubted).tolist() == [7]
+    assert not rezero.cut_off.any()
 
 
 def test_it_settles_a_second_after_the_look_however_long_that_took() -> None:

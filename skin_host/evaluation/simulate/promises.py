@@ -799,7 +799,7 @@ class Promises:
         calibration = life.daemon.engine.calibration
         if calibration is not None:
             # A part whose other pads are valid has a contact, and health names those without one.
-            pads &= calibration.usable
+            pads &= calibration.usable & ~life.daemon.engine.cut_off()
         pressed = (lately.min(axis=0) > PRESSED_KPA) & pads
         for name, part in self._parts.items():
             topic = life.daemon.publisher.topics.part("contact", name)

@@ -44,6 +44,14 @@ def test_every_promise_holds_through_a_storm(config: Path, seed: int) -> None:
     assert result.touches
 
 
+def test_the_zero_of_noisy_pads_is_known_before_they_are_valid_after_a_set_up() -> None:
+    """One second of noise left 1.4 units of error: a touch of 5 kPa that nothing caused."""
+    icub = configuration("icub.toml")
+    settings, layout = load_skin(icub)
+    result = simulate(settings, layout, icub, 1, 72.0, until_s=31.0)
+    assert result.broken is None, "\n".join([*result.last, result.broken])
+
+
 def test_the_same_seed_gives_the_same_events_in_another_process(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "skin_host", "simulate", "--seed", "4", "--until", "14"]
     said = subprocess.run(
