@@ -46,6 +46,8 @@ SATURATED_SHARE = 0.05
 CUT_OFF_SHARE = 0.95
 #: With fewer samples than this, neither rest position nor noise of a taxel is known.
 FEWEST_SAMPLES = 10
+#: A triangle of which less than this share of its part's samples were received dropped out.
+RECEIVED_SHARE = 0.9
 #: The course of a calibration is kept as means of this many samples, ...
 BLOCK = 4
 #: ... and at most this many means: when they are full, pairs are joined.
@@ -258,11 +260,12 @@ class Calibrator:
         verdict[decides > USELESS_MARGINS * margin] = Verdict.TOO_NOISY
         verdict[ends > SATURATED_SHARE * samples] = Verdict.OUT_OF_RANGE
         verdict[(counts[:, 0] == samples) | (counts[:, 255] == samples)] = Verdict.STUCK
-        verdict[received < FEWEST_SAMPLES] = Verdict.TOO_FEW
-        absent = received == 0
-        verdict[absent] = Verdict.ABSENT
+        few = (received < FEWEST_SAMPLES) | self._froze(variance)
+        verdict[few] = Verdict.TOO_FEW
+        verdict[received == 0] = Verdict.ABSENT
+        # What a few bytes scatter by is not their noise: too little would call it damaged later.
         for array in (baseline, percentile, noise, spread):
-            array[absent] = 0.0
+            array[few] = 0.0
         return _identified(
             Calibration(
                 configuration,
@@ -277,6 +280,25 @@ class Calibrator:
                 verdict=verdict,
             )
         )
+
+    def _froze(self, variance: Floats) -> Mask:
+        """Return the taxels [n] whose triangle was no longer received, and no pad of it had sent
+        a second value by then.
+
+        Its chip had stopped answering before: what was received is one reading again and again,
+        until that was noticed. Triangles in coarse units may repeat theirs all the time.
+
+        Args:
+            variance: float64[n], of a measurement.
+        """
+        triangle = self._layout.triangle_of
+        dropped = np.zeros(len(triangle), np.bool_)
+        for part in self._layout.parts:
+            mine = slice(part.start, part.stop)
+            dropped[mine] = self._received[mine] < RECEIVED_SHARE * self._received[mine].max()
+        lively = np.bincount(triangle, (variance > 0.0) | ~dropped)
+        froze: Mask = lively[triangle] == 0.0
+        return froze
 
     def _lasting(self, variance: Floats, repeats: Floats) -> Floats:
         """Return for how many measurements [n] noise lasts: 1 where each is independent of the

@@ -272,6 +272,28 @@ def test_what_was_hardly_ever_received_is_not_judged_by_that(samples):
     assert not found.usable.any()
 
 
+def test_a_triangle_that_repeated_itself_until_it_was_no_longer_received_is_not_known():
+    """Its chip had stopped answering; without noise, all that it sends later would be damage."""
+    sweeps = noisy(np.random.default_rng(8))
+    sweeps[:, 24:36] = 239
+    present = np.ones((125, N), bool)
+    present[20:, 24:36] = False
+    found = calibrated(sweeps, present)
+    assert np.all(found.verdict[24:36] == Verdict.TOO_FEW)
+    assert np.count_nonzero(found.verdict) == 12
+    # One in coarse units may repeat itself all the time.
+    assert not calibrated(sweeps).verdict.any()
+
+
+def test_noise_is_not_known_from_a_few_bytes():
+    present = np.ones((125, N), bool)
+    present[9:, 24:36] = False
+    found = calibrated(noisy(np.random.default_rng(8), sd=1.0), present)
+    assert np.all(found.verdict[24:36] == Verdict.TOO_FEW)
+    assert not found.noise[24:36].any()
+    assert found.noise[:24].all()
+
+
 def test_lost_sweeps_do_not_shift_the_baseline():
     sweeps = noisy(np.random.default_rng(9))
     present = np.random.default_rng(10).uniform(size=(125, N)) > 0.3
