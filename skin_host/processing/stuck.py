@@ -33,7 +33,6 @@ Floats = NDArray[np.float64]
 
 #: At most this many bits may be left out, for the words that a byte stands for to fit into 64 bits.
 MOST_SHIFT = 4
-_ALL_WORDS = np.uint64(2**64 - 1)
 
 
 class Encoding(NamedTuple):

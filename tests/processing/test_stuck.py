@@ -247,14 +247,15 @@ def test_nothing_shows_where_the_thermal_pad_is_at_an_end_of_its_scale(end: int)
     assert told[others].all()
 
 
-def test_of_triangles_without_compensation_only_the_end_of_a_pads_own_scale_hides_its_moves() -> (
-    None
-):
+@pytest.mark.parametrize("end", [0, 255])
+def test_of_triangles_without_compensation_only_the_end_of_a_pads_own_scale_hides_its_moves(
+    end: int,
+) -> None:
     """They may be of a board whose other triangles are compensated."""
     plain, compensated = Encoding(NO_GAIN, 2, NO_LOAD, False), Encoding(GAIN, 2, NO_LOAD, False)
     repeats = Repeats([compensated, plain, compensated, plain])
     before = np.full((4, 12), NO_LOAD, np.uint8)
-    before[:, THERMAL_TAXEL] = 255
+    before[:, THERMAL_TAXEL] = end
     repeats.step(before, np.ones((4, 12), bool), inside(before))
     raw = before.copy()
     raw[:, :3] -= 40

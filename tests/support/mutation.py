@@ -10,6 +10,7 @@ file, and one change of each place.
 
 import argparse
 import ast
+import compileall
 import contextlib
 import difflib
 import os
@@ -94,6 +95,7 @@ def copied_tree() -> Iterator[Path]:
         for entry in ROOT.iterdir():
             if entry.name in COPIED:
                 shutil.copytree(entry, folder / entry.name)
+                compileall.compile_dir(folder / entry.name, quiet=1)
             elif not entry.name.startswith("."):
                 (folder / entry.name).symlink_to(entry)
         with contextlib.chdir(folder):
