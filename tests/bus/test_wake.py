@@ -1,6 +1,7 @@
 """When the ports are read: right after each sweep, seldom otherwise, never in a tight loop."""
 
 import asyncio
+from itertools import pairwise
 
 import pytest
 
@@ -105,6 +106,15 @@ def test_one_late_sweep_does_not_delay_the_next():
     assert plan.next_ns(now) == T0 + 2 * PERIOD + SLIP_NS + GUARD_NS
 
 
+@pytest.mark.parametrize("late", [PERIOD // 2, PERIOD * 3 // 4, PERIOD + MS, 7 * PERIOD])
+def test_a_sweep_that_is_late_by_half_a_period_or_more_begins_a_new_beat(late: int) -> None:
+    plan = Plan({0: PERIOD}, POLL)
+    plan.sweep_ended(0, T0)
+    came = T0 + PERIOD + late
+    plan.sweep_ended(0, came)
+    assert plan.next_ns(came + PERIOD - MS) == came + PERIOD + GUARD_NS
+
+
 @pytest.mark.parametrize("ppm", [-1000, 0, 900])
 def test_a_board_with_another_clock_is_followed(ppm):
     plan = Plan({0: PERIOD}, POLL)
@@ -165,22 +175,29 @@ async def test_an_idle_reader_does_not_spin(clock: SteppedClock):
     assert 1 <= calls <= 2 + 0.2 / 0.02
 
 
+@pytest.mark.parametrize("took_ms", [0, 3])
+@pytest.mark.parametrize(("n", "apart_ms"), [(14, 20), (10, 20), (2, 4)])
 @stepped
-async def test_when_a_sweep_is_always_due_looks_begin_a_poll_apart(clock: SteppedClock):
-    boards = dict.fromkeys(range(14), 10 * MS)
+async def test_when_a_sweep_is_always_due_looks_begin_a_share_of_a_poll_apart(
+    clock: SteppedClock, n: int, apart_ms: int, took_ms: int
+) -> None:
+    """A whole poll at a thousand samples a second, however long the work takes."""
+    boards = dict.fromkeys(range(n), 10 * MS)
     wake_up = WakeUp(Receive(poll_ms=20.0), boards, clock)
-    calls = 0
+    began_ns: list[int] = []
 
     def work() -> None:
-        nonlocal calls
-        calls += 1
+        began_ns.append(clock.now_ns())
+        clock.advance(took_ms * 1e-3)
         for board in boards:
-            wake_up.sweep_ended(board, clock.now_ns() - 10 * MS + board * MS // 14)
+            wake_up.sweep_ended(board, clock.now_ns() - 10 * MS + board * MS // n)
 
     running = asyncio.create_task(wake_up.run(work))
     await clock.sleep(0.2)
     running.cancel()
-    assert 1 <= calls <= 2 + 0.2 / 0.02
+    assert len(began_ns) >= 9
+    apart_ns = [after - before for before, after in pairwise(began_ns)]
+    assert apart_ns == pytest.approx([apart_ms * MS] * len(apart_ns), abs=10)
 
 
 async def test_an_error_in_the_work_ends_the_run_with_it():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from skin_host.processing.curves import KNOTS_UNITS, TableCurve
-from skin_host.processing.erratic import RELIEF, Erratic, step_kpa
+from skin_host.processing.erratic import LIMIT, RELIEF, Erratic, step_kpa
 from skin_host.processing.pressure import PressureCurve
 
 STEP_KPA = 5.0
@@ -83,6 +83,14 @@ def test_a_new_zero_of_one_pad_changes_nothing_of_another():
     assert found.pads.tolist() == [False, True, False]
 
 
+def test_a_pad_that_jumped_for_long_is_a_suspect_no_longer_than_at_its_limit():
+    found = jumping(100)
+    for _ in range(round(LIMIT / RELIEF)):
+        assert found.suspects
+        found.look(samples(0, 0, 0))
+    assert not found.suspects
+
+
 def test_a_pad_is_a_suspect_from_its_first_jumps_until_they_are_forgotten():
     assert not jumping(0).suspects
     found = jumping(1)
@@ -116,3 +124,8 @@ def test_a_jump_is_measured_by_the_mean_slope_of_the_curve_where_it_was_calibrat
     assert step_kpa(soft, noise_units) == pytest.approx(
         8.0 * soft.kpa(np.array([1.0, 100.0])) / np.array([1.0, 100.0])
     )
+    # Of one that ends beyond what a byte can say, the byte's end.
+    fine = PressureCurve([0.5])
+    assert fine.beyond_units > 255.0
+    slope = fine.kpa(np.array([255.0])) / 255.0
+    assert step_kpa(fine, noise_units[:1]) == pytest.approx(8.0 * slope, rel=1e-9)

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from skin_host.config.settings import TouchSettings
-from skin_host.processing.rezero import LARGEST_UNITS, LOOK_SWEEPS, Rezero, look_s
+from skin_host.processing.rezero import (
+    FEWEST,
+    LARGEST_UNITS,
+    LOOK_SWEEPS,
+    SETTLE_NS,
+    Rezero,
+    look_s,
+)
 from skin_host.processing.touch import levels
 
 N = 192
@@ -129,6 +136,94 @@ def test_it_settles_a_second_after_the_look_however_long_that_took() -> None:
     assert rezero.settled(ended_ns + 2 * S)
 
 
+def test_new_baselines_are_unsettled_until_the_pipeline_uses_them() -> None:
+    rezero = Rezero(NONE, NO_LOAD, ~NONE)
+    _, ended_ns = look(rezero, np.zeros(N), 0.05)
+    assert not rezero.settled(ended_ns)
+    rezero.finish(np.zeros(N), np.full(N, NOISE_UNITS))
+    # Times of a part may lie a little before that of the board's sweep.
+    for passed_ns in (-SETTLE_NS + 1, 0, 1, SETTLE_NS - 1):
+        late = rezero.unsettled(ended_ns + passed_ns)
+        assert late is not None
+        assert late.all()
+        assert not rezero.settled(ended_ns + passed_ns)
+    for passed_ns in (SETTLE_NS, SETTLE_NS + 1, 1000 * S):
+        assert rezero.unsettled(ended_ns + passed_ns) is None
+        assert rezero.settled(ended_ns + passed_ns)
+
+
+def test_a_zero_that_has_long_been_in_use_is_settled_and_in_no_doubt() -> None:
+    t_ns = 1_700_000_000 * S
+    rezero = Rezero.over(NO_LOAD, t_ns)
+    assert rezero.begun
+    for passed_ns in (0, SETTLE_NS, 100 * S):
+        assert rezero.settled(t_ns + passed_ns)
+        assert rezero.unsettled(t_ns + passed_ns) is None
+    assert not rezero.doubted.any()
+    assert not rezero.step(NO_LOAD.astype(np.uint8), ~NONE, NONE, t_ns)
+
+
+def test_a_look_begins_with_the_first_sweep() -> None:
+    rezero = Rezero(NONE, NO_LOAD, ~NONE)
+    assert not rezero.begun
+    late = rezero.unsettled(S)
+    assert late is not None
+    assert late.all()
+    rezero.step(NO_LOAD.astype(np.uint8), NONE, NONE, S)
+    assert rezero.begun
+
+
+@pytest.mark.parametrize(
+    ("no_load", "raw", "noise", "in_doubt"),
+    [
+        # Noise that is cut off at the end of the scale gives a wrong mean.
+        (240, 253, 1.0, False),
+        (240, 253, 1.01, True),
+        (240, 255, 0.01, True),
+        # Thirty units are more than a set-up can move the zero of an untouched pad.
+        (240, 210, 1.0, False),
+        (240, 209, 1.0, True),
+        (200, 230, 1.0, False),
+        (200, 231, 1.0, True),
+    ],
+)
+def test_a_zero_is_in_doubt_if_it_is_far_off_or_its_noise_reaches_the_end_of_the_scale(
+    no_load: int, raw: int, noise: float, in_doubt: bool
+) -> None:
+    rezero = Rezero(NONE, np.full(N, float(no_load)), ~NONE)
+    for number in range(LOOK_SWEEPS + 1):
+        ended = rezero.step(np.full(N, raw, np.uint8), ~NONE, NONE, number * S // 20)
+        assert ended == (number == LOOK_SWEEPS)
+    found, baseline = rezero.finish(np.zeros(N), np.full(N, noise))
+    assert found.all()
+    assert rezero.doubted.tolist() == [in_doubt] * N
+    assert baseline.tolist() == [0.0 if in_doubt else float(no_load - raw)] * N
+
+
+def test_ten_readings_make_a_zero_and_nine_do_not() -> None:
+    rezero = Rezero(NONE, NO_LOAD, ~NONE)
+    few, enough = np.arange(N) < 4, np.arange(N) >= 4
+    for number in range(LOOK_SWEEPS + 1):
+        present = (enough & (number < FEWEST)) | (few & (number < FEWEST - 1))
+        ended = rezero.step((NO_LOAD - 3).astype(np.uint8), present, NONE, number * S // 20)
+    assert ended
+    found, baseline = rezero.finish(np.zeros(N), np.full(N, NOISE_UNITS))
+    assert np.flatnonzero(~found).tolist() == [0, 1, 2, 3]
+    assert baseline.tolist() == [0.0] * 4 + [3.0] * (N - 4)
+    late = rezero.unsettled(LOOK_SWEEPS * S // 20 + SETTLE_NS)
+    assert late is not None
+    assert np.flatnonzero(late).tolist() == [0, 1, 2, 3]
+
+
+def test_what_is_read_after_the_look_is_no_part_of_a_zero_that_is_known() -> None:
+    rezero = Rezero(NONE, NO_LOAD, ~NONE)
+    for number in range(LOOK_SWEEPS + 1):
+        raw = NO_LOAD - (2 if number < LOOK_SWEEPS else 40)
+        rezero.step(raw.astype(np.uint8), ~NONE, NONE, number * S // 20)
+    _, baseline = rezero.finish(np.zeros(N), np.full(N, NOISE_UNITS))
+    assert baseline.tolist() == [2.0] * N
+
+
 def test_a_zero_taken_under_a_press_is_in_doubt() -> None:
     offset = np.where(np.arange(N) == 7, -LARGEST_UNITS - 5.0, 0.0)
     touched = np.arange(N) == 3
@@ -164,8 +259,11 @@ def test_the_zero_of_what_was_far_out_of_range_all_the_while_is_in_doubt() -> No
     rezero = Rezero(NONE, NO_LOAD, ~NONE)
     for number in range(LOOK_SWEEPS + 1):
         rezero.step(np.zeros(N, np.uint8), ~NONE, np.arange(N) < 12, number * S // 20)
-    rezero.finish(np.full(N, 240.0), np.zeros(N))
+    before = np.where(np.arange(N) < 12, 0.0, 240.0)
+    found, baseline = rezero.finish(before, np.zeros(N))
+    assert found.all()
     assert np.flatnonzero(rezero.doubted).tolist() == list(range(12))
+    assert baseline.tolist() == before.tolist()
 
 
 def test_pads_whose_frames_were_lost_in_the_look_are_observed_until_their_zero_is_known() -> None:

@@ -56,6 +56,8 @@ SLOWER, SLOWER_S = 2.0, 3.0
 INTERRUPTED_S = 5
 #: So do tests that wait for so long.
 LONGEST_S = 600
+#: A number that changes by less than a millionth of itself promises nothing.
+LARGE = 10**6
 #: They make the same of what is only ever compared with None.
 SAME = ("ReplaceComparisonOperator_Is_Eq", "ReplaceComparisonOperator_IsNot_NotEq")
 
@@ -121,7 +123,9 @@ def drawn(source: str, items: list[Any], places: int, seed: int) -> list[Any]:
         (change,) = item.mutations
         row, column = change.start_pos
         is_type = any((a, b) <= (row, column) < (c, d) for a, b, c, d in typed)
-        if not is_type and not change.operator_name.endswith(SAME):
+        number = re.match(r"[\d_]+", lines[row - 1][column:])
+        is_large = number is not None and int(number[0]) >= LARGE
+        if not is_type and not is_large and not change.operator_name.endswith(SAME):
             found.setdefault(change.start_pos, item)
     return list(found.values())[:places]
 
