@@ -19,9 +19,9 @@ BABBLE_LOAD = 0.4
 PERIOD_SHARE = 0.05
 #: Intervals that scatter by more than this share of the period (median deviation) are a fault.
 JITTER_SHARE = 0.06
-#: Tolerated number of lone frames (one of a pair) in the last second.
+#: This many lone frames (one of a pair) in the last second are a fault.
 FEW_HALVES = 2
-#: Tolerated number of pads on a bus that jumped for one sweep and back, in the last second.
+#: So is this many pads of a bus that jumped for one sweep and back, in the last second.
 FEW_SPIKES = 2
 #: Limit of the mean shift of the temperature pads since the calibration, in units.
 THERMAL_UNITS = 8.0
@@ -32,8 +32,8 @@ COMMON_UNITS = 1.5
 EMULATED = {"virtual", "socketpair"}
 #: Number of chips that share one data line.
 LINE = 4
-#: Order of the triangles of an ergoCub hand (skin type 3) along the data lines.
-_ERGO_HAND_SLOTS = (0, 4, 8, 12, 16, 9, 10, 11, 13, 15, 1, 2, 3, 5, 6, 7)
+#: Data lines of the triangles of an ergoCub hand (skin type 3).
+_ERGO_HAND_LINES = (0, 1, 2, 3, 4, 2, 2, 2, 3, 3, 0, 0, 0, 1, 1, 1)
 
 _BUS_STATES = {
     "bus_off": (
@@ -246,8 +246,7 @@ def _board(board: BoardHealth) -> Iterator[FoundFault]:
 
 
 def _line_of(board: BoardHealth, triangle: int) -> int:
-    slot = _ERGO_HAND_SLOTS[triangle] if board.get("skin_type") == 3 else triangle
-    return slot // LINE
+    return _ERGO_HAND_LINES[triangle] if board.get("skin_type") == 3 else triangle // LINE
 
 
 def _triangles(record: Record, silent: set[str]) -> Iterator[FoundFault]:

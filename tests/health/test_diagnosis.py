@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from skin_host.bus.pair import PAIR
-from skin_host.health.diagnosis import FoundFault, diagnose
+from skin_host.health.diagnosis import FoundFault, diagnose, named
 from tests.support.fault_bench import FaultBench
 
 
@@ -110,3 +110,154 @@ def test_a_part_that_is_disabled_has_no_other_faults_of_its_own(calibrated: Faul
     assert "part_disabled" in found(calibrated, state="disabled", calibration=None)
     assert "part_not_calibrated" not in found(calibrated, state="disabled", calibration=None)
     assert "part_not_calibrated" in found(calibrated, calibration=None)
+
+
+@pytest.mark.parametrize(
+    ("gained", "code", "limit", "beyond"),
+    [
+        ("other_load", "bus_babbling", 0.4, 0.41),
+        ("halves", "bus_loses_frames", 1, 2),
+        ("spikes", "bus_bit_errors", 1, 2),
+        ("wrong", "bus_bit_errors", 0, 1),
+        ("dropped", "bus_drops", 0, 1),
+    ],
+)
+def test_what_happens_on_a_bus_now_and_then_is_no_fault(
+    calibrated: FaultBench, gained: str, code: str, limit: float, beyond: float
+) -> None:
+    assert code not in found(calibrated, gained={gained: limit})
+    assert code in found(calibrated, gained={gained: beyond})
+
+
+@pytest.mark.parametrize(
+    ("wanted_ms", "seen_ms", "jitter_ms", "codes"),
+    [
+        (40, 42.0, 2.4, set()),
+        (40, 38.0, 0.0, set()),
+        (40, 42.1, 0.0, {"board_period"}),
+        (40, 37.9, 9.0, {"board_period"}),
+        (40, 40.0, 2.5, {"board_jitter"}),
+        (40, 80.0, None, set()),
+        (40, None, 9.0, set()),
+    ],
+)
+def test_a_board_may_be_off_by_a_twentieth_of_its_period_and_scatter_a_little_more(
+    calibrated: FaultBench,
+    wanted_ms: int,
+    seen_ms: float | None,
+    jitter_ms: float | None,
+    codes: set[str],
+) -> None:
+    board = copy.deepcopy(calibrated.records["left_hand"]["boards"][0])
+    board |= {"period_ms": wanted_ms, "period_seen_ms": seen_ms, "jitter_ms": jitter_ms}
+    faults = found(calibrated, boards=[board])
+    assert faults.keys() & {"board_period", "board_jitter"} == codes
+    # Of one that has stopped, the last intervals mean nothing.
+    assert "board_period" not in found(calibrated, boards=[board | {"alive": False}])
+
+
+@pytest.mark.parametrize(
+    ("thermal_units", "common_units", "words"),
+    [
+        (8.0, 1.5, None),
+        (-8.0, -1.5, None),
+        (8.1, 0.0, "thermal pads read +8"),
+        (-9.0, 9.0, "thermal pads read -9"),
+        (None, 1.5, None),
+        (None, 1.6, "all read +1.6"),
+        (None, -1.6, "all read -1.6"),
+        (0.0, 2.0, "all read +2.0"),
+    ],
+)
+def test_a_temperature_that_has_changed_shows_in_the_thermal_pads_or_in_all(
+    calibrated: FaultBench, thermal_units: float | None, common_units: float, words: str | None
+) -> None:
+    warmth = {"thermal_units": thermal_units, "common_units": common_units}
+    fault = found(calibrated, warmth=warmth).get("part_temperature")
+    assert (fault is None) == (words is None)
+    assert fault is None or str(words) in fault.sentence
+    assert "part_temperature" not in found(calibrated, warmth=None)
+
+
+def of_lines(
+    bench: FaultBench, faults: dict[int, str], fitted: range, skin_type: int = 0
+) -> dict[str, set[str]]:
+    """Places by code, where triangles of one board have faults."""
+    record: Any = copy.deepcopy(bench.records["left_hand"])
+    board = record["boards"][0] | {"fitted": list(fitted), "skin_type": skin_type}
+    record["boards"] = [board]
+    record["triangles"] = [
+        {"board": board["name"], "triangle": triangle, "fault": fault}
+        for triangle, fault in faults.items()
+    ]
+    places: dict[str, set[str]] = {}
+    for fault in diagnose(record):
+        places.setdefault(fault.code, set()).add(fault.where.removeprefix(board["name"] + "/"))
+    return places
+
+
+@pytest.mark.parametrize(
+    ("skin_type", "lines"),
+    [
+        (0, [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11], [12, 13, 14, 15]]),
+        (3, [[0, 10, 11, 12], [1, 13, 14, 15], [2, 5, 6, 7], [3, 8, 9]]),
+    ],
+)
+def test_a_line_whose_chips_all_stopped_answering_is_shorted(
+    calibrated: FaultBench, skin_type: int, lines: list[list[int]]
+) -> None:
+    """The chips of an ergoCub hand are wired in another order, one of them alone."""
+    for number, line in enumerate(lines):
+        dead = dict.fromkeys(line, "no ack") | {line[0]: "silenced"}
+        places = of_lines(calibrated, dead, range(16), skin_type)
+        assert places == {"line_shorted": {f"line{number}"}}
+        one_lives = dict.fromkeys(line[1:], "no ack")
+        places = of_lines(calibrated, one_lives, range(16), skin_type)
+        assert places == {"triangle_no_ack": {str(triangle) for triangle in line[1:]}}
+    # A line of one chip is a dead chip.
+    alone = (range(4, 5), 0, 4) if skin_type == 0 else (range(16), 3, 4)
+    assert of_lines(calibrated, {4: "no ack"}, *alone[:2]) == {"triangle_no_ack": {"4"}}
+
+
+def test_two_lines_that_read_wrong_at_once_are_swapped_and_one_or_three_are_not(
+    calibrated: FaultBench,
+) -> None:
+    def wrong(*lines: int, fault: str = "out of range") -> dict[str, set[str]]:
+        faults = {4 * line + place: fault for line in lines for place in range(4)}
+        return of_lines(calibrated, faults, range(16))
+
+    assert wrong(0, 2) == {"lines_swapped": {"line0+2"}}
+    assert wrong(1, 3) == {"lines_swapped": {"line1+3"}}
+    assert wrong(0).keys() == wrong(0, 1, 2).keys() == {"triangle_out_of_range"}
+    # A short is no second swap.
+    faults = dict.fromkeys(range(4), "no ack") | dict.fromkeys(range(4, 12), "out of range")
+    assert of_lines(calibrated, faults, range(16)) == {
+        "line_shorted": {"line0"},
+        "lines_swapped": {"line1+2"},
+    }
+
+
+def test_a_chip_at_the_address_of_another_is_suspected_where_both_read_wrong(
+    calibrated: FaultBench,
+) -> None:
+    def sentence(faults: dict[int, str]) -> str:
+        record: Any = copy.deepcopy(calibrated.records["left_hand"])
+        name = record["boards"][0]["name"]
+        record["triangles"] = [
+            {"board": name, "triangle": triangle, "fault": fault}
+            for triangle, fault in faults.items()
+        ]
+        return next(
+            one.sentence for one in diagnose(record) if one.code == "triangle_not_connected"
+        )
+
+    assert "does it have this address" in sentence({1: "not connected", 2: "out of range"})
+    assert "does it have this address" not in sentence({1: "not connected", 5: "out of range"})
+
+
+def test_taxels_are_named_in_runs_and_no_more_than_eight_of_them() -> None:
+    assert named([3]) == "taxel 3"
+    assert named([9, 4, 5, 1, 6, 7]) == "taxels 1, 4-7, 9"
+    eight = list(range(0, 16, 2))
+    assert named(eight) == "taxels 0, 2, 4, 6, 8, 10, 12, 14"
+    assert named([*eight, 16, 17]) == "taxels 0, 2, 4, 6, 8, 10, 12, 14, ... (10 in all)"
