@@ -124,7 +124,6 @@ class PartContact:
     def stop(self, events: Iterable[Touch]) -> ContactState:
         """End the contacts, because no data of the part will come for a while."""
         self._present.difference_update(event.id for event in events)
-        self._felt_ns[:] = _NEVER_NS
         self._unsure[:] = SURE_FRAMES
         self._is_unsure = True
         return "UNKNOWN"

@@ -132,6 +132,16 @@ def test_a_clock_that_is_set_forward_makes_nothing_unfelt() -> None:
     assert contact.step(frame(late_ns, blind=slice(0, 12)), []) == "UNKNOWN"
 
 
+def test_a_clock_that_is_set_forward_a_little_delays_what_is_lost_by_that_once() -> None:
+    contact = watched()
+    contact.follow_clock(30 * MS)
+    states = [
+        contact.step(frame(30 * MS + t_ns, blind=slice(0, 12)), [])
+        for t_ns in range(50 * MS, LOST_NS + 50 * MS, 50 * MS)
+    ]
+    assert states == ["OFF"] * (len(states) - 1) + ["UNKNOWN"]
+
+
 def test_frames_that_are_lost_for_a_moment_change_nothing() -> None:
     contact = watched()
     states = [
@@ -139,6 +149,13 @@ def test_frames_that_are_lost_for_a_moment_change_nothing() -> None:
         for t_ns in range(50 * MS, LOST_NS + 50 * MS, 50 * MS)
     ]
     assert states == ["OFF"] * (len(states) - 1) + ["UNKNOWN"]
+
+
+def test_frames_that_are_lost_for_a_moment_change_nothing_however_long_all_was_felt() -> None:
+    contact = watched()
+    for t_ns in range(50 * MS, 3 * LOST_NS, 50 * MS):
+        assert contact.step(frame(t_ns), []) == "OFF"
+    assert contact.step(frame(3 * LOST_NS, blind=slice(0, 12)), []) == "OFF"
 
 
 def test_a_contact_whose_frames_are_lost_stays_on_until_it_is_lost_itself() -> None:
