@@ -7,6 +7,7 @@
     |  |  |- OtherSkinError   the latter
     |  |- NewerFileError      a file that a newer version has written
     |  |- LogError            a recording that cannot be read
+    |- BusyFileError          a file that another program is writing at this moment
     |- BusError               the CAN interface: absent, down, refused
     |- BrokerError            the MQTT broker: refused us, or sent an invalid answer
 
@@ -45,6 +46,10 @@ class OtherSkinError(CalibrationError):
 
 class NewerFileError(RequestError):
     """A file of the state directory that a newer version has written. It is not changed."""
+
+
+class BusyFileError(SkinError):
+    """Another program is writing a file at this moment. systemd starts a service again."""
 
 
 class LogError(RequestError):

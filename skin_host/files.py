@@ -2,9 +2,11 @@
 
 import contextlib
 import errno
+import fcntl
 import logging
 import os
 import secrets
+import signal
 import stat
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
@@ -13,7 +15,7 @@ from typing import Protocol, TypeVar
 
 import msgspec
 
-from skin_host.errors import NewerFileError, SkinError
+from skin_host.errors import BusyFileError, NewerFileError, SkinError
 
 log = logging.getLogger(__name__)
 
@@ -37,7 +39,8 @@ def read_whole(path: Path, most_bytes: int = MAX_DOCUMENT_BYTES) -> bytes:
     """Read a file that somebody names, whatever it is: a device without end, a pipe, a file that
     grows.
 
-    A named pipe that nobody has open for writing is refused, not waited for.
+    A named pipe that nobody has open for writing is refused, not waited for. A file that another
+    program is writing is refused, because half of it may look like a whole one.
 
     Args:
         path: of the file.
@@ -46,6 +49,7 @@ def read_whole(path: Path, most_bytes: int = MAX_DOCUMENT_BYTES) -> bytes:
 
     Raises:
         OSError: the file cannot be read, or is larger; `strerror` is the reason.
+        BusyFileError: another program is writing it.
     """
 
     def at_once(name: str, flags: int) -> int:
@@ -58,7 +62,9 @@ def read_whole(path: Path, most_bytes: int = MAX_DOCUMENT_BYTES) -> bytes:
     with file:
         os.set_blocking(file.fileno(), True)
         status = os.fstat(file.fileno())
-        if not stat.S_ISREG(status.st_mode):
+        if stat.S_ISREG(status.st_mode):
+            _refuse_busy(path, file.fileno())
+        else:
             most_bytes = min(most_bytes, MAX_DOCUMENT_BYTES)
         # What states its size is refused unread; the rest is read up to the limit.
         left = most_bytes + 1 if status.st_size <= most_bytes else 0
@@ -66,11 +72,41 @@ def read_whole(path: Path, most_bytes: int = MAX_DOCUMENT_BYTES) -> bytes:
         while left and (piece := file.read(min(left, _PIECE_BYTES))):
             pieces.append(piece)
             left -= len(piece)
+        after = os.fstat(file.fileno())
+    if stat.S_ISREG(status.st_mode) and _version(after) != _version(status):
+        raise _busy(path)
     if stat.S_ISFIFO(status.st_mode) and not pieces:
         raise OSError(errno.ENODATA, "a pipe that nobody writes to", str(path))
     if not left:
         raise OSError(errno.EFBIG, f"larger than {most_bytes} bytes", str(path))
     return b"".join(pieces)
+
+
+def _refuse_busy(path: Path, descriptor: int) -> None:
+    """Refuse a file that a program has open for writing; who opens it for that then waits until it
+    is closed here.
+
+    A read lease does both. The system gives it to a file's owner and to root, and not on every kind
+    of disk; where there is none, what changes during the reading is noticed after it.
+    """
+    lease = getattr(fcntl, "F_SETLEASE", None)  # Linux only
+    if lease is None:
+        return
+    try:
+        # Otherwise the signal for "somebody waits" would end the program.
+        fcntl.fcntl(descriptor, fcntl.F_SETSIG, signal.SIGURG)
+        fcntl.fcntl(descriptor, lease, fcntl.F_RDLCK)
+    except OSError as error:
+        if error.errno == errno.EAGAIN:
+            raise _busy(path) from None
+
+
+def _version(status: os.stat_result) -> tuple[int, int]:
+    return status.st_size, status.st_mtime_ns
+
+
+def _busy(path: Path) -> BusyFileError:
+    return BusyFileError(f"{path}: another program is writing it; repeat this when it has ended")
 
 
 def read_document(
@@ -83,6 +119,7 @@ def read_document(
     Raises:
         NewerFileError: a newer version has written it: its schema has a larger number, or a field
             that is not known.
+        BusyFileError: another program is writing it.
         Exception: result of `wrong`, if the file is unreadable, damaged or of another schema.
     """
     try:
@@ -114,6 +151,7 @@ def refuse_newer(path: Path, schema: str, what: str) -> None:
 
     Raises:
         NewerFileError: `path` is such a file.
+        BusyFileError: another program is writing it.
     """
     try:
         data = read_whole(path)
@@ -238,6 +276,17 @@ def growing(path: Path) -> Path:
     name = path.with_name(f".{path.stem}.growing-{secrets.token_hex(4)}{path.suffix}")
     os.close(os.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
     return name
+
+
+def refuse_removed(path: Path) -> None:
+    """Notice that a file that is being written was removed, or its folder: what is written to it
+    then is lost, and no write fails.
+
+    Raises:
+        OSError: it is not there any more.
+    """
+    if not os.path.lexists(path):
+        raise OSError(errno.ENOENT, "it was removed while it was being written", str(path))
 
 
 @contextlib.contextmanager

@@ -283,6 +283,7 @@ def read_toml(path: Path, table: type[T], named: Named) -> T:
 
     Raises:
         ConfigurationError: unreadable, not TOML, or wrong; the message names file and key.
+        BusyFileError: another program is writing it.
     """
     try:
         data = read_whole(path)
@@ -307,6 +308,7 @@ def load(path: Path) -> Settings:
 
     Raises:
         ConfigurationError: unreadable, not TOML, or wrong; the message names file and key.
+        BusyFileError: another program is writing it, or a file that it names.
     """
     named: Named = {
         "buses": Bus,

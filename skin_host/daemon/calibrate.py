@@ -127,6 +127,7 @@ def stored_calibration(settings: Settings, layout: Layout, node: str) -> Calibra
     Raises:
         OtherSkinError: it belongs to another configuration or robot.
         NewerFileError: a newer version has written it.
+        BusyFileError: another program is writing it.
     """
     path = calibration_path(settings, node)
     if not os.access(path, os.F_OK):

@@ -170,12 +170,12 @@ class Control:
     async def _disable(self, payload: bytes) -> Answer:
         name = _decode(payload, _Parts).part
         self._daemon.disable(self._part(name))
-        return await self._keep()
+        return await self.keep()
 
     async def _enable(self, payload: bytes) -> Answer:
         name = _decode(payload, _Parts).part
         self._daemon.enable(self._part(name))
-        return await self._keep()
+        return await self.keep()
 
     async def _set_thresholds(self, payload: bytes) -> Answer:
         request = _decode(payload, _Thresholds)
@@ -187,7 +187,7 @@ class Control:
             changes = msgspec.structs.asdict(request.set)
             wanted = known | {key: value for key, value in changes.items() if value is not None}
             daemon.set_thresholds(Thresholds(**wanted))
-        answer = dict(await self._keep()) if request.reset or request.set is not None else {}
+        answer = dict(await self.keep()) if request.reset or request.set is not None else {}
         return answer | {"touch": msgspec.to_builtins(daemon.settings.processing.touch)}
 
     async def _configure(self, payload: bytes) -> Answer:
@@ -241,7 +241,7 @@ class Control:
             "ended": recorder.ended,
         }
 
-    async def _keep(self) -> Answer:
+    async def keep(self) -> Answer:
         """Store what operators changed; report it if that failed. The disk may be slow."""
         daemon = self._daemon
         async with self._keeping:  # the newest is written last
@@ -252,8 +252,7 @@ class Control:
             answer: dict[str, Any] = {"disabled": state.disabled, "kept": True}
             try:
                 await daemon.clock.in_thread(daemon.keep, state)
-            except OSError as error:
-                log.error("state not kept: %s", error.strerror)
+            except OSError:
                 answer["kept"] = False
         return answer
 

@@ -40,12 +40,16 @@ log = logging.getLogger(__name__)
 LOOK_S = 0.1
 #: ... otherwise this often.
 HEALTH_S = 1.0
+#: What is kept in files.
+_KEPT = ("calibration", "state", "zeros")
 #: Faults that are expected while a calibration is being taken.
 _UNTIL_CALIBRATED = {"part_not_calibrated", "fingertip_not_calibrated"}
 #: The time of day was set if it differs by more than this from the monotonic time.
 JUMP_NS = 50_000_000
 #: The end waits so long for a file that is being written.
 KEEPING_S = 2.0
+#: What could not be written, or was removed since, is written again after this time.
+AGAIN_S = 10.0
 #: Readiness is reported after the first sweeps, or after this time without them.
 PATIENCE_S = 3.0
 
@@ -133,7 +137,10 @@ class Daemon:
         self.fingertips = FingertipPublisher(self.engine.fingertips, self.publisher)
         self.link = Link(self.engine, wait=True, open_port=open_port, clock=clock)
         self.unkept: dict[str, str] = {}
+        #: Files of this node that were found or written.
+        self._files = {what for what in _KEPT if self._path(what).exists()}
         self._calibration_lock = asyncio.Lock()
+        self._saving = asyncio.Lock()
         self._feed_s = service.watchdog_interval_s()
         self._fed_s = 0.0
         self._status_s = 0.0
@@ -167,6 +174,7 @@ class Daemon:
             ),
             asyncio.create_task(self._start(calibrate), name="start"),
             asyncio.create_task(self._housekeep(), name="housekeeping"),
+            asyncio.create_task(self._keep_again(), name="keep again"),
         ]
         if self.settings.service.metrics_port:
             serving = metrics.serve(self.settings.service.metrics_port, self.status, self.clock)
@@ -226,15 +234,7 @@ class Daemon:
                 keeping = self._keep_zeros(before=known, doubted=doubted)
                 self._keeping = asyncio.create_task(keeping, name="keep zeros")
                 await self._kept()
-            try:
-                await self.clock.in_thread(calibrations.save, path, found, self.layout)
-            except OSError as error:
-                # The calibration is in use anyway; a restart will need a new one.
-                self.unkept["calibration"] = f"{path}: {error.strerror}"
-                log.error("calibration not kept: %s", self.unkept["calibration"])
-            else:
-                self.unkept.pop("calibration", None)
-                log.info("calibration %s kept in %s", found.id, path)
+            await self._save_calibration()
             self.publisher.put_info(await self.clock.in_thread(self._info))
             return found
 
@@ -295,13 +295,12 @@ class Daemon:
         Raises:
             OSError: it cannot be written.
         """
-        path = self._path("state")
         try:
-            write_document(path, state)
+            write_document(self._path("state"), state)
         except OSError as error:
-            self.unkept["state"] = f"{path}: {error.strerror}"
+            self._note_unkept("state", error)
             raise
-        self.unkept.pop("state", None)
+        self._note_kept("state")
 
     def records(self) -> dict[str, Record]:
         """The health record of every part, as it is now."""
@@ -529,17 +528,60 @@ class Daemon:
         if zeros == self._zeros or not (unknown or baselines or self._zeros.unknown):
             self._zeros_kept = n_found
             return
-        path = self._path("zeros")
         try:
-            await self.clock.in_thread(write_document, path, zeros)
+            await self.clock.in_thread(write_document, self._path("zeros"), zeros)
         except OSError as error:
-            if "zeros" not in self.unkept:
-                log.error("zeros not kept: %s: %s", path, error.strerror)
-            self.unkept["zeros"] = f"{path}: {error.strerror}"
+            self._note_unkept("zeros", error)
             return
-        self.unkept.pop("zeros", None)
+        self._note_kept("zeros")
         self._zeros = zeros
         self._zeros_kept = n_found
+
+    async def _save_calibration(self) -> None:
+        """Write the calibration in use. If that fails it is used anyway, until a restart."""
+        async with self._saving:  # the newest is written last
+            found = self.engine.calibration
+            if found is None:
+                return
+            path = calibration_path(self.settings, self._node)
+            try:
+                await self.clock.in_thread(calibrations.save, path, found, self.layout)
+            except OSError as error:
+                self._note_unkept("calibration", error)
+            else:
+                self._note_kept("calibration")
+                log.info("calibration %s kept in %s", found.id, path)
+
+    def _note_unkept(self, what: str, error: OSError) -> None:
+        reason = f"{self._path(what)}: {error.strerror}"
+        if what not in self.unkept:
+            log.error("%s not kept: %s", what, reason)
+        self.unkept[what] = reason
+
+    def _note_kept(self, what: str) -> None:
+        self.unkept.pop(what, None)
+        self._files.add(what)
+
+    async def _keep_again(self) -> None:
+        """Write again what could not be written, and what somebody removed with its folder."""
+        while True:
+            await self.clock.sleep(AGAIN_S)
+            removed = await self.clock.in_thread(self._removed)
+            for what in removed:
+                log.warning("%s: was removed; it is written again", self._path(what))
+            wanted = removed | self.unkept.keys()
+            if "calibration" in wanted and not self._calibration_lock.locked():
+                await self._save_calibration()
+            if "state" in wanted:
+                await self.control.keep()
+            if "zeros" in removed:
+                await self._kept()
+                self._zeros = msgspec.structs.replace(self._zeros, calibration="")
+                self._begin_to_keep_zeros()
+
+    def _removed(self) -> set[str]:
+        """Return what was kept, and its file is not there any more."""
+        return {what for what in self._files - self.unkept.keys() if not self._path(what).exists()}
 
     def _record_of(self, part: int) -> Record:
         link = self.link

@@ -90,6 +90,7 @@ def load_kept(path: Path, kind: type[Kept]) -> Kept:
 
     Raises:
         NewerFileError: a newer version has written it.
+        BusyFileError: another program is writing it.
     """
     unchanged = kind()
     if not os.access(path, os.F_OK):

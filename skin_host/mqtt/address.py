@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 from urllib.parse import SplitResult, unquote, urlsplit
 
-from skin_host.errors import ConfigurationError, RequestError
+from skin_host.errors import BusyFileError, ConfigurationError, RequestError
 from skin_host.files import read_whole
 
 if TYPE_CHECKING:
@@ -169,6 +169,8 @@ def _password(settings: "Mqtt", folder: Path) -> str | None:
             return None
     try:
         password = read_whole(path).decode().rstrip("\r\n")
+    except BusyFileError as error:
+        raise CredentialError(f"mqtt.password_file: {error}") from None
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8"
         raise CredentialError(f"mqtt.password_file: {path}: {reason}") from None

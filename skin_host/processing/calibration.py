@@ -552,6 +552,9 @@ def with_gains_of(calibration: Calibration, path: Path, layout: Layout) -> Calib
 
     Zero and noise are measured at every start; gains and curves belong to pad and foam, and remain
     valid.
+
+    Raises:
+        BusyFileError: another program is writing the file.
     """
     try:
         before = load(path, layout, calibration.configuration)
@@ -742,6 +745,7 @@ def load(path: Path, layout: Layout, configuration: str) -> Calibration:
         CalibrationError: unreadable, damaged, of another schema, configuration or robot; one
             line that ends with the command that helps.
         NewerFileError: a newer version has written it.
+        BusyFileError: another program is writing it.
     """
 
     def refused(what: str) -> CalibrationError:

@@ -31,7 +31,7 @@ from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Settings
 from skin_host.errors import RequestError, SkinError
-from skin_host.files import growing, writing
+from skin_host.files import growing, refuse_removed, writing
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import Retry, connect, explain, first_error
 from skin_host.mqtt.payload import MAX_PACKET_BYTES
@@ -104,7 +104,7 @@ class CanLog:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None and not self.frames:
             self._logger.stop()
-            self._growing.unlink()
+            self._growing.unlink(missing_ok=True)
         else:
             self.close()
 
@@ -115,14 +115,20 @@ class CanLog:
             SkinError: the disk is full or gone.
         """
         with writing(self._path):
+            refuse_removed(self._growing)
             for row in range(len(batch)):
                 self._logger.on_message_received(message_at(batch, row, channel))
                 self.frames += 1
 
     def close(self) -> None:
-        """End the recording and give it its name."""
-        self._logger.stop()
-        os.replace(self._growing, self._path)
+        """End the recording and give it its name.
+
+        Raises:
+            SkinError: the disk is full or gone.
+        """
+        with writing(self._path):
+            self._logger.stop()
+            os.replace(self._growing, self._path)
 
 
 async def capture_buses(settings: Settings, sink: CanSink, stop: asyncio.Event) -> int:
@@ -281,6 +287,7 @@ class FrameRecorder:
                     if self.bytes + len(lines) > self._max_bytes:
                         self.ended = f"it reached its {self._max_bytes} bytes"
                         return
+                    refuse_removed(self.path)
                     self._append(lines)
                     self.bytes += len(lines)
                     self.frames += len(item[1])

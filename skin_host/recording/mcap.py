@@ -19,7 +19,7 @@ from msgspec import Struct
 from skin_host.bus.logs import open_recording
 from skin_host.bus.wire import FrameBatch
 from skin_host.errors import LogError, SkinError, required
-from skin_host.files import growing, writing
+from skin_host.files import growing, refuse_removed, writing
 from skin_host.fingertip.events import Over, Slip
 from skin_host.health.record import Record
 from skin_host.mqtt.frames import FRAME_SCHEMA, JsonFrame, decode_frame, encode_frame
@@ -110,7 +110,7 @@ class Recorder:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None and not self.messages:
             self._file.close()
-            self._growing.unlink()
+            self._growing.unlink(missing_ok=True)
         else:
             self.close()
 
@@ -178,10 +178,11 @@ class Recorder:
             self._writer.finish()
             self._file.flush()
             os.fsync(self._file.fileno())
-        os.replace(self._growing, self._path)
+            os.replace(self._growing, self._path)
 
     def _add(self, topic: str, kind: str, t_ns: int, sent_ns: int, data: bytes) -> None:
         with writing(self._path):
+            refuse_removed(self._growing)
             if topic not in self._channels:
                 if kind not in self._schemas:
                     name, content = _TYPES[kind]

@@ -102,7 +102,7 @@ async def refused_by_the_disk(
     found = await calibrated(daemon)
     assert daemon.engine.calibration is found
     assert f"calibration not kept: {state}/load-main.calibration.json: {why}" in caplog.text
-    assert f"state not kept: {why}" in caplog.text
+    assert f"state not kept: {state}/load-main.state.json: {why}" in caplog.text
     await sweeps_go_on(daemon)
     # Nothing is damaged, nothing half written lies about.
     assert contents(state) == kept
