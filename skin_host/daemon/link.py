@@ -350,6 +350,7 @@ class Link:
 
     async def _bring_up(self, boards: Boards | StrainBoards) -> None:
         told = ""
+        sweeps: dict[int, int] = {}
         while True:
             try:
                 if isinstance(boards, Boards):
@@ -363,6 +364,14 @@ class Link:
                     log.warning("%s", error)
                     told = str(error)
                 if isinstance(boards, Boards):
-                    # What sends all the same keeps the zero that it has.
-                    self._engine.release([one.index for one in boards.records.values()])
+                    # Boards that go on sending keep the zero that they have. Those of a bus that
+                    # was away may have another when it is back; then they are set up.
+                    before, sweeps = sweeps, self._sweeps_of(boards)
+                    sending = [one for one, n in sweeps.items() if n > before.get(one, n)]
+                    self._engine.release(sending)
                 await self._clock.sleep(RETRY_S)
+
+    def _sweeps_of(self, boards: Boards) -> dict[int, int]:
+        """Return how many sweeps of each board, by index, have been received."""
+        received = self._engine.ledger.sweeps
+        return {one.index: int(received[one.row]) for one in boards.records.values()}

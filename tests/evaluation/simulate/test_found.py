@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from emulator.probes.scene import Fault, Scene
+from skin_host.bus.port import LinkState
 from skin_host.bus.wire import HEADER_A, HEADER_B, FrameBatch
 from skin_host.cli.common import load_skin
 from skin_host.clock import SteppedClock
@@ -384,6 +385,54 @@ def test_pads_whose_noise_a_set_up_cuts_off_are_named_and_make_no_part_unknown(
         life.kill()
 
     with worn.clock.runner() as runner:
+        runner.run(live())
+
+
+def test_a_bus_that_comes_back_after_a_start_has_no_valid_taxel_before_its_boards_are_set_up(
+    world: World,
+) -> None:
+    """Boards that were away when the daemon started may have zeroed themselves before."""
+
+    async def live() -> None:
+        life = start(world)
+        await world.clock.sleep(8.0)
+        life.kill()
+        world.cables["can0"].set_state(LinkState.GONE)
+        life = start(world)
+        await world.clock.sleep(4.5)
+        world.cables["can0"].set_state(LinkState.UP)
+        boards = life.daemon.link.boards["can0"]
+        came = 0
+        while not all(record.configurations for record in boards.records.values()):
+            await world.clock.sleep(0.02)
+            came = int(life.daemon.engine.ledger.sweeps.max())
+            valid = {name: one["valid_taxels"] for name, one in life.daemon.records().items()}
+            assert not any(valid.values())
+        assert came > 0
+        await world.clock.sleep(4.0)
+        assert all(record["valid_taxels"] for record in life.daemon.records().values())
+        life.kill()
+
+    with world.clock.runner() as runner:
+        runner.run(live())
+
+
+def test_boards_of_a_bus_that_takes_no_frames_are_valid_with_the_zero_that_they_have(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An adapter that only listens: no daemon can set its boards up, and all of them send."""
+
+    async def live() -> None:
+        life = start(world)
+        await world.clock.sleep(8.0)
+        life.kill()
+        monkeypatch.setattr(Cable, "send", lambda *_: False)
+        life = start(world)
+        await world.clock.sleep(10.0)
+        assert all(record["valid_taxels"] for record in life.daemon.records().values())
+        life.kill()
+
+    with world.clock.runner() as runner:
         runner.run(live())
 
 
