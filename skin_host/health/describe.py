@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.bus.wire import TRIANGLES, StatusError
+from skin_host.health.diagnosis import HOLDS_UP_SHARE
 from skin_host.health.record import (
     BoardHealth,
     BusHealth,
@@ -359,8 +360,24 @@ class Describer:
                 for name, at_ns in watch.event_ns.items()
                 if abs(now_ns - at_ns) < LATELY_NS
             }
+            record["held_up"] = (
+                jitter_ms is not None
+                and jitter_ms > HOLDS_UP_SHARE * board.settings.period_ms
+                and self._is_held_up(index)
+            )
             record["twice"] = watch.is_twice(now_ns, board.settings.period_ms * 1_000_000)
         return record
+
+    def _is_held_up(self, index: int) -> bool:
+        """Whether a more urgent board of the same bus sends irregularly."""
+        ledger, own = self._engine.ledger, self._layout.boards[index].settings
+        for other in self._engine.boards:
+            one, row = self._layout.boards[other].settings, ledger.row[other]
+            if one.bus == own.bus and one.address < own.address and not ledger.is_silent(row):
+                _, jitter_ms = _period(ledger.intervals_ns(row), one.period_ms)
+                if jitter_ms is not None and jitter_ms > HOLDS_UP_SHARE * one.period_ms:
+                    return True
+        return False
 
     def _is_new(self, index: int) -> bool:
         """Whether a board that had timed out sends again, but no sample has its values yet."""

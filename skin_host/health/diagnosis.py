@@ -19,6 +19,9 @@ BABBLE_LOAD = 0.4
 PERIOD_SHARE = 0.05
 #: Intervals that scatter by more than this share of the period (median deviation) are a fault.
 JITTER_SHARE = 0.06
+#: A board whose intervals scatter by more than this share may hold up all less urgent ones of its
+#: bus: they want it at the same time if they were set up together, and wait for whole sweeps.
+HOLDS_UP_SHARE = 0.02
 #: This many lone frames (one of a pair) in the last second are a fault.
 FEW_HALVES = 2
 #: So is this many pads of a bus that jumped for one sweep and back, in the last second.
@@ -239,7 +242,7 @@ def _board(board: BoardHealth) -> Iterator[FoundFault]:
     if board["alive"] and seen is not None and jitter_ms is not None:
         if abs(seen - wanted) > PERIOD_SHARE * wanted:
             yield fault("board_period", f" sends every {seen:.1f} ms instead of {wanted} ms")
-        elif jitter_ms > JITTER_SHARE * wanted:
+        elif jitter_ms > JITTER_SHARE * wanted and not board.get("held_up"):
             yield fault(
                 "board_jitter", f" sends irregularly: its {wanted} ms scatter by {jitter_ms:.1f} ms"
             )

@@ -8,7 +8,7 @@ from emulator.probes.scene import Place, Probe, Scene
 from emulator.robot import Robot
 from skin_host.bus.wire import FrameBatch
 from skin_host.health import LATELY_NS, STALLED_NS, HealthWatch
-from tests.support.fault_bench import FaultBench
+from tests.support.fault_bench import CONFIG, FaultBench
 
 OUTPUT: dict[str, Any] = {"connected": True, "touches_dropped": 0, "refused": 0, "last_error": ""}
 
@@ -44,6 +44,24 @@ def test_losses_of_the_output_are_faults_for_a_minute(bench: FaultBench) -> None
     assert codes(bench.health, now_ns + 2 * LATELY_NS, touches_dropped=4, refused=1) == {
         "touches_dropped"
     }
+
+
+def test_a_board_whose_frames_wait_for_those_of_an_irregular_one_is_not_called_irregular() -> None:
+    """Six boards that were set up together want the bus at the same time; urgent ones go first."""
+    bench = FaultBench(2.0, config=CONFIG.with_name("nao.toml"), settle_s=2.0)
+    end = bench.inject("jittered_period", board="left_upper_arm", value=7.25)
+    bench.run(10.0)
+    jittered = {where for code, where in bench.told if code == "board_jitter"}
+    assert jittered == {"left_upper_arm"}
+    end()
+    bench.run(5.0)
+    assert not bench.told
+    # Of two the more urgent one is named; the other one when that is mended.
+    for board in ("left_lower_arm_1", "right_lower_arm_2"):
+        bench.inject("jittered_period", board=board, value=8.0)
+    bench.run(5.0)
+    jittered = {where for code, where in bench.told if code == "board_jitter"}
+    assert jittered == {"left_lower_arm_1"}
 
 
 def test_a_part_with_complaints_is_not_ok(bench: FaultBench) -> None:
