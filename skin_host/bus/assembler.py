@@ -698,11 +698,11 @@ class Assembler:
     def _count_sweep(self, state: _BoardState, last_ns: int) -> int:
         """Count a sweep and those missed since the board's last one; return the latter."""
         missed = 0
-        if state.sent_last_ns:
-            apart = round((last_ns - state.sent_last_ns) / state.period_ns)
-            missed = max(0, apart - 1)
+        passed_ns = last_ns - state.sent_last_ns
+        if state.sent_last_ns and 2 * passed_ns >= 3 * state.period_ns:
+            missed = round(passed_ns / state.period_ns) - 1
+            self.counters.missed += missed
         self.counters.sweeps += 1
-        self.counters.missed += missed
         return missed
 
     def _learn_order(self, state: _BoardState, came: list[tuple[bytes, int, int]]) -> None:

@@ -42,7 +42,7 @@ from skin_host.bus.commands import (
     TxMode,
     command_frame,
 )
-from skin_host.bus.ledger import BoardLedger
+from skin_host.bus.ledger import WRONG_PERIOD, BoardLedger
 from skin_host.bus.opening import open_port
 from skin_host.bus.wire import BROADCAST_ADDRESS, find_skin_frames
 from skin_host.clock import SYSTEM, Clock
@@ -72,8 +72,6 @@ LISTEN_AT_LEAST_PERIODS = 3
 #: board.
 WRONG_S = 1.0
 WRONG_RETRY_S = (5.0, 10.0, 20.0, 60.0)
-#: A period that differs by more than this share is not the one that was set.
-WRONG_PERIOD = 0.25
 #: What a board reports of itself is logged no oftener than this.
 WARN_S = 60.0
 #: An answer counts until so many queries after it were not answered.
@@ -271,17 +269,16 @@ class Boards:
         It never sends a discovery to all boards, because that would stop the MTB3s that work.
         """
         now_ns = self._ledger.now_ns
-        at_ease = self._ledger.at_ease(WRONG_PERIOD)
         for record in self.records.values():
             if not record.started or record.busy is not None:
                 continue
             if (
-                at_ease[record.row]
+                self._ledger.is_easy(record.row)
                 and record.alive
                 and record.configurations
                 and not (record.wrong or record.wrong_tries or record.claims)
             ):
-                continue  # the usual case, checked for all boards at once
+                continue  # the usual case
             if self._ledger.overdue(record.row, record.configured_ns):
                 self._note_silence(record, now_ns)
             elif self._ledger.since_set_up(record.row):

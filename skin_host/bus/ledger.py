@@ -36,6 +36,8 @@ MISSING_SWEEPS = 5
 #: An MTB3 that zeroes itself, after five bad readings, sends nothing for four periods. It times out
 #: no earlier than after this many: to query it then would stop it.
 MTB3_PERIODS = 6.0
+#: A period that differs by more than this share is not the one that was set.
+WRONG_PERIOD = 0.25
 #: For a regular board all intervals, except the longest and shortest fifth, lie within this share.
 UNEVEN = 0.1
 _BITS = np.arange(TRIANGLES)
@@ -99,8 +101,14 @@ class BoardLedger:
         self.flagged = [False] * n
         self.absent = np.zeros((n, TRIANGLES), np.int64)
         self._complete = [True] * n
-        self._intervals_ns = np.zeros((n, INTERVALS), np.int64)
+        self._intervals_ns = [[0] * INTERVALS for _ in range(n)]
         self._n_intervals = [0] * n
+        #: Of each board, a mask of the intervals that are not within `WRONG_PERIOD` of its period.
+        self._uneasy = [(1 << INTERVALS) - 1] * n
+        self._easy_ns = [
+            ((1 - WRONG_PERIOD) * period_ns, (1 + WRONG_PERIOD) * period_ns)
+            for period_ns in self._period_ns.tolist()
+        ]
         self._since_set_up = [0] * n
         self.silences = np.zeros(n, np.int64)
         self.resets = np.zeros(n, np.int64)
@@ -189,19 +197,12 @@ class BoardLedger:
         quiet_ns = self.now_ns - max(int(self.received_ns[row]), since_ns)
         return quiet_ns > int(self.silent_after_ns[row])
 
-    def at_ease(self, share: float) -> list[bool]:
-        """Return by row whether a board sends all that it was set up to send, each of its last
-        sweeps within this share of its period. One that does not may do so within other limits.
+    def is_easy(self, row: int) -> bool:
+        """Return whether a board sends all that it was set up to send, each of its last sweeps
+        within `WRONG_PERIOD` of its period. One that does not may do so within other limits.
         """
-        period_ns = self._period_ns[:, None]
-        near = np.abs(self._intervals_ns - period_ns) < share * period_ns
-        sends = near.all(axis=1) & ~self.silent
-        return [
-            sends and complete and since > 0
-            for sends, complete, since in zip(
-                sends.tolist(), self._complete, self._since_set_up, strict=True
-            )
-        ]
+        sends = self._complete[row] and self._since_set_up[row] > 0
+        return sends and not self._uneasy[row] and not (self.any_silent and self.is_silent(row))
 
     def missing(self, row: int) -> int:
         """Return a mask of the enabled triangles that a board has not sent since it was set up, or
@@ -213,7 +214,7 @@ class BoardLedger:
 
     def intervals_ns(self, row: int) -> NDArray[np.int64]:
         """Return the last intervals int64[up to 16] between a board's sweeps, unordered."""
-        return self._intervals_ns[row, : min(self._n_intervals[row], INTERVALS)]
+        return np.array(self._intervals_ns[row][: self._n_intervals[row]], np.int64)
 
     def regular_period_ns(self, row: int) -> float | None:
         """Return the median of a board's last intervals, or None if they are few or irregular.
@@ -222,7 +223,7 @@ class BoardLedger:
         elsewhere.
         """
         # For so few numbers a list is faster than an array.
-        intervals = sorted(self.intervals_ns(row).tolist())
+        intervals = sorted(self._intervals_ns[row][: self._n_intervals[row]])
         if len(intervals) < INTERVALS // 2 - 1:
             return None
         fifth, usual_ns = len(intervals) // 5, float(median(intervals))
@@ -234,8 +235,14 @@ class BoardLedger:
             self._n_intervals[row] = 0
             return
         n = self._n_intervals[row]
-        self._intervals_ns[row, n % INTERVALS] = interval_ns
+        place = n % INTERVALS
+        self._intervals_ns[row][place] = interval_ns
         self._n_intervals[row] = n + 1
+        least_ns, most_ns = self._easy_ns[row]
+        if least_ns < interval_ns < most_ns:
+            self._uneasy[row] &= ~(1 << place)
+        else:
+            self._uneasy[row] |= 1 << place
 
     def _advance(self, now_ns: int) -> None:
         newest_ns, self._newest_ns = self._newest_ns, now_ns

@@ -237,7 +237,7 @@ class Link:
             deliver(output)
         self.read_ns = read_ns
         # What is behind is complete up to its last frame, whatever held this computer up.
-        if not is_behind and self._is_patient(now_ns):
+        if self._held_up_at_ns is not None and not is_behind and self._is_patient(now_ns):
             self._engine.ledger.pass_over(read_ns)
             return
         self._engine.ledger.look(read_ns)

@@ -42,7 +42,9 @@ class PartWatch:
         late_samples: a triangle that was not received for fewer samples in a row is only late.
         lost: int64[k], for how many samples in a row each triangle was not received; None if all
             were.
-        touched_ns: when each taxel [m] was last touched; None if none ever was.
+        touched: bool[m], taxels that are touched, since `touched_ns` was renewed.
+        touched_ns: when each taxel [m] was last touched before; None if none ever was.
+        sample_ns: time of the last sample.
         late: bool[m], taxels that are late and were valid before.
         doubted: bool[16 b, 12], pads that were in doubt after the last sample but one, and after
             the last one: its own doubts are between them.
@@ -57,6 +59,8 @@ class PartWatch:
     valid: NDArray[np.bool_] | None = None
     touched: NDArray[np.bool_] | None = None
     touched_ns: NDArray[np.int64] | None = None
+    any_valid: bool = False
+    any_touched: bool = False
     beyond: NDArray[np.bool_] | None = None
     raw: NDArray[np.uint8] | None = None
     lost: NDArray[np.int64] | None = None
@@ -67,19 +71,21 @@ class PartWatch:
     def note(self, step: Step, doubted: Mask | None) -> None:
         """Take in a processed sample, with the pads that are in doubt now."""
         frame = step.frame
-        self.sample_ns = frame.t_ns
         self.doubted = self.doubted[1], doubted
-        if any_of(frame.valid):
+        # The same masks as in the sample before are mostly the same objects.
+        if frame.valid is not self.valid:
+            self.any_valid = any_of(frame.valid)
+        if self.any_valid:
             self.last_ns = frame.t_ns
             self.frames += 1
             self.rate_frames += 1
         self._note_lost(frame)
         self.valid = frame.valid
-        self.touched = frame.touched
-        if any_of(frame.touched):
-            if self.touched_ns is None:
-                self.touched_ns = np.full(len(frame.touched), -FOAM_NS, np.int64)
-            self.touched_ns[frame.touched] = frame.t_ns
+        if frame.touched is not self.touched:
+            self._note_touched()
+            self.touched = frame.touched
+            self.any_touched = any_of(frame.touched)
+        self.sample_ns = frame.t_ns
         self.beyond = frame.beyond_range
         self.raw = frame.raw
         if not self.rate_since_ns:
@@ -93,12 +99,21 @@ class PartWatch:
 
     def rests(self) -> Mask | None:
         """Return the valid taxels, bool[m], that nothing touches and no foam still pushes."""
+        self._note_touched()
         if self.valid is None or self.touched_ns is None:
             return self.valid
         passed_ns = self.sample_ns - self.touched_ns
         # A touch in the future was before the clock was set back.
         rests: Mask = self.valid & ((passed_ns < 0) | (passed_ns >= FOAM_NS))
         return rests
+
+    def _note_touched(self) -> None:
+        """Note until when the touched taxels of the last samples were touched."""
+        if self.touched is None or not self.any_touched:
+            return
+        if self.touched_ns is None:
+            self.touched_ns = np.full(len(self.touched), -FOAM_NS, np.int64)
+        self.touched_ns[self.touched] = self.sample_ns
 
     def _note_lost(self, frame: PressureFrame) -> None:
         # Where nothing was received there is 0. A sample of nothing reports silence.

@@ -176,11 +176,8 @@ def encode_frame(
     scaled = np.divide(frame.pressure_kpa, SCALE_KPA, dtype=np.float64)
     np.rint(scaled, out=scaled)
     valid = frame.valid
-    # False with any number that is not one.
-    if not (
-        np.minimum.reduce(scaled, initial=0.0) >= -_INT32
-        and np.maximum.reduce(scaled, initial=0.0) <= _INT32
-    ):
+    # No number can be larger than the root of this, which is not true of what is no number.
+    if not np.dot(scaled, scaled) <= _INT32**2:
         finite = np.isfinite(scaled)
         valid = valid & finite
         scaled = np.clip(np.where(finite, scaled, 0.0), -_INT32, _INT32)

@@ -335,8 +335,8 @@ class Engine:
             samples = felt.samples
             grasps += felt.events
         sweeps, answers = self.assemblers[bus].feed(batch)
-        steps = self._process(self._take(sweeps)) if sweeps else []
-        return Output(sweeps, steps, samples, grasps, answers)
+        taken = self._take(sweeps) if sweeps else []
+        return Output(sweeps, self._process(taken) if taken else [], samples, grasps, answers)
 
     def feed_long(self, bus: str, batch: FrameBatch) -> Iterator[Output]:
         """Process a batch that spans many sweeps; yield a result for each, as if it came alone.

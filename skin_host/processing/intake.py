@@ -149,6 +149,7 @@ class Intake:
         self._encodings = _encodings(layout, boards)
         self.liveness = self._new_liveness(None)
         self._states = [self._new_state(part, silent_periods) for part in parts]
+        self._waits = [state.waits for state in self._states]
         self._of_board: dict[int, list[_PartState]] = {board: [] for board in boards}
         for state in self._states:
             for board in state.rows:
@@ -178,6 +179,7 @@ class Intake:
         self._present, self._received = before._present, before._received
         self._masks, self._usual, self._here = before._masks, before._usual, before._here
         self._states, self._of_board = before._states, before._of_board
+        self._waits = before._waits
 
     def take(self, sweep: Sweep, row: int) -> list[PartSample]:
         """Take a sweep that the ledger has just noted; return the samples that it completes.
@@ -230,7 +232,7 @@ class Intake:
 
     def missing(self) -> list[dict[int, int]]:
         """Of each part, the boards whose sweeps its next sample waits for."""
-        return [state.waits for state in self._states]
+        return self._waits
 
     def expire(self, now_ns: int) -> list[PartSample]:
         """Return samples that have waited for a whole period, and report which parts are silent."""
@@ -426,7 +428,7 @@ class Intake:
             # clock is set back.
             state.last_ns = state.stamped_ns + 1
         state.stamped_ns = state.last_ns
-        state.waits = state.rows.copy()
+        state.waits.update(state.rows)
         state.pending = False
         state.reported_ns = -1
         return PartSample(state.index, raw, present, received, state.last_ns)

@@ -300,22 +300,27 @@ def test_an_mtb3_may_pause_for_six_periods_and_another_board_as_long_as_is_set(
 
 
 @pytest.mark.parametrize(
-    ("interval_ms", "share", "at_ease"),
-    [
-        (50.0, 0.1, True),
-        (54.0, 0.1, True),
-        (56.0, 0.1, False),
-        (46.0, 0.1, True),
-        (44.0, 0.1, False),
-    ],
+    ("interval_ms", "is_easy"),
+    [(50.0, True), (62.0, True), (63.0, False), (38.0, True), (37.0, False)],
 )
-def test_a_board_is_at_ease_while_each_of_its_last_sweeps_is_near_its_period(
-    interval_ms: float, share: float, at_ease: bool
+def test_a_board_is_easy_while_each_of_its_last_sweeps_is_near_its_period(
+    interval_ms: float, is_easy: bool
 ) -> None:
     known = after([50.0] * 16 + [interval_ms])
-    assert known.at_ease(share)[HAND] is at_ease
-    assert not known.at_ease(share)[OUTER]
+    assert known.is_easy(HAND) is is_easy
+    assert not known.is_easy(OUTER)
     known.set_up(HAND)
-    assert not known.at_ease(share)[HAND]
+    assert not known.is_easy(HAND)
     known.note(sweep(HAND, T0 + 900 * MS))
-    assert known.at_ease(share)[HAND] is at_ease
+    assert known.is_easy(HAND) is is_easy
+    for turn in range(17):
+        known.note(sweep(HAND, T0 + (950 + 50 * turn) * MS))
+    assert known.is_easy(HAND)
+
+
+def test_a_board_that_timed_out_is_not_easy() -> None:
+    known = after([50.0] * 16)
+    for turn in range(1, 4):
+        assert known.is_easy(HAND)
+        known.look(T0 + 800 * MS + turn * 90 * MS)
+    assert not known.is_easy(HAND)
