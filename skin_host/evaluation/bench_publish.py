@@ -25,7 +25,8 @@ from skin_host.config.settings import Mqtt
 from skin_host.errors import RequestError
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import Connection, PackedProperties, connect, message_properties
-from skin_host.mqtt.frames import encode_frame, publish_head, publish_packet
+from skin_host.mqtt.frames import encode_frame
+from skin_host.mqtt.packets import publish_head, publish_packet
 from skin_host.mqtt.payload import JSON_TYPE
 from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.pipeline import PressureFrame

@@ -5,7 +5,7 @@ that never waits for a broker that does not answer, and a count of publications 
 took but refused (MQTT 5 reports that in the acknowledgement, aiomqtt does not).
 
 Frames (QoS 0) do not pass through paho: `Connection.write_now` writes packets that are encoded
-already, see `frames.publish_packet`, to paho's socket. Nothing is expected in answer to such a
+already, see `packets.publish_packet`, to paho's socket. Nothing is expected in answer to such a
 packet, so nothing of it has to be kept: no number, no future, no lock, no callback, which together
 cost paho and aiomqtt several times what the bytes do. Only the writing has to be shared, and
 paho's queue of packets does that: while it holds anything, no frame is written past it, and the
@@ -13,8 +13,10 @@ rest of a frame that the socket took in part becomes its first packet. Alternati
 internals as far as `_send_publish`, which still make a numbered, logged and announced message of
 each frame; the encoder of the package `mqtt5`, which writes any packet of MQTT 5 and needs 3.1.1
 beside it, where one packet is needed whose head never changes; a major version of aiomqtt that has
-no paho below it, which is not released. Whatever is acknowledged (events, states, commands) needs
-paho's bookkeeping and keeps it. A broker's limits: no packet is longer than it takes (`fits`), no
+no paho below it, which is not released. Whatever is acknowledged (events, states) keeps paho's
+bookkeeping: its number, its place among those in flight, its entry until it is acknowledged. But
+its packet is encoded here, and its entry is one object for all of them, because paho never sends
+it again over another connection. A broker's limits: no packet is longer than it takes (`fits`), no
 topic alias is used, and packets with QoS 0 do not count for its receive maximum.
 """
 
@@ -36,7 +38,7 @@ from paho.mqtt.client import (
     MQTT_ERR_PROTOCOL,
     MQTT_ERR_SUCCESS,
 )
-from paho.mqtt.enums import MQTTErrorCode
+from paho.mqtt.enums import MessageState, MQTTErrorCode
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
@@ -44,7 +46,7 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from skin_host.clock import SYSTEM, Clock
 from skin_host.mqtt.address import Broker
-from skin_host.mqtt.packets import KEPT_BYTES, unfit
+from skin_host.mqtt.packets import KEPT_BYTES, numbered_packet, unfit
 
 #: A broker that does not answer for this long is lost.
 TIMEOUT_S = 3.0
@@ -73,6 +75,26 @@ _USUAL_ACKS = {
 }
 _PUBACK = 0x40
 _NO_PROPERTIES = Properties(PacketTypes.PUBACK)  # type: ignore[no-untyped-call]
+
+#: The properties of a message without any.
+_NONE = b"\0"
+
+
+class _OnItsWay:
+    """A message with QoS 1 that waits for its acknowledgement, as far as paho looks at it."""
+
+    qos = 1
+    state = MessageState.MQTT_MS_WAIT_FOR_PUBACK
+
+    @property
+    def info(self) -> "_OnItsWay":
+        return self
+
+    def _set_as_published(self) -> None:
+        """Nobody waits for this one."""
+
+
+_ON_ITS_WAY = _OnItsWay()
 
 MqttError = aiomqtt.MqttError
 Message = aiomqtt.Message
@@ -147,6 +169,8 @@ class Connection(aiomqtt.Client):
         self._read_packet, self._handle_packet = self._paho._packet_read, self._paho._packet_handle
         self._paho._packet_read, self._paho._packet_handle = self._bounded_read, self._checked
         self._sent: dict[int, asyncio.Future[None]] = {}
+        #: Packets for which `flush` follows.
+        self._held: list[bytes] = []
         self.when_clear: Callable[[], None] = lambda: None
         self._is_refusing = False
         self._cut = False
@@ -171,16 +195,43 @@ class Connection(aiomqtt.Client):
         qos: int = 0,
         retain: bool = False,
         properties: Properties | None = None,
+        hold: bool = False,
     ) -> "asyncio.Future[None]":
-        """Hand over a message without waiting: half the cost of `publish`.
+        """Hand over a message without waiting: a fraction of the cost of `publish`.
 
         What is sent in one turn of the loop is written together. The future is done when
         the message is written (QoS 0) or acknowledged (QoS 1); it never fails, for when
         the connection is lost `messages` raises.
 
+        Args:
+            topic, payload, qos, retain, properties: of the message.
+            hold: `flush` follows in this turn of the loop.
+
         Raises:
             MqttError: the connection is lost.
         """
+        paho = self._paho
+        in_flight = paho._inflight_messages
+        # What is above the window, and all after it, waits in paho.
+        if (
+            qos == 1
+            and paho._sock is not None
+            and len(paho._out_messages) <= in_flight < paho._max_inflight_messages
+            and (number := paho._mid_generate()) not in paho._out_messages
+        ):
+            packed: bytes | None = None
+            if self._v5:
+                packed = _NONE if properties is None else properties.pack()  # type: ignore[no-untyped-call]
+            packet = numbered_packet(topic, number, packed, payload, retain=retain)
+            paho._out_messages[number] = _ON_ITS_WAY
+            paho._inflight_messages = in_flight + 1
+            done = self._sent[number] = self._loop.create_future()
+            if hold:
+                self._held.append(packet)
+            else:
+                self._put_behind(packet)
+            return done
+        self.flush()
         info = self._client.publish(topic, payload, qos, retain, properties)
         if info.rc != MQTT_ERR_SUCCESS:
             raise aiomqtt.MqttCodeError(info.rc, "not sent")
@@ -193,8 +244,20 @@ class Connection(aiomqtt.Client):
 
     def flush(self) -> None:
         """Write what was sent in this turn of the loop now, not at its end."""
-        sock = self._client.socket()
-        if sock is not None:
+        held, self._held = self._held, []
+        sock = self._paho._sock
+        if sock is None:
+            return
+        if held:
+            data = held[0] if len(held) == 1 else b"".join(held)
+            if self._paho._out_packet:
+                self._put_behind(data)
+            else:
+                written = self._push(sock, data)
+                if 0 <= written < len(data):
+                    self._is_refusing = True
+                    self._put_behind(data[written:])
+        if self._paho._out_packet:
             self._write(self._client, sock)
 
     def is_clear(self) -> bool:
@@ -202,9 +265,10 @@ class Connection(aiomqtt.Client):
 
         What was sent in this turn of the loop is written first.
         """
-        if self._client.want_write():
+        paho = self._paho
+        if paho._out_packet or self._held:
             self.flush()
-        clear = not self._client.want_write() and self._client.socket() is not None
+        clear = not paho._out_packet and paho._sock is not None
         self._is_refusing |= not clear
         return clear
 
@@ -217,36 +281,42 @@ class Connection(aiomqtt.Client):
         """
         if not self.is_clear():
             return 0
-        sock: Any = self._client.socket()
+        sock: Any = self._paho._sock
         data = packets[0] if len(packets) == 1 else b"".join(packets)
-        try:
-            written = sock.send(data)
-        except (ssl.SSLWantWriteError, ssl.SSLWantReadError):
-            # Some of it may be on its way, encrypted: TLS needs the same bytes again.
-            self._complete(data)
-            return len(packets)
-        except BlockingIOError:
-            written = 0
-        except OSError:
-            # The reader of the socket gets the same error and ends the connection.
-            return 0
+        written = self._push(sock, data)
         if written == len(data):
             return len(packets)
+        if written < 0:
+            return 0
         self._is_refusing = True
         taken = end = 0
         while end < written:
             end += len(packets[taken])
             taken += 1
         if end > written:
-            self._complete(data[written:end])
+            self._put_behind(data[written:end])
         else:
             self._loop.add_writer(sock.fileno(), self._write, self._client, sock)
         return taken
 
-    def _complete(self, rest: bytes) -> None:
-        """Let paho write the rest of a packet before all others, when the socket takes it."""
+    def _push(self, sock: Any, data: bytes) -> int:
+        """Write past paho's queue, which is empty; return how much was taken, -1 after an error."""
+        try:
+            return int(sock.send(data))
+        except (ssl.SSLWantWriteError, ssl.SSLWantReadError):
+            # Some of it may be on its way, encrypted: TLS needs the same bytes again.
+            self._put_behind(data)
+            return len(data)
+        except BlockingIOError:
+            return 0
+        except OSError:
+            # The reader of the socket gets the same error and ends the connection.
+            return -1
+
+    def _put_behind(self, packets: bytes) -> None:
+        """Let paho write these after all that it has to write, when the socket takes it."""
         # The number 0 is not a type of packet: paho only writes it.
-        self._paho._packet_queue(0, rest, 0, 0)
+        self._paho._packet_queue(0, packets, 0, 0)
 
     async def _wait_for(self, fut: Any, timeout: float | None) -> Any:  # noqa: ASYNC109  # aiomqtt names it
         """Wait as aiomqtt does, and never lose a cancellation.
@@ -457,6 +527,16 @@ class Connection(aiomqtt.Client):
         """Do what paho does for an acknowledgement, decoded already."""
         paho = self._paho
         code: MQTTErrorCode = MQTT_ERR_SUCCESS
+        waiting = paho._out_messages
+        if waiting.get(mid) is _ON_ITS_WAY:
+            del waiting[mid]
+            paho._inflight_messages -= 1
+            done = self._sent.pop(mid)
+            if not done.done():
+                done.set_result(None)
+            if len(waiting) > paho._inflight_messages:
+                code = paho._update_inflight()
+            return code
         with paho._out_message_mutex:
             if mid in paho._out_messages:
                 code = paho._do_on_publish(mid, reason, _NO_PROPERTIES)

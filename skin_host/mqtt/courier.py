@@ -25,8 +25,9 @@ from skin_host.mqtt.connection import (
     PackedProperties,
     within,
 )
-from skin_host.mqtt.frames import encode_frame, publish_head, publish_packet
+from skin_host.mqtt.frames import encode_frame
 from skin_host.mqtt.outbox import Outbox
+from skin_host.mqtt.packets import publish_head, publish_packet
 from skin_host.mqtt.topics import Topics
 from skin_host.processing.pipeline import PressureFrame
 
@@ -365,7 +366,8 @@ class Courier:
             if not self._fits(connection, event.topic, event.payload):
                 self._drop_large_event(len(in_flight))
                 continue
-            done = connection.send(event.topic, event.payload, qos=1, properties=event.properties)
+            topic, payload, properties, _ = event
+            done = connection.send(topic, payload, qos=1, properties=properties, hold=True)
             done.add_done_callback(self._note_acknowledged)
             in_flight.append(_InFlight(done, until_s))
         connection.flush()  # a touch must not wait for the encoding of frames

@@ -1,4 +1,4 @@
-"""Pressure of a part: the payload of `<part>/frame`, JSON or CBOR, and the packet around it.
+"""Pressure of a part: the payload of `<part>/frame`, JSON or CBOR.
 
 Pure: arrays to bytes and back.
 
@@ -11,9 +11,6 @@ Untrusted CBOR is checked before it is decoded. The decoder accepts everything t
 describe: sets, patterns, mails, and references by which 170 bytes become a key whose hash takes for
 ever. Our payloads need far less: maps with text for keys, lists, numbers, text, bytes and typed
 arrays. Source: RFC 8949, section 3; RFC 8746, section 2.
-
-Frames are most of the published messages, and differ only in their payload: the head of a topic's
-packet is encoded once. Source: MQTT 5.0, section 3.3 (PUBLISH).
 """
 
 import re
@@ -27,7 +24,6 @@ from numpy.typing import NDArray
 
 from skin_host.errors import SkinError
 from skin_host.mqtt.messages import SCALE_KPA, Frame
-from skin_host.mqtt.packets import pack_number, pack_text
 from skin_host.mqtt.payload import MessageError, check_size, decode
 from skin_host.processing.events import MAX_TAXELS, Count, Int64
 from skin_host.processing.masks import Mask, any_of
@@ -36,10 +32,6 @@ FRAME_SCHEMA: Final = "skin.frame/1"
 #: RFC 8746, section 2.1: typed arrays of little-endian signed 16-bit and 32-bit integers.
 _TYPED_ARRAYS: dict[int, np.dtype[Any]] = {77: np.dtype("<i2"), 78: np.dtype("<i4")}
 _INT32 = 2**31 - 1
-#: The largest variable byte integer: the maximum length of a packet after its fixed header.
-_MOST_BYTES = 268_435_455
-#: The first byte of a PUBLISH with QoS 0, not retained.
-_PUBLISH = b"\x30"
 _HEX = re.compile("[0-9a-f]*")
 #: Limits of a valid payload: depth of nested values, and number of all values.
 MAX_DEPTH = 16
@@ -202,32 +194,6 @@ def encode_frame(
             del keys[key]
     encoded: bytes = cbor2.dumps(keys)
     return encoded
-
-
-def publish_head(topic: str, properties: bytes | None) -> bytes:
-    """Return the bytes between fixed header and payload of a PUBLISH with QoS 0.
-
-    Args:
-        topic: where to.
-        properties: packed, with their length; None for MQTT 3.1.1.
-    """
-    return pack_text(topic) + (properties or b"")
-
-
-def publish_packet(head: bytes, payload: bytes) -> bytes:
-    """A whole PUBLISH with QoS 0, not retained.
-
-    Args:
-        head: of `publish_head`.
-        payload: of the message.
-
-    Raises:
-        ValueError: it is longer than a packet can be.
-    """
-    left = len(head) + len(payload)
-    if left > _MOST_BYTES:
-        raise ValueError(f"a packet of {left} bytes; wanted at most {_MOST_BYTES}")
-    return b"".join((_PUBLISH, pack_number(left), head, payload))
 
 
 def decode_frame(part: str, payload: bytes) -> Frame:

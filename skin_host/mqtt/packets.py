@@ -5,6 +5,9 @@ paho decodes properties in quadratic time: 80 kB of them take a second, 700 kB m
 So packets that are too long or have too many properties are found here first, in bounded time.
 Source: MQTT 5.0, sections 1.5.4 (text), 1.5.5 (variable byte integer), 2.2.2 (properties) and 3.3
 (PUBLISH); MQTT 3.1.1 has no properties.
+
+Of what is published, frames are the most, and differ only in their payload: the head of a topic's
+packet is encoded once.
 """
 
 from typing import NamedTuple
@@ -17,6 +20,10 @@ MAX_PROPERTY_BYTES = 4096
 MAX_PROPERTIES = 32
 
 _PUBLISH = 0x30
+#: In the first byte of a PUBLISH: QoS 1, and to be retained.
+_QOS_1, _RETAIN = 0x02, 0x01
+#: The largest variable byte integer: the maximum length of a packet after its fixed header.
+_MOST_BYTES = 268_435_455
 #: Bytes of a property's value by its identifier; strings, binary data and pairs have a length.
 _FIXED = {
     0x01: 1, 0x02: 4, 0x11: 4, 0x13: 2, 0x17: 1, 0x18: 4, 0x19: 1, 0x21: 2,
@@ -87,6 +94,52 @@ def _properties(packet: bytes | bytearray, at: int) -> str | None:
             if identifier not in _STRINGS:
                 return None  # malformed: the decoder reports it
     return f"a message with more than {MAX_PROPERTIES} properties"
+
+
+def publish_head(topic: str, properties: bytes | None) -> bytes:
+    """Return the bytes between fixed header and payload of a PUBLISH with QoS 0.
+
+    Args:
+        topic: where to.
+        properties: packed, with their length; None for MQTT 3.1.1.
+    """
+    return pack_text(topic) + (properties or b"")
+
+
+def publish_packet(head: bytes, payload: bytes, first: int = _PUBLISH) -> bytes:
+    """A whole PUBLISH.
+
+    Args:
+        head: of `publish_head`.
+        payload: of the message.
+        first: byte of the packet; that of QoS 0, not retained, by default.
+
+    Raises:
+        ValueError: it is longer than a packet can be.
+    """
+    left = len(head) + len(payload)
+    if left > _MOST_BYTES:
+        raise ValueError(f"a packet of {left} bytes; wanted at most {_MOST_BYTES}")
+    return b"".join((bytes((first,)), pack_number(left), head, payload))
+
+
+def numbered_packet(
+    topic: str, number: int, properties: bytes | None, payload: bytes, *, retain: bool
+) -> bytes:
+    """A whole PUBLISH with QoS 1.
+
+    Args:
+        topic: where to.
+        number: by which it is acknowledged.
+        properties: packed, with their length; None for MQTT 3.1.1.
+        payload: of the message.
+        retain: whether the broker keeps it.
+
+    Raises:
+        ValueError: it is longer than a packet can be.
+    """
+    head = b"".join((pack_text(topic), number.to_bytes(2, "big"), properties or b""))
+    return publish_packet(head, payload, _PUBLISH | _QOS_1 | retain * _RETAIN)
 
 
 def pack_number(number: int) -> bytes:

@@ -8,7 +8,7 @@ import pytest
 from skin_host.client import links
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import connect
-from skin_host.mqtt.frames import publish_head, publish_packet
+from skin_host.mqtt.packets import publish_head, publish_packet
 from skin_host.mqtt.topics import OFFLINE, ONLINE
 from tests.support.packets import CONNACK, CONNECT, SUBSCRIBE, packet, suback
 

@@ -15,8 +15,8 @@ from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 
 from skin_host.mqtt.address import Broker
-from skin_host.mqtt.connection import PackedProperties, connect, message_properties
-from skin_host.mqtt.frames import publish_head, publish_packet
+from skin_host.mqtt.connection import MAX_IN_FLIGHT, PackedProperties, connect, message_properties
+from skin_host.mqtt.packets import numbered_packet, publish_head, publish_packet
 from tests.support.certificates import authority, certificate
 from tests.support.packets import packet_with_flags
 from tests.support.waiting import PATIENCE_S, until
@@ -108,7 +108,9 @@ async def test_no_packet_is_cut_by_another_when_the_socket_is_full(
                     taken = connection.write_now(packets)
                     written += frames[:taken]
                     if len(events) < 10 * (tries + 1):
-                        events.append(connection.send("e", numbered(number, 3001), qos=1))
+                        payload = numbered(number, 3001)
+                        events.append(connection.send("e", payload, qos=1, hold=number % 2 > 0))
+                        connection.flush()
                     await asyncio.sleep(0)
                 broker.reading.set()
                 await asyncio.wait_for(cleared.wait(), PATIENCE_S)
@@ -122,6 +124,49 @@ async def test_no_packet_is_cut_by_another_when_the_socket_is_full(
         )
         events_seen = [packet for command, packet in broker.packets if command & 0xF6 == 0x32]
         assert len(events_seen) == len(events)
+
+
+@pytest.mark.parametrize("retain", [False, True])
+@pytest.mark.parametrize("size", [0, 1, 100, 128, 16_384])
+@pytest.mark.parametrize("version", ["5", "3.1.1"])
+def test_an_event_has_the_bytes_that_paho_would_write(
+    size: int, version: Literal["5", "3.1.1"], retain: bool
+) -> None:
+    broker = Broker(protocol=version)
+    properties = PackedProperties.of(message_properties(broker, "application/json"))
+    protocol = MQTTProtocolVersion.MQTTv5 if broker.v5 else MQTTProtocolVersion.MQTTv311
+    client = Client(CallbackAPIVersion.VERSION2, protocol=protocol)
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        client._sock = ours
+        sent = client.publish("skin/robot/palm/touch", b"x" * size, 1, retain, properties)
+        expected = theirs.recv(200_000)
+        client._sock = None
+    packed = None if properties is None else properties.pack()
+    assert (
+        numbered_packet("skin/robot/palm/touch", sent.mid, packed, b"x" * size, retain=retain)
+        == expected
+    )
+
+
+@pytest.mark.parametrize("hold", [False, True])
+async def test_events_keep_their_order_beyond_those_that_may_be_on_their_way(hold: bool) -> None:
+    n = 5 * MAX_IN_FLIGHT
+    async with slow_broker(None) as broker:
+        broker.reading.set()
+        async with connect(Broker("127.0.0.1", broker.port), identifier="writer") as connection:
+            events = []
+            for number in range(n):
+                payload = number.to_bytes(4, "big")
+                events.append(connection.send("e", payload, qos=1, hold=hold))
+                if number % 7 == 0:
+                    connection.flush()
+                    await asyncio.sleep(0.001 * (number % 3))
+            connection.flush()
+            await asyncio.wait_for(asyncio.gather(*events), PATIENCE_S)
+        await until(lambda: broker.packets[-1][0] == DISCONNECT)
+    came = [packet[-4:] for command, packet in broker.packets if command == PUBLISH | 0x02]
+    assert [int.from_bytes(payload, "big") for payload in came] == list(range(n))
 
 
 @pytest.mark.parametrize("size", [0, 1, 100, 127, 128, 16_383, 16_384, 70_000])

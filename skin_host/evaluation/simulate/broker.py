@@ -217,6 +217,7 @@ class Line:
         qos: int = 0,
         retain: bool = False,
         properties: Any = None,
+        hold: bool = False,  # nothing waits for the end of the turn
     ) -> "asyncio.Future[None]":
         if self._ended.done():
             raise MqttError("not sent: the connection is lost")
