@@ -460,8 +460,9 @@ def longest_run(rate: Floats, samples: Floats | float, odds: float) -> Floats:
     n = np.maximum(samples, still)
     wanted = math.log(odds)
     first = np.log(n / still)
-    run = np.zeros_like(still)
-    for _ in range(NEWTON_STEPS):
+    # The first step, from 0, where the other logarithms are 0.
+    run = np.minimum(wanted / np.maximum(first, wanted / LONGEST_RUN), LONGEST_RUN)
+    for _ in range(NEWTON_STEPS - 1):
         of_all, of_still = np.log1p(run / n), np.log1p(run / still)
         slope = first + of_all - of_still
         told = n * of_all - still * of_still + run * slope
