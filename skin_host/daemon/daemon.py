@@ -207,11 +207,17 @@ class Daemon:
             boards: indices of those whose taxels are calibrated; all by default.
 
         Raises:
-            SkinError: another one is being taken, or no data came.
+            SkinError: another one is being taken, no data came, or the file is not to be replaced:
+                another program is writing it, or a newer version has.
         """
         if self._calibration_lock.locked():
             raise SkinError("a calibration is being taken already; wait for it to end")
         async with self._calibration_lock:
+            # Gains and curves are the file's: another program may have fitted them meanwhile.
+            path = calibration_path(self.settings, self._node)
+            before = await self.clock.in_thread(
+                calibrations.find, path, self.layout, self.engine.configuration
+            )
             log.info("calibrating for %g s: keep the skin untouched", seconds)
             found = await collect(lambda: self.engine, seconds, clock=self.clock)
             known = self.engine.calibration
@@ -220,11 +226,8 @@ class Daemon:
                 found = calibrations.merge(
                     known, found, self.engine.taxels_of(chosen), zeros=boards is None
                 )
-            path = calibration_path(self.settings, self._node)
-            if known is None:
-                found = await self.clock.in_thread(
-                    calibrations.with_gains_of, found, path, self.layout
-                )
+            if before is not None:
+                found = calibrations.with_pressures_of(found, before)
             doubted = self.engine.zero_at_risk(touched=False)
             self.engine.use(found, boards)
             self._use_usable()
@@ -351,6 +354,7 @@ class Daemon:
                 break
             except SkinError as error:
                 log.warning("%s", error)
+                await self.clock.sleep(HEALTH_S)
         await asyncio.Event().wait()
 
     async def _report_ready(self) -> None:

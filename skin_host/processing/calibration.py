@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.config.settings import TouchSettings
-from skin_host.errors import CalibrationError, NewerFileError, OtherSkinError
+from skin_host.errors import CalibrationError, OtherSkinError
 from skin_host.files import read_document, write_document
 from skin_host.layout import Layout, PadKind
 from skin_host.processing.conversions import Conversions
@@ -554,13 +554,10 @@ def with_gains_of(calibration: Calibration, path: Path, layout: Layout) -> Calib
     valid.
 
     Raises:
-        BusyFileError: another program is writing the file.
+        NewerFileError, BusyFileError: see `find`.
     """
-    try:
-        before = load(path, layout, calibration.configuration)
-    except (CalibrationError, NewerFileError):
-        return calibration
-    return with_pressures_of(calibration, before)
+    before = find(path, layout, calibration.configuration)
+    return calibration if before is None else with_pressures_of(calibration, before)
 
 
 def with_pressures_of(calibration: Calibration, before: Calibration) -> Calibration:
@@ -801,6 +798,19 @@ def load(path: Path, layout: Layout, configuration: str) -> Calibration:
         curves=curves,
         **arrays,
     )
+
+
+def find(path: Path, layout: Layout, configuration: str) -> Calibration | None:
+    """Return the calibration of this skin that a file holds; None if it holds none.
+
+    Raises:
+        NewerFileError: a newer version has written it; it is not to be replaced.
+        BusyFileError: another program is writing it.
+    """
+    try:
+        return load(path, layout, configuration)
+    except CalibrationError:
+        return None
 
 
 def _curves_of(

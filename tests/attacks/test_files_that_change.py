@@ -21,7 +21,7 @@ from skin_host.config.settings import Bus, changed, load
 from skin_host.daemon.calibrate import calibration_path, stored_calibration
 from skin_host.daemon.state import NodeState, load_kept
 from skin_host.demo import configuration
-from skin_host.errors import BusyFileError, SkinError
+from skin_host.errors import BusyFileError, NewerFileError, SkinError
 from skin_host.files import read_whole, write_atomic
 from skin_host.layout import build_layout
 from skin_host.mqtt.address import Broker
@@ -146,6 +146,35 @@ async def test_a_reload_of_half_a_configuration_changes_nothing(
         with pytest.raises(SkinError, match=r"demo\.toml: cannot be read: No such file"):
             await daemon.control.handle("reload", b"{}")
         assert daemon.settings is before
+
+
+@stepped
+async def test_gains_that_another_program_fits_while_the_daemon_runs_are_not_lost(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    """The next calibration wrote its older ones over them."""
+    path = tmp_path / "demo-main.calibration.json"
+    async with living(can_bus_settings, tmp_path, clock=clock) as live:
+        daemon = live.daemon
+        configuration = daemon.engine.configuration
+        stored = calibrations.load(path, daemon.layout, configuration)
+        fitted = calibrations.with_gains(stored, 1.25 * stored.gain, stored.bend)
+        calibrations.save(path, fitted, daemon.layout)
+        for request in (b'{"seconds":0.5,"board":"hand"}', b'{"seconds":0.5}'):
+            await daemon.control.handle("calibrate", request)
+            for found in (
+                daemon.engine.calibration,
+                calibrations.load(path, daemon.layout, configuration),
+            ):
+                assert found is not None
+                assert found.gain == pytest.approx(1.25 * stored.gain)
+        newer = path.read_text().replace("skin.calibration/1", "skin.calibration/2")
+        path.write_text(newer)
+        with pytest.raises(NewerFileError, match="of a newer version"):
+            await daemon.control.handle("calibrate", b'{"seconds":0.5}')
+        assert path.read_text() == newer
+        with path.open("a"), pytest.raises(BusyFileError):
+            await daemon.control.handle("calibrate", b'{"seconds":0.5}')
 
 
 @stepped
