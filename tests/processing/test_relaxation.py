@@ -3,13 +3,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skin_host.config.relaxation import FITTED, MODELS
+from skin_host.config.relaxation import FITTED, MODELS, RelaxationSettings
 from skin_host.processing.relaxation import (
     STAND_INS,
     AsymmetricRelaxation,
     NoRelaxation,
+    ParameterSet,
     PublishedRelaxation,
     make_model,
+    parameters_of,
     stand_in,
 )
 
@@ -230,3 +232,49 @@ def test_states_never_become_denormal():
     seen = [float(model.step(np.zeros(1, np.float32), 0.3)[0]) for _ in range(400)]
     assert all(value == 0.0 or value > 1e-37 for value in seen)
     assert seen[-1] == 0.0
+
+
+@pytest.mark.parametrize("name", FITTED)
+@pytest.mark.parametrize(("stand", "lost_kpa"), [("mild", 15.0), ("mid", 25.0), ("strong", 40.0)])
+def test_a_stand_in_set_loses_its_share_of_a_pressure_that_is_held_for_ever(
+    name: str, stand: str, lost_kpa: float
+) -> None:
+    model = make_model(name, 1, stand_in(name, stand))
+    for _ in range(200):
+        relaxed = model.step(np.array([100.0]), 1000.0)
+    assert relaxed == pytest.approx([lost_kpa], rel=1e-6)
+
+
+def test_modes_of_the_asymmetric_stand_in_share_alike_and_recover_half_as_fast() -> None:
+    found = stand_in("asymmetric", "mid")
+    assert found.beta == found.beta_unload == pytest.approx([0.25 / 6] * 6)
+    ratios = np.diff(np.log(found.tau_s))
+    assert ratios == pytest.approx([ratios.mean()] * 5, rel=0.01)
+    assert np.array(found.tau_unload_s) == pytest.approx(2.0 * np.array(found.tau_s))
+
+
+def test_numbers_of_a_configuration_take_precedence_and_serve_unloading_too() -> None:
+    assert parameters_of(RelaxationSettings(model="published", set="mild")) == STAND_INS["mild"]
+    assert parameters_of(RelaxationSettings(set="strong")) == stand_in("asymmetric", "strong")
+    own = RelaxationSettings(beta=[0.1, 0.2], tau_s=[3.0, 30.0])
+    assert parameters_of(own) == ParameterSet([0.1, 0.2], [3.0, 30.0], [0.1, 0.2], [3.0, 30.0])
+    both = RelaxationSettings(
+        beta=[0.1], tau_s=[3.0], beta_unload=[0.2], tau_unload_s=[6.0], set="strong"
+    )
+    assert parameters_of(both) == ParameterSet([0.1], [3.0], [0.2], [6.0])
+
+
+@pytest.mark.parametrize(("name", "of_a_mode"), [("asymmetric", 1), ("published", 2)])
+def test_the_size_of_a_state_grows_with_its_modes(name: str, of_a_mode: int) -> None:
+    """The published model has modes of its own for unloading."""
+
+    def size(modes: int, dtype: str) -> int:
+        few = ParameterSet([0.1] * modes, [3.0] * modes, [0.1] * modes, [6.0] * modes)
+        return make_model(name, 7, few, dtype=dtype).bytes_per_taxel
+
+    for dtype, item in (("float64", 8), ("float32", 4)):
+        assert size(5, dtype) - size(2, dtype) == 3 * of_a_mode * item
+        # Besides the modes: the last pressure, and what averages need.
+        assert size(2, dtype) % item == 0
+        assert size(2, dtype) >= 3 * item
+    assert size(3, "float64") == 2 * size(3, "float32")
