@@ -9,6 +9,7 @@ from skin_host.processing.relaxation import (
     AsymmetricRelaxation,
     NoRelaxation,
     ParameterSet,
+    PlayRelaxation,
     PublishedRelaxation,
     make_model,
     parameters_of,
@@ -186,16 +187,20 @@ def test_parameters_per_taxel_give_what_shared_ones_give(name):
         assert many.step(pressure, 0.7) == pytest.approx(one.step(pressure, 0.7), abs=1e-12)
 
 
+@pytest.mark.parametrize("held", [False, True])
 @pytest.mark.parametrize("name", FITTED)
-def test_reset_forgets_the_chosen_taxels_alone(name):
-    model, other = (make_model(name, 2, stand_in(name, "mid")) for _ in "ab")
+def test_reset_forgets_the_chosen_taxels_alone(name, held):
+    model, other, new = (make_model(name, 2, stand_in(name, "mid"), held=held) for _ in "abc")
     for _ in range(30):
         model.step(np.array([50.0, 50.0]), 1.0)
         other.step(np.array([50.0, 50.0]), 1.0)
     model.reset(np.array([True, False]))
-    gone, kept = model.step(np.zeros(2), 1e-6)
-    assert gone == 0.0
-    assert kept == other.step(np.zeros(2), 1e-6)[1]
+    for pressure_kpa in (np.nan, 0.0, 0.0, 0.0, 30.0, 30.0, 0.0, 0.0):
+        gone, kept = model.step(np.full(2, pressure_kpa), 1.0)
+        assert gone == pytest.approx(new.step(np.full(2, pressure_kpa), 1.0)[0], abs=1e-12)
+        assert kept == pytest.approx(other.step(np.full(2, pressure_kpa), 1.0)[1], abs=1e-12)
+    model.reset()
+    assert not model.step(np.zeros(2), 0.1).any()
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -278,3 +283,89 @@ def test_the_size_of_a_state_grows_with_its_modes(name: str, of_a_mode: int) -> 
         assert size(2, dtype) % item == 0
         assert size(2, dtype) >= 3 * item
     assert size(3, "float64") == 2 * size(3, "float32")
+
+
+def test_stand_ins_keep_the_time_constants_that_published_figures_were_made_with() -> None:
+    """They replace a lost table: loading in seconds, minutes and an hour, recovery slower."""
+    times = {name: (chosen.tau_s, chosen.tau_unload_s) for name, chosen in STAND_INS.items()}
+    assert times == {
+        "mild": ((4, 90, 1500), (8, 180, 3000)),
+        "mid": ((6, 120, 1800), (12, 240, 3600)),
+        "strong": ((8, 150, 2400), (20, 400, 4800)),
+    }
+
+
+@given(steps, st.sampled_from([0.4, 2.5]))
+@settings(max_examples=40, deadline=None)
+def test_a_mean_of_another_length_is_the_direct_sum_of_such_means(samples, mean_s):
+    model = PublishedRelaxation(1, mean_s=mean_s, **PUBLISHED)
+    answers = [model.step(np.array([pressure]), 3.0 * dt)[0] for pressure, dt in samples]
+    expected = direct_sum([(pressure, 3.0 * dt) for pressure, dt in samples], mean_s=mean_s)
+    np.testing.assert_allclose(answers, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("held", [False, True])
+@pytest.mark.parametrize("name", MODELS)
+def test_an_answer_may_be_written_where_it_is_wanted(name, held):
+    own, given_one = (make_model(name, 2, stand_in(name, "mid"), held=held) for _ in "ab")
+    for pressure_kpa in (50.0, 80.0, 0.0):
+        where = np.full(2, 7.0)
+        assert given_one.step(np.full(2, pressure_kpa), 1.0, where) is where
+        assert where.tolist() == own.step(np.full(2, pressure_kpa), 1.0).tolist()
+
+
+RADII_KPA, PLAY_WEIGHTS = [5.0, 20.0, 60.0], [0.1, 0.05, 0.2]
+
+
+def play(n: int = 3) -> PlayRelaxation:
+    return PlayRelaxation(n, radius_kpa=RADII_KPA, weight=PLAY_WEIGHTS)
+
+
+@given(st.lists(st.floats(-20.0, 250.0) | st.just(np.nan), min_size=1, max_size=40))
+def test_plays_follow_their_definition(readings):
+    """Equation by equation, one play and one reading at a time."""
+    model = play(1)
+    plays, last = [0.0] * 3, 0.0
+    for reading in readings:
+        c = last = max(reading, 0.0) if np.isfinite(reading) else last
+        plays = [min(max(p, c - r), c + r) for p, r in zip(plays, RADII_KPA, strict=True)]
+        relaxed = sum(
+            w * (p - max(c - r, 0.0))
+            for p, r, w in zip(plays, RADII_KPA, PLAY_WEIGHTS, strict=True)
+        )
+        assert model.step(np.array([reading]), 0.05) == pytest.approx([relaxed], abs=1e-9)
+
+
+@pytest.mark.parametrize("per_taxel", [False, True])
+def test_plays_of_some_taxels_continue_by_themselves_and_are_taken_back(per_taxel: bool) -> None:
+    radii = np.outer(RADII_KPA, [1.0, 1.5, 2.0]) if per_taxel else RADII_KPA
+    whole, split = (
+        PlayRelaxation(3, radius_kpa=radii, weight=PLAY_WEIGHTS) for _ in ("whole", "split")
+    )
+    for model in (whole, split):
+        model.step(np.array([100.0, 150.0, 200.0]), 0.05)
+    some = np.array([0, 2])
+    part = split.part(some)
+    for kpa in (40.0, np.nan, 90.0, 10.0):
+        expected = whole.step(np.array([kpa, 150.0, kpa]), 0.05)
+        assert part.step(np.full(2, kpa), 0.05).tolist() == expected[some].tolist()
+    split.take_back(some, part)
+    # A reading that is missing counts as the last one of the part.
+    missing = np.full(3, np.nan)
+    assert split.step(missing, 0.05).tolist() == whole.step(missing, 0.05).tolist()
+
+
+def test_plays_of_chosen_taxels_are_forgotten() -> None:
+    model, other, new = play(2), play(2), play(2)
+    for one in (model, other):
+        one.step(np.array([120.0, 120.0]), 0.05)
+    model.reset(np.array([True, False]))
+    for kpa in (np.nan, 30.0, 5.0):
+        gone, kept = model.step(np.full(2, kpa), 0.05)
+        assert gone == new.step(np.full(2, kpa), 0.05)[0]
+        assert kept == other.step(np.full(2, kpa), 0.05)[1]
+
+
+def test_radii_and_weights_of_plays_go_together() -> None:
+    with pytest.raises(ValueError, match="3 radii and 2 weights"):
+        PlayRelaxation(1, radius_kpa=RADII_KPA, weight=[0.1, 0.2])

@@ -1,0 +1,176 @@
+"""What health keeps in mind of parts, boards and buses between two records."""
+
+import numpy as np
+import pytest
+
+from skin_host.health.watch import (
+    RECENT_NS,
+    TWICE_NS,
+    BoardWatch,
+    BusWatch,
+    PartWatch,
+    Window,
+)
+from skin_host.processing.core import Step
+from skin_host.processing.pipeline import PressureFrame
+
+MS = 1_000_000
+S = 1000 * MS
+PERIOD = 50 * MS
+#: Of two triangles.
+N = 24
+FIRST, SECOND = list(range(12)), list(range(12, 24))
+
+
+def note(
+    watch: PartWatch, t_ns: int, lost: tuple[int, ...] = (), valid: bool = True
+) -> PressureFrame:
+    """A sample in which triangles were not received."""
+    raw = np.full(N, 240, np.uint8)
+    here = np.full(N, valid)
+    for triangle in lost:
+        raw[12 * triangle : 12 * (triangle + 1)] = 0
+        here[12 * triangle : 12 * (triangle + 1)] = False
+    none = np.zeros(N, np.bool_)
+    frame = PressureFrame("arm", 0, t_ns, raw, np.zeros(N, np.float32), none, here, none)
+    watch.note(Step(0, frame, []), None)
+    return frame
+
+
+def late(watch: PartWatch) -> list[int]:
+    return [] if watch.late is None else np.flatnonzero(watch.late).tolist()
+
+
+def test_a_rate_is_the_mean_over_two_seconds_of_samples_with_a_valid_taxel() -> None:
+    watch = PartWatch(late_samples=3)
+    for turn in range(1, 42):
+        assert watch.rate_hz == 0.0
+        note(watch, turn * PERIOD)
+    assert watch.rate_hz == pytest.approx(20.0)
+    for turn in range(42, 82):
+        note(watch, turn * PERIOD, valid=turn % 2 == 0)
+    assert watch.rate_hz == pytest.approx(10.0)
+    assert watch.frames == 61
+    assert watch.last_ns == 80 * PERIOD
+    # A clock that is set back begins a new mean.
+    note(watch, PERIOD)
+    assert watch.rate_hz <= 0.0
+    for turn in range(2, 42):
+        note(watch, turn * PERIOD)
+    assert watch.rate_hz == pytest.approx(20.0)
+
+
+def test_a_triangle_whose_frames_are_lost_is_late_for_a_few_samples_and_then_not() -> None:
+    watch = PartWatch(late_samples=3)
+    note(watch, PERIOD)
+    assert late(watch) == []
+    note(watch, 2 * PERIOD, lost=(1,))
+    assert late(watch) == SECOND
+    note(watch, 3 * PERIOD, lost=(1,))
+    assert late(watch) == SECOND
+    note(watch, 4 * PERIOD, lost=(1,))
+    assert late(watch) == []
+    note(watch, 5 * PERIOD)
+    note(watch, 6 * PERIOD, lost=(0,))
+    assert late(watch) == FIRST
+    # The other one goes, and this one comes: each is counted by itself.
+    note(watch, 7 * PERIOD, lost=(1,))
+    assert late(watch) == SECOND
+    note(watch, 8 * PERIOD, lost=(0, 1))
+    # A sample of nothing reports silence, not lateness.
+    assert late(watch) == []
+
+
+def test_what_was_not_valid_before_is_not_late() -> None:
+    watch = PartWatch(late_samples=3)
+    note(watch, PERIOD, lost=(1,))
+    assert late(watch) == []
+    note(watch, 2 * PERIOD, valid=False)
+    note(watch, 3 * PERIOD, lost=(0,))
+    assert late(watch) == []
+
+
+def crowd(
+    watch: BoardWatch, looks: int, share: float = 2.0, first: int = 0, apart_ns: int = 250 * MS
+) -> int:
+    """Look so often at an address that sends `share` times as many sweeps as one board, half of
+    which come too soon; return the time of the last look.
+    """
+    per_look = apart_ns / PERIOD * share
+    now_ns = 0
+    for look in range(first, first + looks):
+        now_ns, then_ns = look * apart_ns, (look - 1) * apart_ns
+        sweeps, before = round(look * per_look), round((look - 1) * per_look)
+        watch.note_crowded(sweeps // 2, sweeps, now_ns, then_ns, before)
+    return now_ns
+
+
+def test_two_boards_send_at_an_address_when_sweeps_come_too_soon_for_two_seconds() -> None:
+    watch = BoardWatch()
+    for looks in range(1, 20):
+        watch = BoardWatch()
+        now_ns = crowd(watch, looks, first=40)
+        lasted_ns = looks * 250 * MS
+        assert watch.is_twice(now_ns, PERIOD) == (lasted_ns >= TWICE_NS)
+    # It is over when none comes too soon for a second, or when the clock is set back.
+    assert watch.is_twice(now_ns + RECENT_NS - 1, PERIOD)
+    assert not watch.is_twice(now_ns + RECENT_NS, PERIOD)
+    assert not watch.is_twice(now_ns - 1, PERIOD)
+
+
+def test_as_many_sweeps_as_of_one_board_are_of_one_board_however_they_come() -> None:
+    """What waited while this computer was busy comes too soon as well."""
+    for share, twice in ((1.0, False), (1.3, False), (1.6, True)):
+        watch = BoardWatch()
+        assert watch.is_twice(crowd(watch, 40, share, first=40), PERIOD) == twice
+
+
+def test_what_comes_too_soon_now_and_then_is_no_second_board() -> None:
+    watch = BoardWatch()
+    for look in range(20):
+        now_ns = 2 * S * look
+        watch.note_crowded(look, 40 * look, now_ns, now_ns - 250 * MS, 40 * look - 5)
+        assert not watch.is_twice(now_ns, PERIOD)
+
+
+def test_events_of_a_board_are_dated_when_their_count_rises() -> None:
+    watch = BoardWatch()
+    watch.note({"resets": 0, "rezeros": 2}, 10)
+    assert watch.event_ns == {"rezeros": 10}
+    watch.note({"resets": 1, "rezeros": 2}, 20)
+    assert watch.event_ns == {"rezeros": 10, "resets": 20}
+    watch.note({"resets": 1, "rezeros": 2}, 30)
+    assert watch.event_ns == {"rezeros": 10, "resets": 20}
+    assert watch.events == {"resets": 1, "rezeros": 2}
+
+
+def test_a_window_gives_what_was_gained_in_about_its_length() -> None:
+    window = Window(S)
+    gains = [window.note(turn * 250 * MS, {"frames": turn * turn}) for turn in range(10)]
+    assert gains[0] == {"frames": 0, "seconds": 0.0}
+    assert gains[3] == {"frames": 9, "seconds": pytest.approx(0.75)}
+    assert gains[4] == {"frames": 16, "seconds": pytest.approx(1.0)}
+    assert gains[9] == {"frames": 81 - 25, "seconds": pytest.approx(1.0)}
+    # After a pause, or with rare looks, it is as long as it must be.
+    assert window.note(60 * S, {"frames": 100}) == {
+        "frames": 19,
+        "seconds": pytest.approx(60 - 2.25),
+    }
+    # A clock that was set back begins a new one.
+    assert window.note(5 * S, {"frames": 500}) == {"frames": 0, "seconds": 0.0}
+
+
+def test_a_bus_is_silent_when_no_frame_came_for_too_long_unless_none_is_expected() -> None:
+    watch = BusWatch()
+    silent = []
+    for turn, frames in enumerate((3, 9, 9, 9, 9, 9, 12), start=1):
+        now_ns = turn * 100 * MS
+        watch.note(now_ns, now_ns, {"frames": frames}, silent_after_ns=300 * MS)
+        silent.append(watch.silent)
+    assert silent == [False] * 5 + [True, False]
+    assert watch.gained == {"frames": 12 - 3, "seconds": pytest.approx(0.6)}
+    watch.note(2 * S, 2 * S, {"frames": 12}, silent_after_ns=300 * MS, awaited=True)
+    assert not watch.silent
+    # A set clock makes nothing silent: only what the ledger has seen pass counts.
+    watch.note(9 * S, 800 * MS, {"frames": 12}, silent_after_ns=300 * MS)
+    assert not watch.silent
