@@ -15,6 +15,7 @@ from skin_host.processing.relaxation import (
     parameters_of,
     stand_in,
 )
+from skin_host.processing.relaxation.base import TumblingMean
 
 MID = STAND_INS["mid"]
 LOADING = {"beta": MID.beta, "tau_s": MID.tau_s, "tau_unload_s": MID.tau_unload_s}
@@ -194,13 +195,22 @@ def test_reset_forgets_the_chosen_taxels_alone(name, held):
     for _ in range(30):
         model.step(np.array([50.0, 50.0]), 1.0)
         other.step(np.array([50.0, 50.0]), 1.0)
+    # Amid a mean.
+    for _ in range(12):
+        model.step(np.array([50.0, 50.0]), 0.05)
+        other.step(np.array([50.0, 50.0]), 0.05)
+        new.step(np.zeros(2), 0.05)
     model.reset(np.array([True, False]))
     for pressure_kpa in (np.nan, 0.0, 0.0, 0.0, 30.0, 30.0, 0.0, 0.0):
         gone, kept = model.step(np.full(2, pressure_kpa), 1.0)
         assert gone == pytest.approx(new.step(np.full(2, pressure_kpa), 1.0)[0], abs=1e-12)
         assert kept == pytest.approx(other.step(np.full(2, pressure_kpa), 1.0)[1], abs=1e-12)
+    model.step(np.array([50.0, 50.0]), 0.3)
     model.reset()
-    assert not model.step(np.zeros(2), 0.1).any()
+    new = make_model(name, 2, stand_in(name, "mid"), held=held)
+    for dt_s in (0.5, 0.45, 0.1, 0.1):
+        pressures_kpa = np.array([50.0, 80.0])
+        assert model.step(pressures_kpa, dt_s).tolist() == new.step(pressures_kpa, dt_s).tolist()
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -346,7 +356,7 @@ def test_plays_of_some_taxels_continue_by_themselves_and_are_taken_back(per_taxe
         model.step(np.array([100.0, 150.0, 200.0]), 0.05)
     some = np.array([0, 2])
     part = split.part(some)
-    for kpa in (40.0, np.nan, 90.0, 10.0):
+    for kpa in (np.nan, 180.0, np.nan, 90.0):
         expected = whole.step(np.array([kpa, 150.0, kpa]), 0.05)
         assert part.step(np.full(2, kpa), 0.05).tolist() == expected[some].tolist()
     split.take_back(some, part)
@@ -369,3 +379,15 @@ def test_plays_of_chosen_taxels_are_forgotten() -> None:
 def test_radii_and_weights_of_plays_go_together() -> None:
     with pytest.raises(ValueError, match="3 radii and 2 weights"):
         PlayRelaxation(1, radius_kpa=RADII_KPA, weight=[0.1, 0.2])
+
+
+def test_what_is_missing_from_a_mean_counts_as_the_mean_so_far() -> None:
+    found: list[float] = []
+    mean = TumblingMean(1, 1.0, np.float64)
+    for kpa, dt_s in [(10.0, 0.2), (np.nan, 0.3), (40.0, 0.2), *[(np.nan, 0.03)] * 10]:
+        mean.feed(np.array([kpa]), dt_s, lambda value, _: found.append(float(value[0])))
+    so_far = (10.0 * 0.5 + 40.0 * 0.2) / 0.7
+    assert found == pytest.approx([so_far])
+    # Nothing of a window: the mean of the one before.
+    mean.feed(np.array([np.nan]), 1.0, lambda value, _: found.append(float(value[0])))
+    assert found == pytest.approx([so_far] * 2)
