@@ -320,6 +320,8 @@ def _address_twice(world: World, chance: random.Random, _: bool) -> Trouble:
         frozenset({"board_twice"}),
         5.0,
         places_of(world, board=board.name),
+        # One measurement comes in two sweeps, and so may noise: twice is enough for a touch.
+        spoils=taxels_of(world, board=board.name),
     )
 
 
