@@ -446,18 +446,22 @@ class I2cWire:
         """
         if self._clock or self.t_ns < self._held_until_ns:
             return None
-        for line in self.lines:
-            if not (line.asleep or line.takes_bytes):
+        awake = [number for number, line in enumerate(self.lines) if not line.asleep]
+        for number in awake:
+            if not self.lines[number].takes_bytes:
                 return None
         self.t_ns += 2 * CLOCKS_OF_A_BYTE * half_ns
         self._released = False
         self._levels = -1 if out & 1 else ~lines
-        taken = [
-            line.clock_byte(out if lines >> number & 1 else _RELEASED)
-            for number, line in enumerate(self.lines)
-        ]
-        self._held_until_ns = self.t_ns + max([held_ns for _, held_ns in taken])
-        return [bits for bits, _ in taken]
+        taken = [_RELEASED] * len(self.lines)
+        longest_ns = 0
+        moved = awake if out == _RELEASED else range(len(self.lines))
+        for number in moved:
+            line = self.lines[number]
+            taken[number], held_ns = line.clock_byte(out if lines >> number & 1 else _RELEASED)
+            longest_ns = max(longest_ns, held_ns)
+        self._held_until_ns = self.t_ns + longest_ns
+        return taken
 
     def clock(self, levels: int, half_ns: int) -> int:
         """Do what a master that does not look at the clock does with its pins in one clock.
@@ -473,12 +477,28 @@ class I2cWire:
             self.set_sda(levels)
         self.t_ns += half_ns
         if not self._clock and self.t_ns >= self._held_until_ns:
-            self._rise()
+            return self._up_and_down(half_ns)
         sampled = self.sda
         self.t_ns += half_ns
         if not self._clock and self.t_ns >= self._held_until_ns:
             self._rise()
         self.set_scl(False)
+        return sampled
+
+    def _up_and_down(self, half_ns: int) -> int:
+        """Let the clock rise, and fall after a while; returns the levels that were sampled."""
+        self.t_ns += half_ns
+        self._released = False
+        sampled = longest_ns = 0
+        for number, line in enumerate(self.lines):
+            if not line.asleep:
+                line.rise()
+            if line.seen:
+                sampled |= 1 << number
+            if not line.asleep:
+                longest_ns = max(longest_ns, line.fall())
+        if longest_ns:
+            self._held_until_ns = self.t_ns + longest_ns
         return sampled
 
     def set_sda(self, levels: int) -> None:
