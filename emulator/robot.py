@@ -29,7 +29,7 @@ from emulator.probes.contacts import ContactSource
 from emulator.probes.scene import Fault, Probe, Scene, check
 from emulator.probes.skin import NEVER_NS, Skin
 from emulator.state import StateError
-from emulator.wire import Wire
+from emulator.wire import NOTHING, Wire
 from skin_host.bus.commands import Message, SetTxMode, TxMode, command_frame
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import Settings
@@ -160,6 +160,17 @@ class Robot:
             By bus, the frames whose transmission ended meanwhile, `t_ns` that moment.
         """
         end_ns = self.t_ns + round(dt_s * NS)
+        wires = self.wires
+        if (
+            end_ns < self._boards_due_ns
+            and end_ns < self._skin_due_ns
+            and end_ns < self._tips_due_ns
+            and not (self._agenda and self._agenda[0][0] <= end_ns)
+            and all(wire.silent for wire in wires.values())
+        ):
+            # Nothing happens until then: a host looks more often than boards send.
+            self.t_ns = self.converters.t_ns = end_ns
+            return dict.fromkeys(wires, NOTHING)
         while True:
             next_ns = min(end_ns, self._skin_due_ns, self._boards_due_ns, self._tips_due_ns)
             if self._agenda and self._agenda[0][0] < next_ns:
@@ -170,25 +181,26 @@ class Robot:
                 self._look_ahead()
             if self._boards_due_ns <= self.t_ns:
                 self._sample()
-                self._look_ahead()
             if self._tips_due_ns <= self.t_ns:
                 for bus, batch in self.fingertips.step(self.t_ns):
                     self.wires[bus].put(batch)
                 self._look_ahead()
             if self.t_ns >= end_ns:
                 break
-        return {name: wire.until(self.t_ns) for name, wire in self.wires.items()}
+        return {name: wire.until(self.t_ns) for name, wire in wires.items()}
 
     def _look_ahead(self) -> None:
         """Find out when the next board is due; after anything that may have changed it."""
-        self._due_ns = [
-            NEVER_NS if due_ns is None else -(-due_ns // TICK_NS) * TICK_NS
-            for due_ns in [board.due_ns for board in self._boards]
-        ]
-        for number in self.hung:
-            self._due_ns[number] = NEVER_NS
+        self._due_ns = [self._due_of(number) for number in range(len(self._boards))]
         self._boards_due_ns = min(self._due_ns, default=NEVER_NS)
         self._tips_due_ns = self.fingertips.due_ns
+
+    def _due_of(self, number: int) -> int:
+        """When a board is due."""
+        due_ns = self._boards[number].due_ns
+        if due_ns is None or number in self.hung:
+            return NEVER_NS
+        return -(-due_ns // TICK_NS) * TICK_NS
 
     def _move_to(self, t_ns: int) -> None:
         """Time up to `t_ns`; where mechanics is due, its outcome goes to the chips."""
@@ -237,6 +249,8 @@ class Robot:
                 else:
                     self.wires[bus].put(self._sample_alone(number, board))
             self._answer(bus, board.answers())
+            self._due_ns[number] = self._due_of(number)
+        self._boards_due_ns = min(self._due_ns)
         for numbers in together.values():
             for bus, batch in self._bursts.frames(numbers, self.t_ns):
                 self.wires[bus].put(batch, self.t_ns)

@@ -25,7 +25,7 @@ QUEUE_FRAMES = 48
 #: it is remembered how long they take.
 _MOST_PASSED = 64
 NEVER_NS = 1 << 62
-_NOTHING = FrameBatch.of([])
+NOTHING = FrameBatch.of([])
 
 Ints = NDArray[np.int64]
 
@@ -53,7 +53,7 @@ class Wire:
         self._rng = rng
         #: Frames that their boards have made, `t_ns` when; and those that they have handed over to
         #: the bus, `t_ns` when their transmission ends unless more urgent ones come.
-        self._waiting = self._under_way = _NOTHING
+        self._waiting = self._under_way = NOTHING
         #: When all that wait became ready, if that is known to be one moment.
         self._ready_ns: int | None = None
         #: By the object of identifiers in the order of the bus: they, the lengths, and when after
@@ -87,6 +87,11 @@ class Wire:
         self._ready_ns = ready_ns if alone else None
 
     @property
+    def silent(self) -> bool:
+        """Whether no frame will come until a board sends one."""
+        return not (self._babble_every_ns or len(self._waiting) or len(self._under_way))
+
+    @property
     def idle(self) -> bool:
         """Whether no frame waits or is under way."""
         return not len(self._waiting) and not len(self._under_way)
@@ -97,7 +102,7 @@ class Wire:
             self._add_babble(t_ns)
         if self.off:
             self.lost += len(self._waiting) + len(self._under_way)
-            self._waiting = self._under_way = _NOTHING
+            self._waiting = self._under_way = NOTHING
         if len(self._waiting):
             self._hand_over(t_ns)
         under_way = self._under_way
@@ -118,14 +123,14 @@ class Wire:
         """Take what is ready by `t_ns` to the bus, one moment after the other."""
         waiting = self._waiting
         if self._ready_ns is not None and self._ready_ns <= t_ns:
-            self._waiting = _NOTHING
+            self._waiting = NOTHING
             self._arbitrate(waiting, self._ready_ns)
             return
         if not waiting.rising:
             waiting = _rows(waiting, np.argsort(waiting.t_ns, kind="stable"))
         times_ns = waiting.t_ns
         if times_ns[0] == times_ns[-1] <= t_ns:
-            self._waiting = _NOTHING
+            self._waiting = NOTHING
             self._arbitrate(waiting, int(times_ns[0]))
             return
         taken = int(np.searchsorted(times_ns, t_ns, side="right"))
@@ -249,9 +254,9 @@ def _ended(under_way: FrameBatch, t_ns: int) -> int:
 def _split(batch: FrameBatch, n: int) -> tuple[FrameBatch, FrameBatch]:
     """The first `n` frames, and the others."""
     if n == len(batch):
-        return batch, _NOTHING
+        return batch, NOTHING
     if not n:
-        return _NOTHING, batch
+        return NOTHING, batch
     return _rows(batch, slice(n)), _rows(batch, slice(n, None))
 
 

@@ -9,6 +9,7 @@ kinds of chip answer the same words.
 from bisect import bisect_left
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,8 @@ _NO_SET_UP = np.zeros((reg.N_STAGES, reg.STAGE_WORDS), np.uint16)
 _MOST_CHANGES = 64
 #: Of so many sets of chips it is remembered how they are indexed.
 _MOST_SETS = 4096
+#: And so many arrays of their numbers.
+_MOST_KEYS = 64
 #: A sequence that never comes to its end.
 _STOPPED_NS = 1 << 58
 #: The results of so many reads are foreseen together, of no more chips: of many, a read costs what
@@ -116,6 +119,8 @@ class SignalSkin:
         self._pace_of: dict[bytes, tuple[int, int, int] | None] = {}
         #: By the same numbers: as an index.
         self._rows_of: dict[bytes, Ints | slice] = {}
+        #: By the object of these numbers: they, and their bytes.
+        self._keys: dict[int, tuple[Ints, bytes]] = {}
         #: The chips whose registers were read last, and when.
         self._settled: set[int] = set()
         self._settled_ns = 0
@@ -310,8 +315,8 @@ class SignalSkin:
         """
         changed: NDArray[np.bool_] | None = None
         if self._changes:
-            changed = self._is_changed[chips]
-            if not changed.any():
+            changed = self._is_changed[self._rows(chips)]
+            if b"\1" not in changed.tobytes():
                 changed = None
         settled = self._settle_in_step(chips, changed)
         if settled is not None:
@@ -355,19 +360,24 @@ class SignalSkin:
         sequences, rest_ns = divmod(self.t_ns - start_ns, stages * stage_ns)
         done = rest_ns // stage_ns
         ended = sequences * stages + done
-        if stages < reg.N_STAGES or ended - int(self._taken[chips].max()) < stages:
-            return None
-        self._taken[chips] = ended
         rows = self._rows(chips)
+        if stages < reg.N_STAGES or ended - int(np.maximum.reduce(self._taken[rows])[0]) < stages:
+            return None
+        self._taken[rows] = ended
         ahead: Ahead | None = self._foresee(chips, rows, pace)
         assert ahead is not None
         results: Words = ahead.results[ahead.row]
         if changed is not None:
             began_ns = start_ns + sequences * stages * stage_ns
-            before_ns = began_ns - stages * stage_ns
-            ended_ns = np.where(done > _STAGES, began_ns, before_ns) + (_STAGES + 1) * stage_ns
             mine = changed.nonzero()[0]
-            codes = self._ideal_at(chips[mine], ended_ns)
+            # The oldest conversion is of the stage that comes next, the newest of the one before.
+            oldest_ns = began_ns + (done + 1 - stages) * stage_ns
+            codes = self._ideal_at(
+                chips[mine],
+                began_ns + _ended(stages, stage_ns)[done],
+                oldest_ns,
+                began_ns + done * stage_ns,
+            )
             if ahead.noise is not None:
                 codes = codes + ahead.noise[ahead.row, mine]
             results = results.copy()
@@ -384,7 +394,7 @@ class SignalSkin:
         """
         m, interval_ns = 1, 0
         is_few = len(chips) <= _MOST_CHIPS_AHEAD
-        key = chips.tobytes() if is_few else b""
+        key = self._key(chips) if is_few else b""
         ahead = self._ahead.get(key) if is_few else None
         if ahead is not None:
             interval_ns = self.t_ns - ahead.last_ns
@@ -428,9 +438,20 @@ class SignalSkin:
         ahead.results[ahead.row :, mine] = _rounded(codes)
         ahead.revision += 1
 
+    def _key(self, chips: Ints) -> bytes:
+        """Return the numbers of chips as bytes; boards read the same array again and again."""
+        known = self._keys.get(id(chips))
+        if known is not None and known[0] is chips:
+            return known[1]
+        if len(self._keys) >= _MOST_KEYS:
+            self._keys.clear()
+        key = chips.tobytes()
+        self._keys[id(chips)] = chips, key
+        return key
+
     def _pace(self, chips: Ints) -> tuple[int, int, int] | None:
         """Return start, stages and time of a stage, if some chips have all of them in common."""
-        key = chips.tobytes()
+        key = self._key(chips)
         if key not in self._pace_of:
             paces = {
                 (int(self._start_ns[chip]), int(self._n_stages[chip]), int(self._stage_ns[chip]))
@@ -441,7 +462,7 @@ class SignalSkin:
 
     def _rows(self, chips: Ints) -> Ints | slice:
         """The same chips; those that follow each other as a slice, which costs no copies."""
-        key = chips.tobytes()
+        key = self._key(chips)
         rows = self._rows_of.get(key)
         if rows is None:
             follow = len(chips) > 0 and bool((np.diff(chips) == 1).all())
@@ -499,12 +520,17 @@ class SignalSkin:
             self._began_ns[chips] = np.where(done, began_ns, self._began_ns[chips])
             self._unseen[chips] |= done
 
-    def _ideal_at(self, chips: Ints, ended_ns: NDArray[np.int64]) -> Floats:
-        """What changed chips converted in stages that ended then, int64[12]: float64[k, 12]."""
+    def _ideal_at(
+        self, chips: Ints, ended_ns: NDArray[np.int64], oldest_ns: int, newest_ns: int
+    ) -> Floats:
+        """What changed chips converted in stages that ended then, int64[12]: float64[k, 12].
+
+        `oldest_ns` and `newest_ns` are the least and the most of these times.
+        """
         times_ns = self._changed_ns
         # Those in force at all of these times: the last one before, and those amid them.
-        first = bisect_left(times_ns, int(ended_ns.min())) - 1
-        last = bisect_left(times_ns, int(ended_ns.max()))
+        first = bisect_left(times_ns, oldest_ns) - 1
+        last = bisect_left(times_ns, newest_ns)
         if not last:
             return self._ideal[chips]
         place = self._place[chips]
@@ -556,6 +582,16 @@ class SignalSkin:
         sigma = np.sqrt(own**2 + np.square(weights) @ squares)
         self._sigma[chip] = sigma * ~self._held[chip]
         self._noise_version += 1
+
+
+@cache
+def _ended(stages: int, stage_ns: int) -> NDArray[np.int64]:
+    """When stages were last converted, after the beginning of a pass, int64[stages + 1, 12].
+
+    By how many stages of the pass have been converted; the others were in the pass before.
+    """
+    is_before = np.arange(stages + 1)[:, None] <= _STAGES
+    return ((_STAGES + 1 - stages * is_before) * stage_ns).astype(np.int64)
 
 
 def _rounded(codes: Floats) -> Words:
