@@ -261,15 +261,16 @@ class _SteppedLoop(asyncio.SelectorEventLoop):
         while timers and timers[0].timer._cancelled:
             heappop(timers)
             self._n_cancelled -= 1
-        wait_s = timers[0] - self.time() if timers and not ready else 0.0
+        clock = self._clock
+        wait_s = timers[0] - clock._t_ns / NS_PER_S if timers and not ready else 0.0
         if len(own._selector._fd_to_key) > 1 or not (timers or ready) or own._stopping:
             is_idle = not (ready or own._stopping)
             longest_s = max(wait_s, 0.0) if timers else None
             own._process_events(own._selector.select(longest_s if is_idle else 0.0))
         elif wait_s > 0:
-            self._clock.jump(wait_s)
+            clock.jump(wait_s)
         if timers:
-            end_s = self.time() + own._clock_resolution
+            end_s = clock._t_ns / NS_PER_S + own._clock_resolution
             while timers and timers[0] < end_s:
                 timer = heappop(timers).timer
                 timer._scheduled = False

@@ -8,6 +8,8 @@ the other end. Sources: `fill`, `computedrift` of embot_app_application_theSkin.
 `FillCanMessages8bit` of mtb3/main_V3.c.
 """
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,14 +42,15 @@ def transmit_32(
     change = raw - base
     value = change
     if gain.any():
-        dt = change[np.arange(len(raw)), thermal][:, None]
-        size = np.sign(dt) * (np.abs(dt) >> 2) * gain
+        dt = change[_rows(len(raw)), thermal]
+        # A quarter of it, towards zero.
+        size = (dt * 0.25).astype(np.int32)[:, None] * gain
         # The source negates before the last shift, so falling temperatures round down.
         value = change - (size >> 5)
     shift, no_load = shift[:, None], no_load[:, None]
     sent = no_load - (value >> shift)
     is_there = _all_there(raw)
-    if is_there and (sent - 1).view(np.uint32).max(initial=0) < 254:
+    if is_there and np.maximum.reduce((sent - 1).view(np.uint32), None, initial=0) < 254:
         # Nothing is clipped, so nothing is as far out as that takes: nearly always.
         return sent.astype(np.uint8), np.zeros(len(raw), np.uint16)
     values = np.minimum(np.maximum(sent, 0), 255).astype(np.uint8)
@@ -60,7 +63,12 @@ def transmit_32(
 
 def _all_there(raw: Words) -> bool:
     """Whether no word is 0 or `ABSENT`."""
-    return bool((raw - np.uint16(1)).max(initial=0) < ABSENT - 1)
+    return bool(np.maximum.reduce(raw - np.uint16(1), None, initial=0) < ABSENT - 1)
+
+
+@cache
+def _rows(n: int) -> NDArray[np.intp]:
+    return np.arange(n)
 
 
 def _status(far: NDArray[np.bool_], raw: Words, base: Ints) -> Words:

@@ -106,9 +106,11 @@ class Sent:
         #: By address, the keys (address and triangle) of its whole sweeps, and those of them that
         #: are not yet in `_whole`: nearly always nobody asks for a single triangle.
         self._sweeps: dict[int, tuple[tuple[int, ...], deque[_Sweep]]] = {}
-        #: Identifiers of the last batches, the arrays themselves, and the keys of the sweep that
-        #: they are, if they are one.
-        self._known: dict[int, tuple[NDArray[np.uint32], tuple[int, ...] | None]] = {}
+        #: Identifiers and lengths of the last batches, the arrays themselves, and the keys of the
+        #: sweep that they are, if they are one.
+        self._known: dict[
+            int, tuple[NDArray[np.uint32], NDArray[np.uint8], tuple[int, ...] | None]
+        ] = {}
         self.bursts: dict[int, int] = {}
         self._last_ns: dict[int, int] = {}
 
@@ -119,12 +121,11 @@ class Sent:
 
     def _note_sweep(self, batch: FrameBatch) -> bool:
         """Take the frames of one whole sweep of one board; False if they are not that."""
-        keys = self._keys_of(batch.id)
+        keys = self._keys_of(batch.id, batch.dlc)
         if keys is None:
             return False
         octets = batch.data.tobytes()
-        n = 2 * len(keys)
-        if octets[::8] != _HEADERS[:n] or batch.dlc.tobytes().count(8) < n:
+        if octets[::8] != _HEADERS[: 2 * len(keys)]:
             return False
         address = keys[0] >> 4
         first_ns, last_ns = int(batch.t_ns[0]), int(batch.t_ns[-1])
@@ -143,11 +144,13 @@ class Sent:
         known[1].append(_Sweep(octets, values, answered, batch.t_ns))
         return True
 
-    def _keys_of(self, ids: NDArray[np.uint32]) -> tuple[int, ...] | None:
+    def _keys_of(
+        self, ids: NDArray[np.uint32], lengths: NDArray[np.uint8]
+    ) -> tuple[int, ...] | None:
         """Return the keys of a sweep with these identifiers, None if they are not of one."""
         known = self._known.get(id(ids))
-        if known is not None and known[0] is ids:
-            return known[1]
+        if known is not None and known[0] is ids and known[1] is lengths:
+            return known[2]
         if len(self._known) >= KEPT:
             self._known.clear()
         numbers = ids.tolist()
@@ -157,9 +160,10 @@ class Sent:
             and len(set(heads)) == len(heads)
             and heads[0] >> 8 in _STREAMS
             and all(head >> 4 == heads[0] >> 4 for head in heads)
+            and lengths.tobytes().count(8) == len(numbers)
         )
         keys = tuple(head & 0xFF for head in heads) if is_sweep else None
-        self._known[id(ids)] = ids, keys
+        self._known[id(ids)] = ids, lengths, keys
         return keys
 
     def _spread(self, address: int) -> None:
@@ -307,6 +311,9 @@ class Cable:
         self._n_waiting = 0
         self._late: list[FrameBatch] = []
         self._twin: list[FrameBatch] = []
+        #: Identifiers of the last batches, the arrays themselves; where in `read_ns` they are, and
+        #: as bytes.
+        self._ids: dict[int, tuple[NDArray[np.uint32], NDArray[np.intp], bytes]] = {}
         #: When a frame of each standard identifier was last read (ns, stepped time).
         self.read_ns = np.full(0x800, -(1 << 62), np.int64)
 
@@ -453,8 +460,14 @@ class Cable:
         self._n_waiting -= n
         self.fate.read += n
         now_ns = self._clock.monotonic_ns()
-        self.read_ns[batch.id & 0x7FF] = now_ns
-        self._trace.data(now_ns, self.name, batch.id.tobytes(), batch.data.tobytes())
+        ids = batch.id
+        known = self._ids.get(id(ids))
+        if known is None or known[0] is not ids:
+            if len(self._ids) >= KEPT:
+                self._ids.clear()
+            known = self._ids[id(ids)] = ids, (ids & 0x7FF).astype(np.intp), ids.tobytes()
+        self.read_ns[known[1]] = now_ns
+        self._trace.data(now_ns, self.name, known[2], batch.data.tobytes())
         return batch
 
     def send(self, can_id: int, data: bytes) -> bool:

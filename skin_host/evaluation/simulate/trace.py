@@ -5,6 +5,8 @@ from hashlib import blake2b
 
 #: So many events are shown when a promise is broken.
 KEPT = 40
+#: So many are hashed at once: the hash is of all bytes, however they come.
+_AT_ONCE = 256
 
 
 class Trace:
@@ -21,14 +23,16 @@ class Trace:
 
     def __init__(self) -> None:
         self._hash = blake2b(digest_size=16)
+        self._events: list[bytes] = []
         self.count = 0
         self.last: deque[str] = deque(maxlen=KEPT)
 
     def data(self, t_ns: int, kind: str, *values: bytes) -> None:
         """An event that is only hashed: frames on a bus, publications."""
         self.count += 1
-        event = b"%d %b%b" % (t_ns, kind.encode(), b"".join(values))
-        self._hash.update(event.replace(self.unnamed, b"") if self.unnamed else event)
+        self._events += (b"%d %b" % (t_ns, kind.encode()), *values)
+        if len(self._events) >= _AT_ONCE:
+            self._take()
 
     def note(self, t_ns: int, text: str) -> None:
         """An event that is hashed and shown."""
@@ -37,4 +41,10 @@ class Trace:
 
     def digest(self) -> str:
         """Of all events so far, 32 hexadecimal digits."""
+        self._take()
         return self._hash.hexdigest()
+
+    def _take(self) -> None:
+        events = b"".join(self._events)
+        self._events.clear()
+        self._hash.update(events.replace(self.unnamed, b"") if self.unnamed else events)
