@@ -19,15 +19,21 @@ from numpy.typing import NDArray
 from emulator import faults, state
 from emulator.boards.arithmetic import TAXELS
 from emulator.boards.board import join
+from emulator.boards.chip_access import BangedChips
 from emulator.boards.contents import Bursts, load_recordings
 from emulator.boards.fingertips import Fingertips
 from emulator.boards.mtb import Mtb, make_board, set_up
 from emulator.chips.converters import Converters, fidelities
+from emulator.chips.i2c_wire import I2cWire
+from emulator.chips.noise import ChipNoise
 from emulator.clock import EmulatedTime, RealClock
 from emulator.link import BoardLink
-from emulator.probes.contacts import ContactSource
+from emulator.probes.contacts import ContactPads, ContactSource
+from emulator.probes.coverage import Coverage
+from emulator.probes.pads import Pads
 from emulator.probes.scene import Fault, Probe, Scene, check
 from emulator.probes.skin import NEVER_NS, Skin
+from emulator.rewind import Mark, holders
 from emulator.state import StateError
 from emulator.wire import NOTHING, Wire
 from skin_host.bus.commands import Message, SetTxMode, TxMode, command_frame
@@ -54,6 +60,9 @@ REPORT_NS = 10_000_000_000
 #: Before time is left out, sweeps in progress get so long to end; a full bus is never idle.
 LONGEST_SWEEP_NS = 100_000_000
 
+#: What does not change where a robot is steady.
+_STEADY = (BangedChips, ChipNoise, ContactPads, Coverage, I2cWire, Pads)
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
@@ -78,6 +87,9 @@ class Robot:
         converters: the chips.
         wires: the buses by name.
         hung, late_ns, jitter_ns: faults of boards, by their index in the layout.
+        before_input: called before anything acts on the robot; see `mark`.
+        felt: each time at which the mechanics was worked out, and the true pressure on all taxels
+            (kPa) then, are added to it; None is not kept.
 
     Raises:
         ConfigurationError: the scene, the fidelities or the recordings name something that the
@@ -141,6 +153,9 @@ class Robot:
         self.hung: set[int] = set()
         self.late_ns: dict[int, int] = {}
         self.jitter_ns: dict[int, float] = {}
+        self.before_input: Callable[[], object] = _nothing
+        self.felt: list[tuple[int, Floats]] | None = None
+        self._holders: list[object] | None = None
         self._planned = 0
         self._agenda: list[tuple[int, int, Callable[[], object]]] = []
         for number, fault in enumerate(scene.fault):
@@ -210,6 +225,8 @@ class Robot:
         taxels = self.skin.step(t_ns)
         # The mechanics has a grid of its own: the caller's steps do not change what happens.
         self._skin_due_ns = self.skin.due_ns
+        if self.felt is not None:
+            self.felt.append((t_ns, self.skin.true_pressure_kpa()))
         if taxels is not self._felt_taxels:
             self._felt_taxels = taxels
             chips = np.unique(self.layout.triangle_of[taxels]).astype(np.intp)
@@ -267,6 +284,7 @@ class Robot:
 
     def receive(self, bus: str, can_id: int, data: bytes) -> None:
         """A frame from the host; the boards' answers come with the next step."""
+        self.before_input()
         if self.wires[bus].off:
             return
         for number, board in enumerate(self._boards):
@@ -377,6 +395,7 @@ class Robot:
         Raises:
             ConfigurationError: there is no such part, triangle or taxel.
         """
+        self.before_input()
         return LiveProbe(self, self.skin.add_live(probe))
 
     def inject(self, fault: Fault) -> Callable[[], None]:
@@ -385,12 +404,14 @@ class Robot:
         Raises:
             ConfigurationError: no such fault, or not a thing of this robot.
         """
+        self.before_input()
         mend = faults.begin(self, fault)
         self._look_ahead()
         if fault.until_s is not None:
             self._plan(self.t_ns / NS + fault.until_s - fault.at_s, mend)
 
         def end() -> None:
+            self.before_input()
             mend()
             self._look_ahead()
 
@@ -416,6 +437,39 @@ class Robot:
     def work_out_now(self) -> None:
         """Something changed that the mechanics must take up at once."""
         self._skin_due_ns = self.t_ns
+
+    # ------------------------------------------------------------------ ahead, and back
+
+    @property
+    def next_ns(self) -> int:
+        """When something happens next, or all frames under way have passed."""
+        due_ns = [self._skin_due_ns, self._boards_due_ns, self._tips_due_ns]
+        if self._agenda:
+            due_ns.append(self._agenda[0][0])
+        ends_ns = [wire.ends_ns for wire in self.wires.values()]
+        return min(due_ns + [end_ns for end_ns in ends_ns if end_ns > self.t_ns])
+
+    @property
+    def is_steady(self) -> bool:
+        """Whether it may live ahead of those who act on it, and go back; see `mark`.
+
+        Nothing is on its buses. What goes wrong with data lines and on buses is left to chance
+        read by read, and nothing that was planned is undone.
+        """
+        return (
+            not self._agenda
+            and not self._recordings
+            and not self.converters.is_any_faulty
+            and all(wire.silent and wire.is_sound for wire in self.wires.values())
+        )
+
+    def mark(self) -> Mark:
+        """What the robot is now: `restore` of it lets it be that again, until something acts on
+        it. Only where it is steady.
+        """
+        if self._holders is None:
+            self._holders = holders(self, without=_STEADY)
+        return Mark(self._holders)
 
     # ------------------------------------------------------------------ save and restore
 
@@ -474,6 +528,10 @@ class Robot:
         )
 
 
+def _nothing() -> None:
+    """Nobody asks."""
+
+
 class LiveProbe:
     """A probe in a program's hand, see `Robot.touch`."""
 
@@ -483,6 +541,7 @@ class LiveProbe:
 
     def press(self, drive: float, x_mm: float = 0.0, y_mm: float = 0.0) -> None:
         """Press from now on with a force (N), or to a depth (mm) if it is driven by depth."""
+        self._robot.before_input()
         self._robot.skin.set_live(self._number, drive, x_mm, y_mm)
         self._robot.work_out_now()
 

@@ -92,6 +92,16 @@ class Wire:
         return not (self._babble_every_ns or len(self._waiting) or len(self._under_way))
 
     @property
+    def is_sound(self) -> bool:
+        """Whether nothing goes wrong on it."""
+        return not (self.loss_share or self.error_share or self._babble_every_ns or self.off)
+
+    @property
+    def ends_ns(self) -> int:
+        """When the last frame under way ends, unless more urgent ones come; 0 if there is none."""
+        return int(self._under_way.t_ns[-1]) if len(self._under_way) else 0
+
+    @property
     def idle(self) -> bool:
         """Whether no frame waits or is under way."""
         return not len(self._waiting) and not len(self._under_way)
