@@ -247,11 +247,7 @@ class DataLine:
     @property
     def takes_bytes(self) -> bool:
         """Whether the clocks of the next byte may be taken at once, by `clock_byte`."""
-        return (
-            (self._count == 0 or self._state is _State.IDLE)
-            and self._held_clocks <= 0
-            and (not self._flip_share or self._until_flip > CLOCKS_OF_A_BYTE)
-        )
+        return (self._count == 0 or self._state is _State.IDLE) and self._held_clocks <= 0
 
     def clock_byte(self, out: int) -> tuple[int, int]:
         """Do what `drive`, `rise` and `fall` do in the nine clocks of a byte.
@@ -266,8 +262,6 @@ class DataLine:
             return out, 0
         self.asleep = False
         held_ns = 0
-        if self._flip_share:
-            self._until_flip -= CLOCKS_OF_A_BYTE
         # Held for ever: nobody sees a 1.
         free = 0 if self._held_clocks else out
         if self._state is _State.IDLE:
@@ -295,19 +289,36 @@ class DataLine:
         return taken, held_ns
 
     def _sample(self, levels: int, n: int) -> int:
-        """The bits that are sampled of a line with these levels, where none is flipped."""
-        if self._slow_every:
-            taken = 0
-            for bit in range(n - 1, -1, -1):
-                level = bool(levels >> bit & 1)
-                if level and not self._sampled:
-                    self._rises += 1
-                    level = self._rises % self._slow_every != 0
-                self._sampled = level
-                taken = taken << 1 | level
-            levels = taken
+        """The bits that are sampled of a line with these levels."""
+        if self._slow_every or self._flip_share:
+            levels = self._disturbed(levels, n)
         self.seen = self._sampled = bool(levels & 1)
         return levels
+
+    def _disturbed(self, levels: int, n: int) -> int:
+        """The same where bits are flipped, or rise slowly; nearly always none of so few is."""
+        every = self._slow_every
+        rises = (levels & ~(self._sampled << n - 1 | levels >> 1)).bit_count() if every else 0
+        is_flipped = self._flip_share and self._until_flip <= n
+        if not is_flipped and (not every or self._rises % every + rises < every):
+            self._rises += rises
+            if self._flip_share:
+                self._until_flip -= n
+            return levels
+        taken = 0
+        for bit in range(n - 1, -1, -1):
+            level = bool(levels >> bit & 1)
+            if every and level and not self._sampled:
+                self._rises += 1
+                level = self._rises % every != 0
+            if self._flip_share:
+                self._until_flip -= 1
+                if self._until_flip <= 0:
+                    level = not level
+                    self._until_flip = int(self._rng.geometric(self._flip_share))
+            self._sampled = level
+            taken = taken << 1 | level
+        return taken
 
     # ------------------------------------------------------------------ the chips
 

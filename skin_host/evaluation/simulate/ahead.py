@@ -17,10 +17,10 @@ from emulator.robot import NS, Robot
 from emulator.wire import NOTHING
 from skin_host.bus.wire import FrameBatch
 
-#: How far ahead it lives; and only so long after something acted on it, because that comes seldom
-#: alone.
-AHEAD_NS = 400_000_000
-REST_NS = 150_000_000
+#: How far ahead it lives: what acts on it comes seldom alone, so that is little at first, from some
+#: time after it on, and doubles each time.
+REST_NS = 40_000_000
+LEAST_NS, MOST_NS = 100_000_000, 400_000_000
 
 
 class Ahead:
@@ -37,6 +37,7 @@ class Ahead:
         self._robot = robot
         self.t_ns = robot.t_ns
         self._acted_ns = self.t_ns
+        self._ahead_ns = LEAST_NS
         self._mark: Mark | None = None
         #: By bus, what was sent in the future.
         self._frames: dict[str, deque[FrameBatch]] = {name: deque() for name in robot.wires}
@@ -71,7 +72,8 @@ class Ahead:
         robot = self._robot
         self._mark = robot.mark()
         self._felt = robot.felt = [(self.t_ns, robot.skin.true_pressure_kpa())]
-        end_ns = self.t_ns + AHEAD_NS
+        end_ns = self.t_ns + self._ahead_ns
+        self._ahead_ns = min(2 * self._ahead_ns, MOST_NS)
         while robot.t_ns < end_ns:
             sent = robot.step((min(end_ns, robot.next_ns) - robot.t_ns) / NS)
             for name, batch in sent.items():
@@ -82,6 +84,7 @@ class Ahead:
     def _go_back(self) -> None:
         """Something is about to act on the robot."""
         self._acted_ns = self.t_ns
+        self._ahead_ns = LEAST_NS
         mark = self._mark
         if mark is None:
             return
