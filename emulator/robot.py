@@ -97,6 +97,10 @@ class Robot:
         LogError: a recording cannot be read.
     """
 
+    before_input: Callable[[], object] = staticmethod(lambda: None)
+    felt: list[tuple[int, Floats]] | None = None
+    _holders: list[object] | None = None
+
     def __init__(
         self,
         settings: Settings,
@@ -153,9 +157,6 @@ class Robot:
         self.hung: set[int] = set()
         self.late_ns: dict[int, int] = {}
         self.jitter_ns: dict[int, float] = {}
-        self.before_input: Callable[[], object] = _nothing
-        self.felt: list[tuple[int, Floats]] | None = None
-        self._holders: list[object] | None = None
         self._planned = 0
         self._agenda: list[tuple[int, int, Callable[[], object]]] = []
         for number, fault in enumerate(scene.fault):
@@ -464,12 +465,18 @@ class Robot:
         )
 
     def mark(self) -> Mark:
-        """What the robot is now: `restore` of it lets it be that again, until something acts on
-        it. Only where it is steady.
+        """What the robot is now: `go_back` lets it be that again, until something acts on it.
+
+        Only where it is steady.
         """
         if self._holders is None:
             self._holders = holders(self, without=_STEADY)
         return Mark(self._holders)
+
+    def go_back(self, mark: Mark) -> None:
+        """Be what it was at a mark, which can be used once."""
+        mark.restore()
+        self.converters.signal.forget()
 
     # ------------------------------------------------------------------ save and restore
 
@@ -526,10 +533,6 @@ class Robot:
         return _StackSizes(
             [board for number, board in enumerate(self._boards) if self._bus_of[number] == bus]
         )
-
-
-def _nothing() -> None:
-    """Nobody asks."""
 
 
 class LiveProbe:

@@ -53,6 +53,18 @@ async def test_an_alarm_rings_at_its_time_and_a_new_time_voids_the_old(clock: St
     assert rung[0] == pytest.approx(3_000, abs=2)
 
 
+@stepped
+async def test_timers_that_are_cancelled_never_ring_however_many(clock: SteppedClock) -> None:
+    loop = asyncio.get_running_loop()
+    rang: list[int] = []
+    timers = [loop.call_later(1 + number, rang.append, number) for number in range(500)]
+    for number, timer in enumerate(timers):
+        if number % 7:
+            timer.cancel()
+    await clock.sleep(600.0)
+    assert rang == list(range(0, 500, 7))
+
+
 def test_the_same_seed_draws_the_same_numbers() -> None:
     clocks = [SteppedClock(seed=seed) for seed in (1, 1, 2)]
     drawn = [[clock.uniform(0.5, 1.0) for _ in range(4)] for clock in clocks]

@@ -89,7 +89,7 @@ class Ahead:
         if mark is None:
             return
         self._forget()
-        mark.restore()
+        self._robot.go_back(mark)
         # What is sent until now has passed already.
         self._robot.step((self.t_ns - self._robot.t_ns) / NS)
 
