@@ -143,6 +143,9 @@ class _Order(NamedTuple):
         places: of each frame, its place among the board's values.
         missing: masks of the halves that are missing before each frame, and after the last.
         keys: what of the heads identifies the frames: identifier, DLC, and the data's header.
+        n: how many frames.
+        values: where `gathers` have the values: after the keys, before the status words.
+        no_status: the status words of a sweep without any.
         triangles: those that it sends, in rising order; None for all.
         gathers: by the size of a record and the place of its head, the places of the keys of all
             frames, and of the values and then the status words of all triangles, among the octets
@@ -153,17 +156,25 @@ class _Order(NamedTuple):
     places: list[int]
     missing: list[int]
     keys: bytes
+    n: int
+    values: slice
+    no_status: bytes
     triangles: NDArray[np.intp] | None
     gathers: dict[tuple[int, int], NDArray[np.intp]]
 
     @classmethod
     def of(cls, heads: Sequence[bytes], places: Sequence[int], missing: Sequence[int]) -> "_Order":
         triangles = np.array(sorted({place // 2 for place in places}), np.intp)
+        n = len(places)
+        keys = b"".join(head[:_PAD_AT] + head[-1:] for head in heads)
         return cls(
             b"".join(heads),
             list(places),
             [*missing, 0],
-            b"".join(head[:_PAD_AT] + head[-1:] for head in heads),
+            keys,
+            n,
+            slice(len(keys), len(keys) + n // 2 * TAXELS),
+            bytes(n),
             None if len(triangles) == TRIANGLES else triangles,
             {},
         )
@@ -483,7 +494,7 @@ class Assembler:
         octets, form, head = records
         places, size = order.places, form.size
         done = state.done if state.begun else 0
-        n = len(places) - done
+        n = order.n - done
         begin, end = at * size, (at + n) * size
         if end > len(text):
             end = len(text)
@@ -506,7 +517,7 @@ class Assembler:
                 or state.last_place == places[0]
             ):
                 return 0
-        if done + n < len(places):
+        if done + n < order.n:
             heads = octets[at:, head : head + HEAD_BYTES].tobytes()
             if heads != order.heads[done * HEAD_BYTES : (done + n) * HEAD_BYTES]:
                 return 0
@@ -532,11 +543,10 @@ class Assembler:
         line = got.tobytes()
         if not line.startswith(order.keys):
             return 0
-        n_values, values = len(places) // 2 * TAXELS, len(order.keys)
-        raw = got[values : values + n_values].reshape(-1, TAXELS)
+        raw = got[order.values].reshape(-1, TAXELS)
         status = NO_STATUS
-        if not line.endswith(_NO_STATUS[: len(places)]):
-            status = got[-len(places) :].view(">u2").astype(np.uint16)
+        if not line.endswith(order.no_status):
+            status = got[order.values.stop :].view(">u2").astype(np.uint16)
         if order.triangles is not None:
             raw = _spread(raw, order.triangles)
             if status is not NO_STATUS:

@@ -201,8 +201,12 @@ class BoardLedger:
         """Return whether a board sends all that it was set up to send, each of its last sweeps
         within `WRONG_PERIOD` of its period. One that does not may do so within other limits.
         """
-        sends = self._complete[row] and self._since_set_up[row] > 0
-        return sends and not self._uneasy[row] and not (self.any_silent and self.is_silent(row))
+        return (
+            self._complete[row]
+            and self._since_set_up[row] > 0
+            and not self._uneasy[row]
+            and (self.now_ns <= self._none_silent_until_ns or not self.is_silent(row))
+        )
 
     def missing(self, row: int) -> int:
         """Return a mask of the enabled triangles that a board has not sent since it was set up, or

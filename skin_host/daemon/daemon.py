@@ -369,7 +369,8 @@ class Daemon:
         service.notify("READY=1")
 
     def _deliver(self, output: Output) -> None:
-        self.fingertips.deliver(output.grasps)
+        if self.engine.fingertips is not None:
+            self.fingertips.deliver(output.grasps)
         if output.steps:
             # Touches first, so that they leave before the frames are encoded.
             for step in output.steps:

@@ -29,7 +29,7 @@ import ssl
 import struct
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from typing import Any
+from typing import Any, cast
 
 import aiomqtt
 from aiomqtt.exceptions import MqttConnectError
@@ -165,6 +165,8 @@ class Connection(aiomqtt.Client):
         self.packet_limit: int | None = None
         self._v5 = broker.v5
         self._max_packet = max_packet
+        #: paho's client, with its private members.
+        self._paho = cast(Any, self._client)
         # paho's own: packets that they read are checked before they are decoded.
         self._read_packet, self._handle_packet = self._paho._packet_read, self._paho._packet_handle
         self._paho._packet_read, self._paho._packet_handle = self._bounded_read, self._checked
@@ -181,11 +183,6 @@ class Connection(aiomqtt.Client):
         self._disconnected.add_done_callback(
             lambda future: future.cancelled() or future.exception()
         )
-
-    @property
-    def _paho(self) -> Any:
-        """Return paho's client, with its private members."""
-        return self._client
 
     def send(
         self,
@@ -279,9 +276,9 @@ class Connection(aiomqtt.Client):
             How many the socket took, from the first on. The others are left to the caller; a
             packet that it took in part is completed before anything else is written.
         """
-        if not self.is_clear():
-            return 0
         sock: Any = self._paho._sock
+        if (self._paho._out_packet or self._held or sock is None) and not self.is_clear():
+            return 0
         data = packets[0] if len(packets) == 1 else b"".join(packets)
         written = self._push(sock, data)
         if written == len(data):

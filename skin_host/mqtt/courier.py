@@ -316,6 +316,7 @@ class Courier:
                 self._fill_window(connection)
             except MqttError:
                 return  # the reader of the connection finds it lost
+        # Nothing is encoded for a socket that takes nothing.
         if not outbox.frames or not connection.is_clear():
             return
         frames, packets = [], []
