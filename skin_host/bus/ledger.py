@@ -175,6 +175,11 @@ class BoardLedger:
         return self._complete[row]
 
     @property
+    def all_complete(self) -> bool:
+        """Whether the last sweep of every board had every enabled triangle: none is absent then."""
+        return all(self._complete)
+
+    @property
     def any_silent(self) -> bool:
         """Whether any board has timed out."""
         if self.now_ns <= self._none_silent_until_ns:

@@ -227,9 +227,9 @@ def _pulse_of_boards(engine: Engine) -> tuple[object, ...]:
     ledger, liveness = engine.ledger, engine.intake.liveness
     events = (ledger.resets, ledger.lost_set_ups, ledger.tx_overflows, ledger.rezeros)
     found: tuple[object, ...] = (
-        ledger.silent.tobytes(),
+        ledger.any_silent and ledger.silent.tobytes(),
         (ledger.sweeps > 0).tobytes(),
-        np.minimum(ledger.absent, ABSENT_SWEEPS).tobytes(),
+        ledger.all_complete or np.minimum(ledger.absent, ABSENT_SWEEPS).tobytes(),
         (engine.doubts(), engine.zero_changes),
         *(counts.tobytes() for counts in events),
     )

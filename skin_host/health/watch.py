@@ -266,7 +266,7 @@ class Watch:
                 now_ns,
                 ledger.now_ns,
                 self._totals(bus, ports.get(bus)),
-                silent_after_ns=int(ledger.silent_after_ns[rows].max()) if len(rows) else ALONE_NS,
+                silent_after_ns=max(ledger.silent_after_ns[rows].tolist(), default=ALONE_NS),
                 awaited=bus in boards and boards[bus].awaits_all,
             )
         (then_ns, then), self._looked = self._looked, (now_ns, ledger.sweeps.copy())
@@ -301,7 +301,7 @@ class Watch:
             "halves": counters.halves,
             "missed": counters.missed,
             "unknown": counters.unknown_board + counters.unknown_triangle,
-            "spikes": int(self._engine.intake.liveness.spikes[self._rows[bus]].sum()),
+            "spikes": sum(self._engine.intake.liveness.spikes[self._rows[bus]].tolist()),
             "dropped": 0 if port is None else port.counters.dropped,
             "error_frames": 0 if port is None else port.counters.error_frames,
         }
