@@ -282,11 +282,10 @@ class Residuals:
 
     A taxel that was released is reported as touched again when its reading exceeds the threshold by
     the residual: that of any press, or what was felt when this one fell. A firm press ends when it
-    has fallen to its residual, in the mean of the measurements since: by evidence alone that takes
-    long, because the residual is nearly enough to keep a touch. The baselines still follow the
-    decision before: what is left may be drift, and then it lasts. While that decision holds on to a
-    residual it is no new evidence: a taxel is touched again when its mean rises further than noise
-    carries it.
+    has fallen to its residual: by evidence alone that takes long, because the residual is nearly
+    enough to keep a touch. The baselines still follow the decision before: what is left may be
+    drift, and then it lasts. While that decision holds on to a residual it is no new evidence: a
+    taxel is touched again when its mean rises further than noise carries it.
 
     Attributes:
         any: whether any is reported.
@@ -301,9 +300,7 @@ class Residuals:
         #: What the last firm press of each taxel left when it fell, fading.
         self._left = np.zeros(n, np.float32)
         self._felt = np.zeros(n, np.float32)
-        #: Measurements since a fall, and their sum.
         self._fallen = np.zeros(n, np.int64)
-        self._fallen_sum = np.zeros(n, np.float32)
         #: What noise adds to the mean at most; and which taxels have fallen to their residual and
         #: are still touched by the decision before.
         self._rise = np.zeros(n, np.float32)
@@ -322,7 +319,7 @@ class Residuals:
         Args:
             on: float[n], activations that count in full, in kPa.
             firm: float[n], activations that noise does not take below `on`.
-            votes: int[n], measurements that end a firm press.
+            votes: int[n], measurements in a row that end a firm press.
         """
         np.copyto(self._on, on, casting="same_kind")
         with np.errstate(invalid="ignore"):  # both are infinite where nothing is touched
@@ -376,23 +373,17 @@ class Residuals:
                 np.copyto(mean, felt, where=repeated[which])
             self._felt[which] = mean
             return
-        before, sum_before = self._fallen[which], self._fallen_sum[which]
-        counts = before + 1
-        sums = sum_before + now
-        # Noise takes single measurements back above what the fall is compared with, not their mean.
-        counts[~(fallen | (before > 0)) | (sums >= counts * bar)] = 0
+        counts = np.where(fallen, self._fallen[which] + 1, 0)
         # The earlier mean is kept while the fall is observed.
-        felt = np.where(counts > 0, felt, felt + MEAN_SHARE * (now - felt))
+        felt = np.where(fallen, felt, felt + MEAN_SHARE * (now - felt))
         if repeated is not None:
             again = repeated[which]
-            counts = np.where(again, before, counts)
-            sums = np.where(again, sum_before, sums)
+            counts = np.where(again, self._fallen[which], counts)
             felt = np.where(again, self._felt[which], felt)
-        sums = np.where(counts > 0, sums, 0.0)
-        self._fallen[which], self._fallen_sum[which] = counts, sums
+        self._fallen[which] = counts
         self._any_fallen = any_of(counts > 0)
         self._felt[which] = felt
-        ended = np.flatnonzero((counts >= self._votes[which]) & (now < bar))
+        ended = np.flatnonzero(counts >= self._votes[which])
         if len(ended):
             if not isinstance(which, slice):
                 ended = which[ended]
@@ -406,9 +397,7 @@ class Residuals:
 
     def _report(self, reported: Mask) -> None:
         if not np.array_equal(reported, self._reported):
-            begun = reported & ~self._reported
-            self._fallen[begun] = 0
-            self._fallen_sum[begun] = 0.0
+            self._fallen[reported & ~self._reported] = 0
             self._reported = reported
             found = np.flatnonzero(reported)
             self._which = found if len(found) < len(reported) else slice(None)

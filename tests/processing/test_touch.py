@@ -279,35 +279,6 @@ def test_a_noisy_taxel_that_falls_needs_as_many_measurements_as_for_a_touch():
     assert all(reported_over([100] * 5 + [3, 3, 50] * 10, residuals_of(votes=3))[1:])
 
 
-def share_touched(spread: float, units: float, seconds: float) -> float:
-    """Which share of taxels of so much noise is touched so long after a hard press has fallen."""
-    n, sweep_s = 200, 0.05
-    found = levels(np.full(n, 0.5), np.full(n, spread), TouchSettings())
-    detector, residuals = TouchDetector(found), Residuals(n)
-    detector.renew(np.full(n, 230.0))
-    whole = found.enter + 0.25
-    residuals.configure(whole, whole + found.fall, found.votes)
-    rng = np.random.default_rng(1)
-    for pressed_units, lasts_s in ((100.0, 3.0), (units, seconds)):
-        for _ in range(round(lasts_s / sweep_s)):
-            noise = spread * rng.standard_normal(n)
-            raw = np.clip(np.rint(230.0 - pressed_units - noise), 0, 255).astype(np.uint8)
-            reported = residuals.step(detector.step(raw, sweep_s), (230.0 - raw).astype(np.float32))
-            residuals.fade(sweep_s)
-    return float(np.mean(reported))
-
-
-@pytest.mark.parametrize("spread", [0.8, 1.5, 2.5, 4.0, 6.0])
-def test_what_a_hard_press_leaves_is_over_in_two_seconds_however_noisy_a_taxel_is(
-    spread: float,
-) -> None:
-    """Single measurements of a noisy one go back above what would keep the touch."""
-    assert share_touched(spread, units=2.0, seconds=2.0) < 0.02
-    # A press that was eased to more than that is still one.
-    enter = levels(np.array([0.5]), np.array([spread]), TouchSettings()).enter[0]
-    assert share_touched(spread, units=3.0 + enter + 1.5 * spread, seconds=5.0) > 0.9
-
-
 def test_a_measurement_that_is_sent_again_ends_no_press():
     reported = reported_over([100] * 8 + [3] * 3, residuals_of(), dt_s=0.01)
     assert reported[-3:] == flags(1, 1, 1)
