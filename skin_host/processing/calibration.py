@@ -73,6 +73,9 @@ ROUNDING_VARIANCE = 0.1
 FEWEST_BLOCKS = 4
 #: A histogram is smoothed with this share of its variance.
 SMOOTHED_SHARE = 0.25
+#: Noise jumps away from pressure if its skewness says so by this many standard errors. A robot has
+#: thousands of pads: with three, one in four hundred was taken for quieter than it is.
+AWAY_ERRORS = 6.0
 #: Upper limit of the exponents, and number of bisections to find one.
 LARGEST_EXPONENT = 40.0
 BISECTIONS = 24
@@ -419,7 +422,7 @@ def _upward_variance(counts: NDArray[np.int64], variance: Floats, touch: TouchSe
     third = np.sum(share * reading**3, axis=1)
     skewness = third / np.maximum(variance, ROUNDING_VARIANCE) ** 1.5
     # The skewness of normal noise is estimated within sqrt(6 / samples).
-    away = skewness < -3.0 * np.sqrt(6.0 / samples)
+    away = skewness < -AWAY_ERRORS * np.sqrt(6.0 / samples)
     upward: Floats = np.where(away, np.minimum(found, surely), np.maximum(found, surely))
     return upward
 

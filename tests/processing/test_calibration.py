@@ -170,6 +170,16 @@ def test_jumps_towards_pressure_count_for_more_than_jumps_away_from_it():
     assert np.median(towards.spread) > 1.5 * np.median(away.spread)
 
 
+def test_of_thousands_of_equal_pads_none_is_taken_for_much_quieter_than_it_is():
+    """A hundred bytes are skewed by chance; that is no noise that jumps away from pressure."""
+    rng = np.random.default_rng(23)
+    least = [
+        calibrated(noisy(rng, sweeps=100, sd=0.9, level=rng.uniform(239.5, 240.5, N))).spread.min()
+        for _ in range(-(-10_000 // N))
+    ]
+    assert min(least) > 0.75 * 0.9
+
+
 def test_taps_that_two_pads_share_are_a_touch_and_those_of_one_pad_are_noise():
     sweeps = noisy(np.random.default_rng(16), sweeps=250)
     taps = np.arange(250) % 60 < 30
