@@ -464,6 +464,39 @@ class Robot:
             and all(wire.silent and wire.is_sound for wire in self.wires.values())
         )
 
+    def sweep(self, end_ns: int) -> tuple[str, FrameBatch] | None:
+        """Live up to the next sweep of a board; return it as it passes over its bus, alone.
+
+        Only where the robot is steady. None if something else happens by `end_ns` at the latest, or
+        amid the sweep; then nothing was done. `step` does the same at more cost.
+        """
+        t_ns = self._boards_due_ns
+        numbers = [number for number, due_ns in enumerate(self._due_ns) if due_ns <= t_ns]
+        if t_ns > end_ns or len(numbers) != 1:
+            return None
+        number = numbers[0]
+        board, wire = self._boards[number], self.wires[self._bus_of[number]]
+        is_plain = board.is_sweeping and number not in self.jitter_ns and number not in self.late_ns
+        if not (is_plain and wire.silent) or number in self.converters.lines:
+            return None
+        passed_ns = wire.passed_ns(*self._bursts.frame_heads(number))
+        if passed_ns is None:
+            return None
+        over_ns = t_ns + int(passed_ns[-1])
+        others_ns = (due_ns for other, due_ns in enumerate(self._due_ns) if other != number)
+        if over_ns > min(end_ns, t_ns + board.period_ns, self._tips_due_ns, *others_ns):
+            return None
+        while self._skin_due_ns < t_ns:
+            self._move_to(max(self.t_ns, self._skin_due_ns))
+        self._move_to(t_ns)
+        board.advance(t_ns)
+        self._due_ns[number] = self._due_of(number)
+        self._boards_due_ns = min(self._due_ns)
+        ((bus, batch),) = self._bursts.frames([number], t_ns)
+        batch.t_ns = batch.t_ns + passed_ns
+        wire.pass_by(over_ns)
+        return bus, batch
+
     def mark(self) -> Mark:
         """What the robot is now: `go_back` lets it be that again, until something acts on it.
 

@@ -75,6 +75,10 @@ class Ahead:
         end_ns = self.t_ns + self._ahead_ns
         self._ahead_ns = min(2 * self._ahead_ns, MOST_NS)
         while robot.t_ns < end_ns:
+            sweep = robot.sweep(end_ns)
+            if sweep is not None:
+                self._frames[sweep[0]].append(sweep[1])
+                continue
             sent = robot.step((min(end_ns, robot.next_ns) - robot.t_ns) / NS)
             for name, batch in sent.items():
                 if len(batch):
