@@ -181,6 +181,28 @@ def test_in_a_gap_the_foam_relaxes_under_what_is_read_after_it(update_s):
     assert after[-1].touched[:6].all()
 
 
+@pytest.mark.parametrize("update_s", [0.0, 1.0])
+@pytest.mark.parametrize("units", [20.0, 110.0])
+def test_a_gap_counts_once_and_beyond_the_calibrated_range_too(units, update_s):
+    processing = {"relaxation": {"update_s": update_s}, "drift": {"rule": "none"}}
+    rig, held = (Rig(1, 0.0, hz=10.0, processing=processing) for _ in ("rig", "held"))
+    press(rig, units, 20)
+    press(held, units, 20)
+    rig.t_ns += 30_000_000_000
+    expected = press(held, units, 320)[-1].pressure_kpa[:6]
+    assert press(rig, units, 20)[-1].pressure_kpa[:6] == pytest.approx(expected, rel=0.006)
+
+
+def test_what_was_released_in_a_gap_is_no_touch_and_what_still_presses_is_one_at_once():
+    hour_ns = 3_600_000_000_000
+    for units in (0.0, 20.0):
+        rig = Rig(1, 0.0)
+        press(rig, 20.0, 50)
+        rig.t_ns += hour_ns
+        (frame,) = press(rig, units, 1)
+        assert frame.touched[:6].all() == frame.touched.any() == (units > 0.0)
+
+
 def test_foam_released_while_its_board_was_silent_has_recovered_when_it_is_back():
     rig = Rig(1, 0.0, hz=2.0, processing={"drift": {"rule": "none"}})
     press(rig, 28.0, 1200)
@@ -194,6 +216,10 @@ def test_foam_released_while_its_board_was_silent_has_recovered_when_it_is_back(
 def test_a_taxel_that_reads_too_little_for_long_is_not_touched_when_it_is_back(update_s):
     rig = Rig(1, 0.0, processing={"drift": {"rule": "none"}, "relaxation": {"update_s": update_s}})
     press(rig, -30.0, 6000)
+    assert not any(frame.touched.any() for frame in press(rig, 0.0, 300))
+    press(rig, -30.0, 10)
+    rig.t_ns += 3_600_000_000_000
+    press(rig, -30.0, 1)
     assert not any(frame.touched.any() for frame in press(rig, 0.0, 300))
 
 
@@ -238,6 +264,14 @@ def test_what_a_hard_press_leaves_is_no_touch_though_it_would_be_one_by_itself()
         press(rig, 0.0, 5)
         told.append(any(frame.touched.any() for frame in press(rig, 2.0, 50)))
     assert told == [True, False]
+
+
+def test_what_a_hard_press_left_has_gone_after_an_hour_without_data():
+    rig = Rig(1, 0.3, processing=NO_RELAXATION)
+    press(rig, 45.0, 50)
+    press(rig, 0.0, 5)
+    rig.t_ns += 3_600_000_000_000
+    assert any(frame.touched.any() for frame in press(rig, 2.0, 50))
 
 
 def test_a_byte_at_an_end_of_the_scale_is_told_beyond_range():

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from skin_host.config.settings import TouchSettings
+from skin_host.processing.conversions import CONVERSION_S
 from skin_host.processing.rezero import (
     FEWEST,
     LARGEST_UNITS,
@@ -281,3 +282,9 @@ def test_pads_whose_frames_were_lost_in_the_look_are_observed_until_their_zero_i
     assert late is not None
     assert np.flatnonzero(late).tolist() == list(range(180, N))
     assert not rezero.doubted.any()
+
+
+def test_a_zero_is_observed_for_longer_the_more_it_scatters_against_the_threshold() -> None:
+    """Until its standard error is a seventh of the threshold, a conversion being a second."""
+    spread, enter = np.array([0.5, 1.0, 3.0, 0.0]), np.array([7.0, 7.0, 10.5, 7.0])
+    assert look_s(spread, enter) == pytest.approx(np.array([0.25, 1.0, 4.0, 0.0]) * CONVERSION_S)
