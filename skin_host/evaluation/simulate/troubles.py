@@ -16,6 +16,7 @@ from skin_host.bus.port import LinkState
 from skin_host.evaluation.simulate.cables import Mischief
 from skin_host.evaluation.simulate.disk import FULL, READ_ONLY
 from skin_host.evaluation.simulate.world import World
+from skin_host.layout import PadKind
 
 Triangle = tuple[str, int]
 Mask = NDArray[np.bool_]
@@ -229,7 +230,11 @@ def _emulated(
                 number = next(one for one in world.layout.boards if one.name == board)
                 taxels = number.taxel_index[triangle]
                 if "taxel" in targets:
-                    taxels = taxels[[int(str(targets["taxel"]))]]
+                    taxel = taxels[[int(str(targets["taxel"]))]]
+                    # A board takes what its temperature pad reads off all pads of the triangle.
+                    warms = world.layout.pad_kind[taxel] == PadKind.THERMAL
+                    if not (name == "noisy_taxel" and warms.any() and (taxel >= 0).all()):
+                        taxels = taxel
                 spoiled = np.zeros_like(spoiled)
                 spoiled[taxels[taxels >= 0]] = True
         elif spoils:

@@ -24,6 +24,7 @@ from skin_host.evaluation.simulate.trace import Trace
 from skin_host.evaluation.simulate.troubles import KINDS
 from skin_host.evaluation.simulate.world import Life, World
 from skin_host.fingertip.events import FingertipEvent
+from skin_host.layout import PadKind
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.events import Touch
 
@@ -641,3 +642,17 @@ def test_a_press_that_lifted_while_its_bus_was_off_is_no_touch_when_it_is_back(
 
     with world.clock.runner() as runner:
         assert runner.run(live()) == ["begin", "end"]
+
+
+def test_a_noisy_temperature_pad_spoils_its_triangle_and_another_pad_itself(world: World) -> None:
+    """`icub.toml`, seed 5: its board takes what it reads off all others."""
+    kinds = world.layout.pad_kind
+    seen = set()
+    for seed in range(60):
+        trouble = KINDS["noisy_taxel"](world, random.Random(seed), False)
+        trouble.end()
+        assert trouble.spoils is not None
+        warms = bool((kinds[trouble.spoils] == PadKind.THERMAL).any())
+        assert np.count_nonzero(trouble.spoils) == (12 if warms else 1)
+        seen.add(warms)
+    assert seen == {False, True}
