@@ -1,18 +1,26 @@
 """What health keeps in mind of parts, boards and buses between two records."""
 
+from dataclasses import dataclass, field
+from typing import Any
+
 import numpy as np
 import pytest
 
+from skin_host.bus.port import PortCounters
+from skin_host.config.settings import load
 from skin_host.health.watch import (
     RECENT_NS,
     TWICE_NS,
     BoardWatch,
     BusWatch,
     PartWatch,
+    Watch,
     Window,
 )
-from skin_host.processing.core import Step
+from skin_host.layout import build_layout
+from skin_host.processing.core import Engine, Step
 from skin_host.processing.pipeline import PressureFrame
+from tests.support.fault_bench import CONFIG
 
 MS = 1_000_000
 S = 1000 * MS
@@ -174,3 +182,42 @@ def test_a_bus_is_silent_when_no_frame_came_for_too_long_unless_none_is_expected
     # A set clock makes nothing silent: only what the ledger has seen pass counts.
     watch.note(9 * S, 800 * MS, {"frames": 12}, silent_after_ns=300 * MS)
     assert not watch.silent
+
+
+@dataclass
+class Counted:
+    """Of a port, what is counted there."""
+
+    counters: PortCounters = field(default_factory=PortCounters)
+
+
+def test_what_a_bus_gained_adds_up_all_that_was_unknown_or_damaged() -> None:
+    settings = load(CONFIG)
+    layout = build_layout(settings, CONFIG.parent)
+    engine = Engine(settings, layout, list(range(len(layout.parts))))
+    watch, port = Watch(engine), Counted()
+    bus = next(iter(engine.assemblers))
+    ports: Any = {bus: port}
+    watch.tick(0, ports, {})
+    counters = engine.assemblers[bus].counters
+    counters.frames, counters.sweeps, counters.other = 100, 9, 11
+    counters.unknown_board, counters.unknown_triangle = 2, 3
+    counters.wrong_header, counters.short, port.counters.damaged = 1, 4, 20
+    counters.halves, counters.missed = 6, 7
+    port.counters.dropped, port.counters.error_frames = 8, 13
+    engine.intake.liveness.spikes[:] = 1
+    watch.tick(100 * MS, ports, {})
+    boards = [one for one in engine.boards if layout.boards[one].settings.bus == bus]
+    assert watch.buses[bus].gained == {
+        "frames": 100,
+        "sweeps": 9,
+        "other": 11,
+        "wrong": 1 + 4 + 20,
+        "halves": 6,
+        "missed": 7,
+        "unknown": 2 + 3,
+        "spikes": len(boards),
+        "dropped": 8,
+        "error_frames": 13,
+        "seconds": pytest.approx(0.1),
+    }
