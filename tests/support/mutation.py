@@ -152,8 +152,12 @@ def identity(file: str, line: str, becomes: str) -> tuple[str, str, str]:
 
 
 def is_same(line: str, becomes: str) -> bool:
-    """Whether numpy makes the same of a change: any negative number stands for a size to find."""
-    return line == re.sub(r"reshape\((-2|~1)\b", "reshape(-1", becomes)
+    """Whether the same is made of a change.
+
+    To numpy any negative number stands for a size to find; `strict` finds only other mistakes.
+    """
+    becomes = re.sub(r"reshape\((-2|~1)\b", "reshape(-1", becomes)
+    return line == becomes.replace("strict=False", "strict=True")
 
 
 class Quickest:
