@@ -213,9 +213,10 @@ class Describer:
             return "answers again"
         if liveness.frozen[triangle]:
             return "silenced" if liveness.silenced[triangle] else "frozen"
-        if liveness.unproven[triangle]:
-            if liveness.silenced[triangle]:
-                return "silenced"
+        if liveness.unproven[triangle] and liveness.silenced[triangle]:
+            return "silenced"
+        # If pads read far below zero, the readings are not taken and cannot show a change.
+        if liveness.unproven[triangle] and self._engine.intake.takes(row, number):
             since_ns = self._unproven_ns.setdefault((board, number), ledger.now_ns)
             return "constant" if ledger.now_ns - since_ns >= CONSTANT_NS else None
         self._unproven_ns.pop((board, number), None)

@@ -230,6 +230,12 @@ class Intake:
             self.judge()
         self.liveness.note_gap(row)
 
+    def takes(self, row: int, number: int) -> bool:
+        """Return whether the readings of a triangle in the last sweep of a board (its row) are
+        taken: it was received without an error, and in its range.
+        """
+        return bool(self._here[row, number])
+
     def missing(self) -> list[dict[int, int]]:
         """Of each part, the boards whose sweeps its next sample waits for."""
         return self._waits

@@ -9,6 +9,7 @@ import pytest
 from skin_host.bus.wire import FrameBatch, encode_sweep
 from skin_host.config.settings import load
 from skin_host.daemon.daemon import Daemon
+from skin_host.health import HealthWatch
 from skin_host.layout import build_layout
 from skin_host.processing.core import Engine, Output
 from tests.support.stack import ROOT
@@ -109,3 +110,20 @@ def test_a_part_is_not_off_when_a_pad_shows_that_it_was_pressed_when_zeroed(
     hand.send(20)
     assert states[-1] == "UNKNOWN"
     daemon.link.close()
+
+
+def test_a_triangle_with_pads_below_zero_when_calibrated_is_not_called_constant(hand: Hand) -> None:
+    """Its readings are not taken, so it cannot show that it lives; its board's doubt is named."""
+    pressed = {"p3": FAR_BELOW, "p4": FAR_BELOW, "p5": FAR_BELOW}
+    hand.send(10, **pressed)
+    hand.engine.begin_calibration(1.0)
+    hand.send(25, **pressed)
+    hand.engine.use(hand.engine.end_calibration("2026-01-01T00:00:00+00:00"))
+    health = HealthWatch(hand.engine)
+    codes: set[str] = set()
+    for _ in range(10):
+        hand.send(5, **pressed)
+        record = health.record(hand.engine.parts[0], hand.engine.ledger.now_ns, {}, {})
+        codes |= {fault["code"] for fault in record["faults"]}
+    assert "board_in_doubt" in codes
+    assert "triangle_constant" not in codes
