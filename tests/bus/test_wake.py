@@ -1,7 +1,7 @@
 """When the ports are read: right after each sweep, seldom otherwise, never in a tight loop."""
 
 import asyncio
-from itertools import pairwise
+from itertools import pairwise, permutations
 
 import pytest
 
@@ -48,8 +48,9 @@ def test_between_sweeps_it_sleeps_long_only_if_every_board_is_known():
     assert plan.next_ns(once_between) == T0 + PERIOD + GUARD_NS
 
 
-def test_boards_of_one_sample_are_read_with_the_last_but_one_and_the_last():
-    missing = [[0, 1, 2], [3]]
+@pytest.mark.parametrize("order", list(permutations((0, 1, 2))))
+def test_boards_of_one_sample_are_read_with_the_last_but_one_and_the_last(order: tuple[int, ...]):
+    missing = [list(order), [3]]
     plan = Plan(dict.fromkeys(range(4), PERIOD), POLL, lambda: missing)
     for board, at_ms in ((0, 0), (3, 5), (1, 10), (2, 20)):
         plan.sweep_ended(board, T0 + at_ms * MS)

@@ -407,3 +407,18 @@ async def test_all_has_arrived_when_neither_an_event_nor_a_state_waits() -> None
         step()
     await waiting
     assert done == [False, False]
+
+
+def test_who_sends_is_woken_by_a_frame_and_by_states_that_are_repeated() -> None:
+    outbox, woken = connected(frame_hz=10.0), []
+    outbox.on_put = lambda: woken.append(len(outbox.frames))
+    outbox.put_frame(frame("palm", 0))
+    assert woken == [1]
+    # One that is not due wakes nobody.
+    outbox.put_frame(frame("palm", 1, 1))
+    assert woken == [1]
+    outbox.put_state("palm/contact", b"ON")
+    outbox.retained_put.clear()
+    outbox.repeat_states()
+    assert outbox.retained_put.is_set()
+    assert list(outbox.pending) == ["palm/contact"]

@@ -19,6 +19,7 @@ def read(**changes: Any) -> Touch:
 
 
 def test_a_published_event_is_numbered_and_rounded() -> None:
+    assert make_event().count == make_event().missed == 0
     event = make_event(
         centroid_m=(LONG, -LONG, -1e-9),
         normal=(LONG, -1e-9, 0.0),

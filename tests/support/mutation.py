@@ -123,8 +123,8 @@ def drawn(source: str, items: list[Any], places: int, seed: int) -> list[Any]:
         (change,) = item.mutations
         row, column = change.start_pos
         is_type = any((a, b) <= (row, column) < (c, d) for a, b, c, d in typed)
-        number = re.match(r"\d[\d_]*", lines[row - 1][column:])
-        is_large = number is not None and int(number[0]) >= LARGE
+        number = re.match(r"\d[\d_]*(\.\d+)?(e\d+)?", lines[row - 1][column:])
+        is_large = number is not None and float(number[0]) >= LARGE
         if not is_type and not is_large and not change.operator_name.endswith(SAME):
             found.setdefault(change.start_pos, item)
     return list(found.values())[:places]
