@@ -536,7 +536,12 @@ KINDS: dict[str, Begin] = {
         "no_acknowledge", _SWAPPED, _LINE | {"triangle_silenced"}, 1.0, spoils=True
     ),
     "data_held_low": _emulated(
-        "data_held_low", _CHIPS | _SET_UP, _LINE | _SILENCED, 1.0, spoils=True
+        "data_held_low",
+        _CHIPS | _SET_UP,
+        # In the middle of a reading it turns one pad's bytes into ones, and nothing else.
+        _LINE | _SILENCED | {"board_in_doubt"},
+        1.0,
+        spoils=True,
     ),
     "clock_stretched": _emulated("clock_stretched", _SWAPPED, _ELSEWHERE | _LINE, 1.0, spoils=True),
     # What a wrong bit does to a reading, or to the board that takes it for a missing chip.
