@@ -110,6 +110,20 @@ def test_a_sweep_is_skipped_unless_it_adds_evidence(units: int, idle: bool) -> N
     assert detector.is_idle(np.array([REST - units], np.uint8)) is idle
 
 
+def test_evidence_fades_before_sweeps_are_skipped_so_votes_far_apart_are_no_touch() -> None:
+    detector, rest = detector_of(), np.full(1, REST, np.uint8)
+    for _ in range(3):
+        assert not pressed(detector, 5)[0]
+        assert not detector.is_idle(rest)
+        skipped = 0
+        for _ in range(10):
+            if detector.is_idle(rest):
+                skipped += 1
+            else:
+                pressed(detector, 0)
+        assert 0 < skipped < 10
+
+
 def test_a_taxel_without_a_vote_is_never_touched():
     found = levels_of(np.inf, np.inf, 1.0, 1.0)
     assert not any(touched_over([200] * 20, found=found))
