@@ -19,21 +19,15 @@ from numpy.typing import NDArray
 from emulator import faults, state
 from emulator.boards.arithmetic import TAXELS
 from emulator.boards.board import join
-from emulator.boards.chip_access import BangedChips
 from emulator.boards.contents import Bursts, load_recordings
 from emulator.boards.fingertips import Fingertips
 from emulator.boards.mtb import Mtb, make_board, set_up
 from emulator.chips.converters import Converters, fidelities
-from emulator.chips.i2c_wire import I2cWire
-from emulator.chips.noise import ChipNoise
 from emulator.clock import EmulatedTime, RealClock
 from emulator.link import BoardLink
-from emulator.probes.contacts import ContactPads, ContactSource
-from emulator.probes.coverage import Coverage
-from emulator.probes.pads import Pads
+from emulator.probes.contacts import ContactSource
 from emulator.probes.scene import Fault, Probe, Scene, check
 from emulator.probes.skin import NEVER_NS, Skin
-from emulator.rewind import Mark, holders
 from emulator.state import StateError
 from emulator.wire import NOTHING, Wire
 from skin_host.bus.commands import Message, SetTxMode, TxMode, command_frame
@@ -60,9 +54,6 @@ REPORT_NS = 10_000_000_000
 #: Before time is left out, sweeps in progress get so long to end; a full bus is never idle.
 LONGEST_SWEEP_NS = 100_000_000
 
-#: What does not change where a robot is steady.
-_STEADY = (BangedChips, ChipNoise, ContactPads, Coverage, I2cWire, Pads)
-
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
@@ -87,19 +78,12 @@ class Robot:
         converters: the chips.
         wires: the buses by name.
         hung, late_ns, jitter_ns: faults of boards, by their index in the layout.
-        before_input: called before anything acts on the robot; see `mark`.
-        felt: each time at which the mechanics was worked out, and the true pressure on all taxels
-            (kPa) then, are added to it; None is not kept.
 
     Raises:
         ConfigurationError: the scene, the fidelities or the recordings name something that the
             layout does not have.
         LogError: a recording cannot be read.
     """
-
-    before_input: Callable[[], object] = staticmethod(lambda: None)
-    felt: list[tuple[int, Floats]] | None = None
-    _holders: list[object] | None = None
 
     def __init__(
         self,
@@ -226,8 +210,6 @@ class Robot:
         taxels = self.skin.step(t_ns)
         # The mechanics has a grid of its own: the caller's steps do not change what happens.
         self._skin_due_ns = self.skin.due_ns
-        if self.felt is not None:
-            self.felt.append((t_ns, self.skin.true_pressure_kpa()))
         if taxels is not self._felt_taxels:
             self._felt_taxels = taxels
             chips = np.unique(self.layout.triangle_of[taxels]).astype(np.intp)
@@ -285,7 +267,6 @@ class Robot:
 
     def receive(self, bus: str, can_id: int, data: bytes) -> None:
         """A frame from the host; the boards' answers come with the next step."""
-        self.before_input()
         if self.wires[bus].off:
             return
         for number, board in enumerate(self._boards):
@@ -396,7 +377,6 @@ class Robot:
         Raises:
             ConfigurationError: there is no such part, triangle or taxel.
         """
-        self.before_input()
         return LiveProbe(self, self.skin.add_live(probe))
 
     def inject(self, fault: Fault) -> Callable[[], None]:
@@ -405,14 +385,12 @@ class Robot:
         Raises:
             ConfigurationError: no such fault, or not a thing of this robot.
         """
-        self.before_input()
         mend = faults.begin(self, fault)
         self._look_ahead()
         if fault.until_s is not None:
             self._plan(self.t_ns / NS + fault.until_s - fault.at_s, mend)
 
         def end() -> None:
-            self.before_input()
             mend()
             self._look_ahead()
 
@@ -438,78 +416,6 @@ class Robot:
     def work_out_now(self) -> None:
         """Something changed that the mechanics must take up at once."""
         self._skin_due_ns = self.t_ns
-
-    # ------------------------------------------------------------------ ahead, and back
-
-    @property
-    def next_ns(self) -> int:
-        """When something happens next, or all frames under way have passed."""
-        due_ns = [self._skin_due_ns, self._boards_due_ns, self._tips_due_ns]
-        if self._agenda:
-            due_ns.append(self._agenda[0][0])
-        ends_ns = [wire.ends_ns for wire in self.wires.values()]
-        return min(due_ns + [end_ns for end_ns in ends_ns if end_ns > self.t_ns])
-
-    @property
-    def is_steady(self) -> bool:
-        """Whether it may live ahead of those who act on it, and go back; see `mark`.
-
-        Nothing is on its buses. What goes wrong with data lines and on buses is left to chance
-        read by read, and nothing that was planned is undone.
-        """
-        return (
-            not self._agenda
-            and not self._recordings
-            and not self.converters.is_any_faulty
-            and all(wire.silent and wire.is_sound for wire in self.wires.values())
-        )
-
-    def sweep(self, end_ns: int) -> tuple[str, FrameBatch] | None:
-        """Live up to the next sweep of a board; return it as it passes over its bus, alone.
-
-        Only where the robot is steady. None if something else happens by `end_ns` at the latest, or
-        amid the sweep; then nothing was done. `step` does the same at more cost.
-        """
-        t_ns = self._boards_due_ns
-        numbers = [number for number, due_ns in enumerate(self._due_ns) if due_ns <= t_ns]
-        if t_ns > end_ns or len(numbers) != 1:
-            return None
-        number = numbers[0]
-        board, wire = self._boards[number], self.wires[self._bus_of[number]]
-        is_plain = board.is_sweeping and number not in self.jitter_ns and number not in self.late_ns
-        if not (is_plain and wire.silent) or number in self.converters.lines:
-            return None
-        passed_ns = wire.passed_ns(*self._bursts.frame_heads(number))
-        if passed_ns is None:
-            return None
-        over_ns = t_ns + int(passed_ns[-1])
-        others_ns = (due_ns for other, due_ns in enumerate(self._due_ns) if other != number)
-        if over_ns > min(end_ns, t_ns + board.period_ns, self._tips_due_ns, *others_ns):
-            return None
-        while self._skin_due_ns < t_ns:
-            self._move_to(max(self.t_ns, self._skin_due_ns))
-        self._move_to(t_ns)
-        board.advance(t_ns)
-        self._due_ns[number] = self._due_of(number)
-        self._boards_due_ns = min(self._due_ns)
-        ((bus, batch),) = self._bursts.frames([number], t_ns)
-        batch.t_ns = batch.t_ns + passed_ns
-        wire.pass_by(over_ns)
-        return bus, batch
-
-    def mark(self) -> Mark:
-        """What the robot is now: `go_back` lets it be that again, until something acts on it.
-
-        Only where it is steady.
-        """
-        if self._holders is None:
-            self._holders = holders(self, without=_STEADY)
-        return Mark(self._holders)
-
-    def go_back(self, mark: Mark) -> None:
-        """Be what it was at a mark, which can be used once."""
-        mark.restore()
-        self.converters.signal.forget()
 
     # ------------------------------------------------------------------ save and restore
 
@@ -577,7 +483,6 @@ class LiveProbe:
 
     def press(self, drive: float, x_mm: float = 0.0, y_mm: float = 0.0) -> None:
         """Press from now on with a force (N), or to a depth (mm) if it is driven by depth."""
-        self._robot.before_input()
         self._robot.skin.set_live(self._number, drive, x_mm, y_mm)
         self._robot.work_out_now()
 

@@ -91,28 +91,6 @@ class Wire:
         """Whether no frame will come until a board sends one."""
         return not (self._babble_every_ns or len(self._waiting) or len(self._under_way))
 
-    def passed_ns(self, ids: NDArray[np.uint32], lengths: NDArray[np.uint8]) -> Ints | None:
-        """When after its beginning each frame of a burst ends that is alone on the bus, int64[n];
-        None if that is not known, because there has been none with these identifiers.
-        """
-        known = self._passed.get(id(ids))
-        is_known = known is not None and known[0] is ids and known[1] is lengths
-        return known[2] if known is not None and is_known else None
-
-    def pass_by(self, t_ns: int) -> None:
-        """Frames have passed that were alone on the bus, until then."""
-        self._free_ns = t_ns
-
-    @property
-    def is_sound(self) -> bool:
-        """Whether nothing goes wrong on it."""
-        return not (self.loss_share or self.error_share or self._babble_every_ns or self.off)
-
-    @property
-    def ends_ns(self) -> int:
-        """When the last frame under way ends, unless more urgent ones come; 0 if there is none."""
-        return int(self._under_way.t_ns[-1]) if len(self._under_way) else 0
-
     @property
     def idle(self) -> bool:
         """Whether no frame waits or is under way."""

@@ -95,11 +95,6 @@ class Mtb(ABC):
     def count_no_ack(self, triangles: int) -> None:
         """Count so many triangles of a burst that had taxels without acknowledge."""
 
-    @property
-    def is_sweeping(self) -> bool:
-        """Whether its next ticks surely do nothing but read its chips and send that."""
-        return False
-
     def answers(self) -> list[Frame]:
         """Answers to frames that were queued when they came, and are ready now."""
         return []
@@ -264,11 +259,6 @@ class Burst:
         if self._order is not None:
             data = data[self._order]
         return self.batch(data, t_ns)
-
-    @property
-    def heads(self) -> tuple[NDArray[np.uint32], Bytes]:
-        """Identifiers uint32[2 k] and lengths uint8[2 k] of its frames."""
-        return self._ids, self._dlc
 
     def batch(self, data: Bytes, t_ns: int) -> FrameBatch:
         """The frames with some contents, uint8[2 k, 8] in the order in which they are sent."""

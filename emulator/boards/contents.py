@@ -107,10 +107,6 @@ class Bursts:
                 FrameBatch(batch.id[rows], batch.dlc[rows], batch.data[rows], batch.t_ns[rows]),
             )
 
-    def frame_heads(self, number: int) -> tuple[NDArray[np.uint32], Bytes]:
-        """Identifiers uint32[2 k] and lengths uint8[2 k] of the frames of a board's sweep."""
-        return self._of([number]).burst.heads
-
     def _of(self, numbers: list[int]) -> _Known:
         boards = [self._boards[number] for number in numbers]
         versions = [board.version for board in boards]

@@ -96,12 +96,6 @@ class Mtb4(Mtb):
         return True
 
     @property
-    def is_sweeping(self) -> bool:
-        """Whether its next ticks surely do nothing but read its chips and send that."""
-        busy = self._calibrate_at_tick or self._in_bootloader_until_ns is not None
-        return not busy and self.next_ns is not None
-
-    @property
     def due_ns(self) -> int | None:
         """The next tick, or the end of the bootloader."""
         return self.next_ns if self.next_ns is not None else self._in_bootloader_until_ns

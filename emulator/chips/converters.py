@@ -173,11 +173,6 @@ class Converters:
             self._plug(number)
         return self._wires[number]
 
-    @property
-    def is_any_faulty(self) -> bool:
-        """Whether any data line has a fault."""
-        return any(line.faulty for wire in self._wires for line in wire.lines)
-
     def read_at_once(self, number: int) -> bool:
         """Return whether a board may take its chips' results from `signal` now; this counts as
         read.

@@ -308,10 +308,6 @@ class SignalSkin:
         results: Words = self._results[chips]
         return results, None
 
-    def forget(self) -> None:
-        """Foresee anew: what was foreseen may be of a time that will not come."""
-        self._ahead.clear()
-
     def _settle(self, chips: Ints) -> tuple[Words, Ahead | None] | None:
         """Store the results of the conversions that have ended, with their noise.
 

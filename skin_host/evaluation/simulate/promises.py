@@ -364,7 +364,7 @@ class Promises:
         mine = np.asarray(taxels, np.intp) + self._parts[part].start
         caused: Mask = self._now_ns() - self._touched_ns[mine] < lately_ns
         if not caused.all():
-            caused |= self._world.ahead.true_pressure_kpa()[mine] > TOUCHING_KPA
+            caused |= self._world.robot.skin.true_pressure_kpa()[mine] > TOUCHING_KPA
             caused |= (self._exempt | self._spoiled())[mine]
         return caused
 
@@ -625,7 +625,7 @@ class Promises:
         world = self._world
         now_ns = self._now_ns()
         world.move()
-        truth = world.ahead.true_pressure_kpa().copy()
+        truth = world.robot.skin.true_pressure_kpa().copy()
         self._truth.append((now_ns, truth))
         life = world.life
         self._touched_ns[truth > TOUCHING_KPA] = now_ns
@@ -699,7 +699,7 @@ class Promises:
 
     def _note_pause(self) -> None:
         """Something is about to be pressed; what was lifted just before has not been sampled."""
-        rests = self._world.ahead.true_pressure_kpa() <= PRESSED_KPA
+        rests = self._world.robot.skin.true_pressure_kpa() <= PRESSED_KPA
         self._paused_ns[rests] = self._now_ns()
 
     def _noise_kpa(self, life: Life, name: str) -> NDArray[np.float64]:

@@ -18,7 +18,6 @@ from skin_host.clock import SYSTEM, Clock, SteppedClock
 from skin_host.config.settings import Bus, Receive, Settings
 from skin_host.daemon.calibrate import stored_calibration
 from skin_host.daemon.daemon import Daemon
-from skin_host.evaluation.simulate.ahead import Ahead
 from skin_host.evaluation.simulate.broker import Living, MemoryBroker
 from skin_host.evaluation.simulate.cables import Cable, SimulatedPort
 from skin_host.evaluation.simulate.disk import SimulatedDisk
@@ -116,7 +115,6 @@ class World:
         self.clock = SteppedClock(seed=seed)
         self.trace = Trace()
         self.robot = Robot(settings, layout, scene, seed=seed)
-        self.ahead = Ahead(self.robot)
         self.broker = MemoryBroker(self.clock, self.trace)
         self.cables = {
             name: Cable(
@@ -144,10 +142,10 @@ class World:
 
     def move(self) -> None:
         """Bring the robot to the present; what its boards sent waits on the buses."""
-        now_ns = self.clock.monotonic_ns() + self.slept_ns
-        if now_ns <= self.ahead.t_ns:
+        passed_ns = self.clock.monotonic_ns() + self.slept_ns - self.robot.t_ns
+        if passed_ns <= 0:
             return
-        for name, batch in self.ahead.move_to(now_ns).items():
+        for name, batch in self.robot.step(passed_ns / NS).items():
             if self.slept_ns and len(batch):
                 batch.t_ns = batch.t_ns - self.slept_ns
             self.cables[name].arrive(batch)
@@ -155,9 +153,9 @@ class World:
     def suspend(self, seconds: float) -> None:
         """The computer sleeps and wakes up: its monotonic time has not moved, all else has."""
         self.move()
-        for name, batch in self.ahead.move_to(self.ahead.t_ns + round(seconds * NS)).items():
+        for name, batch in self.robot.step(seconds).items():
             self.cables[name].sleep_through(batch)
-        self.slept_ns = self.ahead.t_ns - self.clock.monotonic_ns()
+        self.slept_ns = self.robot.t_ns - self.clock.monotonic_ns()
         self.clock.set(seconds)
 
     @property
