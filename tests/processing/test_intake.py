@@ -70,6 +70,20 @@ def test_a_dead_board_is_waited_for_no_longer_than_its_second_turn():
     (sample,) = parts.feed([sweep(OUTER, 3 * PERIOD)])
     assert sample.present[: 16 * 12].all()
     assert not sample.present[16 * 12 :].any()
+    assert (sample.raw[: 16 * 12] == 240).all()
+    assert not sample.raw[16 * 12 :].any()
+
+
+def test_a_part_names_the_boards_whose_sweeps_its_sample_waits_for() -> None:
+    parts = intake()
+    inner = parts.engine.intake
+    for board, left in ((OUTER, [INNER]), (INNER, [OUTER, INNER])):
+        parts.feed([sweep(board, PERIOD)])
+        assert [sorted(waits) for waits in inner.missing()] == [left]
+    parts.feed([sweep(OUTER, 2 * PERIOD)])
+    configuration, layout = skin()
+    after = Engine(configuration, layout, [1], after=parts.engine)
+    assert [sorted(waits) for waits in after.intake.missing()] == [[INNER]]
 
 
 def test_sweeps_from_before_and_after_a_pause_are_no_one_sample():
@@ -297,11 +311,12 @@ def test_single_pads_far_below_zero_are_named_and_those_of_another_chip_are_not(
 
 
 def test_pads_are_lifted_off_by_another_chip_if_two_are_or_one_among_seven_far_ones() -> None:
-    raw = np.zeros((4, 12), np.uint8)
-    raw[[0, 1, 2], 0] = 255
-    raw[2, 1] = 255
-    far_pads = np.arange(12) < np.array([[6], [7], [2], [12]])
-    assert lifted(raw, far_pads).tolist() == [False, True, True, False]
+    raw = np.zeros((5, 12), np.uint8)
+    raw[[0, 1, 2, 4], 0] = 255
+    raw[[2, 4], 1] = 255
+    raw[4, 2] = 255
+    far_pads = np.arange(12) < np.array([[6], [7], [2], [12], [3]])
+    assert lifted(raw, far_pads).tolist() == [False, True, True, False, True]
 
 
 def far(pads: int) -> int:
