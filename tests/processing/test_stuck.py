@@ -219,6 +219,18 @@ def test_a_word_that_stays_is_a_repetition_whatever_is_taken_from_it(
         assert not (moved & before_seen & inside).any()
 
 
+def test_bytes_without_compensation_or_too_coarse_to_show_it_are_compared_themselves() -> None:
+    changed = np.arange(12 * K).reshape(SHAPE) % 3 == 0
+    raw = np.full(SHAPE, NO_LOAD, np.uint8)
+    for gain, shift in ((NO_GAIN, 2), (GAIN, stuck.MOST_SHIFT + 1), (NO_GAIN, 6)):
+        repeats = Repeats([Encoding(gain, shift, NO_LOAD, False)] * K)
+        assert not repeats.shifted.any()
+        moved, told = repeats.step(raw, changed, None)
+        assert moved.tolist() == changed.tolist()
+        assert told is None
+    assert Repeats([Encoding(GAIN, stuck.MOST_SHIFT, NO_LOAD, False)] * K).shifted.any()
+
+
 def test_noise_that_the_compensation_adds_is_not_the_pads_own() -> None:
     """But half of the byte's noise always is: both are estimates."""
     repeats = Repeats([Encoding(GAIN, 2, NO_LOAD, False)] * K)
