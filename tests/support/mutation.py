@@ -156,7 +156,7 @@ def is_same(line: str, becomes: str) -> bool:
 
     To numpy any negative number stands for a size to find; `strict` finds only other mistakes.
     """
-    becomes = re.sub(r"reshape\((-2|~1)\b", "reshape(-1", becomes)
+    becomes = re.sub(r"(reshape\((?:\w+,)?)(?:-2|~1)\b", r"\1-1", becomes)
     return line == becomes.replace("strict=False", "strict=True")
 
 
