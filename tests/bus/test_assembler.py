@@ -653,3 +653,12 @@ def test_what_a_board_of_known_order_lost_is_counted_though_whole_sweeps_follow(
         if not period % 2:
             assert assembler.counters.halves == assembler.counters.incomplete == period // 2 - 2
         assembler.expire((period + 1) * PERIOD - 1)
+
+
+def test_a_short_frame_amid_a_known_order_is_counted_and_is_no_value() -> None:
+    assembler = learnt("0-3", 4)
+    sent = frames(values(4, 9), 5 * PERIOD)
+    sent[5] = (sent[5][0], sent[5][1][:5], sent[5][2])
+    sweeps = feed(assembler, sent) + assembler.flush()
+    assert [sweep.present for sweep in sweeps] == [0b1011]
+    assert assembler.counters.short == 1

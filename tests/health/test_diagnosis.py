@@ -118,6 +118,7 @@ def test_a_part_that_is_disabled_has_no_other_faults_of_its_own(calibrated: Faul
         ("other_load", "bus_babbling", 0.4, 0.41),
         ("halves", "bus_loses_frames", 1, 2),
         ("spikes", "bus_bit_errors", 1, 2),
+        ("spikes", "bus_bit_errors", 0, 9),
         ("wrong", "bus_bit_errors", 0, 1),
         ("dropped", "bus_drops", 0, 1),
     ],
