@@ -122,14 +122,15 @@ def test_a_triangle_that_was_never_felt_makes_it_unknown() -> None:
     assert contact.step(frame(50 * MS, [30], blind=slice(0, 12)), [begin([30])]) == "ON"
 
 
-def test_a_clock_that_is_set_forward_makes_nothing_unfelt() -> None:
-    contact = watched()
+@pytest.mark.parametrize("start_ns", [0, 1_700_000_000_000 * MS])
+def test_a_clock_that_is_set_forward_makes_nothing_unfelt(start_ns: int) -> None:
+    contact = watched(start_ns)
     hour_ns = 3600 * 1000 * MS
     contact.follow_clock(hour_ns)
-    assert contact.step(frame(50 * MS), []) == "OFF"  # from before
-    assert contact.step(frame(hour_ns + 100 * MS, blind=slice(0, 12)), []) == "OFF"
-    late_ns = hour_ns + 100 * MS + LOST_NS
-    assert contact.step(frame(late_ns, blind=slice(0, 12)), []) == "UNKNOWN"
+    assert contact.step(frame(start_ns + 50 * MS), []) == "OFF"  # from before
+    after_ns = start_ns + hour_ns + 100 * MS
+    assert contact.step(frame(after_ns, blind=slice(0, 12)), []) == "OFF"
+    assert contact.step(frame(after_ns + LOST_NS, blind=slice(0, 12)), []) == "UNKNOWN"
 
 
 def test_a_clock_that_is_set_forward_a_little_delays_what_is_lost_by_that_once() -> None:
