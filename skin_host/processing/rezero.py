@@ -12,7 +12,9 @@ lifts: the pad then reads far below zero, which nothing can press it to.
 The threshold of touch is that of a zero which is known. So a noisy taxel is observed until what its
 noise leaves in the mean is a small part of its threshold. While another taxel of its board is
 touched, what it reads does not count. A board's zero, one reading, may leave a noisy pad so near to
-the end of the scale that its noise is cut off: it is refused, as a calibration would refuse it.
+the end of the scale that its noise is cut off: it is refused, as a calibration would refuse it. A
+pad that was pressed then and lifts is at that end too, but farther off than its noise reaches: its
+zero is in doubt.
 """
 
 import numpy as np
@@ -80,6 +82,7 @@ class Rezero:
         self._no_load = no_load
         self._wanted = np.maximum(FEWEST, 0 if wanted is None else wanted)
         self._sum = np.zeros(len(no_load))
+        self._squares = np.zeros(len(no_load))
         self._count = np.zeros(len(no_load), np.int64)
         self._n_far = np.zeros(len(no_load), np.int64)
         self._n_end = np.zeros(len(no_load), np.int64)
@@ -130,7 +133,9 @@ class Rezero:
             if touched:
                 observed &= self._count < FEWEST
         read = observed & ~far
-        self._sum += np.where(read, self._no_load - raw, 0.0)
+        units = np.where(read, self._no_load - raw, 0.0)
+        self._sum += units
+        self._squares += np.square(units)
         self._count += read
         self._n_far += observed & far
         self._n_end += observed & (raw == END)
@@ -185,7 +190,9 @@ class Rezero:
         # Noise that is cut off at the end of the scale gives a wrong mean.
         ends = known & (self._n_end > SATURATED_SHARE * (self._count + self._n_far))
         far = known & (np.abs(mean - baseline) > LARGEST_UNITS)
-        far |= ends & (np.abs(mean) > SNAPSHOT_SIGMAS * noise)
+        # By their squares: readings of a press, before it lifted far below zero, balance in a mean.
+        mean_square = self._squares / np.maximum(self._count, 1)
+        far |= ends & (mean_square > (SNAPSHOT_SIGMAS**2 + 1.0) * np.square(noise))
         self.doubted |= far
         self.cut_off |= ends & ~far
         return found, np.where(known & ~far & ~ends, mean, baseline)

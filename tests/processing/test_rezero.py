@@ -128,6 +128,19 @@ def test_a_quiet_pad_at_the_end_of_the_scale_was_pressed_when_zeroed() -> None:
     assert not rezero.cut_off.any()
 
 
+def test_a_pad_that_lifts_while_it_is_observed_was_pressed_when_zeroed() -> None:
+    """What pressed it harder for some sweeps balances in the mean what it reads once it lifts."""
+    rezero = Rezero(NONE, NO_LOAD, ~NONE)
+    pad = np.arange(N) == 7
+    for number in range(LOOK_SWEEPS + 1):
+        units = np.where(pad, 18.0 if number < 9 else -20.0, 0.0)
+        raw = np.clip(NO_LOAD - units, 0, 255).astype(np.uint8)
+        rezero.step(raw, ~NONE, NONE, round(number * PERIOD_S * S))
+    rezero.finish(np.zeros(N), np.full(N, NOISE_UNITS))
+    assert np.flatnonzero(rezero.doubted).tolist() == [7]
+    assert not rezero.cut_off.any()
+
+
 def test_it_settles_a_second_after_the_look_however_long_that_took() -> None:
     rezero = Rezero(NONE, NO_LOAD, ~NONE)
     _, ended_ns = look(rezero, np.zeros(N), 0.2)

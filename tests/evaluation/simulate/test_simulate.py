@@ -23,11 +23,11 @@ SECONDS = 30.0
 #: after a release; 21 touches after a restart, by zeros that were out of date; 23 sweeps of
 #: different times in one sample after a stall; 24 a pad in doubt that was pressed again; 27 a zero
 #: taken under a shorted line; 33 noise that no calibration has seen; 35 a zero of too few sweeps;
-#: 63 what a board sent just before it was set up at a start; 278 a triangle called
-#: constant just after a start.
+#: 63 what a board sent just before it was set up at a start; 143 a pad that lifted while its zero
+#: was observed; 278 a triangle called constant just after a start.
 FIXED = [
     (DEMO, 1),
-    *((SMALL, seed) for seed in (4, 5, 6, 8, 9, 10, 11, 21, 23, 24, 27, 33, 35, 63, 278)),
+    *((SMALL, seed) for seed in (4, 5, 6, 8, 9, 10, 11, 21, 23, 24, 27, 33, 35, 63, 143, 278)),
 ]
 
 
