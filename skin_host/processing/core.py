@@ -17,7 +17,7 @@ from skin_host.bus.wire import TRIANGLES, FrameBatch, StatusError
 from skin_host.config.settings import Settings, skin_hash
 from skin_host.fingertip.events import FingertipEvent
 from skin_host.layout import Layout
-from skin_host.processing.calibration import Calibration, Calibrator, with_zeros
+from skin_host.processing.calibration import Calibration, Calibrator, Verdict, with_zeros
 from skin_host.processing.contacts import ContactTracker
 from skin_host.processing.events import Touch
 from skin_host.processing.intake import Intake, PartSample, below_zero
@@ -244,7 +244,8 @@ class Engine:
         """
         self.calibration = calibration
         boards = self.boards if boards is None else boards
-        self.intake.use(calibration.noise, np.isin(self.boards, boards))
+        noise = np.where(calibration.verdict < Verdict.ABSENT, calibration.noise, np.nan)
+        self.intake.use(noise, np.isin(self.boards, boards))
         for board in boards:
             self._rezeros.pop(board, None)
         if self.fingertips is not None and boards == self.boards:

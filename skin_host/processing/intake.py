@@ -159,7 +159,8 @@ class Intake:
         """Use a calibrated noise.
 
         Args:
-            noise: float64[n] over the skin in units, or None without a calibration.
+            noise: float64[n] over the skin in units, NaN where it is not known, or None without a
+                calibration.
             boards: bool[b], the calibrated ones; the others continue unchanged.
         """
         self.judge()

@@ -103,9 +103,9 @@ class Liveness:
 
     Args:
         k: triangles, those of one board after those of another, equally many of each.
-        noise_units: float64[k, 12], calibrated noise, or None without a calibration. All zeros in
-            a triangle mean that it was constant during the calibration: it is not valid before
-            it changes.
+        noise_units: float64[k, 12], calibrated noise, NaN of pads that were received too rarely,
+            or None without a calibration. No noise of any pad in a triangle means that it was
+            constant during the calibration, or absent: it is not valid before it changes.
         period_s: how often each board sends, [boards] or the same for all.
         repeats: finds which pads send something new; without it, those whose byte changes.
         boards: how many boards.
@@ -140,6 +140,8 @@ class Liveness:
         calibrated = noise_units is not None
         if noise_units is None:
             noise_units = np.full(shape, USUAL_NOISE_UNITS)
+        measured = ~np.isnan(noise_units)
+        noise_units = np.where(measured, noise_units, 0.0)
         self._share: Floats = np.minimum(1.0, period_s / CONVERSION_S)
         self._weight: Floats = RATE_SAMPLES * period_s / RATE_MEMORY_S
         self._memory: Floats = RATE_MEMORY_S / conversion_s
@@ -154,9 +156,9 @@ class Liveness:
         self._rate: Floats = np.minimum(change_rate(noise_units), MOST_RATE)
         self._triangle_rate: Floats = 1.0 - np.prod(1.0 - self._rate, axis=1)
         constant = ~np.any(noise_units > 0.0, axis=1) & fitted
-        # Without a calibration, or if a triangle was absent from it or constant, it is not known
-        # how much noise is too much.
-        known = np.repeat(~constant[:, None], PADS, axis=1) & calibrated
+        # Without a calibration, or if a pad was absent from it or its triangle constant, it is not
+        # known how much noise is too much.
+        known = ~constant[:, None] & measured & calibrated
         self._jump = np.where(known, np.maximum(NOISY_UNITS, NOISY_SIGMAS * noise_units), np.inf)
         #: Steps are whole units, at most 255.
         self._jump_units = np.minimum(np.floor(self._jump), 255.0).astype(np.uint8)

@@ -1,9 +1,11 @@
 """How long a calibration looks: its time, and enough samples however slow the boards are."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from skin_host.bus.wire import FrameBatch, encode_sweep
 from skin_host.config.settings import load
@@ -18,7 +20,7 @@ CONFIG = ROOT / "config" / "demo.toml"
 def sweeps_taken(
     engine: Engine,
     time_s: Callable[[int], float],
-    shift: Callable[[int], int] = lambda _: 0,
+    shift: Callable[[int], int | NDArray[np.int64]] = lambda _: 0,
 ) -> int:
     """How many sweeps a calibration takes, of which number `i` comes at `time_s(i)`.
 
@@ -98,6 +100,28 @@ def test_a_board_that_is_zeroed_while_its_calibration_is_computed_finds_its_zero
     engine.rezero(0)
     engine.use(compute())
     assert engine.intake.veto[0].all()
+
+
+def test_a_pad_of_which_too_little_was_received_is_as_noisy_as_it_is_in_the_next_calibration(
+    engine: Engine,
+) -> None:
+    """It was held to the limit of a pad without noise: refused as noisy, and so absent again."""
+    sweeps_taken(engine, lambda number: 1.0 + 0.05 * number)
+    first = engine.end_calibration("2026-01-01T00:00:00+00:00")
+    pad = int(engine.layout.boards[0].taxel_index[engine.layout.boards[0].triangles[1], 4])
+    verdict, noise = first.verdict.copy(), first.noise.copy()
+    verdict[pad], noise[pad] = Verdict.TOO_FEW, 0.0
+    engine.use(replace(first, verdict=verdict, noise=noise))
+    noisy = np.zeros((len(engine.layout.boards[0].triangles), 12), np.int64)
+
+    def shift(number: int) -> NDArray[np.int64]:
+        noisy[1, 4] = 12 * (number % 2)
+        return noisy
+
+    sweeps_taken(engine, lambda number: 10.0 + 0.05 * number, shift)
+    assert engine.intake.liveness.spikes.sum() == 0
+    found = engine.end_calibration("2026-01-01T00:00:00+00:00")
+    assert found.verdict[pad] not in {Verdict.ABSENT, Verdict.TOO_FEW}
 
 
 def test_a_zero_from_before_is_over_with_the_next_calibration(engine: Engine) -> None:

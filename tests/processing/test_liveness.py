@@ -340,6 +340,21 @@ def test_a_triangle_that_was_absent_when_calibrated_may_be_as_noisy_as_it_is() -
     assert not liveness.noisy.any()
 
 
+def test_a_pad_of_which_too_little_was_received_may_be_as_noisy_as_it_is() -> None:
+    """As a whole triangle: what was not measured is no reason to refuse or accuse anything."""
+    rng = np.random.default_rng(5)
+    centre = np.full((K, 12), 240.3)
+    noise = np.full((K, 12), 0.5)
+    noise[1, 4] = np.nan
+    liveness = Liveness(K, noise, PERIOD_S)
+    for _ in range(200):
+        raw = noisy_bytes(rng, 0.5, centre)
+        raw[1, 4] = noisy_bytes(rng, 5.0, centre)[1, 4]
+        liveness.step(raw, HERE, NO)
+    assert liveness.spikes.sum() == 0
+    assert liveness.doubted is None
+
+
 def test_a_pad_that_was_pressed_to_its_end_for_a_minute_is_known_as_well_as_before() -> None:
     rng = np.random.default_rng(3)
     centre = np.full((K, 12), 240.0)
