@@ -410,8 +410,10 @@ class Engine:
         if self._zeroed_since is not None:
             self._zeroed_since[board] = believed
         if self._run is not None:
-            # A calibration of two zeros would be that of none.
+            # A calibration of two zeros would be that of none, and the rest of its time too short
+            # for noisy pads.
             self._run.calibrator.forget(taxels[taxels >= 0].astype(np.intp))
+            self._run.passed_ns = 0
             for part in self._run.samples:
                 if board in self.layout.parts[part].boards:
                     self._run.samples[part] = 0

@@ -80,7 +80,8 @@ def test_a_board_that_is_zeroed_during_a_calibration_is_calibrated_with_its_new_
             engine.rezero(0)
         return 20 if number < 35 else 0
 
-    assert sweeps_taken(engine, lambda number: 1.0 + 0.05 * number, shift) >= 35 + FEWEST_SAMPLES
+    # For all of its time: the zero of a noisy pad is not known from the rest of it.
+    assert sweeps_taken(engine, lambda number: 1.0 + 0.05 * number, shift) >= 35 + 40
     found = engine.end_calibration("2026-01-01T00:00:00+00:00")
     mine = engine.taxels_of([0])
     no_load = engine.layout.boards[0].settings.no_load
