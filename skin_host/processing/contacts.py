@@ -257,11 +257,16 @@ class ContactTracker:
                 contact.parted_ns = None
                 kept += parts
                 continue
-            if contact.parted_ns is None:
-                contact.parted_ns = frame.t_ns
             least_kpa = max(FELT_KPA, PIECE_SHARE * contact.firm_kpa)
             strong = [part for part in parts if frame.pressure_kpa[list(part)].max() >= least_kpa]
-            if 0 <= frame.t_ns - contact.parted_ns < PARTED_NS or len(strong) < 2:
+            if len(strong) < 2:
+                # What noise lifts for a moment is a remainder all the same.
+                contact.parted_ns = None
+                kept.append(frozenset().union(*parts))
+                continue
+            if contact.parted_ns is None:
+                contact.parted_ns = frame.t_ns
+            if 0 <= frame.t_ns - contact.parted_ns < PARTED_NS:
                 kept.append(frozenset().union(*parts))
             else:
                 strong.sort(key=len)

@@ -187,6 +187,14 @@ def test_a_piece_that_hardly_feels_anything_is_no_contact_of_its_own():
         assert kinds(skin.show({0}, {4, 5, 6}, kpa=1.0)) in ([], [("move", 1)])
 
 
+def test_a_piece_that_noise_lifts_for_a_moment_is_no_contact_of_its_own():
+    """A noisy taxel that releases late: its mean is far below what a piece must feel."""
+    skin = Skin()
+    skin.show(set(range(12)), kpa=50.0)
+    for kpa in (12.0, 0.0, 5.0, 12.0, 3.0, 0.0) * 5:
+        assert kinds(skin.show({0}, {4, 5, 6}, kpa=50.0, unlike={0: kpa})) in ([], [("move", 1)])
+
+
 def test_a_change_of_pressure_moves_and_noise_does_not():
     skin = Skin()
     skin.show(HERE, kpa=20.0)
