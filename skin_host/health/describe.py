@@ -36,6 +36,8 @@ FRAME_BITS = 121
 FEWEST_INTERVALS = 8
 #: Ratio of standard deviation to median absolute deviation, for a normal distribution.
 SIGMA = 1.4826
+#: Regular intervals of less than this share of the period are those of one board.
+QUICK_SHARE = 0.45
 #: A shift of the whole part is measured on this many untouched taxels or more.
 FEWEST_RESTING = 12
 #: A triangle is missing when it was absent from this many sweeps in a row.
@@ -366,8 +368,18 @@ class Describer:
                 and jitter_ms > HOLDS_UP_SHARE * board.settings.period_ms
                 and self._is_held_up(index)
             )
-            record["twice"] = watch.is_twice(now_ns, board.settings.period_ms * 1_000_000)
+            period_ns = board.settings.period_ms * 1_000_000
+            record["twice"] = watch.is_twice(now_ns, period_ns) and not self._is_quick(
+                row, period_ns
+            )
         return record
+
+    def _is_quick(self, row: int, period_ns: int) -> bool:
+        """Whether one board sends too often: its sweeps are regular. Those of two boards are too
+        where they fall half a period apart, but not closer.
+        """
+        seen_ns = self._engine.ledger.regular_period_ns(row)
+        return seen_ns is not None and seen_ns < QUICK_SHARE * period_ns
 
     def _is_held_up(self, index: int) -> bool:
         """Whether a more urgent board of the same bus sends irregularly."""

@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import pytest
 
 from emulator.probes.scene import Place, Probe, Scene
 from emulator.robot import Robot
@@ -107,6 +108,17 @@ def test_two_boards_at_one_address_are_called_by_name(bench: FaultBench) -> None
     bench.robot.step = step  # type: ignore[method-assign]
     bench.run(5.0)
     assert ("board_twice", name) not in bench.told
+
+
+@pytest.mark.parametrize("sooner_ms", [30.0, 40.0])
+def test_one_board_that_sends_far_too_often_is_not_called_two(
+    bench: FaultBench, sooner_ms: float
+) -> None:
+    end = bench.inject("late_period", board="hand", value=-sooner_ms)
+    bench.run(6.0)
+    assert ("board_period", "hand") in bench.told
+    assert "board_twice" not in {code for code, _ in bench.first_told}
+    end()
 
 
 def test_what_pressed_as_a_board_took_its_zero_is_no_fault_of_its_triangle() -> None:
