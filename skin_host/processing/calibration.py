@@ -76,6 +76,8 @@ SMOOTHED_SHARE = 0.25
 #: Noise jumps away from pressure if its skewness says so by this many standard errors. A robot has
 #: thousands of pads: with three, one in four hundred was taken for quieter than it is.
 AWAY_ERRORS = 6.0
+#: A normal variable is below its mean plus so many standard deviations in 95 of 100 cases.
+SURE_QUANTILE = 1.645
 #: Upper limit of the exponents, and number of bisections to find one.
 LARGEST_EXPONENT = 40.0
 BISECTIONS = 24
@@ -404,8 +406,8 @@ def _upward_variance(counts: NDArray[np.int64], variance: Floats, touch: TouchSe
         touch: the touch decision.
     """
     samples = np.maximum(counts.sum(axis=1), 1)
-    # Plus twice the standard error of a variance, because a short calibration may underestimate it.
-    surely = variance * (1.0 + 2.0 * np.sqrt(2.0 / samples))
+    # A short calibration may underestimate it.
+    surely = variance * _underestimated(samples)
     codes = np.flatnonzero(counts.any(axis=0))
     share = counts[:, codes] / samples[:, None]
     reading = (share @ codes)[:, None] - codes
@@ -425,6 +427,20 @@ def _upward_variance(counts: NDArray[np.int64], variance: Floats, touch: TouchSe
     away = skewness < -AWAY_ERRORS * np.sqrt(6.0 / samples)
     upward: Floats = np.where(away, np.minimum(found, surely), np.maximum(found, surely))
     return upward
+
+
+def _underestimated(samples: NDArray[np.int64]) -> Floats:
+    """Return how many times larger [n] a variance is at most, in 95 of 100 cases, than the mean
+    square of so many normal samples: three times for ten samples, 1.3 times for a hundred.
+
+    By the chi-squared distribution (Wilson and Hilferty, 1931); a standard error does not show how
+    skewed that is for few samples.
+    """
+    freedom = np.maximum(samples - 1, 1)
+    part = 2.0 / (9.0 * freedom)
+    root = np.maximum(1.0 - part - SURE_QUANTILE * np.sqrt(part), 0.1)
+    found: Floats = samples / freedom / root**3
+    return found
 
 
 class _Course:

@@ -180,6 +180,17 @@ def test_of_thousands_of_equal_pads_none_is_taken_for_much_quieter_than_it_is():
     assert min(least) > 0.75 * 0.9
 
 
+@pytest.mark.parametrize("sweeps", [10, 20, 40, 100, 400])
+def test_a_pad_is_seldom_noisier_than_calibrated_however_short_that_was(sweeps):
+    """Ten bytes of noise easily scatter by half of it."""
+    rng = np.random.default_rng(29)
+    n_trials = -(-4000 // N)
+    quieter = [
+        (calibrated(noisy(rng, sweeps=sweeps, sd=2.0)).spread < 2.0).mean() for _ in range(n_trials)
+    ]
+    assert np.mean(quieter) < 0.06
+
+
 def test_taps_that_two_pads_share_are_a_touch_and_those_of_one_pad_are_noise():
     sweeps = noisy(np.random.default_rng(16), sweeps=250)
     taps = np.arange(250) % 60 < 30
