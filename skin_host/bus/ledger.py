@@ -197,6 +197,13 @@ class BoardLedger:
         """Return whether a board has timed out."""
         return self.overdue(row, 0)
 
+    def silent_ns(self, board: int) -> int:
+        """Return for how long a board, by its index, has not been received, if it has timed out;
+        otherwise 0.
+        """
+        row = self.row[board]
+        return self.now_ns - int(self.received_ns[row]) if self.is_silent(row) else 0
+
     def overdue(self, row: int, since_ns: int) -> bool:
         """As `is_silent`, for a board that could not send before `since_ns` (ledger's clock)."""
         quiet_ns = self.now_ns - max(int(self.received_ns[row]), since_ns)

@@ -393,7 +393,11 @@ class Describer:
         return False
 
     def _is_new(self, index: int) -> bool:
-        """Whether a board that had timed out sends again, but no sample has its values yet."""
+        """Whether a board that had timed out sends again, but no sample has its values yet, or it
+        is not known yet whether it zeroed itself meanwhile.
+        """
+        if self._engine.compares(index):
+            return True
         sweep = self._engine.ledger.last[self._engine.ledger.row[index]]
         if sweep is None or self._engine.ledger.flagged[self._engine.ledger.row[index]]:
             return False

@@ -26,6 +26,7 @@ from skin_host.processing.masks import Mask, any_of
 from skin_host.processing.pipeline import Pipeline, PressureFrame
 from skin_host.processing.pressure import PressureCurve, vertex
 from skin_host.processing.rezero import BELOW_SWEEPS, JUMPS_NS, Rezero, look_s
+from skin_host.processing.silent_zero import SilentZero
 
 if TYPE_CHECKING:
     from skin_host.fingertip.engine import FingertipEngine
@@ -168,6 +169,8 @@ class Engine:
         self.zeros_found = 0
         self.zero_changes = 0
         self._rezeros: dict[int, Rezero] = {}
+        #: Boards that were silent and may have zeroed themselves meanwhile.
+        self._silent_zeros: dict[int, SilentZero] = {}
         self._unanswered: dict[int, Mask] = {}
         #: For how many sweeps pads int64[16, 12] of a board have read far below zero, where any do.
         self._below: dict[int, NDArray[np.int64]] = {}
@@ -211,6 +214,7 @@ class Engine:
         self.zeros_found = after.zeros_found
         self.zero_changes = after.zero_changes
         self._rezeros = after._rezeros
+        self._silent_zeros = after._silent_zeros
         self._unanswered = after._unanswered
         self._below = after._below
         self._jumped_ns = after._jumped_ns
@@ -248,6 +252,7 @@ class Engine:
         self.intake.use(noise, np.isin(self.boards, boards))
         for board in boards:
             self._rezeros.pop(board, None)
+            self._silent_zeros.pop(board, None)
         if self.fingertips is not None and boards == self.boards:
             self._ended += self.fingertips.use(calibration.zeros)
         self.release(boards)
@@ -406,6 +411,7 @@ class Engine:
             How many taxels were touched.
         """
         taxels = self._taxels_of(board)
+        self._silent_zeros.pop(board, None)
         self._releasing.add(board)
         if self._zeroed_since is not None:
             self._zeroed_since[board] = believed
@@ -480,6 +486,12 @@ class Engine:
             found |= self._below[board] > 0
         return found
 
+    def compares(self, board: int) -> bool:
+        """Return whether it was not known before a board's last sweep if it zeroed itself while it
+        was silent.
+        """
+        return board in self._silent_zeros
+
     def doubts(self) -> dict[int, int]:
         """Return how many taxels of each board that was zeroed have an unknown zero, by index."""
         return {
@@ -501,7 +513,10 @@ class Engine:
     def _take(self, sweeps: list[Sweep]) -> list[PartSample]:
         samples: list[PartSample] = []
         for sweep in sweeps:
+            silent_ns = self.ledger.silent_ns(sweep.board) if self.ledger.any_silent else 0
             row = self.ledger.note(sweep)
+            if silent_ns:
+                self._note_return(sweep, silent_ns)
             if self.ledger.flagged[row] or self._unanswered:
                 self._note_unanswered(sweep, row)
             if self.ledger.flagged[row] or self._below:
@@ -510,6 +525,10 @@ class Engine:
                 rezero = self._rezeros.get(sweep.board)
                 if rezero is not None:
                     self._find_zero(sweep, row, rezero)
+            if self._silent_zeros:
+                silent_zero = self._silent_zeros.get(sweep.board)
+                if silent_zero is not None:
+                    self._find_silent_zero(sweep, row, silent_zero)
             samples += self.intake.take(sweep, row)
         return samples
 
@@ -525,6 +544,54 @@ class Engine:
             self._unanswered.pop(sweep.board, None)
         if before is not None and any_of(before & ~now & self.ledger.present[row]):
             self.rezero(sweep.board)
+
+    def _note_return(self, sweep: Sweep, silent_ns: int) -> None:
+        """A board sends again: for half a second, see whether it zeroed itself meanwhile."""
+        rezero = self._rezeros.get(sweep.board)
+        if rezero is not None:
+            rezero.restart(sweep.t_ns)
+        # What was set up since it was received last has a new zero, and one that is still sought
+        # is that of the board as it is now.
+        sought = rezero is not None and rezero.seeks_all
+        if self._pipeline is None or self.calibration is None or sought:
+            return
+        taxels = self._taxels_of(sweep.board).ravel()
+        known = (taxels >= 0) & self.calibration.usable[taxels] & ~self._last_touched[taxels]
+        known &= ~self.in_doubt(sweep.board).ravel()
+        if rezero is not None:
+            known &= ~rezero.cut_off
+            if rezero.late is not None:
+                known &= ~rezero.late
+        own = self.layout.boards[sweep.board].settings
+        self._silent_zeros[sweep.board] = SilentZero(
+            self._pipeline.baseline[taxels],
+            self.calibration.noise[taxels],
+            self.calibration.spread[taxels],
+            known,
+            float(own.no_load),
+            own.period_ms * 1e-3,
+            silent_ns * 1e-9,
+        )
+
+    def _find_silent_zero(self, sweep: Sweep, row: int, silent_zero: SilentZero) -> None:
+        if silent_zero.decided:
+            # Its last sweep is in a sample of its part by now.
+            del self._silent_zeros[sweep.board]
+            return
+        ledger = self.ledger
+        here = np.repeat(ledger.present[row] & (ledger.error[row] == 0), PADS)
+        zeroed = silent_zero.step(sweep.raw.ravel(), here & ~ledger.far[row].ravel())
+        if zeroed is None:
+            self.intake.veto[row] = np.ones((TRIANGLES, PADS), np.bool_)
+            return
+        if zeroed:
+            self.rezero(sweep.board)
+            return
+        rezero = self._rezeros.get(sweep.board)
+        if rezero is None:
+            self.intake.veto.pop(row, None)
+        else:
+            self._veto_unknown(sweep, row, rezero)
 
     def _note_below_zero(self, sweep: Sweep, row: int) -> None:
         """Detect pads whose zero was taken while something pressed that has lifted now."""
@@ -572,15 +639,19 @@ class Engine:
             if sweep.board in self._releasing:
                 self._releasing.discard(sweep.board)
                 self.release([sweep.board])
-            veto = self.in_doubt(sweep.board)
-            veto |= rezero.cut_off.reshape(TRIANGLES, PADS)
-            unsettled = rezero.unsettled(sweep.t_ns)
-            if unsettled is not None:
-                veto |= unsettled.reshape(TRIANGLES, PADS)
-            self.intake.veto[row] = veto
+            self._veto_unknown(sweep, row, rezero)
             return
         # What jumps while a board is set up was not damaged on its way.
         self.intake.note_gap(row)
+
+    def _veto_unknown(self, sweep: Sweep, row: int, rezero: Rezero) -> None:
+        """Taxels whose zero is not known, or not yet, are not valid."""
+        veto = self.in_doubt(sweep.board)
+        veto |= rezero.cut_off.reshape(TRIANGLES, PADS)
+        unsettled = rezero.unsettled(sweep.t_ns)
+        if unsettled is not None:
+            veto |= unsettled.reshape(TRIANGLES, PADS)
+        self.intake.veto[row] = veto
 
     def _process(self, samples: list[PartSample]) -> list[Step]:
         steps = []

@@ -158,6 +158,23 @@ class Rezero:
         """Return whether a sweep has been received since."""
         return self._since_ns is not None
 
+    @property
+    def seeks_all(self) -> bool:
+        """Return whether no new zero has been found yet."""
+        return self._first_ns is None
+
+    def restart(self, t_ns: int) -> None:
+        """The board was not received for a while, up to a time: what it sent before may have been
+        of another zero.
+        """
+        if self._since_ns is None or not self._seeks:
+            return
+        for of_pads in (self._sum, self._count, self._n_far, self._n_end):
+            of_pads[:] = 0
+        if self.seeks_all:
+            self._since_ns = t_ns
+            self._sweeps = 0
+
     def settled(self, t_ns: int) -> bool:
         """Return whether new baselines are in use, but for those of `unsettled`."""
         return self._first_ns is not None and abs(t_ns - self._first_ns) >= SETTLE_NS

@@ -1,6 +1,6 @@
 """What is known of a board's zero: pads that were pressed when it was taken, and what looks so."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,8 @@ from skin_host.config.settings import load
 from skin_host.daemon.daemon import Daemon
 from skin_host.health import HealthWatch
 from skin_host.layout import build_layout
-from skin_host.processing.core import Engine, Output
+from skin_host.processing.core import Engine, Output, Step
+from skin_host.processing.silent_zero import SWEEPS
 from tests.support.stack import ROOT
 
 CONFIG = ROOT / "config" / "demo.toml"
@@ -24,15 +25,19 @@ FAR_BELOW = 255
 class Hand:
     """An engine with a calibrated board, which sends what it is asked to."""
 
-    def __init__(self) -> None:
+    def __init__(self, rest_seed: int | None = None) -> None:
         settings = load(CONFIG)
         layout = build_layout(settings, CONFIG.parent)
         self.engine = Engine(settings, layout, [layout.parts.index(layout.part("left_hand"))])
         self._board = layout.boards[0]
         self._rng = np.random.default_rng(1)
         self._t_ns = 1_000_000_000
+        #: What each pad rests at, away from its board's zero: the noise of one reading.
+        self.rest_units = np.zeros((len(self._board.triangles), 12), np.int64)
         #: Takes the outputs.
         self.deliver: Callable[[Output], None] = lambda output: None
+        if rest_seed is not None:
+            self.rests_elsewhere(rest_seed)
         self.engine.begin_calibration(2.0)
         self.send(50)
         self.engine.use(self.engine.end_calibration("2026-01-01T00:00:00+00:00"))
@@ -42,6 +47,7 @@ class Hand:
         triangles = np.array(self._board.triangles)
         for _ in range(sweeps):
             values = self._rng.integers(NO_LOAD - 1, NO_LOAD + 2, (len(triangles), 12))
+            values -= self.rest_units
             status = np.zeros(len(triangles), np.uint16)
             for name, value in pads.items():
                 values[0, int(name[1:])] = value
@@ -53,6 +59,17 @@ class Hand:
             self._t_ns += PERIOD_NS
             frames = [(int(i), bytes(d), self._t_ns) for i, d in zip(ids, data, strict=True)]
             self.deliver(self.engine.feed(self._board.settings.bus, FrameBatch.of(frames)))
+
+    def pause(self, seconds: float) -> None:
+        """Send nothing, while the bus is read."""
+        for _ in range(round(seconds * 1e9 / PERIOD_NS)):
+            self._t_ns += PERIOD_NS
+            self.deliver(self.engine.expire(self._t_ns))
+
+    def rests_elsewhere(self, seed: int) -> None:
+        """It was zeroed, by one reading."""
+        rng = np.random.default_rng(seed)
+        self.rest_units = rng.integers(-3, 4, self.rest_units.shape)
 
     @property
     def in_doubt(self) -> list[int]:
@@ -127,3 +144,79 @@ def test_a_triangle_with_pads_below_zero_when_calibrated_is_not_called_constant(
         codes |= {fault["code"] for fault in record["faults"]}
     assert "board_in_doubt" in codes
     assert "triangle_constant" not in codes
+
+
+@pytest.fixture
+def worn() -> Iterator[tuple[Hand, list[Step]]]:
+    """A calibrated hand whose pads rest away from its zero, and what it delivers."""
+    hand = Hand(rest_seed=1)
+    steps: list[Step] = []
+    hand.deliver = lambda output: steps.extend(output.steps)
+    hand.send(20)
+    yield hand, steps
+
+
+def valid_share(step: Step) -> float:
+    return float(step.frame.valid.mean())
+
+
+def test_a_touch_that_lasts_through_a_silence_is_felt_again_and_its_zero_in_no_doubt(
+    worn: tuple[Hand, list[Step]],
+) -> None:
+    hand, steps = worn
+    hand.send(20, p3=200)
+    hand.pause(3.0)
+    steps.clear()
+    hand.send(SWEEPS - 1, p3=200)
+    assert max(map(valid_share, steps)) == 0.0
+    hand.send(10, p3=200)
+    assert valid_share(steps[-1]) > 0.9
+    assert steps[-1].frame.touched.sum() == 1
+    assert hand.in_doubt == []
+    assert hand.engine.ledger.rezeros.tolist() == [0]
+
+
+def test_a_board_that_was_zeroed_unheard_gets_new_baselines(
+    worn: tuple[Hand, list[Step]],
+) -> None:
+    """What was touched before may have been touched then: its zero is in doubt."""
+    hand, steps = worn
+    hand.send(20, p3=200)
+    hand.pause(3.0)
+    hand.rests_elsewhere(seed=2)
+    steps.clear()
+    hand.send(80)
+    assert not any(step.frame.touched.any() for step in steps)
+    assert not any(step.events for step in steps)
+    assert valid_share(steps[-1]) > 0.8
+    assert hand.in_doubt == [3]
+    assert hand.engine.ledger.rezeros.tolist() == [1]
+
+
+def test_a_new_zero_is_not_that_of_two_if_the_board_was_silent_while_it_was_sought(
+    worn: tuple[Hand, list[Step]],
+) -> None:
+    hand, steps = worn
+    hand.engine.rezero(0)
+    hand.rests_elsewhere(seed=2)
+    hand.send(15)
+    hand.pause(3.0)
+    hand.rests_elsewhere(seed=3)
+    steps.clear()
+    hand.send(80)
+    assert not any(step.frame.touched.any() for step in steps)
+    assert valid_share(steps[-1]) > 0.8
+    assert hand.engine.ledger.rezeros.tolist() == [1]
+
+
+def test_a_calibration_after_a_silence_decides_by_itself(worn: tuple[Hand, list[Step]]) -> None:
+    """The zero before it does not matter any more."""
+    hand, _ = worn
+    hand.pause(3.0)
+    hand.rests_elsewhere(seed=2)
+    hand.send(4)
+    hand.engine.begin_calibration(0.2)
+    hand.send(SWEEPS - 6)
+    hand.engine.use(hand.engine.end_calibration("2026-01-01T00:00:00+00:00"))
+    hand.send(20)
+    assert hand.engine.ledger.rezeros.tolist() == [0]

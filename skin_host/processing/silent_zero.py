@@ -1,0 +1,125 @@
+"""Decides whether a board zeroed itself while it was not received.
+
+A board zeroes itself after five readings without acknowledge, which its status words report
+(icub-firmware, mtb3/main_V3.c). Nobody learns of it while its bus is away, and then its
+readings are judged by the zero before. They show it: just after a zero all pads read the byte of an
+untouched pad, but for the noise of one reading, and without a zero each reads its own baseline.
+
+So the first sweeps after a silence are compared with both, over all pads that nothing touched. Both
+allow for what moves all pads together, as temperature does, and for pads that are pressed or fail.
+Where both fit alike, the baselines are near zero and nothing depends on the answer.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.processing.conversions import CONVERSION_S
+from skin_host.processing.drift import SLOW_UNITS_PER_S
+
+#: So many sweeps are compared; pads of which fewer than half were received do not count.
+SWEEPS = 10
+FEWEST = SWEEPS // 2
+#: A board was zeroed when its readings are so many times as probable then.
+ODDS = 1e4
+#: Rounding, and what the baseline of a pad drifts by itself (units, standard deviation).
+OWN_UNITS = 0.5
+#: What all pads of a board drift by together (units, standard deviation), however short the
+#: silence was; in a long one this grows by `SLOW_UNITS_PER_S`, up to a limit.
+COMMON_UNITS = 1.0
+MOST_COMMON_UNITS = 10.0
+#: By this share of what a long silence adds, pads may drift apart: they differ in their foam.
+APART_SHARE = 0.2
+#: Common drifts are tried up to so many standard deviations, in steps of so many units.
+COMMON_SIGMAS = 3.0
+STEP_UNITS = 0.25
+#: This share of the pads is pressed or fails: they read anything, within so many units.
+ELSEWHERE_SHARE = 0.05
+RANGE_UNITS = 60.0
+#: A baseline is the mean of this time, at least.
+BASELINE_S = 1.0
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class SilentZero:
+    """Compares the n taxels of a board after it was silent with both explanations.
+
+    Args:
+        baseline: float64[n], activation of the untouched taxels before, in units.
+        noise: float64[n], standard deviation of a measurement, as calibrated.
+        spread: float64[n], the same derived from sums of measurements: it includes slow noise.
+        known: bool[n], usable taxels that were untouched, and whose baseline was known.
+        no_load: the byte of an untouched pad just after a zero.
+        period_s: how often the board sends.
+        silent_s: for how long it was not received.
+    """
+
+    def __init__(
+        self,
+        baseline: Floats,
+        noise: Floats,
+        spread: Floats,
+        known: Mask,
+        no_load: float,
+        period_s: float,
+        silent_s: float,
+    ) -> None:
+        self._baseline = baseline
+        self._noise = noise
+        self._spread = spread
+        self._known = known
+        self._no_load = no_load
+        self._period_s = period_s
+        drifted = min(SLOW_UNITS_PER_S * silent_s, MOST_COMMON_UNITS)
+        self._common_units = math.hypot(COMMON_UNITS, drifted)
+        self._own_units = math.hypot(OWN_UNITS, APART_SHARE * drifted)
+        self._sum = np.zeros(len(known))
+        self._count = np.zeros(len(known), np.int64)
+        self._sweeps = 0
+
+    @property
+    def decided(self) -> bool:
+        """Return whether enough sweeps have been compared."""
+        return self._sweeps >= SWEEPS
+
+    def step(self, raw: NDArray[np.uint8], present: Mask) -> bool | None:
+        """Take one sweep; return whether the board was zeroed, or None while that is not known.
+
+        Args:
+            raw: uint8[n], the bytes.
+            present: bool[n], which of them were received and are readings.
+        """
+        self._sum += np.where(present, self._no_load - raw, 0.0)
+        self._count += present
+        self._sweeps += 1
+        if self._sweeps < SWEEPS:
+            return None
+        return self.evidence() > math.log(ODDS)
+
+    def evidence(self) -> float:
+        """Return how much more probable the readings are after a zero, as a natural logarithm."""
+        seen = self._known & (self._count >= FEWEST)
+        if not seen.any():
+            return 0.0
+        count, baseline = self._count[seen], self._baseline[seen]
+        mean = self._sum[seen] / count
+        # Readings within one conversion repeat it; slower ones are each their own.
+        independent = count * min(1.0, self._period_s / CONVERSION_S)
+        share = 1.0 / np.maximum(independent, 1.0) + CONVERSION_S / BASELINE_S
+        variance = np.square(self._spread[seen]) * share + self._own_units**2
+        # A zero is a single reading: its noise is in all that follow.
+        zeroed = self._log_likelihood(mean, variance + np.square(self._noise[seen]))
+        return zeroed - self._log_likelihood(mean - baseline, variance)
+
+    def _log_likelihood(self, residual: Floats, variance: Floats) -> float:
+        """Return the logarithm of the likelihood of residuals [n], whatever moved them together."""
+        most = COMMON_SIGMAS * self._common_units
+        common = np.arange(-most, most + STEP_UNITS, STEP_UNITS)
+        apart = residual - common[:, None]
+        density = np.exp(-0.5 * apart**2 / variance) / np.sqrt(2.0 * np.pi * variance)
+        mixed = (1.0 - ELSEWHERE_SHARE) * density + ELSEWHERE_SHARE / RANGE_UNITS
+        of_common = np.log(mixed).sum(axis=1) - 0.5 * np.square(common / self._common_units)
+        return float(np.logaddexp.reduce(of_common))

@@ -1,0 +1,131 @@
+"""Readings after a silence show whether the board zeroed itself meanwhile."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skin_host.processing.silent_zero import SWEEPS, SilentZero
+
+NO_LOAD = 240.0
+PERIOD_S = 0.05
+N = 48
+
+
+class Skin:
+    """Pads with noise of their own, which a first zero left off by the noise of one reading.
+
+    Args:
+        seed: of all that is drawn.
+        slow_share: how much of the noise lasts for longer than the comparison.
+        n: pads.
+    """
+
+    def __init__(self, seed: int, slow_share: float = 0.0, n: int = N) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.noise = self.rng.uniform(0.3, 3.0, n)
+        self.slow = np.sqrt(slow_share) * self.noise
+        self.fast = np.sqrt(1.0 - slow_share) * self.noise
+        # A measurement of the slow part is no better for being repeated.
+        self.spread = np.hypot(self.fast, self.slow / np.sqrt(0.0369))
+        self.baseline = self.noise * self.rng.standard_normal(n)
+        self.known = np.ones(n, np.bool_)
+
+    def evidence(
+        self,
+        zeroed: bool,
+        *,
+        common_units: float = 0.0,
+        own_units: float = 0.0,
+        pressed: slice = slice(0),
+        press_units: float = 20.0,
+        silent_s: float = 3.0,
+    ) -> tuple[bool | None, float]:
+        """Return what is decided, and the evidence, after a silence in which all pads drifted by
+        `common_units`, each by up to `own_units`, and some were pressed.
+        """
+        n = len(self.noise)
+        rest = self.noise * self.rng.standard_normal(n) if zeroed else self.baseline
+        rest = rest + common_units + own_units * self.rng.uniform(-1.0, 1.0, n)
+        rest = rest + self.slow * self.rng.standard_normal(n)
+        rest[pressed] += press_units
+        test = SilentZero(
+            self.baseline, self.noise, self.spread, self.known, NO_LOAD, PERIOD_S, silent_s
+        )
+        found = None
+        for sweep in range(SWEEPS):
+            assert found is None, sweep
+            raw = np.rint(NO_LOAD - rest - self.fast * self.rng.standard_normal(n))
+            found = test.step(np.clip(raw, 0, 255).astype(np.uint8), np.ones(n, np.bool_))
+        return found, test.evidence()
+
+
+SEEDS = st.integers(0, 10_000)
+COMMON = st.floats(-1.0, 1.0)
+SLOW = st.sampled_from([0.0, 0.05, 0.2])
+
+
+@given(SEEDS, COMMON, SLOW, st.integers(0, 8))
+def test_a_board_that_was_not_zeroed_is_not_called_so(
+    seed: int, common_units: float, slow_share: float, presses: int
+) -> None:
+    found, _ = Skin(seed, slow_share).evidence(
+        False, common_units=common_units, own_units=0.5, pressed=slice(0, presses)
+    )
+    assert found is False
+
+
+@given(SEEDS, COMMON, st.integers(0, 8))
+def test_a_board_that_was_zeroed_is_recognised(
+    seed: int, common_units: float, presses: int
+) -> None:
+    found, _ = Skin(seed).evidence(True, common_units=common_units, pressed=slice(0, presses))
+    assert found is True
+
+
+@given(SEEDS, st.floats(-6.0, 6.0))
+def test_a_long_silence_in_which_it_became_warmer_is_no_zero(
+    seed: int, common_units: float
+) -> None:
+    found, _ = Skin(seed).evidence(False, common_units=common_units, own_units=2.0, silent_s=600.0)
+    assert found is False
+
+
+def test_slow_noise_hides_few_zeros() -> None:
+    found = [Skin(seed, 0.05, 192).evidence(True)[0] for seed in range(100)]
+    assert np.mean(np.array(found, np.bool_)) > 0.95
+
+
+@pytest.mark.parametrize("zeroed", [False, True])
+def test_a_board_whose_pads_are_all_touched_keeps_its_zero(zeroed: bool) -> None:
+    skin = Skin(1)
+    skin.known[:] = False
+    assert skin.evidence(zeroed) == (False, 0.0)
+
+
+def test_baselines_near_zero_decide_nothing() -> None:
+    """Whether quiet pads that rest at zero were zeroed again changes nothing."""
+    skin = Skin(2)
+    skin.noise[:] = skin.fast[:] = skin.spread[:] = 0.05
+    skin.baseline[:] = 0.0
+    for zeroed in (False, True):
+        found, evidence = skin.evidence(zeroed)
+        assert found is False
+        assert abs(evidence) < 1.0
+
+
+def test_one_firm_press_where_a_zero_would_be_is_no_zero() -> None:
+    """A pad that rests at -3 units and is pressed to 0 is one of many."""
+    skin = Skin(3)
+    skin.baseline[0] = -3.0
+    found, _ = skin.evidence(False, pressed=slice(0, 1), press_units=3.0)
+    assert found is False
+
+
+def test_pads_that_are_hardly_received_do_not_count() -> None:
+    skin = Skin(4)
+    test = SilentZero(skin.baseline, skin.noise, skin.spread, skin.known, NO_LOAD, PERIOD_S, 3.0)
+    raw = np.full(N, NO_LOAD).astype(np.uint8)
+    found = [test.step(raw, np.full(N, number < 4)) for number in range(SWEEPS)]
+    assert found == [None] * (SWEEPS - 1) + [False]
+    assert test.evidence() == 0.0
