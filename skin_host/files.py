@@ -283,7 +283,7 @@ def refuse_removed(path: Path) -> None:
     then is lost, and no write fails.
 
     Raises:
-        OSError: it is not there any more.
+        OSError: it has been removed.
     """
     if not os.path.lexists(path):
         raise OSError(errno.ENOENT, "it was removed while it was being written", str(path))

@@ -73,7 +73,7 @@ ROUNDING_VARIANCE = 0.1
 FEWEST_BLOCKS = 4
 #: A histogram is smoothed with this share of its variance.
 SMOOTHED_SHARE = 0.25
-#: Noise jumps away from pressure if its skewness says so by this many standard errors. A robot has
+#: Noise jumps away from pressure if its skewness is beyond so many standard errors. A robot has
 #: thousands of pads: with three, one in four hundred was taken for quieter than it is.
 AWAY_ERRORS = 6.0
 #: A normal variable is below its mean plus so many standard deviations in 95 of 100 cases.

@@ -538,7 +538,7 @@ KINDS: dict[str, Begin] = {
     "data_held_low": _emulated(
         "data_held_low",
         _CHIPS | _SET_UP,
-        # In the middle of a reading it turns one pad's bytes into ones, and nothing else.
+        # In the middle of a reading it turns one pad's bytes into ones and changes nothing besides.
         _LINE | _SILENCED | {"board_in_doubt"},
         1.0,
         spoils=True,
