@@ -382,13 +382,18 @@ class Describer:
         return seen_ns is not None and seen_ns < QUICK_SHARE * period_ns
 
     def _is_held_up(self, index: int) -> bool:
-        """Whether a more urgent board of the same bus sends irregularly."""
+        """Whether a more urgent board of the same bus sends irregularly, or at another period and so
+        at ever other moments.
+        """
         ledger, own = self._engine.ledger, self._layout.boards[index].settings
         for other in self._engine.boards:
             one, row = self._layout.boards[other].settings, ledger.row[other]
             if one.bus == own.bus and one.address < own.address and not ledger.is_silent(row):
-                _, jitter_ms = _period(ledger.intervals_ns(row), one.period_ms)
-                if jitter_ms is not None and jitter_ms > HOLDS_UP_SHARE * one.period_ms:
+                period_ms, jitter_ms = _period(ledger.intervals_ns(row), one.period_ms)
+                if period_ms is None or jitter_ms is None:
+                    continue
+                off_ms = max(jitter_ms, abs(period_ms - one.period_ms))
+                if off_ms > HOLDS_UP_SHARE * one.period_ms:
                     return True
         return False
 

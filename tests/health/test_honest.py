@@ -57,6 +57,14 @@ def test_a_board_whose_frames_wait_for_those_of_an_irregular_one_is_not_called_i
     end()
     bench.run(5.0)
     assert not bench.told
+    # One of another period comes between them at ever other moments.
+    end = bench.inject("late_period", board="left_upper_arm", value=25.3)
+    for _ in range(20):
+        bench.run(0.25)
+        assert "board_jitter" not in {code for code, _ in bench.told}
+    assert ("board_period", "left_upper_arm") in bench.told
+    end()
+    bench.run(5.0)
     # Of two the more urgent one is named; the other one when that is mended.
     for board in ("left_lower_arm_1", "right_lower_arm_2"):
         bench.inject("jittered_period", board=board, value=8.0)
