@@ -585,7 +585,7 @@ class Daemon:
                 self._begin_to_keep_zeros()
 
     def _removed(self) -> set[str]:
-        """Return what was kept, and its file has been removed."""
+        """Return what was kept and whose file has been removed."""
         return {what for what in self._files - self.unkept.keys() if not self._path(what).exists()}
 
     def _record_of(self, part: int) -> Record:

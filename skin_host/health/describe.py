@@ -382,8 +382,8 @@ class Describer:
         return seen_ns is not None and seen_ns < QUICK_SHARE * period_ns
 
     def _is_held_up(self, index: int) -> bool:
-        """Whether a more urgent board of the same bus sends irregularly, or at another period and so
-        at ever other moments.
+        """Whether a more urgent board of the same bus sends irregularly, or at another period: then
+        it comes at ever other moments.
         """
         ledger, own = self._engine.ledger, self._layout.boards[index].settings
         for other in self._engine.boards:
