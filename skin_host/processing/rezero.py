@@ -81,11 +81,7 @@ class Rezero:
     ) -> None:
         self._no_load = no_load
         self._wanted = np.maximum(FEWEST, 0 if wanted is None else wanted)
-        self._sum = np.zeros(len(no_load))
-        self._squares = np.zeros(len(no_load))
-        self._count = np.zeros(len(no_load), np.int64)
-        self._n_far = np.zeros(len(no_load), np.int64)
-        self._n_end = np.zeros(len(no_load), np.int64)
+        self._forget()
         self._sweeps = 0
         self._since_ns: int | None = None
         self._t_ns = 0
@@ -169,11 +165,19 @@ class Rezero:
         """
         if self._since_ns is None or not self._seeks:
             return
-        for of_pads in (self._sum, self._count, self._n_far, self._n_end):
-            of_pads[:] = 0
+        self._forget()
         if self.seeks_all:
             self._since_ns = t_ns
             self._sweeps = 0
+
+    def _forget(self) -> None:
+        """Observe from the first byte on."""
+        n = len(self._no_load)
+        self._sum = np.zeros(n)
+        self._squares = np.zeros(n)
+        self._count = np.zeros(n, np.int64)
+        self._n_far = np.zeros(n, np.int64)
+        self._n_end = np.zeros(n, np.int64)
 
     def settled(self, t_ns: int) -> bool:
         """Return whether new baselines are in use, but for those of `unsettled`."""

@@ -126,12 +126,10 @@ async def test_no_packet_is_cut_by_another_when_the_socket_is_full(
         assert len(events_seen) == len(events)
 
 
-@pytest.mark.parametrize("retain", [False, True])
-@pytest.mark.parametrize("size", [0, 1, 100, 128, 16_384])
-@pytest.mark.parametrize("version", ["5", "3.1.1"])
-def test_an_event_has_the_bytes_that_paho_would_write(
-    size: int, version: Literal["5", "3.1.1"], retain: bool
-) -> None:
+def written_by_paho(
+    version: Literal["5", "3.1.1"], topic: str, payload: bytes, qos: int = 0, retain: bool = False
+) -> tuple[int, bytes | None, bytes]:
+    """What paho numbers a message with, the packed properties that it has, and paho's packet."""
     broker = Broker(protocol=version)
     properties = PackedProperties.of(message_properties(broker, "application/json"))
     protocol = MQTTProtocolVersion.MQTTv5 if broker.v5 else MQTTProtocolVersion.MQTTv311
@@ -139,14 +137,21 @@ def test_an_event_has_the_bytes_that_paho_would_write(
     ours, theirs = socket.socketpair()
     with ours, theirs:
         client._sock = ours
-        sent = client.publish("skin/robot/palm/touch", b"x" * size, 1, retain, properties)
-        expected = theirs.recv(200_000)
+        sent = client.publish(topic, payload, qos, retain, properties)
+        packet = theirs.recv(200_000)
         client._sock = None
-    packed = None if properties is None else properties.pack()
-    assert (
-        numbered_packet("skin/robot/palm/touch", sent.mid, packed, b"x" * size, retain=retain)
-        == expected
-    )
+    return sent.mid, None if properties is None else properties.pack(), packet
+
+
+@pytest.mark.parametrize("retain", [False, True])
+@pytest.mark.parametrize("size", [0, 1, 100, 128, 16_384])
+@pytest.mark.parametrize("version", ["5", "3.1.1"])
+def test_an_event_has_the_bytes_that_paho_would_write(
+    size: int, version: Literal["5", "3.1.1"], retain: bool
+) -> None:
+    topic, payload = "skin/robot/palm/touch", b"x" * size
+    mid, packed, expected = written_by_paho(version, topic, payload, 1, retain)
+    assert numbered_packet(topic, mid, packed, payload, retain=retain) == expected
 
 
 @pytest.mark.parametrize("hold", [False, True])
@@ -174,19 +179,9 @@ async def test_events_keep_their_order_beyond_those_that_may_be_on_their_way(hol
 def test_a_frame_has_the_bytes_that_paho_would_write(
     size: int, version: Literal["5", "3.1.1"]
 ) -> None:
-    broker = Broker(protocol=version)
-    properties = PackedProperties.of(message_properties(broker, "application/json"))
-    protocol = MQTTProtocolVersion.MQTTv5 if broker.v5 else MQTTProtocolVersion.MQTTv311
-    client = Client(CallbackAPIVersion.VERSION2, protocol=protocol)
-    ours, theirs = socket.socketpair()
-    with ours, theirs:
-        client._sock = ours
-        client.publish("skin/robot/palm/frame", b"x" * size, properties=properties)
-        expected = theirs.recv(200_000)
-        client._sock = None
-    packed = None if properties is None else properties.pack()
-    head = publish_head("skin/robot/palm/frame", packed)
-    assert publish_packet(head, b"x" * size) == expected
+    topic, payload = "skin/robot/palm/frame", b"x" * size
+    _, packed, expected = written_by_paho(version, topic, payload)
+    assert publish_packet(publish_head(topic, packed), payload) == expected
 
 
 def test_a_packet_longer_than_mqtt_knows_is_refused() -> None:

@@ -301,3 +301,23 @@ def test_a_zero_is_observed_for_longer_the_more_it_scatters_against_the_threshol
     """Until its standard error is a seventh of the threshold, a conversion being a second."""
     spread, enter = np.array([0.5, 1.0, 3.0, 0.0]), np.array([7.0, 7.0, 10.5, 7.0])
     assert look_s(spread, enter) == pytest.approx(np.array([0.25, 1.0, 4.0, 0.0]) * CONVERSION_S)
+
+
+def test_what_was_sent_before_a_silence_decides_nothing_after_it() -> None:
+    """A pad near the end of the scale was pressed before; what it reads afterwards is its noise."""
+    noise_units = 5.0
+    rng = np.random.default_rng(3)
+    rezero = Rezero(NONE, NO_LOAD, ~NONE)
+    t_ns = 1_700_000_000 * S
+    for _ in range(5):
+        rezero.step(np.full(N, 160, np.uint8), ~NONE, NONE, t_ns)
+        t_ns += S // 20
+    rezero.restart(t_ns)
+    done = False
+    while not done:
+        raw = np.clip(np.rint(250.0 + noise_units * rng.standard_normal(N)), 0, 255)
+        done = rezero.step(raw.astype(np.uint8), ~NONE, NONE, t_ns)
+        t_ns += S // 20
+    rezero.finish(np.zeros(N), np.full(N, noise_units))
+    assert rezero.cut_off.mean() > 0.9
+    assert rezero.doubted.mean() < 0.1
