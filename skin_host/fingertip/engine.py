@@ -5,11 +5,13 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from skin_host.bus.strain import (
     CHANNELS,
     SILENT_NS,
+    ZERO_WORD,
     StrainType,
     Wrench,
     WrenchAssembler,
@@ -24,11 +26,18 @@ from skin_host.fingertip.tip import Tip
 from skin_host.layout import Layout
 from skin_host.processing.calibration import Zero
 from skin_host.processing.events import Touch
+from skin_host.processing.masks import Mask
 
 Floats = NDArray[np.float64]
 
 #: A zero is the mean of at least this many samples.
 FEWEST_SAMPLES = 10
+#: A sample is compared with the median of so many, itself in the middle: a load lasts for longer.
+AROUND = 5
+#: It was damaged if a channel is off by so many times what half of the samples are off.
+DAMAGED_TIMES = 12.0
+#: If more of the samples are off, that is noise.
+MOST_DAMAGED = 0.2
 
 
 @dataclass(slots=True)
@@ -191,7 +200,9 @@ class FingertipEngine:
         found = {}
         for name, state in self.tips.items():
             if len(state.zeroing) >= FEWEST_SAMPLES:
+                assert state.assembler is not None
                 samples = np.array(state.zeroing)
+                samples = samples[~damaged(samples, state.assembler.full_scale / ZERO_WORD)]
                 found[name] = Zero(samples.mean(axis=0), samples.std(axis=0, ddof=1))
             state.zeroing.clear()
         return found
@@ -230,3 +241,20 @@ class FingertipEngine:
     def _assemble(state: TipState, full_scale: Floats) -> None:
         table = state.settings
         state.assembler = WrenchAssembler(table.address, table.period_ms, full_scale)
+
+
+def damaged(samples: Floats, step: Floats) -> Mask:
+    """Return which samples bool[n] are off alone, as damaged frames are, and loads are not.
+
+    Noise and zero would be wrong by them: one wrong bit may be thousands of noises.
+
+    Args:
+        samples: float64[n, 6], in the order of their times.
+        step: float64[6], the least difference of two values of a channel.
+    """
+    ends = AROUND // 2
+    padded = np.pad(samples, ((ends, ends), (0, 0)), mode="edge")
+    off = np.abs(samples - np.median(sliding_window_view(padded, AROUND, axis=0), axis=-1))
+    usual = np.maximum(np.median(off, axis=0), step)
+    found: Mask = (off > DAMAGED_TIMES * usual).any(axis=1)
+    return found if found.mean() <= MOST_DAMAGED else np.zeros_like(found)

@@ -31,6 +31,7 @@ from skin_host.processing.core import Engine
 from skin_host.processing.events import Touch
 
 CONFIG = Path(__file__).parents[2] / "config"
+FORCE_OF_INDEX = 0x31A
 
 
 class Bench:
@@ -198,6 +199,40 @@ async def test_load_beyond_the_range_is_told_and_has_no_place() -> None:
     assert "saturated" in {load.verdict for load in loads if load is not None}
     await bench.run(6.0)
     assert bench.codes() == []
+
+
+@pytest.mark.parametrize("bit", [0x01, 0x10])
+async def test_damaged_frames_of_a_calibration_are_no_noise_of_a_board(
+    bit: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench()
+    await bench.boards.bring_up()
+    await bench.calibrate()
+    whole = bench.record()["threshold_n"]
+    step = bench.robot.step
+    number = 0
+
+    def damaged(seconds: float) -> dict[str, FrameBatch]:
+        nonlocal number
+        batches = step(seconds)
+        batch = batches["can0"]
+        forces = np.flatnonzero(batch.id == FORCE_OF_INDEX)
+        number += 1
+        batch.data[forces[number % 10 : number % 10 + 1], 1] ^= bit
+        return batches
+
+    monkeypatch.setattr(bench.robot, "step", damaged)
+    await bench.calibrate()
+    assert bench.codes() == []
+    assert bench.record()["threshold_n"] == pytest.approx(whole, rel=0.05)
+
+
+async def test_a_load_that_comes_during_a_calibration_counts_as_noise() -> None:
+    bench = Bench({"part": "index", "force_n": [[1.4, 0], [1.45, 2]]})
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    await bench.calibrate()
+    assert bench.codes() == ["noisy"]
 
 
 async def test_a_contact_without_end_makes_its_zero_uncertain() -> None:
