@@ -81,13 +81,13 @@ def _add_fits(calibrate: argparse.ArgumentParser) -> None:
     )
     calibrate.add_argument(
         "--weight-kpa",
-        type=float,
+        type=positive,
         metavar="P",
         help="with --relaxation: a dead weight of this pressure was laid on and taken off",
     )
     calibrate.add_argument(
         "--levels",
-        type=float,
+        type=positive,
         nargs="+",
         metavar="KPA",
         help="with --pressure, without --load: the known pressures in kPa in their order",
@@ -210,8 +210,6 @@ def _pressure(arguments: argparse.Namespace) -> int:
         )
     if arguments.load is not None:
         return _course(arguments)
-    if min(arguments.levels) <= 0.0:
-        raise RequestError(f"--levels: {min(arguments.levels):g} kPa; wanted pressures above 0")
     settings, layout = load_skin(arguments.config)
     samples = _read_samples(arguments.pressure, settings, layout, arguments.seconds)
     found, fit = fitting.fit_pressures(samples, settings, layout, arguments.levels)

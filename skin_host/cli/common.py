@@ -3,6 +3,7 @@
 import argparse
 import json
 import logging
+import math
 import os
 import signal
 import sys
@@ -22,6 +23,14 @@ T = TypeVar("T")
 Commands = Any  # argparse's own type of sub-parser collections is private
 
 
+class _Help(argparse.ArgumentDefaultsHelpFormatter):
+    """Names the defaults of options that have one."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        has_one = action.default is not None and action.default is not False
+        return super()._get_help_string(action) if has_one else action.help
+
+
 def add_command(commands: Commands, name: str, about: str, example: str) -> argparse.ArgumentParser:
     """Add a sub-command with its one-line description and an example at the end of its help."""
     parser: argparse.ArgumentParser = commands.add_parser(
@@ -29,7 +38,7 @@ def add_command(commands: Commands, name: str, about: str, example: str) -> argp
         help=about,
         description=about[0].upper() + about[1:] + ".",
         epilog=f"Example: {example}",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        formatter_class=_Help,
     )
     parser.set_defaults(command=name)
     return parser
@@ -46,15 +55,61 @@ def add_broker(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", help="whose skin, if the broker knows several robots")
 
 
-def positive(text: str) -> float:
-    """A number above 0, for argparse."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0 < value < 1e9:
-        raise argparse.ArgumentTypeError(f"seen {text}, wanted a number above 0")
+def positive_below(limit: float) -> Callable[[str], float]:
+    """Return the type, for argparse, of a number above 0 and below a limit."""
+
+    def of(text: str) -> float:
+        value = _number(text)
+        if not 0 < value < limit:
+            bound = f"below {limit:g}" if value >= limit else "above 0"
+            raise argparse.ArgumentTypeError(f"seen {text}, wanted a number {bound}")
+        return value
+
+    return of
+
+
+#: Times, speeds, pressures.
+positive = positive_below(1e9)
+
+
+def finite(text: str) -> float:
+    """A number, for argparse."""
+    value = _number(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"seen {text}, wanted a number")
     return value
+
+
+def whole(least: int, most: int) -> Callable[[str], int]:
+    """Return the type, for argparse, of a whole number, with bounds that belong to it."""
+
+    def of(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = least - 1
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(
+                f"seen {text}, wanted a whole number from {least} to {most}"
+            )
+        return value
+
+    return of
+
+
+#: What random numbers begin with.
+seed_number = whole(0, 2**63 - 1)
+#: How many of something there are; where fewer are possible, that is found out later.
+count = whole(1, 1_000_000_000)
+#: A port to listen on; 0 is any.
+port_number = whole(0, 65535)
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def add_log_level(parser: argparse.ArgumentParser) -> None:

@@ -16,6 +16,7 @@ from skin_host.cli.common import (
     add_command,
     add_config,
     add_log_level,
+    count,
     load_skin,
     positive,
     print_json,
@@ -50,7 +51,7 @@ def add_commands(commands: Commands) -> None:
     run.add_argument("--duration", type=positive, metavar="S", help="end after so many seconds")
     run.add_argument(
         "--workers",
-        type=int,
+        type=count,
         metavar="N",
         help="share the buses among so many processes, each a node: NODE-1, NODE-2, ...",
     )
@@ -193,8 +194,6 @@ def _run_workers(arguments: argparse.Namespace, settings: "Settings") -> int:
     from skin_host.daemon.workers import share_name, share_out
 
     node, n = arguments.node, arguments.workers
-    if n < 1:
-        raise RequestError(f"--workers {n}: wanted 1 or more")
     shares = share_out(settings, node, n)
     if not shares:
         raise RequestError(f'{arguments.config}: no part belongs to node "{node}"')

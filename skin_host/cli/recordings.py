@@ -11,6 +11,7 @@ from skin_host.cli.common import (
     Commands,
     add_command,
     add_config,
+    finite,
     load_skin,
     positive,
     print_json,
@@ -72,7 +73,7 @@ def add_commands(commands: Commands) -> None:
     plot.add_argument("output", metavar="OUTPUT", type=Path, help="file .png, .svg or .pdf")
     plot.add_argument("--part", help="which part, if there are several")
     plot.add_argument("--taxels", type=_numbers, metavar="N,N", help="of the part; the strongest")
-    plot.add_argument("--at", type=float, metavar="S", help="instant of the map; the strongest")
+    plot.add_argument("--at", type=finite, metavar="S", help="instant of the map; the strongest")
     plot.set_defaults(run=_plot)
 
     dbc = add_command(

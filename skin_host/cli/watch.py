@@ -11,6 +11,8 @@ from skin_host.cli.common import (
     add_broker,
     add_command,
     add_log_level,
+    count,
+    port_number,
     print_json,
     run,
     set_up_logging,
@@ -34,7 +36,7 @@ def add_commands(commands: Commands) -> None:
     listen.add_argument("--part", help="only this part")
     listen.add_argument("--moves", action="store_true", help="also while a touch goes on")
     listen.add_argument("--json", action="store_true", help="one JSON document a line")
-    listen.add_argument("--count", type=int, metavar="N", help="end after N lines")
+    listen.add_argument("--count", type=count, metavar="N", help="end after N lines")
     listen.set_defaults(run=_listen)
 
     status = add_command(
@@ -63,7 +65,7 @@ def add_commands(commands: Commands) -> None:
     )
     view.add_argument("--host", default="127.0.0.1", help="address to listen on")
     view.add_argument(
-        "--port", type=int, help="port to listen on (8080; Foxglove 8765, Rerun 9090)"
+        "--port", type=port_number, help="port to listen on (8080; Foxglove 8765, Rerun 9090)"
     )
     view.add_argument("--read-only", action="store_true", help="pages calibrate and record nothing")
     view.add_argument(

@@ -15,11 +15,16 @@ from skin_host.cli.common import (
     add_command,
     add_config,
     add_log_level,
+    count,
     load_skin,
+    port_number,
     positive,
+    positive_below,
     print_json,
     run,
+    seed_number,
     set_up_logging,
+    whole,
 )
 from skin_host.errors import RequestError
 
@@ -63,7 +68,7 @@ def add_commands(commands: Commands) -> None:
     emulate.add_argument(
         "--fidelity", choices=("signal", "chip"), default="signal", help="how deep the chips go"
     )
-    emulate.add_argument("--seed", type=int, help="replaces the scene's seed")
+    emulate.add_argument("--seed", type=seed_number, help="replaces the scene's seed")
     emulate.add_argument(
         "--state",
         type=Path,
@@ -81,7 +86,7 @@ def add_commands(commands: Commands) -> None:
     )
     emulate.add_argument(
         "--i2c-dev",
-        type=int,
+        type=whole(0, 255),
         metavar="N",
         help="show the I2C lines of --board as /dev/i2c-N, N+1, ... (CUSE, root)",
     )
@@ -100,7 +105,7 @@ def add_commands(commands: Commands) -> None:
     _add_scene(demo)
     demo.add_argument(
         "--page-port",
-        type=int,
+        type=port_number,
         metavar="PORT",
         help="of the live page, 0 is any; without it 8080, or any if that is taken",
     )
@@ -114,7 +119,7 @@ def _add_measurements(commands: Commands) -> None:
     about = "; ".join(f"{name}: {text}" for name, text in BENCHMARKS.items())
     bench.add_argument("name", choices=list(BENCHMARKS), metavar="NAME", help=about)
     bench.add_argument("--quick", action="store_true", help="shorter and less certain")
-    bench.add_argument("--robots", type=int, metavar="N", help="of bench fleet; 1000 otherwise")
+    bench.add_argument("--robots", type=count, metavar="N", help="of bench fleet; 1000 otherwise")
     bench.add_argument("--full", action="store_true", help="bench fleet: 7 messages/s a robot")
     bench.add_argument("--json", action="store_true", help="one JSON document")
     bench.set_defaults(run=_bench)
@@ -153,14 +158,22 @@ def _add_measurements(commands: Commands) -> None:
         nargs="?",
         help="configuration file (TOML); the demo's if not given",
     )
-    simulate.add_argument("--seed", type=int, default=1, help="decides everything that happens")
     simulate.add_argument(
-        "--seeds", type=int, default=1, metavar="N", help="so many, from --seed, on all cores"
+        "--seed", type=seed_number, default=1, help="decides everything that happens"
     )
-    simulate.add_argument("--hours", type=float, default=1.0, metavar="H", help="of each seed")
+    simulate.add_argument(
+        "--seeds",
+        type=whole(1, 1_000_000),
+        default=1,
+        metavar="N",
+        help="so many, from --seed, on all cores",
+    )
+    simulate.add_argument(
+        "--hours", type=positive_below(1e4), default=1.0, metavar="H", help="of each seed"
+    )
     simulate.add_argument(
         "--until",
-        type=float,
+        type=positive,
         metavar="S",
         help="end the run at this simulated time, with the daemon's log on stderr",
     )
@@ -341,8 +354,8 @@ def _bench(arguments: argparse.Namespace) -> int:
     module = import_module(f"skin_host.evaluation.bench_{arguments.name}")
     more: dict[str, int] = {}
     if arguments.robots is not None:
-        if arguments.name != "fleet" or arguments.robots < 1:
-            raise RequestError("--robots is a number of 1 or more, of bench fleet")
+        if arguments.name != "fleet":
+            raise RequestError("--robots is of bench fleet")
         more["robots"] = arguments.robots
     if arguments.full:
         if arguments.name != "fleet":
@@ -382,8 +395,6 @@ def _simulate(arguments: argparse.Namespace) -> int:
     from skin_host.evaluation.simulate import outcome
     from skin_host.evaluation.simulate.run import simulate, simulate_all
 
-    if arguments.seeds < 1 or arguments.hours <= 0 or arguments.seed < 0:
-        raise RequestError("wanted --seed of 0 or more, --seeds of 1 or more and --hours above 0")
     if arguments.until is not None and arguments.seeds != 1:
         raise RequestError("--until goes with one seed")
     config: Path = arguments.config or configuration("demo.toml")

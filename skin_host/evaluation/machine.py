@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from skin_host.processes import cores
+
 
 def machine() -> dict[str, Any]:
     """What the times were measured on."""
@@ -18,11 +20,6 @@ def machine() -> dict[str, Any]:
         "numpy": np.__version__,
         "load": round(os.getloadavg()[0], 2),
     }
-
-
-def cores() -> int:
-    """How many cores this process may use."""
-    return len(os.sched_getaffinity(0))
 
 
 def _processor() -> str:

@@ -6,11 +6,9 @@ of the same foam, and from no other data.
 """
 
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import pairwise
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +22,9 @@ from skin_host.evaluation import insole, page, tables
 from skin_host.evaluation.document import as_text, write
 from skin_host.evaluation.goals import goal
 from skin_host.evaluation.insole import InsoleRecording
-from skin_host.evaluation.machine import cores, machine
+from skin_host.evaluation.machine import machine
 from skin_host.layout import Layout, build_layout
+from skin_host.processes import Processes
 from skin_host.processing.calibration import Calibration, Verdict, with_pressures_of
 from skin_host.processing.core import Engine
 from skin_host.recording.fitting import Samples, fit_curves
@@ -139,18 +138,20 @@ def run(
     if quick:
         paths = [path for path in paths if path.stem in QUICK] or paths[:1]
     grasp_log = folder.parent / GRASPS
-    with ProcessPoolExecutor(cores(), mp_context=get_context("spawn")) as pool:
-        grasping = pool.submit(grasps, grasp_log) if grasp_log.exists() else None
+    with Processes() as processes:
+        grasping = processes.submit(grasps, grasp_log) if grasp_log.exists() else None
         known = {_foam(path): _calibration_path(_foam(path), folder) for path in paths}
         fitting = {
-            foam: pool.submit(fit_pressures, path) for foam, path in known.items() if path.exists()
+            foam: processes.submit(fit_pressures, path)
+            for foam, path in known.items()
+            if path.exists()
         }
         fitted = {foam: future.result() for foam, future in fitting.items()}
-        measured = [pool.submit(measure, path, fitted.get(_foam(path))) for path in paths]
+        measured = [processes.submit(measure, path, fitted.get(_foam(path))) for path in paths]
         calibration = next((path for path in paths if path.stem == FITTED_FOAM), None)
         emulating = None
         if calibration is not None and with_emulation:
-            emulating = pool.submit(insole.compare, calibration)
+            emulating = processes.submit(insole.compare, calibration)
         rows = [future.result() for future in measured]
         found = None if grasping is None else grasping.result()
         compared = [] if emulating is None else emulating.result()

@@ -8,9 +8,8 @@ machine, what is timed, in the same run as a copy of the same numbers in memory.
 import sys
 import time
 from collections.abc import Callable, Iterable
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, as_completed
 from datetime import UTC, datetime
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,8 @@ from skin_host.evaluation.document import as_text
 from skin_host.evaluation.goals import goal
 from skin_host.evaluation.histories import TRUTHS
 from skin_host.evaluation.localization_trials import Case, errors, localizer_for
-from skin_host.evaluation.machine import cores, machine
+from skin_host.evaluation.machine import machine
+from skin_host.processes import Processes
 
 Row = dict[str, Any]
 Report = dict[str, Any]
@@ -138,18 +138,13 @@ def jobs_of(quick: bool) -> list[Job]:
 
 def _worked_out(jobs: list[Job]) -> tuple[dict[str, list[Any]], dict[str, float]]:
     """Results of all jobs by their name, in their order, and what they cost in CPU seconds."""
-    # Fresh processes: the parent may run threads, which a fork would not survive.
-    with ProcessPoolExecutor(cores(), mp_context=get_context("spawn")) as pool:
+    with Processes() as processes:
         running: list[Future[tuple[Any, float]]] = [
-            pool.submit(_timed, function, arguments) for _, function, arguments in jobs
+            processes.submit(_timed, function, arguments) for _, function, arguments in jobs
         ]
-        try:
-            for done, future in enumerate(as_completed(running), 1):
-                future.result()
-                _tell(f"{done} of {len(jobs)} parts")
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+        for done, future in enumerate(as_completed(running), 1):
+            future.result()
+            _tell(f"{done} of {len(jobs)} parts")
     found: dict[str, list[Any]] = {}
     seconds_of: dict[str, float] = {}
     for (name, _, _), future in zip(jobs, running, strict=True):

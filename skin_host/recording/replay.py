@@ -6,8 +6,6 @@ this computer, or the workers of an existing Dask cluster (extra `cluster`). A t
 files; a cluster's workers must find them under the same absolute paths.
 """
 
-import os
-import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -232,17 +230,14 @@ def process_all(
     if scheduler is not None:
         yield from _on_cluster(ordered, scheduler)
         return
-    from concurrent.futures import ProcessPoolExecutor, as_completed
-    from multiprocessing import get_context
+    from concurrent.futures import as_completed
 
-    processes = min(len(ordered), len(os.sched_getaffinity(0)))
-    with ProcessPoolExecutor(processes, get_context("spawn"), _leave_interrupts) as pool:
-        futures = {pool.submit(process, task): task for task in ordered}
-        try:
-            for future in as_completed(futures):
-                yield futures[future], _result(future)
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+    from skin_host.processes import Processes
+
+    with Processes(len(ordered)) as processes:
+        futures = {processes.submit(process, task): task for task in ordered}
+        for future in as_completed(futures):
+            yield futures[future], _result(future)
 
 
 def _size(task: Task) -> int:
@@ -259,11 +254,6 @@ def _result(future: "Future[int] | Any") -> int | SkinError:
     except SkinError as error:
         return error
     return number
-
-
-def _leave_interrupts() -> None:
-    """Ignore Ctrl-C, which the parent process handles."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _on_cluster(tasks: list[Task], scheduler: str) -> Iterator[tuple[Task, int | SkinError]]:

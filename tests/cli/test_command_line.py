@@ -1,5 +1,6 @@
 """What a user sees who asks for the wrong thing: one clear line and the right status."""
 
+import argparse
 import contextlib
 import errno
 import io
@@ -12,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skin_host.cli import main, watch
+from skin_host.cli import build_parser, main, watch
 from skin_host.config.settings import skin_hash
 from skin_host.processing.calibration import Calibrator
 from tests.support.broker import free_port
@@ -138,6 +139,12 @@ def test_a_calibration_of_another_configuration_is_refused(tmp_path):
         (["run", str(DEMO), "--duration", "-3"], "seen -3, wanted a number above 0"),
         (["calibrate", str(DEMO), "--seconds", "0"], "seen 0, wanted a number above 0"),
         (["emulate", str(DEMO), "--speed", "fast"], "seen fast, wanted a number above 0"),
+        (["emulate", str(DEMO), "--seed", "-1"], "seen -1, wanted a whole number from 0 to"),
+        (["simulate", "--hours", "inf"], "seen inf, wanted a number below 10000"),
+        (["simulate", "--until", "nan"], "seen nan, wanted a number above 0"),
+        (["simulate", "--seeds", "0"], "seen 0, wanted a whole number from 1 to 1000000"),
+        (["view", "--port", "65536"], "seen 65536, wanted a whole number from 0 to 65535"),
+        (["plot", "map", "x.mcap", "--at", "inf"], "seen inf, wanted a number"),
     ],
 )
 def test_a_mistyped_word_comes_with_what_was_meant(typed, meant, capsys):
@@ -145,6 +152,21 @@ def test_a_mistyped_word_comes_with_what_was_meant(typed, meant, capsys):
         main(typed)
     assert ended.value.code == 2
     assert meant in capsys.readouterr().err
+
+
+def actions_of(parser):
+    """All arguments of a command and of its sub-commands."""
+    for action in parser._actions:
+        yield action
+        if isinstance(action, argparse._SubParsersAction):
+            for command in action.choices.values():
+                yield from actions_of(command)
+
+
+def test_every_number_has_bounds():
+    numbers = [action.dest for action in actions_of(build_parser()) if action.type in (int, float)]
+    assert "hours" in {action.dest for action in actions_of(build_parser())}
+    assert numbers == []
 
 
 def test_a_status_without_broker_waits_for_none(capsys):

@@ -6,12 +6,11 @@ import os
 import random
 import tempfile
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,6 @@ import msgspec
 from emulator.probes.scene import Fault, Scene, Temperature
 from skin_host.config.settings import Settings
 from skin_host.errors import ConfigurationError
-from skin_host.evaluation.machine import cores
 from skin_host.evaluation.simulate.accusations import BACK_NS, NOISE, QUIET_NS, STARTED_NS
 from skin_host.evaluation.simulate.disk import PowerCut
 from skin_host.evaluation.simulate.promises import SAMPLE_S, Promises
@@ -28,6 +26,7 @@ from skin_host.evaluation.simulate.troubles import ACTS, KINDS, WIRING, Trouble,
 from skin_host.evaluation.simulate.world import Life, Spot, World
 from skin_host.layout import Layout
 from skin_host.mqtt.commands import MAX_RUNNING
+from skin_host.processes import Processes
 
 #: How long a storm lasts, how long the calm after it may take to be well, and after what time an
 #: operator calibrates again.
@@ -48,6 +47,8 @@ LONG_SHARE = 0.3
 WANDER_S, MOST_WANDER_C = 600.0, 1.0
 #: Presses of rehearsals.
 FIRM_KPA = (40.0, 80.0)
+#: So many seeds wait for a process, or for the seed before them to be reported.
+AHEAD = 1000
 #: Troubles at one time.
 MOST_TROUBLES = 3
 #: Faults that a calm may keep: they report what happened within the last minute, or real pads.
@@ -137,23 +138,26 @@ def simulate_all(
     """Run `simulate` for several seeds, side by side on all cores; yield in the order of the seeds.
 
     The daemon logs nothing meanwhile.
+
+    Raises:
+        SkinError: somebody killed one of the processes that run them.
     """
-    run = partial(simulate, settings, layout, config, seconds=seconds)
-    at_once = min(cores(), len(seeds))
-    if at_once == 1:
-        yield from map(run, seeds)
-        return
-    # Fresh processes: the parent may run threads, which a fork would not survive.
-    with ProcessPoolExecutor(
-        at_once, get_context("spawn"), logging.disable, (logging.CRITICAL,)
-    ) as pool:
-        running = [pool.submit(run, seed) for seed in seeds]
-        try:
-            for future in running:
-                yield future.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    run = partial(_quietly, settings, layout, config, seconds)
+    with Processes(len(seeds)) as processes:
+        running: deque[Future[RunResult]] = deque()
+        for seed in seeds:
+            running.append(processes.submit(run, seed))
+            if len(running) >= AHEAD:
+                yield running.popleft().result()
+        for future in running:
+            yield future.result()
+
+
+def _quietly(
+    settings: Settings, layout: Layout, config: Path, seconds: float, seed: int
+) -> RunResult:
+    logging.disable(logging.CRITICAL)
+    return simulate(settings, layout, config, seed, seconds)
 
 
 def coverage(results: Iterable[RunResult]) -> dict[str, list[str]]:

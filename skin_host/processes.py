@@ -1,0 +1,119 @@
+"""Work shared among processes, on all cores of this computer."""
+
+import ctypes
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from types import TracebackType
+from typing import Any, TypeVar, TypeVarTuple, Unpack
+
+from skin_host.errors import SkinError
+
+T = TypeVar("T")
+Ts = TypeVarTuple("Ts")
+
+#: A process that is to end has so long to clean up.
+AGAIN_S = 2.0
+#: From linux/prctl.h.
+_PR_SET_PDEATHSIG = 1
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+class Processes:
+    """Processes that share work.
+
+        with Processes() as processes:
+            futures = [processes.submit(function, item) for item in items]
+
+    They are fresh ones: the parent may run threads, which a fork would not survive. When the block
+    ends by an exception, such as Ctrl-C or SIGTERM, they end at once and clean up, and so they do
+    when their parent is killed.
+
+    Args:
+        most: no more than these.
+
+    Raises:
+        SkinError: at the end of the block, if somebody killed one of them.
+    """
+
+    def __init__(self, most: int | None = None) -> None:
+        self._pool = ProcessPoolExecutor(
+            cores() if most is None else min(cores(), most),
+            multiprocessing.get_context("spawn"),
+            _begin,
+            (os.getpid(),),
+        )
+        self._others = set(multiprocessing.active_children())
+        self._before: Any = None
+
+    def submit(self, function: Callable[[Unpack[Ts]], T], *arguments: *Ts) -> "Future[T]":
+        """Call a function, which can be pickled, in one of the processes."""
+        return self._pool.submit(_work, function, arguments)
+
+    def __enter__(self) -> "Processes":
+        if threading.current_thread() is threading.main_thread():
+            self._before = signal.signal(signal.SIGTERM, _leave)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if error is not None:
+            for process in set(multiprocessing.active_children()) - self._others:
+                process.terminate()
+        self._pool.shutdown(cancel_futures=error is not None)
+        if self._before is not None:
+            signal.signal(signal.SIGTERM, self._before)
+        if isinstance(error, BrokenProcessPool):
+            raise SkinError(
+                "a process that shared this work was killed, perhaps because memory was short"
+            ) from None
+
+
+def _leave(number: int, _: object) -> None:
+    """End this process by an exception, so that everything is cleaned up."""
+    sys.exit(128 + number)
+
+
+#: Set in a process that is to end.
+_is_ended = False
+
+
+def _begin(parent: int) -> None:
+    """Leave Ctrl-C to the parent; end when it asks for that, or has ended."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, _end)
+    signal.signal(signal.SIGALRM, _end)
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != parent:
+        _end()
+
+
+def _end(*_: object) -> None:
+    global _is_ended  # noqa: PLW0603
+    _is_ended = True
+    # An exception is lost where nothing can be raised, such as in a destructor: then once more.
+    sys.unraisablehook = lambda _: None
+    signal.setitimer(signal.ITIMER_REAL, AGAIN_S)
+    sys.exit()
+
+
+def _work(function: Callable[[Unpack[Ts]], T], arguments: tuple[*Ts]) -> T:
+    try:
+        return function(*arguments)
+    finally:
+        if _is_ended:  # The pool would wait for more work, of a parent that may be gone.
+            os._exit(1)

@@ -1,0 +1,107 @@
+"""Work shared among processes ends whole, with an error, or at once."""
+
+import asyncio
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from skin_host.errors import SkinError
+from skin_host.processes import Processes
+from tests.support.waiting import until
+
+#: It works until it is ended, in a folder that it removes then, and names itself in there.
+WORKS = """
+import os, signal, sys
+from pathlib import Path
+from skin_host.processes import Processes
+from tests.test_processes import works_on
+
+if __name__ == "__main__":
+    with Processes(2) as processes:
+        for future in [processes.submit(works_on, Path(sys.argv[1])) for _ in range(8)]:
+            future.result()
+"""
+
+
+def square(number: int) -> int:
+    return number * number
+
+
+def works_on(folder: Path) -> None:
+    with tempfile.TemporaryDirectory(dir=folder, prefix=f"{os.getpid()}-"):
+        while True:
+            time.sleep(0.01)
+
+
+def wait_for(condition: Callable[[], object]) -> None:
+    asyncio.run(until(condition))
+
+
+def is_gone(process: int) -> bool:
+    return not Path(f"/proc/{process}").exists()
+
+
+def workers(folder: Path) -> list[int]:
+    return [int(path.name.partition("-")[0]) for path in folder.iterdir()]
+
+
+def two_work(folder: Path) -> bool:
+    return len(workers(folder)) == 2
+
+
+def test_each_piece_of_work_has_its_result():
+    with Processes() as processes:
+        futures = [processes.submit(square, number) for number in range(5)]
+    assert [future.result() for future in futures] == [0, 1, 4, 9, 16]
+
+
+def test_a_process_that_is_killed_is_an_error_in_one_line():
+    with pytest.raises(SkinError, match="was killed"), Processes(1) as processes:
+        processes.submit(os.kill, 0, 0).result()
+        (child,) = multiprocessing.active_children()
+        future = processes.submit(time.sleep, 600.0)
+        os.kill(child.pid, signal.SIGKILL)
+        future.result()
+
+
+def test_an_exception_ends_the_others_at_once_and_they_clean_up(tmp_path):
+    with pytest.raises(KeyboardInterrupt), Processes(2) as processes:
+        for _ in range(8):
+            processes.submit(works_on, tmp_path)
+        wait_for(lambda: two_work(tmp_path))
+        running = workers(tmp_path)
+        raise KeyboardInterrupt
+    assert all(map(is_gone, running))
+    assert not workers(tmp_path)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+def test_they_end_with_their_parent_however_it_ends(tmp_path, number):
+    folder = tmp_path / "work"
+    folder.mkdir()
+    program = tmp_path / "program.py"
+    program.write_text(WORKS)
+    parent = subprocess.Popen(
+        [sys.executable, str(program), str(folder)],
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    wait_for(lambda: two_work(folder))
+    running = workers(folder)
+    parent.send_signal(number)
+    # Its pipe ends when the last of them has.
+    said = parent.communicate()[1]
+    wait_for(lambda: all(map(is_gone, running)))
+    assert not workers(folder)
+    if number == signal.SIGTERM:
+        assert parent.returncode == 128 + number
+        assert not said
