@@ -248,7 +248,6 @@ class Courier:
             topic = next(iter(self._states_alone))
             states = {topic: outbox.retained[topic]}
             if not self._fits(connection, topic, states[topic]):
-                outbox.give_up_state(topic)
                 del self._states_alone[topic]
                 continue
             self._states_out[topic] = self._send_state(connection, topic, states[topic])

@@ -91,6 +91,14 @@ def test_a_part_whose_messages_come_about_too_late_does_not_flap() -> None:
     assert presence.changes(60.0) == [Contact("palm", "OFF")]
 
 
+def test_a_part_is_known_while_all_comes_a_little_late() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_state("palm", "OFF", 0.0, sent_s=0.0)
+    for second in range(1, 60):
+        presence.take_sign("palm", float(second), second - 2.0)
+        assert presence.contact("palm", float(second)) == Contact("palm", "OFF")
+
+
 def test_a_late_sign_of_life_takes_nothing_from_an_earlier_one() -> None:
     presence = Presence(stale_s=3.0)
     presence.take_state("palm", "OFF", 0.0, sent_s=0.0)

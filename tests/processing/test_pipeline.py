@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 import pytest
@@ -413,3 +415,131 @@ def test_a_new_zero_forgets_what_was_received_against_the_old_one():
     rig.pipeline.step(0, raw, np.ones(rig.n, bool), rig.t_ns)
     frame = rig.pipeline.step(0, raw, np.ones(rig.n, bool), rig.t_ns + 40_000_000)
     assert np.flatnonzero(frame.touched).tolist() == [3]
+
+
+@pytest.mark.parametrize("units", [-12.0, -1.0, 1.0])
+def test_a_zero_that_has_moved_becomes_the_zero(units):
+    rig = Rig(1, 0.0)
+    before = [rig.step(0.0) for _ in range(50)][-1].raw.astype(float)
+    after = press(rig, units, 3000)[-1].raw.astype(float)
+    zero = rig.layout.no_load - rig.pipeline.baseline
+    assert zero[:6] == pytest.approx(after[:6], abs=0.3)
+    assert zero[6:] == pytest.approx(before[6:], abs=0.3)
+
+
+@pytest.mark.parametrize("units", [3.0, 8.0, 20.0])
+def test_a_press_moves_no_zero(units):
+    rig = Rig(1, 0.0)
+    before = rig.pipeline.baseline.copy()
+    press(rig, units, 250)
+    assert rig.pipeline.baseline == pytest.approx(before, abs=0.3)
+
+
+@pytest.mark.parametrize("units", [-12.0, 1.0])
+def test_zeros_move_alike_whether_pressures_are_subscribed_or_not(units):
+    rigs = [Rig(1, 0.0) for _ in range(2)]
+    for _ in range(3000):
+        for rig, pressures in zip(rigs, (True, False), strict=True):
+            rig.t_ns += 40_000_000
+            raw = rig.read(np.where(np.arange(rig.n) < 6, units, 0.0))
+            rig.pipeline.step(0, raw, np.ones(rig.n, bool), rig.t_ns, pressures)
+    watched, unwatched = (rig.pipeline.baseline for rig in rigs)
+    assert unwatched == pytest.approx(watched, abs=0.05)
+
+
+def test_without_a_subscriber_an_untouched_part_is_computed_five_times_a_second():
+    rig = Rig(1, 0.0, hz=50.0)
+    present = np.ones(rig.n, bool)
+    frames = []
+    for _ in range(500):
+        rig.t_ns += 20_000_000
+        frames.append(rig.pipeline.step(0, rig.read(0.0), present, rig.t_ns, pressures=False))
+    assert sum(frame.computed for frame in frames) == pytest.approx(50, abs=12)
+    idle = next(frame for frame in frames if not frame.computed)
+    assert not idle.pressure_kpa.any()
+    assert not idle.touched.any()
+    assert idle.valid.all()
+
+
+def test_a_sweep_that_is_only_followed_takes_no_number_and_counts_as_any_other():
+    rig = Rig(1, 0.0)
+    press(rig, 20.0, 5)
+    rig.t_ns += 40_000_000
+    raw = rig.read(np.where(np.arange(rig.n) < 6, 20.0, 0.0))
+    frame = rig.pipeline.follow(0, raw, np.ones(rig.n, bool), rig.t_ns)
+    assert frame.touched[:6].all()
+    assert rig.pipeline.seq(0) == 5
+    assert press(rig, 20.0, 1)[0].seq == 5
+    assert rig.pipeline.seq(0) == 6
+
+
+def test_every_taxel_detects_the_pressure_that_is_named_for_its_part_within_a_second():
+    rig = Rig(1, 0.8, seed=3, hz=50.0, calibrate_s=20.0, processing=NO_RELAXATION)
+    kpa = rig.pipeline.decides_kpa(0)
+    assert 1.0 < kpa < 50.0
+    units = float(CURVE.units(np.array([kpa]))[0])
+    frames = press(rig, units, 50, where=slice(None))
+    seen = np.array([frame.touched for frame in frames]).any(axis=0)
+    assert seen.mean() > 0.98
+
+
+def test_a_frame_keeps_its_bytes_when_the_reader_uses_its_buffer_again():
+    rig = Rig(1, 0.0)
+    raw = rig.read(0.0)
+    frame = rig.pipeline.step(0, raw, np.ones(rig.n, bool), 40_000_000)
+    sent = raw.copy()
+    raw[:] = 0
+    assert np.array_equal(frame.raw, sent)
+    later = rig.pipeline.step(0, sent, np.zeros(rig.n, bool), 80_000_000)
+    assert not later.touched.any()
+
+
+def test_pressures_beyond_the_calibrated_range_are_told_so_below_the_end_of_the_scale_too():
+    rig = Rig(1, 0.0, processing=NO_RELAXATION)
+    # The paper's curve is calibrated up to 131 kPa.
+    limit_units = float(CURVE.units(np.array([131.0]))[0])
+    for units, beyond in ((limit_units - 2.0, False), (limit_units + 3.0, True)):
+        frame = press(rig, units, 5)[-1]
+        assert frame.beyond_range[:6].all() == frame.beyond_range[:6].any() == beyond
+        assert not frame.beyond_range[6:].any()
+        assert frame.pressure_kpa[:6] == pytest.approx(CURVE.kpa(units)[0], rel=0.05)
+
+
+def test_another_model_of_the_foam_begins_without_what_the_last_one_had_taken_off():
+    rig = Rig(1, 0.0)
+    press(rig, 30.0, 500)
+    assert rig.pipeline.relaxation_kpa[:6].min() > 1.0
+    other = msgspec.convert(NO_RELAXATION, Processing)
+    rig.pipeline.renew(other, rig.calibration, np.zeros(rig.n, bool))
+    assert not rig.pipeline.relaxation_kpa.any()
+    frame = press(rig, 30.0, 1)[0]
+    assert frame.pressure_kpa[:6] == pytest.approx(CURVE.kpa(30.0)[0], abs=3.5)
+
+
+def test_a_new_calibration_of_some_taxels_gives_them_their_new_zero():
+    rig = Rig(1, 0.0)
+    moved = rig.calibration.baseline + 2.0
+    calibration = replace(rig.calibration, baseline=moved)
+    before = rig.pipeline.baseline.copy()
+    zeroed = np.arange(rig.n) < 12
+    rig.pipeline.renew(rig.settings.processing, calibration, zeroed)
+    assert np.array_equal(rig.pipeline.baseline[:12], moved[:12])
+    assert np.array_equal(rig.pipeline.baseline[12:], before[12:])
+
+
+def test_a_zero_that_rises_slowly_beneath_a_long_hold_is_followed():
+    rig = Rig(1, 0.0, hz=10.0, processing=NO_RELAXATION)
+    before = rig.pipeline.baseline[:6].copy()
+    for sweep in range(6000):
+        press(rig, 30.0 + 0.0004 * sweep, 1)
+    assert rig.pipeline.baseline[:6] - before == pytest.approx(np.full(6, 2.4), abs=0.7)
+    assert not any(frame.touched.any() for frame in press(rig, 2.4, 50)[3:])
+
+
+def test_what_a_taxel_read_before_its_calibration_does_not_move_its_new_zero():
+    rig = Rig(1, 0.0)
+    press(rig, -12.0, 12, where=slice(None))  # half of a window of a second
+    rig.pipeline.renew(rig.settings.processing, rig.calibration, np.ones(rig.n, bool))
+    for _ in range(40):
+        rig.step(0.0)
+    assert rig.pipeline.baseline == pytest.approx(rig.calibration.baseline, abs=0.5)

@@ -224,7 +224,7 @@ EQUATION_1_KPA = PressureCurve(2.88).kpa(KNOTS_UNITS[:, np.newaxis])[:, 0]
 
 
 def use_own_curves(rig, noise_units, verdict=CurveVerdict.GOOD, kpa=EQUATION_1_KPA):
-    """Give all pads equation (1) or another own curve, and a foam with plays."""
+    """Give all pads equation (1) or another own curve, and a foam with plays; return these."""
     n = rig.n
     curves = Curves(
         kpa=np.tile(kpa, (n, 1)),
@@ -238,6 +238,7 @@ def use_own_curves(rig, noise_units, verdict=CurveVerdict.GOOD, kpa=EQUATION_1_K
     )
     calibration = replace(rig.calibration, curves=curves)
     rig.pipeline.renew(rig.settings.processing, calibration, np.zeros(n, np.bool_))
+    return calibration
 
 
 def test_pads_that_were_noisy_under_pressure_do_not_flicker_though_they_rest_calmly():
