@@ -31,7 +31,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.bus.compensation import NO_GAIN
+from skin_host.bus.compensation import NO_GAIN, THERMAL_TAXEL
 from skin_host.processing.masks import Mask, all_of, any_of, count_of
 from skin_host.processing.stuck import (
     MOST_RATE,
@@ -82,7 +82,7 @@ LATELY_MEAN = 0.01
 MOST_WAITING = 2
 #: A spike is one sweep off by more than this many units, and this multiple of the noise, and back
 #: where it was but for the noise: a press after a release ends elsewhere. A spike of a pad that has
-#: jumped lately is a fault of the pad, not of the bus.
+#: jumped lately, or jumps again so soon, is a fault of the pad, not of the bus.
 SPIKE_UNITS = 7.0
 SPIKE_SIGMAS = 8.0
 
@@ -117,10 +117,11 @@ class Liveness:
             enough since.
         silenced: bool[k], those of them whose last reason was an error.
         noisy: bool[k, 12], pads that jump up and down much more than when calibrated.
-        doubted: bool[k, 12], pads that are not valid, or None if all are.
+        doubted: bool[k, 12], pads that are not valid, or None if all are. Of a noisy temperature
+            pad those that its board compensates with it are not.
         spikes: int64[boards], how often a single pad of a triangle was off for one sweep and
-            back in the next: a damaged frame does that, a sensor does not. Those of sweeps that
-            wait are not counted yet.
+            back in the next, and did not jump in some 25 sweeps before and after: a damaged frame
+            does that, a sensor does not. One is counted when that is known.
     """
 
     def __init__(
@@ -147,6 +148,7 @@ class Liveness:
         self._memory: Floats = RATE_MEMORY_S / conversion_s
         self._seen: Floats = CALIBRATED_S / conversion_s
         self._repeats = repeats
+        self._compensated = repeats.compensated
         self._pads = StuckPads(noise_units, self._share, period_s, repeats, boards, fitted)
         fitted = np.ones(k, np.bool_) if fitted is None else fitted
         self._every = fitted.copy()
@@ -173,6 +175,8 @@ class Liveness:
         self._owes_step = False
         self._jumping = np.zeros(shape)
         self._any_jumping = False
+        #: Pads with a spike that are not known yet to stay calm.
+        self._spiked = np.zeros(shape, np.bool_)
         self._felt: TouchedPads | None = None
         self._surprise = np.zeros(k)
         self._any_surprise = False
@@ -367,8 +371,12 @@ class Liveness:
         return self._felt
 
     def _doubt(self) -> None:
-        doubts = self._any_to_show or self._pads.any_stuck or self._any_noisy
-        self.doubted = self.unproven[:, None] | self.stuck | self.noisy if doubts else None
+        if not (self._any_to_show or self._pads.any_stuck or self._any_noisy):
+            self.doubted = None
+            return
+        self.doubted = self.unproven[:, None] | self.stuck | self.noisy
+        if self._any_noisy:
+            self.doubted |= self._compensated & self.noisy[:, THERMAL_TAXEL, None]
 
     def _note_triangles(
         self,
@@ -445,14 +453,19 @@ class Liveness:
             return
         both = np.minimum(np.abs(step), np.abs(self._step))
         spike = jump & (both > self._spike) & (np.abs(step + self._step) <= self._jump_units)
-        alone = count_of(spike & (self._jumping < LATELY_MEAN)) == 1
-        self.spikes += count_of(alone.reshape(self._boards, -1))
+        spike &= self._jumping < LATELY_MEAN
+        self._spiked &= ~jump
+        self._spiked |= spike & (count_of(spike) == 1)[:, None]
         np.copyto(self._step, step, where=compared[:, None])
         jumped = jump * np.minimum(both / self._jump, MOST_JUMP)
         self._jumping += compared[:, None] * (jumped - self._jumping) / NOISE_MEMORY_SAMPLES
         self._note_noise()
 
     def _note_noise(self) -> None:
+        if any_of(self._spiked):
+            calm = self._spiked & (self._jumping < LATELY_MEAN)
+            self.spikes += count_of(calm.reshape(self._boards, -1))
+            self._spiked ^= calm
         self._jumping[self._jumping < 1e-3] = 0.0
         self._any_jumping = any_of(self._jumping > 0.0)
         self.noisy = self._jumping > np.where(self.noisy, CALM_MEAN, NOISY_MEAN)

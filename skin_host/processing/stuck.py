@@ -104,11 +104,17 @@ class Repeats:
         self._moved = np.empty(shape, np.bool_)
 
     @property
+    def compensated(self) -> Mask:
+        """Return pads of which their board takes a share of the temperature pad, bool[k, 12]."""
+        found: Mask = self._gain > 0.0
+        return found
+
+    @property
     def shifted(self) -> Mask:
         """Return pads whose words compensation moves against the edges of their bytes, bool[k,
         12].
         """
-        shifted = self._gain > 0.0
+        shifted = self.compensated
         if self._any_plain:
             shifted[self._plain] = False
         return shifted

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from emulator.probes.scene import Air, Fault, Scene, load
+from skin_host.bus.compensation import thermal_gains
 from skin_host.health.diagnosis import diagnose
 from skin_host.layout import PadKind
 from tests.support.fault_bench import FaultBench
@@ -129,3 +130,27 @@ def test_a_temperature_pad_that_is_stuck_is_named(bench: FaultBench) -> None:
     part = layout.parts[triangle.part]
     assert bench.records[part.name]["taxel_faults"] == {"stuck": [index - part.start]}
     assert "taxel_stuck" in codes(bench, part.name)
+
+
+def test_a_noisy_temperature_pad_makes_the_pads_invalid_that_its_board_takes_it_off(
+    bench: FaultBench,
+) -> None:
+    layout = bench.layout
+    triangle = next(
+        one
+        for one in layout.triangles
+        if any(thermal_gains(layout.boards[one.board].settings.skin_type, one.number)[0])
+    )
+    board, part = layout.boards[triangle.board], layout.parts[triangle.part]
+    gain, thermal = thermal_gains(board.settings.skin_type, triangle.number)
+    first = triangle.first - part.start
+    where = {"board": board.name, "triangle": triangle.number, "taxel": thermal}
+    mend = bench.inject("noisy_taxel", **where)
+    bench.run(4.0)
+    depend = [first + taxel for taxel in range(12) if gain[taxel]]
+    assert first + thermal in bench.records[part.name]["taxel_faults"]["noisy"]
+    assert bench.records[part.name]["invalid"] == depend
+    assert codes(bench, part.name) == {"taxel_noisy"}
+    mend()
+    bench.run(8.0)
+    assert not bench.records[part.name]["invalid"]

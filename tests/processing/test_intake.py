@@ -370,6 +370,7 @@ def test_a_gap_before_a_sweep_is_no_gap_before_the_one_that_is_not_judged_yet():
     away.raw[1, 4] -= 40
     parts.feed([away])
     joined.note_gap(parts.engine.ledger.row[OUTER])
-    parts.feed([sweep(OUTER, 5 * PERIOD), sweep(INNER, 5 * PERIOD)])
+    for turn in range(5, 40):
+        parts.feed([sweep(OUTER, turn * PERIOD), sweep(INNER, turn * PERIOD)])
     joined.judge()
     assert joined.liveness.spikes.sum() == 0

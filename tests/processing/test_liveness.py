@@ -5,9 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from skin_host.bus.compensation import GAIN, NO_GAIN, THERMAL_TAXEL
 from skin_host.processing.liveness import CONVERSION_S, Liveness, change_rate
 from skin_host.processing.masks import Mask
-from skin_host.processing.stuck import longest_run
+from skin_host.processing.stuck import Encoding, Repeats, longest_run
 
 K = 4
 HERE = np.ones(K, bool)
@@ -17,6 +18,11 @@ PERIOD_S = 0.05
 
 def noisy_bytes(rng: np.random.Generator, sigma: float, centre: np.ndarray) -> np.ndarray:
     return np.clip(np.rint(centre + sigma * rng.standard_normal((K, 12))), 0, 255).astype(np.uint8)
+
+
+def rest(liveness: Liveness, sweeps: int) -> None:
+    for _ in range(sweeps):
+        liveness.step(np.full((K, 12), 240, np.uint8), HERE, NO)
 
 
 def calibrated(rng: np.random.Generator, sigma: float, centre: np.ndarray) -> Liveness:
@@ -247,6 +253,7 @@ def test_a_press_before_a_gap_and_its_end_after_it_are_no_spike(gap: bool) -> No
         if gap and raw is not pressed:
             liveness.note_gap(0)
         liveness.step(raw, HERE, NO)
+    rest(liveness, 30)
     assert liveness.spikes.sum() == (0 if gap else 1)
 
 
@@ -259,7 +266,54 @@ def test_one_sweep_off_by_more_than_seven_units_and_back_is_a_spike(
         raw = np.full((K, 12), 240, np.uint8)
         raw[1, 4] -= off
         liveness.step(raw, HERE, NO)
+    rest(liveness, 30)
     assert liveness.spikes.tolist() == [spikes]
+
+
+@pytest.mark.parametrize("again", [2, 5, 20])
+def test_a_byte_that_is_off_and_off_again_is_a_fault_of_its_pad_from_the_first(again: int) -> None:
+    """Pads that become noisy, or are another chip's, all at once: none of them harms a frame."""
+    liveness = Liveness(K, np.full((K, 12), 0.4), PERIOD_S)
+    for number in range(60):
+        raw = np.full((K, 12), 240, np.uint8)
+        for pad in range(4):
+            if number in {10 + pad, 10 + pad + again}:
+                raw[pad, 4] -= 12
+        liveness.step(raw, HERE, NO)
+        assert not liveness.spikes.any()
+
+
+def test_bytes_of_other_pads_that_are_off_are_each_counted_once() -> None:
+    liveness = Liveness(K, np.full((K, 12), 0.4), PERIOD_S)
+    for number in range(60):
+        raw = np.full((K, 12), 240, np.uint8)
+        if 10 <= number < 18:
+            raw[number % 4, number % 12] -= 12
+        liveness.step(raw, HERE, NO)
+    assert liveness.spikes.tolist() == [8]
+
+
+@pytest.mark.parametrize("gain", [GAIN, NO_GAIN])
+def test_pads_of_which_a_noisy_temperature_pad_is_taken_off_are_in_doubt_with_it(
+    gain: tuple[int, ...],
+) -> None:
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+    repeats = Repeats([Encoding(gain, 2, 240, truncates=False)] * K)
+    liveness = Liveness(K, np.full((K, 12), 0.6), PERIOD_S, repeats)
+    for _ in range(60):
+        raw = noisy_bytes(rng, 0.5, centre)
+        raw[2, THERMAL_TAXEL] = np.clip(240 + 8 * rng.standard_normal(), 0, 255)
+        liveness.step(raw, HERE, NO)
+    assert np.argwhere(liveness.noisy).tolist() == [[2, THERMAL_TAXEL]]
+    assert liveness.doubted is not None
+    expected = np.zeros((K, 12), np.bool_)
+    expected[2] = np.array(gain) > 0
+    expected[2, THERMAL_TAXEL] = True
+    assert liveness.doubted.tolist() == expected.tolist()
+    for _ in range(40):
+        liveness.step(noisy_bytes(rng, 0.5, centre), HERE, NO)
+    assert liveness.doubted is None
 
 
 def test_a_new_calibration_of_one_board_keeps_what_is_known_of_the_other() -> None:
@@ -296,6 +350,7 @@ def test_a_gap_of_one_board_hides_no_spike_of_another() -> None:
         for raw in (noisy_bytes(rng, 0.4, centre), pressed, noisy_bytes(rng, 0.4, centre)):
             liveness.note_gap(0)
             liveness.step(raw, HERE, NO)
+    rest(liveness, 30)
     assert liveness.spikes.tolist() == [0, 1]
 
 
