@@ -229,8 +229,10 @@ class BoardLedger:
         return int((self.absent[row] >= MISSING_SWEEPS) @ (1 << _BITS))
 
     def intervals_ns(self, row: int) -> NDArray[np.int64]:
-        """Return the last intervals int64[up to 16] between a board's sweeps, unordered."""
-        return np.array(self._intervals_ns[row][: self._n_intervals[row]], np.int64)
+        """Return the last intervals int64[up to 16] between a board's sweeps, the oldest first."""
+        n, intervals = self._n_intervals[row], self._intervals_ns[row]
+        oldest = n % INTERVALS if n > INTERVALS else 0
+        return np.array([*intervals[oldest:], *intervals[:oldest]][:n], np.int64)
 
     def regular_period_ns(self, row: int) -> float | None:
         """Return the median of a board's last intervals, or None if they are few or irregular.

@@ -7,8 +7,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.bus.ledger import BoardLedger
 from skin_host.bus.wire import TRIANGLES, StatusError
-from skin_host.health.diagnosis import HOLDS_UP_SHARE
+from skin_host.health.diagnosis import JITTER_SHARE
 from skin_host.health.record import (
     BoardHealth,
     BusHealth,
@@ -32,6 +33,10 @@ if TYPE_CHECKING:
 LATELY_NS = 60_000_000_000
 #: Length of a frame of 8 bytes on the wire in bits, with stuff bits and the pause after it.
 FRAME_BITS = 121
+#: A longer interval is one in which a sweep was lost.
+LOST_PERIODS = 1.6
+#: Sweeps with a shorter pause between them follow one another: how long they take is estimated.
+PAUSE_MS = 1.0
 #: The period of a board is judged from this many intervals between sweeps or more.
 FEWEST_INTERVALS = 8
 #: Ratio of standard deviation to median absolute deviation, for a normal distribution.
@@ -364,9 +369,10 @@ class Describer:
                 if abs(now_ns - at_ns) < LATELY_NS
             }
             record["held_up"] = (
-                jitter_ms is not None
-                and jitter_ms > HOLDS_UP_SHARE * board.settings.period_ms
-                and self._is_held_up(index)
+                period_seen_ms is not None
+                and jitter_ms is not None
+                and jitter_ms > JITTER_SHARE * board.settings.period_ms
+                and self._is_held_up(index, period_seen_ms)
             )
             period_ns = board.settings.period_ms * 1_000_000
             record["twice"] = watch.is_twice(now_ns, period_ns) and not self._is_quick(
@@ -381,21 +387,49 @@ class Describer:
         seen_ns = self._engine.ledger.regular_period_ns(row)
         return seen_ns is not None and seen_ns < QUICK_SHARE * period_ns
 
-    def _is_held_up(self, index: int) -> bool:
-        """Whether a more urgent board of the same bus sends irregularly, or at another period: then
-        it comes at ever other moments.
+    def _is_held_up(self, index: int, period_ms: float) -> bool:
+        """Whether a board's intervals scatter because its sweeps wait for those of more urgent
+        boards of its bus, as far as can be known.
+
+        What is seen is when its sweeps end. Each was ready at some moment since the bus had its
+        last pause. As long as three quarters of the intervals may have been regular, it is not
+        accused.
+
+        Args:
+            index: of the board.
+            period_ms: the mean of its intervals.
         """
         ledger, own = self._engine.ledger, self._layout.boards[index].settings
+        sweeps: list[tuple[float, float]] = []
+        known_ms = -np.inf
         for other in self._engine.boards:
             one, row = self._layout.boards[other].settings, ledger.row[other]
             if one.bus == own.bus and one.address < own.address and not ledger.is_silent(row):
-                period_ms, jitter_ms = _period(ledger.intervals_ns(row), one.period_ms)
-                if period_ms is None or jitter_ms is None:
-                    continue
-                off_ms = max(jitter_ms, abs(period_ms - one.period_ms))
-                if off_ms > HOLDS_UP_SHARE * one.period_ms:
-                    return True
-        return False
+                theirs_ms, took_ms = _ends_ms(ledger, row), self._sweep_ms(other)
+                known_ms = max(known_ms, theirs_ms[0])
+                sweeps += [(end_ms, took_ms) for end_ms in theirs_ms]
+        if not sweeps:
+            return False
+        sweeps.sort(reverse=True)
+        ends_ms, took_ms = _ends_ms(ledger, ledger.row[index]), self._sweep_ms(index)
+        latest_ms = [end_ms - took_ms for end_ms in ends_ms]
+        earliest_ms = [
+            _busy_since_ms(end_ms - took_ms, end_ms, sweeps) if end_ms > known_ms else -np.inf
+            for end_ms in ends_ms
+        ]
+        off_ms = sorted(
+            max(earliest_ms[at] - latest_ms[at - 1] - period_ms, 0.0)
+            + max(period_ms - latest_ms[at] + earliest_ms[at - 1], 0.0)
+            for at in range(1, len(ends_ms))
+            if ends_ms[at] - ends_ms[at - 1] < LOST_PERIODS * own.period_ms
+        )
+        return not off_ms or SIGMA * off_ms[3 * len(off_ms) // 4] <= JITTER_SHARE * own.period_ms
+
+    def _sweep_ms(self, index: int) -> float:
+        """Return how long a board's sweep takes its bus."""
+        board = self._layout.boards[index]
+        bitrate = self._engine.settings.buses[board.settings.bus].bitrate
+        return 2 * len(board.triangles) * FRAME_BITS / bitrate * 1e3
 
     def _is_new(self, index: int) -> bool:
         """Whether a board that had timed out sends again, but no sample has its values yet, or it
@@ -480,7 +514,7 @@ def _period(intervals_ns: NDArray[np.int64], wanted_ms: int) -> tuple[float | No
         return None, None
     # For so few numbers lists are faster than arrays.
     intervals_ms = [interval_ns / 1e6 for interval_ns in intervals_ns.tolist()]
-    usual = [interval_ms for interval_ms in intervals_ms if interval_ms < 1.6 * wanted_ms]
+    usual = [interval_ms for interval_ms in intervals_ms if interval_ms < LOST_PERIODS * wanted_ms]
     if 2 * len(usual) < len(intervals_ms):
         usual = intervals_ms
     elif len(usual) < FEWEST_INTERVALS:
@@ -489,6 +523,31 @@ def _period(intervals_ns: NDArray[np.int64], wanted_ms: int) -> tuple[float | No
     middle = median(usual)
     jitter_ms = SIGMA * median([abs(interval_ms - middle) for interval_ms in usual])
     return round(fmean(usual), 2), round(jitter_ms, 2)
+
+
+def _ends_ms(ledger: BoardLedger, row: int) -> list[float]:
+    """Return when a board's last sweeps ended, the oldest first."""
+    last = ledger.last[row]
+    if last is None:
+        return []
+    intervals_ns = ledger.intervals_ns(row)
+    before_ns = last.t_ns - np.cumsum(intervals_ns[::-1])[::-1]
+    return [t_ns / 1e6 for t_ns in [*before_ns.tolist(), last.t_ns]]
+
+
+def _busy_since_ms(begin_ms: float, end_ms: float, sweeps: list[tuple[float, float]]) -> float:
+    """Return since when a bus passed frames without a pause until a sweep began.
+
+    Args:
+        begin_ms, end_ms: of the sweep.
+        sweeps: others, each with its end and how long it took the bus, the last first.
+    """
+    for other_ms, took_ms in sweeps:
+        if other_ms < begin_ms - PAUSE_MS:
+            break
+        if other_ms <= end_ms:
+            begin_ms = min(begin_ms, other_ms) - took_ms
+    return begin_ms
 
 
 def _last_second(gained: dict[str, float], bitrate: int) -> LastSecond:

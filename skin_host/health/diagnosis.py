@@ -19,9 +19,6 @@ BABBLE_LOAD = 0.4
 PERIOD_SHARE = 0.05
 #: Intervals that scatter by more than this share of the period (median deviation) are a fault.
 JITTER_SHARE = 0.06
-#: A board whose intervals scatter by more than this share may hold up all less urgent ones of its
-#: bus: they want it at the same time if they were set up together, and wait for whole sweeps.
-HOLDS_UP_SHARE = 0.02
 #: This many lone frames (one of a pair) in the last second are a fault.
 FEW_HALVES = 2
 #: So is this many pads of a bus that jumped for one sweep and back, in the last second.

@@ -66,8 +66,7 @@ class BoardHealth(TypedDict):
     `in_doubt` counts taxels whose zero is unknown; `awaited`: since the start
     it has not had the time to send; `lately` has the counters among `resets`, `lost_set_ups`,
     `tx_overflows` and `rezeros` that rose within the last minute; `twice`: two boards send at its
-    address; `held_up`: its frames wait for those of a board that sends irregularly or at another
-    period.
+    address; `held_up`: it may be regular, but its frames waited for those of more urgent boards.
     """
 
     name: str

@@ -74,6 +74,12 @@ def test_jitter_does_not_hide_the_period() -> None:
     assert after([49.0, 51.5] * 8).regular_period_ns(HAND) == pytest.approx(50e6, rel=0.03)
 
 
+@pytest.mark.parametrize("n", [3, 16, 17, 40])
+def test_intervals_are_known_in_their_order(n: int) -> None:
+    came = [50.0 + k for k in range(n)]
+    assert (after(came).intervals_ns(HAND) / MS).tolist() == came[-16:]
+
+
 def test_triangles_that_never_come_are_missing_and_those_of_cut_sweeps_are_not() -> None:
     known, all_of = ledger(), enabled(HAND)
     lowest = all_of & -all_of

@@ -188,7 +188,7 @@ class Accusations:
             elif not late:
                 continue
             self._settled.add((trouble.name, began_ns))
-            if not trouble.must & said and self._is_plain(trouble, began_ns):
+            if not trouble.must & said and self._is_plain(trouble, began_ns) and trouble.shows():
                 wanted = " or ".join(sorted(trouble.must))
                 return f"{trouble.about}: health lacks {wanted} after {trouble.within_s:g} s"
         return None

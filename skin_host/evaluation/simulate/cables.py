@@ -20,6 +20,7 @@ from skin_host.clock import Clock
 from skin_host.config.settings import Bus
 from skin_host.errors import BusError
 from skin_host.evaluation.simulate.trace import Trace
+from skin_host.health.describe import FEWEST_INTERVALS, SIGMA
 
 #: Frames that wait to be read; more are dropped and counted, as a socket does.
 BUFFER_FRAMES = 4000
@@ -97,6 +98,7 @@ class Sent:
 
     Attributes:
         bursts: by address, how many sweeps began.
+        begun_ns: by address, when the last ones began.
     """
 
     def __init__(self) -> None:
@@ -112,6 +114,7 @@ class Sent:
             int, tuple[NDArray[np.uint32], NDArray[np.uint8], tuple[int, ...] | None]
         ] = {}
         self.bursts: dict[int, int] = {}
+        self.begun_ns: dict[int, deque[int]] = {}
         self._last_ns: dict[int, int] = {}
 
     def note(self, batch: FrameBatch) -> None:
@@ -133,7 +136,7 @@ class Sent:
             return False
         if last_ns - first_ns > PAIR_NS:
             return False
-        self.bursts[address] = self.bursts.get(address, 0) + 1
+        self._note_begin(address, first_ns)
         self._last_ns[address] = last_ns
         known = self._sweeps.get(address)
         if known is None or known[0] != keys:
@@ -143,6 +146,23 @@ class Sent:
         answered = not any(octets[15::16]) or not any(octet & ERROR for octet in octets[15::16])
         known[1].append(_Sweep(octets, values, answered, batch.t_ns))
         return True
+
+    def _note_begin(self, address: int, t_ns: int) -> None:
+        self.bursts[address] = self.bursts.get(address, 0) + 1
+        begun_ns = self.begun_ns.get(address)
+        if begun_ns is None:
+            begun_ns = self.begun_ns[address] = deque(maxlen=KEPT)
+        begun_ns.append(t_ns)
+
+    def scatter_ms(self, address: int, since_ns: int) -> float:
+        """Return the scatter of a board's intervals since a time, a standard deviation from their
+        median deviation; 0 if there are few.
+        """
+        begun_ns = [t_ns for t_ns in self.begun_ns.get(address, ()) if t_ns >= since_ns]
+        intervals_ms = np.diff(begun_ns) / 1e6
+        if len(intervals_ms) < FEWEST_INTERVALS:
+            return 0.0
+        return float(SIGMA * np.median(np.abs(intervals_ms - np.median(intervals_ms))))
 
     def _keys_of(
         self, ids: NDArray[np.uint32], lengths: NDArray[np.uint8]
@@ -189,7 +209,7 @@ class Sent:
             if address in self._sweeps:
                 self._spread(address)
             if t_ns - self._last_ns.get(address, -PAUSE_NS) >= PAUSE_NS:
-                self.bursts[address] = self.bursts.get(address, 0) + 1
+                self._note_begin(address, t_ns)
             self._last_ns[address] = t_ns
             half = self._half.get(key)
             # A bus that was full passes sweeps close together, and one may have lost its first

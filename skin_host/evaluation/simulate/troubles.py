@@ -16,6 +16,7 @@ from skin_host.bus.port import LinkState
 from skin_host.evaluation.simulate.cables import Mischief
 from skin_host.evaluation.simulate.disk import FULL, READ_ONLY
 from skin_host.evaluation.simulate.world import World
+from skin_host.health.diagnosis import JITTER_SHARE
 from skin_host.layout import PadKind
 
 Triangle = tuple[str, int]
@@ -81,6 +82,8 @@ _BUS |= {"bus_silent", "board_overflows", "fingertip_loses_frames"}
 _SWAPPED = _CHIPS | _SET_UP | {"part_temperature"}
 #: Until a calibration at rest.
 FOR_EVER_S = 1e6
+#: Health sees few intervals at a time: one that is as far as this beyond its limit is named.
+SURE_SCATTER = 1.25
 #: A broker ends the connection of a client from which nothing came for longer.
 KEEP_ALIVE_S = 10.0
 #: While it lasts, the chip that it names does not measure.
@@ -88,6 +91,15 @@ SILENCING = {"chip_gone"}
 #: Nothing but the chip that it names sends what is wrong.
 ALONE = {"no_acknowledge"}
 _BROKER = {"broker_away", "touches_dropped", "broker_refuses", "node_name_taken", "broker_rejects"}
+
+
+def _nothing() -> None:
+    """It is over already."""
+
+
+def _always() -> bool:
+    """It shows."""
+    return True
 
 
 @dataclass
@@ -107,6 +119,7 @@ class Trouble:
             know, and for `recovers_s` afterwards.
         lingers: what it did lasts until it is put right.
         writes: it shows only when something is written.
+        shows: whether what passed over the buses has shown it so far.
         lasts_s: shortest and longest; no time at all for what happens at once.
     """
 
@@ -122,6 +135,7 @@ class Trouble:
     recovers_s: float = 3.0
     lingers: bool = False
     writes: bool = False
+    shows: Callable[[], bool] = _always
     lasts_s: tuple[float, float] = (0.2, 15.0)
 
     def accuses(self, code: str, where: str) -> bool:
@@ -134,10 +148,6 @@ class Trouble:
 #: Takes the world, what draws target and strength, and whether it is to be so strong that health
 #: must name it (if it must at any strength).
 Begin = Callable[[World, random.Random, bool], Trouble]
-
-
-def _nothing() -> None:
-    """It is over already."""
 
 
 def _triangle(world: World, chance: random.Random) -> Triangle:
@@ -263,10 +273,21 @@ def _emulated(
             spoiled,
             recovers_s,
             lingers,
+            shows=_scatters(world, board) if name == "jittered_period" else _always,
             lasts_s=lasts_s,
         )
 
     return begin
+
+
+def _scatters(world: World, board: str) -> Callable[[], bool]:
+    """Return a function: whether a board's sweeps have been irregular on their bus since now. Those
+    that are ready while more urgent ones pass begin when these have passed.
+    """
+    settings = next(one.settings for one in world.layout.boards if one.name == board)
+    sent, since_ns = world.cables[settings.bus].sent, world.clock.monotonic_ns()
+    sure_ms = SURE_SCATTER * JITTER_SHARE * settings.period_ms
+    return lambda: sent.scatter_ms(settings.address, since_ns) > sure_ms
 
 
 def _frames(

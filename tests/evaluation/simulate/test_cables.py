@@ -70,3 +70,20 @@ def test_what_two_boards_at_one_address_send_in_the_longest_stall_is_known() -> 
         ids, data = encode_sweep(1, np.array([0]), raw, np.zeros(1, np.uint16))
         sent.note(FrameBatch(ids, np.full(2, 8, np.uint8), data, np.full(2, 25 * MS * number)))
     assert list(sent.find(1, 0, values[0].tobytes()))
+
+
+def test_an_irregular_board_shows_by_when_its_sweeps_begin() -> None:
+    """Not one whose sweeps all wait until the bus is free, nor what was before."""
+    sent = Sent()
+    rng = np.random.default_rng(1)
+    ids, data = encode_sweep(1, np.array([0]), np.zeros((1, 12), np.uint8), np.zeros(1, np.uint16))
+    for number in range(100):
+        late_ns = round(abs(rng.normal(0.0, 6.0 * MS))) * (number < 50)
+        begins_ns = 50 * MS * number + max(late_ns, 0 if number < 25 else 20 * MS)
+        times_ns = np.array([begins_ns, begins_ns + MS // 8])
+        sent.note(FrameBatch(ids, np.full(2, 8, np.uint8), data, times_ns))
+        if number == 24:
+            assert 3.0 < sent.scatter_ms(1, 0) < 7.0
+    assert sent.scatter_ms(1, 25 * 50 * MS) < 0.1
+    assert sent.scatter_ms(1, 95 * 50 * MS) == 0.0
+    assert sent.scatter_ms(2, 0) == 0.0
