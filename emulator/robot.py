@@ -377,7 +377,10 @@ class Robot:
         Raises:
             ConfigurationError: there is no such part, triangle or taxel.
         """
-        return LiveProbe(self, self.skin.add_live(probe))
+        bare = probe.part in self.fingertips.boards
+        live = LiveProbe(self, None if bare else self.skin.add_live(probe))
+        self.fingertips.touch(probe, self.layout, live.pressing_n)
+        return live
 
     def inject(self, fault: Fault) -> Callable[[], None]:
         """Let a fault begin now; it ends by itself after `until_s - at_s`, or by the answer.
@@ -475,14 +478,25 @@ class Robot:
 
 
 class LiveProbe:
-    """A probe in a program's hand, see `Robot.touch`."""
+    """A probe in a program's hand, see `Robot.touch`.
 
-    def __init__(self, robot: Robot, number: int) -> None:
+    Args:
+        robot: that it touches.
+        number: among the probes on its skin; None on a fingertip without skin.
+    """
+
+    def __init__(self, robot: Robot, number: int | None) -> None:
         self._robot = robot
         self._number = number
+        self._drive_n = 0.0
 
     def press(self, drive: float, x_mm: float = 0.0, y_mm: float = 0.0) -> None:
-        """Press from now on with a force (N), or to a depth (mm) if it is driven by depth."""
+        """Press from now on with a force (N), or to a depth (mm) if it is driven by depth; on skin
+        also somewhere else.
+        """
+        if self._number is None:
+            self._drive_n = drive
+            return
         self._robot.skin.set_live(self._number, drive, x_mm, y_mm)
         self._robot.work_out_now()
 
@@ -493,6 +507,12 @@ class LiveProbe:
     @property
     def force_n(self) -> float:
         """Force on it at the last step of the mechanics; 0 off the skin."""
+        return self.pressing_n()
+
+    def pressing_n(self) -> float:
+        """Return `force_n`."""
+        if self._number is None:
+            return self._drive_n
         return self._robot.skin.contact_force_n().get(self._number, 0.0)
 
 

@@ -18,7 +18,7 @@ import msgspec
 from skin_host.errors import RequestError
 from skin_host.files import read_whole
 
-MAGIC = b"skin-emulator-state/6\n"
+MAGIC = b"skin-emulator-state/7\n"
 DIGEST_BYTES = 32
 #: More than a robot of 100 000 taxels needs.
 MOST_BYTES = 2_000_000_000

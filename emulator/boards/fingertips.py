@@ -189,8 +189,9 @@ class Fingertips:
             for i, probe in enumerate(scene.probe):
                 if probe.part not in (name, tip.array):
                     continue
+                force_n = None if probe.part == name else partial(self._force_on_skin, i)
                 try:
-                    presses.append(self._press(i, name, tip, probe, layout))
+                    presses.append(self._press(name, tip, probe, layout, force_n))
                 except ConfigurationError as error:
                     raise ConfigurationError(f"probe[{i}].{error}") from None
             rng = np.random.default_rng([scene.seed, 6, number])
@@ -228,6 +229,11 @@ class Fingertips:
         """How far what presses on a fingertip has slid over it since it was put there."""
         return max((press.slipped_mm for press in self._presses[name]), default=0.0)
 
+    def force_n(self, name: str, t_ns: int) -> Floats:
+        """Force (N) of all that presses on a fingertip at a time, float64[3]."""
+        force: Floats = sum((press.wrench(t_ns)[:3] for press in self._presses[name]), np.zeros(3))
+        return force
+
     def step(self, t_ns: int) -> list[tuple[str, FrameBatch]]:
         """Bring all boards to `t_ns`; the frames that they send, by bus."""
         return [
@@ -248,8 +254,28 @@ class Fingertips:
     def _force_on_skin(self, number: int) -> float:
         return self._skin_force_n().get(number, 0.0)
 
+    def touch(self, probe: Probe, layout: Layout, force_n: Callable[[], float]) -> None:
+        """Add a probe that a program moves, if it is on a fingertip.
+
+        Args:
+            probe: its keyframes are not used.
+            layout: of the skin.
+            force_n: returns with what force it presses now.
+
+        Raises:
+            ConfigurationError: it cannot be on its fingertip.
+        """
+        for name, tip in self._tips.items():
+            if probe.part in (name, tip.array):
+                self._presses[name].append(self._press(name, tip, probe, layout, force_n))
+
+    @staticmethod
     def _press(
-        self, number: int, name: str, tip: Fingertip, probe: Probe, layout: Layout
+        name: str,
+        tip: Fingertip,
+        probe: Probe,
+        layout: Layout,
+        force_n: Callable[[], float] | None,
     ) -> "_Press":
         if probe.part == name:
             if tip.array is not None:
@@ -257,35 +283,32 @@ class Fingertips:
             if probe.by_depth:
                 raise ConfigurationError("depth_mm: a fingertip without skin is driven by a force")
             point, normal = place_on(tip, probe)
-            return _Press(probe, point, normal, partial(self._force_on_skin, number))
+            return _Press(probe, point, normal, force_n)
         point_m, normal = resolve(probe.at, probe.part, layout)
-        return _Press(
-            probe,
-            1e3 * point_m,
-            normal,
-            partial(self._force_on_skin, number),
-            on_skin=True,
-        )
+        return _Press(probe, 1e3 * point_m, normal, force_n)
 
 
 class _Press:
-    """One probe on a fingertip, and the object that its pull hangs on."""
+    """One probe on a fingertip, and the object that its pull hangs on.
+
+    Args:
+        probe: of it.
+        point_mm, normal: its place.
+        force_n: returns with what force it presses now; by the probe's keyframes if None.
+    """
 
     def __init__(
         self,
         probe: Probe,
         point_mm: Floats,
         normal: Floats,
-        skin_force_n: Callable[[], float],
-        *,
-        on_skin: bool = False,
+        force_n: Callable[[], float] | None,
     ) -> None:
         self._probe = probe
         self._point_mm = point_mm
         self._normal = normal
         self._along = tangents(normal)
-        self._skin_force_n = skin_force_n
-        self._on_skin = on_skin
+        self._force_n = force_n
         turn = np.deg2rad(probe.tangential_deg)
         self._pull = np.cos(turn) * self._along[0] + np.sin(turn) * self._along[1]
         self._object: HeldObjects | None = None
@@ -302,7 +325,7 @@ class _Press:
         phase_s = 1e-9 * t_ns - probe.start_s
         if probe.repeat_s and phase_s >= 0.0:
             phase_s %= probe.repeat_s
-        normal_n = self._skin_force_n() if self._on_skin else _value(probe.drive, phase_s)
+        normal_n = _value(probe.drive, phase_s) if self._force_n is None else self._force_n()
         force = -normal_n * self._normal
         if probe.tangential_n is not None:
             force = force + self._held_n(normal_n, phase_s, t_ns) * self._pull

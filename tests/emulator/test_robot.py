@@ -361,6 +361,29 @@ def test_a_program_can_slide_its_probe_to_another_taxel() -> None:
     assert not robot.true_pressure_kpa("left_forearm").any()
 
 
+def test_what_a_program_presses_loads_the_fingertip_below_it() -> None:
+    settings, layout = load("fingertips")
+    robot = Robot(settings, layout, Scene(noise=False))
+    robot.bring_up()
+    covered = robot.touch(Probe(part="thumb_skin", at=Place(taxel=3), force_n=[(0.0, 0.0)]))
+    bare = robot.touch(Probe(part="index", force_n=[(0.0, 0.0)]))
+
+    def loads_n() -> list[float]:
+        robot.step(0.1)
+        return [
+            float(np.linalg.norm(board._load(robot.t_ns)[:3] - board._load._offset[:3]))
+            for board in robot.fingertips.boards.values()
+        ]
+
+    assert loads_n() == pytest.approx([0.0, 0.0], abs=1e-9)
+    covered.press(2.0)
+    bare.press(3.0)
+    assert loads_n() == pytest.approx([3.0, 2.0], rel=0.01)
+    covered.lift()
+    bare.lift()
+    assert loads_n() == pytest.approx([0.0, 0.0], abs=1e-9)
+
+
 GRASP_LOG = CONFIG.parent / "../shared/data/icub_grasp.log"
 
 

@@ -74,6 +74,8 @@ ALWAYS = {
 }
 #: One pad in twenty of real skin is so noisy that a calibration refuses it.
 NOISE = {"taxel_refused", "taxel_noisy", "taxel_saturates"}
+#: A fingertip that was loaded when its zero was taken is as noisy as that, and touched afterwards.
+OF_LOADS = {"fingertip_noisy", "fingertip_held"}
 #: A trouble is plain if nothing else happened for so long before it, nor a start for longer.
 QUIET_NS = 10 * NS
 STARTED_NS = 15 * NS
@@ -98,6 +100,8 @@ class Accusations:
         self.required: set[str] = set()
         self.named: set[str] = set()
         self.troubles: list[tuple[Trouble, int, int | None]] = []
+        #: Fingertips whose zero may be of a load.
+        self.loaded: set[str] = set()
         self._faults: dict[str, set[tuple[str, str]]] = {}
         #: Parts with pads of real skin that have been stuck from the first.
         held = ~np.isnan(world.robot.skin.held_ff)
@@ -137,6 +141,14 @@ class Accusations:
             for trouble, _, over in self.troubles
         )
 
+    def may_damage(self, tip: str) -> bool:
+        """Whether something damages what a fingertip's board sends, or did so lately."""
+        now_ns = self._world.clock.monotonic_ns()
+        return any(
+            trouble.accuses("fingertip_noisy", tip) and (over is None or now_ns - over < QUIET_NS)
+            for trouble, _, over in self.troubles
+        )
+
     def restarted(self) -> None:
         """Another daemon has reported nothing yet."""
         self.codes.clear()
@@ -156,6 +168,8 @@ class Accusations:
 
     def _has_cause(self, code: str, where: str) -> bool:
         if code in ALWAYS or (code in NOISE and self._world.real_noise):
+            return True
+        if code in OF_LOADS and where in self.loaded:
             return True
         if code == "taxel_stuck" and where in self._stuck:
             return True

@@ -54,6 +54,8 @@ CAUSE_NS = 3 * NS
 RELAXED_NS = 60 * NS
 #: A calibration at rest began no longer ago when it is noted.
 RESTING_NS = 8 * NS
+#: A fingertip is loaded from a small force on, and must be felt from a larger one on.
+LOADED_N, FELT_N = 0.05, 1.0
 #: A board that is set up has so many tasks, and all else no more than this.
 TASKS_OF_BOARD = 2
 MOST_TASKS = 60
@@ -219,6 +221,9 @@ class Promises:
         #: Calibrations in the order in which they were taken, and the last that was surely kept.
         self._calibrations: list[str] = []
         self.kept = -1
+        #: When each fingertip on a force/torque board was last loaded, and was not loaded firmly.
+        self._loaded_ns = dict.fromkeys(world.settings.fingertips, -(1 << 62))
+        self._eased_ns = dict.fromkeys(world.settings.fingertips, -(1 << 62))
         #: When each taxel was last seen not to be pressed between two samples.
         self._paused_ns = np.full(layout.n_taxels, -(1 << 62), np.int64)
         world.before_press = self._note_pause
@@ -281,6 +286,7 @@ class Promises:
         long_ago = self._calibrated_touched_ns < self._now_ns() - RESTING_NS
         self._calibrated_touched_ns[long_ago] = -(1 << 62)
         self._exempt[:] = False
+        self.accusations.loaded.clear()
         self._spoiled_until_ns[:] = self._now_ns()
         self.accusations.repaired()
 
@@ -641,6 +647,7 @@ class Promises:
             self._exempt_zeroed(life, truth)
             if life.daemon.engine.calibration is not None:
                 self._note_calibration(life.daemon.engine.calibration.id)
+        self._note_loads(life, now_ns)
         if life is None or life.dead or len(self._truth) < SAMPLES:
             return
         spoiled = self._spoiled()
@@ -690,12 +697,41 @@ class Promises:
                     "while nothing presses it"
                 )
         if not life.stop.is_set():  # a daemon that ends reads no more, and stops the boards
+            self._fingertips(life, now_ns)
             self._missed_boards(now_ns)
         unnamed = self.accusations.unnamed()
         if unnamed is not None:
             self.break_(unnamed)
         if len(asyncio.all_tasks()) > MOST_TASKS + TASKS_OF_BOARD * len(world.layout.boards):
             self.break_(f"{len(asyncio.all_tasks())} tasks run")
+
+    def _note_loads(self, life: Life | None, now_ns: int) -> None:
+        """Note which fingertips are loaded, and which zeros may be of a load."""
+        tips = self._world.robot.fingertips
+        calibrating = life is not None and life.daemon.engine.calibrating
+        for name in self._loaded_ns:
+            force_n = float(np.linalg.norm(tips.force_n(name, now_ns)))
+            if force_n > LOADED_N:
+                self._loaded_ns[name] = now_ns
+            if force_n < FELT_N:
+                self._eased_ns[name] = now_ns
+            if calibrating and now_ns - self._loaded_ns[name] < NS:
+                self.accusations.loaded.add(name)
+
+    def _fingertips(self, life: Life, now_ns: int) -> None:
+        """A fingertip whose zero is of no load is touched while it is loaded, and only then."""
+        engine = life.daemon.engine.fingertips
+        for name, state in ({} if engine is None else engine.tips).items():
+            if name in self.accusations.loaded or self.accusations.may_damage(name):
+                continue
+            # What it sent lately waits to be read after a stall.
+            if not state.tip.feels or abs(self._world.clock.now_ns() - state.last_ns) > NS // 2:
+                continue
+            if state.tip.touched and now_ns - self._loaded_ns[name] > CAUSE_NS:
+                self.break_(f"{name}: still touched, and nothing presses")
+            threshold_n = state.tip.threshold_n
+            if not state.tip.touched and now_ns - self._eased_ns[name] > PAUSE_NS:
+                self.break_(f"{name}: not touched while it is pressed, from {threshold_n:.2f} N on")
 
     def _note_pause(self) -> None:
         """Something is about to be pressed; what was lifted just before has not been sampled."""

@@ -309,13 +309,16 @@ class _Run:
         world = self.world
         world.note("storm")
         end_s = world.clock.monotonic_s() + STORM_S
+        works = [
+            (self._trouble, TROUBLE_S),
+            (self._press, PRESS_S),
+            (self._request, REQUEST_S),
+            (self._die, DEATH_S),
+        ]
+        if world.tips:
+            works.append((self._press_tip, PRESS_S))
         async with asyncio.TaskGroup() as group:
-            for work, mean_s in (
-                (self._trouble, TROUBLE_S),
-                (self._press, PRESS_S),
-                (self._request, REQUEST_S),
-                (self._die, DEATH_S),
-            ):
+            for work, mean_s in works:
                 group.create_task(self._now_and_then(work, mean_s, end_s, group))
 
     async def _now_and_then(
@@ -378,6 +381,15 @@ class _Run:
                 self.world.clock.call_later(self._chance.uniform(1.0, 2.0), self._meddle, spot)
             # A tap of one sweep cannot be distinguished from a byte that was off for one sweep.
             await spot.press(max(SHORT_S[0], min(left_s, seconds)))
+
+    async def _press_tip(self, left_s: float) -> None:
+        """As `_press`, a fingertip without skin."""
+        tip = self._chance.choice(self.world.tips)
+        if not tip.pressed:
+            seconds = self._chance.uniform(
+                *(LONG_S if self._chance.random() < LONG_SHARE else SHORT_S)
+            )
+            await tip.press(max(SHORT_S[0], min(left_s, seconds)))
 
     def _meddle(self, spot: Spot) -> None:
         """An operator does something to what is pressed."""
@@ -501,7 +513,7 @@ class _Run:
     async def _press_all(self, seconds: float) -> None:
         """Press every place firmly for a while."""
         async with asyncio.TaskGroup() as group:
-            for spot in self.world.spots:
+            for spot in [*self.world.spots, *self.world.tips]:
                 group.create_task(spot.press(seconds, self._staging.uniform(*FIRM_KPA)))
 
     async def _reset_in_a_press(self) -> None:

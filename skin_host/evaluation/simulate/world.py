@@ -135,6 +135,11 @@ class World:
         #: By how much the robot's time is ahead of the computer's, which was suspended.
         self.slept_ns = 0
         self.spots = [Spot(self, self.chance) for _ in range(SPOTS)]
+        self.tips = [
+            Tip(self, self.chance, name)
+            for name, tip in settings.fingertips.items()
+            if tip.array is None
+        ]
         #: Looks at the skin just before a place is pressed: pauses may be shorter than samples.
         self.before_press: Callable[[], object] = lambda: None
         self.power_failed = asyncio.Event()
@@ -194,27 +199,22 @@ class World:
         self.trace.note(self.clock.monotonic_ns(), text)
 
 
-class Spot:
-    """A place on the skin that is pressed now and then."""
+class Target:
+    """A place that is pressed now and then.
 
-    def __init__(self, world: World, chance: random.Random) -> None:
-        part = chance.choice(world.layout.parts)
-        self.part = part.name
-        self.taxel = chance.randrange(part.n_taxels)
-        diameter_mm = chance.choice((4.0, 8.0, 12.0))
-        self._area_mm2 = np.pi / 4 * diameter_mm**2
+    Args:
+        world: that it is in.
+        chance: draws how it is pressed.
+        probe: what presses it.
+        about: the place, for people.
+    """
+
+    def __init__(self, world: World, chance: random.Random, probe: Probe, about: str) -> None:
         self._world = world
         self._chance = chance
-        self._probe: LiveProbe = world.robot.touch(
-            Probe(
-                # Skin without its cover feels only what is earthed.
-                kind="disc" if part.covered else "grounded",
-                part=part.name,
-                at=Place(taxel=self.taxel),
-                diameter_mm=diameter_mm,
-                force_n=[(0.0, 0.0)],
-            )
-        )
+        self._probe: LiveProbe = world.robot.touch(probe)
+        self._area_mm2 = np.pi / 4 * probe.diameter_mm**2
+        self._about = about
         self.pressed = False
 
     async def press(self, seconds: float, kpa: float | None = None) -> None:
@@ -222,7 +222,7 @@ class Spot:
         world = self._world
         if kpa is None:
             kpa = self._chance.uniform(20.0, 80.0)
-        world.note(f"press {self.part}/{self.taxel} {kpa:.0f} kPa for {seconds:.1f} s")
+        world.note(f"press {self._about} {kpa:.0f} kPa for {seconds:.1f} s")
         self.pressed = True
         world.move()
         world.before_press()
@@ -235,5 +235,31 @@ class Spot:
         finally:
             world.move()
             self._probe.lift()
-            world.note(f"lift {self.part}/{self.taxel}")
+            world.note(f"lift {self._about}")
             self.pressed = False
+
+
+class Spot(Target):
+    """One on the skin."""
+
+    def __init__(self, world: World, chance: random.Random) -> None:
+        part = chance.choice(world.layout.parts)
+        self.part = part.name
+        self.taxel = chance.randrange(part.n_taxels)
+        probe = Probe(
+            # Skin without its cover feels only what is earthed.
+            kind="disc" if part.covered else "grounded",
+            part=part.name,
+            at=Place(taxel=self.taxel),
+            diameter_mm=chance.choice((4.0, 8.0, 12.0)),
+            force_n=[(0.0, 0.0)],
+        )
+        super().__init__(world, chance, probe, f"{self.part}/{self.taxel}")
+
+
+class Tip(Target):
+    """A fingertip without skin, which only its force/torque board feels."""
+
+    def __init__(self, world: World, chance: random.Random, name: str) -> None:
+        probe = Probe(part=name, diameter_mm=8.0, force_n=[(0.0, 0.0)])
+        super().__init__(world, chance, probe, name)

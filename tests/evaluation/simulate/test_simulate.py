@@ -4,13 +4,18 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from skin_host.bus.strain import Wrench
 from skin_host.cli.common import load_skin
 from skin_host.demo import configuration
 from skin_host.evaluation.simulate.run import RunResult, simulate, simulate_all
+from skin_host.fingertip.events import FingertipEvent
+from skin_host.fingertip.tip import Tip
 
 pytestmark = pytest.mark.long
 
@@ -52,6 +57,21 @@ def test_the_zero_of_noisy_pads_is_known_before_they_are_valid_after_a_set_up() 
     settings, layout = load_skin(icub)
     result = simulate(settings, layout, icub, 1, 72.0, until_s=31.0)
     assert result.broken is None, "\n".join([*result.last, result.broken])
+
+
+def test_a_fingertip_that_does_not_feel_what_presses_it_breaks_a_promise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    step = Tip.step
+
+    def feel_nothing(tip: Tip, wrench: Wrench) -> list[FingertipEvent]:
+        offset = np.zeros(6) if tip._zero is None else tip._zero.offset
+        return step(tip, replace(wrench, force_n=offset[:3], torque_nm=offset[3:]))
+
+    monkeypatch.setattr(Tip, "step", feel_nothing)
+    result = run(101, configuration("fingertips.toml"), until_s=11.0)
+    assert result.broken is not None
+    assert "not touched while it is pressed" in result.broken
 
 
 def test_the_same_seed_gives_the_same_events_in_another_process(tmp_path: Path) -> None:
