@@ -313,6 +313,12 @@ def test_the_uncertainty_of_a_place_falls_with_the_root_of_its_taxels():
     assert 0.1e-3 < many.sigma_m < few.sigma_m < 2e-3
 
 
+def test_the_uncertainty_of_a_place_grows_with_the_distance_of_taxels_wherever_the_part_is():
+    wide = replace(LAYOUT, position_m=2.0 * LAYOUT.position_m + 1.0)
+    (event,), (usual,) = Skin(wide).show(HERE), Skin().show(HERE)
+    assert event.sigma_m == pytest.approx(2.0 * usual.sigma_m)
+
+
 def test_the_place_of_a_pad_without_neighbours_is_as_certain_as_the_pad():
     alone = replace(LAYOUT, neighbour_start=np.zeros_like(LAYOUT.neighbour_start))
     (event,) = Skin(alone).show({0})

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -7,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skin_host.config.relaxation import MODELS
-from skin_host.config.settings import Processing
+from skin_host.config.settings import Processing, Settings
 from skin_host.evaluation.rig import Rig, flat_skin
-from skin_host.layout import PadKind
+from skin_host.layout import PadKind, build_layout
 from skin_host.processing.calibration import Calibrator, Verdict
 from skin_host.processing.pipeline import Pipeline
 from skin_host.processing.pressure import PressureCurve
@@ -543,3 +544,88 @@ def test_what_a_taxel_read_before_its_calibration_does_not_move_its_new_zero():
     for _ in range(40):
         rig.step(0.0)
     assert rig.pipeline.baseline == pytest.approx(rig.calibration.baseline, abs=0.5)
+
+
+def test_a_calibration_of_taxels_forgets_what_a_hard_press_left():
+    rig = Rig(1, 0.3, processing=NO_RELAXATION)
+    press(rig, 45.0, 50)
+    press(rig, 0.0, 5)
+    rig.pipeline.renew(rig.settings.processing, rig.calibration, np.ones(rig.n, bool))
+    assert any(frame.touched.any() for frame in press(rig, 2.0, 50))
+
+
+@pytest.mark.parametrize("units", [25.0, 110.0])
+def test_what_is_reported_and_what_the_foam_takes_are_together_what_the_curve_reads(units):
+    rig = Rig(1, 0.0)
+    press(rig, 40.0, 1500)
+    frame = press(rig, units, 3)[-1]
+    taken = rig.pipeline.relaxation_kpa[:6]
+    read = (rig.layout.no_load - rig.pipeline.baseline - frame.raw)[:6]
+    assert taken.min() > 5.0
+    assert frame.pressure_kpa[:6] + taken == pytest.approx(CURVE.kpa(read), rel=0.01)
+
+
+def two_parts():
+    """A skin of two parts of one board each, with temperature pads."""
+    patch = {"triangles": "0-15", "kind": "triangle_10pad", "shift": 3}
+    skin = msgspec.convert(
+        {
+            "robot": "two",
+            "buses": {"can0": {}},
+            "boards": {
+                name: {"bus": "can0", "address": number}
+                for number, name in enumerate(("a", "b"), start=1)
+            },
+            "parts": {
+                name: {
+                    "foam_mm": 2.0,
+                    "patches": [{"board": board, **patch}],
+                }
+                for name, board in (("first", "a"), ("second", "b"))
+            },
+        },
+        Settings,
+    )
+    return skin, build_layout(skin, Path())
+
+
+def test_a_part_is_processed_alike_whatever_part_comes_before_it():
+    rig = Rig(1, 0.4, kind="triangle_10pad", hz=10.0, seed=8)
+    n = rig.n
+    skin, layout = two_parts()
+    present = np.ones(n, bool)
+    calibrator = Calibrator(layout)
+    for number in range(100):
+        calibrator.add(0, np.full(n, 230 - number % 2, np.uint8), present)
+        calibrator.add(1, rig.read(0.0), present)
+    found = calibrator.finish("x", "t")
+    both = Pipeline(layout, skin.processing, found)
+    arrays = ("baseline", "percentile", "noise", "spread", "gain", "bend", "verdict")
+    second = {name: getattr(found, name)[n:] for name in arrays}
+    alone_found = replace(rig.calibration, **second)
+    alone = Pipeline(rig.layout, skin.processing, alone_found)
+    pressed = np.arange(n) < 24
+    for sweep in range(900):
+        t_ns = sweep * 100_000_000
+        raw = rig.read(np.where(pressed, 25.0 * (100 <= sweep < 500), -0.002 * sweep))
+        # The first part is touched when the second is not.
+        other = np.full(n, 230 - 40 * (sweep >= 500), np.uint8)
+        assert both.step(0, other, present, t_ns).touched.any() == (sweep > 500)
+        one, same = alone.step(0, raw, present, t_ns), both.step(1, raw, present, t_ns)
+        assert same.part == "second"
+        assert np.array_equal(same.touched, one.touched)
+        assert np.array_equal(same.valid, one.valid)
+        assert same.pressure_kpa == pytest.approx(one.pressure_kpa)
+    assert both.baseline[n:] == pytest.approx(alone.baseline)
+    assert both.decides_kpa(1) == alone.decides_kpa(0)
+    some = np.arange(12, dtype=np.int32)
+    for pipeline, before in ((both, n), (alone, 0)):
+        zeroed = np.zeros(before + n, bool)
+        zeroed[before + 24 :] = True
+        pipeline.renew(skin.processing, found if before else alone_found, zeroed)
+        pipeline.set_zero(before + some, np.full(12, 30.0))
+    assert both.baseline[n:] == pytest.approx(alone.baseline)
+    raw[some] = 255 - 30
+    assert np.array_equal(
+        both.step(1, raw, present, t_ns).touched, alone.step(0, raw, present, t_ns).touched
+    )

@@ -1,8 +1,9 @@
 """Changes of the code that cosmic-ray does not make: what a line does is left out, or mixed up.
 
 cosmic-ray changes operators, numbers and words; each line still runs. These leave out a call, a
-value kept in an object, an early return or a raised error, and exchange a call's first two
-arguments. A local variable is always set: without it nothing runs, which any test notices.
+value kept in an object, another value of a local variable, an early return or a raised error, and
+exchange a call's first two arguments. A local variable's first value is always set: without it
+nothing runs, which any test notices.
 """
 
 from collections.abc import Iterator
@@ -77,7 +78,30 @@ def _has_effect(statement: Any) -> bool:
     target, what = statement.children[:2]
     if what.type == "annassign":
         return target.type != "name" and len(what.children) > 2
-    return what.type == "operator" and (what.value != "=" or target.type != "name")
+    if what.type != "operator":
+        return False
+    return what.value != "=" or target.type != "name" or _has_value(target.value, statement)
+
+
+def _has_value(name: str, statement: Any) -> bool:
+    """Whether a local variable has a value before it gets another one in this statement."""
+    within = statement.parent
+    while within.type not in ("funcdef", "file_input"):
+        before = within.get_previous_sibling()
+        while before is not None:
+            if name in _assigned(before):
+                return True
+            before = before.get_previous_sibling()
+        within = within.parent
+    return within.type == "funcdef" and any(one.name.value == name for one in within.get_params())
+
+
+def _assigned(node: Any) -> list[str]:
+    """The local variables that a statement gives values."""
+    if node.type != "simple_stmt" or node.children[0].type != "expr_stmt":
+        return []
+    names = node.children[0].get_defined_names()
+    return [one.value for one in names if one.parent.type != "trailer"]
 
 
 def _can_swap(arguments: Any) -> bool:
