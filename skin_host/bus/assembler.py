@@ -85,6 +85,9 @@ class Sweep(NamedTuple):
         present: mask of triangles whose two frames came.
         t_ns: time of the sweep's last frame.
         missed: whole periods without any frame since the sweep before.
+        crowded: it, or a part of one since the last, began within half a period of the one before,
+            with a frame that was already in that: no board sends like that, but two at one address
+            do.
     """
 
     board: int
@@ -93,6 +96,7 @@ class Sweep(NamedTuple):
     present: int
     t_ns: int
     missed: int
+    crowded: bool = False
 
 
 class Assembled(NamedTuple):
@@ -219,6 +223,7 @@ class _BoardState:
             order from its first frame; their payloads are not among `values` yet.
         stray: sweeps in succession with frames in another order.
         learn_after: so many sweeps pass before the order is learnt.
+        crowded: see `Sweep`, since the last one that was returned.
     """
 
     index: int
@@ -246,6 +251,7 @@ class _BoardState:
     begun: bytes = b""
     stray: int = 0
     learn_after: int = 1
+    crowded: bool = False
 
     def unpack(self) -> None:
         """Take the payloads of the frames in `begun`."""
@@ -268,8 +274,6 @@ class Assembler:
         stranger_id: the most frequent identifier among motor frames, when these were last more than
             half of a batch; otherwise None.
         unconfigured: frames of the skin stream by address of a board that is not configured.
-        crowded: per board, sweeps that began within half a period of the previous one with a frame
-            that was already in it: no board sends like that, but two at one address do.
     """
 
     def __init__(
@@ -281,7 +285,6 @@ class Assembler:
         self.counters = AssemblerCounters()
         self.stranger_id: int | None = None
         self.unconfigured: Counter[int] = Counter()
-        self.crowded: Counter[int] = Counter()
         self._force_torque = force_torque
         self._states: dict[int, _BoardState] = {}
         # For identifier << 8 | header byte of each frame that a configured triangle may send: the
@@ -563,7 +566,8 @@ class Assembler:
             state.absent_for = [0] * TRIANGLES
             state.any_absent = False
         present = state.awaited & _ALL_TRIANGLES
-        sweeps.append(Sweep(state.index, raw, status, present, last_ns, missed))
+        sweeps.append(Sweep(state.index, raw, status, present, last_ns, missed, state.crowded))
+        state.crowded = False
         state.first_ns = state.sent_first_ns = first_ns
         state.last_ns = state.sent_last_ns = last_ns
         return n
@@ -643,7 +647,7 @@ class Assembler:
                 state.lone &= ~(bit << TRIANGLES | bit >> TRIANGLES)
                 return False
             if bit & state.sent and 0 < 2 * (t_ns - state.sent_first_ns) < state.period_ns:
-                self.crowded[state.index] += 1
+                state.crowded = True
             if state.lone:
                 self._count_lone(state)
             if t_ns > self._none_old_until_ns:
@@ -699,7 +703,9 @@ class Assembler:
             raw, status = triangles[:, :TAXELS], NO_STATUS
             if triangles[:, TAXELS:].tobytes() != _NO_STATUS:
                 status = triangles[:, TAXELS:].copy().view(">u2")[:, 0].astype(np.uint16)
-            sweeps.append(Sweep(state.index, raw, status, present, state.last_ns, missed))
+            t_ns = state.last_ns
+            sweeps.append(Sweep(state.index, raw, status, present, t_ns, missed, state.crowded))
+            state.crowded = False
         state.sent = got
         state.sent_first_ns = state.first_ns
         state.sent_last_ns = state.last_ns

@@ -11,6 +11,7 @@ back or forward changes nothing. While nothing is read, or old frames are read, 
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from statistics import median
 
 import numpy as np
@@ -40,8 +41,39 @@ MTB3_PERIODS = 6.0
 WRONG_PERIOD = 0.25
 #: For a regular board all intervals, except the longest and shortest fifth, lie within this share.
 UNEVEN = 0.1
+#: Two boards send at one address when so many times as many sweeps come as of one board, for this
+#: long, and some of them too soon after the one before.
+TWICE_SWEEPS = 1.4
+TWICE_NS = 2_000_000_000
+#: What waited while this computer was busy comes too soon as well, but in one burst.
+BURST_NS = 250_000_000
+#: It is over when so much time's sweeps of one board have come, none of them too soon.
+ALONE_NS = 1_000_000_000
+#: Of two boards, however far apart, one sweep a period does not come too soon, or fewer where
+#: frames are lost. Of one that sends far too often nearly all do.
+APART_SHARE = 0.7
+LEAST_APART_SHARE = 0.4
 _BITS = np.arange(TRIANGLES)
 _NO_STATUS = bytes(2 * TRIANGLES)
+
+
+@dataclass(slots=True)
+class _Crowd:
+    """Sweeps of a board of which some come too soon after the one before.
+
+    Attributes:
+        since_ns: time of the first that did, of those that are counted.
+        counted_ns, counted: time and number of the sweep from which on they are counted.
+        last_ns, last: time and number of the last that came too soon.
+        apart: how many of those that are counted did not.
+    """
+
+    since_ns: int
+    counted_ns: int
+    counted: int
+    last_ns: int
+    last: int
+    apart: int = 0
 
 
 class BoardLedger:
@@ -65,6 +97,8 @@ class BoardLedger:
         far: bool[b, 16, 12], pads that the last sweep's status words mark as far out of range.
         flagged: whether a board's last sweep had any status word that is not 0.
         absent: int64[b, 16], in how many sweeps in a row each enabled triangle has been missing.
+        twice: rows of boards at whose address a second one sends, each with the time of a sweep
+            since when: what comes is of one or the other.
         silences, resets, lost_set_ups, tx_overflows, rezeros: int64[b], how often it timed out,
             restarted by itself, sent something that it was not set up to send, reported that it had
             to drop frames, and was zeroed.
@@ -110,6 +144,8 @@ class BoardLedger:
             for period_ns in self._period_ns.tolist()
         ]
         self._since_set_up = [0] * n
+        self.twice: dict[int, int] = {}
+        self._crowds: dict[int, _Crowd] = {}
         self.silences = np.zeros(n, np.int64)
         self.resets = np.zeros(n, np.int64)
         self.lost_set_ups = np.zeros(n, np.int64)
@@ -143,6 +179,8 @@ class BoardLedger:
         if before is not None and self._since_set_up[row]:
             self._note_interval(row, sweep.t_ns - before.t_ns)
         self._since_set_up[row] += 1
+        if sweep.crowded or self._crowds:
+            self._note_crowd(row, sweep)
         if sweep.present != self._present[row]:
             self._present[row] = sweep.present
             self.present[row] = sweep.present >> _BITS & 1
@@ -247,6 +285,39 @@ class BoardLedger:
         fifth, usual_ns = len(intervals) // 5, float(median(intervals))
         spread_ns = intervals[-1 - fifth] - intervals[fifth]
         return usual_ns if spread_ns < UNEVEN * usual_ns else None
+
+    def _note_crowd(self, row: int, sweep: Sweep) -> None:
+        """Decide whether two boards send at an address.
+
+        By the sweeps alone, so that neither a silence nor a clock that is set ends it.
+        """
+        crowd, t_ns, number = self._crowds.get(row), sweep.t_ns, int(self.sweeps[row])
+        period_ns = int(self._period_ns[row])
+        if not sweep.crowded:
+            if crowd is not None:
+                crowd.apart += 1
+                passed_ns, came_ns = t_ns - crowd.last_ns, (number - crowd.last) * period_ns
+                if passed_ns < 0:
+                    crowd.last_ns, crowd.last = t_ns, number
+                elif ALONE_NS <= came_ns <= TWICE_SWEEPS * passed_ns:
+                    del self._crowds[row]
+                    self.twice.pop(row, None)
+            return
+        if crowd is None or not 0 <= t_ns - crowd.last_ns < ALONE_NS:
+            self._crowds[row] = _Crowd(t_ns, t_ns, number, t_ns, number)
+            return
+        crowd.last_ns, crowd.last = t_ns, number
+        if t_ns - crowd.since_ns < BURST_NS:
+            crowd.counted_ns, crowd.counted, crowd.apart = t_ns, number, 0
+        elif t_ns - crowd.since_ns >= TWICE_NS:
+            passed_ns = t_ns - crowd.counted_ns
+            apart = crowd.apart * period_ns / passed_ns
+            many = (number - crowd.counted) * period_ns > TWICE_SWEEPS * passed_ns
+            if many and apart > APART_SHARE:
+                self.twice.setdefault(row, crowd.since_ns)
+            elif apart < LEAST_APART_SHARE:
+                self.twice.pop(row, None)
+            self._crowds[row] = _Crowd(t_ns, t_ns, number, t_ns, number)
 
     def _note_interval(self, row: int, interval_ns: int) -> None:
         if not 0 < interval_ns < STALE_INTERVALS_NS:

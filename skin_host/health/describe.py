@@ -41,8 +41,6 @@ PAUSE_MS = 1.0
 FEWEST_INTERVALS = 8
 #: Ratio of standard deviation to median absolute deviation, for a normal distribution.
 SIGMA = 1.4826
-#: Regular intervals of less than this share of the period are those of one board.
-QUICK_SHARE = 0.45
 #: A shift of the whole part is measured on this many untouched taxels or more.
 FEWEST_RESTING = 12
 #: A triangle is missing when it was absent from this many sweeps in a row.
@@ -374,18 +372,8 @@ class Describer:
                 and jitter_ms > JITTER_SHARE * board.settings.period_ms
                 and self._is_held_up(index, period_seen_ms)
             )
-            period_ns = board.settings.period_ms * 1_000_000
-            record["twice"] = watch.is_twice(now_ns, period_ns) and not self._is_quick(
-                row, period_ns
-            )
+            record["twice"] = row in ledger.twice and not ledger.is_silent(row)
         return record
-
-    def _is_quick(self, row: int, period_ns: int) -> bool:
-        """Whether one board sends too often: its sweeps are regular. Those of two boards are too
-        where they fall half a period apart, but not closer.
-        """
-        seen_ns = self._engine.ledger.regular_period_ns(row)
-        return seen_ns is not None and seen_ns < QUICK_SHARE * period_ns
 
     def _is_held_up(self, index: int, period_ms: float) -> bool:
         """Whether a board's intervals scatter because its sweeps wait for those of more urgent

@@ -24,10 +24,6 @@ if TYPE_CHECKING:
 RATE_S = 2.0
 #: Length of "the last second" in records.
 RECENT_NS = 1_000_000_000
-#: Two boards at one address are reported when sweeps have come too soon for this long, and so many
-#: times as many as of one board: what waited while this computer was busy comes too soon as well.
-TWICE_NS = 2_000_000_000
-TWICE_SWEEPS = 1.4
 #: A bus without skin boards is silent after this long: force/torque boards send often.
 ALONE_NS = 200_000_000
 #: Foam that was pressed pushes for so long that a pad reads too much, as drift's `SETTLE_S`.
@@ -133,30 +129,6 @@ class BoardWatch:
 
     events: dict[str, int] = field(default_factory=dict)
     event_ns: dict[str, int] = field(default_factory=dict)
-    crowded: int = 0
-    crowded_since_ns: int = 0
-    crowded_ns: int = 0
-    sweeps_since: int = 0
-    sweeps: int = 0
-
-    def is_twice(self, now_ns: int, period_ns: int) -> bool:
-        """Whether two boards send at this address: for longer than after a stall of ours."""
-        lasted_ns = self.crowded_ns - self.crowded_since_ns
-        if lasted_ns < TWICE_NS or not 0 <= now_ns - self.crowded_ns < RECENT_NS:
-            return False
-        return (self.sweeps - self.sweeps_since) * period_ns > TWICE_SWEEPS * lasted_ns
-
-    def note_crowded(
-        self, count: int, sweeps: int, now_ns: int, then_ns: int, sweeps_then: int
-    ) -> None:
-        """Take in how many sweeps have come, now and at the look before, and how many of them too
-        soon after the one before.
-        """
-        if count != self.crowded:
-            if not 0 <= now_ns - self.crowded_ns < RECENT_NS:
-                # What came in a burst was sent since the look before.
-                self.crowded_since_ns, self.sweeps_since = then_ns, sweeps_then
-            self.crowded, self.crowded_ns, self.sweeps = count, now_ns, sweeps
 
     def note(self, counts: dict[str, int], now_ns: int) -> None:
         """Note which counters have risen."""
@@ -245,9 +217,6 @@ class Watch:
             for bus in engine.assemblers
         }
 
-        #: When the counters were last read, and how many sweeps of each board there were.
-        self._looked = 0, engine.ledger.sweeps.copy()
-
     def use(self, engine: Engine) -> None:
         """Continue with another engine, after a reload."""
         self._engine = engine
@@ -269,26 +238,18 @@ class Watch:
                 silent_after_ns=max(ledger.silent_after_ns[rows].tolist(), default=ALONE_NS),
                 awaited=bus in boards and boards[bus].awaits_all,
             )
-        (then_ns, then), self._looked = self._looked, (now_ns, ledger.sweeps.copy())
         counts = self._counts()
         if counts == self._noted:
             return
         self._noted = counts
         for index, watch in self.boards.items():
             watch.note(self._events(index, watch, boards), now_ns)
-            bus = self._engine.layout.boards[index].settings.bus
-            row, crowded = ledger.row[index], self._engine.assemblers[bus].crowded[index]
-            sweeps, sweeps_then = int(ledger.sweeps[row]), int(then[row])
-            watch.note_crowded(crowded, sweeps, now_ns, then_ns, sweeps_then)
 
     def _counts(self) -> tuple[object, ...]:
         """Return all that the boards are watched for: it rarely changes."""
         ledger = self._engine.ledger
         events = (ledger.rezeros, ledger.resets, ledger.lost_set_ups, ledger.tx_overflows)
-        return (
-            *(counts.tobytes() for counts in events),
-            *(dict(assembler.crowded) for assembler in self._engine.assemblers.values()),
-        )
+        return tuple(counts.tobytes() for counts in events)
 
     def _totals(self, bus: str, port: "Port | None") -> dict[str, int]:
         counters = self._engine.assemblers[bus].counters

@@ -519,6 +519,10 @@ class Engine:
                 self._note_return(sweep, silent_ns)
             if self.ledger.flagged[row] or self._unanswered:
                 self._note_unanswered(sweep, row)
+            if row in self.ledger.twice:
+                self._note_twice(sweep, row)
+                samples += self.intake.take(sweep, row)
+                continue
             if self.ledger.flagged[row] or self._below:
                 self._note_below_zero(sweep, row)
             if self._rezeros:
@@ -531,6 +535,19 @@ class Engine:
                     self._find_silent_zero(sweep, row, silent_zero)
             samples += self.intake.take(sweep, row)
         return samples
+
+    def _note_twice(self, sweep: Sweep, row: int) -> None:
+        """Two boards send at an address: what both send is the zero of neither."""
+        if self._run is not None:
+            taxels = self._taxels_of(sweep.board)
+            self._run.calibrator.forget(taxels[taxels >= 0].astype(np.intp))
+        rezero = self._rezeros.get(sweep.board)
+        if rezero is None:
+            return
+        if rezero.found_since(self.ledger.twice[row]):
+            self.rezero(sweep.board)
+        else:
+            rezero.restart(sweep.t_ns)
 
     def _note_unanswered(self, sweep: Sweep, row: int) -> None:
         """Detect that a board zeroed itself, which it does after missing acknowledges (section

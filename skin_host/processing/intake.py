@@ -5,7 +5,8 @@ every living board has sent a sweep, or when one sends its second: no board wait
 Values that were not received, or are not valid, are not present.
 
 A value is valid when its triangle was received, its chip answers (status words), it is not at a
-rail that pressing cannot reach, its chip lives (`liveness`), and the zero of its board is known.
+rail that pressing cannot reach, its chip lives (`liveness`), the zero of its board is known, and no
+second board sends at its address.
 
 Deciding whether a chip lives takes more computing time than everything else of a sample, and does
 not depend on one sweep. So a sweep affects that decision only from the next sweep on. It is made
@@ -142,6 +143,10 @@ class Intake:
         #: Triangles of each board's last sweep.
         self._here = np.zeros((n, TRIANGLES), np.bool_)
         self._none = np.zeros(n * TRIANGLES, np.bool_)
+        nothing = np.zeros(TRIANGLES * TAXELS, np.bool_)
+        nothing.flags.writeable = False
+        #: Of a sweep whose readings are not taken.
+        self._nothing = nothing, nothing
         self._erring: dict[int, NDArray[np.uint8]] = {}
         self._felt: dict[int, Mask] = {}
         #: What it was at the last judgement with any, and the same over all boards.
@@ -283,7 +288,13 @@ class Intake:
         doubted = self.liveness.doubted
         if doubted is not None:
             doubted = doubted[TRIANGLES * row : TRIANGLES * (row + 1)]
-        if ledger.flagged[row]:
+        if row in ledger.twice:
+            # Which of the two boards it is of, nobody knows: it shows neither that a chip lives nor
+            # what is a zero.
+            self._here[row] = False
+            self._usual[row] = None
+            masks = self._nothing
+        elif ledger.flagged[row]:
             here = self._flagged(row, sweep.raw)
             # A copy: it may be judged after the ledger has noted the next sweep.
             self._erring[row] = ledger.error[row].copy()

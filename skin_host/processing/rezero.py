@@ -159,6 +159,10 @@ class Rezero:
         """Return whether no new zero has been found yet."""
         return self._first_ns is None
 
+    def found_since(self, t_ns: int) -> bool:
+        """Return whether any new zero has been found since a time."""
+        return bool((self._found_ns >= t_ns).any())
+
     def restart(self, t_ns: int) -> None:
         """The board was not received for a while, up to a time: what it sent before may have been
         of another zero.

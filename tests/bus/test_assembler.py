@@ -296,7 +296,6 @@ def test_frames_in_the_usual_order_are_taken_together_with_the_same_result(data)
         for sweep in feed(together, sent[begin:end])
     ]
     assert together.counters == alone.counters
-    assert together.crowded == alone.crowded
     for mine, its in zip(found, expected, strict=True):
         assert all(map(np.array_equal, mine, its))
 
@@ -469,14 +468,27 @@ def test_what_began_before_a_pause_comes_before_what_began_after_it(first: int) 
 
 
 def test_two_boards_at_one_address_crowd_it_and_one_that_is_early_does_not() -> None:
-    def crowded(apart_ms: float) -> int:
+    def crowded(apart_ms: float) -> list[bool]:
         assembler = make("0")
-        for start in (PERIOD, PERIOD + round(apart_ms * MS)):
-            feed(assembler, frames(values(1, start), start))
-        assert assembler.counters.sweeps == 2
-        return assembler.crowded[0]
+        starts = PERIOD, PERIOD + round(apart_ms * MS), 2 * PERIOD + 20 * MS
+        sweeps = [one for at in starts for one in feed(assembler, frames(values(1, at), at))]
+        assert assembler.counters.sweeps == 3
+        return [sweep.crowded for sweep in sweeps]
 
-    assert [crowded(apart_ms) for apart_ms in (1.0, 24.0, 25.0, 40.0)] == [1, 1, 0, 0]
+    found = [crowded(apart_ms) for apart_ms in (1.0, 24.0, 25.0, 40.0)]
+    assert found == [[False, second, False] for second in (True, True, False, False)]
+
+
+def test_a_sweep_after_one_that_came_too_soon_and_without_a_whole_triangle_is_crowded() -> None:
+    assembler = make("0-3")
+    sent = frames(values(4), PERIOD)
+    feed(assembler, sent)
+    # Half a triangle of another board, which is no sweep.
+    assert feed(assembler, frames(values(4, 9), PERIOD + 13 * MS)[:1]) == []
+    (sweep,) = feed(assembler, frames(values(4), 2 * PERIOD))
+    assert sweep.crowded
+    (sweep,) = feed(assembler, frames(values(4), 3 * PERIOD))
+    assert not sweep.crowded
 
 
 def test_a_slot_that_repeats_its_bytes_a_period_later_was_sent_again() -> None:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skin_host.bus.assembler import Sweep
-from skin_host.bus.ledger import LONGEST_PAUSE_NS, BoardLedger
+from skin_host.bus.ledger import ALONE_NS, LONGEST_PAUSE_NS, TWICE_NS, BoardLedger
 from skin_host.config.settings import Board, Bus, Part, Patch, Settings, load
 from skin_host.layout import BoardLayout, build_layout
 from tests.support.stack import ROOT
@@ -36,10 +36,16 @@ def enabled(board: int) -> int:
     return boards()[board][1].enabled
 
 
-def sweep(board: int, t_ns: int, present: int | None = None, status: int = 0) -> Sweep:
+def sweep(
+    board: int,
+    t_ns: int,
+    present: int | None = None,
+    status: int = 0,
+    crowded: bool = False,
+) -> Sweep:
     mask = enabled(board) if present is None else present
     words = np.full(16, status, np.uint16)
-    return Sweep(board, np.zeros((16, 12), np.uint8), words, mask, t_ns, 0)
+    return Sweep(board, np.zeros((16, 12), np.uint8), words, mask, t_ns, 0, crowded)
 
 
 def after(intervals_ms: list[float]) -> BoardLedger:
@@ -330,3 +336,125 @@ def test_a_board_that_timed_out_is_not_easy() -> None:
         assert known.is_easy(HAND)
         known.look(T0 + 800 * MS + turn * 90 * MS)
     assert not known.is_easy(HAND)
+
+
+class Crowd:
+    """An address at which sweeps may come too soon."""
+
+    def __init__(self) -> None:
+        self.known = ledger()
+        self.t_ns = T0
+        self._last_ns = 0
+
+    def send(self, seconds: float, apart_ms: float = 0.0) -> None:
+        """Send as one board; with `apart_ms` a second one does so, too, that much later."""
+        for _ in range(round(seconds * 1e9 / PERIOD)):
+            self.t_ns += PERIOD
+            self.note(self.t_ns)
+            if apart_ms:
+                self.note(self.t_ns + round(apart_ms * MS))
+
+    def burst(self, waited: float) -> None:
+        """A stalled computer reads and stamps at once what one board sent meanwhile."""
+        self.t_ns += round(waited * 1e9)
+        for number in range(round(waited * 1e9 / PERIOD)):
+            self.note(self.t_ns + number * MS)
+
+    def note(self, t_ns: int) -> None:
+        crowded = 0 < 2 * (t_ns - self._last_ns) < PERIOD
+        self._last_ns = t_ns
+        self.known.note(sweep(HAND, t_ns, crowded=crowded))
+
+    @property
+    def twice(self) -> bool:
+        return HAND in self.known.twice
+
+
+@pytest.mark.parametrize("apart_ms", [0.5, 13.0, 24.0, 26.0, 49.0])
+def test_two_boards_send_at_an_address_when_sweeps_come_too_soon_for_two_seconds(
+    apart_ms: float,
+) -> None:
+    address = Crowd()
+    address.send(5.0)
+    address.send(TWICE_NS / 1e9 - 0.1, apart_ms)
+    assert not address.twice
+    address.send(0.2, apart_ms)
+    assert address.twice
+    for _ in range(600):
+        address.send(0.1, apart_ms)
+        assert address.twice
+    since_ns = address.known.twice[HAND]
+    assert T0 + 5 * 10**9 <= since_ns <= T0 + 5 * 10**9 + 2 * PERIOD
+
+
+def test_one_board_is_alone_when_none_of_its_sweeps_comes_too_soon_for_a_second() -> None:
+    address = Crowd()
+    address.send(3.0, 13.0)
+    address.send(ALONE_NS / 1e9 - 0.1)
+    assert address.twice
+    address.send(0.2)
+    assert not address.twice
+    # The next one is named after two seconds again.
+    address.send(1.9, 13.0)
+    assert not address.twice
+    address.send(0.3, 13.0)
+    assert address.twice
+
+
+def test_two_boards_that_come_half_a_period_apart_for_a_while_are_still_two() -> None:
+    """Their clocks differ: then no sweep comes too soon, but twice as many."""
+    address = Crowd()
+    address.send(3.0, 24.0)
+    for _ in range(50):
+        address.send(0.1, 25.0)
+        assert address.twice
+
+
+@pytest.mark.parametrize("jump_s", [-3600.0, -0.02, 0.02, 3600.0])
+def test_neither_a_silence_nor_a_clock_that_is_set_ends_two_boards(jump_s: float) -> None:
+    address = Crowd()
+    address.send(3.0, 13.0)
+    address.t_ns += round(jump_s * 1e9)
+    for _ in range(40):
+        address.send(0.1, 13.0)
+        assert address.twice
+    address.t_ns += round(jump_s * 1e9)
+    address.send(2.5)
+    assert not address.twice
+
+
+@pytest.mark.parametrize("waited_s", [0.2, 0.5, 0.9, 4.0])
+def test_what_waited_while_this_computer_was_busy_is_of_one_board(waited_s: float) -> None:
+    address = Crowd()
+    address.send(2.0)
+    for _ in range(20):
+        address.burst(waited_s)
+        assert not address.twice
+
+
+def test_what_comes_too_soon_now_and_then_is_no_second_board() -> None:
+    address = Crowd()
+    for _ in range(20):
+        address.send(0.9)
+        address.send(0.1, 13.0)
+        assert not address.twice
+
+
+@pytest.mark.parametrize("period_ms", [10, 20])
+def test_a_board_that_sends_too_often_is_one(period_ms: int) -> None:
+    address = Crowd()
+    for number in range(10_000 // period_ms):
+        # Some of its frames wait for those of a more urgent board.
+        waits_ms = 5 if number % 5 == 0 else 0
+        address.note(T0 + (number * period_ms + waits_ms) * MS)
+        assert not address.twice
+
+
+def test_sweeps_that_two_boards_cut_into_pieces_are_of_two() -> None:
+    """Both send at the same moments: each frame begins a sweep, in which one triangle is whole."""
+    address = Crowd()
+    for _ in range(50):
+        address.t_ns += PERIOD
+        for number in range(15):
+            address.note(address.t_ns + number * MS // 2)
+    assert address.twice

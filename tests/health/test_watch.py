@@ -8,15 +8,7 @@ import pytest
 
 from skin_host.bus.port import PortCounters
 from skin_host.config.settings import load
-from skin_host.health.watch import (
-    RECENT_NS,
-    TWICE_NS,
-    BoardWatch,
-    BusWatch,
-    PartWatch,
-    Watch,
-    Window,
-)
+from skin_host.health.watch import BoardWatch, BusWatch, PartWatch, Watch, Window
 from skin_host.layout import build_layout
 from skin_host.processing.core import Engine, Step
 from skin_host.processing.pipeline import PressureFrame
@@ -96,49 +88,6 @@ def test_what_was_not_valid_before_is_not_late() -> None:
     note(watch, 2 * PERIOD, valid=False)
     note(watch, 3 * PERIOD, lost=(0,))
     assert late(watch) == []
-
-
-def crowd(
-    watch: BoardWatch, looks: int, share: float = 2.0, first: int = 0, apart_ns: int = 250 * MS
-) -> int:
-    """Look so often at an address that sends `share` times as many sweeps as one board, half of
-    which come too soon; return the time of the last look.
-    """
-    per_look = apart_ns / PERIOD * share
-    now_ns = 0
-    for look in range(first, first + looks):
-        now_ns, then_ns = look * apart_ns, (look - 1) * apart_ns
-        sweeps, before = round(look * per_look), round((look - 1) * per_look)
-        watch.note_crowded(sweeps // 2, sweeps, now_ns, then_ns, before)
-    return now_ns
-
-
-def test_two_boards_send_at_an_address_when_sweeps_come_too_soon_for_two_seconds() -> None:
-    watch = BoardWatch()
-    for looks in range(1, 20):
-        watch = BoardWatch()
-        now_ns = crowd(watch, looks, first=40)
-        lasted_ns = looks * 250 * MS
-        assert watch.is_twice(now_ns, PERIOD) == (lasted_ns >= TWICE_NS)
-    # It is over when none comes too soon for a second, or when the clock is set back.
-    assert watch.is_twice(now_ns + RECENT_NS - 1, PERIOD)
-    assert not watch.is_twice(now_ns + RECENT_NS, PERIOD)
-    assert not watch.is_twice(now_ns - 1, PERIOD)
-
-
-def test_as_many_sweeps_as_of_one_board_are_of_one_board_however_they_come() -> None:
-    """What waited while this computer was busy comes too soon as well."""
-    for share, twice in ((1.0, False), (1.3, False), (1.6, True)):
-        watch = BoardWatch()
-        assert watch.is_twice(crowd(watch, 40, share, first=40), PERIOD) == twice
-
-
-def test_what_comes_too_soon_now_and_then_is_no_second_board() -> None:
-    watch = BoardWatch()
-    for look in range(20):
-        now_ns = 2 * S * look
-        watch.note_crowded(look, 40 * look, now_ns, now_ns - 250 * MS, 40 * look - 5)
-        assert not watch.is_twice(now_ns, PERIOD)
 
 
 def test_events_of_a_board_are_dated_when_their_count_rises() -> None:

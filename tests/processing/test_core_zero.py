@@ -34,6 +34,8 @@ class Hand:
         self._t_ns = 1_000_000_000
         #: What each pad rests at, away from its board's zero: the noise of one reading.
         self.rest_units = np.zeros((len(self._board.triangles), 12), np.int64)
+        #: What the pads of a second board at its address rest at, which sends 13 ms after each.
+        self.other_units: np.ndarray | None = None
         #: Takes the outputs.
         self.deliver: Callable[[Output], None] = lambda output: None
         if rest_seed is not None:
@@ -44,21 +46,26 @@ class Hand:
 
     def send(self, sweeps: int, **pads: int) -> None:
         """Send sweeps of an untouched board, but for some pads of its first triangle (`p3=255`)."""
-        triangles = np.array(self._board.triangles)
         for _ in range(sweeps):
-            values = self._rng.integers(NO_LOAD - 1, NO_LOAD + 2, (len(triangles), 12))
-            values -= self.rest_units
-            status = np.zeros(len(triangles), np.uint16)
-            for name, value in pads.items():
-                values[0, int(name[1:])] = value
-                if value == FAR_BELOW:
-                    status[0] |= 0x10 << int(name[1:])
-            ids, data = encode_sweep(
-                self._board.settings.address, triangles, values.astype(np.uint8), status
-            )
             self._t_ns += PERIOD_NS
-            frames = [(int(i), bytes(d), self._t_ns) for i, d in zip(ids, data, strict=True)]
-            self.deliver(self.engine.feed(self._board.settings.bus, FrameBatch.of(frames)))
+            self._send(self._t_ns, self.rest_units, pads)
+            if self.other_units is not None:
+                self._send(self._t_ns + 13_000_000, self.other_units, {})
+
+    def _send(self, t_ns: int, rest_units: np.ndarray, pads: dict[str, int]) -> None:
+        triangles = np.array(self._board.triangles)
+        values = self._rng.integers(NO_LOAD - 1, NO_LOAD + 2, (len(triangles), 12))
+        values -= rest_units
+        status = np.zeros(len(triangles), np.uint16)
+        for name, value in pads.items():
+            values[0, int(name[1:])] = value
+            if value == FAR_BELOW:
+                status[0] |= 0x10 << int(name[1:])
+        ids, data = encode_sweep(
+            self._board.settings.address, triangles, values.astype(np.uint8), status
+        )
+        frames = [(int(i), bytes(d), t_ns) for i, d in zip(ids, data, strict=True)]
+        self.deliver(self.engine.feed(self._board.settings.bus, FrameBatch.of(frames)))
 
     def pause(self, seconds: float) -> None:
         """Send nothing, while the bus is read."""
@@ -220,3 +227,43 @@ def test_a_calibration_after_a_silence_decides_by_itself(worn: tuple[Hand, list[
     hand.engine.use(hand.engine.end_calibration("2026-01-01T00:00:00+00:00"))
     hand.send(20)
     assert hand.engine.ledger.rezeros.tolist() == [0]
+
+
+@pytest.mark.parametrize("waits", [0, 15, 45])
+def test_what_two_boards_send_at_one_address_is_the_zero_of_neither(
+    worn: tuple[Hand, list[Step]], waits: int
+) -> None:
+    """A second board is there when the first is zeroed, or a little later; then it is gone."""
+    hand, steps = worn
+    other = 4 + np.abs(hand.rest_units)
+    hand.other_units = None if waits else other
+    hand.engine.rezero(0)
+    hand.rests_elsewhere(seed=2)
+    hand.send(waits)
+    hand.other_units = other
+    hand.send(60)
+    assert valid_share(steps[-1]) == 0.0
+    hand.other_units = None
+    hand.send(20)
+    steps.clear()
+    hand.send(110)
+    assert valid_share(steps[-1]) > 0.8
+    assert not any(step.frame.touched.any() for step in steps)
+    pipeline = hand.engine.pipeline
+    assert pipeline is not None
+    triangles = np.array(hand.engine.layout.boards[0].triangles)
+    taxels = hand.engine.layout.boards[0].taxel_index[triangles]
+    wrong = np.abs(pipeline.baseline[taxels] - hand.rest_units)[taxels >= 0]
+    assert np.quantile(wrong, 0.9) < 0.5
+
+
+def test_a_calibration_takes_nothing_of_two_boards_at_one_address(
+    worn: tuple[Hand, list[Step]],
+) -> None:
+    hand, steps = worn
+    hand.other_units = np.abs(hand.rest_units) + 4
+    hand.engine.begin_calibration(2.0)
+    hand.send(80)
+    found = hand.engine.end_calibration("2026-01-01T00:00:00+00:00")
+    assert not found.usable.any()
+    assert valid_share(steps[-1]) == 0.0

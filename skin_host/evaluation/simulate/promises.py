@@ -150,6 +150,8 @@ class Promises:
         self._seq: dict[str, int] = {}
         #: Taxels whose values may be wrong: now, and until when.
         self._spoiling: list[Trouble] = []
+        #: Those of them of which health has reported that two boards send at one address.
+        self._known_twice: list[Trouble] = []
         self._spoiled_until_ns = np.full(layout.n_taxels, -(1 << 62), np.int64)
         self._exempt = np.zeros(layout.n_taxels, np.bool_)
         #: When each taxel began to be pressed, when its board was last received, and since when
@@ -248,6 +250,7 @@ class Promises:
             self._spoiling.append(trouble)
             if not trouble.lasts_s[1]:
                 self._recover(trouble)
+                self._spoiling.remove(trouble)
         if trouble.name == "clock_set":
             self._clock_set_ns = now_ns
         if trouble.name == "stall":
@@ -260,9 +263,11 @@ class Promises:
             self._blind_since.pop(triangle, None)
         if trouble in self._spoiling:
             self._recover(trouble)
+            self._spoiling.remove(trouble)
+        if trouble in self._known_twice:
+            self._known_twice.remove(trouble)
 
     def _recover(self, trouble: Trouble) -> None:
-        self._spoiling.remove(trouble)
         assert trouble.spoils is not None
         until_ns = self._now_ns() + int(trouble.recovers_s * NS)
         wrong = self._spoiled_until_ns
@@ -278,7 +283,8 @@ class Promises:
         spoiled |= ~np.isnan(self._world.robot.skin.held_ff)
         for trouble in self._spoiling:
             assert trouble.spoils is not None
-            spoiled |= trouble.spoils
+            if trouble not in self._known_twice:
+                spoiled |= trouble.spoils
         return spoiled
 
     def calibrated_at_rest(self) -> None:
@@ -299,6 +305,7 @@ class Promises:
         self._counts.clear()
         self._put.clear()
         self._frames.clear()
+        self._known_twice.clear()
         self.accusations.restarted()
         self._swept = dict.fromkeys(self._world.cables, 0)
         self._said = {}
@@ -407,6 +414,14 @@ class Promises:
             taxels = taxels[(taxels >= part.start) & (taxels < part.stop)] - part.start
             if frame.valid[taxels].any():
                 self.break_(f"{name}: triangle {board}/{triangle} is valid, and has no chip")
+        for trouble in self._known_twice:
+            assert trouble.spoils is not None
+            taxels = np.flatnonzero(frame.valid & trouble.spoils[mine])
+            if len(taxels):
+                self.break_(
+                    f"{name}: taxels {taxels.tolist()} are valid, and two boards send at the "
+                    f"address of {trouble.twice}"
+                )
         if frame.touched is not self._felt.get(name):
             begun = np.flatnonzero(frame.touched & ~self._felt.get(name, False))
             self._felt[name] = frame.touched
@@ -474,6 +489,11 @@ class Promises:
             self.break_(wrong)
         if part not in self._parts:
             return
+        for trouble in self._spoiling:
+            named = {"code": "board_twice", "where": trouble.twice} in record["faults"]
+            if named and trouble not in self._known_twice:
+                self._known_twice.append(trouble)
+                self._recover(trouble)
         touched = np.array(record["taxel_verdicts"].get("touched", []), np.intp)
         false = touched[self._calibrated_touched_ns[touched + self._parts[part].start] < 0]
         if len(false):

@@ -121,6 +121,8 @@ class Trouble:
         writes: it shows only when something is written.
         shows: whether what passed over the buses has shown it so far.
         lasts_s: shortest and longest; no time at all for what happens at once.
+        twice: the board at whose address a second one sends; once health has reported that, no
+            taxel of it is valid.
     """
 
     name: str
@@ -137,6 +139,7 @@ class Trouble:
     writes: bool = False
     shows: Callable[[], bool] = _always
     lasts_s: tuple[float, float] = (0.2, 15.0)
+    twice: str = ""
 
     def accuses(self, code: str, where: str) -> bool:
         """Whether health may report this because of it."""
@@ -348,6 +351,7 @@ def _address_twice(world: World, chance: random.Random, _: bool) -> Trouble:
         places_of(world, board=board.name),
         # One measurement comes in two sweeps, and so may noise: twice is enough for a touch.
         spoils=taxels_of(world, board=board.name),
+        twice=board.name,
     )
 
 

@@ -138,6 +138,12 @@ MUTANTS = [
         "        if True:\n            return masks\n",
     ),
     Mutant(
+        "readings of two boards at one address are valid",
+        "processing/intake.py",
+        "        if row in ledger.twice:",
+        "        if row in ():",
+    ),
+    Mutant(
         "errors of chips are not noted",
         "bus/ledger.py",
         "self.error[row] = status_error(sweep.status)",
