@@ -18,14 +18,23 @@ def line(result: RunResult) -> str:
 
 
 def story(result: RunResult, config: Path, hours: float) -> str:
-    """Return the events before a broken promise, and the command that repeats it."""
+    """Return the events before a broken promise, and the command that repeats them up to a second
+    before, with the hash that it must have then.
+    """
     command = f"skin simulate {config} --seed {result.seed} --hours {hours:g}"
-    again = max(0.0, result.simulated_s - 1.0)
+    over = [one for one in result.seconds if one.at_s <= result.simulated_s - 1.0]
+    repeated: list[str] = []
+    if over:
+        again = over[-1]
+        repeated = [
+            f"  with logs: {command} --until {again.at_s}",
+            f"  which must end with {again.events} events, hash {again.digest}",
+        ]
     return "\n".join(
         [
             *(f"  {line}" for line in result.last),
             f"  broken at {result.simulated_s:.3f} s: {result.broken}",
-            f"  with logs: {command} --until {again:.1f}",
+            *repeated,
         ]
     )
 

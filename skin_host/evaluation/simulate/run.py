@@ -22,6 +22,7 @@ from skin_host.errors import ConfigurationError
 from skin_host.evaluation.simulate.accusations import BACK_NS, NOISE, QUIET_NS, STARTED_NS
 from skin_host.evaluation.simulate.disk import PowerCut
 from skin_host.evaluation.simulate.promises import SAMPLE_S, Promises
+from skin_host.evaluation.simulate.trace import Before
 from skin_host.evaluation.simulate.troubles import ACTS, KINDS, WIRING, Trouble, act
 from skin_host.evaluation.simulate.world import Life, Spot, World
 from skin_host.layout import Layout
@@ -73,7 +74,9 @@ class RunResult:
     Attributes:
         seed: of it.
         simulated_s, cpu_s: how long it lasted, simulated and in CPU time.
-        events, digest: how many events there were, and the hash of them all.
+        events, digest: how many events there were, and the hash of them all: of those before
+            `until_s` if the run was to end there.
+        seconds: the same before its last whole seconds, to compare it with a repetition.
         broken: the promise that was broken, or None; `last` are the events before.
         troubles: how many of each kind were injected.
         required, named: kinds that health had to name if they lasted, and those that it named.
@@ -85,6 +88,7 @@ class RunResult:
     cpu_s: float = 0.0
     events: int = 0
     digest: str = ""
+    seconds: list[Before] = field(default_factory=list)
     broken: str | None = None
     last: list[str] = field(default_factory=list)
     troubles: dict[str, int] = field(default_factory=dict)
@@ -109,7 +113,7 @@ def simulate(
         settings, layout, config: of the robot, and the file that they were read from.
         seed: of everything that happens.
         seconds: simulated time, rounded up to a whole storm and its calm.
-        until_s: end the same run at this time.
+        until_s: end the same run at this time; what happened before it is the same.
     """
     began_s = time.process_time()
     with tempfile.TemporaryDirectory(prefix="skin-simulate-") as state:
@@ -119,6 +123,8 @@ def simulate(
             scene = _scene(seed, seconds)
             world = World(settings, layout, config, seed, scene)
             world.trace.unnamed = state.encode()
+            if until_s is not None:
+                world.trace.end_at(until_s)
             with world.clock.runner() as runner:
                 run = _Run(world, Path(state), seed, seconds, until_s)
                 runner.run(run.live())
@@ -223,6 +229,7 @@ class _Run:
         )
         # What ends now ends in any order.
         self.result.events, self.result.digest = world.trace.count, world.trace.digest()
+        self.result.seconds = list(world.trace.seconds)
         for task in (living, looking, stopped):
             task.cancel()
         outcome, *_ = await asyncio.gather(living, looking, stopped, return_exceptions=True)

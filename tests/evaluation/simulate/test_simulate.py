@@ -90,6 +90,9 @@ def test_the_same_seed_gives_the_same_events_in_another_process(tmp_path: Path) 
     here = run(4, until_s=14.0)
     assert (other["hash"], other["events"]) == (here.digest, here.events)
     assert run(5, until_s=14.0).digest != here.digest
+    # It had the same events before, which one that ends earlier shows.
+    earlier = run(4, until_s=12.0)
+    assert (12, earlier.events, earlier.digest) in here.seconds
 
 
 def test_where_the_files_are_does_not_count_among_the_events() -> None:
