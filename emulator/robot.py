@@ -492,7 +492,7 @@ class LiveProbe:
 
     def press(self, drive: float, x_mm: float = 0.0, y_mm: float = 0.0) -> None:
         """Press from now on with a force (N), or to a depth (mm) if it is driven by depth; on skin
-        also somewhere else.
+        also off its place.
         """
         if self._number is None:
             self._drive_n = drive

@@ -51,6 +51,7 @@ class TipState:
         saturated_ns: when a sample was last saturated, 0 if never.
         silenced: how often the board has timed out.
         awaited: the board is being set up and has not had the time to send yet.
+        zeroing, touching: samples of which a zero is taken, and whether it was touched in each.
     """
 
     name: str
@@ -66,6 +67,7 @@ class TipState:
     alive: bool = False
     awaited: bool = False
     zeroing: list[Floats] = field(default_factory=list)
+    touching: list[bool] = field(default_factory=list)
 
     @property
     def scale_differs(self) -> bool:
@@ -193,6 +195,7 @@ class FingertipEngine:
         self._zeroing = True
         for state in self.tips.values():
             state.zeroing.clear()
+            state.touching.clear()
 
     def end_zero(self) -> dict[str, Zero]:
         """Return the zeros from the collected samples, for each fingertip with enough samples."""
@@ -202,9 +205,12 @@ class FingertipEngine:
             if len(state.zeroing) >= FEWEST_SAMPLES:
                 assert state.assembler is not None
                 samples = np.array(state.zeroing)
-                samples = samples[~damaged(samples, state.assembler.full_scale / ZERO_WORD)]
-                found[name] = Zero(samples.mean(axis=0), samples.std(axis=0, ddof=1))
+                whole = ~damaged(samples, state.assembler.full_scale / ZERO_WORD)
+                touched = bool(np.array(state.touching)[whole].any())
+                samples = samples[whole]
+                found[name] = Zero(samples.mean(axis=0), samples.std(axis=0, ddof=1), touched)
             state.zeroing.clear()
+            state.touching.clear()
         return found
 
     def use(self, zeros: dict[str, Zero]) -> list[FingertipEvent]:
@@ -221,9 +227,11 @@ class FingertipEngine:
     def _step(self, state: TipState, wrench: Wrench) -> list[FingertipEvent]:
         if wrench.saturated:
             state.saturated_ns = wrench.t_ns
+        events = state.tip.step(wrench)
         if self._zeroing and not wrench.saturated:
             state.zeroing.append(np.concatenate([wrench.force_n, wrench.torque_nm]))
-        return state.tip.step(wrench)
+            state.touching.append(state.tip.touched)
+        return events
 
     def _note_answer(self, here: dict[int, TipState], can_id: int, payload: bytes) -> None:
         found = parse_full_scale(can_id, payload)

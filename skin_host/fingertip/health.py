@@ -134,6 +134,12 @@ class FingertipHealth:
                 f"{name} has no zero: no contact is reported; calibrate it unloaded: "
                 "skin command calibrate",
             )
+        if state.tip.zeroed_touched:
+            yield fault(
+                "pressed",
+                f"{name}: touched when calibrated, by its zero before; calibrate it unloaded, "
+                "again if this stays: skin command calibrate",
+            )
         if now_ns is None:
             return
         if state.saturated_ns and abs(now_ns - state.saturated_ns) < HOLD_NS:
@@ -150,7 +156,8 @@ class FingertipHealth:
                 f"{name} has been touched for so long that its zero is uncertain; calibrate it "
                 "unloaded",
             )
-        if state.tip.threshold_n > table.threshold_n:
+        # The load that came or went is in that noise.
+        if state.tip.threshold_n > table.threshold_n and not state.tip.zeroed_touched:
             yield fault(
                 "noisy",
                 f"{name}: contacts below {state.tip.threshold_n:.2f} N drown in the noise of its "

@@ -174,6 +174,11 @@ class Tip:
         return self._zero is not None
 
     @property
+    def zeroed_touched(self) -> bool:
+        """Whether something touched the fingertip when its zero was taken."""
+        return self._zero is not None and self._zero.touched
+
+    @property
     def touched(self) -> bool:
         """Whether something touches the fingertip."""
         return self._reported is not None

@@ -111,10 +111,14 @@ class Verdict(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Zero:
-    """Load that an unloaded force/torque board sends: mean and sd, float64[6], N and N m."""
+    """Load that an unloaded force/torque board sends: mean and sd, float64[6], N and N m.
+
+    `touched`: something touched the fingertip meanwhile, by the zero before.
+    """
 
     offset: Floats
     noise: Floats
+    touched: bool = False
 
 
 @dataclass(frozen=True)
@@ -621,6 +625,7 @@ def _identified(calibration: Calibration) -> Calibration:
         digest.update(np.ascontiguousarray(array).tobytes())
     for name, zero in sorted(calibration.zeros.items()):
         digest.update(name.encode() + zero.offset.tobytes() + zero.noise.tobytes())
+        digest.update(b"touched" * zero.touched)
     if (curves := calibration.curves) is not None:
         for array in curves.arrays().values():
             digest.update(np.ascontiguousarray(array).tobytes())
@@ -651,9 +656,10 @@ class _PartFile(msgspec.Struct, forbid_unknown_fields=True):
     spread: list[float] | None = None
 
 
-class _ZeroFile(msgspec.Struct, forbid_unknown_fields=True):
+class _ZeroFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
     offset: list[float]
     noise: list[float]
+    touched: bool = False
 
 
 class _PartCurves(msgspec.Struct, forbid_unknown_fields=True):
@@ -707,7 +713,7 @@ def save(path: Path, calibration: Calibration, layout: Layout) -> None:
         )
     zeros = {
         # Not rounded, so that it serves for coarse and fine boards.
-        name: _ZeroFile(zero.offset.tolist(), zero.noise.tolist())
+        name: _ZeroFile(zero.offset.tolist(), zero.noise.tolist(), zero.touched)
         for name, zero in calibration.zeros.items()
     }
     content = _File(
@@ -804,7 +810,7 @@ def load(path: Path, layout: Layout, configuration: str) -> Calibration:
         fits = offset.shape == noise.shape == (CHANNELS,)
         if not fits or not np.isfinite([offset, noise]).all() or (noise < 0.0).any():
             raise refused(f"fingertips.{name}: wanted twice {CHANNELS} finite numbers")
-        zeros[name] = Zero(offset, noise)
+        zeros[name] = Zero(offset, noise, zero.touched)
     curves = None
     if content.curves is not None:
         curves = _curves_of(content.curves, layout, refused)

@@ -26,6 +26,7 @@ from skin_host.fingertip.health import FingertipHealth, FingertipRecord
 from skin_host.fingertip.service import StrainBoards
 from skin_host.layout import build_layout
 from skin_host.mqtt import messages
+from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Zero
 from skin_host.processing.core import Engine
 from skin_host.processing.events import Touch
@@ -233,6 +234,35 @@ async def test_a_load_that_comes_during_a_calibration_counts_as_noise() -> None:
     await bench.run(0.4)
     await bench.calibrate()
     assert bench.codes() == ["noisy"]
+
+
+async def test_a_fingertip_that_was_touched_when_calibrated_is_named_until_it_was_not(
+    tmp_path: Path,
+) -> None:
+    bench = Bench({"part": "index", "force_n": [[2.0, 0], [2.1, 2], [4.0, 2], [4.1, 0]]})
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    await bench.calibrate()
+    assert bench.codes() == []
+    await bench.run(0.7)
+    await bench.calibrate()
+    assert bench.codes() == ["pressed"]
+    assert bench.codes("thumb") == []
+    found = bench.engine.calibration
+    assert found is not None
+    layout, skin = bench.engine.layout, bench.engine.configuration
+    calibrations.save(tmp_path / "calibration.json", found, layout)
+    kept = calibrations.load(tmp_path / "calibration.json", layout, skin)
+    assert {name: zero.touched for name, zero in kept.zeros.items()} == {
+        "index": True,
+        "thumb": False,
+    }
+    await bench.run(1.5)
+    # By that zero it is touched now, so only a second calibration is known to be unloaded.
+    await bench.calibrate()
+    assert bench.codes() == ["pressed"]
+    await bench.calibrate()
+    assert bench.codes() == []
 
 
 async def test_a_contact_without_end_makes_its_zero_uncertain() -> None:

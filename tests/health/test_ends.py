@@ -138,6 +138,7 @@ ELSEWHERE = {
     "fingertip_held": "tests/fingertip/test_boards.py",
     "fingertip_loses_frames": "tests/fingertip/test_boards.py",
     "fingertip_not_configured": "tests/fingertip/test_boards.py",
+    "fingertip_pressed": "tests/fingertip/test_boards.py",
     "fingertip_saturated": "tests/fingertip/test_boards.py",
     "fingertip_scale": "tests/fingertip/test_boards.py",
     "fingertip_silent": "tests/fingertip/test_boards.py",
