@@ -428,7 +428,7 @@ class Engine:
         touched: NDArray[np.bool_] = self._last_touched[taxels] & (taxels >= 0) & believed
         before = self._rezeros.get(board)
         if before is not None:
-            touched |= before.doubted.reshape(TRIANGLES, PADS)
+            touched |= before.unknown.reshape(TRIANGLES, PADS)
         own = self.layout.boards[board].settings
         no_load = np.full(taxels.size, float(own.no_load))
         wanted = None
@@ -436,7 +436,8 @@ class Engine:
             seconds = look_s(self.calibration.spread, self._pipeline.enter)[taxels.ravel()]
             wanted = np.ceil(seconds * 1e3 / own.period_ms).astype(np.int64)
         fitted = (taxels >= 0).ravel()
-        self._rezeros[board] = Rezero(touched.ravel(), no_load, fitted, wanted)
+        period_s = own.period_ms * 1e-3
+        self._rezeros[board] = Rezero(touched.ravel(), no_load, fitted, wanted, period_s)
         self.intake.veto[self.ledger.row[board]] = np.ones((TRIANGLES, PADS), np.bool_)
         self.zero_changes += 1
         return int(np.count_nonzero(touched))
@@ -457,7 +458,7 @@ class Engine:
         """
         found = self._last_touched.copy() if touched else np.zeros_like(self._touched)
         for board, rezero in self._rezeros.items():
-            found[self._taxels_of(board).ravel()[rezero.doubted]] = True
+            found[self._taxels_of(board).ravel()[rezero.unknown]] = True
         return found
 
     def may_be_touched(self) -> Mask:
@@ -481,7 +482,7 @@ class Engine:
         """Return taxels bool[16, 12] of a board whose zero is unknown."""
         found = np.zeros((TRIANGLES, PADS), np.bool_)
         if board in self._rezeros:
-            found |= self._rezeros[board].doubted.reshape(TRIANGLES, PADS)
+            found |= self._rezeros[board].unknown.reshape(TRIANGLES, PADS)
         if board in self._below:
             found |= self._below[board] > 0
         return found
@@ -544,6 +545,8 @@ class Engine:
         rezero = self._rezeros.get(sweep.board)
         if rezero is None:
             return
+        # What differed was another board's, and no press.
+        rezero.moved[:] = False
         if rezero.found_since(self.ledger.twice[row]):
             self.rezero(sweep.board)
         else:
@@ -620,7 +623,7 @@ class Engine:
             back = (before > 0) & (before < BELOW_SWEEPS) & answered[:, None]
             if sweep.board in self._rezeros:
                 # What is known to have been pressed comes back when it is pressed again.
-                back &= ~self._rezeros[sweep.board].doubted.reshape(TRIANGLES, PADS)
+                back &= ~self._rezeros[sweep.board].unknown.reshape(TRIANGLES, PADS)
             if any_of(back & (sweep.raw < (no_load + 255) / 2)):
                 # What was pressed and lifts stays below zero; what a bad wire brings does not.
                 self._jumped_ns[sweep.board] = sweep.t_ns
@@ -648,9 +651,13 @@ class Engine:
         if rezero.step(sweep.raw.ravel(), here, far, sweep.t_ns, touched):
             taxels = self._taxels_of(sweep.board).ravel()
             baseline = np.where(taxels >= 0, self._pipeline.baseline[taxels], 0.0)
-            found, baseline = rezero.finish(baseline, self.calibration.noise[taxels])
+            calibration = self.calibration
+            noise = calibration.noise[taxels]
+            spread = np.maximum(calibration.spread[taxels], noise)
+            spread[~calibration.usable[taxels]] = np.inf
+            found, baseline = rezero.finish(baseline, noise, spread)
             self._pipeline.set_zero(taxels[found], baseline[found])
-            self.zeros_found += 1
+            self.zeros_found += any_of(found)
             self.zero_changes += 1
         if rezero.settled(sweep.t_ns):
             if sweep.board in self._releasing:

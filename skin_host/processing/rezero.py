@@ -9,6 +9,12 @@ a taxel that was touched just before is unknown; it is in doubt until it is cali
 A press that nobody felt begin (the daemon was not running) becomes the zero too. It shows when it
 lifts: the pad then reads far below zero, which nothing can press it to.
 
+A press that begins, ends or changes while the new zero is observed is in the mean of what is read.
+It shows in its course: before some moment and after it the readings differ by more than noise
+explains. Such a pad is observed again until it rests, and no higher than it did before or after
+that moment. So is one that rests higher than the noise of one reading explains, because it was
+pressed between the zero and the first sweep. Until then its zero is in doubt.
+
 The threshold of touch is that of a zero which is known. So a noisy taxel is observed until what its
 noise leaves in the mean is a small part of its threshold. While another taxel of its board is
 touched, what it reads does not count. A board's zero, one reading, may leave a noisy pad so near to
@@ -37,8 +43,13 @@ ERROR_SHARE = 1 / 7
 BELOW_SWEEPS = 5
 #: One that comes back sooner jumps: for so long, none of its board is taken for a lifted press.
 JUMPS_NS = 2_000_000_000
-#: A zero that has moved by more than this was not that of an untouched pad.
-LARGEST_UNITS = 30.0
+#: Readings before and after a moment have another mean if they differ by more than drift does, ...
+STEADY_UNITS = 0.5
+#: ... and so many standard errors, of a spread that rounding alone may have.
+STEADY_ERRORS = 5.0
+LEAST_SPREAD = 0.5
+#: With fewer conversions before or after, where an untouched pad rests is not taken from them.
+FEWEST_RESTING = 3
 #: Noise explains that a board's zero, one reading, is off by so many of its standard deviations.
 SNAPSHOT_SIGMAS = 3.0
 #: The byte at the end of the scale, of a pad far below zero.
@@ -70,17 +81,27 @@ class Rezero:
         no_load: float64[n], the byte of an untouched pad as the board was set up.
         fitted: bool[n], taxels that there are.
         wanted: int[n], how many bytes of each are wanted; `FEWEST` by default.
+        period_s: how often the board sends: it may repeat conversions.
 
     Attributes:
         doubted: bool[n], taxels whose zero is not known.
         cut_off: bool[n], taxels whose noise reaches the end of the scale: they are refused.
+        moved: bool[n], taxels that something may have pressed while they were observed: they are
+            observed again.
     """
 
     def __init__(
-        self, touched: Mask, no_load: Floats, fitted: Mask, wanted: NDArray[np.int64] | None = None
+        self,
+        touched: Mask,
+        no_load: Floats,
+        fitted: Mask,
+        wanted: NDArray[np.int64] | None = None,
+        period_s: float = CONVERSION_S,
     ) -> None:
         self._no_load = no_load
-        self._wanted = np.maximum(FEWEST, 0 if wanted is None else wanted)
+        self._repeats = max(1.0, CONVERSION_S / period_s)
+        none = np.zeros(len(no_load), np.int64)
+        self._wanted = np.maximum(FEWEST, none if wanted is None else wanted)
         self._forget()
         self._sweeps = 0
         self._since_ns: int | None = None
@@ -94,6 +115,18 @@ class Rezero:
         self._last_ns = 0
         self.doubted: Mask = touched.copy()
         self.cut_off: Mask = np.zeros(len(no_load), np.bool_)
+        self.moved: Mask = np.zeros(len(no_load), np.bool_)
+        #: Where untouched pads rest at most, in units.
+        self._highest = np.full(len(no_load), np.inf)
+
+    def _forget(self) -> None:
+        """Observe from the first byte on."""
+        n = len(self._no_load)
+        #: The bytes of each, in the order in which they came.
+        self._raw: NDArray[np.uint8] = np.zeros((LOOK_SWEEPS, n), np.uint8)
+        self._count: NDArray[np.int64] = np.zeros(n, np.int64)
+        self._n_far = np.zeros(n, np.int64)
+        self._n_end = np.zeros(n, np.int64)
 
     @classmethod
     def over(cls, no_load: Floats, t_ns: int) -> "Rezero":
@@ -115,7 +148,7 @@ class Rezero:
                 reading: boards send it while a data line is shorted, and for some sweeps after.
             t_ns: time of the sweep.
             touched: whether any taxel whose zero is known is touched: then what noisy ones read
-                does not count, for it may press them too.
+                does not count, for it may press them too. Those that moved show that themselves.
         """
         if self._since_ns is None:
             self._since_ns = t_ns
@@ -127,11 +160,13 @@ class Rezero:
         if not looks:
             observed &= ~self._enough
             if touched:
-                observed &= self._count < FEWEST
+                observed &= (self._count < FEWEST) | self.moved
         read = observed & ~far
-        units = np.where(read, self._no_load - raw, 0.0)
-        self._sum += units
-        self._squares += np.square(units)
+        pads = np.flatnonzero(read)
+        rows = self._count[pads]
+        if rows.max(initial=0) >= len(self._raw):
+            self._raw = np.concatenate([self._raw, np.zeros_like(self._raw)])
+        self._raw[rows, pads] = raw[pads]
         self._count += read
         self._n_far += observed & far
         self._n_end += observed & (raw == END)
@@ -143,6 +178,11 @@ class Rezero:
         """Return which taxels [n] have been observed often enough, at their rest or far off."""
         enough: Mask = (self._count >= self._wanted) | (self._n_far >= self._wanted)
         return enough
+
+    @property
+    def unknown(self) -> Mask:
+        """Return the taxels bool[n] whose zero is not known, or not before they rest."""
+        return self.doubted | self.moved
 
     @property
     def late(self) -> Mask | None:
@@ -170,18 +210,10 @@ class Rezero:
         if self._since_ns is None or not self._seeks:
             return
         self._forget()
+        self._highest[~self.moved] = np.inf
         if self.seeks_all:
             self._since_ns = t_ns
             self._sweeps = 0
-
-    def _forget(self) -> None:
-        """Observe from the first byte on."""
-        n = len(self._no_load)
-        self._sum = np.zeros(n)
-        self._squares = np.zeros(n)
-        self._count = np.zeros(n, np.int64)
-        self._n_far = np.zeros(n, np.int64)
-        self._n_end = np.zeros(n, np.int64)
 
     def settled(self, t_ns: int) -> bool:
         """Return whether new baselines are in use, but for those of `unsettled`."""
@@ -194,30 +226,77 @@ class Rezero:
         unsettled: Mask = self._sought | (np.abs(t_ns - self._found_ns) < SETTLE_NS)
         return unsettled
 
-    def finish(self, baseline: Floats, noise: Floats) -> tuple[Mask, Floats]:
-        """Return the taxels bool[n] that have been observed enough now, and the new baselines [n],
-        in units.
+    def finish(
+        self, baseline: Floats, noise: Floats, spread: Floats | None = None
+    ) -> tuple[Mask, Floats]:
+        """Return the taxels bool[n] whose zero has been found now, and the new baselines [n], in
+        units.
 
         Args:
             baseline: float64[n], the previous ones.
             noise: float64[n], as calibrated.
+            spread: float64[n], as for `look_s`; infinite for taxels that are not used. The noise by
+                default.
         """
         found = self._sought & self._enough
-        self._sought &= ~found
-        self._seeks = bool(self._sought.any())
-        self._found_ns[found] = self._last_ns = self._t_ns
         if self._first_ns is None:
             self._first_ns = self._t_ns
-        mean = self._sum / np.maximum(self._count, 1)
+        longest = int(self._count.max())
+        units = self._no_load - self._raw[:longest]
+        units[np.arange(longest)[:, None] >= self._count] = 0.0
+        count = np.maximum(self._count, 1)
+        mean = units.sum(axis=0) / count
         # What was far out of range mostly may have another zero when it is back.
         self.doubted |= found & (self._count < self._wanted)
         known = found & ~self.doubted
         # Noise that is cut off at the end of the scale gives a wrong mean.
         ends = known & (self._n_end > SATURATED_SHARE * (self._count + self._n_far))
-        far = known & (np.abs(mean - baseline) > LARGEST_UNITS)
         # By their squares: readings of a press, before it lifted far below zero, balance in a mean.
-        mean_square = self._squares / np.maximum(self._count, 1)
-        far |= ends & (mean_square > (SNAPSHOT_SIGMAS**2 + 1.0) * np.square(noise))
-        self.doubted |= far
-        self.cut_off |= ends & ~far
-        return found, np.where(known & ~far & ~ends, mean, baseline)
+        mean_square = np.square(units).sum(axis=0) / count
+        below = ends & (mean_square > (SNAPSHOT_SIGMAS**2 + 1.0) * np.square(noise))
+        self.doubted |= below
+        self.cut_off |= ends & ~below
+        known &= ~ends
+        moved = self._moves(known, units, baseline, noise if spread is None else spread)
+        self.moved = (self.moved & ~found) | moved
+        self._wanted[moved] = np.maximum(self._wanted, self._count)[moved]
+        for array in (self._count, self._n_far, self._n_end):
+            array[moved] = 0
+        found &= ~moved
+        self._sought &= ~found
+        self._seeks = bool(self._sought.any())
+        self._found_ns[found] = self._last_ns = self._t_ns
+        return found, np.where(known & found, mean, baseline)
+
+    def _moves(self, known: Mask, units: Floats, baseline: Floats, spread: Floats) -> Mask:
+        """Return which of some taxels bool[n] did not rest, or higher than they do untouched.
+
+        Args:
+            known: bool[n], those.
+            units: float64[k, n], the readings, 0 where there are fewer.
+            baseline: float64[n], the previous ones.
+            spread: float64[n], see `finish`.
+        """
+        # That of a mean of k readings is this by sqrt(k).
+        error = STEADY_ERRORS * np.sqrt(self._repeats) * np.maximum(spread, LEAST_SPREAD)
+        # The board's zero is one reading. Without one, pads rest where they did.
+        most = np.maximum(baseline, 0.0) + STEADY_UNITS + error
+        self._highest = np.minimum(self._highest, most)
+        before = np.arange(1, len(units))[:, None]
+        after = self._count - before
+        sums = np.cumsum(units, axis=0)
+        means_after = (sums[-1:] - sums[:-1]) / np.maximum(after, 1)
+        apart = np.abs(means_after - sums[:-1] / before)
+        apart -= error * np.sqrt(1.0 / before + 1.0 / np.maximum(after, 1))
+        apart[after <= 0] = -np.inf
+        moves: Mask = known & (apart.max(axis=0, initial=-np.inf) > STEADY_UNITS)
+        for pad in np.flatnonzero(moves):
+            split = int(apart[:, pad].argmax()) + 1
+            for side in (units[:split, pad], units[split : self._count[pad], pad]):
+                if len(side) >= FEWEST_RESTING * self._repeats:
+                    # A damaged byte is no rest.
+                    rest = float(np.median(side)) + error[pad] / np.sqrt(len(side))
+                    self._highest[pad] = min(self._highest[pad], rest + STEADY_UNITS)
+        mean = units.sum(axis=0) / np.maximum(self._count, 1)
+        moves |= known & (mean > self._highest)
+        return moves

@@ -136,6 +136,35 @@ def test_a_part_is_not_off_when_a_pad_shows_that_it_was_pressed_when_zeroed(
     daemon.link.close()
 
 
+def test_a_pad_that_is_pressed_while_its_zero_is_observed_is_in_doubt_until_it_rests(
+    hand: Hand,
+) -> None:
+    valid: list[bool] = []
+    hand.deliver = lambda output: valid.extend(bool(frame.valid[3]) for frame in output.frames)
+    hand.engine.rezero(0)
+    hand.send(10)
+    hand.send(100, p3=NO_LOAD - 12)
+    assert hand.in_doubt == [3]
+    assert np.flatnonzero(hand.engine.zero_at_risk(touched=False)).tolist() == [3]
+    assert not any(valid)
+    hand.send(80)
+    assert hand.in_doubt == []
+    assert not hand.engine.may_be_touched().any()
+    assert valid[-1]
+    hand.send(10, p3=NO_LOAD - 12)
+    assert hand.engine.zero_at_risk(touched=True)[3]
+
+
+def test_a_pad_that_is_in_doubt_when_its_board_is_zeroed_again_stays_so(hand: Hand) -> None:
+    """What pressed it while its zero was observed may be in the next."""
+    hand.engine.rezero(0)
+    hand.send(10)
+    hand.send(30, p3=NO_LOAD - 12)
+    assert hand.engine.rezero(0) == 1
+    hand.send(50)
+    assert hand.in_doubt == [3]
+
+
 def test_a_triangle_with_pads_below_zero_when_calibrated_is_not_called_constant(hand: Hand) -> None:
     """Its readings are not taken, so it cannot show that it lives; its board's doubt is named."""
     pressed = {"p3": FAR_BELOW, "p4": FAR_BELOW, "p5": FAR_BELOW}
@@ -267,3 +296,17 @@ def test_a_calibration_takes_nothing_of_two_boards_at_one_address(
     found = hand.engine.end_calibration("2026-01-01T00:00:00+00:00")
     assert not found.usable.any()
     assert valid_share(steps[-1]) == 0.0
+
+
+def test_what_touched_pads_read_after_a_silence_shows_no_zero(hand: Hand) -> None:
+    """Pressed more weakly than before, they may read as pads do that were just zeroed."""
+    hand.rest_units[0] = -3
+    hand.engine.rezero(0)
+    hand.send(60)
+    found = hand.engine.ledger.rezeros[0]
+    pads = [f"p{number}" for number in range(12)]
+    hand.send(30, **dict.fromkeys(pads, NO_LOAD - 15))
+    assert hand.engine.zero_at_risk(touched=True).sum() > 6
+    hand.pause(1.0)
+    hand.send(2 * SWEEPS, **dict.fromkeys(pads, NO_LOAD))
+    assert hand.engine.ledger.rezeros[0] == found

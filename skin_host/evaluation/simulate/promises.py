@@ -166,6 +166,8 @@ class Promises:
         self._touched_ns = np.full(layout.n_taxels, -(1 << 62), np.int64)
         self._calibrated_touched_ns = np.full(layout.n_taxels, -(1 << 62), np.int64)
         self._zeros: dict[int, Rezero] = {}
+        #: By board: the time of the first sweep that its zero was observed in, and when that was.
+        self._observed: dict[int, tuple[int | None, int]] = {}
         self._wrong_since_ns: dict[str, int] = {}
         self._truth: deque[tuple[int, NDArray[np.float64]]] = deque(maxlen=SAMPLES)
         self._frames: dict[str, PressureFrame] = {}
@@ -328,11 +330,16 @@ class Promises:
         ):
             setattr(publisher, name, _after(life, look, getattr(publisher, name)))
 
-    def forget(self, daemon: Daemon) -> None:
-        """A daemon is killed: the doubts that the disk refused, or had not taken yet, are lost."""
+    def forget(self, daemon: Daemon, *, touched: bool = False) -> None:
+        """A daemon is over: the doubts that the disk refused, or had not taken yet, are lost.
+
+        Args:
+            daemon: it.
+            touched: it was asked to end, so what is touched then is in doubt, too.
+        """
         keeping = daemon._keeping
         if "zeros" in daemon.unkept or (keeping is not None and not keeping.done()):
-            self._exempt |= daemon.engine.zero_at_risk(touched=False)
+            self._exempt |= daemon.engine.zero_at_risk(touched)
 
     def over(self, life: Life, *, whole: bool) -> None:
         """A life has ended; `whole`: as it was asked to."""
@@ -340,6 +347,7 @@ class Promises:
             for part, ids in self._open.items():
                 if ids:
                     self.break_(f"{part}: touches {sorted(ids)} have no end at the daemon's end")
+            self.forget(life.daemon, touched=True)
         self.account(life)
 
     # ------------------------------------------------------------------ where things leave the core
@@ -817,13 +825,17 @@ class Promises:
                     # Its chip has sent nothing valid since, and not because of the zero before.
                     valid_ns = self._valid_ns[taxels] - DECIDED_NS
                     self._unfelt_ns[taxels] = np.minimum(self._unfelt_ns[taxels], valid_ns)
-            # Whatever presses later is felt.
+            if rezero._since_ns != self._observed.get(board, (None, 0))[0]:
+                self._observed[board] = rezero._since_ns, now_ns
+            # Whatever begins to press while the zero is observed, or later, is felt.
             finds = np.ones(len(taxels), np.bool_)
             if rezero.settled(wall_ns):
                 unsettled = rezero.unsettled(wall_ns)
                 fitted = (layout.boards[board].taxel_index >= 0).ravel()
                 finds = np.zeros_like(finds) if unsettled is None else unsettled[fitted]
             unfelt = pressed[taxels] & (self._pressed_ns[taxels] > self._unfelt_ns[taxels])
+            if rezero.begun:
+                unfelt &= self._pressed_ns[taxels] <= self._observed[board][1]
             self._exempt[taxels] |= finds & (unfelt | spoiled[taxels])
         self._felt_ns = self._heard_ns()
 

@@ -178,6 +178,66 @@ def test_what_pressed_as_the_daemon_started_is_in_doubt_when_it_lifts_and_no_bro
         runner.run(live())
 
 
+def test_a_press_that_begins_while_a_zero_is_observed_is_felt_when_it_comes_again(
+    world: World,
+) -> None:
+    """`fingertips.toml` 18, `gripper.toml` 16: half of it became the zero, and it read 0 kPa."""
+
+    async def live() -> None:
+        life = start(world)
+        await world.clock.sleep(8.0)
+        spot, engine = world.spots[0], life.daemon.engine
+        topic = life.daemon.publisher.topics.part("contact", spot.part)
+        before = engine.zeros_found
+        await life.daemon.configure()
+        while not all(rezero.begun for rezero in engine._rezeros.values()):
+            await world.clock.sleep(0.01)
+        await world.clock.sleep(0.5)
+        assert engine.zeros_found == before
+        pressing = asyncio.create_task(spot.press(3.0, 60.0))
+        await world.clock.sleep(2.5)
+        assert engine.zeros_found > before
+        assert world.broker.retained[topic] == b"UNKNOWN"
+        await pressing
+        while engine.may_be_touched().any():
+            await world.clock.sleep(0.1)
+        await world.clock.sleep(3.0)
+        assert world.broker.retained[topic] == b"OFF"
+        pressing = asyncio.create_task(spot.press(3.0, 60.0))
+        await world.clock.sleep(2.5)
+        assert world.broker.retained[topic] == b"ON"
+        await pressing
+        life.kill()
+
+    with world.clock.runner() as runner:
+        runner.run(live())
+
+
+@pytest.mark.parametrize("refused", [False, True])
+def test_doubts_that_the_disk_refused_are_lost_with_a_daemon_that_was_asked_to_end(
+    world: World, refused: bool
+) -> None:
+    """`fingertips.toml` 18: after the next start nobody knows what pressed before it."""
+
+    async def live() -> None:
+        promises, _ = start_watched(world)
+        await world.clock.sleep(8.0)
+        life, spot = world.life, world.spots[0]
+        assert life is not None
+        pressing = asyncio.create_task(spot.press(8.0, 60.0))
+        await world.clock.sleep(2.0)
+        if refused:
+            KINDS["disk_read_only"](world, random.Random(1), False)
+        await world.end()
+        promises.over(life, whole=True)
+        part = world.layout.part(spot.part)
+        assert promises._exempt[part.start : part.stop].any() == refused
+        await pressing
+
+    with world.clock.runner() as runner:
+        runner.run(live())
+
+
 def test_a_slow_disk_does_not_make_touches_last_when_the_daemon_ends(world: World) -> None:
     """It reads nothing any more, so what it retained would be stale until the disk is done."""
 
