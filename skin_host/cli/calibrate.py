@@ -42,7 +42,12 @@ def add_commands(commands: Commands) -> None:
     )
     add_config(calibrate)
     calibrate.add_argument("--node", default="main", help="which parts to calibrate")
-    calibrate.add_argument("--seconds", type=positive, default=5.0, help="how long to look")
+    calibrate.add_argument(
+        "--seconds",
+        type=positive,
+        default=5.0,
+        help="how long to look; at least 60 readings of each pad are taken",
+    )
     calibrate.add_argument("--output", type=Path, metavar="FILE", help="keep it here instead")
     calibrate.add_argument("--json", action="store_true", help="one JSON document")
     calibrate.add_argument(

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Settings, skin_hash
-from skin_host.daemon import service
 from skin_host.daemon.link import Link
+from skin_host.daemon.state import kept_path
 from skin_host.errors import CalibrationError, OtherSkinError, SkinError
 from skin_host.files import set_aside
 from skin_host.layout import Layout
@@ -84,7 +84,7 @@ async def collect(
 
     Args:
         engine: returns the engine in use, which may be replaced meanwhile.
-        seconds: how long.
+        seconds: how long at least; less than noise is known from is not enough.
         progress: is called with the share that has been collected.
         clock: for waiting.
 
@@ -114,8 +114,7 @@ async def collect(
 
 def calibration_path(settings: Settings, node: str) -> Path:
     """Where a node keeps its calibration."""
-    directory = service.state_directory(settings.service.state_directory)
-    return directory / f"{settings.robot}-{node}.calibration.json"
+    return kept_path(settings, node, "calibration")
 
 
 def stored_calibration(settings: Settings, layout: Layout, node: str) -> Calibration | None:

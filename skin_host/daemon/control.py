@@ -155,6 +155,7 @@ class Control:
             "id": found.id,
             "time": found.time,
             "verdicts": calibrations.summary(found, layout),
+            "unchanged": calibrations.unchanged(found, layout),
             "kept": "calibration" not in daemon.unkept,
         }
 

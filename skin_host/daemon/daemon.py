@@ -15,15 +15,16 @@ from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Settings, load, needs_restart, skin_hash
 from skin_host.daemon import metrics, service
-from skin_host.daemon.calibrate import calibration_path, collect
+from skin_host.daemon.calibrate import collect
 from skin_host.daemon.control import Control
 from skin_host.daemon.link import Link, OpenPort
-from skin_host.daemon.state import NodeState, Thresholds, Zeros, load_kept
+from skin_host.daemon.state import NodeState, Thresholds, Zeros, kept_path, load_kept
 from skin_host.errors import ConfigurationError, RequestError, SkinError
 from skin_host.files import write_document
 from skin_host.fingertip.health import FingertipRecord
 from skin_host.fingertip.service import FingertipPublisher
 from skin_host.health import FaultLog, HealthWatch, Record
+from skin_host.health.diagnosis import named
 from skin_host.layout import Layout, build_layout, parts_of
 from skin_host.mqtt.connection import connect
 from skin_host.mqtt.contact import PartContact
@@ -31,7 +32,7 @@ from skin_host.mqtt.info import CalibrationInfo, NodeInfo, node_info
 from skin_host.mqtt.publisher import Connect, Publisher
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration
-from skin_host.processing.core import Engine, Output
+from skin_host.processing.core import SHORTEST_S, Engine, Output
 from skin_host.tasks import cancel
 
 log = logging.getLogger(__name__)
@@ -203,7 +204,7 @@ class Daemon:
         """Take a calibration, use it from then on, and store it.
 
         Args:
-            seconds: how long to observe the untouched skin.
+            seconds: how long to observe the untouched skin at least.
             boards: indices of those whose taxels are calibrated; all by default.
 
         Raises:
@@ -214,11 +215,11 @@ class Daemon:
             raise SkinError("a calibration is being taken already; wait for it to end")
         async with self._calibration_lock:
             # Gains and curves are the file's: another program may have fitted them meanwhile.
-            path = calibration_path(self.settings, self._node)
+            path = self._path("calibration")
             before = await self.clock.in_thread(
                 calibrations.find, path, self.layout, self.engine.configuration
             )
-            log.info("calibrating for %g s: keep the skin untouched", seconds)
+            log.info("calibrating for %g s: keep the skin untouched", max(seconds, SHORTEST_S))
             found = await collect(lambda: self.engine, seconds, clock=self.clock)
             known = self.engine.calibration
             if known is not None:
@@ -228,6 +229,8 @@ class Daemon:
                 )
             if before is not None:
                 found = calibrations.with_pressures_of(found, before)
+            for name, taxels in calibrations.unchanged(found, self.layout).items():
+                log.warning("%s of %s: not calibrated, received too rarely", named(taxels), name)
             doubted = self.engine.zero_at_risk(touched=False)
             self.engine.use(found, boards)
             self._use_usable()
@@ -548,7 +551,7 @@ class Daemon:
             found = self.engine.calibration
             if found is None:
                 return
-            path = calibration_path(self.settings, self._node)
+            path = self._path("calibration")
             try:
                 await self.clock.in_thread(calibrations.save, path, found, self.layout)
             except OSError as error:
@@ -619,8 +622,7 @@ class Daemon:
 
     def _path(self, what: str) -> Path:
         """Return a file of this node's state."""
-        directory = service.state_directory(self.settings.service.state_directory)
-        return directory / f"{self.settings.robot}-{self._node}.{what}.json"
+        return kept_path(self.settings, self._node, what)
 
 
 def _taxels(layout: Layout, zeros: Zeros) -> NDArray[np.bool_]:

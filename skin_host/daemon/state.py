@@ -15,6 +15,7 @@ from msgspec import Meta, Struct, field
 
 from skin_host.config.fields import Name
 from skin_host.config.settings import Settings, TouchSettings, changed
+from skin_host.daemon import service
 from skin_host.files import read_document, set_aside
 
 log = logging.getLogger(__name__)
@@ -81,6 +82,12 @@ class Zeros(Struct, forbid_unknown_fields=True):
 
 
 Kept = TypeVar("Kept", NodeState, Zeros)
+
+
+def kept_path(settings: Settings, node: str, what: str) -> Path:
+    """Return where a node keeps its `calibration`, `state` or `zeros`."""
+    directory = service.state_directory(settings.service.state_directory)
+    return directory / f"{settings.robot}-{node}.{what}.json"
 
 
 def load_kept(path: Path, kind: type[Kept]) -> Kept:

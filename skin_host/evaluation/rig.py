@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from emulator.chips.noise import SampledNoise
 from skin_host.config.settings import Settings
 from skin_host.layout import Layout, build_layout
-from skin_host.processing.calibration import Calibrator
+from skin_host.processing.calibration import KNOWN_SAMPLES, Calibrator
 from skin_host.processing.pipeline import Pipeline, PressureFrame
 
 BOARDS_PER_BUS = 14
@@ -66,7 +66,7 @@ class Rig:
         hz: sweeps a second.
         kind: of the triangles.
         processing: table of the configuration, as in TOML.
-        calibrate_s: length of the calibration.
+        calibrate_s: length of the calibration, which takes enough samples in any case.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class Rig:
         self._resting = self._rng.uniform(200.0, 240.0, self.n).astype(np.float32)
         self.t_ns = 0
         calibrator = Calibrator(self.layout)
-        for _ in range(round(calibrate_s * hz)):
+        for _ in range(max(round(calibrate_s * hz), KNOWN_SAMPLES)):
             self.t_ns += self._dt_ns
             calibrator.add(0, self.read(0.0), self._present)
         self.calibration = calibrator.finish("rig", "1970-01-01T00:00:00Z")

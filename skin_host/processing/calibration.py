@@ -15,6 +15,7 @@ from enum import IntEnum
 from functools import cached_property
 from pathlib import Path
 from statistics import median
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -44,8 +45,15 @@ SATURATED_SHARE = 0.05
 #: The rest of a healthy pad is some noise beside its no-load value; at equation (1) the last
 #: twentieth of the units are 3 % of the pressure.
 CUT_OFF_SHARE = 0.95
-#: With fewer samples than this, neither rest position nor noise of a taxel is known.
+#: With fewer samples than this, the rest position of a taxel is not known, ...
 FEWEST_SAMPLES = 10
+#: ... nor while its standard error may be a larger share of the threshold of touch: a noisy pad
+#: needs 42 samples.
+ERROR_SHARE = 1 / 4
+#: With fewer measurements than this, nothing is known of a taxel's noise, ...
+NOISE_SAMPLES = 40
+#: ... and with fewer than this, it is at least what the calibration before has found.
+KNOWN_SAMPLES = 60
 #: A triangle of which less than this share of its part's samples were received dropped out.
 RECEIVED_SHARE = 0.9
 #: The course of a calibration is kept as means of this many samples, ...
@@ -139,6 +147,8 @@ class Calibration:
         verdict: uint8[n], see `Verdict`.
         zeros: of the fingertips on force/torque boards, by name.
         curves: of the pads and their foam, from a recording under known pressure, if there was one.
+        unchanged: bool[n], taxels of which too little was received and that go on with what was
+            known of them; None without a calibration before, and of a stored one.
     """
 
     configuration: str
@@ -153,6 +163,7 @@ class Calibration:
     verdict: NDArray[np.uint8]
     zeros: dict[str, Zero] = field(default_factory=dict)
     curves: Curves | None = None
+    unchanged: Mask | None = None
 
     @cached_property
     def usable(self) -> NDArray[np.bool_]:
@@ -162,6 +173,20 @@ class Calibration:
             usable &= self.curves.usable
         usable.flags.writeable = False
         return usable
+
+
+class Known(NamedTuple):
+    """What is known of a skin while it is calibrated again.
+
+    Attributes:
+        calibration: the one in use.
+        baseline: float64[n], the zeros in use, which have drifted or were found since, in units.
+        zeroed: bool[n], taxels of which the zero in use is not in doubt.
+    """
+
+    calibration: Calibration
+    baseline: Floats
+    zeroed: Mask
 
 
 class Calibrator:
@@ -229,8 +254,15 @@ class Calibrator:
         self._counts[taxels] = 0
         self._course.forget(taxels)
 
-    def finish(self, configuration: str, time: str) -> Calibration:
-        """Return the calibration from the added sweeps, at `time` (ISO 8601, UTC)."""
+    def finish(self, configuration: str, time: str, known: Known | None = None) -> Calibration:
+        """Return the calibration from the added sweeps.
+
+        Args:
+            configuration: hash of the configuration.
+            time: when it was taken, ISO 8601 in UTC.
+            known: of this skin from before. A taxel of which too little was received goes on with
+                it, and noise is not lowered by few samples.
+        """
         counts, received = self._counts, self._received
         samples = counts.sum(axis=1)
         some = np.maximum(samples, 1)
@@ -256,39 +288,49 @@ class Calibrator:
         noise = np.where(touched, steady_noise, noise)
         upward = np.where(touched, noise**2, _upward_variance(counts, variance, self._touch))
         spread = np.sqrt(upward * np.where(touched, 1.0, lasting))
+        unknown = samples < NOISE_SAMPLES
+        if known is not None:
+            before = known.calibration
+            unknown &= ~before.usable
+            noisier = (samples < KNOWN_SAMPLES) & before.usable & (before.spread > spread)
+            noise = np.where(noisier, np.fmax(noise, before.noise), noise)
+            spread = np.where(noisier, before.spread, spread)
+            above = np.fmax(percentile - baseline, before.percentile - before.baseline)
+            percentile = np.where(noisier, baseline + above, percentile)
 
         rest = no_load - baseline
         margin = self._touch.margin_units * self._fineness
-        decides = levels(percentile - baseline, spread, self._touch).decides
+        touch = levels(percentile - baseline, spread, self._touch)
         cut_off = (rest < CUT_OFF_SHARE * self._range_units) & np.isfinite(self._range_units)
         ends = counts[:, 0] + counts[:, 255]
         verdict = np.full(len(samples), Verdict.OK, dtype=np.uint8)
-        verdict[decides > NOISY_MARGINS * margin] = Verdict.NOISY
+        verdict[touch.decides > NOISY_MARGINS * margin] = Verdict.NOISY
         verdict[cut_off] = Verdict.SATURATES
         verdict[touched | self._pressed(baseline, counts)] = Verdict.TOUCHED
-        verdict[decides > USELESS_MARGINS * margin] = Verdict.TOO_NOISY
+        verdict[touch.decides > USELESS_MARGINS * margin] = Verdict.TOO_NOISY
         verdict[ends > SATURATED_SHARE * samples] = Verdict.OUT_OF_RANGE
         verdict[(counts[:, 0] == samples) | (counts[:, 255] == samples)] = Verdict.STUCK
         few = (received < FEWEST_SAMPLES) | self._froze(variance)
+        uncertain = spread > ERROR_SHARE * touch.enter * np.sqrt(some)
+        few |= (unknown | uncertain) & (verdict < Verdict.STUCK)
         verdict[few] = Verdict.TOO_FEW
         verdict[received == 0] = Verdict.ABSENT
         # What a few bytes scatter by is not their noise: too little would call it damaged later.
         for array in (baseline, percentile, noise, spread):
             array[few] = 0.0
-        return _identified(
-            Calibration(
-                configuration,
-                "",
-                time,
-                baseline=baseline,
-                percentile=percentile,
-                noise=noise,
-                spread=spread,
-                gain=np.ones(len(samples)),
-                bend=np.ones(len(samples)),
-                verdict=verdict,
-            )
+        found = Calibration(
+            configuration,
+            "",
+            time,
+            baseline=baseline,
+            percentile=percentile,
+            noise=noise,
+            spread=spread,
+            gain=np.ones(len(samples)),
+            bend=np.ones(len(samples)),
+            verdict=verdict,
         )
+        return _identified(found if known is None else _going_on(found, known, few))
 
     def _froze(self, variance: Floats) -> Mask:
         """Return the taxels [n] whose triangle was no longer received, and no pad of it had sent
@@ -445,6 +487,22 @@ def _underestimated(samples: NDArray[np.int64]) -> Floats:
     root = np.maximum(1.0 - part - SURE_QUANTILE * np.sqrt(part), 0.1)
     found: Floats = samples / freedom / root**3
     return found
+
+
+def _going_on(found: Calibration, known: Known, few: Mask) -> Calibration:
+    """Return a calibration in which the taxels `few` [n] have what is known of them, if it is."""
+    before = known.calibration
+    unchanged = few & known.zeroed & before.usable
+    above = before.percentile - before.baseline
+    return replace(
+        found,
+        baseline=np.where(unchanged, known.baseline, found.baseline),
+        percentile=np.where(unchanged, known.baseline + above, found.percentile),
+        noise=np.where(unchanged, before.noise, found.noise),
+        spread=np.where(unchanged, before.spread, found.spread),
+        verdict=np.where(unchanged, before.verdict, found.verdict),
+        unchanged=unchanged,
+    )
 
 
 class _Course:
@@ -605,6 +663,7 @@ def merge(
             gain=old.gain,
             bend=old.bend,
             verdict=np.where(renewed, new.verdict, old.verdict),
+            unchanged=None if new.unchanged is None else new.unchanged & renewed,
             zeros=old.zeros | new.zeros if zeros else old.zeros,
         )
     )
@@ -643,6 +702,15 @@ def summary(calibration: Calibration, layout: Layout) -> dict[str, dict[str, int
         counted = {verdict.name.lower(): int((verdicts == verdict).sum()) for verdict in Verdict}
         result[part.name] = {name: count for name, count in counted.items() if count}
     return result
+
+
+def unchanged(calibration: Calibration, layout: Layout) -> dict[str, list[int]]:
+    """Return by part the numbers of the pressure taxels that go on as before: see `Calibration`."""
+    if calibration.unchanged is None:
+        return {}
+    these = calibration.unchanged & (layout.pad_kind == PadKind.PRESSURE)
+    found = {p.name: np.flatnonzero(these[p.start : p.stop]).tolist() for p in layout.parts}
+    return {name: taxels for name, taxels in found.items() if taxels}
 
 
 class _PartFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -821,6 +889,7 @@ def load(path: Path, layout: Layout, configuration: str) -> Calibration:
         verdict=verdict,
         zeros=zeros,
         curves=curves,
+        unchanged=None,
         **arrays,
     )
 

@@ -17,8 +17,16 @@ from skin_host.bus.wire import TRIANGLES, FrameBatch, StatusError
 from skin_host.config.settings import Settings, skin_hash
 from skin_host.fingertip.events import FingertipEvent
 from skin_host.layout import Layout
-from skin_host.processing.calibration import Calibration, Calibrator, Verdict, with_zeros
+from skin_host.processing.calibration import (
+    KNOWN_SAMPLES,
+    Calibration,
+    Calibrator,
+    Known,
+    Verdict,
+    with_zeros,
+)
 from skin_host.processing.contacts import ContactTracker
+from skin_host.processing.conversions import CONVERSION_S
 from skin_host.processing.events import Touch
 from skin_host.processing.intake import Intake, PartSample, below_zero
 from skin_host.processing.liveness import PADS
@@ -31,9 +39,9 @@ from skin_host.processing.silent_zero import SilentZero
 if TYPE_CHECKING:
     from skin_host.fingertip.engine import FingertipEngine
 
-#: A calibration takes at least this many samples of each part, even if its boards are slow: the
-#: 95th percentile of fewer would be the largest.
-FEWEST_SAMPLES = 20
+#: A calibration takes at least `KNOWN_SAMPLES` of each board, even if that is slow, and the time of
+#: so many conversions, even if less is asked for.
+SHORTEST_S = KNOWN_SAMPLES * CONVERSION_S
 #: A longer interval between two samples of a calibration does not count for its time: nothing was
 #: received, or the clock was set.
 LONGEST_INTERVAL_NS = 1_000_000_000
@@ -85,12 +93,13 @@ class Output(NamedTuple):
 class _CalibrationRun:
     calibrator: Calibrator
     duration_ns: int
+    fewest: int
     #: Time of the newest sample; None before the first.
     last_ns: int | None = None
     #: The sum of the intervals between samples: a clock that is set adds nothing.
     passed_ns: int = 0
-    #: By part, for the parts that have sent any.
-    samples: dict[int, int] = field(default_factory=dict)
+    #: By board and part, for those that have sent any.
+    samples: dict[tuple[int, int], int] = field(default_factory=dict)
 
 
 class Engine:
@@ -281,8 +290,13 @@ class Engine:
             found[taxels[taxels >= 0]] = True
         return found
 
-    def begin_calibration(self, seconds: float) -> None:
-        """Start to collect samples; see `end_calibration`."""
+    def begin_calibration(self, seconds: float, fewest: int = KNOWN_SAMPLES) -> None:
+        """Start to collect samples, see `end_calibration`.
+
+        Args:
+            seconds: how long, at least.
+            fewest: samples of each board, and conversions, that are taken in any case.
+        """
         processing = self.settings.processing
         curve = PressureCurve(
             self.layout.unit_ff / self.layout.sensitivity,
@@ -292,17 +306,18 @@ class Engine:
         calibrator = Calibrator(
             self.layout, processing.calibration.percentile, processing.touch, curve.beyond_units
         )
-        self._run = _CalibrationRun(calibrator, int(seconds * 1e9))
+        duration_s = max(seconds, fewest * CONVERSION_S)
+        self._run = _CalibrationRun(calibrator, int(duration_s * 1e9), fewest)
         if self.fingertips is not None:
             self.fingertips.begin_zero()
 
     def calibration_progress(self) -> float:
         """Share of the wanted time, and of the fewest samples, that has been collected, 0 to 1."""
         run = self._run
-        if run is None or run.last_ns is None:
+        if run is None or not run.samples:
             return 0.0
         time_share = run.passed_ns / run.duration_ns
-        return min(1.0, time_share, min(run.samples.values()) / FEWEST_SAMPLES)
+        return min(1.0, time_share, min(run.samples.values()) / run.fewest)
 
     def end_calibration(self, time: str) -> Calibration:
         """Return a calibration from the collected samples and stop collecting.
@@ -325,12 +340,26 @@ class Engine:
         run, self._run = self._run, None
         self._zeroed_since = {}
         zeros = None if self.fingertips is None else self.fingertips.end_zero()
+        known = self._known()
 
         def compute() -> Calibration:
-            found = run.calibrator.finish(self.configuration, time)
+            found = run.calibrator.finish(self.configuration, time, known)
             return found if zeros is None else with_zeros(found, zeros)
 
         return compute
+
+    def _known(self) -> Known | None:
+        """Return what is known of the skin now, if there is a calibration."""
+        if self.calibration is None or self._pipeline is None:
+            return None
+        zeroed = np.ones(self.layout.n_taxels, np.bool_)
+        for board in self.boards:
+            veto = self.intake.veto.get(self.ledger.row[board])
+            if veto is not None:
+                zeroed[self._taxels_of(board)[veto & (self._taxels_of(board) >= 0)]] = False
+        if self._held is not None:
+            zeroed &= ~self._held
+        return Known(self.calibration, self._pipeline.baseline.copy(), zeroed)
 
     def feed(self, bus: str, batch: FrameBatch) -> Output:
         """Process a batch of frames of one bus."""
@@ -420,9 +449,9 @@ class Engine:
             # for noisy pads.
             self._run.calibrator.forget(taxels[taxels >= 0].astype(np.intp))
             self._run.passed_ns = 0
-            for part in self._run.samples:
-                if board in self.layout.parts[part].boards:
-                    self._run.samples[part] = 0
+            for sender in self._run.samples:
+                if sender[0] == board:
+                    self._run.samples[sender] = 0
         if self.calibration is None:
             return 0
         touched: NDArray[np.bool_] = self._last_touched[taxels] & (taxels >= 0) & believed
@@ -738,8 +767,7 @@ class Engine:
             else:
                 self.intake.touched.pop(row, None)
 
-    @staticmethod
-    def _collect(run: _CalibrationRun, sample: PartSample) -> None:
+    def _collect(self, run: _CalibrationRun, sample: PartSample) -> None:
         if not any_of(sample.received):
             return
         interval_ns = 0 if run.last_ns is None else sample.t_ns - run.last_ns
@@ -748,11 +776,20 @@ class Engine:
         # Samples of several parts come in any order, by much less.
         if run.last_ns is None or interval_ns > 0 or interval_ns < -LONGEST_INTERVAL_NS:
             run.last_ns = sample.t_ns
-        samples = run.samples.setdefault(sample.part, 0)
-        in_time = run.passed_ns <= run.duration_ns
-        if in_time or samples < FEWEST_SAMPLES:
+        senders = [(board, sample.part) for board in self._sent(sample)]
+        samples = [run.samples.setdefault(sender, 0) for sender in senders]
+        if run.passed_ns <= run.duration_ns or min(samples) < run.fewest:
             run.calibrator.add(sample.part, sample.raw, sample.received, sample.t_ns)
-            run.samples[sample.part] += 1
+            for sender in senders:
+                run.samples[sender] += 1
+
+    def _sent(self, sample: PartSample) -> list[int]:
+        """Return the boards of which a sample has any value."""
+        part = self.layout.parts[sample.part]
+        if len(part.boards) == 1:
+            return list(part.boards)
+        triangles = np.unique(self.layout.triangle_of[part.start : part.stop][sample.received])
+        return sorted({self.layout.triangles[triangle].board for triangle in triangles.tolist()})
 
 
 def _fingertips(settings: Settings, layout: Layout, parts: list[int]) -> "FingertipEngine | None":

@@ -21,7 +21,7 @@ from skin_host.files import whole_file
 from skin_host.health import HealthWatch
 from skin_host.layout import Layout, load_skin
 from skin_host.processing import calibration as calibrations
-from skin_host.processing.calibration import Calibration
+from skin_host.processing.calibration import NOISE_SAMPLES, Calibration
 from skin_host.processing.core import Engine, Output, Step
 from skin_host.recording import MCAP_SUFFIX
 from skin_host.recording.lines import LineWriter, health_line
@@ -101,13 +101,13 @@ def calibration_for(
 def calibrate_from_log(
     log: Path, settings: Settings, layout: Layout, seconds: float
 ) -> Calibration:
-    """Calibrate on the first `seconds` of a recording.
+    """Calibrate on the first `seconds` of a recording, longer only if nothing is known from these.
 
     Raises:
         LogError: unreadable, or without a single sweep of this skin.
     """
     engine = Engine(settings, layout, list(range(len(layout.parts))))
-    engine.begin_calibration(seconds)
+    engine.begin_calibration(seconds, NOISE_SAMPLES)
     last_ns = 0
     for output in replay(log, engine):
         last_ns = output.sweeps[-1].t_ns if output.sweeps else last_ns

@@ -9,7 +9,7 @@ from skin_host.config.settings import Processing
 from skin_host.errors import CalibrationError
 from skin_host.evaluation.rig import flat_skin
 from skin_host.processing import calibration
-from skin_host.processing.calibration import Calibrator, Verdict
+from skin_host.processing.calibration import Calibrator, Known, Verdict
 from skin_host.processing.curves import KNOTS_UNITS, Curves, CurveVerdict, Memory, rising
 from skin_host.processing.pipeline import Pipeline
 
@@ -116,7 +116,7 @@ def calibrated_as_sent(conversions, period_s):
 
 @pytest.mark.parametrize("period_s", [0.01, 0.02, 0.0204, 0.04, 0.2])
 def test_noise_is_that_of_measurements_at_any_period(period_s):
-    conversions = 220.0 + np.random.default_rng(12).normal(0.0, 1.0, (140, N))
+    conversions = 220.0 + np.random.default_rng(12).normal(0.0, 1.0, (280, N))
     found = calibrated_as_sent(conversions, period_s)
     assert np.median(found.noise) == pytest.approx(1.04, rel=0.05)
     # What is seen for a short time may be more; that it was sent again makes it no more.
@@ -186,7 +186,8 @@ def test_a_pad_is_seldom_noisier_than_calibrated_however_short_that_was(sweeps):
     rng = np.random.default_rng(29)
     n_trials = -(-4000 // N)
     quieter = [
-        (calibrated(noisy(rng, sweeps=sweeps, sd=2.0)).spread < 2.0).mean() for _ in range(n_trials)
+        (found.usable & (found.spread < 2.0)).mean()
+        for found in (calibrated(noisy(rng, sweeps=sweeps, sd=2.0)) for _ in range(n_trials))
     ]
     assert np.mean(quieter) < 0.06
 
@@ -229,7 +230,7 @@ def test_noise_of_real_skin_is_no_press_however_the_zero_caught_it(seconds, peri
             raw = np.clip(np.rint(240.0 + noise.at(t_ns) - zero), 0, 255).astype(np.uint8)
             calibrator.add(0, raw, PRESENT, t_ns)
         found = calibrator.finish("abc", TIME)
-        rest = found.baseline - np.median(found.baseline)
+        rest = zero - np.median(zero)
         assert not (found.verdict == Verdict.TOUCHED).any(), rest[found.verdict == Verdict.TOUCHED]
         # It can tell: pads that are pressed all the time are still named.
     assert rest.max() > calibration.PRESSED_UNITS
@@ -313,6 +314,86 @@ def test_noise_is_not_known_from_a_few_bytes():
     assert np.all(found.verdict[24:36] == Verdict.TOO_FEW)
     assert not found.noise[24:36].any()
     assert found.noise[:24].all()
+
+
+@pytest.mark.parametrize("sd", [0.0, 0.5, 3.0])
+def test_a_pad_of_unknown_noise_is_not_judged_by_what_shows_little_of_it(sd):
+    """The few readings of some noisy pads are alike by chance."""
+    found = calibrated(noisy(np.random.default_rng(8), sweeps=calibration.NOISE_SAMPLES - 1, sd=sd))
+    assert (found.verdict == Verdict.TOO_FEW).all()
+
+
+@pytest.mark.parametrize(("sd", "used"), [(0.3, True), (3.0, False)])
+def test_a_pad_of_known_noise_is_used_if_its_zero_is_known_well_enough_for_its_threshold(sd, used):
+    rng = np.random.default_rng(8)
+    before = calibrated(noisy(rng, sd=sd))
+    found = recalibrated(before, noisy(rng, sweeps=20, sd=sd), zeroed=~PRESENT)
+    assert (found.usable == used).all()
+    assert set(found.verdict[~found.usable]) <= {Verdict.TOO_FEW}
+
+
+def test_every_noisy_pad_is_used_after_the_least_that_a_calibration_takes():
+    for seed in range(5):
+        rng = np.random.default_rng([8, seed])
+        found = calibrated(noisy(rng, sweeps=calibration.KNOWN_SAMPLES, sd=4.0))
+        assert not (found.verdict == Verdict.TOO_FEW).any()
+
+
+def recalibrated(before, sweeps, present=None, zeroed=PRESENT, moved=0.0):
+    """Calibrated after `before`, whose baselines have moved since."""
+    calibrator = Calibrator(LAYOUT)
+    present = np.ones(sweeps.shape, bool) if present is None else present
+    for raw, here in zip(sweeps, present, strict=True):
+        calibrator.add(0, raw.astype(np.uint8), here)
+    return calibrator.finish("abc", TIME, Known(before, before.baseline + moved, zeroed))
+
+
+def test_few_samples_do_not_lower_the_noise_that_is_known():
+    """A pad that scatters little for half a second may be as noisy as before."""
+    rng = np.random.default_rng(26)
+    before = calibrated(noisy(rng, sd=2.0))
+    short = recalibrated(before, noisy(rng, sweeps=45, sd=0.5))
+    assert np.all(short.spread >= before.spread)
+    assert np.all(short.noise >= before.noise)
+    assert np.all(short.percentile - short.baseline >= 1.0)
+    assert np.abs(short.baseline).max() < 1.5
+    # They raise it, and more samples lower it.
+    assert np.median(recalibrated(before, noisy(rng, sweeps=45, sd=4.0)).spread) > 4.0
+    assert recalibrated(before, noisy(rng, sweeps=60, sd=0.5)).spread.max() < 1.5
+
+
+def test_a_pad_of_which_too_little_was_received_goes_on_with_what_is_known_of_it():
+    rng = np.random.default_rng(27)
+    before = calibrated(noisy(rng, sd=3.0))
+    present = np.ones((125, N), bool)
+    present[20:, 24:36] = False
+    present[:, 36:48] = False
+    zeroed = PRESENT.copy()
+    zeroed[30:42] = False
+    found = recalibrated(before, noisy(rng, sd=3.0, level=235.0), present, zeroed, moved=1.5)
+    goes_on = np.flatnonzero(before.usable & zeroed & ~present.all(axis=0))
+    assert len(goes_on) >= 10
+    assert np.flatnonzero(found.unchanged).tolist() == goes_on.tolist()
+    assert found.baseline[goes_on] == pytest.approx(before.baseline[goes_on] + 1.5)
+    assert found.spread[goes_on] == pytest.approx(before.spread[goes_on])
+    assert np.all(found.verdict[goes_on] == before.verdict[goes_on])
+    above = (found.percentile - found.baseline)[goes_on]
+    assert above == pytest.approx((before.percentile - before.baseline)[goes_on])
+    # Where the zero is in doubt, nothing is known.
+    assert np.all(found.verdict[30:36] == Verdict.TOO_FEW)
+    assert np.all(found.verdict[36:42] == Verdict.ABSENT)
+    assert found.baseline[:24] == pytest.approx(np.full(24, 5.0), abs=1.7)
+    assert calibration.unchanged(found, LAYOUT) == {"skin": goes_on.tolist()}
+
+
+def test_a_pad_that_was_refused_before_does_not_go_on():
+    rng = np.random.default_rng(28)
+    present = np.ones((125, N), bool)
+    present[:, 24:36] = False
+    before = calibrated(noisy(rng), present)
+    found = recalibrated(before, noisy(rng), present)
+    assert not found.unchanged.any()
+    assert np.all(found.verdict[24:36] == Verdict.ABSENT)
 
 
 def test_lost_sweeps_do_not_shift_the_baseline():

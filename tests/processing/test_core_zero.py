@@ -293,8 +293,12 @@ def test_a_calibration_takes_nothing_of_two_boards_at_one_address(
     hand.other_units = np.abs(hand.rest_units) + 4
     hand.engine.begin_calibration(2.0)
     hand.send(80)
+    assert hand.engine.calibration is not None
+    known = hand.engine.calibration.usable & hand.engine.taxels_of([0])
     found = hand.engine.end_calibration("2026-01-01T00:00:00+00:00")
-    assert not found.usable.any()
+    assert found.unchanged is not None
+    assert (found.unchanged | ~found.usable).all()
+    assert not (found.unchanged & ~known).any()
     assert valid_share(steps[-1]) == 0.0
 
 

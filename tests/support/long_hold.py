@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from emulator.probes.viscoelastic import TruthKind
 from skin_host.evaluation.histories import PlayedHistory, record
 from skin_host.evaluation.rig import Rig
-from skin_host.processing.calibration import FEWEST_SAMPLES
 from skin_host.processing.pressure import PressureCurve
 
 CURVE = PressureCurve(2.88)
@@ -44,7 +43,7 @@ def hold(
     Nothing else may be touched.
     """
     played = history(truth, seconds, hz)
-    rig = Rig(1, 0.3, seed=21, hz=hz, calibrate_s=max(5.0, FEWEST_SAMPLES / hz))
+    rig = Rig(1, 0.3, seed=21, hz=hz)
     here = np.arange(rig.n) < pressed
     start, end = round(BEFORE_S * hz), round((BEFORE_S + seconds) * hz)
     shares = []

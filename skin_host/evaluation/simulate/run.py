@@ -468,7 +468,7 @@ class _Run:
             self._ask("thresholds", '{"set": {"margin_units": 3}}')
             world.power_failed.clear()
             await asyncio.wait(
-                [asyncio.create_task(world.power_failed.wait())], timeout=min(3.0, left_s)
+                [asyncio.create_task(world.power_failed.wait())], timeout=min(6.0, left_s)
             )
             self._kill(power=True)
         else:
