@@ -26,6 +26,7 @@ import numpy as np  # noqa: F401
 ROOT = Path(__file__).parents[3]
 SMALL = Path(__file__).with_name("small.toml")
 KASPAR = ROOT / "config" / "kaspar.toml"
+DEMO = ROOT / "config" / "demo.toml"
 PACKAGES = ("skin_host", "emulator", "config")
 
 
@@ -125,13 +126,6 @@ MUTANTS = [
         KASPAR,  # its boards share a bus
     ),
     Mutant(
-        "a board that was reset is only started again",
-        "bus/boards.py",
-        "            await self._set_up(record)\n\n    async def stop",
-        "            await self._port.send([command_frame(SetTxMode(TxMode.START), address)])\n\n"
-        "    async def stop",
-    ),
-    Mutant(
         "taxels that a new zero made unknown stay valid",
         "processing/intake.py",
         "        if veto is None:\n            return masks\n",
@@ -142,6 +136,19 @@ MUTANTS = [
         "processing/intake.py",
         "        if row in ledger.twice:",
         "        if row in ():",
+    ),
+    Mutant(
+        "a zero that a board took while nobody received it is not recognised",
+        "processing/core.py",
+        "        if zeroed:\n            self.rezero(sweep.board)\n            return\n",
+        "",
+        DEMO,
+    ),
+    Mutant(
+        "taxels of boards that are not zeroed yet are valid after a start",
+        "processing/core.py",
+        "        self._held = held if self._held is None else self._held | held\n",
+        "",
     ),
     Mutant(
         "errors of chips are not noted",
