@@ -249,3 +249,21 @@ def test_no_board_or_triangle_that_dies_while_it_is_touched_looks_untouched(
     assert end.reason == "lost"
     assert "OFF" not in states
     assert states[-1] == "UNKNOWN"
+
+
+def test_any_pressure_pad_of_a_triangle_feels_for_it() -> None:
+    """Also the very first taxel of the skin."""
+    first = LAYOUT.parts[0]
+    pads = LAYOUT.pad_kind[first.start : first.stop] == PadKind.PRESSURE
+    same = LAYOUT.triangle_of[first.start : first.stop] == LAYOUT.triangle_of[first.start]
+    none = np.zeros(first.n_taxels, np.bool_)
+    raw, kpa = np.zeros(first.n_taxels, np.uint8), np.zeros(first.n_taxels, np.float32)
+    for taxel in np.flatnonzero(same):
+        valid = pads & ~same
+        valid[taxel] = pads[taxel]
+        contact = PartContact(LAYOUT, 0)
+        states = [
+            contact.step(PressureFrame(first.name, n, n * MS, raw, kpa, none, valid, none), [])
+            for n in range(SURE_FRAMES)
+        ]
+        assert states[-1] == ("OFF" if pads[taxel] else "UNKNOWN")

@@ -621,3 +621,9 @@ def test_what_temperature_pads_showed_hours_ago_counts_less_than_what_they_show_
         units = np.where(thermal, warmth, 30.0)
         track.step(units, ~thermal, NOBODY, 10.0)
     assert (track.baseline[~thermal] - begun) == pytest.approx(0.8, abs=0.3)
+
+
+def test_a_small_change_that_all_readings_share_is_followed_at_once_and_only_once():
+    track = tracker()
+    follow(track, np.full(N, 0.02))
+    assert track.baseline == pytest.approx(np.full(N, 0.02))

@@ -585,3 +585,18 @@ def test_a_second_press_ends_by_as_many_measurements_as_the_first() -> None:
     over(first, 0, 0, 0)
     assert over(both, 100, 100, 100, 3, 100)[-2:] == flags(1, 1)
     assert over(both, 3, 3) == flags(1, 0)
+
+
+def test_a_press_is_felt_as_firm_while_another_seems_to_fall_again_and_again() -> None:
+    residuals = Residuals(2)
+    residuals.configure(np.full(2, 2.0), np.full(2, 6.0), np.array([5, 5]))
+    both = np.ones(2, bool)
+    for _ in range(20):
+        residuals.step(both, np.array([100.0, 5.0]))
+    # The first one never falls for as many measurements as would end it.
+    falling = [3.0, 3.0, 3.0, 3.0, 100.0]
+    for unsteady, reading in [(one, 100.0) for one in 10 * falling] + [
+        (one, 3.0) for one in falling
+    ]:
+        reported = residuals.step(both, np.array([unsteady, reading]))
+    assert reported.tolist() == [True, False]
