@@ -36,6 +36,7 @@ class Sent:
     topic: str
     payload: bytes
     qos: int
+    retain: bool
     done: "asyncio.Future[None]"
 
     @property
@@ -69,14 +70,14 @@ class Link:
         return self.packet_limit is None or len(payload) <= self.packet_limit
 
     def send(
-        self, topic: str, payload: bytes, *, qos: int = 0, **_: object
+        self, topic: str, payload: bytes, *, qos: int = 0, retain: bool = False, **_: object
     ) -> "asyncio.Future[None]":
         if self.is_lost:
             raise MqttError("lost")
         done = asyncio.get_running_loop().create_future()
         if self.is_prompt:
             done.set_result(None)
-        self.sent.append(Sent(topic, payload, qos, done))
+        self.sent.append(Sent(topic, payload, qos, retain, done))
         self.written.append("event")
         return done
 
@@ -361,6 +362,18 @@ async def test_states_go_some_at_a_time_and_are_counted_when_all_of_these_have_a
         assert sender.outbox.counters.retained_sent == RETAINED_WINDOW
         assert sender.acknowledged == [link]
         assert [one.topic for one in link.waiting()] == [f"state{RETAINED_WINDOW - 1}"]
+
+
+@stepped
+async def test_states_are_retained_and_touches_not_and_both_ask_for_an_acknowledgement(
+    clock: SteppedClock,
+) -> None:
+    sender, link = Sender(clock), Link(is_prompt=True)
+    async with sender.over(link):
+        sender.put_touches([1])
+        await sender.turn()
+    forms = {(one.topic, one.qos, one.retain) for one in link.sent}
+    assert forms == {(STATUS, 1, True), (TOUCHES, 1, False)}
 
 
 @stepped
