@@ -47,6 +47,9 @@ class TipState:
     Attributes:
         number: among the fingertips of the configuration.
         reported_scale: float64[6], the full scales that the board reported; 0 where it has not.
+        last_ns, received_ns: time of its last frame, and the same by the ledger's clock, which does
+            not jump.
+        touched_since_ns: the same of its touch, if there is one.
         assembler: of its samples; None until the full scales are known.
         saturated_ns: when a sample was last saturated, 0 if never.
         silenced: how often the board has timed out.
@@ -61,6 +64,8 @@ class TipState:
     reported_scale: Floats = field(default_factory=lambda: np.zeros(CHANNELS))
     assembler: WrenchAssembler | None = None
     last_ns: int = 0
+    received_ns: int = 0
+    touched_since_ns: int | None = None
     frames: int = 0
     saturated_ns: int = 0
     silenced: int = 0
@@ -107,6 +112,7 @@ class FingertipEngine:
         self._of_address: dict[str, dict[int, TipState]] = {}
         self._of_part: dict[int, TipState] = {}
         self._zeroing = False
+        self._now_ns = 0
         for number, (name, table) in enumerate(settings.fingertips.items()):
             if table.node not in nodes:
                 continue
@@ -146,8 +152,9 @@ class FingertipEngine:
             for kind in StrainType
         )
 
-    def feed(self, bus: str, batch: FrameBatch) -> FingertipOutput:
-        """Process a batch of frames of one bus."""
+    def feed(self, bus: str, batch: FrameBatch, now_ns: int) -> FingertipOutput:
+        """Process a batch of frames of one bus; `now_ns` is the time of the ledger's clock."""
+        self._now_ns = now_ns
         felt = FingertipOutput([], [])
         here = self._of_address.get(bus)
         if here is None:
@@ -163,6 +170,7 @@ class FingertipEngine:
                 continue
             state.frames += len(mine)
             state.last_ns = int(batch.t_ns[frames.row[mine[-1]]])
+            state.received_ns = now_ns
             state.alive = True
             if state.assembler is not None:
                 for wrench in state.assembler.take(frames, batch.t_ns):
@@ -176,15 +184,33 @@ class FingertipEngine:
         if state is not None:
             state.tip.note_skin(events, t_ns)
 
-    def expire(self, now_ns: int) -> list[FingertipEvent]:
-        """Find boards that have timed out, on the clock of the frames' time stamps."""
+    def expire(self, t_ns: int, now_ns: int) -> list[FingertipEvent]:
+        """Find boards that have timed out.
+
+        Args:
+            t_ns: now, on the clock of the frames' time stamps, which may be set.
+            now_ns: now, on the ledger's clock.
+        """
+        self._now_ns = now_ns
         events: list[FingertipEvent] = []
         for state in self.tips.values():
-            if state.alive and now_ns - state.last_ns > SILENT_NS:
+            quiet_ns = now_ns - state.received_ns
+            if state.alive and quiet_ns > SILENT_NS:
                 state.alive = False
                 state.silenced += 1
-            events += state.tip.expire(now_ns)
+            events += state.tip.expire(t_ns, quiet_ns)
+            self._note_touch(state)
         return events
+
+    def touched_for_ns(self, state: TipState) -> int:
+        """How long the contact of a fingertip has lasted; 0 without one."""
+        return 0 if state.touched_since_ns is None else self._now_ns - state.touched_since_ns
+
+    def _note_touch(self, state: TipState) -> None:
+        if not state.tip.touched:
+            state.touched_since_ns = None
+        elif state.touched_since_ns is None:
+            state.touched_since_ns = self._now_ns
 
     def end_all(self, t_ns: int) -> list[FingertipEvent]:
         """End every contact, because the daemon stops."""
@@ -222,12 +248,14 @@ class FingertipEngine:
         for name, state in self.tips.items():
             events += state.tip.end_all(state.last_ns)
             state.tip.use(zeros.get(name))
+            self._note_touch(state)
         return events
 
     def _step(self, state: TipState, wrench: Wrench) -> list[FingertipEvent]:
         if wrench.saturated:
             state.saturated_ns = wrench.t_ns
         events = state.tip.step(wrench)
+        self._note_touch(state)
         if self._zeroing and not wrench.saturated:
             state.zeroing.append(np.concatenate([wrench.force_n, wrench.torque_nm]))
             state.touching.append(state.tip.touched)

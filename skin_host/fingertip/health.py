@@ -150,7 +150,7 @@ class FingertipHealth:
                 f"{here}: force comes without torque, or the reverse: frames are lost or late; "
                 "the bus is overloaded or badly terminated",
             )
-        if state.tip.touched_for_ns(now_ns) > self._engine.held_report_ns:
+        if self._engine.touched_for_ns(state) > self._engine.held_report_ns:
             yield fault(
                 "held",
                 f"{name} has been touched for so long that its zero is uncertain; calibrate it "

@@ -183,10 +183,6 @@ class Tip:
         """Whether something touches the fingertip."""
         return self._reported is not None
 
-    def touched_for_ns(self, now_ns: int) -> int:
-        """How long the contact has lasted; 0 without one."""
-        return now_ns - self._begun_ns if self.touched else 0
-
     def use(self, zero: Zero | None) -> None:
         """Use this zero from now on. All contacts must have been ended before."""
         self._zero = zero
@@ -247,14 +243,14 @@ class Tip:
             events += self._end(wrench.t_ns)
         return events
 
-    def expire(self, now_ns: int) -> list[FingertipEvent]:
-        """End a contact whose samples have stopped for too long."""
-        if now_ns - self._last_ns < LOST_NS:
+    def expire(self, t_ns: int, quiet_ns: int) -> list[FingertipEvent]:
+        """End a contact whose samples have stopped for too long: now, and for how long."""
+        if quiet_ns < LOST_NS:
             return []
         self.feels = False
         if self._reported is None:
             return []
-        return self.end_all(now_ns, "lost")
+        return self.end_all(t_ns, "lost")
 
     def end_all(self, t_ns: int, reason: Reason = "stopped") -> list[FingertipEvent]:
         """End all contacts, because the fingertip will not send for a while."""
@@ -314,7 +310,7 @@ class Tip:
         self, load: Floats, contact: IntrinsicContact | None, t_ns: int, *, touches: bool
     ) -> list[FingertipEvent]:
         """Update the flags from a sample that is not smoothed."""
-        settled = self._reported is not None and t_ns - self._begun_ns > SETTLING_NS
+        settled = self._reported is not None and not (0 <= t_ns - self._begun_ns <= SETTLING_NS)
         located = contact is not None and contact.verdict[0] == ContactVerdict.CONTACT
         normal = contact.normal[0] if contact is not None and located else None
         seen = self._watch.step(load, normal, settled=settled)
@@ -415,7 +411,7 @@ class Tip:
 
     def _worth_reporting(self, said: Touch, now: Touch) -> bool:
         assert said.load is not None and now.load is not None
-        if now.t_ns - said.t_ns >= ALIVE_NS:
+        if not 0 <= now.t_ns - said.t_ns < ALIVE_NS:
             return True
         if (now.load.verdict, now.load.flags) != (said.load.verdict, said.load.flags):
             return True

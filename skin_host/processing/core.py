@@ -366,7 +366,7 @@ class Engine:
         samples: list[tuple[int, int]] = []
         grasps, self._ended = self._ended, []
         if self.fingertips is not None:
-            felt = self.fingertips.feed(bus, batch)
+            felt = self.fingertips.feed(bus, batch, self.ledger.now_ns)
             samples = felt.samples
             grasps += felt.events
         sweeps, answers = self.assemblers[bus].feed(batch)
@@ -396,7 +396,7 @@ class Engine:
         ]
         grasps, self._ended = self._ended, []
         if self.fingertips is not None:
-            grasps += self.fingertips.expire(now_ns)
+            grasps += self.fingertips.expire(now_ns, self.ledger.now_ns)
         samples = self._take(sweeps)
         samples += self.intake.expire(now_ns)
         return Output(sweeps, self._process(samples) if samples else [], [], grasps, [])

@@ -52,6 +52,8 @@ class Bench:
         self.health = FingertipHealth(self.tips)
         self.sent: list[tuple[int, bytes]] = []
         self.felt: list[FingertipEvent] = []
+        #: By how much the computer's clock was set since the start.
+        self.ahead_ns = 0
         clock = lambda: self.robot.t_ns  # noqa: E731
         self.boards = StrainBoards("can0", self, self.tips.on_bus("can0"), clock)
 
@@ -63,10 +65,14 @@ class Bench:
 
     async def run(self, seconds: float) -> None:
         for _ in range(round(seconds / 0.02)):
-            self.felt += self.engine.feed("can0", self.robot.step(0.02)["can0"]).grasps
-            self.felt += self.engine.expire(self.robot.t_ns).grasps
+            batch = self.robot.step(0.02)["can0"]
+            batch.t_ns = batch.t_ns + self.ahead_ns
+            # A clock may be set between two reads.
+            self.felt += self.engine.expire(self.now_ns - 10_000_000).grasps
+            self.felt += self.engine.feed("can0", batch).grasps
+            self.felt += self.engine.expire(self.now_ns).grasps
             self.boards.supervise()
-            self.health.tick(self.robot.t_ns)
+            self.health.tick(self.now_ns)
             await asyncio.sleep(0)
 
     async def calibrate(self) -> None:
@@ -74,8 +80,12 @@ class Bench:
         await self.run(0.6)
         self.engine.use(self.engine.end_calibration("2026-01-01T00:00:00+00:00"))
 
+    @property
+    def now_ns(self) -> int:
+        return self.robot.t_ns + self.ahead_ns
+
     def record(self, name: str = "index") -> FingertipRecord:
-        return self.health.records(self.robot.t_ns)[name]
+        return self.health.records(self.now_ns)[name]
 
     def codes(self, name: str = "index") -> list[str]:
         return [fault["code"].removeprefix("fingertip_") for fault in self.record(name)["faults"]]
@@ -263,6 +273,38 @@ async def test_a_fingertip_that_was_touched_when_calibrated_is_named_until_it_wa
     assert bench.codes() == ["pressed"]
     await bench.calibrate()
     assert bench.codes() == []
+
+
+@pytest.mark.parametrize("set_s", [-3600, -2, 2, 3600])
+async def test_a_clock_that_is_set_changes_nothing_of_a_touch(set_s: int) -> None:
+    bench = Bench({"part": "index", "force_n": [[2.0, 0], [2.1, 2], [6.0, 2], [6.1, 0]]})
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    await bench.calibrate()
+    await bench.run(2.0)
+    bench.ahead_ns = set_s * 1_000_000_000
+    before = len(bench.felt)
+    await bench.run(2.0)
+    told = [event for event in bench.felt[before:] if isinstance(event, Touch)]
+    assert [event.event for event in told] == ["move"] * len(told)
+    assert told, "a touch that lasts is reported every second"
+    assert bench.codes() == []
+    await bench.run(2.0)
+    assert [event.event for event in bench.felt if event.part == "index"][-1] == "end"
+
+
+@pytest.mark.parametrize("set_s", [-3600, 0, 3600])
+async def test_a_board_that_stops_sending_when_the_clock_is_set_has_timed_out(set_s: int) -> None:
+    bench = Bench({"part": "index", "force_n": [[2.0, 0], [2.1, 2], [9.0, 2]]})
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    await bench.calibrate()
+    await bench.run(2.0)
+    bench.robot.inject(parse("board_silent board=index"))
+    bench.ahead_ns = set_s * 1_000_000_000
+    await bench.run(0.8)
+    assert bench.codes() == ["silent"]
+    assert getattr(bench.felt[-1], "reason", None) == "lost"
 
 
 async def test_a_contact_without_end_makes_its_zero_uncertain() -> None:

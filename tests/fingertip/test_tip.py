@@ -168,8 +168,8 @@ def test_a_board_that_falls_silent_ends_its_touch_and_slip() -> None:
     bench = Bench(friction=0.2)
     bench.hold(20, POINT, -2 * DIRECTION + np.array([0.8, -0.6, 0.0]))
     assert bench.tip.touched
-    assert bench.tip.expire(bench.t_ns + 400 * MS) == []
-    ended = bench.tip.expire(bench.t_ns + 600 * MS)
+    assert bench.tip.expire(bench.t_ns + 400 * MS, 400 * MS) == []
+    ended = bench.tip.expire(bench.t_ns + 600 * MS, 600 * MS)
     assert [(type(event), event.event) for event in ended] == [
         (Slip, "end"),
         (Touch, "end"),
