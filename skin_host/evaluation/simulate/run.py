@@ -230,6 +230,7 @@ class _Run:
         # What ends now ends in any order.
         self.result.events, self.result.digest = world.trace.count, world.trace.digest()
         self.result.seconds = list(world.trace.seconds)
+        self.result.last = list(world.trace.last)
         for task in (living, looking, stopped):
             task.cancel()
         outcome, *_ = await asyncio.gather(living, looking, stopped, return_exceptions=True)
@@ -240,7 +241,6 @@ class _Run:
         result = self.result
         result.simulated_s = world.clock.monotonic_s()
         result.broken = self._promises.broken
-        result.last = list(world.trace.last)
         result.troubles = dict(sorted(self._injected.items()))
         result.required = sorted(self._promises.accusations.required)
         result.named = sorted(self._promises.accusations.named)

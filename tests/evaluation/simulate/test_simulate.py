@@ -72,6 +72,8 @@ def test_a_fingertip_that_does_not_feel_what_presses_it_breaks_a_promise(
     result = run(101, configuration("fingertips.toml"), until_s=11.0)
     assert result.broken is not None
     assert "not touched while it is pressed" in result.broken
+    # What the end of the run does is not shown.
+    assert result.last[-1].endswith(f"BROKEN: {result.broken}")
 
 
 def test_the_same_seed_gives_the_same_events_in_another_process(tmp_path: Path) -> None:
