@@ -139,6 +139,7 @@ def test_a_calibration_of_another_configuration_is_refused(tmp_path):
         (["run", str(DEMO), "--duration", "-3"], "seen -3, wanted a number above 0"),
         (["calibrate", str(DEMO), "--seconds", "0"], "seen 0, wanted a number above 0"),
         (["emulate", str(DEMO), "--speed", "fast"], "seen fast, wanted a number above 0"),
+        (["run", str(DEMO), "--workers", "0"], "seen 0, wanted a whole number from 1 to"),
         (["emulate", str(DEMO), "--seed", "-1"], "seen -1, wanted a whole number from 0 to"),
         (["simulate", "--hours", "inf"], "seen inf, wanted a number below 10000"),
         (["simulate", "--until", "nan"], "seen nan, wanted a number above 0"),
