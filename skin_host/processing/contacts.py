@@ -36,9 +36,10 @@ FELT_KPA = 2.0
 #: Pieces of a contact become separate contacts when they have been apart for this long.
 PARTED_NS = 150_000_000
 #: A piece that feels less than this share of what the contact felt is a remainder of it: noisy
-#: taxels release late. The contact's own value fades in the second time.
+#: taxels release late. The contact's own value fades in the second time, which is longer than foam
+#: that is not fitted takes to recover to `FELT_KPA`: it keeps up to 7 % of a hard press at first.
 PIECE_SHARE = 0.2
-FADES_NS = 2_000_000_000
+FADES_NS = 10_000_000_000
 #: Contacts that have grown together become one after this time: a taxel between two may flicker.
 MERGED_NS = 1_000_000_000
 #: A touched taxel that is not received for less than this time still counts as touched.

@@ -74,7 +74,9 @@ def test_what_a_file_says_does_not_steer_the_terminal(
 
 
 def test_an_impossible_port_is_refused_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["view", "--port", "99999"]) != 0
+    with pytest.raises(SystemExit) as ended:
+        main(["view", "--port", "99999"])
+    assert ended.value.code == 2
     (said,) = capsys.readouterr().err.splitlines()
     assert "99999" in said
 

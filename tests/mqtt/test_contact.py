@@ -205,9 +205,9 @@ def soon_pressed() -> FaultBench:
         at=Place(taxel=39),
         diameter_mm=3,
         pressure_kpa=[(0, 0), (0.1, 100), (100, 100)],
-        start_s=9.0,
+        start_s=11.0,
     )
-    return FaultBench(1.0, Scene(probe=[press], quiet=True))
+    return FaultBench(3.0, Scene(probe=[press], quiet=True))
 
 
 @pytest.mark.parametrize(
