@@ -330,6 +330,13 @@ def test_a_board_is_easy_while_each_of_its_last_sweeps_is_near_its_period(
     assert known.is_easy(HAND)
 
 
+@pytest.mark.parametrize("before", [16, 20, 31])
+def test_an_uneven_interval_counts_until_sixteen_even_ones_followed(before: int) -> None:
+    for followed in (15, 16):
+        known = after([50.0] * before + [63.0] + [50.0] * followed)
+        assert known.is_easy(HAND) is (followed == 16)
+
+
 def test_a_board_that_timed_out_is_not_easy() -> None:
     known = after([50.0] * 16)
     for turn in range(1, 4):

@@ -107,6 +107,14 @@ def test_a_late_sign_of_life_takes_nothing_from_an_earlier_one() -> None:
     assert presence.contact("palm", 9.6) == Contact("palm", "OFF")
 
 
+def test_a_late_sign_shows_that_a_part_lived_when_it_was_sent() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_state("palm", "OFF", 0.0, sent_s=0.0)
+    presence.take_sign("palm", 2.0, 1.0)
+    assert presence.contact("palm", 3.9) == Contact("palm", "OFF")
+    assert presence.contact("palm", 4.1) == Contact("palm", "UNKNOWN", "stale")
+
+
 def test_a_clock_that_was_set_back_looks_late_for_a_limited_time() -> None:
     lateness = Lateness()
     assert lateness.of(100.0, 0.0) == 0.0

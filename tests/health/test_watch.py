@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -79,6 +80,22 @@ def test_a_triangle_whose_frames_are_lost_is_late_for_a_few_samples_and_then_not
     note(watch, 8 * PERIOD, lost=(0, 1))
     # A sample of nothing reports silence, not lateness.
     assert late(watch) == []
+
+
+@pytest.mark.parametrize(("silent_periods", "samples"), [(4.0, 4), (5.0, 5), (6.5, 6)])
+def test_a_triangle_is_late_until_a_board_that_sends_nothing_has_timed_out(
+    silent_periods: float, samples: int
+) -> None:
+    settings = load(CONFIG)
+    receive = msgspec.structs.replace(settings.receive, silent_periods=silent_periods)
+    settings = msgspec.structs.replace(settings, receive=receive)
+    watch = Watch(Engine(settings, build_layout(settings, CONFIG.parent), [0])).parts[0]
+    note(watch, PERIOD)
+    found = []
+    for turn in range(2, 12):
+        note(watch, turn * PERIOD, lost=(1,))
+        found.append(late(watch) == SECOND)
+    assert found == [True] * samples + [False] * (10 - samples)
 
 
 def test_what_was_not_valid_before_is_not_late() -> None:

@@ -254,6 +254,21 @@ def test_a_chip_that_reported_an_error_in_one_sweep_is_invalid_until_its_bytes_c
     assert invalid == [[1], [1, 2], [1, 2], [1, 2], [1, 2], [1, 2], [1, 2], [2]]
 
 
+@pytest.mark.parametrize("eager", [False, True])
+def test_an_error_before_a_calibration_is_none_after_it(eager: bool) -> None:
+    """Judged already or not, and of the calibrated board only."""
+    parts = intake()
+    joined = parts.engine.intake
+    parts.feed([sweep(board, PERIOD, status=2) for board in (OUTER, INNER)])
+    if eager:
+        joined.judge()
+    noise = np.full(parts.engine.layout.n_taxels, 0.5)
+    joined.use(noise, np.array([True, False]))
+    (sample,) = parts.feed([sweep(board, 2 * PERIOD) for board in (OUTER, INNER)])
+    assert sample.present[: 16 * 12].all()
+    assert not sample.present[16 * 12 :].any()
+
+
 def test_a_veto_makes_a_taxel_invalid_that_was_received() -> None:
     parts = intake()
     vetoed = np.zeros((16, 12), np.bool_)

@@ -197,6 +197,21 @@ def test_a_held_hand_is_given_more_time() -> None:
         assert not liveness.frozen.any()
 
 
+def test_repeats_count_for_less_on_the_board_that_is_touched_now_not_on_one_that_was() -> None:
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+    liveness = Liveness(K, np.full((K, 12), 0.8), PERIOD_S, boards=2)
+    before, now = np.zeros((2, K, 12), np.bool_)
+    before[1, 0] = now[3, 0] = True
+    for _ in range(30):
+        raw = noisy_bytes(rng, 0.8, centre)
+        liveness.step(raw, HERE, NO, before)
+    for _ in range(19):
+        liveness.step(raw, HERE, NO, now)
+    # The touch on triangle 3 may be its own.
+    assert liveness.frozen.tolist() == [True, True, False, True]
+
+
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=30, deadline=None)
 def test_any_bytes_at_all_are_survived(seed: int) -> None:

@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import assume, currently_in_test_context, given, settings
@@ -380,9 +382,39 @@ def test_plays_of_chosen_taxels_are_forgotten() -> None:
         assert kept == other.step(np.full(2, kpa), 0.05)[1]
 
 
+@pytest.mark.parametrize(("dtype", "item"), [(np.float64, 8), (np.float32, 4)])
+def test_the_size_of_the_state_of_plays_is_one_number_each_and_the_last_reading(
+    dtype: type[np.floating[Any]], item: int
+) -> None:
+    model = PlayRelaxation(7, radius_kpa=RADII_KPA, weight=PLAY_WEIGHTS, dtype=dtype)
+    assert model.bytes_per_taxel == (3 + 1) * item
+
+
 def test_radii_and_weights_of_plays_go_together() -> None:
     with pytest.raises(ValueError, match="3 radii and 2 weights"):
         PlayRelaxation(1, radius_kpa=RADII_KPA, weight=[0.1, 0.2])
+
+
+def test_a_mean_that_was_reset_has_nothing_of_the_samples_before() -> None:
+    completed: list[float] = []
+    means = TumblingMean(1, 1.0, np.float64)
+    for number, kpa in enumerate((99.0, 10.0, np.nan)):
+        means.feed(np.array([kpa]), 0.5, lambda mean, windows: completed.extend(mean))
+        if number == 0:
+            means.reset(None)
+    assert completed == [10.0]
+
+
+@pytest.mark.parametrize("step_s", [3.0, 3.0 - 1e-12])
+def test_a_step_of_whole_windows_completes_each_of_them_but_for_what_is_rounded(
+    step_s: float,
+) -> None:
+    completed: list[tuple[list[float], int]] = []
+    means = TumblingMean(1, 1.0, np.float64)
+    means.feed(
+        np.array([7.0]), step_s, lambda mean, windows: completed.append((mean.tolist(), windows))
+    )
+    assert completed == [([7.0], 1), ([7.0], 2)]
 
 
 def test_what_is_missing_from_a_mean_counts_as_the_mean_so_far() -> None:

@@ -1,6 +1,7 @@
 """A stuck pad is told from a quiet one by odds, and the odds are what they say."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -329,3 +330,32 @@ def test_a_pad_has_moved_when_no_word_explains_all_its_bytes(
             now = {base + bit for bit in range(bits.bit_length()) if bits >> bit & 1}
             assert moved[0, pad] == words[pad].isdisjoint(now)
             words[pad] = words[pad] & now or now
+
+
+@pytest.mark.parametrize("board", [0, 1])
+def test_what_a_board_learns_of_its_pads_does_not_depend_on_whether_another_sends(
+    board: int,
+) -> None:
+    rng = np.random.default_rng(2)
+    both, alone = (
+        StuckPads(
+            np.full(SHAPE, 0.4),
+            np.ones(K),
+            np.full(K, PERIOD_S),
+            Repeats([Encoding(NO_GAIN, 2, NO_LOAD, False)] * K),
+            2,
+        )
+        for _ in ("both", "alone")
+    )
+    before = alone.longest.copy()
+    came = np.arange(2) == board
+    mine = np.repeat(came, K // 2)
+    sent = to_bytes(239.8 + 0.4 * rng.standard_normal((2 * stuck.STEP_SAMPLES + 1, *SHAPE)))
+    for last, raw in pairwise(sent):
+        changed = raw != last
+        both.step(raw, changed, None, NO)
+        here = mine[:, None]
+        alone.step(raw, changed & here, inside(raw) & here, NO, came=came)
+    assert (alone.longest[mine] == both.longest[mine]).all()
+    assert (alone.longest[mine] != before[mine]).all()
+    assert (alone.longest[~mine] == before[~mine]).all()

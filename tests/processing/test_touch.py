@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skin_host.config.settings import TouchSettings
-from skin_host.processing.touch import Levels, Residuals, TouchDetector, levels
+from skin_host.processing.touch import LOST_S, Levels, Residuals, TouchDetector, levels
 
 REST = 200
 
@@ -52,6 +52,19 @@ def touched_over(signal, votes=2, found=BAND):
 
 def flags(*numbers):
     return [bool(number) for number in numbers]
+
+
+def test_a_touch_ends_when_its_taxel_is_lost_for_long_at_a_time_and_not_now_and_then():
+    detector = detector_of()
+    raw = np.full(1, REST - 50, np.uint8)
+    lost = np.ones(1, np.bool_)
+    for _ in range(2):
+        detector.step(raw, SWEEP_S)
+    for _ in range(20):
+        assert detector.step(raw, SWEEP_S, lost)[0]
+        assert detector.step(raw, SWEEP_S)[0]
+    turns = round(LOST_S / SWEEP_S) + 1
+    assert not [detector.step(raw, SWEEP_S, lost)[0] for _ in range(turns)][-1]
 
 
 def test_one_measurement_over_the_threshold_is_no_touch():
