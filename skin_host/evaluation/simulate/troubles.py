@@ -16,6 +16,7 @@ from skin_host.bus.port import LinkState
 from skin_host.evaluation.simulate.cables import Mischief
 from skin_host.evaluation.simulate.disk import FULL, READ_ONLY
 from skin_host.evaluation.simulate.world import World
+from skin_host.health.describe import FEWEST_RESTING
 from skin_host.health.diagnosis import JITTER_SHARE
 from skin_host.layout import PadKind
 
@@ -119,7 +120,7 @@ class Trouble:
             know, and for `recovers_s` afterwards.
         lingers: what it did lasts until it is put right.
         writes: it shows only when something is written.
-        shows: whether what passed over the buses has shown it so far.
+        shows: whether it differs so far, for the daemon, from what is no trouble.
         lasts_s: shortest and longest; no time at all for what happens at once.
         twice: the board at whose address a second one sends; once health has reported that, no
             taxel of it is valid.
@@ -264,6 +265,11 @@ def _emulated(
         elif "bus" in targets:
             places = places_of(world, bus=bus)
         about = " ".join([name, *(f"{key}={value}" for key, value in targets.items())])
+        shows = _always
+        if name == "jittered_period":
+            shows = _scatters(world, board)
+        elif name == "temperature_step" and value is not None and value > 0.0:
+            shows = _differs_from_a_load(world)
         return Trouble(
             name,
             about,
@@ -276,7 +282,7 @@ def _emulated(
             spoiled,
             recovers_s,
             lingers,
-            shows=_scatters(world, board) if name == "jittered_period" else _always,
+            shows=shows,
             lasts_s=lasts_s,
         )
 
@@ -291,6 +297,32 @@ def _scatters(world: World, board: str) -> Callable[[], bool]:
     sent, since_ns = world.cables[settings.bus].sent, world.clock.monotonic_ns()
     sure_ms = SURE_SCATTER * JITTER_SHARE * settings.period_ms
     return lambda: sent.scatter_ms(settings.address, since_ns) > sure_ms
+
+
+def _differs_from_a_load(world: World) -> Callable[[], bool]:
+    """Return a function: whether readings that rise everywhere can be no load. Temperature pads
+    show that, and pads that are not touched. Where all are, an even load reads the same.
+    """
+    layout = world.layout
+    thermal = layout.pad_kind == PadKind.THERMAL
+
+    def differs() -> bool:
+        if world.life is None:
+            return True
+        engine = world.life.daemon.engine
+        if engine.calibration is None:
+            return True
+        rests = engine.calibration.usable & ~thermal
+        for index, row in engine.ledger.row.items():
+            felt = engine.intake.touched.get(row)
+            if felt is not None:
+                rests[layout.boards[index].taxel_index[felt]] = False
+        parts = (slice(part.start, part.stop) for part in layout.parts)
+        return any(
+            thermal[part].any() or np.count_nonzero(rests[part]) >= FEWEST_RESTING for part in parts
+        )
+
+    return differs
 
 
 def _frames(

@@ -21,7 +21,7 @@ from skin_host.demo import configuration
 from skin_host.evaluation.simulate.cables import Cable, Sent, SimulatedPort
 from skin_host.evaluation.simulate.promises import Promises
 from skin_host.evaluation.simulate.trace import Trace
-from skin_host.evaluation.simulate.troubles import KINDS
+from skin_host.evaluation.simulate.troubles import KINDS, Trouble
 from skin_host.evaluation.simulate.world import Life, World
 from skin_host.fingertip.events import FingertipEvent
 from skin_host.layout import PadKind
@@ -716,3 +716,46 @@ def test_a_noisy_temperature_pad_spoils_its_triangle_and_another_pad_itself(worl
         assert np.count_nonzero(trouble.spoils) == (12 if warms else 1)
         seen.add(warms)
     assert seen == {False, True}
+
+
+@pytest.mark.parametrize(
+    ("robot", "warmer", "named"),
+    [("gripper.toml", True, False), ("gripper.toml", False, True), ("demo.toml", True, True)],
+)
+def test_a_step_of_temperature_must_be_named_where_it_cannot_be_an_even_load(
+    robot: str, warmer: bool, named: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`gripper.toml`, seed 21: all pads of two fingertips read as touched with 10 kPa."""
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
+    config = DEMO.with_name(robot)
+    settings, layout = load_skin(config)
+    world = World(settings, layout, config, 1, Scene(quiet=True))
+
+    async def live() -> None:
+        life = start(world)
+        await world.clock.sleep(8.0)
+        await life.daemon.calibrate(5.0)
+        await world.clock.sleep(5.0)
+        trouble = next(
+            trouble for trouble in strong_steps(world) if ("value=-" in trouble.about) != warmer
+        )
+        codes: set[str] = set()
+        for _ in range(round(10 * trouble.within_s)):
+            await world.clock.sleep(0.1)
+            for record in life.daemon.records().values():
+                codes.update(fault["code"] for fault in record["faults"])
+        assert trouble.shows() == named
+        assert ("part_temperature" in codes) == named
+        life.kill()
+
+    with world.clock.runner() as runner:
+        runner.run(live())
+
+
+def strong_steps(world: World) -> Iterator[Trouble]:
+    """Steps of temperature that must be named, each ended when the next is asked for."""
+    for seed in range(1000):
+        trouble = KINDS["temperature_step"](world, random.Random(seed), False)
+        if trouble.must:
+            yield trouble
+        trouble.end()
