@@ -295,9 +295,10 @@ class Residuals:
         self._on = np.zeros(n, np.float32)
         self._firmer = np.zeros(n, np.float32)
         self._votes = np.zeros(n, np.int64)
-        #: The hardest press of each taxel, fading.
+        #: The hardest press of each taxel, fading as its residual, and as what is left at most.
         self._pressed = np.zeros(n, np.float32)
-        #: What the last firm press of each taxel left when it fell, fading.
+        self._hardest = np.zeros(n, np.float32)
+        #: What the last firm press of each taxel left when it fell or ended, fading.
         self._left = np.zeros(n, np.float32)
         self._felt = np.zeros(n, np.float32)
         self._fallen = np.zeros(n, np.int64)
@@ -351,12 +352,22 @@ class Residuals:
         felt = self._felt + np.where(known, MEAN_SHARE, 1.0) * (signal - self._felt)
         np.copyto(self._felt, felt, where=~self._reported, casting="same_kind")
         self._seen = touched
+        self._note_left(np.flatnonzero(self._reported & ~touched))
         left = np.fmax(RESIDUAL_SHARE * self._pressed, self._left)
         self._held &= touched
         enough = (left < LEAST_RESIDUAL * self._on) & ~self._held
         enough |= self._felt >= self._on + left + np.where(self._held, self._rise, 0.0)
         self._report(touched & (self._reported | enough))
         self._undecided = not np.array_equal(self._reported, touched)
+
+    def _note_left(self, ended: NDArray[np.intp]) -> None:
+        """Note what is left of touches that the decision has ended, if they had fallen to that
+        before. It ends them when noise has made some readings low, so more is left than they show.
+        """
+        if len(ended):
+            felt, most = self._felt[ended], LARGEST_SHARE * self._hardest[ended]
+            left = np.clip(felt + self._rise[ended], self._left[ended], most)
+            self._left[ended] = np.where(felt < self._on[ended] + most, left, self._left[ended])
 
     def _end_fallen(self, signal: Array, repeated: Mask | None) -> None:
         """End touches that have fallen from a firm press to its residual."""
@@ -365,6 +376,7 @@ class Residuals:
         now, felt = signal[which], self._felt[which]
         pressed = np.fmax(self._pressed[which], now)
         self._pressed[which] = pressed
+        self._hardest[which] = np.fmax(self._hardest[which], now)
         bar = self._on[which] + RESIDUAL_SHARE * pressed
         fallen = (now < bar) & (felt >= bar + self._firmer[which])
         if not self._any_fallen and not any_of(fallen):
@@ -406,11 +418,13 @@ class Residuals:
     def fade(self, dt_s: float) -> None:
         """Let the residuals of earlier presses fade for this time."""
         self._pressed *= math.exp(-dt_s / RESIDUAL_S)
+        self._hardest *= math.exp(-dt_s / LEFT_S)
         self._left *= math.exp(-dt_s / LEFT_S)
 
     def reset(self, taxels: Mask) -> None:
         """Forget the presses on some taxels [n]."""
         self._pressed[taxels] = 0.0
+        self._hardest[taxels] = 0.0
         self._left[taxels] = 0.0
         self._held[taxels] = False
         self._report(self._reported & ~taxels)

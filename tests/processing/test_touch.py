@@ -446,6 +446,24 @@ def test_of_the_three_units_of_a_hard_press_one_is_left_after_five_seconds(
     assert bool(residuals.step(np.array([True]), np.array([reading]))[0]) is reported
 
 
+@pytest.mark.parametrize(("reading", "reported"), [(5.0, False), (8.0, True)])
+def test_what_a_noisy_touch_feels_at_last_is_no_touch_after_its_end(
+    reading: float, reported: bool
+) -> None:
+    """Noise hides that the press has fallen, and that something is left when the touch ends."""
+    residuals = residuals_of(votes=14)
+    on = np.array([True])
+    for _ in range(20):
+        residuals.step(on, np.array([100.0]))
+    for _ in range(13):
+        for signal in (7.0, 3.0) * 10:
+            assert residuals.step(on, np.array([signal]))[0]
+        residuals.fade(1.0)
+    residuals.step(np.array([False]), np.zeros(1))
+    residuals.fade(2.0)
+    assert bool(residuals.step(on.copy(), np.array([reading]))[0]) is reported
+
+
 @pytest.mark.parametrize(("reading", "reported"), [(3.9, False), (6.5, True)])
 def test_what_a_press_left_when_it_fell_is_no_touch_while_it_slowly_goes(
     reading: float, reported: bool
