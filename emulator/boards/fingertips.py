@@ -326,6 +326,9 @@ class _Press:
         if probe.repeat_s and phase_s >= 0.0:
             phase_s %= probe.repeat_s
         normal_n = _value(probe.drive, phase_s) if self._force_n is None else self._force_n()
+        if normal_n == 0.0:
+            self._object = None
+            return np.zeros(6)
         force = -normal_n * self._normal
         if probe.tangential_n is not None:
             force = force + self._held_n(normal_n, phase_s, t_ns) * self._pull
@@ -334,7 +337,9 @@ class _Press:
             times, x_mm, y_mm = np.array(probe.slide_mm).T
             offset = np.array([np.interp(phase_s, times, x_mm), np.interp(phase_s, times, y_mm)])
         point_mm = self._point_mm + offset @ self._along
-        return np.concatenate([force, 1e-3 * np.cross(point_mm, force)])
+        x, y, z = (1e-3 * point_mm).tolist()
+        fx, fy, fz = force.tolist()
+        return np.array([fx, fy, fz, y * fz - z * fy, z * fx - x * fz, x * fy - y * fx])
 
     def _held_n(self, normal_n: float, phase_s: float, t_ns: int) -> float:
         """Tangential force (N) by which the object drags at the fingertip."""
@@ -358,14 +363,17 @@ class _Load:
     def __init__(self, tip: Fingertip, presses: Sequence[_Press], offset: Floats) -> None:
         self._presses = presses
         self._offset = offset
-        self._sensor_m = 1e-3 * np.array(tip.sensor_mm)
-        self._to_board = np.eye(6) if tip.matrix is None else np.linalg.inv(tip.matrix)
+        x, y, z = (1e-3 * np.array(tip.sensor_mm)).tolist()
+        about_sensor = np.eye(6)
+        about_sensor[3:, :3] -= [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
+        self._to_board = (
+            about_sensor if tip.matrix is None else np.linalg.inv(tip.matrix) @ about_sensor
+        )
 
     def __call__(self, t_ns: int) -> Floats:
         load = np.zeros(6)
         for press in self._presses:
             load += press.wrench(t_ns)
-        load[3:] -= np.cross(self._sensor_m, load[:3])
         measured: Floats = self._to_board @ load + self._offset
         return measured
 

@@ -184,8 +184,8 @@ def sensitivity(force_n: ArrayLike, torque_nmm: ArrayLike, contact: IntrinsicCon
     reach = ((contact.point_mm - arm) * f).sum(axis=1)[:, None] / squared
     change = np.empty((len(f), 3, 6))
     # d(f x m) = df x m + f x dm, and the distance along f changes with |f|.
-    change[:, :, :3] = -_times(m) - 2.0 * arm[:, :, None] * f[:, None, :]
-    change[:, :, 3:] = _times(f)
+    change[:, :, :3] = -cross_matrices(m) - 2.0 * arm[:, :, None] * f[:, None, :]
+    change[:, :, 3:] = cross_matrices(f)
     change /= squared[:, :, None]
     change[:, :, :3] += reach[:, :, None] * np.eye(3)
     lift = np.einsum("ni,nij->nj", contact.normal, change)
@@ -225,8 +225,8 @@ def _cross(a: Floats, b: Floats) -> Floats:
     return product
 
 
-def _times(a: Floats) -> Floats:
-    """Matrices [n, 3, 3] whose product with b is a x b."""
+def cross_matrices(a: Floats) -> Floats:
+    """Matrices float64[n, 3, 3] whose product with b is a x b, of rows a, float64[n, 3]."""
     matrix = np.zeros((len(a), 3, 3))
     matrix[:, _AFTER, _NEXT] = a
     matrix[:, _NEXT, _AFTER] = -a

@@ -22,6 +22,7 @@ from skin_host.fingertip.intrinsic import (
     ContactVerdict,
     IntrinsicContact,
     Surface,
+    cross_matrices,
     locate,
     point_covariance,
 )
@@ -139,8 +140,10 @@ class Tip:
         self._name = name
         self._settings = settings
         self._surface = settings.surface
-        self._matrix = np.eye(6) if settings.matrix is None else np.array(settings.matrix)
-        self._sensor_mm = np.array(settings.sensor_mm)
+        # Of the board's values (N, N m): force (N) and torque (N mm) on the fingertip.
+        self._to_load = np.eye(6) if settings.matrix is None else np.array(settings.matrix)
+        self._to_load[3:] *= 1e3
+        self._to_load[3:] += cross_matrices(np.array([settings.sensor_mm]))[0] @ self._to_load[:3]
         self._rate_hz = 1000.0 / settings.period_ms
         self.move_hz = move_hz
         self._fresh_ns = int(FRESH_PERIODS * array_period_ns)
@@ -284,10 +287,7 @@ class Tip:
         """Convert rows of the board's values (N, N m) to force (N) and torque (N mm) on the
         fingertip.
         """
-        load: Floats = measured @ self._matrix.T
-        load[:, 3:] *= 1e3
-        if self._sensor_mm.any():
-            load[:, 3:] += np.cross(self._sensor_mm, load[:, :3])
+        load: Floats = measured @ self._to_load.T
         return load
 
     def _locate(self, load: Floats, least_n: float) -> IntrinsicContact:
