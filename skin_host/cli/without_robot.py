@@ -399,9 +399,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
         raise RequestError("--until goes with one seed")
     config: Path = arguments.config or configuration("demo.toml")
     settings, layout = load_skin(config)
-    if arguments.until is None:
-        logging.disable(logging.CRITICAL)
-    else:
+    if arguments.until is not None:
         logging.basicConfig(level=logging.DEBUG, format="%(levelname)-7s %(name)s: %(message)s")
     progress = Progress("simulating")
     results: list[RunResult] = []
@@ -425,7 +423,6 @@ def _simulate(arguments: argparse.Namespace) -> int:
             progress.update(len(results) / arguments.seeds, f"seed {result.seed}")
     finally:
         progress.close()
-        logging.disable(logging.NOTSET)
     if arguments.json:
         print_json(outcome.document(results))
     elif arguments.seeds > 1:

@@ -7,7 +7,6 @@ what was read and what the kernel reports as dropped; the rest is `uncounted`. `
 """
 
 import asyncio
-import os
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -15,6 +14,7 @@ from skin_host.daemon.workers import share_out
 from skin_host.errors import BrokerError, SkinError
 from skin_host.evaluation.body_stream import PAUSE, Body
 from skin_host.evaluation.measured_daemon import TOUCHED, running
+from skin_host.processes import cores
 
 SIZES = (10_000, 30_000, 100_000)
 HZ = 20
@@ -39,7 +39,7 @@ def run(*, quick: bool = False) -> dict[str, Any]:
     Raises:
         BrokerError: mosquitto is not installed.
     """
-    workers = len(os.sched_getaffinity(0))
+    workers = cores()
     sizes, seconds = (SIZES[:2], 3.0) if quick else (SIZES, 15.0)
     rows: list[Row] = []
     too_large: Row | None = None

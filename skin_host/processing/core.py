@@ -356,7 +356,8 @@ class Engine:
         for board in self.boards:
             veto = self.intake.veto.get(self.ledger.row[board])
             if veto is not None:
-                zeroed[self._taxels_of(board)[veto & (self._taxels_of(board) >= 0)]] = False
+                taxels = self._taxels_of(board)
+                zeroed[taxels[veto & (taxels >= 0)]] = False
         if self._held is not None:
             zeroed &= ~self._held
         return Known(self.calibration, self._pipeline.baseline.copy(), zeroed)
@@ -447,7 +448,7 @@ class Engine:
         if self._run is not None:
             # A calibration of two zeros would be that of none, and the rest of its time too short
             # for noisy pads.
-            self._run.calibrator.forget(taxels[taxels >= 0].astype(np.intp))
+            self._run.calibrator.forget(np.flatnonzero(self.taxels_of([board])))
             self._run.passed_ns = 0
             for sender in self._run.samples:
                 if sender[0] == board:
@@ -569,8 +570,7 @@ class Engine:
     def _note_twice(self, sweep: Sweep, row: int) -> None:
         """Two boards send at an address: what both send is the zero of neither."""
         if self._run is not None:
-            taxels = self._taxels_of(sweep.board)
-            self._run.calibrator.forget(taxels[taxels >= 0].astype(np.intp))
+            self._run.calibrator.forget(np.flatnonzero(self.taxels_of([sweep.board])))
         rezero = self._rezeros.get(sweep.board)
         if rezero is None:
             return
