@@ -3,6 +3,7 @@
 import asyncio
 from dataclasses import dataclass, field
 
+from skin_host.bus.answers import Discovered, DiscoveredBootloader
 from skin_host.bus.commands import (
     SKIN_BOARD_TYPES,
     BoardType,
@@ -26,7 +27,10 @@ class BoardRecord:
         alive: it sends.
         configurations: how often it was set up.
         unanswered: queries in a row to which it sent no answer.
-        claimed_ns: when it last answered that it is in its bootloader, or reads no skin.
+        asked: how often it was asked what it is.
+        claim: its last answer, if that was that it is in its bootloader or reads no skin, with
+            `asked` at that time.
+        claimed_ns: when such an answer was last believed.
 
     Times ending in `_at_ns`, and `answered_ns`, are monotonic; the others are on the clock of
     the ledger, which stands still while the bus is not read.
@@ -46,6 +50,8 @@ class BoardRecord:
     life_s: float | None = None
     answered_ns: int = 0
     unanswered: int = 0
+    asked: int = 0
+    claim: tuple[Message, int] | None = None
     claimed_ns: int = 0
     wrong: str = ""
     wrong_since_ns: int = 0
@@ -73,6 +79,20 @@ class BoardRecord:
     def claims(self) -> bool:
         """Whether its last answer was that it cannot send skin values."""
         return self.in_bootloader or self.is_wrong_type
+
+    def believes(self, answer: Discovered | DiscoveredBootloader) -> bool:
+        """Return whether an answer to what it is counts. That it cannot send skin values counts
+        when it says so again as it is asked again: one damaged byte can say that.
+        """
+        if isinstance(answer, Discovered) and answer.board_type in SKIN_BOARD_TYPES:
+            self.claim = None
+            return True
+        before, self.claim = self.claim, (answer, self.asked)
+        if before is None or before[0] != answer:
+            return False
+        if before[1] == self.asked:  # The same frame may have come twice.
+            return self.claims
+        return True
 
     def disclaim(self) -> None:
         """That answer is not valid any more."""

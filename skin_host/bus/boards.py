@@ -164,12 +164,16 @@ class Boards:
     async def _bring_up(self, listen: bool) -> None:
         if listen:
             await self._listen()
+        for record in self.records.values():
+            record.asked += 1
         await self._port.send([command_frame(Discover(), BROADCAST_ADDRESS)])
         end_s = self._clock.monotonic_s() + DISCOVERY_S
         while any(record.board_type is None for record in self.records.values()):
             if self._clock.monotonic_s() > end_s:
                 break
             await self._clock.sleep(GAP_S)
+            for record in self.records.values():
+                await self._ask_again(record)
         for address, record in self.records.items():
             if record.board_type is None:
                 log.warning(
@@ -399,6 +403,14 @@ class Boards:
         task.add_done_callback(end)
         return task
 
+    async def _ask_again(self, record: BoardRecord) -> None:
+        """Query a board whose last answer is not believed yet."""
+        doubted = record.claim is not None and record.claim[1] == record.asked
+        if doubted and not record.claims:
+            record.asked += 1
+            address = record.layout.settings.address
+            await self._port.send([command_frame(Discover(), address)])
+
     async def _revive(self, record: BoardRecord) -> None:
         """Query a timed-out board for its type and uptime, and take the action that they call
         for.
@@ -412,6 +424,7 @@ class Boards:
             questions.append(GetTimeOfLife())
         sent_before = self._ledger.since_set_up(record.row) > 0
         record.answered_ns, record.life_s = 0, None
+        record.asked += 1
         await self._port.send([command_frame(question, address) for question in questions])
         sweeps = self._ledger.sweeps[record.row]
         while self._clock.monotonic_ns() - asked_ns < ANSWER_S * 1e9:
@@ -420,6 +433,7 @@ class Boards:
             if tells_age and self._ledger.sweeps[record.row] > sweeps and sent_before:
                 return  # it only paused
             await self._clock.sleep(GAP_S)
+            await self._ask_again(record)
         record.unanswered = 0 if record.answered_ns else record.unanswered + 1
         if record.unanswered >= UNANSWERED:
             record.disclaim()
@@ -462,6 +476,8 @@ class Boards:
                 ask_at_ns = self._ledger.now_ns + int(RETRY_S[-1] * 1e9)
                 frames = self._sent_by.get(address, 0)
                 self._unconfigured[address] = _Unconfigured(ask_at_ns, frames)
+            return
+        if isinstance(answer, Discovered | DiscoveredBootloader) and not record.believes(answer):
             return
         if isinstance(answer, Discovered | DiscoveredBootloader | TimeOfLife):
             record.answered_ns = self._clock.monotonic_ns()

@@ -53,6 +53,12 @@ class Heard:
     def answer(self, message: Message, address: int) -> None:
         self.say(answer_frame(message, address))
 
+    def answer_again(self, message: Message, address: int) -> None:
+        """It is asked twice, and answers the same."""
+        for _ in range(2):
+            self.boards.records[address].asked += 1
+            self.answer(message, address)
+
     def look(self) -> None:
         self.now_ns += S // 10
         self.health.tick(self.now_ns, {}, {"can0": self.boards})
@@ -99,15 +105,43 @@ def heard() -> Heard:
 
 
 def test_a_board_in_its_bootloader_is_told_until_its_application_answers(heard: Heard) -> None:
-    heard.answer(DiscoveredBootloader(BoardType.MTB4, 4, 0), HAND)
+    heard.answer_again(DiscoveredBootloader(BoardType.MTB4, 4, 0), HAND)
     assert ("board_in_bootloader", "hand") in heard.told()
     heard.answer(Discovered(BoardType.MTB4, 1, 25, 0), HAND)
     assert not {code for code, _ in heard.told()} & {"board_in_bootloader", "board_wrong_type"}
 
 
 def test_a_board_of_another_kind_at_the_address_is_told(heard: Heard) -> None:
-    heard.answer(Discovered(BoardType.STRAIN2, 2, 0, 0), HAND)
+    heard.answer_again(Discovered(BoardType.STRAIN2, 2, 0, 0), HAND)
     assert ("board_wrong_type", "hand") in heard.told()
+
+
+def test_one_damaged_answer_makes_no_board_another(heard: Heard) -> None:
+    heard.answer(Discovered(BoardType.MTB4, 1, 25, 0), HAND)
+    heard.boards.records[HAND].asked += 1
+    for _ in range(2):  # The frame comes twice.
+        heard.answer(Discovered(21, 1, 25, 0), HAND)
+    heard.boards.records[HAND].asked += 1
+    heard.answer(DiscoveredBootloader(BoardType.MTB4, 1, 25), HAND)
+    assert not {code for code, _ in heard.told()} & {"board_in_bootloader", "board_wrong_type"}
+
+
+@pytest.mark.parametrize("damaged", [True, False])
+@stepped
+async def test_a_board_that_seems_to_be_another_is_asked_again_at_the_start(
+    clock: SteppedClock, damaged: bool
+) -> None:
+    heard, port = Heard(), Kept(clock)
+    heard.supervised(port, clock)
+    beginning = asyncio.create_task(heard.boards.bring_up())
+    await clock.sleep(0.001)
+    heard.answer(Discovered(21, 1, 25, 0), HAND)
+    assert len(port.sent) == 1
+    await clock.sleep(0.02)
+    assert len(port.sent) == 2
+    heard.answer(Discovered(BoardType.MTB4 if damaged else 21, 1, 25, 0), HAND)
+    assert (("board_wrong_type", "hand") in heard.told()) != damaged
+    await beginning
 
 
 def test_a_board_that_nobody_configured_is_told(heard: Heard) -> None:
@@ -166,9 +200,9 @@ async def test_what_a_board_answered_is_told_until_it_sends_or_answers_no_more(
     heard.answer(Discovered(BoardType.MTB4, 1, 25, 0), HAND)
     record.started, record.configurations = True, 1
     if code == "board_in_bootloader":
-        heard.answer(DiscoveredBootloader(BoardType.MTB4, 4, 0), HAND)
+        heard.answer_again(DiscoveredBootloader(BoardType.MTB4, 4, 0), HAND)
     else:
-        heard.answer(Discovered(BoardType.STRAIN2, 2, 0, 0), HAND)
+        heard.answer_again(Discovered(BoardType.STRAIN2, 2, 0, 0), HAND)
     assert (code, "hand") in heard.told()
     for step in range(250):
         if sends and step % 2:
@@ -271,6 +305,6 @@ async def test_a_zero_is_announced_when_the_bus_is_free_for_it(clock: SteppedClo
 def test_forged_answers_fill_no_log(heard: Heard, caplog: pytest.LogCaptureFixture) -> None:
     for number in range(100):
         kind = BoardType.STRAIN2 if number % 2 else BoardType.MTB4
-        heard.answer(Discovered(kind, 1, 25, 0), HAND)
-        heard.answer(DiscoveredBootloader(BoardType.MTB4, 4, 0), HAND)
+        heard.answer_again(Discovered(kind, 1, 25, 0), HAND)
+        heard.answer_again(DiscoveredBootloader(BoardType.MTB4, 4, 0), HAND)
     assert len(caplog.records) == 1
