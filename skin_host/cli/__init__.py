@@ -16,7 +16,7 @@ import select
 import signal
 import sys
 from collections.abc import Sequence
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from skin_host import __version__, emulator_path
 from skin_host.cli import (
@@ -25,6 +25,7 @@ from skin_host.cli import (
     files,
     operate,
     recordings,
+    stderr,
     watch,
     without_robot,
 )
@@ -70,32 +71,6 @@ def _complain(line: str) -> None:
     print(line, file=sys.stderr)
 
 
-class _Complaints(io.RawIOBase):
-    """Standard error. What it does not take, because its disk is full or its reader is gone, is
-    lost: a complaint that cannot be written changes neither the work nor the exit status.
-    """
-
-    def __init__(self, descriptor: int) -> None:
-        super().__init__()
-        self._descriptor = descriptor
-
-    def fileno(self) -> int:
-        return self._descriptor
-
-    def isatty(self) -> bool:
-        return os.isatty(self._descriptor)
-
-    def writable(self) -> bool:
-        return True
-
-    def write(self, data: Any) -> int:
-        left = memoryview(data)
-        with contextlib.suppress(OSError):
-            while left:
-                left = left[os.write(self._descriptor, left) :]
-        return len(data)
-
-
 def _make_printable() -> None:
     """What is printed where nobody can read it goes nowhere, and never ends a command.
 
@@ -109,14 +84,7 @@ def _make_printable() -> None:
         elif mode == "w" and isinstance(stream, io.TextIOWrapper):
             with contextlib.suppress(OSError):  # a stream that changed under our feet
                 stream.reconfigure(errors="replace")
-    own = sys.__stderr__
-    if own is not None and sys.stderr is own:
-        sys.stderr = io.TextIOWrapper(
-            io.BufferedWriter(_Complaints(own.fileno())),
-            encoding=own.encoding,
-            errors="replace",
-            line_buffering=True,
-        )
+    stderr.replace()
 
 
 def _reader_left() -> bool:

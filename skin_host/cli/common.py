@@ -11,6 +11,7 @@ from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from skin_host.cli import stderr
 from skin_host.daemon import service
 
 if TYPE_CHECKING:
@@ -118,7 +119,9 @@ def add_log_level(parser: argparse.ArgumentParser) -> None:
 
 
 def set_up_logging(verbose: bool) -> None:
-    """Log to stderr, for people or for systemd's journal."""
+    """Log to stderr, for people or for systemd's journal, and never wait until they read it."""
+    if (raw := stderr.current()) is not None:
+        raw.write_in_thread()
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(
         service.JournalFormatter("%(message)s")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from skin_host.cli import stderr
 from skin_host.cli.common import (
     Commands,
     add_broker,
@@ -175,6 +176,7 @@ def _run(arguments: argparse.Namespace) -> int:
             arguments.config.parent,
             configuration=arguments.config,
             share=ours,
+            log_lines_lost=stderr.lines_lost,
         )
         reload_on_hangup(daemon)
         if (runtime := service.runtime_directory()) is not None and arguments.share is None:

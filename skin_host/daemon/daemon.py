@@ -70,6 +70,7 @@ class Daemon:
         connect: connects to the broker, see `mqtt.connection.connect`.
         share: makes of a configuration that was read again the one of this daemon, see
             `workers.share_of`.
+        log_lines_lost: how many lines of the log nobody could read so far.
 
     Attributes:
         settings, layout: in use, with the changes that operators made.
@@ -94,8 +95,10 @@ class Daemon:
         open_port: OpenPort = open_port,
         connect: Connect = connect,
         share: Callable[[Settings], Settings] = lambda settings: settings,
+        log_lines_lost: Callable[[], int] = lambda: 0,
     ) -> None:
         self.clock = clock
+        self._log_lines_lost = log_lines_lost
         self._share = share
         self.settings = settings
         self.layout = layout
@@ -594,7 +597,11 @@ class Daemon:
     def _record_of(self, part: int) -> Record:
         link = self.link
         output = msgspec.to_builtins(self.publisher.counters)
-        return self.health.record(part, link.read_ns, link.ports, link.boards, output, self.unkept)
+        record = self.health.record(
+            part, link.read_ns, link.ports, link.boards, output, self.unkept
+        )
+        record["log_lines_lost"] = self._log_lines_lost()
+        return record
 
     def _status(self, faults: int) -> str:
         rates = self.health.rates()

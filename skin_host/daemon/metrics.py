@@ -64,6 +64,9 @@ _OUTPUT = {
     "touches_sent": ("skin_mqtt_touches_total", "counter", "Touch events acknowledged"),
     "touches_dropped": ("skin_mqtt_touches_dropped_total", "counter", "Touch events lost"),
 }
+_NODE = {
+    "log_lines_lost": ("skin_log_lines_lost_total", "counter", "Lines of the log lost"),
+}
 
 
 def exposition(records: Records) -> str:
@@ -97,6 +100,7 @@ def exposition(records: Records) -> str:
         for board in record.get("boards", ()):
             put(_BOARD, board, _label("board", board["name"]))
         put(_OUTPUT, record.get("output", {}), "")
+        put(_NODE, record, "")
     return "".join(_lines(samples))
 
 

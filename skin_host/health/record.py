@@ -158,5 +158,6 @@ class Record(TypedDict):
     age_ms: NotRequired[float | None]
     output: NotRequired[dict[str, Any]]
     unkept: NotRequired[dict[str, str]]
+    log_lines_lost: NotRequired[int]
     faults: NotRequired[list[FaultName]]
     sentences: NotRequired[list[str]]
