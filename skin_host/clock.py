@@ -22,10 +22,11 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from contextvars import Context
 from datetime import UTC, datetime
 from heapq import heapify, heappop, heappush
+from queue import SimpleQueue
 from typing import Any, Protocol, TypeVar, TypeVarTuple, Unpack
 
 T = TypeVar("T")
@@ -365,27 +366,49 @@ class _LoopAlarm:
 
 
 class _Thread(Executor):
+    """Unlike the threads of `concurrent.futures`, the end of the program does not wait for it."""
+
     def __init__(self, name: str) -> None:
-        self._pool = ThreadPoolExecutor(1, name)
+        self._waiting: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._closed = False
+        threading.Thread(target=self._run, name=name, daemon=True).start()
 
     def submit(self, function: Callable[[Unpack[Ts]], T], *args: *Ts) -> "Future[T]":
-        return self._pool.submit(function, *args)
+        done: Future[T] = Future()
+
+        def call() -> None:
+            if self._closed or not done.set_running_or_notify_cancel():
+                done.cancel()
+            else:
+                _settle(done, function, *args)
+
+        self._waiting.put(call)
+        return done
 
     def close(self) -> None:
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        self._closed = True
+        self._waiting.put(None)
+
+    def _run(self) -> None:
+        while (call := self._waiting.get()) is not None:
+            call()
 
 
 class _Inline(Executor):
     def submit(self, function: Callable[[Unpack[Ts]], T], *args: *Ts) -> "Future[T]":
         done: Future[T] = Future()
-        try:
-            done.set_result(function(*args))
-        except Exception as error:
-            done.set_exception(error)
+        _settle(done, function, *args)
         return done
 
     def close(self) -> None:
         pass
+
+
+def _settle(done: "Future[T]", function: Callable[[Unpack[Ts]], T], *args: *Ts) -> None:
+    try:
+        done.set_result(function(*args))
+    except Exception as error:
+        done.set_exception(error)
 
 
 SYSTEM = Clock()

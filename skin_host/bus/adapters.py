@@ -1,11 +1,16 @@
 """Port for every other interface of python-can (virtual, udp_multicast, slcan, pcan, kvaser ...).
 
 Frames are read one by one, which costs some microseconds each, into the same arrays as SocketCAN's.
+What an adapter's library may wait in for ever (opening, sending, closing) is done in a thread.
 """
 
+import asyncio
+import logging
 import os
 import socket
+from collections.abc import Mapping
 from concurrent.futures import Future
+from concurrent.futures import wait as wait_for
 from importlib.util import find_spec
 
 import can
@@ -16,9 +21,11 @@ from skin_host.bus.port import (
     EXTENDED_FLAG,
     PLAUSIBLE_S,
     REMOTE_FLAG,
+    SEND_DEADLINE_S,
     SKIN_CLASSES,
     LinkState,
     Port,
+    one_line,
 )
 from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SYSTEM, Clock, Executor
@@ -30,11 +37,27 @@ CAPACITY = 1024
 #: A controller that still has many errors reports one within this time.
 CALM_S = 10.0
 MULTICAST = "udp_multicast"
+SOCKETCAND = "socketcand"
+#: They take a frame at once, or never.
+AT_ONCE = ("virtual", MULTICAST)
+#: What so many times in a row could not be read shows that the library does not get past it.
+MOST_UNREADABLE = 8
+#: A serial adapter's line is shorter than this; noise never ends one.
+LONGEST_LINE = 4096
+#: Opening may take so long: a serial adapter takes 2 s. Closing is waited for this long.
+OPEN_S = 5.0
+CLOSE_S = 1.0
+#: A server of buses greets within this time.
+GREETING_S = 2.0
 #: Stands for a frame that the adapter's library could not read.
 _UNREADABLE = can.Message()
 #: Options of Linux sockets (in.h, in6.h) that Python does not name.
 IP_MULTICAST_ALL = 49
 IPV6_MULTICAST_ALL = 29
+
+# Its errors are raised too, and reported in a line; of its own lines, some are tracebacks, and
+# others come ten thousand times a second.
+logging.getLogger("can").setLevel(logging.CRITICAL)
 
 
 def nanoseconds(seconds: float) -> int:
@@ -55,23 +78,32 @@ def identifier(message: can.Message) -> int:
     )
 
 
-def one_line(error: Exception) -> str:
-    """Return the message of a library's error on one line."""
-    return (str(error).splitlines() or [type(error).__name__])[0]
-
-
 class AdapterPort(Port):
-    """A bus that python-can reads, frame by frame."""
+    """A bus that python-can reads, frame by frame.
+
+    Args:
+        name, settings, clock: see `Port`.
+        bus: None if it is not open.
+        worker: the thread for what may block, if there is one already.
+        opening: what it is opening, if the bus is awaited.
+    """
 
     capacity = CAPACITY
     stamps_late = True
 
     def __init__(
-        self, name: str, settings: Bus, bus: can.BusABC | None, clock: Clock = SYSTEM
+        self,
+        name: str,
+        settings: Bus,
+        bus: can.BusABC | None,
+        clock: Clock = SYSTEM,
+        worker: Executor | None = None,
+        opening: Future[can.BusABC] | None = None,
     ) -> None:
         super().__init__(name, settings, bus, clock)
-        self._opener: Executor | None = None
-        self._opening: Future[can.BusABC] | None = None
+        self._worker = worker
+        self._opening = opening
+        self._unreadable = 0
         self._calm_at_s = 0.0
         self._id = np.zeros(CAPACITY, np.uint32)
         self._dlc = np.zeros(CAPACITY, np.uint8)
@@ -92,7 +124,9 @@ class AdapterPort(Port):
                     if self._put(n, message):
                         errors |= bool(message.is_error_frame)
                         n += 1
-            except (can.CanError, OSError) as error:
+                if len(getattr(self._bus, "_buffer", b"")) > LONGEST_LINE:
+                    raise BusError("what it sends is no line of an adapter")
+            except (can.CanError, OSError, BusError) as error:
                 self._note_failure(error)
         self.counters.frames += n
         batch = FrameBatch(self._id[:n], self._dlc[:n], self._data[:n], self._t_ns[:n])
@@ -115,21 +149,70 @@ class AdapterPort(Port):
         return self.state is LinkState.BUS_OFF
 
     def close(self) -> None:
-        super().close()
-        if self._opener is not None:
-            self._opener.close()
-            self._opener = None
+        if (closing := self._shut_down()) is not None:
+            wait_for([closing], CLOSE_S)
+        if self._worker is not None:
+            self._worker.close()
+            self._worker = None
+
+    async def _hand_over(self, bus: can.BusABC, message: can.Message) -> None:
+        if self._settings.interface in AT_ONCE:
+            bus.send(message)
+            return
+        sending = self._in_order().submit(bus.send, message)
+        try:
+            async with self._clock.timeout(SEND_DEADLINE_S):
+                await asyncio.wrap_future(sending)
+        except TimeoutError:
+            if sending.done() and not sending.cancelled():
+                raise  # the library's own
+            why = f"it has taken no frame for {SEND_DEADLINE_S:g} s"
+            if self._bus is bus:
+                self._note_failure(BusError(why))
+                self._worker = None  # it may wait for ever
+            raise BusError(why) from None
+
+    def _in_order(self) -> Executor:
+        """Return the thread for what may block."""
+        if self._worker is None:
+            self._worker = self._clock.executor(f"adapter-{self.name}")
+        return self._worker
+
+    def _shut_down(self) -> "Future[None] | None":
+        """Begin to close the bus, after what is being sent."""
+        bus, self._bus = self._bus, None
+        return None if bus is None else self._in_order().submit(bus.shutdown)
 
     def _receive(self, bus: can.BusABC) -> can.Message | None:
-        """Return the next frame, `_UNREADABLE` in place of a damaged one, or None."""
+        """Return the next frame, `_UNREADABLE` in place of a damaged one, or None.
+
+        Raises:
+            can.CanError, OSError: the adapter is gone, or its library does not get past something.
+        """
         try:
-            return bus.recv(0)
-        except can.CanOperationError as error:
-            # Everybody in the network may send datagrams. Their content shows nothing about the
-            # socket, whose own failures are caused by an OSError.
-            if self._settings.interface != MULTICAST or isinstance(error.__cause__, OSError):
+            message = bus.recv(0)
+        except OSError:
+            raise
+        except Exception as error:
+            # A library fails over damaged bytes in its own ways: with the error of a number, of a
+            # text, or with one of python-can that these caused. Without a cause, or with that of
+            # the system, it is the adapter that fails. Everybody in the network may send datagrams,
+            # whose content shows nothing about the socket.
+            cause = error.__cause__
+            is_can = isinstance(error, can.CanError)
+            if self._settings.interface == MULTICAST:
+                if is_can and isinstance(cause, OSError):
+                    raise
+                return _UNREADABLE
+            self._unreadable += 1
+            if is_can and (cause is None or isinstance(cause, OSError)):
                 raise
+            if self._unreadable >= MOST_UNREADABLE:
+                raise can.CanError(one_line(error)) from cause
             return _UNREADABLE
+        if message is not None:
+            self._unreadable = 0
+        return message
 
     def _wanted(self, message: can.Message) -> bool:
         # python-can's own filters are not used: with a filter, `recv(0)` returns None for a frame
@@ -148,10 +231,13 @@ class AdapterPort(Port):
             if message is _UNREADABLE or not self._wanted(message):
                 self.counters.damaged += message is _UNREADABLE
                 return False
+            if len(message.data) != message.dlc and not message.is_remote_frame:
+                raise ValueError("a frame that was cut")
             self._id[row] = identifier(message)
             self._dlc[row] = message.dlc
-            self._data[row, : len(message.data)] = message.data
-        except (TypeError, ValueError, OverflowError):  # numbers of other types, out of range
+            # Nothing of an earlier frame remains behind this one's bytes.
+            self._data[row] = bytearray(message.data).ljust(8, b"\0")
+        except (TypeError, ValueError, OverflowError):  # cut; numbers of other types, out of range
             self.counters.damaged += 1
             return False
         now_s = self._clock.now_ns() * 1e-9
@@ -162,20 +248,17 @@ class AdapterPort(Port):
         return True
 
     def _note_failure(self, error: Exception) -> None:
-        try:
-            super().close()
-        except (can.CanError, OSError):
-            self._bus = None
-        self._enter(LinkState.GONE, one_line(error))
+        self._shut_down()
+        self._unreadable = 0
+        # What caused it is one sentence; what a library makes of that may be a traceback.
+        self._enter(LinkState.GONE, one_line(error.__cause__ or error))
         self._time_to_check()
 
     def _look_for_device(self) -> None:
         """Try to open the interface again, in a thread: serial adapters take seconds."""
         if self._opening is None:
             if self._time_to_check():
-                if self._opener is None:
-                    self._opener = self._clock.executor(f"open-{self.name}")
-                self._opening = self._opener.submit(open_bus, self.name, self._settings)
+                self._opening = self._in_order().submit(open_bus, self.name, self._settings)
         elif self._opening.done():
             opening, self._opening = self._opening, None
             if opening.exception() is None:
@@ -191,12 +274,16 @@ def open_bus(name: str, settings: Bus) -> can.BusABC:
         known = ", ".join(sorted(can.VALID_INTERFACES))
         raise ConfigurationError(f"{where}: python-can has no such interface; it has {known}")
     try:
+        if settings.interface == SOCKETCAND:
+            _await_greeting(settings.options)
         bus = can.Bus(
             interface=settings.interface,
             channel=settings.channel,
             ignore_config=True,
             **options,  # type: ignore[arg-type]
         )
+        if settings.interface == MULTICAST:
+            _leave_other_groups(bus, settings.channel)
     except Exception as error:
         # Each adapter's library has its own errors; the user gets one kind.
         why = one_line(error)
@@ -204,9 +291,21 @@ def open_bus(name: str, settings: Bus) -> can.BusABC:
             why = "the package msgpack is not installed; mend it with: "
             why += "pip install 'skin-host[multicast]'"
         raise BusError(f"{where}: cannot be opened: {why}") from None
-    if settings.interface == MULTICAST:
-        _leave_other_groups(bus, settings.channel)
     return bus
+
+
+def _await_greeting(options: Mapping[str, object]) -> None:
+    """See whether a server of buses answers.
+
+    python-can's client tries to connect for 10 s without a pause, and waits for answers for ever.
+
+    Raises:
+        OSError: it does not.
+    """
+    host, port = str(options.get("host", "")), int(str(options.get("port", "")))
+    with socket.create_connection((host, port), GREETING_S) as server:
+        if not server.recv(16).startswith(b"< hi"):
+            raise OSError("what listens there is no socketcand")
 
 
 def _leave_other_groups(bus: can.BusABC, group: str) -> None:

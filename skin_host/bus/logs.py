@@ -307,7 +307,7 @@ def read_channels(
             rest, rest_channel, names = batch[begin:], channel[begin:], block.names
             damage = block.damage
     if damage is not None:
-        from skin_host.bus.adapters import one_line
+        from skin_host.bus.port import one_line
 
         where = f"damaged after frame {n}" if n else "cannot be read in the format of its name"
         raise LogError(f"{path}: {where}: {one_line(damage)}") from None

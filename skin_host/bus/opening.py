@@ -1,6 +1,7 @@
 """Opens buses with python-can: chooses the port for an interface."""
 
 import logging
+from concurrent.futures import Future
 
 import can
 from can.interfaces.socketcan import SocketcanBus
@@ -8,9 +9,9 @@ from can.interfaces.socketcan import SocketcanBus
 from skin_host.bus import adapters, socketcan
 from skin_host.bus.pair import PAIR, PairPort
 from skin_host.bus.port import Port
-from skin_host.clock import SYSTEM, Clock
+from skin_host.clock import SYSTEM, Clock, Executor
 from skin_host.config.settings import Bus, Receive
-from skin_host.errors import BusError
+from skin_host.errors import BusError, SkinError
 
 log = logging.getLogger(__name__)
 
@@ -36,10 +37,20 @@ def open_port(
     if bus.interface == PAIR:
         return PairPort(name, bus, clock)
     opened: can.BusABC | None
+    worker: Executor | None = None
+    opening: Future[can.BusABC] | None = None
     try:
-        opened = open_bus(name, bus)
-    except BusError as error:
-        if not wait:
+        if bus.interface == "socketcan":
+            opened = open_bus(name, bus)
+        else:
+            # In a thread: some libraries wait for ever for what does not answer.
+            worker = clock.executor(f"adapter-{name}")
+            opening = worker.submit(open_bus, name, bus)
+            opened = _opened(name, bus, opening)
+    except SkinError as error:
+        if not wait or not isinstance(error, BusError):
+            if worker is not None:
+                worker.close()
             raise
         log.warning("%s; waiting for it", error)
         opened = None
@@ -48,10 +59,24 @@ def open_port(
             name, bus, receive, opened, lambda: socketcan.open_present(name, bus), clock
         )
     if isinstance(opened, SocketcanBus):
+        if worker is not None:
+            worker.close()
         return socketcan.SocketCanPort(
             name, bus, receive, opened, lambda: adapters.open_bus(name, bus), clock
         )
-    return adapters.AdapterPort(name, bus, opened, clock)
+    if opening is not None and opening.done():
+        opening = None
+    return adapters.AdapterPort(name, bus, opened, clock, worker, opening)
+
+
+def _opened(name: str, bus: Bus, opening: "Future[can.BusABC]") -> can.BusABC:
+    try:
+        return opening.result(adapters.OPEN_S)
+    except TimeoutError:
+        raise BusError(
+            f'bus "{name}": {bus.interface} {bus.channel}: has not answered for '
+            f"{adapters.OPEN_S:g} s: check its plug and power"
+        ) from None
 
 
 def open_bus(name: str, bus: Bus) -> can.BusABC:

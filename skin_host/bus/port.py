@@ -60,6 +60,11 @@ _CONTROLLER_PASSIVE = 0x30
 _CONTROLLER_ACTIVE = 0x40
 
 
+def one_line(error: BaseException) -> str:
+    """Return the message of a library's error on one line."""
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
 class LinkState(StrEnum):
     """State of the interface, as far as it is known."""
 
@@ -167,7 +172,7 @@ class Port(ABC):
             for identifier, data in frames:
                 message = can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
                 deadline_s = self._clock.monotonic_s() + SEND_DEADLINE_S
-                while not self._try_send(message):
+                while not await self._try_send(message):
                     if self._clock.monotonic_s() > deadline_s:
                         raise BusError(
                             f'bus "{self.name}": {self.channel}: the transmit queue stayed full '
@@ -185,17 +190,23 @@ class Port(ABC):
             self._bus.shutdown()
             self._bus = None
 
-    def _try_send(self, message: can.Message) -> bool:
+    async def _try_send(self, message: can.Message) -> bool:
+        where = f'bus "{self.name}": {self.channel}: cannot send'
         if self._bus is None or self.state is LinkState.DOWN:
-            raise BusError(f'bus "{self.name}": {self.channel}: cannot send, {self.state}')
+            raise BusError(f"{where}, {self.state}")
         try:
-            self._bus.send(message)
-        except can.CanOperationError as error:
+            await self._hand_over(self._bus, message)
+        except Exception as error:
             # An error without a code only means that the adapter could not send.
-            if error.error_code in {None, errno.ENOBUFS, errno.EAGAIN}:
+            codes = {None, errno.ENOBUFS, errno.EAGAIN}
+            if isinstance(error, can.CanOperationError) and error.error_code in codes:
                 return False
-            raise BusError(f'bus "{self.name}": {self.channel}: cannot send: {error}') from None
+            raise BusError(f"{where}: {one_line(error)}") from None
         return True
+
+    async def _hand_over(self, bus: can.BusABC, message: can.Message) -> None:
+        """Give the bus a frame to send. Raises what its library raises."""
+        bus.send(message)
 
     def _enter(self, state: LinkState, reason: str = "") -> None:
         """Note and count a change of state."""

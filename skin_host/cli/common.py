@@ -129,7 +129,7 @@ def set_up_logging(verbose: bool) -> None:
         else logging.Formatter("%(levelname)-7s %(message)s")
     )
     logging.basicConfig(level=logging.DEBUG if verbose else logging.INFO, handlers=[handler])
-    for noisy in ("can", "mqtt", "asyncio"):
+    for noisy in ("mqtt", "asyncio"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
 
 

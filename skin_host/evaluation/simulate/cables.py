@@ -536,7 +536,7 @@ class SimulatedPort(Port):
     def close(self) -> None:
         self._cable.close(self)
 
-    def _try_send(self, message: can.Message) -> bool:
+    async def _try_send(self, message: can.Message) -> bool:
         if self.dead:
             return True
         if self.state in (LinkState.GONE, LinkState.DOWN):

@@ -1,0 +1,267 @@
+"""Adapters that send damage, hang, or never answer: a state of their bus, and nothing more.
+
+The libraries are python-can's own. The serial adapter (slcan) is the other end of a
+pseudo-terminal; the server of buses (socketcand) is a thread with a real socket.
+"""
+
+import array
+import asyncio
+import contextlib
+import fcntl
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import termios
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from skin_host.bus import adapters, port
+from skin_host.bus.opening import open_port
+from skin_host.bus.port import LinkState, Port
+from skin_host.config.settings import Bus, Receive
+from skin_host.errors import BusError
+from tests.support.broker import free_port
+from tests.support.waiting import PATIENCE_S
+
+ROOT = Path(__file__).parents[2]
+GOOD = b"t4E0840F4F4F3F4F4F3F4\r"
+LAST = b"t4E1840F4F4F3F4F4F3F5\r"
+
+
+class Line:
+    """What slcan needs of pyserial's port."""
+
+    write_timeout = None
+
+    def __init__(self, path: str) -> None:
+        self._fd = os.open(path, os.O_RDWR | os.O_NOCTTY)
+
+    @property
+    def in_waiting(self) -> int:
+        n = array.array("i", [0])
+        fcntl.ioctl(self._fd, termios.FIONREAD, n)
+        return n[0]
+
+    def read(self, n: int) -> bytes:
+        return os.read(self._fd, n) if self.in_waiting else b""
+
+    def write(self, data: bytes) -> None:
+        os.write(self._fd, data)
+
+    def flush(self) -> None:
+        pass
+
+    def close(self) -> None:
+        os.close(self._fd)
+
+
+class Adapter:
+    """The device at the other end."""
+
+    def __init__(self) -> None:
+        self.device, self.tty = os.openpty()
+        tty.setraw(self.tty)
+        self.path = os.ttyname(self.tty)
+
+    def says(self, *lines: bytes) -> None:
+        for line in lines:
+            os.write(self.device, line)
+
+
+@pytest.fixture
+def adapter(monkeypatch: pytest.MonkeyPatch) -> Iterator[Adapter]:
+    serial = SimpleNamespace(
+        serial_for_url=lambda path, **_: Line(path),
+        Timeout=lambda _: SimpleNamespace(expired=lambda: True),
+    )
+    monkeypatch.setattr("can.interfaces.slcan.serial", serial)
+    made = Adapter()
+    yield made
+    for end in (made.device, made.tty):
+        os.close(end)
+
+
+@pytest.fixture
+def slcan(adapter: Adapter) -> Iterator[Port]:
+    settings = Bus(interface="slcan", channel=adapter.path, options={"sleep_after_open": 0.0})
+    opened = open_port("left", settings, Receive())
+    yield opened
+    opened.close()
+
+
+def read_until(bus: Port, condition: Callable[[list[tuple[int, bytes]]], bool]) -> None:
+    frames: list[tuple[int, bytes]] = []
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not condition(frames):
+        assert time.monotonic() < deadline_s, (frames, bus.state, bus.counters)
+        batch = bus.read()
+        frames += zip(batch.id.tolist(), map(bytes, batch.data), strict=True)
+        time.sleep(0.005)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        b"t4E08\r",
+        b"t4E0840F4F4F3F4F4\r",
+        b"t4E0840F4F4F3F4F4F3F\r",
+        b"t4E0840F4F4F3F4F4F3Fx\r",
+        b"tz",
+        b"t\r",
+        b"T4E0\r",
+        b"t4E0",
+        b"r4E09\r",
+        b"b\r",
+        b"D000000000\r",
+        b"t4E09" + 9 * b"00" + b"\r",
+        b"\a\a\a",
+        b"\0\0\0\r",
+    ],
+)
+def test_a_damaged_line_of_a_serial_adapter_is_no_frame_and_ends_nothing(
+    adapter: Adapter, slcan: Port, damage: bytes
+) -> None:
+    """Cut lines are the commonest damage: what they lack is not taken from an earlier frame."""
+    adapter.says(GOOD * 3)
+    read_until(slcan, lambda frames: len(frames) == 3)
+    adapter.says(damage, b"\r", LAST)
+    seen: list[tuple[int, bytes]] = []
+
+    def came(frames: list[tuple[int, bytes]]) -> bool:
+        seen[:] = frames
+        return bool(frames) and frames[-1][0] == 0x4E1
+
+    read_until(slcan, came)
+    assert [one for one in seen if one[0] == 0x4E0] == []
+    assert slcan.state is LinkState.UP
+
+
+@pytest.mark.parametrize("noise", [b"\xff\r", b"x" * 3000])
+def test_what_a_library_does_not_get_past_opens_the_adapter_again(
+    adapter: Adapter, slcan: Port, noise: bytes
+) -> None:
+    """A byte that is no text stays in slcan's buffer; a line without an end fills it."""
+
+    def again(_: list[tuple[int, bytes]]) -> bool:
+        if not slcan.counters.removals:
+            adapter.says(noise)
+        return slcan.counters.reopened > 0
+
+    def good(frames: list[tuple[int, bytes]]) -> bool:
+        adapter.says(b"\r", LAST)
+        return any(one[0] == 0x4E1 for one in frames)
+
+    read_until(slcan, again)
+    read_until(slcan, good)
+
+
+async def test_an_adapter_that_takes_nothing_holds_nobody_up(
+    adapter: Adapter, slcan: Port, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(adapters, "SEND_DEADLINE_S", 0.1)
+    monkeypatch.setattr(port, "SEND_DEADLINE_S", 0.1)
+    termios.tcflow(adapter.tty, termios.TCOOFF)
+    turns = 0
+
+    async def work() -> None:
+        nonlocal turns
+        while True:
+            await asyncio.sleep(0.001)
+            turns += 1
+
+    working = asyncio.create_task(work())
+    with pytest.raises(BusError, match="it has taken no frame for"):
+        await slcan.send([(0x20E, b"\x07\x00")])
+    working.cancel()
+    assert turns
+    assert slcan.state is LinkState.GONE
+    termios.tcflow(adapter.tty, termios.TCOON)
+    read_until(slcan, lambda _: slcan.state is LinkState.UP)
+
+
+class Server:
+    """A socketcand whose manners are given: what it answers to each of a client's messages."""
+
+    def __init__(self, answers: Callable[[int], list[bytes]]) -> None:
+        self._answers = answers
+        self._socket = socket.create_server(("127.0.0.1", 0))
+        self.port = self._socket.getsockname()[1]
+        self.connections = 0
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                client, _ = self._socket.accept()
+                self.connections += 1
+                serving = (client, self._answers(self.connections))
+                threading.Thread(target=self._serve, args=serving, daemon=True).start()
+
+    @staticmethod
+    def _serve(client: socket.socket, answers: list[bytes]) -> None:
+        with contextlib.suppress(OSError), client:
+            for answer in answers:
+                client.sendall(answer)
+                if not client.recv(1000):
+                    return
+            while client.recv(1000):
+                pass
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def configuration(folder: Path, tcp_port: int) -> Path:
+    text = (ROOT / "config" / "demo.toml").read_text()
+    text = re.sub(r'interface = ".*"', 'interface = "socketcand"', text)
+    options = f'options = {{ host = "127.0.0.1", port = {tcp_port} }}'
+    text = re.sub(r'channel = ".*"', f'channel = "can0"\n{options}', text)
+    text += f"\n[mqtt]\nport = {free_port()}\n[service]\nstate_directory = '{folder}/state'\n"
+    path = folder / "robot.toml"
+    path.write_text(text)
+    return path
+
+
+def greeting_only(connection: int) -> list[bytes]:
+    return [b"< hi >"] if connection < 3 else []
+
+
+def damage(connection: int) -> list[bytes]:
+    return [b"< hi >", b"< ok >", b"< ok >", b"< frame zzz 1.0 00 >\xff" * 20]
+
+
+@pytest.mark.parametrize("answers", [None, lambda _: [], greeting_only, damage])
+def test_a_server_of_buses_that_misbehaves_fills_no_log_and_the_daemon_ends_when_told(
+    tmp_path: Path, answers: Callable[[int], list[bytes]] | None
+) -> None:
+    server = None if answers is None else Server(answers)
+    path = configuration(tmp_path, free_port() if server is None else server.port)
+    with (tmp_path / "log").open("w") as log:
+        program = [sys.executable, "-m", "skin_host", "run", str(path)]
+        daemon = subprocess.Popen(program, cwd=ROOT, stdout=log, stderr=log)
+    try:
+        deadline_s = time.monotonic() + PATIENCE_S
+        while "broker" not in (tmp_path / "log").read_text():
+            assert daemon.poll() is None, (tmp_path / "log").read_text()
+            assert time.monotonic() < deadline_s, (tmp_path / "log").read_text()
+            time.sleep(0.1)
+        time.sleep(1.0)
+        daemon.send_signal(signal.SIGTERM)
+        assert daemon.wait(PATIENCE_S) == 0
+    finally:
+        daemon.kill()
+        if server is not None:
+            server.close()
+    said = (tmp_path / "log").read_text()
+    assert "Traceback" not in said
+    assert len(said) < 5_000
+    assert "socketcand can0" in said or "can0 is gone" in said or "did not answer" in said
