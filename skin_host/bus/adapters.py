@@ -6,6 +6,7 @@ What an adapter's library may wait in for ever (opening, sending, closing) is do
 
 import asyncio
 import logging
+import math
 import os
 import socket
 from collections.abc import Mapping
@@ -38,12 +39,15 @@ CAPACITY = 1024
 CALM_S = 10.0
 MULTICAST = "udp_multicast"
 SOCKETCAND = "socketcand"
-#: They take a frame at once, or never.
+#: They take a frame at once, or never, and stamp it by this computer's clock.
 AT_ONCE = ("virtual", MULTICAST)
 #: What so many times in a row could not be read shows that the library does not get past it.
 MOST_UNREADABLE = 8
 #: A serial adapter's line is shorter than this; noise never ends one.
 LONGEST_LINE = 4096
+#: Clocks that differ by less are the same. Within so long some frame is read at once.
+SAME_S = 0.002
+FRESH_S = 2.0
 #: Opening may take so long: a serial adapter takes 2 s. Closing is waited for this long.
 OPEN_S = 5.0
 CLOSE_S = 1.0
@@ -78,6 +82,37 @@ def identifier(message: can.Message) -> int:
     )
 
 
+class Stamps:
+    """Brings the time stamps of another clock, an adapter's or another computer's, to this one's.
+
+    They differ by what the freshest frame of some seconds seems to have waited. A clock that
+    differs by a tenth of a period would make whole sweeps look cut, or boards as if they had
+    sent in the future.
+    """
+
+    def __init__(self) -> None:
+        self._behind_s = 0.0
+        self._since_s = -math.inf
+        self._least_s = math.inf
+
+    def here(self, stamp_s: float, now_s: float) -> float:
+        """Return the time on this computer's clock of a frame that is read now."""
+        if not abs(stamp_s - now_s) <= PLAUSIBLE_S:
+            return now_s
+        waited_s = now_s - stamp_s - self._behind_s
+        self._least_s = min(self._least_s, waited_s)
+        if not 0 <= now_s - self._since_s < FRESH_S:
+            # Frames that waited while this computer was busy come after fresh ones.
+            if self._least_s > SAME_S:
+                self._behind_s += self._least_s
+                waited_s -= self._least_s
+            self._since_s, self._least_s = now_s, math.inf
+        if waited_s < 0:
+            self._behind_s += waited_s
+            return now_s
+        return now_s - waited_s
+
+
 class AdapterPort(Port):
     """A bus that python-can reads, frame by frame.
 
@@ -104,6 +139,7 @@ class AdapterPort(Port):
         self._worker = worker
         self._opening = opening
         self._unreadable = 0
+        self._stamps = Stamps()
         self._calm_at_s = 0.0
         self._id = np.zeros(CAPACITY, np.uint32)
         self._dlc = np.zeros(CAPACITY, np.uint8)
@@ -240,12 +276,14 @@ class AdapterPort(Port):
         except (TypeError, ValueError, OverflowError):  # cut; numbers of other types, out of range
             self.counters.damaged += 1
             return False
-        now_s = self._clock.now_ns() * 1e-9
-        stamp_s = message.timestamp
-        if not abs(stamp_s - now_s) <= PLAUSIBLE_S:
-            stamp_s = now_s
-        self._t_ns[row] = nanoseconds(stamp_s)
+        self._t_ns[row] = nanoseconds(self._time_of(message, self._clock.now_ns() * 1e-9))
         return True
+
+    def _time_of(self, message: can.Message, now_s: float) -> float:
+        if self._settings.interface not in AT_ONCE:
+            return self._stamps.here(message.timestamp, now_s)
+        is_time = abs(message.timestamp - now_s) <= PLAUSIBLE_S
+        return message.timestamp if is_time else now_s
 
     def _note_failure(self, error: Exception) -> None:
         self._shut_down()

@@ -25,6 +25,7 @@ from types import SimpleNamespace
 import pytest
 
 from skin_host.bus import adapters, port
+from skin_host.bus.adapters import Stamps
 from skin_host.bus.opening import open_port
 from skin_host.bus.port import LinkState, Port
 from skin_host.config.settings import Bus, Receive
@@ -196,6 +197,7 @@ class Server:
         self._socket = socket.create_server(("127.0.0.1", 0))
         self.port = self._socket.getsockname()[1]
         self.connections = 0
+        self.clients: list[socket.socket] = []
         threading.Thread(target=self._accept, daemon=True).start()
 
     def _accept(self) -> None:
@@ -203,6 +205,7 @@ class Server:
             while True:
                 client, _ = self._socket.accept()
                 self.connections += 1
+                self.clients.append(client)
                 serving = (client, self._answers(self.connections))
                 threading.Thread(target=self._serve, args=serving, daemon=True).start()
 
@@ -265,3 +268,42 @@ def test_a_server_of_buses_that_misbehaves_fills_no_log_and_the_daemon_ends_when
     assert "Traceback" not in said
     assert len(said) < 5_000
     assert "socketcand can0" in said or "can0 is gone" in said or "did not answer" in said
+
+
+@pytest.mark.parametrize("ahead_s", [-300.0, -0.5, -0.02, 0.0, 0.02, 300.0, 1e9])
+def test_another_computers_clock_does_not_move_the_frames(ahead_s: float) -> None:
+    """Sweeps seemed cut, and boards to have sent minutes ago or in the future."""
+    handshake = [b"< hi >", b"< ok >", b"< ok >"]
+    server = Server(lambda _: handshake)
+    options: dict[str, object] = {"host": "127.0.0.1", "port": server.port}
+    settings = Bus(interface="socketcand", channel="can0", options=options)
+    bus = open_port("left", settings, Receive())
+    for _ in range(20):
+        sent_ns = time.time_ns()
+        server.clients[-1].sendall(
+            f"< frame 4E0 {sent_ns * 1e-9 + ahead_s:.6f} 40F4F4F3F4F4F3F4 >".encode()
+        )
+        n = 0
+        while not n:
+            batch = bus.read()
+            n = len(batch)
+        assert sent_ns - 2_000_000 <= batch.t_ns[0] <= time.time_ns() + 1000
+    bus.close()
+    server.close()
+
+
+def test_stamps_follow_a_clock_that_runs_slowly_and_keep_what_waited() -> None:
+    stamps, slow = Stamps(), 1 - 1e-3
+    now_s = 1_700_000_000.0
+    began_s = now_s
+    for _ in range(2000):
+        now_s += 0.05
+        sent_s = began_s + (now_s - began_s) * slow
+        assert now_s - 0.005 < stamps.here(sent_s, now_s) <= now_s
+    # This computer was stopped for 10 s; what waited comes in a burst.
+    paused_s = now_s
+    now_s += 10.0
+    for number in range(200):
+        sent_s = paused_s + 0.05 * number
+        stamp_s = stamps.here(began_s + (sent_s - began_s) * slow, now_s)
+        assert abs(stamp_s - sent_s) < 0.02
