@@ -67,7 +67,7 @@ def watchdog_interval_s() -> float | None:
     """Return how often to notify systemd's watchdog, half its limit; None without a watchdog."""
     usec = os.environ.get("WATCHDOG_USEC", "")
     pid = os.environ.get("WATCHDOG_PID", "")
-    if not usec.isdigit() or (pid and pid != str(os.getpid())):
+    if not usec.isdecimal() or (pid and pid != str(os.getpid())):
         return None
     return int(usec) / 2e6
 

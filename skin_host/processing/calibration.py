@@ -15,7 +15,7 @@ from enum import IntEnum
 from functools import cached_property
 from pathlib import Path
 from statistics import median
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import msgspec
 import numpy as np
@@ -713,6 +713,23 @@ def unchanged(calibration: Calibration, layout: Layout) -> dict[str, list[int]]:
     return {name: taxels for name, taxels in found.items() if taxels}
 
 
+#: Of a byte.
+SCALE_UNITS = 255.0
+#: Of the numbers of a file. Beyond them a pad would feel nothing, or anything, and be valid.
+_BOUNDS = {
+    "baseline": (-SCALE_UNITS, SCALE_UNITS),
+    "percentile": (-SCALE_UNITS, SCALE_UNITS),
+    "noise": (0.0, SCALE_UNITS),
+    # Of pads that are not used it may be any, where jumps last.
+    "spread": (0.0, 1e6),
+    "gain": (0.01, 100.0),
+    "bend": (0.01, 100.0),
+}
+#: Loads (N, N m), pressures (kPa) and numbers derived from them.
+MOST = 1e6
+_Label = Annotated[str, msgspec.Meta(max_length=64, pattern="^[ -~]*$")]
+
+
 class _PartFile(msgspec.Struct, forbid_unknown_fields=True):
     baseline: list[float]
     percentile: list[float]
@@ -752,8 +769,8 @@ class _CurvesFile(msgspec.Struct, forbid_unknown_fields=True):
 
 class _File(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
     schema: str
-    id: str
-    time: str
+    id: _Label
+    time: _Label
     robot: str
     configuration: str
     parts: dict[str, _PartFile]
@@ -861,23 +878,37 @@ def load(path: Path, layout: Layout, configuration: str) -> Calibration:
             given = getattr(stored, name)
             if given is None:
                 given = stored.noise if name == "spread" else np.ones(part.n_taxels)
-            values = np.array(given)
-            if values.shape != (part.n_taxels,) or not np.all(np.isfinite(values)):
-                raise refused(f"parts.{part.name}.{name}: wanted {part.n_taxels} finite numbers")
+            values, (least, most) = np.array(given), _BOUNDS[name]
+            wrong = values.shape != (part.n_taxels,)
+            if wrong or not np.all((values >= least) & (values <= most)):
+                raise refused(
+                    f"parts.{part.name}.{name}: wanted {part.n_taxels} finite numbers "
+                    f"from {least:g} to {most:g}"
+                )
             array[mine] = values
+        if len(stored.verdict) != part.n_taxels:
+            raise refused(f"parts.{part.name}.verdict: wanted {part.n_taxels} words")
         try:
             verdict[mine] = [Verdict[name.upper()] for name in stored.verdict]
-        except (KeyError, ValueError) as error:
+        except KeyError as error:
             raise refused(f"parts.{part.name}.verdict: {error}") from None
-        for name in ("gain", "bend"):
-            if np.any(arrays[name][mine] <= 0.0):
-                raise refused(f"parts.{part.name}.{name}: every number must be positive")
+        above = arrays["percentile"][mine] - arrays["baseline"][mine]
+        decides = levels(above, arrays["spread"][mine], TouchSettings()).decides
+        deaf = np.flatnonzero((decides > SCALE_UNITS) & (verdict[mine] < Verdict.STUCK))
+        if len(deaf):
+            raise refused(
+                f"parts.{part.name}: taxel {deaf[0]} has so much noise that it would feel nothing, "
+                "and is called usable"
+            )
     zeros = {}
     for name, zero in content.fingertips.items():
         offset, noise = np.array(zero.offset), np.array(zero.noise)
         fits = offset.shape == noise.shape == (CHANNELS,)
-        if not fits or not np.isfinite([offset, noise]).all() or (noise < 0.0).any():
-            raise refused(f"fingertips.{name}: wanted twice {CHANNELS} finite numbers")
+        if not fits or not (np.abs([offset, noise]) <= MOST).all() or (noise < 0.0).any():
+            raise refused(
+                f"fingertips.{name}: wanted twice {CHANNELS} finite numbers up to {MOST:g}, "
+                "and no noise below 0"
+            )
         zeros[name] = Zero(offset, noise, zero.touched)
     curves = None
     if content.curves is not None:
@@ -913,9 +944,9 @@ def _curves_of(
     """Return the curves of a file; errors are raised through `refused`."""
     memory = np.array([*content.radius_kpa, *content.weight])
     lengths_agree = len(content.radius_kpa) == len(content.weight)
-    if not lengths_agree or not np.isfinite(memory).all() or np.any(memory <= 0.0):
+    if not lengths_agree or not np.all((memory > 0.0) & (memory <= MOST)):
         raise refused("curves: wanted as many radii as weights, all positive")
-    if content.units != KNOTS_UNITS.tolist() or not 0.0 < content.highest_kpa < np.inf:
+    if content.units != KNOTS_UNITS.tolist() or not 0.0 < content.highest_kpa <= MOST:
         raise refused("curves.units: not the activations that this version knows")
     n = layout.n_taxels
     kpa = np.zeros((n, len(KNOTS_UNITS)))
@@ -936,7 +967,7 @@ def _curves_of(
             raise refused(f"{where}.verdict: {unknown}") from None
         for taxel, curve in enumerate(stored.kpa, part.start):
             if curve is not None:
-                if len(curve) != len(KNOTS_UNITS) or not np.isfinite(curve).all():
+                if len(curve) != len(KNOTS_UNITS) or not np.all(np.abs(curve) <= MOST):
                     raise refused(f"{where}.kpa: wanted {len(KNOTS_UNITS)} finite numbers a curve")
                 kpa[taxel] = curve
             elif verdict[taxel] == CurveVerdict.GOOD:
@@ -944,7 +975,7 @@ def _curves_of(
         beyond[mine] = [np.inf if units is None else units for units in stored.beyond_units]
         error[mine] = [np.nan if kpa is None else kpa for kpa in stored.error_kpa]
         noise[mine] = stored.noise_units
-    wild = not np.isfinite(noise).all() or np.any(noise < 0.0)
+    wild = not np.all((noise >= 0.0) & (noise <= SCALE_UNITS))
     if wild or np.any(np.diff(kpa) < 0.0) or not np.all(beyond > 0.0):
         raise refused("curves: a curve falls, or a noise is negative")
     return Curves(

@@ -444,6 +444,14 @@ def test_zeros_of_fingertips_are_kept_with_it_and_renewed_with_the_whole_skin(un
         calibration.load(path, LAYOUT, "abc")
 
 
+def test_pads_that_are_not_used_may_have_any_noise(untouched, tmp_path):
+    path = tmp_path / "calibration.json"
+    spread, verdict = untouched.spread.copy(), untouched.verdict.copy()
+    spread[3], verdict[3] = 4000.0, Verdict.TOO_NOISY
+    calibration.save(path, replace(untouched, spread=spread, verdict=verdict), LAYOUT)
+    assert calibration.load(path, LAYOUT, "abc").spread[3] == 4000.0
+
+
 def test_gains_outlive_a_new_zero(untouched, tmp_path):
     path = tmp_path / "calibration.json"
     assert calibration.with_gains_of(untouched, path, LAYOUT) is untouched
@@ -490,6 +498,16 @@ def damaged(document, path):
         (lambda d: d["parts"]["skin"]["gain"].__setitem__(3, -1.0), "parts.skin.gain"),
         (lambda d: d["parts"]["skin"]["verdict"].__setitem__(3, "fine"), "parts.skin.verdict"),
         (lambda d: d.pop("time"), "not a calibration file"),
+        # With these a pad would be valid and feel nothing, or anything.
+        (lambda d: d["parts"]["skin"]["baseline"].__setitem__(3, 300.0), "from -255 to 255"),
+        (lambda d: d["parts"]["skin"]["baseline"].__setitem__(3, -1e300), "from -255 to 255"),
+        (lambda d: d["parts"]["skin"]["noise"].__setitem__(3, -1.0), "from 0 to 255"),
+        (lambda d: d["parts"]["skin"]["spread"].__setitem__(3, 300.0), "taxel 3 has so much noise"),
+        (lambda d: d["parts"]["skin"]["gain"].__setitem__(3, 1e12), "from 0.01 to 100"),
+        (lambda d: d["parts"]["skin"]["bend"].__setitem__(3, 1e-300), "from 0.01 to 100"),
+        (lambda d: d["parts"]["skin"].update(verdict=["ok"]), "verdict: wanted 192 words"),
+        (lambda d: d.update(id="x\nERROR forged"), "not a calibration file"),
+        (lambda d: d.update(time="x" * 100_000), "not a calibration file"),
     ],
 )
 def test_a_file_that_does_not_fit_is_refused_in_one_line_with_the_remedy(
