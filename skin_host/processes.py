@@ -82,6 +82,12 @@ class Processes:
             ) from None
 
 
+def end_with_parent() -> None:
+    """Get SIGTERM when the parent ends, however it does."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
 def _leave(number: int, _: object) -> None:
     """End this process by an exception, so that everything is cleaned up."""
     sys.exit(128 + number)
@@ -96,8 +102,7 @@ def _begin(parent: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _end)
     signal.signal(signal.SIGALRM, _end)
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    end_with_parent()
     if os.getppid() != parent:
         _end()
 

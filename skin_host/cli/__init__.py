@@ -49,7 +49,7 @@ class _Parser(argparse.ArgumentParser):
 
         near = difflib.get_close_matches(typed, known, n=1)
         message += f"; meant {near[0]}?" if near else ""
-        print(f"{self.prog}: {message} (see `{self.prog} --help`)", file=sys.stderr)
+        print(f"{self.prog}: {visible(message)} (see `{self.prog} --help`)", file=sys.stderr)
         raise SystemExit(2)
 
     def _options_of_all(self) -> list[str]:

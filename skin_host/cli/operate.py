@@ -4,6 +4,7 @@ import argparse
 import gc
 import json
 import logging
+import re
 import signal
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
@@ -56,7 +57,7 @@ def add_commands(commands: Commands) -> None:
         metavar="N",
         help="share the buses among so many processes, each a node: NODE-1, NODE-2, ...",
     )
-    run.add_argument("--share", help=argparse.SUPPRESS)
+    run.add_argument("--share", type=_share, help=argparse.SUPPRESS)
     add_log_level(run)
     run.set_defaults(run=_run)
 
@@ -108,6 +109,14 @@ COMMANDS = {
 }
 
 
+def _share(text: str) -> tuple[int, int]:
+    """Which share of how many, for argparse."""
+    number, _, n = text.partition("/")
+    if not re.fullmatch("[1-9][0-9]{0,8}/[1-9][0-9]{0,8}", text) or int(number) > int(n):
+        raise argparse.ArgumentTypeError(f"seen {text}, wanted NUMBER/OF such as 1/2")
+    return int(number), int(n)
+
+
 def reload_on_hangup(daemon: "Daemon") -> None:
     """Read the configuration again on SIGHUP; a wrong one is reported and changes nothing."""
     import asyncio
@@ -139,6 +148,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from skin_host.daemon.daemon import Daemon
     from skin_host.daemon.workers import share_name, share_of
     from skin_host.layout import build_layout
+    from skin_host.processes import end_with_parent
 
     set_up_logging(arguments.verbose)
     settings, layout = load_skin(arguments.config)
@@ -150,11 +160,11 @@ def _run(arguments: argparse.Namespace) -> int:
         """A configuration as this process has it: of one share, or as it is."""
         if arguments.share is None:
             return settings
-        number, _, n = arguments.share.partition("/")
-        return share_of(settings, arguments.node, int(number), int(n))
+        return share_of(settings, arguments.node, *arguments.share)
 
     if arguments.share is not None:
-        nodes.insert(0, share_name(arguments.node, int(arguments.share.partition("/")[0])))
+        end_with_parent()
+        nodes.insert(0, share_name(arguments.node, arguments.share[0]))
         settings = ours(settings)
         layout = build_layout(settings, arguments.config.parent)
     calibration = None

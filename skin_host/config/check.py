@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from skin_host.config.settings import Settings, format_triangles, skin_hash
+from skin_host.errors import visible
 from skin_host.layout import TAXELS_PER_TRIANGLE, BoardLayout, Layout, PadKind
 
 #: Bits of a standard frame of eight bytes with its interframe space: without stuff bits, and with
@@ -265,7 +266,7 @@ def _cell(key: str, value: Any) -> str:
         case "parts":
             return ", ".join(value)
         case _:
-            return "-" if value is None else str(value)
+            return "-" if value is None else visible(str(value))
 
 
 def _load(load: tuple[float, float]) -> str:

@@ -16,17 +16,17 @@ import msgspec
 from msgspec import Meta, Struct, field
 
 from skin_host.config.explain import Named, explain, out_of_bounds
-from skin_host.config.fields import Name, NotNegative, Positive
+from skin_host.config.fields import Name, NotNegative, Positive, wrong_topic
 from skin_host.config.fingertips import Fingertip as Fingertip  # noqa: PLC0414 (for others too)
 from skin_host.config.relaxation import RelaxationSettings, with_file, wrong_parameters
-from skin_host.errors import ConfigurationError, RequestError
+from skin_host.errors import ConfigurationError, RequestError, visible
 from skin_host.files import read_whole
 
 Byte = Annotated[int, Meta(ge=0, le=255)]
 T = TypeVar("T", bound=Struct)
 TRIANGLES_PER_BOARD = 16
 #: host, host:port or [IPv6]:port
-_ADDRESS = r"^([A-Za-z0-9_.-]+|\[[0-9A-Fa-f:.]+\])(:[0-9]{1,5})?$"
+_ADDRESS = r"^([A-Za-z0-9_.-]+|\[[0-9A-Fa-f:.]+\])(:[0-9]{1,5})?(?!\n)$"
 
 
 class _Table(Struct, forbid_unknown_fields=True, kw_only=True, frozen=True):
@@ -205,7 +205,7 @@ class Mqtt(_Table, frozen=True):
     event_queue: Annotated[int, Meta(ge=16, le=1_000_000)] = 10_000
     commands: bool = True
     #: Publish the parts to Home Assistant below this prefix, usually "homeassistant".
-    discovery_prefix: Annotated[str, Meta(pattern=r"^[a-zA-Z0-9_/-]+$")] | None = None
+    discovery_prefix: Annotated[str, Meta(pattern=r"^[a-zA-Z0-9_/-]+(?!\n)$")] | None = None
 
 
 class Receive(_Table, frozen=True):
@@ -214,8 +214,8 @@ class Receive(_Table, frozen=True):
     poll_ms: Annotated[float, Meta(gt=0, le=1000)] = 4.0
     buffer_bytes: Annotated[int, Meta(ge=65536)] = 4_194_304
     #: A sweep with missing triangles is closed after this many periods.
-    close_periods: Positive = 0.9
-    silent_periods: Positive = 4.0
+    close_periods: Annotated[float, Meta(gt=0, le=10)] = 0.9
+    silent_periods: Annotated[float, Meta(gt=0, le=100)] = 4.0
 
 
 class Service(_Table, frozen=True):
@@ -293,7 +293,7 @@ def read_toml(path: Path, table: type[T], named: Named) -> T:
         found = msgspec.toml.decode(data, type=table)
     except msgspec.ValidationError as error:
         what = explain(msgspec.toml.decode(data), error, table, named)
-        raise ConfigurationError(f"{path}: {what}") from None
+        raise ConfigurationError(f"{path}: {visible(what)}") from None
     except (msgspec.DecodeError, ValueError) as error:  # numbers of 4300 digits, too
         raise ConfigurationError(f"{path}: not TOML: {error}") from None
     except RecursionError:
@@ -327,7 +327,7 @@ def load(path: Path) -> Settings:
 
 def _check_references(path: Path, settings: Settings) -> None:
     def wrong(where: str, what: str) -> ConfigurationError:
-        return ConfigurationError(f"{path}: {where}: {what}")
+        return ConfigurationError(f"{path}: {where}: {visible(what)}")
 
     addresses: dict[tuple[str, int], str] = {}
     boards: list[tuple[str, str, Board | Fingertip]] = [
@@ -377,6 +377,8 @@ def _check_references(path: Path, settings: Settings) -> None:
 
 def _check_fingertips(settings: Settings, wrong: Callable[[str, str], ConfigurationError]) -> None:
     nodes = {part.node for part in settings.parts.values()}
+    if (what := wrong_topic(settings.mqtt.base)) is not None:
+        raise wrong("mqtt.base", what)
     for name, tip in settings.fingertips.items():
         where = f"fingertips.{name}"
         if name in settings.parts or name == "nodes":

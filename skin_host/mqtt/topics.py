@@ -7,6 +7,7 @@ below `nodes/<node>`. `docs/mqtt.md` is the contract.
 import re
 from typing import Literal, NamedTuple
 
+from skin_host.config.fields import wrong_topic
 from skin_host.errors import ConfigurationError
 
 PartTopic = Literal["frame", "touch", "slip", "over", "contact", "health"]
@@ -40,16 +41,9 @@ class Topics:
 
     def __init__(self, base: str, robot: str) -> None:
         for what, text in (("mqtt.base", base), ("robot", robot)):
-            if (
-                not text
-                or set(text) & set("+#\0")
-                or text.startswith(("/", "$"))
-                or text[-1] == "/"
-            ):
-                raise ConfigurationError(
-                    f'{what}: "{text}" cannot start a topic; wanted words such as skin or '
-                    "lab/skin, without +, # and a slash at either end"
-                )
+            wrong = wrong_topic(text)
+            if wrong is not None:
+                raise ConfigurationError(f"{what}: {wrong}")
         self.base = f"{base}/{robot}"
 
     def part(self, kind: PartTopic, part: str) -> str:

@@ -727,7 +727,7 @@ _BOUNDS = {
 }
 #: Loads (N, N m), pressures (kPa) and numbers derived from them.
 MOST = 1e6
-_Label = Annotated[str, msgspec.Meta(max_length=64, pattern="^[ -~]*$")]
+_Label = Annotated[str, msgspec.Meta(max_length=64, pattern=r"^[ -~]*(?!\n)$")]
 
 
 class _PartFile(msgspec.Struct, forbid_unknown_fields=True):

@@ -70,6 +70,7 @@ def message_at(batch: FrameBatch, row: int, channel: str | None = None) -> can.M
         arbitration_id=flags & _ID,
         is_extended_id=bool(flags & EXTENDED_FLAG),
         is_remote_frame=bool(flags & REMOTE_FLAG),
+        is_error_frame=bool(flags & ERROR_FLAG),
         dlc=dlc,
         data=batch.data[row, :dlc].tobytes(),
         channel=channel,
@@ -145,11 +146,15 @@ async def capture_buses(settings: Settings, sink: CanSink, stop: asyncio.Event) 
         for name, bus in settings.buses.items():
             ports.append(open_port(name, bus, settings.receive))
         while not stop.is_set():
+            is_behind = False
             for port in ports:
-                while len(batch := port.read()):
+                # Once in turn: a bus on which more comes than is read must not hold up the end.
+                batch = port.read()
+                is_behind |= len(batch) >= port.capacity
+                if len(batch):
                     sink(port.channel, batch)
-            await asyncio.sleep(POLL_S)
-        return sum(port.counters.dropped for port in ports)
+            await asyncio.sleep(0.0 if is_behind else POLL_S)
+        return sum(port.counters.dropped + port.counters.damaged for port in ports)
     finally:
         for port in ports:
             port.close()

@@ -18,6 +18,7 @@ from msgspec import Struct
 
 from skin_host.bus.logs import open_recording
 from skin_host.bus.wire import FrameBatch
+from skin_host.config.fields import wrong_topic
 from skin_host.errors import LogError, SkinError, required
 from skin_host.files import growing, refuse_removed, writing
 from skin_host.fingertip.events import Over, Slip
@@ -34,6 +35,7 @@ MARKS = "marks"
 #: Nothing that is worth recording is longer.
 MAX_PAYLOAD = 32 * 1024 * 1024
 MAX_BATCH = 100_000
+LONGEST_TOPIC = 1024
 #: A chunk of a recording is no larger when decompressed; writers make chunks of some MB.
 MAX_CHUNK_BYTES = 64_000_000
 
@@ -294,12 +296,20 @@ def _check_chunks(path: Path, file: IO[bytes]) -> None:
 
 
 def _kind(topic: str) -> str | None:
-    """Return frame, touch, ... by the end of a topic; None for topics that are not recorded."""
-    head, _, last = topic.rpartition("/")
-    if last in ("frame", "touch", "slip", "over", "contact", "health"):
-        return last
-    if last in ("status", "info") and "/nodes/" in head:
-        return last
+    """Return frame, touch, ... by the end of a topic; None for topics that are not recorded.
+
+    A recording may be anybody's: what cannot be published, or is a command to a node, is none.
+    """
+    words = topic.split("/")
+    if wrong_topic(topic) is not None or not all(words) or len(topic) > LONGEST_TOPIC:
+        return None
+    match words:
+        case [_, _, *_, _, ("frame" | "touch" | "slip" | "over" | "contact" | "health") as kind]:
+            return None if "cmd" in words[-2:-1] else kind
+        case [_, _, *_, "nodes", _, ("status" | "info") as kind]:
+            return kind
+        case [_, _, *_, "nodes", _, piece, "info"] if piece.isdecimal():
+            return "info"
     return None
 
 

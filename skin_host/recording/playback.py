@@ -25,6 +25,7 @@ from skin_host.recording.capture import message_at
 from skin_host.recording.mcap import read_messages_of
 from skin_host.recording.replay import read_buses
 
+LONGEST_PAUSE_S = 600.0
 RETAINED = ("status", "info", "contact", "health")
 _NO_DATA = ERROR_FLAG | REMOTE_FLAG
 
@@ -32,13 +33,18 @@ T = TypeVar("T")
 
 
 async def paced(items: Iterable[T], t_ns: Callable[[T], int], speed: float) -> AsyncIterator[T]:
-    """Yield the items at their own pace times `speed`; late items follow at once."""
+    """Yield the items at their own pace times `speed`; late items follow at once.
+
+    A longer pause than `LONGEST_PAUSE_S`, or time that goes back, is a clock that was set.
+    """
     start: tuple[float, int] | None = None
+    last_ns = 0
     for item in items:
-        now_s = time.monotonic()
-        if start is None:
-            start = now_s, t_ns(item)
-        due_s = start[0] + (t_ns(item) - start[1]) * 1e-9 / speed
+        now_s, item_ns = time.monotonic(), t_ns(item)
+        if start is None or not -1e9 < item_ns - last_ns < LONGEST_PAUSE_S * 1e9:
+            start = now_s, item_ns
+        last_ns = item_ns
+        due_s = start[0] + (item_ns - start[1]) * 1e-9 / speed
         await asyncio.sleep(max(0.0, due_s - now_s))
         yield item
 

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skin_host.cli import main
 from skin_host.config.settings import format_triangles, load, parse_triangles, skin_hash
 from skin_host.errors import ConfigurationError
 from skin_host.layout import build_layout
@@ -145,6 +146,35 @@ def test_a_mistake_is_named_with_its_place(tmp_path: Path, old: str, new: str, s
     with pytest.raises(ConfigurationError) as caught:
         load(path)
     assert str(caught.value) == f"{path}: {said}"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        # A line end after a name would be a part of topics and of file names.
+        (TOP, 'robot = "demo\\n"', "robot: seen 'demo\\n', wanted `str`"),
+        ("left_hand", '"left_hand\\n"', 'parts: the name "left_hand\\n"; wanted at most 64'),
+        (TOP, f'{TOP}\nmqtt.base = "a\\nb"', 'mqtt.base: "a\\nb" cannot start a topic'),
+        (TOP, f'{TOP}\nmqtt.base = "#"', 'mqtt.base: "#" cannot start a topic'),
+        (TOP, f'{TOP}\nmqtt.brokers = ["a\\n"]', "mqtt.brokers"),
+        # A board that is gone would not be missed for as long.
+        (TOP, f"{TOP}\nreceive.silent_periods = 1e8", "receive.silent_periods: seen 100000000.0"),
+    ],
+)
+def test_what_would_only_fail_later_is_refused_by_the_check(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, said: str
+) -> None:
+    assert main(["check", str(edited(tmp_path, old, new))]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+
+
+def test_what_a_channel_is_called_does_not_steer_the_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = edited(tmp_path, 'channel = "skin-demo"', 'channel = "\\u001b[2J"')
+    assert main(["check", str(path)]) == 0
+    assert "\x1b" not in capsys.readouterr().out
 
 
 def test_what_is_not_toml_is_named_with_its_line(tmp_path: Path) -> None:

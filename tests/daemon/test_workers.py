@@ -15,7 +15,7 @@ import pytest
 from skin_host.config.settings import Settings, load
 from skin_host.daemon.workers import Merged, share_of, share_out
 from tests.support.broker import Mosquitto
-from tests.support.waiting import PATIENCE_S
+from tests.support.waiting import PATIENCE_S, until
 
 ROBOT = """
 robot = "body"
@@ -124,6 +124,47 @@ async def test_a_service_of_two_workers_is_one_robot(mosquitto: Mosquitto, tmp_p
         finally:
             with contextlib.suppress(ProcessLookupError):
                 process.kill()
+
+
+def children_of(pid: int) -> list[int]:
+    return list(map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split()))
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+async def test_workers_end_when_their_parent_is_killed(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    """They would go on commanding the boards beside those of the next start."""
+    config = body(tmp_path / "body.toml", [("a", [0]), ("b", [1])], mosquitto.port)
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "skin_host", "run", config, "--workers", "2"),
+        stderr=asyncio.subprocess.DEVNULL,
+    )
+    await states(mosquitto)
+    children = children_of(process.pid)
+    assert len(children) == 2
+    process.kill()
+    await process.wait()
+    await until(lambda: not any(map(is_running, children)))
+
+
+@pytest.mark.parametrize("share", ["", "-", "0/1", "2/1", "1/x", "9" * 5000])
+def test_a_share_that_is_none_is_refused_in_a_line(
+    share: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from skin_host.cli import main
+
+    with pytest.raises(SystemExit) as ended:
+        main(["run", "x.toml", f"--share={share}\x1b[2J"])
+    assert ended.value.code == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert said.isprintable()
 
 
 def test_workers_of_a_node_without_parts_are_refused(

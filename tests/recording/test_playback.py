@@ -9,10 +9,12 @@ from typing import Any
 import can
 import numpy as np
 import pytest
+from mcap.writer import Writer
 
 from emulator.probes.scene import Scene
 from emulator.robot import Robot
 from skin_host.bus.logs import read_channels
+from skin_host.bus.wire import FrameBatch
 from skin_host.client import SkinClient
 from skin_host.config.settings import Bus, Mqtt, Settings, changed, load
 from skin_host.errors import RequestError
@@ -25,6 +27,7 @@ from skin_host.recording.mcap import Recorder, read_can, read_messages_of, recor
 from skin_host.recording.playback import paced, play_messages, play_on_buses, play_processed
 from skin_host.recording.replay import calibrate_from_log, steps
 from tests.support.broker import Mosquitto
+from tests.support.ports import StillPort
 from tests.support.waiting import PATIENCE_S, until
 
 ROOT = Path(__file__).parents[2]
@@ -107,6 +110,75 @@ async def test_a_recording_played_on_a_bus_is_captured_as_it_was(tmp_path: Path)
         stop.set()
         assert await capturing == 0
     assert [frame[:2] for frame in frames_of(path)] == [frame[:2] for frame in frames_of(grasp)]
+
+
+@pytest.mark.timeout(60)
+async def test_a_clock_that_was_set_while_recording_is_not_waited_for() -> None:
+    """A computer without a clock begins in 1970; or somebody wrote such a file."""
+    set_ns = [0, 10, 1_700_000_000 * 10**9, 1_700_000_000 * 10**9 + 10, 20, 30, 2**62]
+    assert [item async for item in paced(set_ns, lambda item: item, speed=1.0)] == set_ns
+
+
+async def test_a_bus_on_which_more_comes_than_is_read_does_not_hold_up_the_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    settings, stop = load(ROOT / "config" / "demo.toml"), asyncio.Event()
+
+    class Flooded(StillPort):
+        def read(self) -> FrameBatch:
+            return FrameBatch.of([(0x4E0, bytes(8), 1)] * self.capacity)
+
+    monkeypatch.setattr("skin_host.recording.capture.open_port", Flooded)
+    asyncio.get_running_loop().call_later(0.05, stop.set)
+    n = 0
+
+    def sink(_: str, batch: FrameBatch) -> None:
+        nonlocal n
+        n += len(batch)
+        assert n < 10_000_000
+
+    assert await capture_buses(settings, sink, stop) == 0
+    assert n
+
+
+def test_errors_of_the_wire_are_recorded_as_such(tmp_path: Path) -> None:
+    """Anybody can send one over multicast: as a data frame it was a board's."""
+    error = FrameBatch.of([(0x20000000 | 0x4E0, bytes(8), 1_700_000_000 * 10**9)])
+    for name in ("a.log", "a.asc", "a.blf", "a.csv"):
+        with CanLog(tmp_path / name) as log:
+            log.put("can0", error)
+            log.put("can0", FrameBatch.of([(0x4E1, bytes(8), 1_700_000_001 * 10**9)]))
+        found = [int(one) for _, batch in read_channels(tmp_path / name) for one in batch.id]
+        assert 0x4E0 not in found
+        assert found[-1] == 0x4E1
+
+
+@pytest.mark.parametrize(
+    "topic",
+    [
+        "status",
+        "/contact",
+        "skin/demo/+/contact",
+        "skin/demo/nodes/main/cmd/status",
+        "skin/demo/palm\0/contact",
+        "$SYS/demo/palm/contact",
+        "skin//palm/contact",
+        "skin/demo/" + "x" * 100_000 + "/contact",
+    ],
+)
+def test_topics_of_a_recording_that_nobody_could_have_recorded_are_not_played(
+    tmp_path: Path, topic: str
+) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("skin.text", "jsonschema", b"{}")
+        for name in (topic, "skin/demo/palm/contact"):
+            channel = writer.register_channel(name, "json", schema)
+            writer.add_message(channel, 1, b'{"text":"ON"}', 1)
+        writer.finish()
+    assert [one.topic for one in read_messages_of(path)] == ["skin/demo/palm/contact"]
 
 
 async def test_pace_follows_the_recording_and_the_speed() -> None:
