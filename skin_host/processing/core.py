@@ -4,6 +4,8 @@ One engine serves both the daemon and the replay of recordings. It has no clock 
 takes frames and times, and returns frames of pressure and events.
 """
 
+import math
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -33,7 +35,14 @@ from skin_host.processing.liveness import PADS
 from skin_host.processing.masks import Mask, any_of
 from skin_host.processing.pipeline import Pipeline, PressureFrame
 from skin_host.processing.pressure import PressureCurve, vertex
-from skin_host.processing.rezero import BELOW_SWEEPS, JUMPS_NS, Rezero, look_s
+from skin_host.processing.rezero import (
+    BELOW_SWEEPS,
+    JUMPS_NS,
+    Rezero,
+    highest_rest,
+    look_s,
+    repeats_of,
+)
 from skin_host.processing.silent_zero import SilentZero
 
 if TYPE_CHECKING:
@@ -45,6 +54,10 @@ SHORTEST_S = KNOWN_SAMPLES * CONVERSION_S
 #: A longer interval between two samples of a calibration does not count for its time: nothing was
 #: received, or the clock was set.
 LONGEST_INTERVAL_NS = 1_000_000_000
+#: So many conversions show that something presses a taxel which is not valid, ...
+GLIMPSED = 3
+#: ... or has become it less than this ago: a touch may not be decided yet.
+DECIDED_NS = 500_000_000
 
 
 class Step(NamedTuple):
@@ -100,6 +113,19 @@ class _CalibrationRun:
     passed_ns: int = 0
     #: By board and part, for those that have sent any.
     samples: dict[tuple[int, int], int] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class _Glimpse:
+    """The last readings of a board of which taxels are not valid, or were not just now.
+
+    Attributes:
+        units: float64[192] each: of its taxels, away from its zero; -inf where there is none.
+        until_ns: then its touches are decided.
+    """
+
+    units: deque[NDArray[np.float64]]
+    until_ns: int = 0
 
 
 class Engine:
@@ -180,6 +206,8 @@ class Engine:
         self._rezeros: dict[int, Rezero] = {}
         #: Boards that were silent and may have zeroed themselves meanwhile.
         self._silent_zeros: dict[int, SilentZero] = {}
+        #: Boards of which taxels are not valid, or were not just now, as their zero is sought.
+        self._glimpses: dict[int, _Glimpse] = {}
         self._unanswered: dict[int, Mask] = {}
         #: For how many sweeps pads int64[16, 12] of a board have read far below zero, where any do.
         self._below: dict[int, NDArray[np.int64]] = {}
@@ -224,6 +252,7 @@ class Engine:
         self.zero_changes = after.zero_changes
         self._rezeros = after._rezeros
         self._silent_zeros = after._silent_zeros
+        self._glimpses = after._glimpses
         self._unanswered = after._unanswered
         self._below = after._below
         self._jumped_ns = after._jumped_ns
@@ -262,6 +291,7 @@ class Engine:
         for board in boards:
             self._rezeros.pop(board, None)
             self._silent_zeros.pop(board, None)
+            self._glimpses.pop(board, None)
         if self.fingertips is not None and boards == self.boards:
             self._ended += self.fingertips.use(calibration.zeros)
         self.release(boards)
@@ -455,7 +485,9 @@ class Engine:
                     self._run.samples[sender] = 0
         if self.calibration is None:
             return 0
-        touched: NDArray[np.bool_] = self._last_touched[taxels] & (taxels >= 0) & believed
+        touched: NDArray[np.bool_] = self._last_touched[taxels] | self._glimpsed(board)
+        touched &= (taxels >= 0) & believed
+        self._glimpses.pop(board, None)
         before = self._rezeros.get(board)
         if before is not None:
             touched |= before.unknown.reshape(TRIANGLES, PADS)
@@ -487,6 +519,8 @@ class Engine:
         touched: after another zero, theirs would not be.
         """
         found = self._last_touched.copy() if touched else np.zeros_like(self._touched)
+        for board in self._glimpses if touched else ():
+            found[self._taxels_of(board)[self._glimpsed(board)]] = True
         for board, rezero in self._rezeros.items():
             found[self._taxels_of(board).ravel()[rezero.unknown]] = True
         return found
@@ -564,6 +598,8 @@ class Engine:
                 silent_zero = self._silent_zeros.get(sweep.board)
                 if silent_zero is not None:
                     self._find_silent_zero(sweep, row, silent_zero)
+            if self._rezeros or self._silent_zeros or self._glimpses:
+                self._note_glimpse(sweep, row)
             samples += self.intake.take(sweep, row)
         return samples
 
@@ -571,6 +607,7 @@ class Engine:
         """Two boards send at an address: what both send is the zero of neither."""
         if self._run is not None:
             self._run.calibrator.forget(np.flatnonzero(self.taxels_of([sweep.board])))
+        self._glimpses.pop(sweep.board, None)
         rezero = self._rezeros.get(sweep.board)
         if rezero is None:
             return
@@ -634,6 +671,8 @@ class Engine:
             self.intake.veto[row] = np.ones((TRIANGLES, PADS), np.bool_)
             return
         if zeroed:
+            # What was read since is of the new zero.
+            self._glimpses.pop(sweep.board, None)
             self.rezero(sweep.board)
             return
         rezero = self._rezeros.get(sweep.board)
@@ -641,6 +680,51 @@ class Engine:
             self.intake.veto.pop(row, None)
         else:
             self._veto_unknown(sweep, row, rezero)
+
+    def _note_glimpse(self, sweep: Sweep, row: int) -> None:
+        """Keep what a board sends while its taxels are not valid, and until their touches are
+        decided: whatever presses them meanwhile must not become a zero unnoticed.
+        """
+        rezero = self._rezeros.get(sweep.board)
+        blind = sweep.board in self._silent_zeros
+        blind |= rezero is not None and rezero.unsettled(sweep.t_ns) is not None
+        glimpse = self._glimpses.get(sweep.board)
+        own = self.layout.boards[sweep.board].settings
+        if glimpse is None:
+            if not blind:
+                return
+            longest = math.ceil(GLIMPSED * repeats_of(own.period_ms * 1e-3))
+            glimpse = self._glimpses[sweep.board] = _Glimpse(deque(maxlen=longest))
+        if blind:
+            glimpse.until_ns = sweep.t_ns + DECIDED_NS
+        elif not 0 <= glimpse.until_ns - sweep.t_ns <= DECIDED_NS:
+            del self._glimpses[sweep.board]
+            return
+        ledger = self.ledger
+        here = (ledger.present[row] & (ledger.error[row] == 0))[:, None] & ~ledger.far[row]
+        units = np.where(here, float(own.no_load) - sweep.raw, -np.inf)
+        glimpse.units.append(units.ravel())
+
+    def _glimpsed(self, board: int) -> Mask:
+        """Return taxels bool[16, 12] of a board that something presses by its last readings, while
+        no touch could be decided.
+        """
+        glimpse = self._glimpses.get(board)
+        calibration, pipeline = self.calibration, self._pipeline
+        pressed = np.zeros((TRIANGLES, PADS), np.bool_)
+        if glimpse is None or calibration is None or pipeline is None:
+            return pressed
+        if len(glimpse.units) < GLIMPSED:
+            return pressed
+        taxels = self._taxels_of(board).ravel()
+        spread = np.maximum(calibration.spread, calibration.noise)[taxels]
+        baseline = pipeline.baseline[taxels]
+        repeats = repeats_of(self.layout.boards[board].settings.period_ms * 1e-3)
+        highest = highest_rest(baseline, spread, repeats)[0]
+        highest = np.maximum(highest, baseline + pipeline.enter[taxels])
+        fit = (taxels >= 0) & calibration.usable[taxels]
+        pressed[:] = (fit & (np.median(glimpse.units, axis=0) > highest)).reshape(pressed.shape)
+        return pressed
 
     def _note_below_zero(self, sweep: Sweep, row: int) -> None:
         """Detect pads whose zero was taken while something pressed that has lifted now."""

@@ -70,6 +70,26 @@ def look_s(spread: Floats, enter: Floats) -> Floats:
     return found
 
 
+def repeats_of(period_s: float) -> float:
+    """Return how often a board that sends at this interval sends a conversion."""
+    return max(1.0, CONVERSION_S / period_s)
+
+
+def highest_rest(baseline: Floats, spread: Floats, repeats: float = 1.0) -> tuple[Floats, Floats]:
+    """Return up to where untouched taxels [n] may read, whether or not their board was zeroed, and
+    what noise may add to one reading, in units.
+
+    Args:
+        baseline: float64[n], where they rested before.
+        spread: float64[n], see `Rezero.finish`.
+        repeats: how often the board sends a conversion.
+    """
+    # That of a mean of k readings is this by sqrt(k).
+    error = STEADY_ERRORS * np.sqrt(repeats) * np.maximum(spread, LEAST_SPREAD)
+    # The board's zero is one reading. Without one, pads rest where they did.
+    return np.maximum(baseline, 0.0) + STEADY_UNITS + error, error
+
+
 class Rezero:
     """Observes the n taxels of a board after the board was zeroed.
 
@@ -99,7 +119,7 @@ class Rezero:
         period_s: float = CONVERSION_S,
     ) -> None:
         self._no_load = no_load
-        self._repeats = max(1.0, CONVERSION_S / period_s)
+        self._repeats = repeats_of(period_s)
         none = np.zeros(len(no_load), np.int64)
         self._wanted = np.maximum(FEWEST, none if wanted is None else wanted)
         self._forget()
@@ -277,10 +297,7 @@ class Rezero:
             baseline: float64[n], the previous ones.
             spread: float64[n], see `finish`.
         """
-        # That of a mean of k readings is this by sqrt(k).
-        error = STEADY_ERRORS * np.sqrt(self._repeats) * np.maximum(spread, LEAST_SPREAD)
-        # The board's zero is one reading. Without one, pads rest where they did.
-        most = np.maximum(baseline, 0.0) + STEADY_UNITS + error
+        most, error = highest_rest(baseline, spread, self._repeats)
         self._highest = np.minimum(self._highest, most)
         before = np.arange(1, len(units))[:, None]
         after = self._count - before

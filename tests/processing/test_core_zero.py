@@ -165,6 +165,50 @@ def test_a_pad_that_is_in_doubt_when_its_board_is_zeroed_again_stays_so(hand: Ha
     assert hand.in_doubt == [3]
 
 
+@pytest.mark.parametrize(("rests", "pressed"), [(5, 10), (25, 10), (36, 7)])
+def test_a_press_that_began_before_its_pad_was_valid_is_in_doubt_after_another_zero(
+    hand: Hand, rests: int, pressed: int
+) -> None:
+    """No touch shows it: while the zero is observed, before it is used, and a sweep after that."""
+    hand.engine.rezero(0)
+    hand.send(rests)
+    hand.send(pressed, p3=200)
+    assert hand.engine.zero_at_risk(touched=True).sum() == 1
+    assert hand.engine.rezero(0) == 1
+    hand.send(60)
+    assert hand.in_doubt == [3]
+
+
+def test_a_press_that_a_board_brings_back_from_a_silence_is_in_doubt_after_a_zero(
+    hand: Hand,
+) -> None:
+    hand.pause(3.0)
+    hand.send(SWEEPS, p3=200)
+    assert hand.engine.rezero(0) == 1
+    hand.send(60)
+    assert hand.in_doubt == [3]
+
+
+def test_a_press_that_has_lifted_before_its_pad_was_valid_is_in_no_later_zero(hand: Hand) -> None:
+    hand.engine.rezero(0)
+    hand.send(25)
+    hand.send(5, p3=200)
+    hand.send(5)
+    assert hand.engine.rezero(0) == 0
+
+
+@pytest.mark.parametrize("sweeps", [3, 15, 30, 44])
+def test_untouched_pads_are_in_no_doubt_when_their_board_is_zeroed_twice(
+    worn: tuple[Hand, list[Step]], sweeps: int
+) -> None:
+    hand, _ = worn
+    for seed in range(20):
+        hand.engine.rezero(0)
+        hand.rests_elsewhere(seed)
+        hand.send(sweeps)
+    assert hand.engine.rezero(0) == 0
+
+
 def test_a_triangle_with_pads_below_zero_when_calibrated_is_not_called_constant(hand: Hand) -> None:
     """Its readings are not taken, so it cannot show that it lives; its board's doubt is named."""
     pressed = {"p3": FAR_BELOW, "p4": FAR_BELOW, "p5": FAR_BELOW}
