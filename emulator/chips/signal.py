@@ -193,6 +193,21 @@ class SignalSkin:
         self._settle(rows)
         self._set_up(rows, bank_2, reg.PowerControl.of(power_control), plain=stages == 0)
 
+    def bit_by_bit(self) -> list[int]:
+        """Return the chips whose registers were written one by one, as on a faulty data line."""
+        return np.flatnonzero(~self._plain).tolist()
+
+    def is_set_up(self, chip: int, cdc_offset: int, power_control: int) -> bool:
+        """Whether a chip measures each pad alone, as firmware sets it up: bits that were read wrong
+        on its data line may have changed its registers.
+        """
+        wanted = dict(set_up_bursts(StageMap.SINGLE, cdc_offset, power_control))
+        measures = all(
+            tuple(stage[:3]) == wanted[reg.BANK_2 + reg.STAGE_WORDS * number][:3]
+            for number, stage in enumerate(self._bank_2[chip].tolist())
+        )
+        return measures and self._power[chip] == reg.PowerControl.of(power_control)
+
     def _set_up(
         self,
         rows: Ints,

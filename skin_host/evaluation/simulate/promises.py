@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from skin_host.bus.wire import TAXELS, TRIANGLES
 from skin_host.daemon.daemon import Daemon
 from skin_host.evaluation.simulate.accusations import Accusations
-from skin_host.evaluation.simulate.troubles import Trouble
-from skin_host.evaluation.simulate.world import Life, World
+from skin_host.evaluation.simulate.troubles import Trouble, damaged_set_up
+from skin_host.evaluation.simulate.world import Life, Triangle, World
 from skin_host.fingertip.events import FingertipEvent
 from skin_host.layout import Layout, PadKind
 from skin_host.processing.events import Touch
@@ -150,7 +150,9 @@ class Promises:
         self._seq: dict[str, int] = {}
         #: Taxels whose values may be wrong: now, and until when.
         self._spoiling: list[Trouble] = []
-        #: Those of them of which health has reported that two boards send at one address.
+        #: Chips that do not measure what they should.
+        self._damaged: dict[Triangle, Trouble] = {}
+        #: Those of `_spoiling` of which health has reported that two boards send at one address.
         self._known_twice: list[Trouble] = []
         self._spoiled_until_ns = np.full(layout.n_taxels, -(1 << 62), np.int64)
         self._exempt = np.zeros(layout.n_taxels, np.bool_)
@@ -661,6 +663,7 @@ class Promises:
         world.move()
         truth = world.robot.skin.true_pressure_kpa().copy()
         self._truth.append((now_ns, truth))
+        self._note_set_ups()
         life = world.life
         self._touched_ns[truth > TOUCHING_KPA] = now_ns
         if life is not None and life.daemon.engine.calibrating:
@@ -732,6 +735,19 @@ class Promises:
             self.break_(unnamed)
         if len(asyncio.all_tasks()) > MOST_TASKS + TASKS_OF_BOARD * len(world.layout.boards):
             self.break_(f"{len(asyncio.all_tasks())} tasks run")
+
+    def _note_set_ups(self) -> None:
+        """Note which chips do not measure what they should: their board is to be switched off and
+        on.
+        """
+        now = self._world.damaged_set_ups()
+        for place in sorted(now - self._damaged.keys()):
+            self._damaged[place] = trouble = damaged_set_up(self._world, place)
+            self._world.note(trouble.about)
+            self._world.unpowered.add(place[0])
+            self.begin(trouble)
+        for place in sorted(self._damaged.keys() - now):
+            self.end(self._damaged.pop(place))
 
     def _note_loads(self, life: Life | None, now_ns: int) -> None:
         """Note which fingertips are loaded, and which zeros may be of a load."""

@@ -15,12 +15,11 @@ from emulator.probes.scene import Fault
 from skin_host.bus.port import LinkState
 from skin_host.evaluation.simulate.cables import Mischief
 from skin_host.evaluation.simulate.disk import FULL, READ_ONLY
-from skin_host.evaluation.simulate.world import World
+from skin_host.evaluation.simulate.world import Triangle, World
 from skin_host.health.describe import FEWEST_RESTING
 from skin_host.health.diagnosis import JITTER_SHARE
 from skin_host.layout import PadKind
 
-Triangle = tuple[str, int]
 Mask = NDArray[np.bool_]
 
 _TAXELS = {
@@ -527,6 +526,27 @@ def _disk_slow(world: World, chance: random.Random, _: bool) -> Trouble:
         world.clock.threads_take_s = 0.0
 
     return Trouble("disk_slow", f"disk_slow {world.clock.threads_take_s:g} s", end)
+
+
+def damaged_set_up(world: World, place: Triangle) -> Trouble:
+    """A chip does not measure what it should, because its set-up was damaged on its way.
+
+    Bytes do not show which pads it measures, and its board writes its set-up after power-up only.
+    """
+    name, number = place
+    board = next(one for one in world.layout.boards if one.name == name)
+    taxels = board.taxel_index[number]
+    spoiled = np.zeros(world.layout.n_taxels, np.bool_)
+    spoiled[taxels[taxels >= 0]] = True
+    return Trouble(
+        "damaged_set_up",
+        f"damaged_set_up board={name} triangle={number}",
+        _nothing,
+        _SWAPPED | {"bus_bit_errors"},
+        places=places_of(world, board=name),
+        spoils=spoiled,
+        recovers_s=FOR_EVER_S,
+    )
 
 
 def act(name: str) -> Trouble:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from emulator.boards.mtb4 import POWER_CONTROL
 from emulator.probes.scene import Place, Probe, Scene
 from emulator.robot import NS, LiveProbe, Robot
 from skin_host.bus.port import Port
@@ -24,6 +25,9 @@ from skin_host.evaluation.simulate.disk import SimulatedDisk
 from skin_host.evaluation.simulate.trace import Trace
 from skin_host.files import on_disk
 from skin_host.layout import Layout
+
+#: A board's name and the number of a triangle on it.
+Triangle = tuple[str, int]
 
 #: Places that are pressed.
 SPOTS = 6
@@ -162,6 +166,21 @@ class World:
             self.cables[name].sleep_through(batch)
         self.slept_ns = self.robot.t_ns - self.clock.monotonic_ns()
         self.clock.set(seconds)
+
+    def damaged_set_ups(self) -> set[Triangle]:
+        """Return the triangles, each by its board, whose chip does not measure what its board has
+        told it to: each pad alone.
+        """
+        found = set()
+        signal = self.robot.converters.signal
+        for chip in signal.bit_by_bit():
+            triangle = self.layout.triangles[chip]
+            name = self.layout.boards[triangle.board].name
+            board = self.robot.boards[name]
+            offset = int(board.cdc_offset[board.slot(triangle.number)])
+            if not signal.is_set_up(chip, offset, POWER_CONTROL):
+                found.add((name, triangle.number))
+        return found
 
     @property
     def disk_refuses(self) -> int | None:

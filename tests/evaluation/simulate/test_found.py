@@ -759,3 +759,42 @@ def strong_steps(world: World) -> Iterator[Trouble]:
         if trouble.must:
             yield trouble
         trouble.end()
+
+
+def test_a_chip_whose_set_up_was_damaged_is_not_judged_until_its_board_was_off_and_on(
+    world: World,
+) -> None:
+    """It measures other pads than it should, or none. An MTB4 writes it once after power-up."""
+    board = next(one for one in world.layout.boards if one.name == "forearm_outer")
+    taxels = board.taxel_index[14]
+
+    async def live() -> None:
+        promises, life = start_watched(world)
+        await world.clock.sleep(8.0)
+        world.move()
+        mend = world.robot.inject(Fault(name="slow_rise", board=board.name, triangle=14))
+        world.robot.inject(Fault(name="board_reset", board=board.name))
+        await world.clock.sleep(8.0)
+        world.move()
+        mend()
+        promises.sample()
+        await life.daemon.link.boards["can0"].set_up(board.settings.address)
+        await world.clock.sleep(4.0)
+        promises.sample()
+        promises.calibrated_at_rest()
+        assert (board.name, 14) in world.damaged_set_ups()
+        assert world.unpowered == {board.name}
+        assert promises._spoiled()[taxels].all()
+        assert promises.accusations._has_cause("taxel_stuck", "left_forearm")
+        world.robot.inject(Fault(name="board_reset", board=board.name))
+        await world.clock.sleep(8.0)
+        promises.sample()
+        assert not world.damaged_set_ups()
+        assert promises._spoiled()[taxels].all()
+        promises.calibrated_at_rest()
+        await world.clock.sleep(0.1)
+        assert not promises._spoiled()[taxels].any()
+        life.kill()
+
+    with world.clock.runner() as runner:
+        runner.run(live())
