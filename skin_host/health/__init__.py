@@ -54,7 +54,7 @@ _PASSING = {
     "taxel_noisy",
 }
 #: What a bus gains in a second through faults.
-_LOSSES = ("wrong", "halves", "spikes", "dropped", "error_frames")
+_LOSSES = ("wrong", "halves", "dropped", "error_frames")
 
 
 class HealthWatch:
@@ -128,7 +128,10 @@ class HealthWatch:
                 None if part.valid is None else part.valid.tobytes()
                 for part in watch.parts.values()
             ),
-            *((bus.silent, *map(bus.gained.get, _LOSSES)) for bus in watch.buses.values()),
+            *(
+                (bus.silent, bus.spiked_pads, *map(bus.gained.get, _LOSSES))
+                for bus in watch.buses.values()
+            ),
             *(port.state for port in ports.values()),
             *(dict(manager.strangers) for manager in boards.values()),
             *(

@@ -461,6 +461,7 @@ class Describer:
         watch = self._watch.buses[name]
         if watch.gained and now_ns is not None:
             record["last_second"] = _last_second(watch.gained, bus.bitrate)
+            record["spiked_pads"] = watch.spiked_pads
             record["silent"] = watch.silent
         return record
 

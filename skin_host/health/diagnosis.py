@@ -21,8 +21,8 @@ PERIOD_SHARE = 0.05
 JITTER_SHARE = 0.06
 #: This many lone frames (one of a pair) in the last second are a fault.
 FEW_HALVES = 2
-#: So is this many pads of a bus that jumped for one sweep and back, in the last second.
-FEW_SPIKES = 2
+#: So are this many pads of a bus that were off for one sweep, in the last ten seconds.
+FEW_SPIKED_PADS = 2
 #: Limit of the mean shift of the temperature pads since the calibration, in units.
 THERMAL_UNITS = 8.0
 #: Limit of the median shift of all untouched taxels from their baselines, in units; used without
@@ -182,11 +182,13 @@ def _bus(bus: BusHealth) -> Iterator[FoundFault]:
             f": single frames are lost, {recent['halves']} in the last second; "
             "the bus is overloaded or badly terminated",
         )
-    if recent["wrong"] or recent["spikes"] >= FEW_SPIKES:
+    spiked_pads = bus.get("spiked_pads", 0)
+    if recent["wrong"] or spiked_pads >= FEW_SPIKED_PADS:
         yield fault(
             "bus_bit_errors",
-            f": damaged frames ({recent['wrong']} with a wrong header or unreadable, "
-            f"{recent['spikes']} single bytes off); suspect a gateway or an adapter",
+            f": damaged frames ({recent['wrong']} with a wrong header or unreadable in the last "
+            f"second, single bytes of {spiked_pads} pads off in the last ten); suspect a gateway "
+            "or an adapter",
         )
     if recent["error_frames"] and state == "up":
         yield fault(

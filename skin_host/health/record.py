@@ -32,7 +32,8 @@ class BusHealth(TypedDict):
     """One bus: the counters of `AssemblerCounters`, and those of its port.
 
     `port` are `PortCounters`. Unconfigured boards are given by type and address, and by the most
-    frequent identifier among the frames of unconfigured nodes.
+    frequent identifier among the frames of unconfigured nodes. `spiked_pads` are those of which a
+    single byte was off within the last ten seconds.
     """
 
     name: str
@@ -56,6 +57,7 @@ class BusHealth(TypedDict):
     strangers: NotRequired[dict[int, int]]
     stranger: NotRequired[str]
     last_second: NotRequired[LastSecond]
+    spiked_pads: NotRequired[int]
     silent: NotRequired[bool]
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from skin_host.layout import TAXELS_PER_TRIANGLE
 from skin_host.processing.core import Engine, Output, Step
-from skin_host.processing.masks import Mask, any_of
+from skin_host.processing.masks import Mask, any_of, count_of
 from skin_host.processing.pipeline import PressureFrame
 
 if TYPE_CHECKING:
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 RATE_S = 2.0
 #: Length of "the last second" in records.
 RECENT_NS = 1_000_000_000
+#: A pad that was off for one sweep counts for its bus for so long.
+SPIKED_NS = 10_000_000_000
 #: A bus without skin boards is silent after this long: force/torque boards send often.
 ALONE_NS = 200_000_000
 #: Foam that was pressed pushes for so long that a pad reads too much, as drift's `SETTLE_S`.
@@ -164,12 +166,14 @@ class BusWatch:
 
     Attributes:
         gained: in about the last second, see `Window`; empty before the first call of `note`.
+        spiked_pads: how many of its pads were off for one sweep within `SPIKED_NS`.
         received_ns: when a frame was last received, on the ledger's clock.
     """
 
     frames: int = -1
     received_ns: int = 0
     silent: bool = False
+    spiked_pads: int = 0
     gained: dict[str, float] = field(default_factory=dict)
     _window: Window = field(default_factory=lambda: Window(RECENT_NS))
 
@@ -211,6 +215,9 @@ class Watch:
         self.boards = {board: BoardWatch() for board in engine.boards}
         self.buses = {bus: BusWatch() for bus in engine.assemblers}
         self._noted: tuple[object, ...] = ()
+        #: Spikes of each pad [16 b, 12], and when they were last seen to rise.
+        self._spikes = engine.intake.liveness.spikes.copy()
+        self._spiked_ns = np.full(self._spikes.shape, -SPIKED_NS)
         ledger_row = engine.ledger.row
         self._rows = {
             bus: np.array([ledger_row[i] for i in self._boards_of(bus)], np.intp)
@@ -229,8 +236,10 @@ class Watch:
     def tick(self, now_ns: int, ports: dict[str, "Port"], boards: dict[str, "Boards"]) -> None:
         """Read all counters; to be called several times a second."""
         ledger = self._engine.ledger
+        spiked_pads = self._spiked_pads(now_ns)
         for bus, bus_watch in self.buses.items():
             rows = self._rows[bus]
+            bus_watch.spiked_pads = int(spiked_pads[rows].sum())
             bus_watch.note(
                 now_ns,
                 ledger.now_ns,
@@ -244,6 +253,17 @@ class Watch:
         self._noted = counts
         for index, watch in self.boards.items():
             watch.note(self._events(index, watch, boards), now_ns)
+
+    def _spiked_pads(self, now_ns: int) -> NDArray[np.intp]:
+        """Return how many pads of each board [b] were off for one sweep lately. Damage strikes any
+        pad; one that jumps again and again is not well itself, and counts once.
+        """
+        spikes = self._engine.intake.liveness.spikes
+        if spikes.tobytes() != self._spikes.tobytes():
+            self._spiked_ns[spikes > self._spikes] = now_ns
+            self._spikes = spikes.copy()
+        lately = np.abs(now_ns - self._spiked_ns) < SPIKED_NS
+        return count_of(lately.reshape(len(self._engine.boards), -1))
 
     def _counts(self) -> tuple[object, ...]:
         """Return all that the boards are watched for: it rarely changes."""
@@ -262,10 +282,14 @@ class Watch:
             "halves": counters.halves,
             "missed": counters.missed,
             "unknown": counters.unknown_board + counters.unknown_triangle,
-            "spikes": sum(self._engine.intake.liveness.spikes[self._rows[bus]].tolist()),
+            "spikes": self._spikes_of(bus),
             "dropped": 0 if port is None else port.counters.dropped,
             "error_frames": 0 if port is None else port.counters.error_frames,
         }
+
+    def _spikes_of(self, bus: str) -> int:
+        of_boards = self._spikes.reshape(len(self._engine.boards), -1)
+        return int(of_boards[self._rows[bus]].sum())
 
     def _events(self, index: int, watch: BoardWatch, boards: dict[str, "Boards"]) -> dict[str, int]:
         ledger = self._engine.ledger

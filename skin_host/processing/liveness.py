@@ -119,9 +119,10 @@ class Liveness:
         noisy: bool[k, 12], pads that jump up and down much more than when calibrated.
         doubted: bool[k, 12], pads that are not valid, or None if all are. Of a noisy temperature
             pad those that its board compensates with it are not.
-        spikes: int64[boards], how often a single pad of a triangle was off for one sweep and
+        spikes: int64[k, 12], how often each pad, alone in its triangle, was off for one sweep and
             back in the next, and did not jump in some 25 sweeps before and after: a damaged frame
-            does that, a sensor does not. One is counted when that is known.
+            does that, a sensor at rest does not. One is counted when that is known, if nothing
+            touched the triangle until then: real pads jump under pressure.
     """
 
     def __init__(
@@ -205,7 +206,7 @@ class Liveness:
         self.noisy: Mask = np.zeros(shape, np.bool_)
         self._any_noisy = False
         self.doubted: Mask | None = None
-        self.spikes = np.zeros(boards, np.int64)
+        self.spikes = np.zeros(shape, np.int64)
         #: Sweeps of all boards that wait, with the touched pads; and how many may wait.
         self._waiting: list[tuple[NDArray[np.uint8], Mask | None]] = []
         self._room = 0
@@ -288,6 +289,8 @@ class Liveness:
         text = (raw if self._rows is None else raw.take(self._rows, 0)).tobytes()
         all_inside = 0 not in text and 255 not in text
         self._note_jumps(raw, changed, compared, whole)
+        if any_of(self._spiked):
+            self._note_spikes(touched)
         felt = None if touched is None else self._what_is_felt(touched)
         self._note_triangles(raw, compared, erring, felt, whole, all_inside)
         within: Mask | None = None
@@ -461,11 +464,17 @@ class Liveness:
         self._jumping += compared[:, None] * (jumped - self._jumping) / NOISE_MEMORY_SAMPLES
         self._note_noise()
 
+    def _note_spikes(self, touched: Mask | None) -> None:
+        """Count the spikes of pads that have stayed calm since, and forget those of touched
+        triangles.
+        """
+        if touched is not None:
+            self._spiked &= (count_of(touched) == 0)[:, None]
+        calm = self._spiked & (self._jumping < LATELY_MEAN)
+        self.spikes += calm
+        self._spiked ^= calm
+
     def _note_noise(self) -> None:
-        if any_of(self._spiked):
-            calm = self._spiked & (self._jumping < LATELY_MEAN)
-            self.spikes += count_of(calm.reshape(self._boards, -1))
-            self._spiked ^= calm
         self._jumping[self._jumping < 1e-3] = 0.0
         self._any_jumping = any_of(self._jumping > 0.0)
         self.noisy = self._jumping > np.where(self.noisy, CALM_MEAN, NOISY_MEAN)

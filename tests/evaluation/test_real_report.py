@@ -12,6 +12,7 @@ from skin_host.errors import LogError
 from skin_host.evaluation import insole, page, real
 from skin_host.evaluation.insole import PADS, InsoleRecording
 from skin_host.evaluation.real import PlayedCourse
+from skin_host.processing.core import Engine
 
 pytestmark = pytest.mark.long
 
@@ -255,3 +256,15 @@ def test_on_recorded_skin_everything_else_is_as_good_as_wanted() -> None:
     goals = real.goals(real.run(quick=False, output=None))
     assert len(goals) > 20
     assert {goal["figure"] for goal in goals if not goal["reached"]} <= MISSED
+
+
+def test_what_real_pads_do_under_pressure_is_no_damage_of_their_bus() -> None:
+    """Two minutes in which pads of noisy triangles jumped for one sweep 33 times."""
+    found = insole.read(ROOT.parent / "shared" / "data" / "insole" / "left_validation_1.npz")
+    made = replace(found, t_ns=found.t_ns[:6200], counts=found.counts[:6200])
+    settings, layout = insole.skin()
+    engine = Engine(settings, layout, [0], real.calibrate(made, settings, layout))
+    for batch in made.batches():
+        engine.feed(insole.BUS, batch)
+    engine.intake.judge()
+    assert engine.intake.liveness.spikes.sum() == 0

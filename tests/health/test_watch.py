@@ -171,7 +171,7 @@ def test_what_a_bus_gained_adds_up_all_that_was_unknown_or_damaged() -> None:
     counters.wrong_header, counters.short, port.counters.damaged = 1, 4, 20
     counters.halves, counters.missed = 6, 7
     port.counters.dropped, port.counters.error_frames = 8, 13
-    engine.intake.liveness.spikes[:] = 1
+    engine.intake.liveness.spikes[:, 3] = 1
     watch.tick(100 * MS, ports, {})
     boards = [one for one in engine.boards if layout.boards[one].settings.bus == bus]
     assert watch.buses[bus].gained == {
@@ -182,8 +182,25 @@ def test_what_a_bus_gained_adds_up_all_that_was_unknown_or_damaged() -> None:
         "halves": 6,
         "missed": 7,
         "unknown": 2 + 3,
-        "spikes": len(boards),
+        "spikes": 16 * len(boards),
         "dropped": 8,
         "error_frames": 13,
         "seconds": pytest.approx(0.1),
     }
+
+
+def test_pads_that_were_off_for_one_sweep_count_once_each_for_ten_seconds() -> None:
+    settings = load(CONFIG)
+    layout = build_layout(settings, CONFIG.parent)
+    engine = Engine(settings, layout, list(range(len(layout.parts))))
+    watch, bus = Watch(engine), next(iter(engine.assemblers))
+    board = next(one for one in engine.boards if layout.boards[one].settings.bus == bus)
+    triangle = 16 * engine.ledger.row[board] + 2
+    found = []
+    for second in range(30):
+        # A pad that jumps every three seconds, and another one, once.
+        engine.intake.liveness.spikes[triangle, 4] += second % 3 == 0 and second < 16
+        engine.intake.liveness.spikes[triangle, 9] += second == 7
+        watch.tick(second * S, {}, {})
+        found.append(watch.buses[bus].spiked_pads)
+    assert found == [1] * 7 + [2] * 10 + [1] * 8 + [0] * 5

@@ -53,7 +53,8 @@ CHANCE = Bound(
     "two of some 5 events a second within one second; chance is later once in 1000", 2.5, 2.5
 )
 CALM = Bound(
-    "the same, and some 25 sweeps in which the byte's pad does not jump again (`LATELY_MEAN`)",
+    "two pads of some 5 events a second within ten seconds, where nothing is touched, and some 25 "
+    "sweeps in which they do not jump again (`LATELY_MEAN`)",
     3.8,
     3.8,
 )

@@ -39,8 +39,8 @@ TROUBLE_S = 3.0
 PRESS_S = 2.5
 REQUEST_S = 6.0
 DEATH_S = 25.0
-#: A trouble without a bound lasts no longer alone.
-LONGEST_DRILL_S = 20.0
+#: A trouble lasts no longer alone.
+LONGEST_DRILL_S = 60.0
 #: Presses: short ones, and long ones in which an operator does something that a press spoils.
 SHORT_S, LONG_S = (0.2, 5.0), (7.0, 11.0)
 LONG_SHARE = 0.3

@@ -3,6 +3,7 @@
 A trouble has the codes that health may report for it, and the one that it must report if it lasts.
 """
 
+import math
 import random
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -84,6 +85,11 @@ _SWAPPED = _CHIPS | _SET_UP | {"part_temperature"}
 FOR_EVER_S = 1e6
 #: Health sees few intervals at a time: one that is as far as this beyond its limit is named.
 SURE_SCATTER = 1.25
+#: By when so many frames of boards are damaged, all but one bus in ten thousand shows it: of one
+#: triangle, at rest (docs/found.md).
+SURE_DAMAGED = 36
+#: Of many more it is named within this.
+DAMAGED_S = 8.0
 #: A broker ends the connection of a client from which nothing came for longer.
 KEEP_ALIVE_S = 10.0
 #: While it lasts, the chip that it names does not measure.
@@ -264,18 +270,21 @@ def _emulated(
         elif "bus" in targets:
             places = places_of(world, bus=bus)
         about = " ".join([name, *(f"{key}={value}" for key, value in targets.items())])
-        shows = _always
-        if name == "jittered_period":
+        shows, bound_s = _always, within_s
+        if name == "bit_errors" and value is not None:
+            bound_s, shows = _until_damage_shows_s(world, bus, value), _rests(world, bus)
+        elif name == "jittered_period":
             shows = _scatters(world, board)
         elif name == "temperature_step" and value is not None and value > 0.0:
             shows = _differs_from_a_load(world)
+        is_sure = (value is None or abs(value) >= sure) and bound_s < math.inf
         return Trouble(
             name,
             about,
             end,
             may,
-            frozenset(must) if value is None or abs(value) >= sure else frozenset(),
-            within_s,
+            frozenset(must) if is_sure else frozenset(),
+            bound_s,
             places,
             blind,
             spoiled,
@@ -324,6 +333,28 @@ def _differs_from_a_load(world: World) -> Callable[[], bool]:
     return differs
 
 
+def _until_damage_shows_s(world: World, bus: str, share: float) -> float:
+    """Return by when it must be known that a bus damages a share of its frames (s)."""
+    frames_hz = sum(
+        2 * len(board.triangles) * 1000 / board.settings.period_ms
+        for board in world.layout.boards
+        if board.settings.bus == bus
+    )
+    return max(DAMAGED_S, SURE_DAMAGED / (share * frames_hz)) if frames_hz else math.inf
+
+
+def _rests(world: World, bus: str) -> Callable[[], bool]:
+    """Return a function: whether nothing touches a bus. What jumps in a touch may be real skin."""
+    return lambda: (
+        world.life is None
+        or not any(
+            world.layout.boards[index].settings.bus == bus
+            for index, row in world.life.daemon.engine.ledger.row.items()
+            if row in world.life.daemon.engine.intake.touched
+        )
+    )
+
+
 def _frames(
     name: str,
     may: set[str],
@@ -347,15 +378,21 @@ def _frames(
             world.move()
             setattr(cable.mischief, name, getattr(Mischief(), name))
 
+        bound_s, shows = 8.0, _always
+        if name == "damaged":
+            bound_s = _until_damage_shows_s(world, cable.name, share)
+            shows = _rests(world, cable.name)
+        is_sure = share >= sure and bound_s < math.inf
         return Trouble(
             f"frames_{name}",
             f"frames_{name} bus={cable.name} share={share}",
             end,
             may,
-            frozenset({must}) if must is not None and share >= sure else frozenset(),
-            8.0,
+            frozenset({must}) if must is not None and is_sure else frozenset(),
+            bound_s,
             places_of(world, bus=cable.name),
             spoils=taxels_of(world, bus=cable.name) if spoils else None,
+            shows=shows,
         )
 
     return begin
@@ -671,7 +708,6 @@ KINDS: dict[str, Begin] = {
         "bit_errors",
         _BUS | _DAMAGED,
         {"bus_bit_errors"},
-        8.0,
         values=(0.0005, 0.05),
         sure=0.02,
         spoils=True,

@@ -798,3 +798,17 @@ def test_a_chip_whose_set_up_was_damaged_is_not_judged_until_its_board_was_off_a
 
     with world.clock.runner() as runner:
         runner.run(live())
+
+
+@pytest.mark.parametrize("kind", ["bit_errors", "frames_damaged"])
+def test_damage_must_be_named_by_when_enough_of_it_came(world: World, kind: str) -> None:
+    """One triangle sends 40 frames a second, 33 of them 1320."""
+    few = DEMO.with_name("fingertips.toml")
+    settings, layout = load_skin(few)
+    one = World(settings, layout, few, 1, Scene(quiet=True))
+    for number in range(20):
+        chance = random.Random(number)
+        trouble = KINDS[kind](one, chance, True)
+        share = float(trouble.about.rpartition("=")[2])
+        assert trouble.within_s == pytest.approx(36 / (40 * share))
+        assert KINDS[kind](world, chance, True).within_s == 8.0
