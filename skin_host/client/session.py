@@ -39,6 +39,8 @@ from skin_host.tasks import cancel
 HOLD_S = 10.0
 #: No robot has so many parts, nor so many nodes; messages of more than these are passed over.
 MAX_NAMES = 256
+#: Of the infos of all its nodes; an iCub's has 0.4 MB.
+MAX_INFO_BYTES = 32 * 1024 * 1024
 #: Timeouts are checked this often.
 WATCH_S = 0.25
 #: Further topics that a stream needs: a contact state is valid only while its part lives.
@@ -67,6 +69,8 @@ class Node:
     info: NodeInfo | None = None
     #: Pieces of its info, by number.
     pieces: dict[int, NodeInfo] = field(default_factory=dict, repr=False)
+    #: Their lengths as messages, in bytes.
+    sizes: dict[int, int] = field(default_factory=dict, repr=False)
 
 
 class SkinClient:
@@ -125,6 +129,7 @@ class SkinClient:
         self._latest: dict[str, Health] = {}
         #: Names that were received: of parts, and of nodes.
         self._names: tuple[set[str], set[str]] = (set(), set())
+        self._info_bytes = 0
         self._presence = Presence(stale_s)
         self._order = EventOrder(HOLD_S if len(brokers) > 1 else 0.0)
         self._newest = Newest()
@@ -484,10 +489,14 @@ class SkinClient:
 
     def _take_info(self, name: str, piece: int, payload: bytes) -> None:
         node = self.nodes.setdefault(name, Node())
+        self._info_bytes -= node.sizes.pop(piece, 0)
+        node.pieces.pop(piece, None)
         if payload:
+            if self._info_bytes + len(payload) > MAX_INFO_BYTES:
+                raise MessageError(f"info: more than {MAX_INFO_BYTES} bytes of one robot")
             node.pieces[piece] = decode_info(payload)
-        else:
-            node.pieces.pop(piece, None)
+            node.sizes[piece] = len(payload)
+            self._info_bytes += len(payload)
         node.info = join_pieces(node.pieces)
         if node.info is not None:
             self._presence.take_info(name, [*node.info.parts, *node.info.fingertips])

@@ -16,11 +16,12 @@ import msgspec
 from msgspec import Meta, Struct, field
 
 from skin_host.config.explain import Named, explain, out_of_bounds
-from skin_host.config.fields import Name, NotNegative, Positive, wrong_topic
+from skin_host.config.fields import Name, NotNegative, Positive
 from skin_host.config.fingertips import Fingertip as Fingertip  # noqa: PLC0414 (for others too)
 from skin_host.config.relaxation import RelaxationSettings, with_file, wrong_parameters
 from skin_host.errors import ConfigurationError, RequestError, visible
 from skin_host.files import read_whole
+from skin_host.mqtt.topics import wrong_topic
 
 Byte = Annotated[int, Meta(ge=0, le=255)]
 T = TypeVar("T", bound=Struct)

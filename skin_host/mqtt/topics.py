@@ -7,8 +7,7 @@ below `nodes/<node>`. `docs/mqtt.md` is the contract.
 import re
 from typing import Literal, NamedTuple
 
-from skin_host.config.fields import wrong_topic
-from skin_host.errors import ConfigurationError
+from skin_host.errors import ConfigurationError, visible
 
 PartTopic = Literal["frame", "touch", "slip", "over", "contact", "health"]
 NodeTopic = Literal["status", "info"]
@@ -20,6 +19,17 @@ _PIECE = re.compile(r"[1-9][0-9]{0,4}")
 
 ONLINE = b"online"
 OFFLINE = b"offline"
+
+
+def wrong_topic(text: str) -> str | None:
+    """Return what is wrong with the first words of topics; None if nothing is."""
+    is_split = text.startswith(("/", "$")) or text.endswith("/")
+    if text and text.isprintable() and not set(text) & set("+#") and not is_split:
+        return None
+    return (
+        f'"{visible(text, 80)}" cannot start a topic; wanted words such as skin or lab/skin, '
+        "without +, #, control characters and a slash at either end"
+    )
 
 
 class Subject(NamedTuple):

@@ -18,7 +18,6 @@ from msgspec import Struct
 
 from skin_host.bus.logs import open_recording
 from skin_host.bus.wire import FrameBatch
-from skin_host.config.fields import wrong_topic
 from skin_host.errors import LogError, SkinError, required
 from skin_host.files import growing, refuse_removed, writing
 from skin_host.fingertip.events import Over, Slip
@@ -26,7 +25,7 @@ from skin_host.health.record import Record
 from skin_host.mqtt.frames import FRAME_SCHEMA, JsonFrame, decode_frame, encode_frame
 from skin_host.mqtt.info import INFO_SCHEMA, NodeInfo
 from skin_host.mqtt.messages import HEALTH_SCHEMA, Frame, decode_over, decode_slip, decode_touch
-from skin_host.mqtt.topics import PartTopic, Topics
+from skin_host.mqtt.topics import PartTopic, Topics, wrong_topic
 from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
 

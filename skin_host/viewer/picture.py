@@ -26,6 +26,8 @@ HAS_RAW = 1
 VALID, BEYOND_RANGE = 1, 2
 _HEAD = struct.Struct("<BBHIIIdII")
 _U32 = 2**32
+#: Of a part; of more the oldest are forgotten.
+MAX_CONTACTS = 200
 
 
 #: A fingertip on a force/torque board has contacts and health; its age is that of its health.
@@ -124,6 +126,8 @@ class Picture:
             part.contacts.pop(touch.id, None)
         else:
             part.contacts[touch.id] = touch
+            if len(part.contacts) > MAX_CONTACTS:  # whoever may publish could go on for ever
+                del part.contacts[next(iter(part.contacts))]
         part.changed["contacts"] += 1
 
     def take_contact(self, contact: Contact) -> None:

@@ -10,13 +10,17 @@ from skin_host.cli.lines import event_line, missed_line
 from skin_host.cli.watch import status_table
 from skin_host.client.presence import MAX_TOUCHES, Presence
 from skin_host.client.session import MAX_NAMES
+from skin_host.mqtt.info import encode_info
 from skin_host.mqtt.messages import decode_health
 from skin_host.mqtt.payload import MessageError
+from skin_host.viewer.picture import MAX_CONTACTS, Picture
 from tests.client.test_client import hearing, publishing, take, touch
 from tests.client.test_presence import seen
 from tests.support.broker import Mosquitto
 from tests.support.waiting import until
+from tests.viewer import test_picture as pages
 
+INFO = pages.info({"palm": 3})
 HEALTH = {"schema": "skin.health/1", "part": "palm", "state": "ok"}
 
 
@@ -59,6 +63,40 @@ async def test_more_parts_and_nodes_than_a_robot_has_are_passed_over(mosquitto: 
         publisher.put_touch(touch(2))
         assert (await take(touches, 1))[0].count == 2
         contacts.close()
+
+
+async def test_infos_in_endless_pieces_are_passed_over(
+    mosquitto: Mosquitto, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("skin_host.client.session.MAX_INFO_BYTES", 100_000)
+    async with publishing(mosquitto) as publisher, hearing(mosquitto) as skin:
+        publisher.put_info(INFO)
+        await until(lambda: "main" in skin.nodes and skin.nodes["main"].info is not None)
+        piece = encode_info(replace(INFO, pieces=10_000))
+        async with aiomqtt.Client(mosquitto.host, mosquitto.port) as stranger:
+            for number in range(2, 200):
+                await stranger.publish(f"skin/robot/nodes/n/{number}/info", piece, qos=1)
+            await until(lambda: skin.unreadable > 0)
+            assert sum(map(len, (one.pieces for one in skin.nodes.values()))) < 200
+            # The robot's own, which is known, may change.
+            publisher.put_info(replace(INFO, version="later"))
+            await until(lambda: skin.nodes["main"].info.version == "later")
+            before = len(skin.nodes["n"].pieces)
+            for number in range(2, 200):
+                await stranger.publish(f"skin/robot/nodes/n/{number}/info", b"", qos=1)
+            await until(lambda: not skin.nodes["n"].pieces)
+            for number in range(2, before):
+                await stranger.publish(f"skin/robot/nodes/n/{number}/info", piece, qos=1)
+            await until(lambda: len(skin.nodes["n"].pieces) == before - 2)
+
+
+def test_contacts_that_never_end_are_forgotten_by_the_page() -> None:
+    picture = Picture()
+    picture.take_nodes("robot", {"main": (True, INFO)})
+    (name, part), *_ = picture.parts.items()
+    for number in range(MAX_CONTACTS + 10):
+        picture.take_touch(replace(seen("begin"), part=name, id=number, taxels=[0]))
+    assert list(part.contacts) == list(range(10, MAX_CONTACTS + 10))
 
 
 def test_touches_that_never_end_are_forgotten_from_the_oldest_on() -> None:
