@@ -21,10 +21,12 @@ from skin_host.bus.strain import (
 from skin_host.bus.wire import FrameBatch, MessageClass
 from skin_host.config.fingertips import Fingertip
 from skin_host.config.settings import Settings
+from skin_host.fingertip.agreement import Agreement
 from skin_host.fingertip.events import FingertipEvent
 from skin_host.fingertip.tip import Tip
 from skin_host.layout import Layout
 from skin_host.processing.calibration import Zero
+from skin_host.processing.contacts import LOST_NS
 from skin_host.processing.events import Touch
 from skin_host.processing.masks import Mask
 
@@ -51,7 +53,8 @@ class TipState:
             not jump.
         touched_since_ns: the same of its touch, if there is one.
         assembler: of its samples; None until the full scales are known.
-        saturated_ns: when a sample was last saturated, 0 if never.
+        agreement: of its samples, which only together are a load.
+        saturated_ns: when its load was last saturated, 0 if never.
         silenced: how often the board has timed out.
         awaited: the board is being set up and has not had the time to send yet.
         zeroing, touching: samples of which a zero is taken, and whether it was touched in each.
@@ -63,6 +66,7 @@ class TipState:
     tip: Tip
     reported_scale: Floats = field(default_factory=lambda: np.zeros(CHANNELS))
     assembler: WrenchAssembler | None = None
+    agreement: Agreement = field(default_factory=Agreement)
     last_ns: int = 0
     received_ns: int = 0
     touched_since_ns: int | None = None
@@ -169,6 +173,8 @@ class FingertipEngine:
             if not len(mine):
                 continue
             state.frames += len(mine)
+            if now_ns - state.received_ns >= LOST_NS:
+                state.agreement.forget()
             state.last_ns = int(batch.t_ns[frames.row[mine[-1]]])
             state.received_ns = now_ns
             state.alive = True
@@ -252,10 +258,13 @@ class FingertipEngine:
         return events
 
     def _step(self, state: TipState, wrench: Wrench) -> list[FingertipEvent]:
-        if wrench.saturated:
-            state.saturated_ns = wrench.t_ns
-        events = state.tip.step(wrench)
-        self._note_touch(state)
+        events: list[FingertipEvent] = []
+        load = state.agreement.take(wrench)
+        if load is not None:
+            if load.saturated:
+                state.saturated_ns = load.t_ns
+            events = state.tip.step(load)
+            self._note_touch(state)
         if self._zeroing and not wrench.saturated:
             state.zeroing.append(np.concatenate([wrench.force_n, wrench.torque_nm]))
             state.touching.append(state.tip.touched)

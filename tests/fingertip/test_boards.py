@@ -16,7 +16,7 @@ from emulator.faults import parse
 from emulator.probes.scene import Probe, Scene
 from emulator.robot import Robot
 from skin_host.bus.answers import answer_frame
-from skin_host.bus.strain import FullScale
+from skin_host.bus.strain import FullScale, StrainType
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import changed, load
 from skin_host.daemon import metrics
@@ -30,6 +30,7 @@ from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Zero
 from skin_host.processing.core import Engine
 from skin_host.processing.events import Touch
+from tests.support.strain import encode_strain
 
 CONFIG = Path(__file__).parents[2] / "config"
 FORCE_OF_INDEX = 0x31A
@@ -210,6 +211,93 @@ async def test_load_beyond_the_range_is_told_and_has_no_place() -> None:
     assert "saturated" in {load.verdict for load in loads if load is not None}
     await bench.run(6.0)
     assert bench.codes() == []
+
+
+class Damage:
+    """Damages one frame of a stream in so many, each in another way, from `begin` on."""
+
+    def __init__(self, bench: Bench, can_id: int, one_in: int) -> None:
+        self.saturates = False
+        self._step = bench.robot.step
+        self._id, self._one_in = can_id, one_in
+        self._chance = np.random.default_rng(can_id)
+        self._frames = 0
+        self._begun = False
+        bench.robot.step = self.step  # type: ignore[method-assign]
+
+    def begin(self) -> None:
+        self._begun = True
+
+    def step(self, seconds: float) -> dict[str, FrameBatch]:
+        batches = self._step(seconds)
+        batch = batches["can0"]
+        for row in np.flatnonzero(batch.id == self._id).tolist() if self._begun else ():
+            self._frames += 1
+            if self._frames % self._one_in:
+                continue
+            if self._chance.random() < 0.3:
+                batch.data[row, :6] = self._chance.integers(0, 256, 6)
+            else:
+                batch.data[row, self._chance.integers(6)] ^= 1 << self._chance.integers(8)
+            if self.saturates:
+                batch.dlc[row], batch.data[row, 6] = 7, 1
+        return batches
+
+
+@pytest.mark.parametrize("can_id", [FORCE_OF_INDEX, FORCE_OF_INDEX + 1])
+@pytest.mark.parametrize("saturates", [False, True])
+async def test_single_damaged_frames_are_no_touch(can_id: int, saturates: bool) -> None:
+    bench = Bench()
+    damage = Damage(bench, can_id, 3)
+    damage.saturates = saturates
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    await bench.calibrate()
+    damage.begin()
+    await bench.run(1.5)
+    assert bench.felt == []
+    assert bench.codes() == []
+
+
+@pytest.mark.parametrize("can_id", [FORCE_OF_INDEX, FORCE_OF_INDEX + 1])
+async def test_single_damaged_frames_change_nothing_of_a_touch(can_id: int) -> None:
+    bench = Bench({"part": "index", "force_n": [[2.0, 0], [2.1, 2], [4.5, 2], [4.6, 0]]})
+    damage = Damage(bench, can_id, 4)
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    await bench.calibrate()
+    await bench.run(1.6)
+    (place,) = {event.centroid_m for event in bench.felt[-1:] if isinstance(event, Touch)}
+    assert place is not None
+    damage.begin()
+    before = len(bench.felt)
+    await bench.run(1.2)
+    told = [event for event in bench.felt[before:] if isinstance(event, Touch)]
+    assert bench.felt[before:] == told
+    assert {event.event for event in told} == {"move"}
+    for event in told:
+        assert event.load is not None and event.load.verdict == "contact"
+        assert event.force_n == pytest.approx(2.0, abs=0.05)
+        np.testing.assert_allclose(event.centroid_m or (), place, atol=2e-3)
+    await bench.run(1.2)
+    ends = [event for event in bench.felt if event.event == "end"]
+    assert len(ends) == 1
+
+
+async def test_a_press_is_felt_with_its_second_sample_and_over_with_the_second_without_it() -> None:
+    bench = Bench(full_scale=(50.0, 50.0, 50.0, 1.0, 1.0, 1.0), noise=False)
+    noise = np.array([2e-3] * 3 + [5e-5] * 3)
+    bench.tips.use(dict.fromkeys(bench.tips.tips, Zero(np.zeros(6), noise)))
+    state = bench.tips.tips["index"]
+    t_ns, seen = 0, []
+    for force_n in (0.0, 0.0, 0.0, 2.0, 2.0, 2.0, 0.0, 0.0, 0.0):
+        t_ns += 3_000_000
+        force = encode_strain(1, StrainType.FORCE, [0, 0, round(-force_n / 50.0 * 0x8000)])
+        torque = encode_strain(1, StrainType.TORQUE, [0, 0, 0])
+        batch = FrameBatch.of([(*force, t_ns), (*torque, t_ns + 100_000)])
+        bench.tips.feed("can0", batch, t_ns)
+        seen.append(state.tip.touched)
+    assert seen == [False] * 4 + [True] * 3 + [False] * 2
 
 
 @pytest.mark.parametrize("bit", [0x01, 0x10])
