@@ -15,18 +15,49 @@ Event = Touch | Slip | Over
 
 #: At most this many events of a part wait for an earlier one.
 MAX_HELD = 1000
+#: Of earlier runs of a part, or what looked like one, so many are known.
+MAX_CHAINS = 8
+#: Greater numbers are given up if only smaller ones came for this long: what comes late from an
+#: earlier run or over another broker comes sooner.
+VANISHED_S = 30.0
+
+
+@dataclass(slots=True)
+class _Chain:
+    """Events of one run whose counts followed one another: what was passed on, or over."""
+
+    run: int
+    first: int
+    last: int
+
+    def holds(self, run: int, count: int) -> bool:
+        return run == self.run and self.first <= count <= self.last + MAX_HELD
 
 
 @dataclass(slots=True)
 class _Followed:
-    run: int
-    count: int
+    chain: _Chain
+    #: Followed before.
+    others: list[_Chain] = field(default_factory=list)
+    #: Since when only older events came.
+    older_s: float | None = None
     #: By count: events that arrived early, and until when they wait for their turn.
     held: dict[int, tuple[Event, float]] = field(default_factory=dict)
+
+    def follow(self, chain: _Chain) -> list[Event]:
+        """Follow another run; return what waited for its turn."""
+        left = [self.held[count][0] for count in sorted(self.held)]
+        self.held.clear()
+        self.others = [one for one in [*self.others, self.chain] if one is not chain][-MAX_CHAINS:]
+        self.chain = chain
+        return left
 
 
 class EventOrder:
     """Passes events on by run and count.
+
+    Anybody may send an event or a frame with a great number, and a node may have had a clock that
+    was ahead. So the greatest number is followed, but not for ever: see `VANISHED_S`.
 
     Args:
         hold_s: how long an event waits for an earlier one, which may come from another broker.
@@ -35,36 +66,47 @@ class EventOrder:
     def __init__(self, hold_s: float) -> None:
         self._hold_s = hold_s
         self._known: dict[tuple[type, str], _Followed] = {}
-        self._frames: dict[str, tuple[int, int]] = {}
+        #: By part: the greatest run and number, and since when only smaller ones came.
+        self._frames: dict[str, tuple[tuple[int, int], float | None]] = {}
 
-    def take_frame(self, frame: Frame, run: int | None) -> bool:
+    def take_frame(self, frame: Frame, run: int | None, now_s: float) -> bool:
         """Return whether a frame is newer than all before; older frames are not waited for."""
         if run is None:
             return True
         number = run, frame.seq
-        newer = number > self._frames.get(frame.part, (0, 0))
+        greatest, older_s = self._frames.get(frame.part, ((0, 0), None))
+        newer = number > greatest or _have_vanished(older_s, now_s)
         if newer:
-            self._frames[frame.part] = number
+            self._frames[frame.part] = number, None
+        elif older_s is None and number < greatest:
+            self._frames[frame.part] = greatest, now_s
         return newer
 
     def take(self, event: Event, run: int | None, now_s: float) -> list[Event]:
         """Take a received event; return the events whose turn it is."""
         if run is None or not event.count:
             return [event]
-        key = type(event), event.part
+        key, count = (type(event), event.part), event.count
         known = self._known.get(key)
         if known is None:
-            self._known[key] = _Followed(run, event.count)
+            self._known[key] = _Followed(_Chain(run, count, count))
             return [event]
-        if run < known.run:
-            return []
         left: list[Event] = []
-        if run > known.run:
-            left = [known.held[count][0] for count in sorted(known.held)]
-            known = self._known[key] = _Followed(run, 0)
-        if event.count <= known.count or event.count in known.held:
-            return left
-        known.held[event.count] = event, now_s + self._hold_s
+        if run > known.chain.run:
+            left = known.follow(_Chain(run, 1, 0))
+        elif (run, count) <= (known.chain.run, known.chain.last):
+            chains = [known.chain, *reversed(known.others)]
+            chain = next((one for one in chains if one.holds(run, count)), None)
+            if chain is not None and count <= chain.last:
+                return []
+            if not _have_vanished(known.older_s, now_s):
+                known.older_s = now_s if known.older_s is None else known.older_s
+                return []
+            left = known.follow(_Chain(run, count, count - 1) if chain is None else chain)
+        elif count in known.held:
+            return []
+        known.older_s = None
+        known.held[count] = event, now_s + self._hold_s
         if len(known.held) > MAX_HELD:
             now_s += self._hold_s
         return left + _released(known, now_s)
@@ -74,35 +116,66 @@ class EventOrder:
         return [event for known in self._known.values() for event in _released(known, now_s)]
 
 
+def _have_vanished(older_s: float | None, now_s: float) -> bool:
+    return older_s is not None and now_s - older_s > VANISHED_S
+
+
 def _released(known: _Followed, now_s: float) -> list[Event]:
     found = []
     for count in sorted(known.held):
         event, until_s = known.held[count]
-        if count != known.count + 1 and now_s < until_s:
+        if count != known.chain.last + 1 and now_s < until_s:
             break
-        known.count = count
         del known.held[count]
+        if known.chain.holds(known.chain.run, count):
+            known.chain.last = count
+        else:  # no run loses so many at once
+            known.others = [*known.others, known.chain][-MAX_CHAINS:]
+            known.chain = _Chain(known.chain.run, count, count)
         found.append(event)
     return found
 
 
 class Newest:
-    """Decides which of several retained messages is the newest, for each topic."""
+    """Decides which of several retained messages is the newest, for each topic.
+
+    A stamp that only smaller ones follow is given up as a run is, see `EventOrder`. A state may not
+    change for long: each message of its part shows that greater stamps live, health once a second.
+    """
 
     def __init__(self) -> None:
         self._stamps: dict[tuple[str, str], Stamp] = {}
+        #: Since when only older messages came of a topic, as long as none with a greater stamp came
+        #: of its part.
+        self._older_s: dict[tuple[str, str], float] = {}
 
-    def take(self, kind: str, name: str, stamp: Stamp | None) -> bool | None:
+    def take(
+        self, kind: str, name: str, stamp: Stamp | None, live_s: float | None = None
+    ) -> bool | None:
         """Return whether a message is newer than all before; None if it is the newest one again.
 
         One without a stamp is newer only if there has been none with one.
+
+        Args:
+            kind: of topic.
+            name: of the part or node.
+            stamp: of the message.
+            live_s: when it came, if it was sent then. None: it was stored, or stays as it is until
+                a greater one comes, however long that lasts.
         """
         key = kind, name
         known = self._stamps.get(key)
         if stamp is None:
             return known is None
+        for other in [one for one in self._older_s if one[1] == name]:
+            if stamp >= self._stamps[other]:
+                del self._older_s[other]
         if known is not None and stamp <= known:
-            return None if stamp == known else False
+            if stamp == known:
+                return None
+            if live_s is None or not _have_vanished(self._older_s.setdefault(key, live_s), live_s):
+                return False
+            del self._older_s[key]
         self._stamps[key] = stamp
         return True
 
@@ -110,3 +183,4 @@ class Newest:
         """Forget all topics of a kind, or one."""
         for key in [key for key in self._stamps if key[0] == kind and name in (None, key[1])]:
             del self._stamps[key]
+            self._older_s.pop(key, None)

@@ -467,7 +467,10 @@ class SkinClient:
         if not message.payload:
             self._newest.forget(kind, name)
             return True
-        return self._newest.take(kind, name, stamp_of(message.properties))
+        # Nodes and their infos are not published again and again.
+        is_live = kind in ("contact", "health") and not message.retain
+        live_s = _now_s() if is_live else None
+        return self._newest.take(kind, name, stamp_of(message.properties), live_s)
 
     def _take_status(self, name: str, payload: bytes, link: BrokerLink, message: Message) -> None:
         newness = self._newness("status", name, message)
@@ -523,7 +526,7 @@ class SkinClient:
             for event in self._order.take(item, run, now_s):
                 self._pass_on(event)
         elif isinstance(item, Frame):
-            if self._order.take_frame(item, run_of(message.properties)):
+            if self._order.take_frame(item, run_of(message.properties), now_s):
                 self._presence.take_sign(part, now_s)
                 self._put(kind, item)
         elif kind == "contact":
