@@ -6,7 +6,7 @@ import sys
 #: What the daemon and the emulator need, and a subscriber of touches never does.
 HEAVY = {"numpy", "can", "smbus2", "emulator", "fastapi", "aiohttp", "matplotlib", "mcap"}
 #: Packages of ours that the client is made of.
-OURS = {"client", "clock", "errors", "files", "fingertip", "mqtt", "processing", "tasks"}
+OURS = {"client", "clock", "config", "errors", "files", "fingertip", "mqtt", "processing", "tasks"}
 MOST_MODULES = 240
 
 PROGRAM = """
@@ -31,4 +31,5 @@ def test_a_subscriber_of_touches_loads_neither_numpy_nor_the_daemon() -> None:
     assert not {name.split(".")[0] for name in loaded} & HEAVY
     ours = {name.split(".")[1] for name in loaded if name.startswith("skin_host.")}
     assert ours <= OURS
+    assert "skin_host.config.settings" not in loaded
     assert len(loaded) <= MOST_MODULES
