@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from skin_host.fingertip.health import FingertipRecord
 from skin_host.fingertip.service import FingertipPublisher
 from skin_host.health import FaultLog, HealthWatch, Record
 from skin_host.health.diagnosis import named
-from skin_host.layout import Layout, build_layout, parts_of
+from skin_host.layout import Layout, PadKind, build_layout, parts_of
 from skin_host.mqtt.connection import connect
 from skin_host.mqtt.contact import PartContact
 from skin_host.mqtt.info import CalibrationInfo, NodeInfo, node_info
@@ -113,11 +114,16 @@ class Daemon:
             i for i in self.engine.parts if layout.parts[i].name in state.disabled
         }
         self.engine.touch_only = _touch_only(settings, layout, self.engine.parts)
+        had_zeros = os.path.lexists(self._path("zeros"))
         self._zeros = load_kept(self._path("zeros"), Zeros)
         doubted = np.zeros(layout.n_taxels, np.bool_)
-        if calibration is not None and self._zeros.are_of(calibration.id):
-            self._use_baselines()
-            doubted = _taxels(layout, self._zeros)
+        if calibration is not None:
+            if self._zeros.are_of(calibration.id):
+                self._use_baselines()
+                doubted = _taxels(layout, self._zeros)
+            elif had_zeros and not self._zeros.calibration:
+                # It could not be read: any of them may have been touched when their zero was taken.
+                doubted = layout.pad_kind == PadKind.PRESSURE
             self.engine.doubt(doubted)
         self.engine.hold(self.engine.boards)
         self.health = HealthWatch(self.engine)

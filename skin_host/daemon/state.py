@@ -68,7 +68,10 @@ class Zeros(Struct, forbid_unknown_fields=True):
             set-up, or as it had drifted by the end. Empty: the calibration's.
     """
 
-    WITHOUT: ClassVar = "calibrate when nothing touches the skin"
+    WITHOUT: ClassVar = (
+        "no taxel is valid until it is calibrated, because any may have been touched: "
+        "skin command calibrate"
+    )
 
     schema: str = "skin.zeros/1"
     calibration: str = ""
@@ -103,7 +106,7 @@ def load_kept(path: Path, kind: type[Kept]) -> Kept:
     if not os.access(path, os.F_OK):
         return unchanged
     if not os.access(path, os.R_OK):
-        log.error("%s: cannot be read: no permission; starting without it", path)
+        log.error("%s: cannot be read: no permission; %s", path, kind.WITHOUT)
         return unchanged
     what = unchanged.schema.removeprefix("skin.").partition("/")[0]
     try:

@@ -208,8 +208,14 @@ def _tls(settings: "Mqtt", folder: Path) -> ssl.SSLContext | None:
     if settings.key_file is not None and settings.certificate_file is None:
         raise ConfigurationError("mqtt.key_file: needs mqtt.certificate_file too")
     for key, name in files.items():
-        if name is not None and not os.access(folder / name, os.R_OK):
-            raise ConfigurationError(f"mqtt.{key}: {folder / name}: cannot be read")
+        if name is None:
+            continue
+        try:
+            read_whole(folder / name)  # OpenSSL would wait for ever for a pipe that nobody writes
+        except OSError as error:
+            raise ConfigurationError(
+                f"mqtt.{key}: {folder / name}: cannot be read: {error.strerror}"
+            ) from None
     where = "ca_file"
     try:
         context = _default_context(folder / settings.ca_file if settings.ca_file else None)

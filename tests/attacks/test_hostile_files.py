@@ -4,8 +4,10 @@ import os
 from pathlib import Path
 
 import pytest
+from msgspec import convert
 
 from skin_host.cli import main
+from skin_host.config.settings import Mqtt
 from skin_host.daemon import metrics
 from skin_host.errors import RequestError, SkinError
 from skin_host.files import read_whole
@@ -123,6 +125,16 @@ READERS = {
     "skin.ini": ["import", "skingui", "{}", "--output", "x.toml"],
     "places.txt": ["import", "positions", "{}", "--output", "x.toml"],
 }
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("key", ["ca_file", "certificate_file", "password_file"])
+def test_a_pipe_of_the_brokers_settings_is_not_waited_for(tmp_path: Path, key: str) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    more: dict[str, object] = {"username": "a"} if key == "password_file" else {"tls": True}
+    settings = convert({key: "pipe"} | more, Mqtt)
+    with pytest.raises(SkinError, match=f"mqtt.{key}: .*pipe: .*a pipe that nobody writes to"):
+        Broker.from_settings(settings, tmp_path)
 
 
 @pytest.mark.timeout(60)

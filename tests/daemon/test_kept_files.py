@@ -20,7 +20,7 @@ from skin_host.daemon.daemon import Daemon
 from skin_host.daemon.state import NodeState, Zeros, load_kept
 from skin_host.errors import NewerFileError, OtherSkinError
 from skin_host.files import write_document
-from skin_host.layout import build_layout
+from skin_host.layout import PadKind, build_layout
 from skin_host.mqtt.publisher import Publisher
 from skin_host.processing import calibration as calibrations
 from tests.support.broker import Mosquitto, free_port
@@ -240,6 +240,25 @@ def test_zeros_that_are_not_known_are_in_doubt_from_the_start(kept: tuple[Any, A
     # A later calibration has measured them.
     write_document(file, Zeros(calibration="an older one", unknown={"left_forearm": [3]}))
     assert doubted(Daemon(settings, layout, calibration=calibration)) == []
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b'{"schema":"skin.zeros/1"}', b'{"unknown":5}'])
+def test_without_the_file_of_unknown_zeros_all_are_in_doubt(
+    kept: tuple[Any, Any, Path], content: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It is there because some were touched: whoever damages it must not make them untouched."""
+    settings, layout, path = kept
+    calibration = stored_calibration(settings, layout, "main")
+    assert calibration is not None
+    assert doubted(Daemon(settings, layout, calibration=calibration)) == []
+    path.with_name("demo-main.zeros.json").write_bytes(content)
+    daemon = Daemon(settings, layout, calibration=calibration)
+    wanted = np.flatnonzero(calibration.usable & (layout.pad_kind == PadKind.PRESSURE))
+    assert set(doubted(daemon)) >= set(wanted.tolist())
+    if content[:2] != b'{"' or b"schema" not in content:
+        assert "skin command calibrate" in caplog.text
+    # One that is being taken anyway needs nothing of it.
+    assert doubted(Daemon(settings, layout)) == []
 
 
 def test_baselines_of_an_older_calibration_are_not_used(kept: tuple[Any, Any, Path]) -> None:
