@@ -41,8 +41,11 @@ PAUSE_MS = 1.0
 FEWEST_INTERVALS = 8
 #: Ratio of standard deviation to median absolute deviation, for a normal distribution.
 SIGMA = 1.4826
-#: A shift of the whole part is measured on this many untouched taxels or more.
-FEWEST_RESTING = 12
+#: A shift of the whole part is measured on so many untouched taxels or more: by fewer their noise
+#: would show one now and then (docs/found.md).
+FEWEST_RESTING = 8
+#: Taxels beside a press move with it, so all of a part with fewer must be untouched.
+MANY_RESTING = 12
 #: A triangle is missing when it was absent from this many sweeps in a row.
 ABSENT_SWEEPS = 3
 #: That a triangle has not changed since its calibration is known after this.
@@ -284,7 +287,7 @@ class Describer:
             shift = units[thermal] - calibration.baseline[span][thermal]
             found["thermal_units"] = round(_middle(shift), 1)
         rests = watch.rests()
-        if rests is not None and np.count_nonzero(rests) >= FEWEST_RESTING:
+        if rests is not None and enough_rest(rests, watch.valid):
             shift = units - pipeline.baseline[span]
             common = common_shift(shift, rests, self._layout.triangle_of[span])
             found["common_units"] = round(common, 1)
@@ -464,6 +467,14 @@ class Describer:
             record["spiked_pads"] = watch.spiked_pads
             record["silent"] = watch.silent
         return record
+
+
+def enough_rest(rests: Mask, valid: Mask) -> bool:
+    """Return whether a shift of a part can be known, bool[m] each: by the untouched taxels of those
+    that are valid.
+    """
+    resting = int(np.count_nonzero(rests))
+    return resting >= max(FEWEST_RESTING, min(MANY_RESTING, int(np.count_nonzero(valid))))
 
 
 def common_shift(

@@ -1,12 +1,16 @@
 """What the records of parts are made of."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from skin_host.health.describe import _period, common_shift
+from skin_host.health.describe import _period, common_shift, enough_rest
 from skin_host.health.watch import FOAM_NS, PartWatch
+from skin_host.processing.calibration import Verdict
 from skin_host.processing.core import Step
 from skin_host.processing.pipeline import PressureFrame
+from tests.support.fault_bench import CONFIG, FaultBench
 
 TRIANGLES = np.repeat(np.arange(3), 10)
 MS = 1_000_000
@@ -53,3 +57,36 @@ def test_a_pad_that_was_pressed_does_not_rest_until_its_foam_has_recovered() -> 
     assert rests_at(1_000 * MS + FOAM_NS) == [0]
     # The clock was set back: nobody knows how long ago it was.
     assert rests_at(0) == [0]
+
+
+def test_a_small_part_with_a_refused_pad_shows_its_temperature() -> None:
+    """All others move together: neither noise nor a press does that."""
+    bench = FaultBench(config=CONFIG.with_name("fingertips.toml"))
+    calibration = bench.engine.calibration
+    assert calibration is not None
+    verdict = calibration.verdict.copy()
+    verdict[bench.layout.parts[0].start + 4] = Verdict.TOO_NOISY
+    bench.engine.use(replace(calibration, verdict=verdict))
+    bench.run(8.0)
+    assert "part_temperature" not in {code for code, _ in bench.told}
+    bench.inject("temperature_step", value=-3.0)
+    bench.run(3.0)
+    assert "part_temperature" in {code for code, _ in bench.told}
+
+
+@pytest.mark.parametrize(
+    ("resting", "valid", "enough"),
+    [
+        (12, 200, True),
+        (11, 200, False),
+        (11, 11, True),
+        (10, 11, False),
+        (8, 8, True),
+        (7, 7, False),
+    ],
+)
+def test_of_a_part_twelve_pads_must_rest_or_all_of_a_small_one(
+    resting: int, valid: int, enough: bool
+) -> None:
+    pads = np.arange(300)
+    assert enough_rest(pads < resting, pads < valid) == enough

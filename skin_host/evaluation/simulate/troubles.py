@@ -17,7 +17,7 @@ from skin_host.bus.port import LinkState
 from skin_host.evaluation.simulate.cables import Mischief
 from skin_host.evaluation.simulate.disk import FULL, READ_ONLY
 from skin_host.evaluation.simulate.world import Triangle, World
-from skin_host.health.describe import FEWEST_RESTING
+from skin_host.health.describe import enough_rest
 from skin_host.health.diagnosis import JITTER_SHARE
 from skin_host.layout import PadKind
 
@@ -320,15 +320,14 @@ def _differs_from_a_load(world: World) -> Callable[[], bool]:
         engine = world.life.daemon.engine
         if engine.calibration is None:
             return True
-        rests = engine.calibration.usable & ~thermal
+        usable = engine.calibration.usable & ~thermal
+        rests = usable.copy()
         for index, row in engine.ledger.row.items():
             felt = engine.intake.touched.get(row)
             if felt is not None:
                 rests[layout.boards[index].taxel_index[felt]] = False
         parts = (slice(part.start, part.stop) for part in layout.parts)
-        return any(
-            thermal[part].any() or np.count_nonzero(rests[part]) >= FEWEST_RESTING for part in parts
-        )
+        return any(thermal[part].any() or enough_rest(rests[part], usable[part]) for part in parts)
 
     return differs
 
