@@ -81,8 +81,8 @@ class BoardRecord:
         return self.in_bootloader or self.is_wrong_type
 
     def believes(self, answer: Discovered | DiscoveredBootloader) -> bool:
-        """Return whether an answer to what it is counts. That it cannot send skin values counts
-        when it says so again as it is asked again: one damaged byte can say that.
+        """Return whether an answer to a query counts. One that it cannot send skin values counts
+        when the next query is answered alike: one damaged byte makes such an answer.
         """
         if isinstance(answer, Discovered) and answer.board_type in SKIN_BOARD_TYPES:
             self.claim = None
