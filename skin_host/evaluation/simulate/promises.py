@@ -168,6 +168,8 @@ class Promises:
         self._touched_ns = np.full(layout.n_taxels, -(1 << 62), np.int64)
         self._calibrated_touched_ns = np.full(layout.n_taxels, -(1 << 62), np.int64)
         self._zeros: dict[int, Rezero] = {}
+        #: By board: the zero that it has itself, at the sample before.
+        self._bases = [board.base.copy() for board in world.robot.boards.values()]
         #: By board: the time of the first sweep that its zero was observed in, and when that was.
         self._observed: dict[int, tuple[int | None, int]] = {}
         self._wrong_since_ns: dict[str, int] = {}
@@ -665,6 +667,7 @@ class Promises:
         self._truth.append((now_ns, truth))
         self._note_set_ups()
         life = world.life
+        self._exempt_zeroed_alone(life, truth)
         self._touched_ns[truth > TOUCHING_KPA] = now_ns
         if life is not None and life.daemon.engine.calibrating:
             # Touched taxels are calibrated anyway, with that verdict.
@@ -815,6 +818,21 @@ class Promises:
                     f"board {board.name} was last received {quiet_ns / NS:.1f} s ago, and nothing "
                     "keeps it silent"
                 )
+
+    def _exempt_zeroed_alone(self, life: Life | None, truth: NDArray[np.float64]) -> None:
+        """A board that zeroes itself while no daemon runs has what presses it in its zero."""
+        before_ns = self._truth[-2][0] if len(self._truth) > 1 else 0
+        alone = life is None or life.began_ns >= before_ns
+        layout = self._world.layout
+        boards = self._world.robot.boards
+        for board, base in zip(layout.boards, self._bases, strict=True):
+            now = boards[board.name].base
+            if np.array_equal(base, now):
+                continue
+            base[:] = now
+            if alone:
+                taxels = board.taxel_index[board.taxel_index >= 0]
+                self._exempt[taxels] |= (truth[taxels] > TOUCHING_KPA) | self._pressed[taxels]
 
     def _exempt_zeroed(self, life: Life, truth: NDArray[np.float64]) -> None:
         """What its board did not feel before it took a zero is in that zero: nobody can know."""
