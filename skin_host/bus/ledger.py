@@ -35,8 +35,10 @@ STALE_INTERVALS_NS = 1_000_000_000
 #: Triangles are missing after this many sweeps in a row: single frames get lost and sweeps get cut.
 MISSING_SWEEPS = 5
 #: An MTB3 that zeroes itself, after five bad readings, sends nothing for four periods. It times out
-#: no earlier than after this many: to query it then would stop it.
+#: no earlier than after the first number of them: to query it then would stop it. The second one of
+#: sweeps is missed at least.
 MTB3_PERIODS = 6.0
+ZEROING_SWEEPS = 3
 #: A period that differs by more than this share is not the one that was set.
 WRONG_PERIOD = 0.25
 #: For a regular board all intervals, except the longest and shortest fifth, lie within this share.
@@ -119,7 +121,8 @@ class BoardLedger:
         self._period_ns = np.array([board.settings.period_ms for _, board in boards]) * 1_000_000
         self.silent_after_ns = (silent_periods * self._period_ns).astype(np.int64)
         self._enabled = [board.enabled for _, board in boards]
-
+        #: Rows of boards that pause where they zero themselves.
+        self._pauses: set[int] = set()
         for row, (_, board) in enumerate(boards):
             if board.settings.model == "mtb3":
                 self.expect_pauses(row)
@@ -154,6 +157,7 @@ class BoardLedger:
 
     def expect_pauses(self, row: int) -> None:
         """Give a board, an MTB3, the time to zero itself before it has timed out."""
+        self._pauses.add(row)
         least_ns = int(MTB3_PERIODS * self._period_ns[row])
         self.silent_after_ns[row] = max(int(self.silent_after_ns[row]), least_ns)
 
@@ -234,6 +238,15 @@ class BoardLedger:
     def is_silent(self, row: int) -> bool:
         """Return whether a board has timed out."""
         return self.overdue(row, 0)
+
+    def zeroing_ns(self, sweep: Sweep) -> int:
+        """Return how long the board of a sweep paused before it, if it may have zeroed itself in
+        that time without its status words showing it, because they were lost; otherwise 0.
+        """
+        row = self.row[sweep.board]
+        if sweep.missed < ZEROING_SWEEPS or row not in self._pauses:
+            return 0
+        return (sweep.missed + 1) * int(self._period_ns[row])
 
     def silent_ns(self, board: int) -> int:
         """Return for how long a board, by its index, has not been received, if it has timed out;

@@ -579,6 +579,8 @@ class Engine:
         samples: list[PartSample] = []
         for sweep in sweeps:
             silent_ns = self.ledger.silent_ns(sweep.board) if self.ledger.any_silent else 0
+            if sweep.missed and not silent_ns:
+                silent_ns = self.ledger.zeroing_ns(sweep)
             row = self.ledger.note(sweep)
             if silent_ns:
                 self._note_return(sweep, silent_ns)

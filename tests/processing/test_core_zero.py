@@ -73,6 +73,10 @@ class Hand:
             self._t_ns += PERIOD_NS
             self.deliver(self.engine.expire(self._t_ns))
 
+    def skip(self, sweeps: int) -> None:
+        """Send nothing for so many periods, which nobody notices before the next sweep."""
+        self._t_ns += sweeps * PERIOD_NS
+
     def rests_elsewhere(self, seed: int) -> None:
         """It was zeroed, by one reading."""
         rng = np.random.default_rng(seed)
@@ -271,6 +275,30 @@ def test_a_board_that_was_zeroed_unheard_gets_new_baselines(
     assert valid_share(steps[-1]) > 0.8
     assert hand.in_doubt == [3]
     assert hand.engine.ledger.rezeros.tolist() == [1]
+
+
+def test_an_mtb3_that_was_zeroed_while_its_status_words_were_lost_gets_new_baselines(
+    worn: tuple[Hand, list[Step]],
+) -> None:
+    """It pauses for four periods, and has not timed out."""
+    hand, steps = worn
+    hand.engine.ledger.expect_pauses(0)
+    hand.skip(3)
+    hand.rests_elsewhere(seed=2)
+    steps.clear()
+    hand.send(80)
+    assert not any(step.frame.touched.any() for step in steps)
+    assert valid_share(steps[-1]) > 0.8
+    assert hand.engine.ledger.rezeros.tolist() == [1]
+
+
+def test_an_mtb3_that_only_paused_keeps_its_baselines(worn: tuple[Hand, list[Step]]) -> None:
+    hand, steps = worn
+    hand.engine.ledger.expect_pauses(0)
+    hand.skip(3)
+    hand.send(SWEEPS + 1)
+    assert valid_share(steps[-1]) > 0.9
+    assert hand.engine.ledger.rezeros.tolist() == [0]
 
 
 def test_a_new_zero_is_not_that_of_two_if_the_board_was_silent_while_it_was_sought(
