@@ -52,6 +52,8 @@ PAUSE_NS = round(0.75 * NS)
 CAUSE_NS = 3 * NS
 #: Foam that was pressed still relaxes for so long.
 RELAXED_NS = 60 * NS
+#: A touch that lasted through a silence begins again within this time.
+AGAIN_NS = 3 * NS // 2
 #: A calibration at rest began no longer ago when it is noted.
 RESTING_NS = 8 * NS
 #: A fingertip is loaded from a small force on, and must be felt from a larger one on.
@@ -167,6 +169,11 @@ class Promises:
         #: When each taxel was last pressed, and when a calibration may last have seen it pressed.
         self._touched_ns = np.full(layout.n_taxels, -(1 << 62), np.int64)
         self._calibrated_touched_ns = np.full(layout.n_taxels, -(1 << 62), np.int64)
+        #: When each taxel was last pressed while it was not valid; when it was last not valid, and
+        #: whether it was touched just before.
+        self._unheard_ns = np.full(layout.n_taxels, -(1 << 62), np.int64)
+        self._blind_ns = np.full(layout.n_taxels, -(1 << 62), np.int64)
+        self._lost = np.zeros(layout.n_taxels, np.bool_)
         self._zeros: dict[int, Rezero] = {}
         #: By board: the zero that it has itself, at the sample before.
         self._bases = [board.base.copy() for board in world.robot.boards.values()]
@@ -368,7 +375,7 @@ class Promises:
             self._last_id[event.part] = event.id
             now.add(event.id)
             part = event.part
-            if part in self._parts and not self._has_cause(part, event.taxels, CAUSE_NS).any():
+            if part in self._parts and not self._may_begin(part, event.taxels):
                 self.break_(
                     f"{part}: touch {event.id} begins at taxels {event.taxels} with "
                     f"{event.peak_kpa:.1f} kPa, and nothing presses there"
@@ -379,6 +386,21 @@ class Promises:
             now.discard(event.id)
         elif not event.taxels and event.part in self._parts:
             self.break_(f"{event.part}: touch {event.id} has no taxel")
+
+    def _may_begin(self, part: str, taxels: Sequence[int]) -> bool:
+        """Return whether a touch of some taxels of a part has a cause.
+
+        What a press leaves in the foam looks like a light press to a daemon that did not receive
+        the press; and a touch that lasts, as long as foam takes, begins again after a silence.
+        """
+        if self._has_cause(part, taxels, CAUSE_NS).any():
+            return True
+        mine = np.asarray(taxels, np.intp) + self._parts[part].start
+        now_ns = self._now_ns()
+        unheard = now_ns - self._unheard_ns[mine] < RELAXED_NS
+        lasts = self._lost[mine] & (now_ns - self._touched_ns[mine] < RELAXED_NS)
+        lasts &= now_ns - self._blind_ns[mine] < AGAIN_NS
+        return bool((unheard | lasts).any())
 
     def _has_cause(
         self, part: str, taxels: Sequence[int] | NDArray[np.intp], lately_ns: int
@@ -398,9 +420,15 @@ class Promises:
         if frame.seq <= self._seq.get(name, -1):
             self.break_(f"{name}: frame {frame.seq} after {self._seq[name]}")
         self._seq[name] = frame.seq
-        self._frames[name] = frame
         part = self._parts[name]
         mine = slice(part.start, part.stop)
+        before = self._frames.get(name)
+        if not frame.valid.all():
+            if before is not None:
+                lost = before.valid & ~frame.valid
+                self._lost[mine][lost] = before.touched[lost]
+            self._blind_ns[mine][~frame.valid] = self._now_ns()
+        self._frames[name] = frame
         pressure = frame.pressure_kpa
         valid = frame.valid.tobytes()
         # Neither comparison holds for what is no number.
@@ -574,7 +602,7 @@ class Promises:
             assembled = daemon.engine.assemblers[name].counters.frames
             if assembled != counters.frames:
                 self.break_(f"bus {name}: {assembled} of {counters.frames} frames were taken")
-            self._account_frames(life, name, daemon.engine.assemblers[name])
+            self._account_frames(life, name, daemon.engine.assemblers[name], fate.dropped)
         known = daemon.publisher.counters
         waiting = sum(
             1
@@ -594,7 +622,7 @@ class Promises:
         if not life.dead and got < known.touches_sent:
             self.break_(f"{known.touches_sent} events were acknowledged, {got} arrived")
 
-    def _account_frames(self, life: Life, bus: str, assembler: Any) -> None:
+    def _account_frames(self, life: Life, bus: str, assembler: Any, dropped: int) -> None:
         """Each frame is in a sweep, waits to be, or is counted; each sweep came or is counted,
         until the daemon was asked to end.
         """
@@ -625,6 +653,10 @@ class Promises:
         known = {board.settings.address for board in self._world.layout.boards}
         sent = sum(count - SLACK for address, count in bursts.items() if address in known)
         came = counters.sweeps + counters.missed
+        if self._clock_set_ns >= life.began_ns:
+            # If it was set back, time stamps do not show how many sweeps the dropped frames were.
+            boards = [one for one in self._world.layout.boards if one.settings.bus == bus]
+            came += dropped // (2 * min((len(one.triangles) for one in boards), default=1))
         if sent > came:
             self.break_(f"bus {bus}: {sent} sweeps were sent; {came} came or are counted as missed")
 
@@ -678,6 +710,7 @@ class Promises:
             for name, frame in self._frames.items():
                 part = self._parts[name]
                 self._valid_ns[part.start : part.stop][frame.valid] = now_ns
+            self._unheard_ns[(truth > TOUCHING_KPA) & (self._valid_ns < now_ns)] = now_ns
             self._exempt_zeroed(life, truth)
             if life.daemon.engine.calibration is not None:
                 self._note_calibration(life.daemon.engine.calibration.id)
