@@ -246,7 +246,13 @@ class BoardLedger:
         row = self.row[sweep.board]
         if sweep.missed < ZEROING_SWEEPS or row not in self._pauses:
             return 0
-        return (sweep.missed + 1) * int(self._period_ns[row])
+        last = self.last[row]
+        if self._looked or last is None:
+            quiet_ns = self.now_ns - int(self.received_ns[row])
+        else:
+            quiet_ns = sweep.t_ns - last.t_ns
+        # A clock that was set makes a gap of time stamps only.
+        return quiet_ns if quiet_ns >= ZEROING_SWEEPS * int(self._period_ns[row]) else 0
 
     def silent_ns(self, board: int) -> int:
         """Return for how long a board, by its index, has not been received, if it has timed out;

@@ -355,7 +355,7 @@ class Describer:
                 "wrong_type": known.is_wrong_type,
                 "firmware": known.firmware,
                 "in_bootloader": known.in_bootloader,
-                "awaited": manager.awaits(board.settings.address),
+                "awaited": manager.awaits(board.settings.address) or self._engine.paused(index),
                 "configurations": known.configurations,
                 "silences": int(ledger.silences[row]),
                 "resets": int(ledger.resets[row]),

@@ -116,7 +116,7 @@ def diagnose(record: Record, lost_lately: Collection[str] = ()) -> list[FoundFau
     faults += _triangles(record, silent)
     faults += _taxels(record)
     faults += _part(record)
-    if record["state"] == "degraded" and not any(map(_invalidates, faults)):
+    if record["state"] == "degraded" and not silent and not any(map(_invalidates, faults)):
         faults.append(
             FoundFault(
                 "taxel_unproven",

@@ -557,6 +557,14 @@ class Engine:
         """
         return board in self._silent_zeros
 
+    def paused(self, board: int) -> bool:
+        """Return whether `compares` holds for a board that had not timed out."""
+        silent_zero = self._silent_zeros.get(board)
+        if silent_zero is None:
+            return False
+        limit_ns = int(self.ledger.silent_after_ns[self.ledger.row[board]])
+        return silent_zero.silent_s * 1e9 <= limit_ns
+
     def doubts(self) -> dict[int, int]:
         """Return how many taxels of each board that was zeroed have an unknown zero, by index."""
         return {

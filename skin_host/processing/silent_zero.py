@@ -55,6 +55,9 @@ class SilentZero:
         no_load: the byte of an untouched pad just after a zero.
         period_s: how often the board sends.
         silent_s: for how long it was not received.
+
+    Attributes:
+        silent_s: as given.
     """
 
     def __init__(
@@ -71,6 +74,7 @@ class SilentZero:
         self._noise = noise
         self._spread = spread
         self._known = known
+        self.silent_s = silent_s
         self._no_load = no_load
         self._period_s = period_s
         drifted = min(SLOW_UNITS_PER_S * silent_s, MOST_COMMON_UNITS)
