@@ -65,10 +65,11 @@ class BoardHealth(TypedDict):
     """One board.
 
     `period_seen_ms` and `jitter_ms` come from the kernel's time stamps of its last sweeps;
-    `in_doubt` counts taxels whose zero is unknown; `awaited`: since the start
-    it has not had the time to send, or it paused and may have zeroed itself; `lately` has the counters among `resets`, `lost_set_ups`,
-    `tx_overflows` and `rezeros` that rose within the last minute; `twice`: two boards send at its
-    address; `held_up`: it may be regular, but its frames waited for those of more urgent boards.
+    `in_doubt` counts taxels whose zero is unknown; `awaited`: since the start it has not had
+    the time to send, or it paused and may have zeroed itself; `lately` has the counters among
+    `resets`, `lost_set_ups`, `tx_overflows` and `rezeros` that rose within the last minute;
+    `twice`: two boards send at its address; `held_up`: it may be regular, but its frames waited
+    for those of more urgent boards.
     """
 
     name: str
