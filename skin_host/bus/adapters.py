@@ -160,7 +160,8 @@ class AdapterPort(Port):
                     if self._put(n, message):
                         errors |= bool(message.is_error_frame)
                         n += 1
-                if len(getattr(self._bus, "_buffer", b"")) > LONGEST_LINE:
+                line = getattr(self._bus, "_buffer", None)
+                if isinstance(line, bytearray) and len(line) > LONGEST_LINE:
                     raise BusError("what it sends is no line of an adapter")
             except (can.CanError, OSError, BusError) as error:
                 self._note_failure(error)
@@ -312,7 +313,7 @@ def open_bus(name: str, settings: Bus) -> can.BusABC:
         known = ", ".join(sorted(can.VALID_INTERFACES))
         raise ConfigurationError(f"{where}: python-can has no such interface; it has {known}")
     try:
-        if settings.interface == SOCKETCAND:
+        if settings.interface == SOCKETCAND and {"host", "port"} <= options.keys():
             _await_greeting(settings.options)
         bus = can.Bus(
             interface=settings.interface,
@@ -340,7 +341,7 @@ def _await_greeting(options: Mapping[str, object]) -> None:
     Raises:
         OSError: it does not.
     """
-    host, port = str(options.get("host", "")), int(str(options.get("port", "")))
+    host, port = str(options["host"]), int(str(options["port"]))
     with socket.create_connection((host, port), GREETING_S) as server:
         if not server.recv(16).startswith(b"< hi"):
             raise OSError("what listens there is no socketcand")

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import logging
+import os
 import sys
 from collections.abc import Callable, Coroutine, Iterable
 from importlib import import_module
@@ -26,7 +27,7 @@ from skin_host.cli.common import (
     set_up_logging,
     whole,
 )
-from skin_host.errors import RequestError
+from skin_host.errors import RequestError, visible
 
 if TYPE_CHECKING:
     import can
@@ -51,6 +52,8 @@ BENCHMARKS = {
     "emulator": "simulated seconds per second",
 }
 HOUR_S = 3600.0
+#: Of stdin, in bytes.
+LONGEST_COMMAND = 4096
 
 log = logging.getLogger(__name__)
 
@@ -291,42 +294,66 @@ def _on_emulated_chips(
             loop.add_reader(device.fileno(), device.handle)
         # A file or /dev/null cannot be waited for; then there are no commands.
         with contextlib.suppress(PermissionError, ValueError, AttributeError):
-            loop.add_reader(sys.stdin.fileno(), take_command, robot, {}, model)
+            loop.add_reader(sys.stdin.fileno(), take_commands, robot, {}, bytearray(), model)
         await robot.run(buses, RealClock(arguments.speed))
 
     return work
 
 
-def take_command(
-    robot: "Robot", mends: dict[str, Callable[[], None]], model: "MujocoModel | None" = None
+def take_commands(
+    robot: "Robot",
+    mends: dict[str, Callable[[], None]],
+    begun: bytearray,
+    model: "MujocoModel | None" = None,
 ) -> None:
-    """Read a line of stdin: a fault such as `chip_gone board=hand triangle=3`, or `mend` and it.
+    """Read what waits on stdin, never for the rest of a line: each line is a fault such as
+    `chip_gone board=hand triangle=3`, or `mend` and it.
 
     With a MuJoCo model also `ctrl ACTUATOR VALUE`, which sets what drives an actuator.
 
-    `mends` are the functions that end the given faults, by their lines.
+    Args:
+        robot: is given the faults.
+        mends: the functions that end the given faults, by their lines.
+        begun: a line whose end has not come.
+        model: of the scene.
     """
-    from emulator import faults
-
-    line = sys.stdin.readline()
-    if not line:
+    data = os.read(sys.stdin.fileno(), LONGEST_COMMAND)
+    if not data:
         import asyncio
 
         asyncio.get_running_loop().remove_reader(sys.stdin.fileno())
-        return
+    begun += data or b"\n"
+    *lines, rest = begun.split(b"\n")
+    if len(rest) > LONGEST_COMMAND:  # it may never end
+        lines, rest = [*lines, rest], bytearray()
+    begun[:] = rest
+    for line in lines:
+        try:
+            if len(line) > LONGEST_COMMAND:
+                raise RequestError(f"a line of more than {LONGEST_COMMAND} bytes")
+            _take_command(robot, mends, line.decode(errors="replace"), model)
+        except RequestError as error:
+            print(f"skin emulate: {visible(str(error))}", file=sys.stderr, flush=True)
+
+
+def _take_command(
+    robot: "Robot",
+    mends: dict[str, Callable[[], None]],
+    line: str,
+    model: "MujocoModel | None",
+) -> None:
+    from emulator import faults
+
     text = " ".join(line.split())
     verb, _, rest = text.partition(" ")
-    try:
-        if verb == "mend":
-            if rest not in mends:
-                raise RequestError(f'"{rest}": no such fault is on; there are: {", ".join(mends)}')
-            mends.pop(rest)()
-        elif verb == "ctrl":
-            _set_control(model, rest)
-        elif text:
-            mends[text] = robot.inject(faults.parse(text))
-    except RequestError as error:
-        print(f"skin emulate: {error}", file=sys.stderr, flush=True)
+    if verb == "mend":
+        if rest not in mends:
+            raise RequestError(f'"{rest}": no such fault is on; there are: {", ".join(mends)}')
+        mends.pop(rest)()
+    elif verb == "ctrl":
+        _set_control(model, rest)
+    elif text:
+        mends[text] = robot.inject(faults.parse(text))
 
 
 def _set_control(model: "MujocoModel | None", text: str) -> None:

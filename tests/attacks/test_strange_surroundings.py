@@ -3,9 +3,12 @@
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
+
+from tests.support.waiting import PATIENCE_S
 
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
 SKIN = Path(sys.executable).parent / "skin"
@@ -48,3 +51,41 @@ def test_a_strange_time_zone_and_locale_are_survived() -> None:
     done = said_by("CHECK", TZ=":/etc/passwd", LANG="xx_YY.bogus", LC_ALL="tr_TR.UTF-8")
     assert done.returncode == 0
     assert done.stderr == b""
+
+
+def test_an_emulated_robot_does_not_wait_for_the_rest_of_a_line(tmp_path: Path) -> None:
+    """Whoever writes faults to it may write half a line, two at once, bytes that are no text, or
+    one without an end: it goes on.
+    """
+    with (tmp_path / "said").open("w") as said:
+        robot = subprocess.Popen(
+            [SKIN, "emulate", CONFIG], stdin=subprocess.PIPE, stdout=said, stderr=said
+        )
+    assert robot.stdin is not None
+
+    def wait_for(text: str) -> str:
+        deadline_s = time.monotonic() + PATIENCE_S
+        while text not in (found := (tmp_path / "said").read_text()):
+            assert robot.poll() is None, found
+            assert time.monotonic() < deadline_s, found
+            time.sleep(0.05)
+        return found
+
+    try:
+        wait_for("is emulated on")
+        os.write(robot.stdin.fileno(), b"nope\nneither\nboard_silent boa")
+        wait_for('"nope"')
+        wait_for('"neither"')
+        os.write(robot.stdin.fileno(), b"rd=\xff\x1b[2J\n")
+        wait_for("\\x1b[2J")
+        os.write(robot.stdin.fileno(), b"x" * 20_000)
+        wait_for("a line of more than 4096 bytes")
+        robot.terminate()
+        assert robot.wait(PATIENCE_S) in (0, -15)
+    finally:
+        robot.kill()
+        robot.communicate()
+    found = (tmp_path / "said").read_text()
+    assert "Traceback" not in found
+    assert "\x1b" not in found
+    assert len(found) < 5000
