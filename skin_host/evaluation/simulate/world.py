@@ -168,8 +168,8 @@ class World:
         self.clock.set(seconds)
 
     def damaged_set_ups(self) -> set[Triangle]:
-        """Return the triangles, each by its board, whose chip does not measure what its board has
-        told it to: each pad alone.
+        """Return the triangles, each by its board, whose chip does not measure each pad alone,
+        as its board sets it up.
         """
         found = set()
         signal = self.robot.converters.signal
