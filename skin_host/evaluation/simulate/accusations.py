@@ -92,6 +92,7 @@ class Accusations:
         required: kinds of trouble that health had to name if they lasted.
         named: those of them that it named.
         troubles: those of now and lately: each with when it began, and ended.
+        stuck: by part, the pads of real skin that have been stuck from the first.
     """
 
     def __init__(self, world: World) -> None:
@@ -103,10 +104,10 @@ class Accusations:
         #: Fingertips whose zero may be of a load.
         self.loaded: set[str] = set()
         self._faults: dict[str, set[tuple[str, str]]] = {}
-        #: Parts with pads of real skin that have been stuck from the first.
         held = ~np.isnan(world.robot.skin.held_ff)
-        self._stuck = {
-            part.name for part in world.layout.parts if held[part.start : part.stop].any()
+        self.stuck = {
+            part.name: frozenset(np.flatnonzero(held[part.start : part.stop]).tolist())
+            for part in world.layout.parts
         }
         #: Troubles, and when they began, for which it is known whether they were named in time.
         self._settled: set[tuple[str, int]] = set()
@@ -171,7 +172,7 @@ class Accusations:
             return True
         if code in OF_LOADS and where in self.loaded:
             return True
-        if code == "taxel_stuck" and where in self._stuck:
+        if code == "taxel_stuck" and self.stuck.get(where):
             return True
         now_ns = self._world.clock.monotonic_ns()
         longest_ns = PASSING_NS

@@ -645,17 +645,25 @@ class _Run:
             state = retained.get(topics.part("contact", name))
             if state != b"OFF":
                 found.append(f"{name}: contact {state!r}")
-            for fault, where in self._faults(retained.get(topics.part("health", name))):
+            stuck = self._promises.accusations.stuck.get(name, frozenset())
+            for fault, where in self._faults(retained.get(topics.part("health", name)), stuck):
                 if fault not in LATE_FAULTS and not (world.real_noise and fault in NOISE):
                     found.append(f"{name}: {fault} {where}")
         return found
 
-    def _faults(self, payload: bytes | None) -> list[tuple[str, str]]:
+    def _faults(self, payload: bytes | None, stuck: frozenset[int]) -> list[tuple[str, str]]:
+        """Return what health reports of a part, but for pads that have been stuck from the first.
+
+        A calibration by damaged bytes finds noise where there is none: then they are named.
+        """
         if payload is None:
             return [("no health", "")]
         record = msgspec.json.decode(payload)
         found = [(fault["code"], fault["where"]) for fault in record["faults"]]
         refused = self.world.real_noise and any(code in NOISE for code, _ in found)
+        if stuck and stuck.issuperset(record["taxel_faults"].get("stuck", ())):
+            found = [(code, where) for code, where in found if code != "taxel_stuck"]
+            refused |= record["state"] == "degraded" and stuck.issuperset(record["invalid"])
         if record["state"] not in ("ok", "warning") and not refused:
             taxels = f"{record['valid_taxels']} of {record['taxels']}" if "taxels" in record else ""
             found.append((record["state"], taxels))

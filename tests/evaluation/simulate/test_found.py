@@ -1,6 +1,7 @@
 """Bugs that seeds of `skin simulate` found, each as a claim."""
 
 import asyncio
+import json
 import random
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +21,7 @@ from skin_host.daemon.daemon import Daemon
 from skin_host.demo import configuration
 from skin_host.evaluation.simulate.cables import Cable, Sent, SimulatedPort
 from skin_host.evaluation.simulate.promises import Promises
+from skin_host.evaluation.simulate.run import _Run
 from skin_host.evaluation.simulate.trace import Trace
 from skin_host.evaluation.simulate.troubles import KINDS, Trouble
 from skin_host.evaluation.simulate.world import Life, World
@@ -812,3 +814,37 @@ def test_damage_must_be_named_by_when_enough_of_it_came(world: World, kind: str)
         share = float(trouble.about.rpartition("=")[2])
         assert trouble.within_s == pytest.approx(36 / (40 * share))
         assert KINDS[kind](world, chance, True).within_s == 8.0
+
+
+def test_a_calm_ends_though_pads_of_real_skin_that_were_stuck_from_the_first_are_named(
+    worn: World, tmp_path: Path
+) -> None:
+    """Damaged bytes were their noise when they were calibrated; other pads may not be stuck."""
+    run = _Run(worn, tmp_path, 2, 60.0, None)
+    held = np.flatnonzero(~np.isnan(worn.robot.skin.held_ff))
+    part = next(part for part in worn.layout.parts if part.start <= held[0] < part.stop)
+    stuck = int(held[0]) - part.start
+
+    def record(state: str, stuck: list[int], invalid: list[int]) -> bytes:
+        return json.dumps(
+            {
+                "state": state,
+                "faults": [{"code": "taxel_stuck", "where": part.name}],
+                "taxels": part.n_taxels,
+                "valid_taxels": part.n_taxels - len(invalid),
+                "taxel_faults": {"stuck": stuck},
+                "invalid": invalid,
+            }
+        ).encode()
+
+    async def live() -> None:
+        run._promises = Promises(worn)
+        pads = run._promises.accusations.stuck[part.name]
+        assert run._faults(record("degraded", [stuck], [stuck]), pads) == []
+        assert run._faults(record("degraded", [stuck], [stuck, stuck + 1]), pads)
+        assert run._faults(record("degraded", [stuck + 1], [stuck + 1]), pads)
+        assert run._faults(record("silent", [], []), pads)
+        assert run._faults(record("degraded", [stuck], [stuck]), frozenset())
+
+    with worn.clock.runner() as runner:
+        runner.run(live())
