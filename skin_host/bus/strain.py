@@ -35,6 +35,12 @@ class StrainType(IntEnum):
     TORQUE = 0xB
 
 
+# As plain numbers: NumPy asks the member of an enumeration in vain for methods of its own, which
+# takes longer than the comparison.
+_STREAM = int(MessageClass.ANALOG_STREAM)
+_FIRST, LOADS, _LAST = map(int, (StrainType.RAW_FORCE, StrainType.FORCE, StrainType.TORQUE))
+
+
 class StrainMode(IntEnum):
     """Argument of command 07 (`SetTxMode`) to a force/torque board."""
 
@@ -105,10 +111,10 @@ def parse_strain(batch: FrameBatch) -> StrainFrames:
     """Return the force/torque frames of a batch."""
     kind = batch.id & 0xF
     mine = (
-        (batch.id >> 8 == MessageClass.ANALOG_STREAM)
+        (batch.id >> 8 == _STREAM)
         & (batch.id >> 4 & 0xF != HOST_ADDRESS)
-        & (kind >= StrainType.RAW_FORCE)
-        & (kind <= StrainType.TORQUE)
+        & (kind >= _FIRST)
+        & (kind <= _LAST)
     )
     fits = (batch.dlc == 6) | (batch.dlc == 7)
     row = np.flatnonzero(mine & fits)
@@ -174,7 +180,7 @@ class WrenchAssembler:
     def take(self, frames: StrainFrames, t_ns_of: NDArray[np.int64]) -> list[Wrench]:
         """Take a batch's frames, and its times [n]; return the samples that they complete."""
         self.counters.wrong_length += frames.wrong_length
-        mine = (frames.board == self.board) & (frames.type >= StrainType.FORCE)
+        mine = (frames.board == self.board) & (frames.type >= LOADS)
         samples = []
         for i in np.flatnonzero(mine).tolist():
             t_ns = int(t_ns_of[frames.row[i]])

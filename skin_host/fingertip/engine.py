@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from skin_host.bus.strain import (
     CHANNELS,
+    LOADS,
     SILENT_NS,
     ZERO_WORD,
     StrainType,
@@ -31,6 +32,8 @@ from skin_host.processing.events import Touch
 from skin_host.processing.masks import Mask
 
 Floats = NDArray[np.float64]
+
+_COMMAND = int(MessageClass.ANALOG_COMMAND)
 
 #: A zero is the mean of at least this many samples.
 FEWEST_SAMPLES = 10
@@ -163,13 +166,13 @@ class FingertipEngine:
         here = self._of_address.get(bus)
         if here is None:
             return felt
-        for row in np.flatnonzero(batch.id >> 8 == MessageClass.ANALOG_COMMAND).tolist():
+        for row in np.flatnonzero(batch.id >> 8 == _COMMAND).tolist():
             self._note_answer(here, int(batch.id[row]), batch.data[row, : batch.dlc[row]].tobytes())
         frames = parse_strain(batch)
         if not len(frames.row) and not frames.wrong_length:
             return felt
         for address, state in here.items():
-            mine = np.flatnonzero((frames.board == address) & (frames.type >= StrainType.FORCE))
+            mine = np.flatnonzero((frames.board == address) & (frames.type >= LOADS))
             if not len(mine):
                 continue
             state.frames += len(mine)

@@ -311,7 +311,7 @@ class Tip:
     ) -> list[FingertipEvent]:
         """Update the flags from a sample that is not smoothed."""
         settled = self._reported is not None and not (0 <= t_ns - self._begun_ns <= SETTLING_NS)
-        located = contact is not None and contact.verdict[0] == ContactVerdict.CONTACT
+        located = contact is not None and int(contact.verdict[0]) == ContactVerdict.CONTACT
         normal = contact.normal[0] if contact is not None and located else None
         seen = self._watch.step(load, normal, settled=settled)
         normal_n = seen.normal_n if touches else 0.0
