@@ -287,7 +287,9 @@ class Describer:
             shift = units[thermal] - calibration.baseline[span][thermal]
             found["thermal_units"] = round(_middle(shift), 1)
         rests = watch.rests()
-        if rests is not None and enough_rest(rests, watch.valid):
+        # Pads in doubt are not valid, and nobody knows that they are untouched.
+        usable = pressure & calibration.usable[span]
+        if rests is not None and enough_rest(rests, usable):
             shift = units - pipeline.baseline[span]
             common = common_shift(shift, rests, self._layout.triangle_of[span])
             found["common_units"] = round(common, 1)
@@ -469,12 +471,12 @@ class Describer:
         return record
 
 
-def enough_rest(rests: Mask, valid: Mask) -> bool:
+def enough_rest(rests: Mask, usable: Mask) -> bool:
     """Return whether a shift of a part can be known, bool[m] each: by the untouched taxels of those
-    that are valid.
+    that are usable.
     """
     resting = int(np.count_nonzero(rests))
-    return resting >= max(FEWEST_RESTING, min(MANY_RESTING, int(np.count_nonzero(valid))))
+    return resting >= max(FEWEST_RESTING, min(MANY_RESTING, int(np.count_nonzero(usable))))
 
 
 def common_shift(
