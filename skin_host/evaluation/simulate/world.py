@@ -140,7 +140,7 @@ class World:
         self.slept_ns = 0
         self.spots = [Spot(self, self.chance) for _ in range(SPOTS)]
         self.tips = [
-            Tip(self, self.chance, name)
+            PressedTip(self, self.chance, name)
             for name, tip in settings.fingertips.items()
             if tip.array is None
         ]
@@ -276,7 +276,7 @@ class Spot(Target):
         super().__init__(world, chance, probe, f"{self.part}/{self.taxel}")
 
 
-class Tip(Target):
+class PressedTip(Target):
     """A fingertip without skin, which only its force/torque board feels."""
 
     def __init__(self, world: World, chance: random.Random, name: str) -> None:
