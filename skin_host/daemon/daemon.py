@@ -384,11 +384,6 @@ class Daemon:
         if self.engine.fingertips is not None:
             self.fingertips.deliver(output.grasps)
         if output.steps:
-            # Touches first, so that they leave before the frames are encoded.
-            for step in output.steps:
-                for event in step.events:
-                    self.publisher.put_touch(event)
-            self.health.note(output)
             self._follow_clock()
             if self._zero_changes != self.engine.zero_changes:
                 # Something may press a pad whose zero was not found, did before it was held, or
@@ -396,9 +391,15 @@ class Daemon:
                 self._zero_changes = self.engine.zero_changes
                 self._use_usable()
                 self._doubt_contacts(self.engine.may_be_touched(), self.engine.parts)
+            # Touches leave before the frames are encoded, and each with its part's contact: that is
+            # ON in a touch only, also where several frames of a part were read together.
             for step in output.steps:
+                for event in step.events:
+                    self.publisher.put_touch(event)
                 state = self._contacts[step.part].step(step.frame, step.events)
                 self.publisher.put_contact(step.frame.part, state)
+            self.health.note(output)
+            for step in output.steps:
                 if step.part not in self.engine.touch_only:
                     self.publisher.put_frame(step.frame)
         # Notify systemd's watchdog only here, after work that was done.

@@ -128,6 +128,38 @@ async def test_a_clock_that_is_set_changes_no_contact(clock: SteppedClock, tmp_p
 
 
 @stepped
+async def test_a_contact_is_on_in_a_touch_only_also_where_many_frames_are_read_together(
+    clock: SteppedClock, tmp_path: Path
+) -> None:
+    async with well(clock, tmp_path, "stepped-k", PRESS) as live:
+        await clock.sleep(2.0)
+        publisher = live.daemon.publisher
+        put_contact, put_touch = publisher.put_contact, publisher.put_touch
+        touched: set[int] = set()
+        said: list[tuple[ContactState, bool]] = []
+
+        def note_contact(part: str, state: ContactState) -> None:
+            if part == "left_hand":
+                said.append((state, bool(touched)))
+            put_contact(part, state)
+
+        def note_touch(event: Touch) -> None:
+            if event.event == "end":
+                touched.discard(event.id)
+            else:
+                touched.add(event.id)
+            put_touch(event)
+
+        publisher.put_contact = note_contact  # type: ignore[method-assign]
+        publisher.put_touch = note_touch  # type: ignore[method-assign]
+        for _ in range(40):
+            clock.advance(0.31)
+            await clock.sleep(0.06)
+        assert ("ON", True) in said
+        assert ("ON", False) not in said
+
+
+@stepped
 async def test_a_board_has_its_time_before_it_is_called_absent(
     clock: SteppedClock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
