@@ -140,8 +140,8 @@ MUTANTS = [
     Mutant(
         "a zero that a board took while nobody received it is not recognised",
         "processing/core.py",
-        "        if zeroed:\n            self.rezero(sweep.board)\n            return\n",
-        "",
+        "        if zeroed:\n",
+        "        if False:\n",
         DEMO,
     ),
     Mutant(
