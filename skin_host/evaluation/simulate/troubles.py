@@ -278,8 +278,8 @@ def _emulated(
             bound_s, shows = _until_damage_shows_s(world, bus, value), _rests(world, bus)
         elif name == "jittered_period":
             shows = _scatters(world, board)
-        elif name == "temperature_step" and value is not None:
-            shows = _differs_from_a_load(world) if value > 0.0 else _is_measured(world)
+        elif name == "temperature_step" and value is not None and value > 0.0:
+            shows = _differs_from_a_load(world)
         is_sure = (value is None or abs(value) >= sure) and bound_s < math.inf
         return Trouble(
             name,
@@ -333,15 +333,6 @@ def _differs_from_a_load(world: World) -> Callable[[], bool]:
         return any(thermal[part].any() or enough_rest(rests[part], usable[part]) for part in parts)
 
     return differs
-
-
-def _is_measured(world: World) -> Callable[[], bool]:
-    """Return a function: whether there is a temperature pad.
-
-    Without one, baselines follow pads that read too little within two seconds: nothing stays off.
-    """
-    measured = bool((world.layout.pad_kind == PadKind.THERMAL).any())
-    return lambda: measured
 
 
 def _until_damage_shows_s(world: World, bus: str, share: float) -> float:
