@@ -99,6 +99,10 @@ class Sweep(NamedTuple):
     crowded: bool = False
 
 
+#: What is stamped so much earlier than its sweep's first frame came after the clock was set back.
+_SET_BACK_NS = 100_000_000
+
+
 class Assembled(NamedTuple):
     """Sweeps and answers from the frames of a batch.
 
@@ -374,9 +378,10 @@ class Assembler:
                 t_ns = seconds * NS_PER_S + nanoseconds
                 if place == state.last_place and self._is_doubled(state, bit, payload, t_ns):
                     continue
-                if (bit & state.missing and t_ns <= state.certain_until_ns) or self._belongs(
-                    state, bit, t_ns, sweeps
-                ):
+                since_ns = state.first_ns - _SET_BACK_NS
+                if (
+                    bit & state.missing and since_ns <= t_ns <= state.certain_until_ns
+                ) or self._belongs(state, bit, t_ns, sweeps):
                     if state.came is not None:
                         head = heads[(at - 1) * HEAD_BYTES : at * HEAD_BYTES]
                         state.came.append((head, place, state.missing))
@@ -505,9 +510,11 @@ class Assembler:
         seconds, nanoseconds, _, _, _, payload = form.unpack_from(text, end - size)
         last_ns = seconds * NS_PER_S + nanoseconds
         if done:
-            if last_ns > state.certain_until_ns or len(state.begun) != done * size:
-                return 0
             first_ns = state.first_ns
+            if not first_ns - _SET_BACK_NS <= last_ns <= state.certain_until_ns:
+                return 0
+            if len(state.begun) != done * size:
+                return 0
         else:
             seconds, nanoseconds, *_ = form.unpack_from(text, begin)
             first_ns = seconds * NS_PER_S + nanoseconds
@@ -596,7 +603,7 @@ class Assembler:
         size = records.form.size
         last = records.form.unpack_from(records.octets.data, (at + n - 1) * size)
         t_ns = last[0] * NS_PER_S + last[1]
-        if t_ns > state.certain_until_ns:
+        if not state.first_ns - _SET_BACK_NS <= t_ns <= state.certain_until_ns:
             return 0
         payload = records.octets[at : at + n, records.head + HEAD_BYTES : size].tobytes()
         places = order.places[done : done + n]
@@ -630,6 +637,7 @@ class Assembler:
             state.awaited & ~state.missing & bit
             or t_ns - state.last_ns > state.pause_ns
             or t_ns - state.first_ns > state.close_ns
+            or t_ns < state.first_ns - _SET_BACK_NS
         ):
             self._close(state, sweeps)
         if not bit & state.awaited:
@@ -640,13 +648,14 @@ class Assembler:
             if state.missing:
                 state.missing |= both
         if not state.missing:
-            if not bit & state.sent and t_ns - state.sent_first_ns <= state.pause_ns:
+            since_sent_ns = t_ns - state.sent_first_ns
+            if not bit & state.sent and -_SET_BACK_NS <= since_sent_ns <= state.pause_ns:
                 # Its sweep was returned without it: the triangle was not awaited, or the frame was
                 # held up for longer than a sweep is waited for.
                 self.counters.late += 1
                 state.lone &= ~(bit << TRIANGLES | bit >> TRIANGLES)
                 return False
-            if bit & state.sent and 0 < 2 * (t_ns - state.sent_first_ns) < state.period_ns:
+            if bit & state.sent and 0 < 2 * since_sent_ns < state.period_ns:
                 state.crowded = True
             if state.lone:
                 self._count_lone(state)

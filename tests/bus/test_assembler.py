@@ -147,6 +147,32 @@ def test_halves_of_different_periods_are_never_paired():
     assert [sweep.present for sweep in sweeps] == [0b0111, 0b0111]
 
 
+@pytest.mark.parametrize("together", [False, True])
+def test_halves_from_before_and_after_a_clock_was_set_back_are_never_paired(
+    together: bool,
+) -> None:
+    """The end of a sweep is lost, and the beginning of the next."""
+    assembler = make("0")
+    first, second, third = (values(1, seed) for seed in (1, 2, 3))
+    known = [frame for i in range(20) for frame in frames(values(1, 10 + i), i * PERIOD)]
+    feed(assembler, known)
+    t_ns = 20 * PERIOD
+    before = frames(first, t_ns)[:1]
+    after = frames(second, t_ns + PERIOD - 2_000 * MS)[1:]
+    last = frames(third, t_ns + 2 * PERIOD - 2_000 * MS)
+    sweeps = []
+    for batch in [before + after + last] if together else [before, after, last]:
+        sweeps += feed(assembler, batch)
+    mixed = np.concatenate([first[0, :7], second[0, 7:]])
+    assert sweeps
+    assert not any((sweep.raw[0] == mixed).all() for sweep in sweeps)
+    assert (sweeps[-1].raw[0] == third[0]).all()
+    counters = assembler.counters
+    assert counters.frames == 2 * sum(s.present.bit_count() for s in sweeps) + 40 + (
+        counters.halves + counters.late + counters.doubled
+    )
+
+
 def test_a_slot_that_comes_twice_starts_a_new_sweep():
     # The boards of one period run together with those of the next: a reader that was late.
     first = frames(values(4, 1), PERIOD, spacing_ns=10)[:-1]
