@@ -569,9 +569,9 @@ class Promises:
             self.kept = len(self._calibrations) - 1
 
     def _note_calibration(self, name: str) -> None:
-        if name in self._calibrations:
-            return
-        self._calibrations.append(name)
+        # Calibrations of the same content, of boards that are not received, have the same name.
+        if self._calibrations[-1:] != [name]:
+            self._calibrations.append(name)
 
     def started(self, life: Life) -> None:
         """A daemon has started, with the calibration that it found."""
@@ -581,7 +581,7 @@ class Promises:
         kept = self._calibrations[self.kept]
         if found is None:
             self.break_(f"calibration {kept} was kept, and there is none at the next start")
-        elif found.id in self._calibrations[: self.kept]:
+        elif found.id in set(self._calibrations) - set(self._calibrations[self.kept :]):
             self.break_(f"calibration {kept} was kept, and the next start has {found.id}")
         elif found.id not in self._calibrations:
             self._note_calibration(found.id)
