@@ -648,14 +648,14 @@ class Assembler:
             if state.missing:
                 state.missing |= both
         if not state.missing:
-            since_sent_ns = t_ns - state.sent_first_ns
-            if not bit & state.sent and -_SET_BACK_NS <= since_sent_ns <= state.pause_ns:
+            since_ns = t_ns - state.sent_first_ns
+            if not bit & state.sent and -_SET_BACK_NS <= since_ns <= state.pause_ns:
                 # Its sweep was returned without it: the triangle was not awaited, or the frame was
                 # held up for longer than a sweep is waited for.
                 self.counters.late += 1
                 state.lone &= ~(bit << TRIANGLES | bit >> TRIANGLES)
                 return False
-            if bit & state.sent and 0 < 2 * since_sent_ns < state.period_ns:
+            if bit & state.sent and 0 < 2 * (t_ns - state.sent_first_ns) < state.period_ns:
                 state.crowded = True
             if state.lone:
                 self._count_lone(state)
