@@ -55,6 +55,8 @@ _SMALLEST_DLC_B = 6
 #: Fewer frames are taken one by one: that costs no more. At a batch's end any number is a run, so
 #: that the rest of the sweep, with which the next batch begins, is one.
 _SHORTEST_RUN = 5
+#: What is stamped so much earlier than its sweep's first frame came after the clock was set back.
+_SET_BACK_NS = 100_000_000
 #: Where a frame's head has its length.
 _DLC_AT = 4
 #: Up to here heads identify a frame; then follows what nobody reads, and the header.
@@ -97,10 +99,6 @@ class Sweep(NamedTuple):
     t_ns: int
     missed: int
     crowded: bool = False
-
-
-#: What is stamped so much earlier than its sweep's first frame came after the clock was set back.
-_SET_BACK_NS = 100_000_000
 
 
 class Assembled(NamedTuple):

@@ -90,9 +90,8 @@ class BoardRecord:
         before, self.claim = self.claim, (answer, self.asked)
         if before is None or before[0] != answer:
             return False
-        if before[1] == self.asked:  # The same frame may have come twice.
-            return self.claims
-        return True
+        # The same frame may have come twice.
+        return self.claims or before[1] != self.asked
 
     def disclaim(self) -> None:
         """That answer is not valid any more."""

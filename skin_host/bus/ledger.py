@@ -35,9 +35,9 @@ STALE_INTERVALS_NS = 1_000_000_000
 #: Triangles are missing after this many sweeps in a row: single frames get lost and sweeps get cut.
 MISSING_SWEEPS = 5
 #: An MTB3 that zeroes itself, after five bad readings, sends nothing for four periods. It times out
-#: no earlier than after the first number of them: to query it then would stop it. The second one of
-#: sweeps is missed at least.
+#: no earlier than after this many: to query it then would stop it.
 MTB3_PERIODS = 6.0
+#: So many of its sweeps are missed then.
 ZEROING_SWEEPS = 3
 #: A period that differs by more than this share is not the one that was set.
 WRONG_PERIOD = 0.25

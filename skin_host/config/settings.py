@@ -330,6 +330,8 @@ def _check_references(path: Path, settings: Settings) -> None:
     def wrong(where: str, what: str) -> ConfigurationError:
         return ConfigurationError(f"{path}: {where}: {visible(what)}")
 
+    if (what := wrong_topic(settings.mqtt.base)) is not None:
+        raise wrong("mqtt.base", what)
     addresses: dict[tuple[str, int], str] = {}
     boards: list[tuple[str, str, Board | Fingertip]] = [
         *((f"boards.{name}", f'board "{name}"', board) for name, board in settings.boards.items()),
@@ -378,8 +380,6 @@ def _check_references(path: Path, settings: Settings) -> None:
 
 def _check_fingertips(settings: Settings, wrong: Callable[[str, str], ConfigurationError]) -> None:
     nodes = {part.node for part in settings.parts.values()}
-    if (what := wrong_topic(settings.mqtt.base)) is not None:
-        raise wrong("mqtt.base", what)
     for name, tip in settings.fingertips.items():
         where = f"fingertips.{name}"
         if name in settings.parts or name == "nodes":

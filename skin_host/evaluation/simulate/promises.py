@@ -450,7 +450,7 @@ class Promises:
         for (board, triangle), since_ns in self._blind_since.items():
             if self._now_ns() - since_ns < NS:
                 continue
-            taxels = self._taxels(board, triangle)
+            taxels = self._world.taxels((board, triangle))
             taxels = taxels[(taxels >= part.start) & (taxels < part.stop)] - part.start
             if frame.valid[taxels].any():
                 self.break_(f"{name}: triangle {board}/{triangle} is valid, and has no chip")
@@ -682,13 +682,6 @@ class Promises:
         """Return when any triangle of a part was last received, the one longest ago (ns)."""
         cables = self._world.cables
         return min(int(cables[bus].read_ns[ids].min()) for bus, ids in self._ids[part])
-
-    def _taxels(self, board: str, triangle: int) -> NDArray[np.intp]:
-        layout = self._world.layout
-        number = next(i for i, one in enumerate(layout.boards) if one.name == board)
-        row = layout.boards[number].taxel_index[triangle]
-        taxels: NDArray[np.intp] = row[row >= 0].astype(np.intp)
-        return taxels
 
     def sample(self) -> None:
         """Compare what was reported last with the truth."""

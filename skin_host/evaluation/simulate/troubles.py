@@ -573,10 +573,8 @@ def damaged_set_up(world: World, place: Triangle) -> Trouble:
     Bytes do not show which pads it measures, and its board writes its set-up after power-up only.
     """
     name, number = place
-    board = next(one for one in world.layout.boards if one.name == name)
-    taxels = board.taxel_index[number]
     spoiled = np.zeros(world.layout.n_taxels, np.bool_)
-    spoiled[taxels[taxels >= 0]] = True
+    spoiled[world.taxels(place)] = True
     return Trouble(
         "damaged_set_up",
         f"damaged_set_up board={name} triangle={number}",

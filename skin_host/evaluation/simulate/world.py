@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from emulator.boards.mtb4 import POWER_CONTROL
 from emulator.probes.scene import Place, Probe, Scene
@@ -166,6 +167,14 @@ class World:
             self.cables[name].sleep_through(batch)
         self.slept_ns = self.robot.t_ns - self.clock.monotonic_ns()
         self.clock.set(seconds)
+
+    def taxels(self, place: Triangle) -> NDArray[np.intp]:
+        """Return the taxels [m] of a triangle."""
+        name, number = place
+        board = next(one for one in self.layout.boards if one.name == name)
+        row = board.taxel_index[number]
+        found: NDArray[np.intp] = row[row >= 0].astype(np.intp)
+        return found
 
     def damaged_set_ups(self) -> set[Triangle]:
         """Return the triangles, each by its board, whose chip does not measure each pad alone,
