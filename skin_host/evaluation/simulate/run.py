@@ -21,7 +21,8 @@ from skin_host.config.settings import Settings
 from skin_host.errors import ConfigurationError
 from skin_host.evaluation.simulate.accusations import BACK_NS, NOISE, QUIET_NS, STARTED_NS
 from skin_host.evaluation.simulate.disk import PowerCut
-from skin_host.evaluation.simulate.promises import SAMPLE_S, Promises
+from skin_host.evaluation.simulate.promises import Promises
+from skin_host.evaluation.simulate.promises.limits import SAMPLE_S
 from skin_host.evaluation.simulate.trace import Before
 from skin_host.evaluation.simulate.troubles import ACTS, KINDS, WIRING, Trouble, act
 from skin_host.evaluation.simulate.world import Life, Spot, World
@@ -557,10 +558,10 @@ class _Run:
     async def _fail_after_writing(self) -> None:
         """The power fails as soon as the daemon has reported that a calibration is kept."""
         clock = self.world.clock
-        kept = self._promises.kept
+        kept = self._promises.subscribers.kept
         self._ask("calibrate", '{"seconds": 0.5}')
         end_s = clock.monotonic_s() + 5.0
-        while self._promises.kept == kept and clock.monotonic_s() < end_s:
+        while self._promises.subscribers.kept == kept and clock.monotonic_s() < end_s:
             await clock.sleep(0.1)
         self.result.deaths += 1
         self._kill(power=True)

@@ -233,7 +233,7 @@ def test_doubts_that_the_disk_refused_are_lost_with_a_daemon_that_was_asked_to_e
         await world.end()
         promises.over(life, whole=True)
         part = world.layout.part(spot.part)
-        assert promises._exempt[part.start : part.stop].any() == refused
+        assert promises.excuses.exempt[part.start : part.stop].any() == refused
         await pressing
 
     with world.clock.runner() as runner:
@@ -558,8 +558,8 @@ def test_what_is_retained_just_before_a_stall_is_at_the_broker_after_it(world: W
         await world.clock.sleep(8.0)
         promises.sample()
         promises.contacts()
-        put_ns = max(put_ns for _, put_ns in promises._said.values())
-        while put_ns == max(put_ns for _, put_ns in promises._said.values()):
+        put_ns = max(put_ns for _, put_ns in promises.subscribers.said.values())
+        while put_ns == max(put_ns for _, put_ns in promises.subscribers.said.values()):
             await world.clock.sleep(0.0005)
         stall = KINDS["stall"](world, random.Random(7), True)
         assert stall.about == "stall 4.72 s"
@@ -786,16 +786,16 @@ def test_a_chip_whose_set_up_was_damaged_is_not_judged_until_its_board_was_off_a
         promises.calibrated_at_rest()
         assert (board.name, 14) in world.damaged_set_ups()
         assert world.unpowered == {board.name}
-        assert promises._spoiled()[taxels].all()
+        assert promises.excuses.spoiled()[taxels].all()
         assert promises.accusations._has_cause("taxel_stuck", "left_forearm")
         world.robot.inject(Fault(name="board_reset", board=board.name))
         await world.clock.sleep(8.0)
         promises.sample()
         assert not world.damaged_set_ups()
-        assert promises._spoiled()[taxels].all()
+        assert promises.excuses.spoiled()[taxels].all()
         promises.calibrated_at_rest()
         await world.clock.sleep(0.1)
-        assert not promises._spoiled()[taxels].any()
+        assert not promises.excuses.spoiled()[taxels].any()
         life.kill()
 
     with world.clock.runner() as runner:
