@@ -137,7 +137,7 @@ class Daemon:
             clock=clock,
             connect=connect,
         )
-        self.publisher.put_info(self._info())
+        self._put_info(self._info())
         self._contacts = {i: PartContact(layout, i) for i in self.engine.parts}
         self._use_usable()
         for i in self.engine.parts:
@@ -250,7 +250,7 @@ class Daemon:
                 self._keeping = asyncio.create_task(keeping, name="keep zeros")
                 await self._kept()
             await self._save_calibration()
-            self.publisher.put_info(await self.clock.in_thread(self._info))
+            self._put_info(await self.clock.in_thread(self._info))
             return found
 
     def disable(self, part: int) -> None:
@@ -302,7 +302,7 @@ class Daemon:
         self._swap(settings, layout)
         log.info("%s read again; the boards are set up again", self._configuration)
         await self.configure()
-        self.publisher.put_info(await self.clock.in_thread(self._info))
+        self._put_info(await self.clock.in_thread(self._info))
 
     def keep(self, state: NodeState) -> None:
         """Write what operators changed to the state directory.
@@ -618,6 +618,10 @@ class Daemon:
             f"{rates['frames_hz']:.0f} frames/s, {rates['sweeps_hz']:.1f} sweeps/s, "
             f"{dropped} dropped, {faults} faults, broker {broker}"
         )
+
+    def _put_info(self, info: NodeInfo) -> None:
+        names = {*self.settings.parts, *self.settings.fingertips}
+        self.publisher.put_info(info, names.difference(info.parts, info.fingertips))
 
     def _info(self) -> NodeInfo:
         found = self.engine.calibration

@@ -331,11 +331,19 @@ def discovery(prefix: str, topics: Topics, info: NodeInfo) -> dict[str, bytes]:
         "origin": {"name": "skin-host", "sw_version": info.version},
     }
     return {
-        f"{prefix}/binary_sensor/{name}/config": msgspec.json.encode(
-            {"unique_id": name} | message | common
-        )
+        _discovery_topic(prefix, name): msgspec.json.encode({"unique_id": name} | message | common)
         for name, message in messages.items()
     }
+
+
+def discovery_topics(prefix: str, topics: Topics, part: str) -> list[str]:
+    """Return the topics that announce a part or fingertip."""
+    skin = _identifier(topics.base)
+    return [_discovery_topic(prefix, f"{skin}_{part}_{what}") for what in ("contact", "problem")]
+
+
+def _discovery_topic(prefix: str, name: str) -> str:
+    return f"{prefix}/binary_sensor/{name}/config"
 
 
 def _identifier(base: str) -> str:

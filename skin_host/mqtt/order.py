@@ -11,9 +11,13 @@ order:
 Runs and connections have rising numbers: nanoseconds since 1970, by the clock of the node. Those of
 messages rise with the nanoseconds since the connection began: a subscriber that sees the distance
 to its own clock grow knows that messages come late.
+
+The status has another one, `parts`: of which parts the node publishes. The next start of the node
+finds it at the broker, and with it what an earlier configuration left there.
 """
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 from paho.mqtt.packettypes import PacketTypes
@@ -23,11 +27,15 @@ from skin_host.mqtt.connection import Will
 
 STAMP = "stamp"
 RUN = "run"
+PARTS = "parts"
+#: Names beyond this length are left out: a message has 4 KiB of properties.
+MAX_PARTS_BYTES = 3000
 #: Longer numbers are not nanoseconds.
 _MAX_DIGITS = 19
 #: A run that comes after a later one than this would have a longer number.
 _LAST_RUN = 10**_MAX_DIGITS - 10**9
 _ONLINE, _LAST_WILL = 0, 1
+_NAME = re.compile(r"[a-z0-9_-]{1,64}")
 
 
 class Stamp(NamedTuple):
@@ -112,12 +120,22 @@ def put_stamp(properties: Properties | None, stamp: Stamp) -> None:
         properties.UserProperty = (STAMP, f"{stamp.connection}.{stamp.message}")
 
 
-def last_will(topic: str, payload: bytes, stamp: Stamp | None) -> Will:
+def put_parts(properties: Properties | None, parts: Iterable[str]) -> None:
+    """Add to a status of which parts the node publishes; MQTT 3.1.1 has no place for it."""
+    names = ",".join(parts)
+    if len(names) > MAX_PARTS_BYTES:
+        names = names[:MAX_PARTS_BYTES].rpartition(",")[0]
+    if properties is not None and names:
+        properties.UserProperty = (PARTS, names)
+
+
+def last_will(topic: str, payload: bytes, stamp: Stamp | None, parts: Iterable[str] = ()) -> Will:
     """Return the broker's message for a node that vanishes; without a stamp for MQTT 3.1.1."""
     properties = None
     if stamp is not None:
         properties = Properties(PacketTypes.WILLMESSAGE)  # type: ignore[no-untyped-call]
         put_stamp(properties, stamp)
+        put_parts(properties, parts)
     return Will(topic, payload, qos=1, retain=True, properties=properties)
 
 
@@ -131,6 +149,11 @@ def stamp_of(properties: Any) -> Stamp | None:
     text, _, rest = _user_property(properties, STAMP).partition(".")
     connection, message = _number(text), _number(rest)
     return None if connection is None or message is None else Stamp(connection, message)
+
+
+def parts_of(properties: Any) -> set[str]:
+    """Return the parts of which a node published, by its status."""
+    return set(filter(_NAME.fullmatch, _user_property(properties, PARTS).split(",")))
 
 
 def _user_property(properties: Any, name: str) -> str:

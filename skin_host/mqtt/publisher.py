@@ -6,7 +6,7 @@ arrive are sent again. Frames are encoded only while there is a connection.
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import AbstractAsyncContextManager, AbstractContextManager
 from functools import partial
 from pathlib import Path
@@ -38,9 +38,23 @@ from skin_host.mqtt.connection import (
 )
 from skin_host.mqtt.courier import Courier, FrameForm
 from skin_host.mqtt.frames import load_cbor2
-from skin_host.mqtt.info import MAX_PIECES, NodeInfo, discovery, encode_pieces
+from skin_host.mqtt.info import (
+    MAX_PIECES,
+    NodeInfo,
+    discovery,
+    discovery_topics,
+    encode_pieces,
+)
 from skin_host.mqtt.messages import ContactState, encode_contact, encode_health
-from skin_host.mqtt.order import Numbers, last_will, put_run, put_stamp, stamp_of
+from skin_host.mqtt.order import (
+    Numbers,
+    last_will,
+    parts_of,
+    put_parts,
+    put_run,
+    put_stamp,
+    stamp_of,
+)
 from skin_host.mqtt.outbox import Event, Outbox, PublisherCounters
 from skin_host.mqtt.payload import CBOR_TYPE, JSON_TYPE
 from skin_host.mqtt.topics import OFFLINE, ONLINE, PartTopic, Topics
@@ -135,6 +149,13 @@ class Publisher:
         self._last_broker: str | None = None
         self._info: NodeInfo | None = None
         self._pieces = 0
+        #: Parts and fingertips of this node, and those of others in the configuration.
+        self._parts: list[str] = []
+        self._elsewhere: Collection[str] = ()
+        #: What an earlier configuration left at the broker, and the tries that remain.
+        self._left: dict[str, int] = {}
+        self._left_found = asyncio.Event()
+        self._met_status = False
         self._name_taken_until_s = 0.0
         self._was_ended = False
         self._is_brief = False  # the last connection did not last
@@ -184,9 +205,15 @@ class Publisher:
             + (connection.discarded if connection else 0),
         )
 
-    def put_info(self, info: NodeInfo) -> None:
-        """Publish the description of this node; again whenever it changes."""
+    def put_info(self, info: NodeInfo, elsewhere: Collection[str] = ()) -> None:
+        """Publish the description of this node; again whenever it changes.
+
+        Args:
+            info: the description.
+            elsewhere: parts of other nodes of the same configuration.
+        """
         self._info = info
+        self._parts, self._elsewhere = [*info.parts, *info.fingertips], elsewhere
         self._publish_info()
         if self._discovery_prefix is not None:
             for topic, payload in discovery(self._discovery_prefix, self.topics, info).items():
@@ -266,7 +293,7 @@ class Publisher:
                 async with self._connect(
                     self._broker,
                     identifier=self._identifier,
-                    will=last_will(self._status, OFFLINE, stamp),
+                    will=last_will(self._status, OFFLINE, stamp, self._parts),
                     max_packet=MAX_PACKET_BYTES,
                     clock=clock,
                 ) as link:
@@ -329,6 +356,7 @@ class Publisher:
     async def _talk(self, connection: Connection) -> None:
         """Send and listen until the end of the publisher; an error means a lost broker."""
         self._connection = connection
+        self._met_status = False
         # Who sees this node online may ask it at once: it listens first.
         await self._subscribe(connection)
         self._outbox.counters.connected = True
@@ -348,6 +376,7 @@ class Publisher:
                 group.create_task(self._courier.carry(connection)),
                 group.create_task(self._listen(connection)),
                 group.create_task(connection.lost()),
+                group.create_task(self._clear_left(connection)),
             ]
             await self._closing.wait()
             await self._outbox.drained()
@@ -385,6 +414,8 @@ class Publisher:
         properties = message_properties(self._broker, kind)
         is_online = topic == self._status and payload == ONLINE
         put_stamp(properties, self._numbers.online if is_online else self._numbers.state())
+        if topic == self._status:
+            put_parts(properties, self._parts)
         return properties
 
     async def _subscribe(self, connection: Connection) -> None:
@@ -411,6 +442,43 @@ class Publisher:
             if not allowed:
                 _log.warning("broker %s: may not subscribe to %s", self._broker, topic)
 
+    def _note_left(self, parts: set[str]) -> None:
+        """Note the parts of which this node published before, by another configuration."""
+        left = sorted(parts.difference(self._parts)) if self._parts else []
+        self._left |= dict.fromkeys(left, TRIES)
+        self._left_found.set()
+
+    async def _clear_left(self, connection: Connection) -> None:
+        """Take back what an earlier configuration left at the broker: nobody knows what touches a
+        part that this node no longer has.
+        """
+        self._left_found.set()
+        while True:
+            await self._left_found.wait()
+            self._left_found.clear()
+            for part in list(self._left):
+                # A broker may end the connection over it.
+                self._left[part] -= 1
+                if self._left[part] < 0:
+                    del self._left[part]
+                    continue
+                for topic, payload in self._states_left(part).items():
+                    properties = self._state_properties(topic, payload)
+                    sent = connection.send(
+                        topic, payload, qos=1, retain=True, properties=properties
+                    )
+                    await within(TIMEOUT_S, sent)
+                del self._left[part]
+
+    def _states_left(self, part: str) -> dict[str, bytes]:
+        states = {self.topics.part("contact", part): encode_contact("UNKNOWN")}
+        if part not in self._elsewhere:  # no other node publishes these
+            gone = [self.topics.part("health", part)]
+            if self._discovery_prefix is not None:
+                gone += discovery_topics(self._discovery_prefix, self.topics, part)
+            states |= dict.fromkeys(gone, b"")
+        return states
+
     async def _listen(self, connection: Connection) -> None:
         async for message in connection.messages:
             self._take(message)
@@ -422,6 +490,9 @@ class Publisher:
             # The last will of our earlier connection can arrive late, but we are online.
             if payload != ONLINE:
                 self._outbox.put_state(self._status, ONLINE)
+            if not self._met_status:  # the stored one; others may come from anybody
+                self._met_status = True
+                self._note_left(parts_of(message.properties))
             stamp = stamp_of(message.properties)
             if message.retain and stamp is not None and self._numbers.overtake(stamp):
                 self._number_messages()
