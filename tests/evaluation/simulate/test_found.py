@@ -558,8 +558,8 @@ def test_what_is_retained_just_before_a_stall_is_at_the_broker_after_it(world: W
         await world.clock.sleep(8.0)
         promises.sample()
         promises.contacts()
-        put_ns = max(put_ns for _, put_ns in promises.subscribers.said.values())
-        while put_ns == max(put_ns for _, put_ns in promises.subscribers.said.values()):
+        put_ns = max(put_ns for _, put_ns in promises.subscribers.wanted.values())
+        while put_ns == max(put_ns for _, put_ns in promises.subscribers.wanted.values()):
             await world.clock.sleep(0.0005)
         stall = KINDS["stall"](world, random.Random(7), True)
         assert stall.about == "stall 4.72 s"

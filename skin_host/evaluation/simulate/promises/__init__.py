@@ -4,7 +4,7 @@ The daemon's outputs are looked at where they leave the core (every frame, touch
 health record) and where subscribers get them from the broker. The first promise that is broken
 ends the run.
 
-- `skin`: frames and touches say what presses the skin
+- `skin`: frames and touches report what presses the skin
 - `fingertips`: so do those on force/torque boards
 - `received`: what is valid was received lately, in one sweep
 - `subscribers`: what the broker keeps and subscribers get is what the daemon put

@@ -8,7 +8,7 @@ from skin_host.evaluation.simulate.world import Life, World
 
 
 class Accounts:
-    """What one life of the daemon put, and what its counters must say of it."""
+    """What one life of the daemon put, and what its counters must show of it."""
 
     def __init__(self, world: World) -> None:
         self._world = world

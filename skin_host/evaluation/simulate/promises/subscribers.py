@@ -25,7 +25,7 @@ class Subscribers:
 
     Attributes:
         counts: by topic the events that a subscriber got in this life, by their counts.
-        said: by retained topic what the daemon put last, and when.
+        wanted: by retained topic what the daemon put last, and when.
         contacts: what each topic of a contact is of.
         stalled_ns: when the computer last began to stall.
         kept: number of the last calibration that the daemon reported as kept, -1 before.
@@ -35,7 +35,7 @@ class Subscribers:
         self._world = world
         self._parts = {part.name: part for part in world.layout.parts}
         self.counts: dict[str, dict[int, bytes]] = {}
-        self.said: dict[str, tuple[bytes, int]] = {}
+        self.wanted: dict[str, tuple[bytes, int]] = {}
         self.contacts: dict[str, str] = {}
         self.stalled_ns = LONG_AGO_NS
         self.kept = -1
@@ -51,7 +51,7 @@ class Subscribers:
     def begin(self, life: Life) -> None:
         """A life begins."""
         self.counts.clear()
-        self.said.clear()
+        self.wanted.clear()
         topics = life.daemon.publisher.topics
         self.contacts = {
             topics.part("contact", name): name
@@ -62,9 +62,9 @@ class Subscribers:
 
     def note_retained(self, topic: str, payload: bytes) -> None:
         """The daemon puts what the broker is to keep."""
-        before = self.said.get(topic)
+        before = self.wanted.get(topic)
         if before is None or before[0] != payload:
-            self.said[topic] = payload, self._now_ns()
+            self.wanted[topic] = payload, self._now_ns()
 
     def note_blank(self, part: str, *, blank: bool) -> None:
         """A frame of a part has no valid taxel, or has one."""
@@ -145,7 +145,7 @@ class Subscribers:
         """Return a topic of which the broker keeps something else than the daemon put."""
         assert self._connected_ns is not None
         now_ns = self._now_ns()
-        for topic, (payload, put_ns) in self.said.items():
+        for topic, (payload, put_ns) in self.wanted.items():
             # What was put just before a stall leaves after it.
             if now_ns - max(put_ns, self._connected_ns, self.stalled_ns) < RETAINED_NS:
                 continue

@@ -1,4 +1,4 @@
-"""What presses a pad when its board takes a zero: if nobody felt it begin, it is in that zero."""
+"""What presses a pad when its board is zeroed: if nobody felt it begin, it is in the zero."""
 
 import numpy as np
 from numpy.typing import NDArray
