@@ -21,7 +21,8 @@ from emulator.probes.pads import UNIT_FF
 from emulator.probes.scene import Fault
 from emulator.probes.skin import Skin
 from emulator.wire import Wire
-from skin_host.errors import ConfigurationError
+from skin_host.config.explain import explain
+from skin_host.errors import ConfigurationError, nearest
 from skin_host.layout import TAXELS_PER_TRIANGLE
 
 #: Ends a fault. Made of parts that a saved state can hold, see `emulator.state`.
@@ -84,7 +85,7 @@ def parse(text: str) -> Fault:
     try:
         fault = msgspec.convert(fields, Fault, strict=False)
     except msgspec.ValidationError as error:
-        raise ConfigurationError(f'"{text}": {error}') from None
+        raise ConfigurationError(f'"{text}": {explain(fields, error, Fault, {})}') from None
     check(fault)
     return fault
 
@@ -97,7 +98,9 @@ def check(fault: Fault) -> None:
     """
     kind = KINDS.get(fault.name)
     if kind is None:
-        raise ConfigurationError(f'name: no fault "{fault.name}"; there are: {", ".join(KINDS)}')
+        near = nearest(fault.name, KINDS)
+        meant = f"meant {near}?" if near else f"there are: {', '.join(KINDS)}"
+        raise ConfigurationError(f'name: no fault "{fault.name}"; {meant}')
     for key in kind.needs:
         if getattr(fault, key) is None:
             raise ConfigurationError(f'{key}: missing; fault "{fault.name}" needs it')

@@ -12,11 +12,12 @@
     |- BrokerError            the MQTT broker: refused us, or sent an invalid answer
 
 A message is one line: what, where, the value seen, the value wanted, and the command that helps.
-The command line prints it (`visible`) and exits with `exit_status`. `required` imports an extra, or
-raises.
+The command line prints it (`visible`) and exits with `exit_status`. `nearest` is the word that was
+probably meant. `required` imports an extra, or raises.
 """
 
 import importlib
+from collections.abc import Iterable
 from typing import Any
 
 
@@ -73,6 +74,15 @@ def visible(text: str, longest: int = 1000) -> str:
     if shown.isprintable():
         return shown
     return "".join(one if one.isprintable() else repr(one)[1:-1] for one in shown)
+
+
+def nearest(typed: str, known: Iterable[str]) -> str | None:
+    """Return which of the known words was probably meant, if any."""
+    import difflib
+
+    words = {word.strip("-"): word for word in known}
+    near = difflib.get_close_matches(typed.strip("-"), words, n=1, cutoff=0.65)
+    return words[near[0]] if near else None
 
 
 def required(module: str, what: str, extra: str) -> Any:

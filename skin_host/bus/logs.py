@@ -460,7 +460,8 @@ def _check(path: Path, suffixes: list[str]) -> None:
 
         known = sorted(can.io.player.MESSAGE_READERS)
         if not any(suffix in known for suffix in suffixes[-2:]):
-            raise LogError(f"{path}: unknown format of file name; known are {', '.join(known)}")
+            names = ", ".join(sorted({*known, ".mcap"}))
+            raise LogError(f"{path}: unknown format of file name; known are {names}")
     open_recording(path).close()
 
 

@@ -30,7 +30,10 @@ from skin_host.cli import (
     without_robot,
 )
 from skin_host.daemon import service
-from skin_host.errors import SkinError, visible
+from skin_host.errors import SkinError, nearest, visible
+
+#: Of more choices only the probable one is named.
+MANY = 8
 
 
 class _Parser(argparse.ArgumentParser):
@@ -44,25 +47,30 @@ class _Parser(argparse.ArgumentParser):
         if choice is not None:
             typed, known = choice[1], re.findall(r"[\w-]+", choice[2])
         elif unknown is not None:
-            typed, known = unknown[1], self._options_of_all()
-        import difflib
-
-        near = difflib.get_close_matches(typed, known, n=1)
-        message += f"; meant {near[0]}?" if near else ""
+            typed = unknown[1]
+            known = [option for action in self._actions for option in action.option_strings]
+        near = nearest(typed, known)
+        if near and choice is not None and len(known) > MANY:
+            message = message.replace(choice[0], f"no '{typed}'")
+        message += f"; meant {near}?" if near else ""
         print(f"{self.prog}: {visible(message)} (see `{self.prog} --help`)", file=sys.stderr)
         raise SystemExit(2)
 
-    def _options_of_all(self) -> list[str]:
-        """The options of this command and of its sub-commands."""
-        own = [option for action in self._actions for option in action.option_strings]
-        inner = [
-            option
-            for action in self._actions
-            if isinstance(action, argparse._SubParsersAction)
-            for parser in action.choices.values()
-            for option in parser._options_of_all()
-        ]
-        return own + inner
+    def read(self, words: Sequence[str]) -> argparse.Namespace:
+        """Parse a command line; what a command does not know is that command's mistake."""
+        if words[:1] == ["help"]:
+            words = [*words[1:], "--help"]
+        arguments, unknown = self.parse_known_args(words)
+        if unknown:
+            command = self._commands().choices[arguments.command]
+            command.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return arguments
+
+    def _commands(self) -> "argparse._SubParsersAction[_Parser]":
+        (commands,) = (
+            action for action in self._actions if isinstance(action, argparse._SubParsersAction)
+        )
+        return commands
 
 
 def _complain(line: str) -> None:
@@ -97,7 +105,7 @@ def _reader_left() -> bool:
     return bool(poll.poll(0))
 
 
-def build_parser() -> argparse.ArgumentParser:
+def build_parser() -> _Parser:
     """The parser of the whole command line."""
     parser = _Parser(
         prog="skin",
@@ -124,7 +132,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     emulator_path.provide()
     parser = build_parser()
     completion.complete_if_asked(parser)
-    arguments = parser.parse_args(argv)
+    arguments = parser.read(sys.argv[1:] if argv is None else list(argv))
     name = f"skin {arguments.command}"
     try:
         status: int = arguments.run(arguments)

@@ -19,6 +19,7 @@ from skin_host.cli.common import (
     print_json,
     set_up_logging,
     warn,
+    warn_of_virtual,
 )
 from skin_host.config.relaxation import FITTED
 from skin_host.errors import RequestError
@@ -111,6 +112,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     if arguments.relaxation is not None or arguments.pressure is not None:
         return _relaxation(arguments) if arguments.relaxation is not None else _pressure(arguments)
     settings, layout = load_skin(arguments.config)
+    warn_of_virtual(settings)
     parts = parts_of(layout, arguments.node)
     path = arguments.output or calibration_path(settings, arguments.node)
     refuse_newer(path, calibrations.SCHEMA, "calibration")

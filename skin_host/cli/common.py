@@ -140,6 +140,17 @@ def load_skin(config: Path) -> "tuple[Settings, Layout]":
     return layout.load_skin(config)
 
 
+def warn_of_virtual(settings: "Settings") -> None:
+    """A bus that ends with its process has nobody else on it, which looks like dead boards."""
+    for name, bus in settings.buses.items():
+        if bus.interface == "virtual":
+            logging.getLogger(__name__).warning(
+                'bus %s: interface "virtual" is of this process alone, and no other program is on '
+                "it; use udp_multicast or vcan (docs/tutorial.md)",
+                name,
+            )
+
+
 def print_json(document: object) -> None:
     print(json.dumps(document, indent=2, ensure_ascii=False))
 

@@ -24,6 +24,7 @@ from skin_host.cli.common import (
     print_json,
     run,
     set_up_logging,
+    warn_of_virtual,
 )
 from skin_host.daemon import service
 from skin_host.errors import OtherSkinError, RequestError, SkinError
@@ -100,7 +101,7 @@ COMMANDS = {
     "configure": "send the boards their set-up again",
     "disable": "publish nothing of a part",
     "enable": "publish a part again",
-    "raw": "publish raw bytes with the frames for a while",
+    "raw": "publish raw bytes with the frames for --seconds, without it no longer",
     "record": "record the CAN frames",
     "reload": "read the configuration file again",
     "status": "health of every part",
@@ -176,6 +177,8 @@ def _run(arguments: argparse.Namespace) -> int:
             raise
     if arguments.calibrate:
         calibration = None  # gains come from the file later
+
+    warn_of_virtual(settings)
 
     async def work(stop: asyncio.Event) -> None:
         daemon = Daemon(

@@ -69,7 +69,7 @@ def add_commands(commands: Commands) -> None:
         "skin plot pressure grasp.mcap grasp.png",
     )
     plot.add_argument("what", choices=("pressure", "map", "calibration"), help="what to draw")
-    _add_recording(plot)
+    _add_recording(plot, "recording, or calibration")
     plot.add_argument("output", metavar="OUTPUT", type=Path, help="file .png, .svg or .pdf")
     plot.add_argument("--part", help="which part, if there are several")
     plot.add_argument("--taxels", type=_numbers, metavar="N,N", help="of the part; the strongest")
@@ -145,8 +145,8 @@ def add_calibration(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_recording(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", metavar="FILE", type=Path, help="recording, or calibration")
+def _add_recording(parser: argparse.ArgumentParser, about: str = "recording") -> None:
+    parser.add_argument("recording", metavar="FILE", type=Path, help=about)
     parser.add_argument("--config", type=Path, help="process the CAN frames of FILE with it")
     add_calibration(parser)
 
@@ -219,7 +219,8 @@ async def _capture(
         sources.append(from_broker())
     if arguments.config is not None:
         sources.append(from_buses())
-    print("recording; end with Ctrl-C", file=sys.stderr)
+    if arguments.seconds is None:
+        print("recording; end with Ctrl-C", file=sys.stderr)
     async with contextlib.AsyncExitStack() as stack:
         stack.callback(stop.set)  # one that fails ends the other
         await asyncio.gather(*sources)

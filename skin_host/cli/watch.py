@@ -1,8 +1,10 @@
 """Commands that subscribe: listen, status, view."""
 
 import argparse
+import contextlib
+import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -16,8 +18,12 @@ from skin_host.cli.common import (
     print_json,
     run,
     set_up_logging,
+    warn,
 )
 from skin_host.errors import visible
+
+if TYPE_CHECKING:
+    from skin_host.client import SkinClient
 
 #: `skin status` looks for the broker for this long; a reachable one answers at once.
 PATIENCE_S = 1.5
@@ -84,10 +90,15 @@ def _listen(arguments: argparse.Namespace) -> int:
 
     from skin_host.cli.lines import event_line, missed_line
     from skin_host.client import SkinClient
+    from skin_host.tasks import cancel
 
     async def work() -> None:
         printed = 0
-        async with SkinClient(arguments.broker, robot=arguments.robot) as skin:
+        async with contextlib.AsyncExitStack() as stack:
+            skin = SkinClient(arguments.broker, robot=arguments.robot)
+            watching = asyncio.create_task(_report_absence(skin, arguments.part))
+            stack.push_async_callback(cancel, watching)
+            await stack.enter_async_context(skin)
             async for event in skin.events(arguments.part):
                 if event.missed:
                     print(missed_line(event, as_json=arguments.json), flush=True)
@@ -105,6 +116,34 @@ def _listen(arguments: argparse.Namespace) -> int:
 
     asyncio.run(work())
     return 0
+
+
+async def _report_absence(skin: "SkinClient", part: str | None) -> None:
+    """Print on stderr, whenever it changes, why no events can come."""
+    import asyncio
+
+    said = ""
+    while True:
+        await asyncio.sleep(1.0)  # what is retained comes soon
+        why = _absence(skin, part)
+        if why != said:
+            if why:
+                warn(f"{why}; waiting")
+            else:
+                print("events can come now", file=sys.stderr)
+            said = why
+
+
+def _absence(skin: "SkinClient", part: str | None) -> str:
+    if not skin.connected:
+        return f"no broker: {skin.last_error}" if skin.last_error else ""
+    if all(node.online is False for node in skin.nodes.values()):
+        return f'no node of robot "{skin.robot}" is online: is `skin run` running?'
+    infos = [node.info for node in skin.nodes.values() if node.info is not None]
+    parts = sorted(name for info in infos for name in [*info.parts, *info.fingertips])
+    if part is not None and parts and part not in parts:
+        return f'robot "{skin.robot}" has no part "{part}"; there are: {", ".join(parts)}'
+    return ""
 
 
 async def health_of_all(broker: str, robot: str | None) -> dict[str, dict[str, Any]]:

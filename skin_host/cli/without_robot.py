@@ -25,6 +25,7 @@ from skin_host.cli.common import (
     run,
     seed_number,
     set_up_logging,
+    warn_of_virtual,
     whole,
 )
 from skin_host.errors import RequestError, visible
@@ -223,6 +224,7 @@ def _emulate(arguments: argparse.Namespace) -> int:
             "channel": arguments.channel or bus.channel,
         }
         settings = changed(settings, {f"buses.{name}": changed(bus, chosen)})
+    warn_of_virtual(settings)
     wanted = settings.buses
     if arguments.i2c:
         only = settings.boards[arguments.board].bus
@@ -348,7 +350,8 @@ def _take_command(
     verb, _, rest = text.partition(" ")
     if verb == "mend":
         if rest not in mends:
-            raise RequestError(f'"{rest}": no such fault is on; there are: {", ".join(mends)}')
+            known = ", ".join(mends) or "none"
+            raise RequestError(f'"{rest}": no such fault is on; there are: {known}')
         mends.pop(rest)()
     elif verb == "ctrl":
         _set_control(model, rest)

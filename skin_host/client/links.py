@@ -32,6 +32,8 @@ SESSION_S = 60
 RETAINED_S = 0.5
 #: The first may take longer: a broker or a network can be slow, and no robot at all is rare.
 FIRST_RETAINED_S = 3.0
+#: So it is known by then which robots there are.
+ROBOT_S = FIRST_RETAINED_S + RETAINED_S + 1.0
 _log = logging.getLogger(__name__)
 
 
@@ -65,6 +67,7 @@ class BrokerLink:
         since_s: when it was made last, by the event loop's clock.
         last_error: why it was lost, or not made.
         failure: why it will not be made, as far as is known, before it was made once.
+        reached: the broker has taken us, whatever came after.
         again: to be set when the wanted topics change.
     """
 
@@ -76,6 +79,7 @@ class BrokerLink:
         self.since_s = 0.0
         self.last_error = ""
         self.failure: SkinError | None = None
+        self.reached = False
         self.again = asyncio.Event()
         self._identifier = identifier
         self._hearer = hearer
@@ -130,6 +134,8 @@ class BrokerLink:
                 self.failure = BrokerError(f"broker {self.broker}: refuses us: {why}")
 
     async def _talk(self, connection: Connection) -> None:
+        self.reached = True
+        self._hearer.note(self)
         await self._hearer.prepare(connection, self.broker)
         async with asyncio.TaskGroup() as group:
             group.create_task(self._keep_subscribed(connection))

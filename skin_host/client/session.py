@@ -11,7 +11,7 @@ from typing import Any, Literal, Self, TypeVar
 from weakref import WeakSet
 
 from skin_host.client.heard import Health, is_online, read
-from skin_host.client.links import RETAINED_S, BrokerLink, only_robot
+from skin_host.client.links import RETAINED_S, ROBOT_S, BrokerLink, only_robot
 from skin_host.client.order import EventOrder, Newest
 from skin_host.client.presence import Contact, Presence
 from skin_host.client.streams import Stream
@@ -274,7 +274,10 @@ class SkinClient:
         self._tasks.append(asyncio.create_task(self._watch(), name="skin client's watch"))
         failure: SkinError | None = None
         try:
-            async with asyncio.timeout(self._patience_s):
+            async with asyncio.timeout(self._patience_s) as waiting:
+                await self._until(lambda: self._is_settled or self._is_asking)
+                if self._is_asking:  # the broker was reached in time; its answer takes longer
+                    waiting.reschedule(_now_s() + max(self._patience_s, ROBOT_S))
                 await self._until(lambda: self._is_settled)
         except TimeoutError:
             if not self.connected:
@@ -296,11 +299,18 @@ class SkinClient:
             return True
         return self.connected and all(link.tried for link in self._links)
 
+    @property
+    def _is_asking(self) -> bool:
+        """Return whether the broker is being asked which robot it knows."""
+        return self._topics is None and any(link.reached for link in self._links)
+
     def _absence(self) -> BrokerError:
         link = next((link for link in self._links if not link.failure), self._links[0])
         why = link.last_error or "it does not answer"
         if link.broker.v5 and "does not answer" in why:
             why += "; if it speaks MQTT 3.1.1 alone, end its URL with ?protocol=3.1.1"
+        if "no broker listens" in why:
+            why += f"; start one, such as `mosquitto -p {link.broker.port}`, or name another"
         return BrokerError(f"broker {self._where}: cannot connect: {why}")
 
     @property
@@ -350,10 +360,14 @@ class SkinClient:
         online = [name for name in known if self.nodes[name].online] or known
         if len(online) == 1:
             return online[0]
-        names = ", ".join(online) or "none"
+        if not online:
+            raise BrokerError(
+                f'broker {self._where}: no node of robot "{self.robot}" is online; '
+                "is `skin run` running?"
+            )
         raise RequestError(
-            f'robot "{self.robot}": wanted one node that is online, there are: {names}; '
-            "name the node"
+            f'robot "{self.robot}": wanted one node that is online, there are: '
+            f"{', '.join(online)}; name the node"
         )
 
     async def _ask(self, node: str, name: str, arguments: dict[str, Any]) -> None:

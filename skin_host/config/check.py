@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from skin_host.config.settings import Settings, format_triangles, skin_hash
-from skin_host.errors import visible
+from skin_host.errors import nearest, visible
 from skin_host.layout import TAXELS_PER_TRIANGLE, BoardLayout, Layout, PadKind
 
 #: Bits of a standard frame of eight bytes with its interframe space: without stuff bits, and with
@@ -70,6 +70,7 @@ def describe(settings: Settings, layout: Layout) -> Record:
         },
         "warnings": [
             *_bus_warnings(buses, {tip.bus for tip in settings.fingertips.values()}),
+            *_interface_warnings(buses),
             *_board_warnings(layout),
             *_part_warnings(layout),
         ],
@@ -147,6 +148,24 @@ def _bus_warnings(buses: list[Record], used: set[str]) -> list[str]:
             if (bus["interface"], bus["channel"]) == (later["interface"], later["channel"])
         ]
     )
+
+
+def _interface_warnings(buses: list[Record]) -> list[str]:
+    unusual = [bus for bus in buses if bus["interface"] not in ("socketcan", "virtual")]
+    if not unusual:
+        return []
+    import can
+
+    warnings = []
+    for bus in unusual:
+        seen = bus["interface"]
+        if seen not in can.VALID_INTERFACES:
+            near = nearest(seen, can.VALID_INTERFACES)
+            known = ", ".join(sorted(can.VALID_INTERFACES))
+            meant = f"meant {near}?" if near else f"it has {known}"
+            where = f"buses.{bus['name']}.interface"
+            warnings.append(f'{where}: python-can here has no interface "{seen}"; {meant}')
+    return warnings
 
 
 def _board_warnings(layout: Layout) -> list[str]:

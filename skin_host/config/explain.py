@@ -1,6 +1,5 @@
 """Explains an error in a configuration file: the place first, then the values seen and wanted."""
 
-import difflib
 import math
 import re
 from collections.abc import Iterator
@@ -10,6 +9,7 @@ import msgspec
 from msgspec import Struct
 
 from skin_host.config.fields import Name
+from skin_host.errors import nearest
 
 Table = type[Struct]
 Named = dict[str, Table]
@@ -56,8 +56,9 @@ def _readable(message: str, place: str, table: Table, document: Any) -> str:
         kind = _innermost(get_type_hints(kind)[key]) if hasattr(kind, key) else kind
     if text.startswith("Object contains unknown field"):
         key = text.split("`")[1]
-        near = difflib.get_close_matches(key, kind.__struct_fields__, n=1)
-        text = f"unknown key `{key}`" + (f"; meant `{near[0]}`?" if near else "")
+        near = nearest(key, kind.__struct_fields__)
+        meant = f"meant `{near}`?" if near else f"known are {', '.join(kind.__struct_fields__)}"
+        text = f"unknown key `{key}`; {meant}"
     elif text.startswith("Invalid enum value"):
         known = ", ".join(str(value) for value in get_args(kind))
         seen = text.removeprefix("Invalid enum value ")

@@ -115,7 +115,10 @@ class Broker:
             raise RequestError(f"the URL of the broker: {error}; {wanted}") from None
         if parts.scheme not in ("mqtt", "mqtts") or not parts.hostname:
             # The URL may hold a password, so it is not repeated here.
-            raise RequestError(f'the URL of the broker begins "{parts.scheme}:"; {wanted}')
+            seen = f'begins with "{parts.scheme}:"' if "://" in url else 'has no "mqtt://"'
+            if parts.scheme in ("mqtt", "mqtts") and "://" in url:
+                seen = "names no host"
+            raise RequestError(f"the URL of the broker {seen}; {wanted}")
         match parts.query:
             case "":
                 pass

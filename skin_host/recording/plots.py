@@ -74,7 +74,7 @@ def plot_map(series: Series, output: Path, part: str, at_s: float | None = None)
     """Draw the part from above at an instant, or when its pressure was highest.
 
     Raises:
-        RequestError: no such part, or the recording has no positions of its taxels.
+        RequestError: no such part or instant, or the recording has no positions of its taxels.
         SkinError: matplotlib is not installed, or the picture cannot be written.
     """
     one = _part(series, part)
@@ -84,6 +84,8 @@ def plot_map(series: Series, output: Path, part: str, at_s: float | None = None)
     felt = np.nan_to_num(one.pressure_kpa, nan=0.0)
     row = int(felt.sum(axis=1).argmax())
     if at_s is not None:
+        if not one.t_s[0] <= at_s <= one.t_s[-1]:
+            raise RequestError(f"{part}: no frame at {at_s:g} s; its last is at {one.t_s[-1]:g} s")
         row = int(np.abs(one.t_s - at_s).argmin())
     kpa = one.pressure_kpa[row]
     thermal = np.array([pad == "thermal" for pad in shape.pads])

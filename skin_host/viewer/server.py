@@ -251,9 +251,12 @@ class Viewer:
     async def _listen(self) -> None:
         """Receive from the robot; look for the broker again whenever it cannot be found."""
         while True:
+            client = self._new_client()
+            waiting = asyncio.create_task(self._await(client))
             try:
-                async with self._new_client() as client, asyncio.TaskGroup() as group:
+                async with client, asyncio.TaskGroup() as group:
                     self._client = client
+                    await cancel(waiting)
                     picture = self._picture
                     group.create_task(_pass_on(client.frames(), picture.take_frame))
                     group.create_task(_pass_on(client.touches(), picture.take_touch))
@@ -266,8 +269,17 @@ class Viewer:
                     _log.warning("%s; trying again", self._why)
             finally:
                 self._client = None
+                await cancel(waiting)
             self._take_status(connected=False)
             await asyncio.sleep(RETRY_S)
+
+    async def _await(self, client: SkinClient) -> None:
+        """Show why the broker cannot be reached while the client still tries."""
+        while True:
+            if client.last_error:
+                self._why = f"no broker: {client.last_error}"
+                self._take_status(connected=False)
+            await asyncio.sleep(NODES_S)
 
     async def _watch(self, client: SkinClient) -> None:
         """Watch the nodes and the connection."""

@@ -135,6 +135,12 @@ def test_a_calibration_of_another_configuration_is_refused(tmp_path):
     [
         (["calibrat"], "meant calibrate?"),
         (["bench", "recieve"], "meant receive?"),
+        (["bench", "recieve"], "skin bench --help"),
+        (
+            ["demo", "--seconds", "8"],
+            "skin demo: unrecognized arguments: --seconds (see `skin demo",
+        ),
+        (["status", "--watch"], "unrecognized arguments: --watch (see `skin status --help`)"),
         (["run", str(DEMO), "--duraton", "3"], "meant --duration?"),
         (["run", str(DEMO), "--duration", "-3"], "seen -3, wanted a number above 0"),
         (["calibrate", str(DEMO), "--seconds", "0"], "seen 0, wanted a number above 0"),
@@ -209,6 +215,13 @@ def help_of(capsys: pytest.CaptureFixture[str], *command: str) -> str:
         main([*command, "--help"])
     assert ended.value.code == 0
     return capsys.readouterr().out
+
+
+def test_help_is_a_word_too(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["help", "record"])
+    assert ended.value.code == 0
+    assert "Example: skin record" in capsys.readouterr().out
 
 
 def test_every_command_has_help_with_an_example(capsys):

@@ -13,7 +13,7 @@ from skin_host.fingertip.events import Over, Slip
 from skin_host.layout import build_layout
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
-from tests.support.broker import Mosquitto
+from tests.support.broker import Mosquitto, free_port
 from tests.support.said import touch_event
 from tests.support.waiting import PATIENCE_S
 
@@ -86,6 +86,39 @@ async def test_programs_get_each_event_as_a_document(mosquitto: Mosquitto) -> No
     slip = next(one for one in documents if one["schema"] == "skin.slip/1")
     assert (slip["cause"], slip["force_n"], slip["shear_n"]) == ("fall", 2.01, 1.14)
     assert slip["missed"] == 0
+
+
+async def first_warning(*options: str) -> str:
+    """What the command reports first on stderr, while no event comes."""
+    command = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "skin_host", "listen", *options),
+        cwd=ROOT,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    assert command.stderr is not None
+    async with asyncio.timeout(PATIENCE_S):
+        line = await command.stderr.readline()
+    command.terminate()
+    await command.communicate()
+    return line.decode()
+
+
+async def test_why_no_events_come_is_on_stderr(mosquitto: Mosquitto) -> None:
+    url = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    where = ("--broker", url, "--robot", "fingertips")
+    missing = await first_warning("--broker", f"mqtt://127.0.0.1:{free_port()}")
+    assert missing.startswith("warning: no broker: Connection refused")
+    nobody = 'warning: no node of robot "fingertips" is online: is `skin run` running?; waiting\n'
+    assert await first_warning(*where) == nobody
+    settings = Mqtt(host=mosquitto.host, port=mosquitto.port)
+    async with Publisher(settings, "fingertips", "main") as publisher:
+        layout = build_layout(load(CONFIG), CONFIG.parent)
+        publisher.put_info(node_info(layout, "main", version="1", configuration="x"))
+        parts = await first_warning(*where, "--part", "indx")
+    known = "thumb_skin"
+    assert parts == (
+        f'warning: robot "fingertips" has no part "indx"; there are: {known}; waiting\n'
+    )
 
 
 def test_what_was_missed_is_said_by_kind_and_part() -> None:

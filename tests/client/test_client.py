@@ -277,6 +277,22 @@ async def test_without_a_broker_the_error_says_so() -> None:
             pass
 
 
+async def test_a_broker_without_robots_is_not_taken_for_one_that_does_not_answer(
+    mosquitto: Mosquitto,
+) -> None:
+    with pytest.raises(RequestError, match="no robot has published"):
+        async with hearing(mosquitto, robot=None, patience_s=0.3):
+            pass
+
+
+async def test_a_command_to_a_robot_that_is_not_there_asks_for_no_node(
+    mosquitto: Mosquitto,
+) -> None:
+    async with hearing(mosquitto) as skin:
+        with pytest.raises(BrokerError, match='no node of robot "robot" is online; is `skin run`'):
+            await skin.command("status")
+
+
 @pytest.mark.parametrize(
     "url", ["http://x", "localhost", "mqtt://", "mqtt://x:y", "mqtt://u:secret@"]
 )

@@ -136,6 +136,16 @@ def test_two_buses_on_one_channel_are_a_warning():
     assert warning.startswith("buses.b.channel: can0 is that of buses.a too")
 
 
+@pytest.mark.parametrize(("seen", "meant"), [("socketcn", "meant socketcan?"), ("x", "it has ")])
+def test_an_interface_that_nothing_here_knows_is_a_warning(seen, meant):
+    boards = {"mtb": {"bus": "can0", "address": 1, "skin_type": 2}}
+    parts = {"arm": {"patches": [{"board": "mtb", "triangles": "0-1"}]}}
+    (warning,) = described(boards, parts, {"can0": {"interface": seen}})["warnings"]
+    assert warning.startswith(
+        f'buses.can0.interface: python-can here has no interface "{seen}"; {meant}'
+    )
+
+
 def test_foam_in_metres_is_a_warning():
     boards = {"mtb": {"bus": "can0", "address": 1, "skin_type": 2}}
     parts = {"arm": {"foam_mm": 0.002, "patches": [{"board": "mtb", "triangles": "0-1"}]}}

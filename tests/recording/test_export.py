@@ -164,6 +164,8 @@ def test_pictures_are_drawn(series: Series, hand: Any, log: Path, tmp_path: Path
 def test_what_is_not_there_is_not_drawn(series: Series, tmp_path: Path) -> None:
     with pytest.raises(RequestError, match='no part "foot"; there are: left_hand'):
         plots.plot_map(series, tmp_path / "a.png", "foot")
+    with pytest.raises(RequestError, match="no frame at 1000 s; its last is at"):
+        plots.plot_map(series, tmp_path / "a.png", "left_hand", at_s=1000.0)
     with pytest.raises(RequestError, match="taxels 0 to 107; seen 108"):
         plots.plot_pressure(series, tmp_path / "a.png", "left_hand", [108])
     with pytest.raises(RequestError, match=r"ends in one of \.png"):
