@@ -21,6 +21,7 @@ from skin_host.daemon.daemon import Daemon
 from skin_host.demo import configuration
 from skin_host.evaluation.simulate.cables import Cable, Sent, SimulatedPort
 from skin_host.evaluation.simulate.promises import Promises
+from skin_host.evaluation.simulate.promises.limits import UNTOUCHED_KPA
 from skin_host.evaluation.simulate.run import _Run
 from skin_host.evaluation.simulate.trace import Trace
 from skin_host.evaluation.simulate.troubles import KINDS, Trouble
@@ -848,3 +849,33 @@ def test_a_calm_ends_though_pads_of_real_skin_that_were_stuck_from_the_first_are
 
     with worn.clock.runner() as runner:
         runner.run(live())
+
+
+def test_what_presses_of_300_kpa_leave_in_the_foam_is_not_taken_for_a_wrong_pressure(
+    world: World,
+) -> None:
+    """`gripper.toml` 4002: a tenth of it is there two seconds after the last of several presses."""
+
+    async def live() -> tuple[float, str | None]:
+        promises, life = start_watched(world)
+        await world.clock.sleep(8.0)
+        promises.sample()
+        spot = world.spots[0]
+        for _ in range(6):
+            pressing = asyncio.create_task(spot.press(4.0, 400.0))
+            for _ in range(18):
+                await world.clock.sleep(0.25)
+                promises.sample()
+            await pressing
+        for _ in range(8):
+            await world.clock.sleep(0.25)
+            promises.sample()
+        left_kpa = max(frame.pressure_kpa.max() for frame in promises._skin._frames.values())
+        wrong = promises._skin.wrong(life)
+        life.kill()
+        return float(left_kpa), wrong
+
+    with world.clock.runner() as runner:
+        left_kpa, wrong = runner.run(live())
+    assert left_kpa > UNTOUCHED_KPA
+    assert wrong is None

@@ -17,6 +17,8 @@ STALE_PERIODS = 8
 #: Pads that press at least so much and read less than that are felt wrong, and the reverse.
 PRESSED_KPA, FELT_KPA = 25.0, 2.0
 UNTOUCHED_KPA = 25.0
+#: Foam keeps less than this part of what pressed it, for seconds after it was lifted.
+KEPT = 0.15
 #: So many standard deviations of the noise of sums of a pad's readings are no press either.
 SIGMAS = 4.0
 #: A pad is pressed at all; and so long after it began, a touch may not be decided yet.

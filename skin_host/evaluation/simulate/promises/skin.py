@@ -13,6 +13,7 @@ from skin_host.evaluation.simulate.promises.limits import (
     DEAF_SAMPLES,
     FELT_KPA,
     FELT_SAMPLES,
+    KEPT,
     LONG_AGO_NS,
     NS,
     PAUSE_NS,
@@ -64,6 +65,8 @@ class Skin:
         self._lost = np.zeros(n, np.bool_)
         #: When each taxel was last seen not to be pressed between two samples.
         self._paused_ns = np.full(n, LONG_AGO_NS, np.int64)
+        #: The hardest press of each taxel since it last had time to recover (kPa).
+        self._hardest_kpa = np.zeros(n)
         #: What presses each taxel (kPa) at the last samples.
         self._truth: deque[NDArray[np.float64]] = deque(maxlen=SAMPLES)
 
@@ -198,6 +201,9 @@ class Skin:
     def note_truth(self, true_kpa: NDArray[np.float64]) -> None:
         """Take a sample of what presses each taxel [n]."""
         self._truth.append(true_kpa)
+        recovered = self._now_ns() - self._excuses.touched_ns > RELAXED_NS
+        self._hardest_kpa[recovered] = 0.0
+        np.maximum(self._hardest_kpa, true_kpa, out=self._hardest_kpa)
 
     def note_valid(self, true_kpa: NDArray[np.float64]) -> None:
         """Note which taxels [n] are valid, and which are pressed and are not."""
@@ -273,7 +279,8 @@ class Skin:
                 f"taxel {taxel} is valid and reads {frame.pressure_kpa[taxel]:.1f} kPa while it is "
                 f"pressed with {self._truth[-1][mine][taxel]:.1f} kPa"
             )
-        false = fit & (most[mine] < 0.01) & (frame.pressure_kpa > UNTOUCHED_KPA)
+        untouched_kpa = np.maximum(UNTOUCHED_KPA, KEPT * self._hardest_kpa[mine])
+        false = fit & (most[mine] < 0.01) & (frame.pressure_kpa > untouched_kpa)
         if false.any():
             false &= frame.pressure_kpa > self._noise_kpa(life, frame.part)
         if not false.any():
