@@ -4,6 +4,7 @@ import asyncio
 import sys
 
 from skin_host.client import SkinClient
+from skin_host.errors import SkinError
 
 
 async def main(url: str) -> None:
@@ -14,4 +15,9 @@ async def main(url: str) -> None:
                 print(touch.part, touch.centroid_m, f"{touch.force_n:.2f} N", touch.missed)
 
 
-asyncio.run(main(sys.argv[1] if len(sys.argv) > 1 else "mqtt://localhost"))
+try:
+    asyncio.run(main(sys.argv[1] if len(sys.argv) > 1 else "mqtt://localhost"))
+except SkinError as error:  # no broker, or no robot there
+    sys.exit(str(error))
+except KeyboardInterrupt:
+    pass

@@ -3,6 +3,7 @@
 import sys
 
 from skin_host.client import Contact, SkinCallbacks
+from skin_host.errors import SkinError
 
 
 def on_contact(contact: Contact) -> None:
@@ -13,8 +14,14 @@ def on_contact(contact: Contact) -> None:
         print("move", flush=True)
 
 
+if len(sys.argv) < 2:
+    sys.exit("which part? python examples/stop_on_touch.py PART [URL]")
 print("stop", "until something is known", flush=True)
-with SkinCallbacks(*sys.argv[2:]) as skin:
-    skin.on_contact(on_contact, part=sys.argv[1])
-    sys.stdin.read()
-print("stop", "the program ends", flush=True)
+try:
+    with SkinCallbacks(*sys.argv[2:]) as skin:
+        skin.on_contact(on_contact, part=sys.argv[1])
+        sys.stdin.read()
+except SkinError as error:  # no broker, or no robot there
+    sys.exit(str(error))
+finally:
+    print("stop", "the program ends", flush=True)

@@ -20,5 +20,9 @@ def on_message(_client: mqtt.Client, _data: object, message: mqtt.MQTTMessage) -
 client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2, protocol=mqtt.MQTTv5)
 client.on_connect = on_connect
 client.on_message = on_message
-client.connect("localhost", int(sys.argv[1]) if len(sys.argv) > 1 else 1883)
+port = int(sys.argv[1]) if len(sys.argv) > 1 else 1883
+try:
+    client.connect("localhost", port)
+except OSError as error:
+    sys.exit(f"localhost:{port}: {error}; is a broker running there?")
 client.loop_forever()

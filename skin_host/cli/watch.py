@@ -218,8 +218,10 @@ def _status(arguments: argparse.Namespace) -> int:
 def _view(arguments: argparse.Namespace) -> int:
     if arguments.foxglove or arguments.rerun:
         return _view_elsewhere(arguments)
+    from skin_host.mqtt.address import Broker
     from skin_host.viewer.server import Viewer
 
+    Broker.from_url(arguments.broker)  # a wrong URL stays wrong, however long it is tried
     port = PAGE_PORT if arguments.port is None else arguments.port
     set_up_logging(arguments.verbose)
 

@@ -201,7 +201,10 @@ def test_a_calibration_of_touched_skin_is_a_warning(options, status, tmp_path, m
     assert "repeat" in warning
 
 
-@pytest.mark.parametrize("arguments", [[], ["fly"], ["replay"], ["run"], ["emulate", "nope.toml"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [[], ["fly"], ["replay"], ["run"], ["emulate", "nope.toml"], ["view", "--broker", "x"]],
+)
 def test_a_wrong_command_is_one_line_and_status_2(arguments):
     refused(asked(*arguments), 2)
 

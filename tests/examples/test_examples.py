@@ -21,7 +21,7 @@ from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.pipeline import PressureFrame
 from tests.support import ros
-from tests.support.broker import Mosquitto
+from tests.support.broker import Mosquitto, free_port
 from tests.support.said import touch_event
 from tests.support.waiting import PATIENCE_S
 
@@ -67,6 +67,25 @@ async def test_a_subscriber_prints_a_touch(mosquitto: Mosquitto, example: str, l
         program.terminate()
         await program.wait()
     assert (await reading).decode().strip() == line
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["subscriber.py", str(free_port())], "is a broker running there?"),
+        (["client.py", "http://x"], "the URL of the broker"),
+        (["stop_on_touch.py"], "which part?"),
+        (["stop_on_touch.py", "left_hand", "http://x"], "the URL of the broker"),
+    ],
+)
+def test_an_example_without_what_it_needs_ends_with_one_line(words: list[str], said: str) -> None:
+    example, *rest = words
+    ended = subprocess.run(
+        [sys.executable, EXAMPLES / example, *rest], capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 1
+    (line,) = ended.stderr.splitlines()
+    assert said in line
 
 
 async def said_to_ros(
