@@ -13,7 +13,7 @@ import numpy as np
 
 from skin_host.config.settings import Settings, format_triangles, skin_hash
 from skin_host.errors import nearest, visible
-from skin_host.layout import TAXELS_PER_TRIANGLE, BoardLayout, Layout, PadKind
+from skin_host.layout import TAXELS_PER_TRIANGLE, BoardLayout, Layout, PadKind, TriangleLayout
 
 #: Bits of a standard frame of eight bytes with its interframe space: without stuff bits, and with
 #: the most possible.
@@ -170,7 +170,10 @@ def _interface_warnings(buses: list[Record]) -> list[str]:
 
 def _board_warnings(layout: Layout) -> list[str]:
     warnings = []
-    for number, board in enumerate(layout.boards):
+    triangles: list[list[TriangleLayout]] = [[] for _ in layout.boards]
+    for triangle in layout.triangles:
+        triangles[triangle.board].append(triangle)
+    for board, mine in zip(layout.boards, triangles, strict=True):
         where = f"boards.{board.name}"
         if board.settings.period_ms < CONVERSION_MS:
             warnings.append(
@@ -188,9 +191,8 @@ def _board_warnings(layout: Layout) -> list[str]:
             continue
         wrong = [
             triangle.number
-            for triangle in layout.triangles
-            if triangle.board == number
-            and triangle.number >= first
+            for triangle in mine
+            if triangle.number >= first
             and layout.pad_kind[triangle.first + THERMOMETER_PAD] != PadKind.THERMAL
         ]
         if wrong:

@@ -1,6 +1,7 @@
 """Positions of a unit's pads: tiled, placed manually, or read from a file."""
 
 import warnings
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -58,16 +59,17 @@ def lay(points_mm: Floats, place: PlaceSettings) -> tuple[Floats, Floats]:
     turned = np.column_stack(
         [cos * flat[:, 0] - sin * flat[:, 1], sin * flat[:, 0] + cos * flat[:, 1]]
     )
-    if not np.any(place.normal):
+    if not any(place.normal):
         raise ConfigurationError(f"normal: {list(place.normal)}; wanted a direction")
-    rotation = _rotation_from_z(np.array(place.normal))
+    rotation = _rotation_from_z(tuple(place.normal))
     position = turned @ rotation[:, :2].T + [place.x_mm, place.y_mm, place.z_mm]
-    return position, np.tile(rotation[:, 2], (len(points_mm), 1))
+    return position, np.broadcast_to(rotation[:, 2], position.shape)
 
 
-def _rotation_from_z(normal: Floats) -> Floats:
+@lru_cache  # most places of a skin have one normal
+def _rotation_from_z(normal: tuple[float, ...]) -> Floats:
     """Shortest rotation [3, 3] that lays the z axis along `normal` (Rodrigues)."""
-    x, y, z = normal / np.linalg.norm(normal)
+    x, y, z = np.array(normal) / np.linalg.norm(normal)
     side = np.hypot(x, y)
     if side == 0:
         return np.diag([1.0, np.sign(z), np.sign(z)])
@@ -100,7 +102,7 @@ def fit_unit(pads_mm: Floats, position_m: Floats, normal: Floats) -> PlaneFit:
     flat = pads_mm * 1e-3 - middle_m
     left, strength, right = np.linalg.svd((position_m - centre_m).T @ flat, full_matrices=False)
     if strength[0] < 1e-9:  # m^2: all at one place
-        axes = _rotation_from_z(normal)[:, :2]
+        axes = _rotation_from_z(tuple(normal.tolist()))[:, :2]
     else:
         if strength[1] < 1e-3 * strength[0]:  # in one line
             along = left[:, 0]
