@@ -249,6 +249,8 @@ class _Received:
     newest: Newest = field(default_factory=Newest)
     presence: Presence = field(default_factory=lambda: Presence(STALE_S))
     counts: list[int] = field(default_factory=list)
+    #: The numbers of all events that arrived, passed on or not.
+    arrived: set[int] = field(default_factory=set)
     contacts: list[tuple[float, str]] = field(default_factory=list)
     status: list[tuple[float, str]] = field(default_factory=list)
 
@@ -338,6 +340,7 @@ class _Receiver:
         kind = words[-1]
         if kind == "touch":
             touch = decode_touch(heard.payload)
+            robot.arrived.add(touch.count)
             self._pass_on(robot, robot.order.take(touch, heard.run, time.monotonic()), now_s)
             return
         newness = robot.newest.take(kind, words[2], heard.stamp)
@@ -371,12 +374,13 @@ class _Receiver:
                 self._pass_on(robot, robot.order.expire(now_s), time.time())
 
     async def settled(self, events: dict[str, int]) -> None:
-        """Wait until as much was received as was sent, for a limited time."""
-        until_s = time.monotonic() + DRAIN_S
-        while time.monotonic() < until_s and any(  # noqa: ASYNC110
-            len(self._robots[name].counts) < n for name, n in events.items()
-        ):
+        """Wait until all events that were sent have arrived, or none has come for long."""
+        arrived, until_s = 0, time.monotonic() + DRAIN_S
+        while arrived < sum(events.values()) and time.monotonic() < until_s:
             await asyncio.sleep(0.1)
+            now = sum(len(robot.arrived) for robot in self._robots.values())
+            if now > arrived:
+                arrived, until_s = now, time.monotonic() + DRAIN_S
         await asyncio.sleep(2 * HOLD_S)
 
     def begin_phase(self) -> None:
@@ -398,13 +402,16 @@ class _Receiver:
 
     def judge(self, told: dict[str, RobotSent], ended_s: float) -> dict[str, Any]:
         """Compare with what the robots sent, which ended at a time."""
-        lost = twice = disordered = wrong = offline = events = changes = 0
+        lost = late = unseen = twice = disordered = wrong = offline = events = changes = 0
         contact_s = status_s = 0.0
         for name, said in told.items():
             heard = self._robots[name]
             events += said.events
             passed = Counter(heard.counts)
-            lost += sum(count not in passed for count in range(1, said.events + 1))
+            missing = {count for count in range(1, said.events + 1) if count not in passed}
+            lost += len(missing)
+            late += len(missing & heard.arrived)
+            unseen += sum(count > max(passed, default=0) for count in missing)
             twice += sum(n - 1 for n in passed.values())
             disordered += sum(b < a for a, b in zip(heard.counts, heard.counts[1:], strict=False))
             wrong += _wrong(said.contacts, heard.contacts)
@@ -418,6 +425,8 @@ class _Receiver:
             "not_acknowledged": sum(one.waiting for one in told.values()),
             "connections": sum(one.connections for one in told.values()),
             "lost": lost,
+            "lost_for_coming_late": late,
+            "lost_without_a_gap": unseen,
             "passed_on_twice": twice,
             "out_of_order": disordered,
             "unknown_s_a_robot": round(contact_s / len(told), 2),
@@ -607,7 +616,9 @@ def describe(document: dict[str, Any]) -> str:
     ]
     lines.append(
         f"{document['events']} events, {document['dropped_by_robots']} dropped by robots, "
-        f"{document['not_acknowledged']} not acknowledged; lost {document['lost']}, "
+        f"{document['not_acknowledged']} not acknowledged; lost {document['lost']} "
+        f"({document['lost_for_coming_late']} came too late to be in order, "
+        f"{document['lost_without_a_gap']} after the last that came), "
         f"passed on twice {document['passed_on_twice']}, out of order {document['out_of_order']}"
     )
     lines.append(
