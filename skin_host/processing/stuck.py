@@ -238,6 +238,10 @@ RESTING_MARGIN = 1.25
 TOUCHED_PACE = 6
 #: After this many moves a stuck pad is valid again.
 PROBATION_MOVES = 3
+#: A step is small up to this: one bit of eight makes a damaged byte such a step. Where boards
+#: compensate, bytes move by that, too: up to this multiple of the calibrated noise.
+SMALL_UNITS = 1.0
+SMALL_SIGMAS = 3.0
 LONGEST_RUN = 1e6
 NEWTON_STEPS = 8
 #: A step that is shorter ends them.
@@ -322,8 +326,15 @@ class StuckPads:
         #: No run is too long before so many more steps.
         self._slack = 0
         self._to_show = np.zeros(shape, np.int64)
+        #: Runs that have ended since rates were learnt; those of a stuck pad since it stuck.
         self._new_seen = np.zeros(shape)
         self._new_moved = np.zeros(shape, np.int8)
+        compensated = repeats.compensated.any(axis=1, keepdims=True)
+        self._small = np.maximum(SMALL_UNITS, SMALL_SIGMAS * noise_units * compensated)
+        # While any pad is stuck: the bytes of the last two sweeps, and which pads went anywhere, or
+        # far, in the last.
+        self._last, self._earlier = np.zeros(shape, np.int16), np.zeros(shape, np.int16)
+        self._went, self._went_far = np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
         #: Samples of each board, less those of all boards.
         self._samples = np.zeros(boards, np.int64)
         self._common_samples = 0
@@ -365,6 +376,8 @@ class StuckPads:
             ended &= felt.calm_pads
         if any_of(ended):
             gained = np.subtract(run, self._before, out=self._gained)
+            if self.any_stuck:
+                np.minimum(gained, self.longest, out=gained)
             gained *= ended
             self._new_seen += gained
             self._new_moved += ended.view(np.int8)
@@ -395,8 +408,12 @@ class StuckPads:
             return
         run[unproven] = 0.0
         too_long &= run > 0.0
-        self._to_show -= moved & (self._to_show > 0)
-        self._to_show[too_long] = PROBATION_MOVES
+        if self.any_stuck:
+            self._note_life(raw, moved, told)
+        else:
+            self._last[:] = self._earlier[:] = raw
+            self._went[:] = self._went_far[:] = False
+        self._to_show[too_long & ~self.stuck] = PROBATION_MOVES
         self.stuck = self._to_show > 0
         self.any_stuck = any_of(self.stuck)
 
@@ -413,18 +430,50 @@ class StuckPads:
         self._until_learning = 0
         self._slack = 0
 
+    def _note_life(self, raw: NDArray[np.uint8], moved: Mask, told: Mask | None) -> None:
+        """Count the moves by which stuck pads show that they live.
+
+        There and back again in two sweeps is one move if it is small, and none otherwise: a damaged
+        byte is such a step, and then all moves until then are in doubt.
+        """
+        here = np.broadcast_to(True, moved.shape) if told is None else told
+        shifts = self._repeats.compensated
+        far = np.abs(raw - self._last) > self._small
+        # What its board takes off a pad is as wrong as the byte of the temperature pad.
+        far |= shifts & far[:, THERMAL_TAXEL, None]
+        off = np.abs(raw - self._earlier)
+        # The byte of a word that is back may be one beside it.
+        back = self._went_far & (off <= shifts) | self._went & (off == 0) & ~shifts
+        went = moved & ~back
+        for lives in (self._went_far & ~back, went & ~far):
+            self._to_show -= here & lives & (self._to_show > 0)
+        damaged = here & self._went_far & back & self.stuck
+        self._to_show[damaged] = PROBATION_MOVES
+        self._new_seen[damaged] = 0.0
+        self._new_moved[damaged] = 0
+        for array, value in (
+            (self._earlier, self._last),
+            (self._last, raw),
+            (self._went, went),
+            (self._went_far, went & far),
+        ):
+            np.copyto(array, value, where=here)
+
     def _learn(self, unproven: Mask) -> None:
         """Update the rates of boards with enough samples, for pads that work."""
         enough = self._samples >= STEP_SAMPLES
         rows: Rows = slice(None)
         if not enough.all():
             rows = np.flatnonzero(np.repeat(enough, len(unproven) // self._boards))
-        lives = ~self.stuck[rows] & ~unproven[rows, None]
+        stuck, doubted = self.stuck[rows], unproven[rows, None]
+        lives = ~stuck & ~doubted
         keep = np.where(lives, 1.0 - self._forget[rows], 1.0)
         self._seen[rows] = self._seen[rows] * keep + np.where(lives, self._new_seen[rows], 0.0)
         self._moved[rows] = self._moved[rows] * keep + np.where(lives, self._new_moved[rows], 0)
-        self._new_seen[rows] = 0.0
-        self._new_moved[rows] = 0
+        # What a stuck pad shows counts once it lives.
+        waits = stuck & ~doubted
+        self._new_seen[rows] *= waits
+        self._new_moved[rows] *= waits
         self._samples[enough] = 0
         self._renew_limits(rows)
 

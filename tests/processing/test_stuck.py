@@ -107,15 +107,78 @@ def test_a_pad_that_stops_is_stuck_until_it_moves_again() -> None:
     assert not watched.pads.stuck.any()
 
 
-def test_a_stuck_pad_is_valid_after_three_moves_however_long_it_rests_between_them() -> None:
+def hold(watched: Watched, rng: np.random.Generator, *bytes_: int) -> list[bool]:
+    """Show these bytes of the pad that stuck; return in which sweeps it is stuck."""
+    found = []
+    for byte in bytes_:
+        raw = to_bytes(240.3 + 0.8 * rng.standard_normal(SHAPE))
+        raw[1, 5] = byte
+        watched.show(raw)
+        found.append(bool(watched.pads.stuck[1, 5]))
+    return found
+
+
+@pytest.mark.parametrize("rests", [10, 200])
+@pytest.mark.parametrize("units", [1, 2, 50])
+def test_a_stuck_pad_is_valid_after_three_moves_however_long_it_rests_between_them(
+    rests: int, units: int
+) -> None:
     watched, rng = lively()
     sweeps_until_stuck(watched, rng, 239)
-    for moves, byte in ((1, 241), (2, 239), (3, 241)):
-        for _ in range(10):
-            raw = to_bytes(240.3 + 0.8 * rng.standard_normal(SHAPE))
-            raw[1, 5] = byte
-            watched.show(raw)
-            assert watched.pads.stuck[1, 5] == (moves < 3)
+    assert all(hold(watched, rng, *[239 - units] * rests, *[239] * rests))
+    # Whether a large step is a damaged byte, the next sweep shows.
+    late = units > 1
+    after = hold(watched, rng, *[239 - units] * 10)
+    assert after == [True] * late + [False] * (10 - late)
+
+
+def test_damaged_bytes_are_no_sign_of_life() -> None:
+    watched, rng = lively()
+    sweeps_until_stuck(watched, rng, 239)
+    for wrong in (239 ^ 128, 239 ^ 4, 239 ^ 1, 239 ^ 2, 239 ^ 1, 239 ^ 1, 239 ^ 64):
+        assert all(hold(watched, rng, *[239] * 15, wrong, *[239] * 15))
+
+
+def test_a_damaged_byte_of_a_board_is_none_until_its_own_next_sweep_shows_that() -> None:
+    """Two boards of which the second sends twice as often."""
+    raw = np.full(SHAPE, 239, np.uint8)
+    plain = Repeats([Encoding(NO_GAIN, 2, NO_LOAD, False)] * K)
+    pads = StuckPads(np.full(SHAPE, 0.8), np.ones(K), np.full(K, PERIOD_S), plain, 2)
+    for sweep in range(400):
+        before, raw = raw, raw.copy()
+        came = np.array([sweep % 2 == 0, True])
+        here = np.repeat(came, K // 2)
+        raw[here] = 239
+        if sweep > 200 and sweep % 20 == 0:
+            raw[: K // 2] ^= 64
+        changed = (raw != before) & here[:, None]
+        pads.step(raw, changed, inside(raw) & here[:, None], NO, came=came)
+        assert pads.stuck.all() or sweep < 200
+
+
+def test_a_quiet_pad_that_was_calibrated_as_a_noisy_one_is_not_called_stuck_for_good() -> None:
+    """It moves for one sweep in ten seconds, so it rests for too long before each move."""
+    raw = np.full(SHAPE, 240, np.uint8)
+    plain = Repeats([Encoding(NO_GAIN, 2, NO_LOAD, False)] * K)
+    pads = StuckPads(np.full(SHAPE, 5.0), np.ones(K), np.full(K, PERIOD_S), plain, 1)
+    stuck_for = []
+    for sweep in range(36_000):
+        before, raw = raw, np.full(SHAPE, 239 if sweep % 200 == 0 else 240, np.uint8)
+        pads.step(raw, raw != before, None, NO)
+        stuck_for.append(bool(pads.stuck[1, 5]))
+    assert any(stuck_for[:200])
+    assert not any(stuck_for[-12_000:])
+
+
+def test_a_pad_that_sticks_again_and_again_is_found_each_time() -> None:
+    """What it shows meanwhile does not let it rest for longer once it has lived for a while."""
+    watched, rng = lively()
+    for _ in range(5):
+        for _ in range(600):
+            watched.show(to_bytes(240.3 + 0.8 * rng.standard_normal(SHAPE)))
+        assert not watched.pads.stuck.any()
+        assert sweeps_until_stuck(watched, rng, 239) * PERIOD_S < 5
+        hold(watched, rng, *[239] * 1200)
 
 
 @pytest.mark.parametrize("sigma", [0.6, 0.8, 1.2])
@@ -301,6 +364,26 @@ def test_a_stuck_pad_is_found_though_the_noise_of_the_thermal_pad_moves_its_byte
         changes += np.count_nonzero((watched.raw != before)[2, [0, 1, 9]])
     assert changes > 30
     assert np.argwhere(watched.pads.stuck).tolist() == [[2, 0], [2, 1], [2, 9]]
+
+
+def test_damaged_bytes_of_the_thermal_pad_show_no_life_of_those_compensated_with_it() -> None:
+    rng = np.random.default_rng(3)
+    repeats = Repeats([Encoding(GAIN, 2, NO_LOAD, False)] * K)
+
+    def sweep() -> np.ndarray:
+        return np.rint(20000 + 3.0 * rng.standard_normal(SHAPE))
+
+    watched = Watched(np.array([sent(sweep(), GAIN, 2, False) for _ in range(100)]), repeats)
+    held = sweep()
+    for number in range(600):
+        words = sweep()
+        words[2, [0, 1]] = held[2, [0, 1]]
+        raw = sent(words, GAIN, 2, False)
+        if number > 300 and number % 20 == 0:
+            raw[2, THERMAL_TAXEL] ^= 64
+        watched.show(raw)
+        if number > 300:
+            assert np.argwhere(watched.pads.stuck).tolist() == [[2, 0], [2, 1]]
 
 
 @pytest.mark.parametrize("gain", [GAIN, GAIN_V2], ids=["type 0", "type 8"])
