@@ -82,6 +82,17 @@ def read_whole(path: Path, most_bytes: int = MAX_DOCUMENT_BYTES) -> bytes:
     return b"".join(pieces)
 
 
+def why_unreadable(path: Path) -> str | None:
+    """Return why a file cannot be read that is there, or may be; None: it can, or there is none."""
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        return error.strerror
+    return None if os.access(path, os.R_OK) else "no permission"
+
+
 def _refuse_busy(path: Path, descriptor: int) -> None:
     """Refuse a file that a program has open for writing; who opens it for that then waits until it
     is closed here.

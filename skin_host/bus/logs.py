@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, BinaryIO, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.bus.wire import FrameBatch, RecordBatch
+from skin_host.bus.wire import MAX_EXTENDED_ID, FrameBatch, RecordBatch
 from skin_host.errors import LogError
 
 if TYPE_CHECKING:
@@ -35,6 +35,8 @@ WINDOW_NS = 4_000_000
 _BLOCK = 4096
 #: Number of bytes that are read at a time.
 BLOCK_BYTES = 1 << 19
+#: No robot has more; looking for a name takes longer the more there are.
+MOST_CHANNELS = 1000
 #: Longer lines are damage.
 _LONGEST_LINE = 1 << 16
 #: Lines of this length and more are decoded one by one.
@@ -262,8 +264,8 @@ def code_of(name: str, names: list[str]) -> int:
         DamageError: there are too many.
     """
     if name not in names:
-        if len(names) > np.iinfo(np.uint16).max:
-            raise DamageError(f"more than {len(names)} channels")
+        if len(names) >= MOST_CHANNELS:
+            raise DamageError(f"more than {MOST_CHANNELS} channels")
         names.append(name)
     return names.index(name)
 
@@ -367,6 +369,8 @@ def _frame(message: "can.Message") -> tuple[str, Frame] | None:
     t_ns = nanoseconds(message.timestamp)
     if len(data) > 8:
         raise ValueError(f"a frame of {len(data)} bytes; wanted at most 8")
+    if not 0 <= message.arbitration_id <= MAX_EXTENDED_ID:
+        raise ValueError(f"an identifier of {hex(message.arbitration_id)[:40]}")
     if not 0 <= t_ns < 2**63:
         raise ValueError(f"a time of {message.timestamp:g} s")
     return channel, (identifier(message), data, t_ns)

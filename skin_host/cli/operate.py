@@ -28,6 +28,7 @@ from skin_host.cli.common import (
 )
 from skin_host.daemon import service
 from skin_host.errors import OtherSkinError, RequestError, SkinError
+from skin_host.files import write_atomic
 
 if TYPE_CHECKING:
     from skin_host.config.settings import Settings
@@ -139,6 +140,7 @@ def reload_on_hangup(daemon: "Daemon") -> None:
         task.add_done_callback(reloading.discard)
 
     asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, begin)
+    service.take_hangups()
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -151,6 +153,7 @@ def _run(arguments: argparse.Namespace) -> int:
     from skin_host.layout import build_layout
     from skin_host.processes import end_with_parent
 
+    service.hold_hangups()
     set_up_logging(arguments.verbose)
     settings, layout = load_skin(arguments.config)
     if arguments.workers is not None:
@@ -192,14 +195,25 @@ def _run(arguments: argparse.Namespace) -> int:
             log_lines_lost=stderr.lines_lost,
         )
         reload_on_hangup(daemon)
-        if (runtime := service.runtime_directory()) is not None and arguments.share is None:
-            (runtime / RUNNING).write_bytes(msgspec.json.encode(settings))
+        if arguments.share is None:
+            _show_running(settings)
         # The collector would look through all that is loaded by now for 30 ms, again and again.
         gc.freeze()
         await daemon.run(stop, calibrate=arguments.calibrate)
 
     run(work, arguments.duration)
     return 0
+
+
+def _show_running(settings: "Settings") -> None:
+    """Write the configuration for `skin check --running`. The skin does not depend on it."""
+    runtime = service.runtime_directory()
+    if runtime is None:
+        return
+    try:
+        write_atomic(runtime / RUNNING, msgspec.json.encode(settings))
+    except OSError as error:
+        log.warning("%s: cannot be written: %s", runtime / RUNNING, error.strerror)
 
 
 def _run_workers(arguments: argparse.Namespace, settings: "Settings") -> int:
@@ -214,8 +228,7 @@ def _run_workers(arguments: argparse.Namespace, settings: "Settings") -> int:
         raise RequestError(f'{arguments.config}: no part belongs to node "{node}"')
     if len(shares) < n:
         log.info("%d workers: no more of the buses can be read apart", len(shares))
-    if (runtime := service.runtime_directory()) is not None:
-        (runtime / RUNNING).write_bytes(msgspec.json.encode(settings))
+    _show_running(settings)
     options = ["--calibrate"] * arguments.calibrate + ["--verbose"] * arguments.verbose
     if arguments.duration is not None:
         options += ["--duration", str(arguments.duration)]

@@ -148,9 +148,13 @@ class Daemon:
         self.link = Link(self.engine, wait=True, open_port=open_port, clock=clock)
         self.unkept: dict[str, str] = {}
         #: Files of this node that were found or written.
-        self._files = {what for what in _KEPT if self._path(what).exists()}
+        self._files = {what for what in _KEPT if os.access(self._path(what), os.F_OK)}
         self._calibration_lock = asyncio.Lock()
         self._saving = asyncio.Lock()
+        self._reloading = asyncio.Lock()
+        #: How many reloads have begun, and why the last one failed.
+        self._reloads = 0
+        self._not_reloaded: SkinError | None = None
         self._feed_s = service.watchdog_interval_s()
         self._fed_s = 0.0
         self._status_s = 0.0
@@ -283,11 +287,25 @@ class Daemon:
         """Read the configuration file again and send it to the boards.
 
         Settings of processing and of the boards' set-up take effect; the calibration stays.
+        Requests that come during a reload share the next one, because each zeroes the boards.
 
         Raises:
             RequestError: the file is wrong, or changes what only a restart can change; then nothing
                 changes.
         """
+        begun = self._reloads
+        async with self._reloading:
+            if self._reloads == begun:
+                self._reloads += 1
+                self._not_reloaded = None
+                try:
+                    await self._reload()
+                except SkinError as error:
+                    self._not_reloaded = error
+            if self._not_reloaded is not None:
+                raise self._not_reloaded
+
+    async def _reload(self) -> None:
         if self._configuration is None:
             raise RequestError("started without a configuration file: nothing to read again")
         settings = self._share(await self.clock.in_thread(load, self._configuration))
@@ -599,7 +617,8 @@ class Daemon:
 
     def _removed(self) -> set[str]:
         """Return what was kept and whose file has been removed."""
-        return {what for what in self._files - self.unkept.keys() if not self._path(what).exists()}
+        kept = self._files - self.unkept.keys()
+        return {what for what in kept if not os.access(self._path(what), os.F_OK)}
 
     def _record_of(self, part: int) -> Record:
         link = self.link

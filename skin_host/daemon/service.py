@@ -2,9 +2,12 @@
 
 import logging
 import os
+import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from skin_host.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from skin_host.clock import Clock
@@ -28,12 +31,26 @@ def notify(message: str) -> None:
 
     if address.startswith("@"):
         address = "\0" + address[1:]
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sock:
-        try:
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sock:
             sock.sendto(message.encode(), socket.MSG_DONTWAIT, address)
-        except OSError:
-            # systemd is busy, restarts or is gone: the skin must not wait for it.
-            return
+    except OSError:
+        # systemd is busy, restarts or is gone, or no more files may be open: the skin must not
+        # wait for it.
+        return
+
+
+def hold_hangups() -> None:
+    """Let a SIGHUP, which asks for a reload, wait; otherwise it ends what cannot take it yet.
+
+    Programs that are started meanwhile let it wait, too.
+    """
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
+
+
+def take_hangups() -> None:
+    """Take the SIGHUP that waits, and those that come."""
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGHUP})
 
 
 def notify_reloading(clock: "Clock") -> None:
@@ -73,14 +90,31 @@ def watchdog_interval_s() -> float | None:
 
 
 def state_directory(configured: str | None) -> Path:
-    """Return the folder of calibrations: as configured, systemd's, or XDG's."""
+    """Return the folder of calibrations: as configured, systemd's, or XDG's.
+
+    Raises:
+        ConfigurationError: it is in the home folder of somebody who has none.
+    """
     if configured is not None:
-        return Path(configured).expanduser()
+        if "\0" in configured:
+            raise ConfigurationError("service.state_directory: seen a zero byte, wanted a path")
+        return _at_home(Path(configured), "wanted a folder that there is")
     given = os.environ.get("STATE_DIRECTORY")
     if given:
         return Path(given.split(":")[0])
     base = os.environ.get("XDG_STATE_HOME")
-    return (Path(base) if base else Path.home() / ".local" / "state") / "skin-host"
+    if base:
+        return Path(base) / "skin-host"
+    return _at_home(Path("~/.local/state/skin-host"), "name a folder there, or set HOME")
+
+
+def _at_home(path: Path, wanted: str) -> Path:
+    try:
+        return path.expanduser()
+    except RuntimeError:
+        raise ConfigurationError(
+            f"service.state_directory: {path}: nobody's home folder; {wanted}"
+        ) from None
 
 
 def runtime_directory() -> Path | None:

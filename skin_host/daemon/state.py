@@ -16,7 +16,7 @@ from msgspec import Meta, Struct, field
 from skin_host.config.fields import Name
 from skin_host.config.settings import Settings, TouchSettings, changed
 from skin_host.daemon import service
-from skin_host.files import read_document, set_aside
+from skin_host.files import read_document, set_aside, why_unreadable
 
 log = logging.getLogger(__name__)
 
@@ -103,10 +103,10 @@ def load_kept(path: Path, kind: type[Kept]) -> Kept:
         BusyFileError: another program is writing it.
     """
     unchanged = kind()
-    if not os.access(path, os.F_OK):
-        return unchanged
-    if not os.access(path, os.R_OK):
-        log.error("%s: cannot be read: no permission; %s", path, kind.WITHOUT)
+    why = why_unreadable(path)
+    if why is not None:
+        log.error("%s: cannot be read: %s; %s", path, why, kind.WITHOUT)
+    if why is not None or not os.access(path, os.F_OK):
         return unchanged
     what = unchanged.schema.removeprefix("skin.").partition("/")[0]
     try:

@@ -21,6 +21,7 @@ from pathlib import Path
 
 from skin_host.config.settings import Settings, changed, parse_triangles
 from skin_host.daemon import service
+from skin_host.errors import RequestError
 
 #: Daemons end touches, stop boards and disconnect within this time; systemd waits as long for all.
 STOP_S = 4.5
@@ -93,12 +94,14 @@ async def run(commands: dict[str, list[str]]) -> int:
         for number, (name, arguments) in enumerate(commands.items()):
             path = folder / str(number)
             _listen(stack, path, name, merged)
+            service.hold_hangups()  # until that daemon can take one
             processes[name] = await asyncio.create_subprocess_exec(
                 *(sys.executable, "-m", "skin_host", *arguments),
                 env=_environment(path),
                 # Ctrl-C of a terminal reaches only this process, which passes it on once.
                 start_new_session=True,
             )
+        service.take_hangups()
         waiting = [asyncio.ensure_future(process.wait()) for process in processes.values()]
         await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
         if not is_ending:  # a second signal would end them at once
@@ -169,8 +172,17 @@ def share_of(settings: Settings, node: str, number: int, n: int) -> Settings:
         node: that is shared.
         number: of the share, from 1.
         n: shares wanted, see `share_out`.
+
+    Raises:
+        RequestError: there are fewer.
     """
-    buses = share_out(settings, node, n)[number - 1]
+    shares = share_out(settings, node, n)
+    if number > len(shares):
+        raise RequestError(
+            f'node "{node}": seen share {number} of {n}, wanted one of the {len(shares)} that its '
+            "parts can be shared out to; start it again"
+        )
+    buses = shares[number - 1]
     values: dict[str, object] = {}
     for name, part in settings.parts.items():
         if part.node == node and settings.boards[part.patches[0].board].bus in buses:

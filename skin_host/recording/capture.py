@@ -348,7 +348,7 @@ class PageRecording:
             raise RequestError(f"{self._path.name} is being recorded already; stop it")
         _check_room(self._folder, f"*{MCAP_SUFFIX}")
         self._path = self._folder / self._clock.today().strftime(f"%Y%m%dT%H%M%SZ{MCAP_SUFFIX}")
-        if self._path.exists():
+        if os.path.lexists(self._path):
             raise RequestError(f"{self._path.name}: is there already; try again")
         self._recorder = Recorder(self._path)
         self._began_s, self._marks, self._ended = self._clock.monotonic_s(), 0, None

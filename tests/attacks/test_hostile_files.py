@@ -199,3 +199,27 @@ def test_positions_beyond_all_bounds_are_refused_in_lines(
     (said,) = capsys.readouterr().err.splitlines()
     assert "rows.txt" in said
     assert "1e+06" in said
+
+
+@pytest.mark.parametrize("number", ["fffffffffffffffffffff", "-5", "20000000"])
+def test_an_identifier_that_can_has_not_is_refused_in_a_line(
+    tmp_path: Path, number: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "x.csv"
+    head = "timestamp,arbitration_id,extended,remote,error,dlc,data\n"
+    log.write_text(f"{head}1.0,{number},1,0,0,1,AA==\n")
+    assert main(["replay", str(log), "--config", str(CONFIG), "--output", "-"]) == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert f"{log}: " in said
+    assert "an identifier of " in said
+
+
+def test_a_recording_of_more_channels_than_any_robot_has_is_refused_in_a_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each new name was compared with all before: 5 MB took minutes."""
+    log = tmp_path / "x.log"
+    log.write_text("".join(f"(1.{n:06d}) can{n} 4E0#00\n" for n in range(100_000)))
+    assert main(["replay", str(log), "--config", str(CONFIG), "--output", "-"]) == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert "more than 1000 channels" in said
