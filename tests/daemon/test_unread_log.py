@@ -134,5 +134,5 @@ async def test_lines_that_nobody_read_are_counted_where_they_are_missing(tmp_pat
         lines = await service.read()
         assert int(re.match(LOST, lines[note])[1]) >= lost
         assert not [line for line in lines[note + 1 :] if re.match(LOST, line)]
-        assert lines[0].startswith("WARNING broker")
+        assert lines[0].startswith("WARNING bus can0: interface")
         assert any("body.toml read again" in line for line in lines[note + 1 :])
