@@ -121,6 +121,8 @@ class Daemon:
             if self._zeros.are_of(calibration.id):
                 self._use_baselines()
                 doubted = _taxels(layout, self._zeros)
+            elif self._zeros.calibration and not self._zeros.are_older_than(calibration.time):
+                doubted = _taxels(layout, self._zeros)
             elif had_zeros and not self._zeros.calibration:
                 # It could not be read: any of them may have been touched when their zero was taken.
                 doubted = layout.pad_kind == PadKind.PRESSURE
@@ -560,10 +562,12 @@ class Daemon:
             before="" if before is None else before.id,
             unknown=unknown,
             baselines=baselines,
+            written=self._zeros.written,
         )
         if zeros == self._zeros or not (unknown or baselines or self._zeros.unknown):
             self._zeros_kept = n_found
             return
+        zeros.written = self.clock.today().isoformat(timespec="seconds")
         try:
             await self.clock.in_thread(write_document, self._path("zeros"), zeros)
         except OSError as error:

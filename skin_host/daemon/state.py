@@ -7,6 +7,7 @@ and reported, so that the service can always start.
 
 import logging
 import os
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, TypeVar
 
@@ -66,6 +67,7 @@ class Zeros(Struct, forbid_unknown_fields=True):
             start.
         baselines: by part, activation of each untouched taxel in units, as found after the last
             set-up, or as it had drifted by the end. Empty: the calibration's.
+        written: when that was so, ISO 8601 in UTC.
     """
 
     WITHOUT: ClassVar = (
@@ -78,10 +80,21 @@ class Zeros(Struct, forbid_unknown_fields=True):
     before: str = ""
     unknown: dict[Name, list[int]] = {}
     baselines: dict[Name, list[Annotated[float, Meta(ge=-255, le=255)]]] = {}
+    written: Annotated[str, Meta(max_length=64)] = ""
 
     def are_of(self, calibration: str) -> bool:
         """Return whether these zeros hold with the calibration of this id."""
         return bool(calibration) and calibration in (self.calibration, self.before)
+
+    def are_older_than(self, time: str) -> bool:
+        """Return whether a calibration that was taken at `time` has measured the zeros since.
+
+        One that somebody has put back has not, nor one whose zero comes from a recording.
+        """
+        try:
+            return datetime.fromisoformat(self.written) < datetime.fromisoformat(time)
+        except (ValueError, TypeError):  # no times, or one without its zone
+            return False
 
 
 Kept = TypeVar("Kept", NodeState, Zeros)

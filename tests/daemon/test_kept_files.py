@@ -238,8 +238,26 @@ def test_zeros_that_are_not_known_are_in_doubt_from_the_start(kept: tuple[Any, A
     daemon = Daemon(settings, layout, calibration=calibration)
     assert doubted(daemon) == [arm.start + 3, arm.start + 17]
     # A later calibration has measured them.
-    write_document(file, Zeros(calibration="an older one", unknown={"left_forearm": [3]}))
+    written = "2000-01-01T00:00:00+00:00"
+    older = Zeros(calibration="an older one", unknown={"left_forearm": [3]}, written=written)
+    write_document(file, older)
     assert doubted(Daemon(settings, layout, calibration=calibration)) == []
+
+
+@pytest.mark.parametrize("written", ["9999-12-31T00:00:00+00:00", "", "x", "2000-01-01T00:00:00"])
+def test_a_calibration_that_was_put_back_ends_no_doubt(
+    kept: tuple[Any, Any, Path], written: str
+) -> None:
+    """It was taken before the taxel was touched when its board was zeroed; or with the curves of a
+    recording came its zero."""
+    settings, layout, path = kept
+    calibration = stored_calibration(settings, layout, "main")
+    assert calibration is not None
+    zeros = Zeros(calibration="a later one", unknown={"left_forearm": [3]}, written=written)
+    write_document(path.with_name("demo-main.zeros.json"), zeros)
+    arm = layout.part("left_forearm")
+    daemon = Daemon(settings, layout, calibration=calibration)
+    assert doubted(daemon) == [arm.start + 3]
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b'{"schema":"skin.zeros/1"}', b'{"unknown":5}'])
