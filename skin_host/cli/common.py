@@ -152,7 +152,17 @@ def warn_of_virtual(settings: "Settings") -> None:
 
 
 def print_json(document: object) -> None:
-    print(json.dumps(document, indent=2, ensure_ascii=False))
+    print(visible_json(json.dumps(document, indent=2, ensure_ascii=False)))
+
+
+def visible_json(text: str) -> str:
+    """Return the same JSON with characters that steer a terminal as escapes, which JSON has, too.
+
+    They are in its texts only, which anybody may have written.
+    """
+    return "".join(
+        one if one.isprintable() or one == "\n" else json.dumps(one)[1:-1] for one in text
+    )
 
 
 def warn(text: str) -> None:

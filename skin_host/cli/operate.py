@@ -27,7 +27,7 @@ from skin_host.cli.common import (
     warn_of_virtual,
 )
 from skin_host.daemon import service
-from skin_host.errors import OtherSkinError, RequestError, SkinError
+from skin_host.errors import OtherSkinError, RequestError, SkinError, visible
 from skin_host.files import write_atomic
 
 if TYPE_CHECKING:
@@ -262,6 +262,7 @@ def _command(arguments: argparse.Namespace) -> int:
 
     from skin_host.cli.watch import status_table
     from skin_host.client import SkinClient
+    from skin_host.mqtt.messages import check_health
 
     request: dict[str, Any] = {
         key: getattr(arguments, key)
@@ -285,11 +286,13 @@ def _command(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json(answer)
     elif arguments.name == "status":
+        for record in answer.values():
+            check_health(record)
         print(status_table(answer))
     else:
         for key, value in answer.items():
             text = json.dumps(value) if isinstance(value, dict | list) else str(value)
-            print(f"{key}: {text}")
+            print(f"{visible(key)}: {visible(text, len(text))}")
     return 0
 
 

@@ -19,6 +19,7 @@ from skin_host.cli.common import (
     run,
     set_up_logging,
     warn,
+    visible_json,
 )
 from skin_host.errors import visible
 
@@ -107,7 +108,7 @@ def _listen(arguments: argparse.Namespace) -> int:
                 if arguments.json:
                     # Its schema too, and what is published only where it is not None or 0.
                     whole = msgspec.to_builtins(event) | msgspec.structs.asdict(event)
-                    print(msgspec.json.encode(whole).decode(), flush=True)
+                    print(visible_json(msgspec.json.encode(whole).decode()), flush=True)
                 else:
                     print(event_line(event), flush=True)
                 printed += 1

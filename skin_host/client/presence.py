@@ -109,6 +109,7 @@ class Presence:
     def __init__(self, stale_s: float) -> None:
         self._stale_s = stale_s
         self._parts: dict[str, _Part] = {}
+        self._parts_of: dict[str, list[str]] = {}
         self._node_of: dict[str, str] = {}
         self._nodes: dict[str, _Node] = {}
 
@@ -172,7 +173,10 @@ class Presence:
         self._nodes[node] = _Node(online, over | {broker})
 
     def take_info(self, node: str, parts: Iterable[str]) -> None:
-        self._node_of |= dict.fromkeys(parts, node)
+        # Only what the last info of each node names: whoever may publish could go on for ever.
+        self._parts_of.pop(node, None)
+        self._parts_of[node] = list(parts)
+        self._node_of = {part: name for name, known in self._parts_of.items() for part in known}
 
     def take_loss(self, broker: int = 0) -> None:
         """Note the loss of a broker. Its retained messages come again with the next connection."""

@@ -139,8 +139,17 @@ def decode_health(payload: bytes) -> dict[str, Any]:
     record = decode(_health_decoder, payload, "health")
     if record.get("schema") != HEALTH_SCHEMA:
         raise MessageError(f"health: wanted the schema {HEALTH_SCHEMA}")
+    check_health(record)
+    return record
+
+
+def check_health(record: Any) -> None:
+    """Check the keys of a health record that others rely on.
+
+    Raises:
+        MessageError: they have other types.
+    """
     try:
         msgspec.convert(record, _HealthHead)
     except msgspec.ValidationError as error:
         raise MessageError(f"health: {error}") from None
-    return record

@@ -1,21 +1,27 @@
 """Whoever may publish below a robot's topics makes no client grow without end, or fail."""
 
+import asyncio
 import json
+from typing import Any
 
 import aiomqtt
 import pytest
 from msgspec.structs import replace
 
+from skin_host.cli import main
 from skin_host.cli.lines import event_line, missed_line
 from skin_host.cli.watch import status_table
+from skin_host.client import Contact
 from skin_host.client.presence import MAX_TOUCHES, Presence
 from skin_host.client.session import MAX_NAMES
 from skin_host.mqtt.info import encode_info
 from skin_host.mqtt.messages import decode_health
 from skin_host.mqtt.payload import MessageError
+from skin_host.mqtt.publisher import Publisher
 from skin_host.viewer.picture import MAX_CONTACTS, Picture
 from tests.client.test_client import hearing, publishing, take, touch
 from tests.client.test_presence import seen
+from tests.mqtt.test_publisher import settings
 from tests.support.broker import Mosquitto
 from tests.support.waiting import until
 from tests.viewer import test_picture as pages
@@ -105,6 +111,45 @@ def test_touches_that_never_end_are_forgotten_from_the_oldest_on() -> None:
         presence.take_touch(seen("begin", number), 1.0)
     known = [one.id for one in presence.touches("palm", 1.0)]
     assert known == list(range(10, MAX_TOUCHES + 10))
+
+
+def test_infos_that_name_other_parts_each_time_do_not_add_up() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_state("palm", "OFF", 1.0)
+    presence.take_node("main", online=True)
+    presence.take_info("main", ["palm"])
+    for number in range(100):
+        presence.take_info("stranger", ["palm", f"part{number}"])
+    assert len(presence._node_of) == 2
+    presence.take_info("stranger", [])
+    presence.take_node("main", online=False)
+    assert presence.changes(1.0) == [Contact("palm", "UNKNOWN", "offline")]
+
+
+async def test_an_answer_does_not_steer_the_terminal_and_is_checked(
+    mosquitto: Mosquitto, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whoever may publish answers may answer before the node does."""
+    evil = "\x1b[2J\x9b2Jpalm\u202e"
+    answers: dict[str, Any] = {
+        "thresholds": {evil: evil},
+        "status": {"palm": 5},
+        "raw": {"seconds": [evil]},
+    }
+
+    async def handle(name: str, _: bytes) -> dict[str, Any]:
+        return answers[name]
+
+    broker = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    async with Publisher(settings(mosquitto), "robot", handler=handle) as publisher:
+        await until(lambda: publisher.counters.connected)
+        for name, ends in (("thresholds", 0), ("raw", 0), ("status", 1)):
+            for words in ([], ["--json"]):
+                asked = ["command", name, "--broker", broker, "--robot", "robot", *words]
+                assert await asyncio.to_thread(main, asked) == (0 if words else ends)
+    said = capsys.readouterr()
+    assert not {one for one in said.out + said.err if one != "\n" and not one.isprintable()}
+    assert said.err == "skin command: health: Expected `object`, got `int`\n"
 
 
 def test_what_is_received_does_not_steer_the_terminal() -> None:
