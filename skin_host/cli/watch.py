@@ -18,8 +18,8 @@ from skin_host.cli.common import (
     print_json,
     run,
     set_up_logging,
-    warn,
     visible_json,
+    warn,
 )
 from skin_host.errors import visible
 
