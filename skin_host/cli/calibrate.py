@@ -38,7 +38,8 @@ def add_commands(commands: Commands) -> None:
     calibrate = add_command(
         commands,
         "calibrate",
-        "calibrate the untouched skin and keep the result",
+        "calibrate the untouched skin and keep the result; while a daemon runs use `skin "
+        "command calibrate`",
         "skin calibrate config/icub.toml --seconds 5",
     )
     add_config(calibrate)

@@ -191,7 +191,7 @@ def _record(arguments: argparse.Namespace) -> int:
 
 def _plain(value: Any) -> str:
     if isinstance(value, dict):
-        return "(" + ", ".join(f"{n} {kind}" for kind, n in value.items()) + ")"
+        return "(" + ", ".join(f"{n} {kind}" for kind, n in value.items()) + ")" if value else "0"
     return str(value)
 
 

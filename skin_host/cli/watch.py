@@ -137,7 +137,7 @@ async def _report_absence(skin: "SkinClient", part: str | None) -> None:
 
 def _absence(skin: "SkinClient", part: str | None) -> str:
     if not skin.connected:
-        return f"no broker: {skin.last_error}" if skin.last_error else ""
+        return f"no broker at {skin.where}: {skin.last_error}" if skin.last_error else ""
     if all(node.online is False for node in skin.nodes.values()):
         return f'no node of robot "{skin.robot}" is online: is `skin run` running?'
     infos = [node.info for node in skin.nodes.values() if node.info is not None]

@@ -223,7 +223,7 @@ class SkinClient:
                 return await self._until(known)
         except TimeoutError:
             raise BrokerError(
-                f'broker {self._where}: no node of robot "{self.robot}" published its info; '
+                f'broker {self.where}: no node of robot "{self.robot}" published its info; '
                 "is `skin run` running?"
             ) from None
 
@@ -259,7 +259,7 @@ class SkinClient:
                 f"{timeout_s:g} s; is `skin run` running there?"
             ) from None
         except MqttError as error:
-            raise CommandError(f"broker {self._where}: {explain(error)}") from None
+            raise CommandError(f"broker {self.where}: {explain(error)}") from None
         finally:
             del self._asked[number]
         if not result.ok:
@@ -311,10 +311,11 @@ class SkinClient:
             why += "; if it speaks MQTT 3.1.1 alone, end its URL with ?protocol=3.1.1"
         if "no broker listens" in why:
             why += f"; start one, such as `mosquitto -p {link.broker.port}`, or name another"
-        return BrokerError(f"broker {self._where}: cannot connect: {why}")
+        return BrokerError(f"broker {self.where}: cannot connect: {why}")
 
     @property
-    def _where(self) -> str:
+    def where(self) -> str:
+        """The address of the broker, or of all."""
         return ", ".join(str(link.broker) for link in self._links)
 
     async def __aexit__(self, *_: object) -> None:
@@ -362,7 +363,7 @@ class SkinClient:
             return online[0]
         if not online:
             raise BrokerError(
-                f'broker {self._where}: no node of robot "{self.robot}" is online; '
+                f'broker {self.where}: no node of robot "{self.robot}" is online; '
                 "is `skin run` running?"
             )
         raise RequestError(

@@ -277,7 +277,7 @@ class Viewer:
         """Show why the broker cannot be reached while the client still tries."""
         while True:
             if client.last_error:
-                self._why = f"no broker: {client.last_error}"
+                self._why = f"no broker at {client.where}: {client.last_error}"
                 self._take_status(connected=False)
             await asyncio.sleep(NODES_S)
 
@@ -290,7 +290,7 @@ class Viewer:
                 self._picture.forget_contacts()
             nodes = {name: (node.online, node.info) for name, node in client.nodes.items()}
             self._picture.take_nodes(client.robot, nodes)
-            self._why = f"no broker: {client.last_error or 'trying again'}"
+            self._why = f"no broker at {client.where}: {client.last_error or 'trying again'}"
             self._take_status(connected=client.connected)
             await asyncio.sleep(NODES_S)
 
