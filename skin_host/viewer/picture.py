@@ -28,6 +28,8 @@ _HEAD = struct.Struct("<BBHIIIdII")
 _U32 = 2**32
 #: Of a part; of more the oldest are forgotten.
 MAX_CONTACTS = 200
+#: A frame has a number of 16 bits for its part. No robot has as many.
+MAX_PARTS = 2**16
 
 
 #: A fingertip on a force/torque board has contacts and health; its age is that of its health.
@@ -184,7 +186,7 @@ class Picture:
             for node, info in nodes.items()
             for name in info.fingertips
         ]
-        for number, (node, name, n_taxels, description) in enumerate(described):
+        for number, (node, name, n_taxels, description) in enumerate(described[:MAX_PARTS]):
             view = old.get(name)
             if view is None or view.n_taxels != n_taxels:
                 view = PartView(0, node, n_taxels)

@@ -9,6 +9,7 @@ import contextlib
 import logging
 import os
 from collections.abc import AsyncIterator, Callable, Mapping
+from functools import partial
 from http import HTTPStatus
 from importlib import resources
 from pathlib import Path
@@ -25,6 +26,7 @@ from websockets.http11 import Request, Response
 from skin_host.client import SkinClient, Stream
 from skin_host.errors import BrokerError, RequestError, SkinError
 from skin_host.mqtt.address import Broker
+from skin_host.mqtt.connection import first_error
 from skin_host.recording.capture import MAX_AGO_S, PageRecording
 from skin_host.tasks import cancel
 from skin_host.viewer.picture import Cursor, Picture
@@ -61,6 +63,9 @@ SECURITY = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
+
+#: Errors of a request, and of what it asks for.
+_REFUSED = (SkinError, OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
@@ -191,6 +196,7 @@ class Viewer:
         """Send one page its new messages until it closes, and take its requests."""
         self._pages += 1
         telling = asyncio.create_task(self._tell(page))
+        telling.add_done_callback(partial(_close_with, page))
         wishes: set[asyncio.Task[None]] = set()
         try:
             async for message in _messages(page):
@@ -226,7 +232,7 @@ class Viewer:
             if self._client is None:
                 raise BrokerError(self._why)
             answer |= {"ok": True, "result": await self._carry_out(wish, self._client)}
-        except (SkinError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        except _REFUSED as error:
             answer |= {"ok": False, "error": str(error)}
         with contextlib.suppress(ConnectionClosed):
             await page.send(msgspec.json.encode(answer).decode())
@@ -267,6 +273,11 @@ class Viewer:
                 said, self._why = self._why, str(errors.exceptions[0])
                 if self._why != said:
                     _log.warning("%s; trying again", self._why)
+            except* Exception as errors:
+                # Pages would go on showing what was last true.
+                said, self._why = self._why, "a message could not be shown; see the server's log"
+                if self._why != said:
+                    _log.error("the page begins again", exc_info=first_error(errors))
             finally:
                 self._client = None
                 await cancel(waiting)
@@ -303,6 +314,15 @@ class Viewer:
                 "recording": self._recording.state,
             }
         )
+
+
+def _close_with(page: ServerConnection, telling: "asyncio.Task[None]") -> None:
+    """Close a page that gets nothing new any more: it shows that, and connects again."""
+    error = None if telling.cancelled() else telling.exception()
+    if error is not None:
+        if not isinstance(error, ConnectionClosed):
+            _log.error("a page is closed", exc_info=error)
+        page.transport.abort()
 
 
 async def _messages(page: ServerConnection) -> AsyncIterator[bytes]:

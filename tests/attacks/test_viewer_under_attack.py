@@ -3,11 +3,19 @@
 import asyncio
 import base64
 import resource
+from contextlib import suppress
 
 import pytest
+from websockets.exceptions import ConnectionClosed
 
+from skin_host.client import Frame
+from skin_host.layout import Layout
+from skin_host.mqtt.publisher import Publisher
+from skin_host.viewer.picture import Cursor, Picture
 from skin_host.viewer.server import MAX_CONNECTIONS, MAX_PIECES, Viewer
-from tests.viewer.test_server import fetch, nowhere, page
+from tests.support.broker import Mosquitto
+from tests.viewer import test_picture as pictures
+from tests.viewer.test_server import fetch, heard, node, nowhere, of_type, page, pressed, skin
 
 _TEXT, _MORE = 0x01, 0x00
 
@@ -103,3 +111,57 @@ async def test_a_page_that_sends_a_request_in_a_few_pieces_is_answered() -> None
             async for said in socket:
                 if '"answer"' in str(said):
                     break
+
+
+async def test_a_message_that_cannot_be_shown_leaves_no_page_as_it_was(
+    mosquitto: Mosquitto, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A page that gets nothing new shows what was true once."""
+    take, monkeys = Picture.take_frame, [1]
+
+    def fail_once(picture: Picture, frame: Frame) -> None:
+        if monkeys:
+            raise ZeroDivisionError(monkeys.pop())
+        take(picture, frame)
+
+    monkeypatch.setattr(Picture, "take_frame", fail_once)
+    monkeypatch.setattr("skin_host.viewer.server.RETRY_S", 0.1)
+    layout = skin()
+    broker = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    async with node(mosquitto, layout) as publisher:
+        async with Viewer(broker, robot="demo").serving(port=0) as url, page(url) as socket:
+            await heard(socket, lambda told: of_type("status")(told) and told["connected"])
+            publisher.put_frame(pressed(layout, 1))
+            lost = await heard(socket, lambda told: of_type("status")(told) and told["error"])
+            assert "see the server's log" in lost["error"]
+            assert not lost["connected"]
+            await heard(socket, lambda told: of_type("status")(told) and told["connected"])
+            sending = asyncio.create_task(put_frames(publisher, layout))
+            assert await heard(socket, lambda told: isinstance(told, bytes))
+            sending.cancel()
+            assert "the page begins again" in caplog.text
+
+            def fail(*_: object) -> list[str]:
+                raise ZeroDivisionError
+
+            monkeypatch.setattr(Picture, "news", fail)
+            async with asyncio.timeout(30):
+                with suppress(ConnectionClosed):
+                    while True:
+                        await socket.recv()
+            assert "a page is closed" in caplog.text
+
+
+async def put_frames(publisher: Publisher, layout: Layout) -> None:
+    for number in range(2, 10**6):
+        publisher.put_frame(pressed(layout, number))
+        await asyncio.sleep(0.05)
+
+
+def test_more_parts_than_frames_can_name_are_not_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("skin_host.viewer.picture.MAX_PARTS", 3)
+    picture = Picture()
+    picture.take_nodes("robot", {"main": (True, pictures.info({f"p{n}": 1 for n in range(9)}))})
+    assert list(picture.parts) == ["p0", "p1", "p2"]
+    picture.take_frame(pictures.frame("p5", [1.0]))
+    assert picture.news(Cursor())

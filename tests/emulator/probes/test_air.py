@@ -1,5 +1,7 @@
 """Air presses all pads of a part alike, as scenes say or as it was recorded."""
 
+import io
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -148,3 +150,39 @@ def test_an_emulated_insole_sends_what_the_recorded_one_sent() -> None:
     for share in (5, 50, 95):
         noise = rows[f"noise at rest, {share} % of the pads"]
         assert noise["emulated"] == pytest.approx(noise["recorded"], rel=0.2)
+
+
+def packed(shape: str, data: bytes = b"", kind: str = "<f8", name: str = "t_s.npy") -> bytes:
+    """An .npz whose head states a shape, whatever is behind it."""
+    head = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    array = b"\x93NUMPY\1\0" + len(head).to_bytes(2, "little") + head + data
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(name, array)
+        archive.writestr("pressure_kpa.npy", array)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        packed("(1000000000000,)"),
+        packed("(1000001,)", bytes(8_000_008)),
+        packed("(-1,)"),
+        packed("(3,)", b"abc", "|O"),
+        packed("(3,)", bytes(48), "<c16"),
+        packed("(3,)", bytes(8)),
+        packed("(" * 5000),
+        packed("(3,)", bytes(24), name="t.npy"),
+        packed("(3,)", bytes(24)).replace(b"\x78", b"\x99").replace(b"\0\0\x08", b"\0\0\x63"),
+        packed("(3,)", bytes(24))[:-40],
+    ],
+)
+def test_a_damaged_or_endless_course_is_refused_in_a_line(tmp_path: Path, data: bytes) -> None:
+    path = tmp_path / "air.npz"
+    path.write_bytes(data)
+    with pytest.raises(ConfigurationError) as refused:
+        read_air(path)
+    assert str(refused.value).isprintable()
+    assert str(path) in str(refused.value)
