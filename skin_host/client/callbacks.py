@@ -12,6 +12,7 @@ from skin_host.client.heard import Health
 from skin_host.client.presence import Contact
 from skin_host.client.session import SkinClient
 from skin_host.client.streams import Stream
+from skin_host.errors import RequestError
 from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.info import NodeInfo
@@ -31,7 +32,8 @@ class SkinCallbacks:
 
     The functions run one after the other in one thread, which is not the caller's: data that they
     share with it needs a lock, and while one of them runs nothing else is received. An exception in
-    one of them is logged, and the next ones are called.
+    one of them is logged, and the next ones are called. In them `present` can be asked, and nothing
+    that waits: `info`, `command` and `on_...` raise a RequestError there.
 
     Raises (on entering): see `SkinClient`.
     """
@@ -92,6 +94,8 @@ class SkinCallbacks:
         self._on(lambda: self._skin.contacts(part), call_unknown)
 
     def present(self, part: str | None = None) -> list[Touch]:
+        if threading.current_thread() is self._thread:
+            return self._skin.present(part)
 
         async def found() -> list[Touch]:
             return self._skin.present(part)
@@ -139,6 +143,9 @@ class SkinCallbacks:
         self._wait_for(begin())
 
     def _wait_for(self, work: Coroutine[Any, Any, T]) -> T:
+        if threading.current_thread() is self._thread:
+            work.close()
+            raise RequestError("a callback cannot wait for messages; ask in another thread")
         return asyncio.run_coroutine_threadsafe(work, self._loop).result()
 
 

@@ -38,10 +38,17 @@ class Contact(NamedTuple):
         return self.state != "OFF"
 
 
-#: At most this many touches of a part are kept: of more, the oldest are forgotten.
+#: At most this many touches of a part are kept, of this many taxels together: of more, the oldest
+#: are forgotten.
 MAX_TOUCHES = 1000
+MAX_TOUCHED = 200_000
 #: A distance between two clocks is the least one that was seen for this long, or twice as long.
 DISTANCE_S = 120.0
+
+
+def too_many(touches: Iterable[Touch]) -> bool:
+    """Return whether touches are of more taxels together than any robot's."""
+    return sum(len(touch.taxels) for touch in touches) > MAX_TOUCHED
 
 
 class Lateness:
@@ -155,7 +162,9 @@ class Presence:
             part.touches.pop(touch.id, None)
         else:
             part.touches[touch.id] = touch, now_s
-            if len(part.touches) > MAX_TOUCHES:
+            while len(part.touches) > MAX_TOUCHES or (
+                len(part.touches) > 1 and too_many(one for one, _ in part.touches.values())
+            ):
                 del part.touches[next(iter(part.touches))]
 
     def take_node(

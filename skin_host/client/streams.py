@@ -21,6 +21,9 @@ HELD = {
     "contact": 1000,
     "health": 1000,
 }
+#: Of touches no more than have this many taxels together: whoever may publish could send some of
+#: a hundred thousand each.
+HELD_TAXELS = 5_000_000
 #: An event that the broker got twice comes again within this many events.
 DUPLICATE_SPAN = 64
 
@@ -34,6 +37,7 @@ class Stream(AsyncIterator[T], Generic[T]):
         self.part = part
         self.kinds = kinds
         self._items: deque[T] = deque(maxlen=max(HELD[kind] for kind in kinds))
+        self._taxels = 0
         self._wake = asyncio.Event()
         self._closed = False
         #: By kind and part; each has separate numbers.
@@ -41,8 +45,18 @@ class Stream(AsyncIterator[T], Generic[T]):
 
     def put(self, item: T) -> None:
         """Add a received item."""
+        if len(self._items) == self._items.maxlen:
+            self._drop()
         self._items.append(item)
+        self._taxels += _taxels_of(item)
+        while self._taxels > HELD_TAXELS and len(self._items) > 1:
+            self._drop()
         self._wake.set()
+
+    def _drop(self) -> T:
+        item = self._items.popleft()
+        self._taxels -= _taxels_of(item)
+        return item
 
     def close(self) -> None:
         """End after the held items."""
@@ -56,7 +70,7 @@ class Stream(AsyncIterator[T], Generic[T]):
                     raise StopAsyncIteration
                 self._wake.clear()
                 await self._wake.wait()
-            item: Any = self._items.popleft()
+            item: Any = self._drop()
             if isinstance(item, Touch | Slip | Over):
                 # A publisher that does not count cannot be checked.
                 missed = self._missed(item, item.count) if item.count else 0
@@ -77,3 +91,7 @@ class Stream(AsyncIterator[T], Generic[T]):
         self._last[kind] = number, item.t_ns
         # A smaller number at a later time means that the node was restarted.
         return max(0, number - last - 1)
+
+
+def _taxels_of(item: object) -> int:
+    return len(item.taxels) if isinstance(item, Touch) else 0

@@ -20,6 +20,7 @@ import numpy as np
 from msgspec import Struct
 
 from skin_host.client import Contact, Frame, Health, NodeInfo, Touch
+from skin_host.client.presence import too_many
 
 FRAME = 1
 HAS_RAW = 1
@@ -128,7 +129,10 @@ class Picture:
             part.contacts.pop(touch.id, None)
         else:
             part.contacts[touch.id] = touch
-            if len(part.contacts) > MAX_CONTACTS:  # whoever may publish could go on for ever
+            # Whoever may publish could go on for ever.
+            while len(part.contacts) > MAX_CONTACTS or (
+                len(part.contacts) > 1 and too_many(part.contacts.values())
+            ):
                 del part.contacts[next(iter(part.contacts))]
         part.changed["contacts"] += 1
 

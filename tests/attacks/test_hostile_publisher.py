@@ -113,6 +113,18 @@ def test_touches_that_never_end_are_forgotten_from_the_oldest_on() -> None:
     assert known == list(range(10, MAX_TOUCHES + 10))
 
 
+def test_touches_of_very_many_taxels_do_not_fill_the_memory() -> None:
+    presence, picture = Presence(stale_s=3.0), Picture()
+    picture.take_nodes("robot", {"main": (True, INFO)})
+    large = list(range(100_000))
+    for number in range(100):
+        one = replace(seen("begin", number), taxels=large)
+        presence.take_touch(one, 1.0)
+        picture.take_touch(one)
+    assert [one.id for one in presence.touches("palm", 1.0)] == [98, 99]
+    assert list(picture.parts["palm"].contacts) == [98, 99]
+
+
 def test_infos_that_name_other_parts_each_time_do_not_add_up() -> None:
     presence = Presence(stale_s=3.0)
     presence.take_state("palm", "OFF", 1.0)

@@ -336,6 +336,38 @@ async def test_callbacks_hear_the_same_from_a_thread_of_their_own(mosquitto: Mos
     ]
 
 
+async def test_a_callback_that_would_wait_for_messages_is_told_so(mosquitto: Mosquitto) -> None:
+    """It holds up the thread that receives them: it would wait for ever."""
+
+    def use() -> list[object]:
+        told: list[object] = []
+        done = threading.Event()
+
+        def ask(_: Touch) -> None:
+            told.append([one.id for one in skin.present()])
+            for call in (skin.info, lambda: skin.command("status"), lambda: skin.on_touch(print)):
+                try:
+                    call()
+                except RequestError as error:
+                    told.append(str(error))
+            done.set()
+
+        with SkinCallbacks(f"mqtt://{mosquitto.host}:{mosquitto.port}", robot="robot") as skin:
+            skin.on_touch(ask)
+            asyncio.run_coroutine_threadsafe(put(), loop).result()
+            assert done.wait(PATIENCE_S)
+        return told
+
+    async def put() -> None:
+        publisher.put_touch(touch(1))
+
+    loop = asyncio.get_running_loop()
+    async with publishing(mosquitto) as publisher:
+        told = await asyncio.to_thread(use)
+    refusal = "a callback cannot wait for messages; ask in another thread"
+    assert told == [[1], refusal, refusal, refusal]
+
+
 def test_callbacks_raise_what_entering_raises() -> None:
     with pytest.raises(BrokerError):
         with SkinCallbacks(f"mqtt://127.0.0.1:{free_port()}", robot="r", patience_s=0.2):

@@ -4,7 +4,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from skin_host.client.heard import Contact
-from skin_host.client.streams import HELD, Stream
+from skin_host.client.streams import HELD, HELD_TAXELS, Stream
 from skin_host.fingertip.events import Over
 from skin_host.mqtt.messages import Frame
 from skin_host.processing.events import Touch
@@ -126,3 +126,16 @@ async def test_kinds_of_events_have_numbers_of_their_own_and_stay_in_order() -> 
     stream.close()
     seen = [(type(event).__name__, event.count, event.missed) async for event in stream]
     assert seen == [("Touch", 7, 0), ("Over", 1, 0), ("Touch", 8, 0), ("Over", 4, 2)]
+
+
+async def test_touches_of_very_many_taxels_are_held_only_so_far_and_counted() -> None:
+    """Whoever may publish could fill the memory of a slow reader."""
+    stream: Stream[Touch] = Stream(None, "touch")
+    large = list(range(100_000))
+    for count in range(1, 201):
+        stream.put(replace(touch(count), taxels=large))
+    assert sum(len(item.taxels) for item in stream._items) == HELD_TAXELS
+    told = await heard(stream)
+    assert len(told) == HELD_TAXELS // len(large)
+    assert told[-1] == (200, 0)
+    assert stream._taxels == 0
