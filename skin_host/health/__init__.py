@@ -43,7 +43,6 @@ LONGEST_LOOK_S = 0.3
 _ACCUSING = {"board_jitter", "board_period", "bus_loses_frames"}
 _PASSING = {
     "board_jitter",
-    "board_overflows",
     "board_period",
     "bus_babbling",
     "bus_bit_errors",

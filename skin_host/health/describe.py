@@ -228,6 +228,9 @@ class Describer:
             since_ns = self._unproven_ns.setdefault((board, number), ledger.now_ns)
             return "constant" if ledger.now_ns - since_ns >= CONSTANT_NS else None
         self._unproven_ns.pop((board, number), None)
+        if row in ledger.twice:
+            # What pressed one of the two boards as it was zeroed cannot be known.
+            return None
         # Single pads are listed with the taxels; only a whole triangle counts here. Pads that were
         # pressed while their board was zeroed are reported as `board_in_doubt`.
         far = ledger.far[row, number] & ~self._engine.in_doubt(board)[number]
@@ -251,7 +254,7 @@ class Describer:
                 "stuck": self._of_board(liveness.stuck, row),
                 "noisy": self._of_board(liveness.noisy, row),
             }
-            if ledger.flagged[row]:
+            if ledger.flagged[row] and row not in ledger.twice:
                 answered = (ledger.error[row] == 0)[:, None]
                 far = ledger.far[row] & ~self._engine.in_doubt(index)
                 masks["out_of_range"] = far & answered

@@ -229,12 +229,12 @@ class Intake:
                 samples.append(self._sample(state))
         return samples
 
-    def note_gap(self, row: int) -> None:
+    def note_gap(self, row: int, missed: int = 0) -> None:
         """A board's next sweep does not follow the one before it: see `Liveness.note_gap`."""
         if self._waiting[row]:
             # The one before may itself not be judged yet.
             self.judge()
-        self.liveness.note_gap(row)
+        self.liveness.note_gap(row, missed)
 
     def takes(self, row: int, number: int) -> bool:
         """Return whether the readings of a triangle in the last sweep of a board (its row) are
@@ -284,7 +284,7 @@ class Intake:
         """
         ledger = self._ledger
         if sweep.missed:
-            self.note_gap(row)
+            self.note_gap(row, sweep.missed)
         doubted = self.liveness.doubted
         if doubted is not None:
             doubted = doubted[TRIANGLES * row : TRIANGLES * (row + 1)]

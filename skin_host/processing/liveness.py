@@ -85,6 +85,8 @@ MOST_WAITING = 2
 #: jumped lately, or jumps again so soon, is a fault of the pad, not of the bus.
 SPIKE_UNITS = 7.0
 SPIKE_SIGMAS = 8.0
+#: A spike that has not been counted when so many sweeps are missed has long been over.
+SPIKE_SWEEPS = 25
 
 
 def change_rate(noise_units: Floats) -> Floats:
@@ -321,13 +323,18 @@ class Liveness:
             self._until_learning = RATE_SAMPLES - int(np.maximum.reduce(self._samples))
         self._doubt()
 
-    def note_gap(self, board: int) -> None:
-        """Sweeps of a board (its row) were lost: the next step does not follow the last one."""
+    def note_gap(self, board: int, missed: int = 0) -> None:
+        """Sweeps of a board (its row) were lost, so many if that is known: the next step does not
+        follow the last one.
+        """
         self.catch_up()
         self._settle_step()
         self._knows_far = False
         triangles = len(self._step) // self._boards
-        self._step[triangles * board : triangles * (board + 1)] = 0
+        mine = slice(triangles * board, triangles * (board + 1))
+        self._step[mine] = 0
+        if missed >= SPIKE_SWEEPS:
+            self._spiked[mine] = False
 
     def keep(self, before: "Liveness", boards: Mask) -> None:
         """Take over the state of a predecessor for the same skin, for some boards

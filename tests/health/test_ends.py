@@ -214,7 +214,8 @@ def test_what_happened_to_a_board_is_told_for_a_minute(counter: str, code: str) 
     getattr(ledger, counter)[0] += 1
     now_ns = bench.now_ns + S // 10
     assert code in codes(bench.health, now_ns, boards=boards)
-    assert code not in codes(bench.health, now_ns + LATELY_NS + 4 * S, boards=boards)
+    assert code in codes(bench.health, now_ns + LATELY_NS - S, boards=boards)
+    assert code not in codes(bench.health, now_ns + LATELY_NS + S // 10, boards=boards)
 
 
 class Silent:

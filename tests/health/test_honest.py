@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from emulator.probes.scene import Place, Probe, Scene
+from emulator.probes.scene import Fault, Place, Probe, Scene
 from emulator.robot import Robot
 from skin_host.bus.wire import FrameBatch
 from skin_host.health import LATELY_NS, STALLED_NS, HealthWatch
@@ -101,9 +101,9 @@ class TwoBoards:
     def __init__(self, bench: FaultBench, scene: Scene) -> None:
         self._bench = bench
         self._alone = bench.robot.step
-        self._other = Robot(bench.engine.settings, bench.layout, scene)
-        self._other.bring_up()
-        self._other.step(0.013)
+        self.other = Robot(bench.engine.settings, bench.layout, scene)
+        self.other.bring_up()
+        self.other.step(0.013)
         bench.robot.step = self._step  # type: ignore[method-assign]
 
     def end(self) -> None:
@@ -112,10 +112,10 @@ class TwoBoards:
     def _step(self, seconds: float) -> dict[str, FrameBatch]:
         batches = self._alone(seconds)
         (bus,) = batches
-        mine, other = batches[bus], self._other.step(seconds)[bus]
+        mine, other = batches[bus], self.other.step(seconds)[bus]
         same = (other.id >> 4 & 0xF) == self._bench.layout.boards[0].settings.address
         t_ns = np.concatenate(
-            [mine.t_ns, other.t_ns[same] - self._other.t_ns + self._bench.robot.t_ns]
+            [mine.t_ns, other.t_ns[same] - self.other.t_ns + self._bench.robot.t_ns]
         )
         order = np.argsort(t_ns, kind="stable")
         return {
@@ -162,6 +162,28 @@ def test_two_boards_at_one_address_are_called_by_name(quiet: bool) -> None:
     bench.run(5.0)
     assert ("board_twice", name) not in bench.told
     assert pads_of(bench, 0).sum() >= before.sum() - 2
+
+
+def test_what_pressed_one_of_two_boards_as_it_took_its_zero_accuses_no_pad() -> None:
+    """Sweep by sweep its pads read far below zero, and as those of the other board."""
+    press = Probe(
+        part="left_hand",
+        at=Place(triangle=4),
+        diameter_mm=12,
+        pressure_kpa=[(0, 0), (0.2, 60), (2.0, 60), (2.2, 0)],
+        start_s=4.0,
+    )
+    bench = FaultBench(3.0, Scene(quiet=True, seed=1))
+    other = TwoBoards(bench, Scene(quiet=True, seed=7, probe=[press])).other
+    name = bench.layout.boards[0].name
+    bench.run(5.0 - other.t_ns / 1e9)
+    assert ("board_twice", name) in bench.told
+    other.inject(Fault(name="chip_gone", board=name, triangle=0, value=0))  # it takes a zero
+    bench.first_told.clear()
+    bench.run(5.0)
+    assert ("board_twice", name) in bench.told
+    assert bench.engine.ledger.far[bench.engine.ledger.row[0]].any()
+    assert not {where for code, where in bench.first_told if "out_of_range" in code}
 
 
 @pytest.mark.parametrize("sooner_ms", [30.0, 40.0])

@@ -384,6 +384,22 @@ def test_a_gap_of_one_board_hides_no_spike_of_another() -> None:
     assert np.argwhere(liveness.spikes).tolist() == [[2, 4]]
 
 
+@pytest.mark.parametrize(("missed", "spikes"), [(1, 1), (200, 0)])
+def test_a_byte_that_was_off_before_a_long_silence_is_not_counted_after_it(
+    missed: int, spikes: int
+) -> None:
+    """It takes 25 sweeps to know that the pad does not jump. What was damaged then is over now."""
+    liveness = Liveness(K, np.full((K, 12), 0.4), PERIOD_S)
+    for number in range(60):
+        raw = np.full((K, 12), 240, np.uint8)
+        raw[1, 4] -= 12 * (number == 10)
+        if number == 20:
+            assert not liveness.spikes.any()
+            liveness.note_gap(0, missed)
+        liveness.step(raw, HERE, NO)
+    assert liveness.spikes.sum() == spikes
+
+
 def test_triangles_are_valid_until_a_calibration_finds_them_constant() -> None:
     rng = np.random.default_rng(3)
     assert Liveness(K, None, PERIOD_S).doubted is None
