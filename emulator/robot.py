@@ -379,7 +379,7 @@ class Robot:
         """
         bare = probe.part in self.fingertips.boards
         live = LiveProbe(self, None if bare else self.skin.add_live(probe))
-        self.fingertips.touch(probe, self.layout, live.pressing_n)
+        self.fingertips.touch(probe, self.layout, live.pressing_n, live.pulling_n)
         return live
 
     def inject(self, fault: Fault) -> Callable[[], None]:
@@ -489,6 +489,7 @@ class LiveProbe:
         self._robot = robot
         self._number = number
         self._drive_n = 0.0
+        self._pull_n: float | None = None
 
     def press(self, drive: float, x_mm: float = 0.0, y_mm: float = 0.0) -> None:
         """Press from now on with a force (N), or to a depth (mm) if it is driven by depth; on skin
@@ -500,8 +501,15 @@ class LiveProbe:
         self._robot.skin.set_live(self._number, drive, x_mm, y_mm)
         self._robot.work_out_now()
 
+    def pull(self, force_n: float) -> None:
+        """Pull an object that hangs on it along the surface from now on, until it is lifted; only a
+        force/torque board feels that.
+        """
+        self._pull_n = force_n
+
     def lift(self) -> None:
         """Take it off the skin."""
+        self._pull_n = None
         self.press(0.0)
 
     @property
@@ -514,6 +522,10 @@ class LiveProbe:
         if self._number is None:
             return self._drive_n
         return self._robot.skin.contact_force_n().get(self._number, 0.0)
+
+    def pulling_n(self) -> float | None:
+        """Return the pull; None if nothing hangs on it."""
+        return self._pull_n
 
 
 class _StackSizes:

@@ -254,20 +254,29 @@ class Fingertips:
     def _force_on_skin(self, number: int) -> float:
         return self._skin_force_n().get(number, 0.0)
 
-    def touch(self, probe: Probe, layout: Layout, force_n: Callable[[], float]) -> None:
+    def touch(
+        self,
+        probe: Probe,
+        layout: Layout,
+        force_n: Callable[[], float],
+        pull_n: Callable[[], float | None],
+    ) -> None:
         """Add a probe that a program moves, if it is on a fingertip.
 
         Args:
             probe: its keyframes are not used.
             layout: of the skin.
             force_n: returns with what force it presses now.
+            pull_n: returns with what force an object that hangs on it is pulled along the surface
+                now; None if there is none.
 
         Raises:
             ConfigurationError: it cannot be on its fingertip.
         """
         for name, tip in self._tips.items():
             if probe.part in (name, tip.array):
-                self._presses[name].append(self._press(name, tip, probe, layout, force_n))
+                press = self._press(name, tip, probe, layout, force_n, pull_n)
+                self._presses[name].append(press)
 
     @staticmethod
     def _press(
@@ -276,6 +285,7 @@ class Fingertips:
         probe: Probe,
         layout: Layout,
         force_n: Callable[[], float] | None,
+        pull_n: Callable[[], float | None] | None = None,
     ) -> "_Press":
         if probe.part == name:
             if tip.array is not None:
@@ -283,9 +293,9 @@ class Fingertips:
             if probe.by_depth:
                 raise ConfigurationError("depth_mm: a fingertip without skin is driven by a force")
             point, normal = place_on(tip, probe)
-            return _Press(probe, point, normal, force_n)
+            return _Press(probe, point, normal, force_n, pull_n)
         point_m, normal = resolve(probe.at, probe.part, layout)
-        return _Press(probe, 1e3 * point_m, normal, force_n)
+        return _Press(probe, 1e3 * point_m, normal, force_n, pull_n)
 
 
 class _Press:
@@ -295,6 +305,7 @@ class _Press:
         probe: of it.
         point_mm, normal: its place.
         force_n: returns with what force it presses now; by the probe's keyframes if None.
+        pull_n: the same of the pull.
     """
 
     def __init__(
@@ -303,12 +314,14 @@ class _Press:
         point_mm: Floats,
         normal: Floats,
         force_n: Callable[[], float] | None,
+        pull_n: Callable[[], float | None] | None,
     ) -> None:
         self._probe = probe
         self._point_mm = point_mm
         self._normal = normal
         self._along = tangents(normal)
         self._force_n = force_n
+        self._pull_n = pull_n
         turn = np.deg2rad(probe.tangential_deg)
         self._pull = np.cos(turn) * self._along[0] + np.sin(turn) * self._along[1]
         self._object: HeldObjects | None = None
@@ -330,8 +343,13 @@ class _Press:
             self._object = None
             return np.zeros(6)
         force = -normal_n * self._normal
-        if probe.tangential_n is not None:
-            force = force + self._held_n(normal_n, phase_s, t_ns) * self._pull
+        pull_n: float | None = None
+        if self._pull_n is not None:
+            pull_n = self._pull_n()
+        elif probe.tangential_n is not None:
+            pull_n = _value(probe.tangential_n, phase_s)
+        if pull_n is not None:
+            force = force + self._held_n(normal_n, pull_n, t_ns) * self._pull
         offset = np.zeros(2)
         if probe.slide_mm:
             times, x_mm, y_mm = np.array(probe.slide_mm).T
@@ -341,7 +359,7 @@ class _Press:
         fx, fy, fz = force.tolist()
         return np.array([fx, fy, fz, y * fz - z * fy, z * fx - x * fz, x * fy - y * fx])
 
-    def _held_n(self, normal_n: float, phase_s: float, t_ns: int) -> float:
+    def _held_n(self, normal_n: float, pull_n: float, t_ns: int) -> float:
         """Tangential force (N) by which the object drags at the fingertip."""
         dt_s = 1e-9 * (t_ns - self._last_ns)
         self._last_ns = t_ns
@@ -353,7 +371,6 @@ class _Press:
             law = Friction(static=static, sliding=SLIDING_SHARE * static)
             self._object = HeldObjects(1, law, mass_kg=OBJECT_KG, dt_s=STEP_S)
             dt_s = 0.0
-        pull_n = _value(self._probe.tangential_n or [], phase_s)
         return float(self._object.advance([pull_n], [normal_n], dt_s)[0])
 
 

@@ -384,6 +384,33 @@ def test_what_a_program_presses_loads_the_fingertip_below_it() -> None:
     assert loads_n() == pytest.approx([0.0, 0.0], abs=1e-9)
 
 
+def test_what_a_program_pulls_slides_when_friction_does_not_hold_it() -> None:
+    settings, layout = load("fingertips")
+    robot = Robot(settings, layout, Scene(noise=False))
+    robot.bring_up()
+    finger = robot.touch(Probe(part="index", friction=0.6, force_n=[(0.0, 0.0)]))
+    finger.press(3.0)
+
+    def shear_n() -> float:
+        for _ in range(50):
+            robot.step(0.01)
+        force_n = robot.fingertips.force_n("index", robot.t_ns)
+        return float(np.hypot(force_n[0], force_n[1]))
+
+    assert shear_n() == 0.0
+    finger.pull(1.0)
+    assert shear_n() == pytest.approx(1.0, abs=0.05)
+    assert robot.fingertips.slipped_mm("index") == 0.0
+    finger.pull(2.4)
+    assert shear_n() == pytest.approx(0.85 * 0.6 * 3.0, rel=0.05)
+    assert robot.fingertips.slipped_mm("index") > 10.0
+    finger.lift()
+    assert shear_n() == 0.0
+    finger.press(3.0)
+    assert shear_n() == 0.0
+    assert robot.fingertips.slipped_mm("index") == 0.0
+
+
 GRASP_LOG = CONFIG.parent / "../shared/data/icub_grasp.log"
 
 

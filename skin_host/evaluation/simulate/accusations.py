@@ -144,9 +144,16 @@ class Accusations:
 
     def may_damage(self, tip: str) -> bool:
         """Whether something damages what a fingertip's board sends, or did so lately."""
+        return self._lately("fingertip_noisy", tip)
+
+    def may_lose(self, tip: str) -> bool:
+        """Whether something loses what a fingertip's board sends, or did so lately."""
+        return self._lately("fingertip_loses_frames", tip) or self._lately("bus_drops", tip)
+
+    def _lately(self, code: str, where: str) -> bool:
         now_ns = self._world.clock.monotonic_ns()
         return any(
-            trouble.accuses("fingertip_noisy", tip) and (over is None or now_ns - over < QUIET_NS)
+            trouble.accuses(code, where) and (over is None or now_ns - over < QUIET_NS)
             for trouble, _, over in self.troubles
         )
 

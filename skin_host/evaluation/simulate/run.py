@@ -45,6 +45,8 @@ LONGEST_DRILL_S = 60.0
 #: Presses: short ones, and long ones in which an operator does something that a press spoils.
 SHORT_S, LONG_S = (0.2, 5.0), (7.0, 11.0)
 LONG_SHARE = 0.3
+#: Share of the presses of a fingertip in which an object is held that slips.
+SLIP_SHARE = 0.4
 #: The temperature moves by at most so much in this time.
 WANDER_S, MOST_WANDER_C = 600.0, 1.0
 #: Presses of rehearsals.
@@ -391,13 +393,15 @@ class _Run:
             await spot.press(max(SHORT_S[0], min(left_s, seconds)))
 
     async def _press_tip(self, left_s: float) -> None:
-        """As `_press`, a fingertip without skin."""
+        """As `_press`, a fingertip without skin; or let slip what it holds."""
         tip = self._chance.choice(self.world.tips)
-        if not tip.pressed:
-            seconds = self._chance.uniform(
-                *(LONG_S if self._chance.random() < LONG_SHARE else SHORT_S)
-            )
-            await tip.press(max(SHORT_S[0], min(left_s, seconds)))
+        if tip.pressed:
+            return
+        if self._chance.random() < SLIP_SHARE:
+            await tip.slip()
+            return
+        seconds = self._chance.uniform(*(LONG_S if self._chance.random() < LONG_SHARE else SHORT_S))
+        await tip.press(max(SHORT_S[0], min(left_s, seconds)))
 
     def _meddle(self, spot: Spot) -> None:
         """An operator does something to what is pressed."""

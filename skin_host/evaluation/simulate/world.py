@@ -34,6 +34,9 @@ Triangle = tuple[str, int]
 SPOTS = 6
 #: A daemon that has not ended so long after it was asked to hangs.
 LONGEST_END_S = 8.0
+#: How a fingertip's object is pulled: so hard in the end, as a share of what presses it; for so
+#: long until it is, and then.
+PULL_SHARE, PULL_S, SLIDE_S = 0.8, 1.0, 0.7
 
 
 class Life(Living):
@@ -291,3 +294,23 @@ class PressedTip(Target):
     def __init__(self, world: World, chance: random.Random, name: str) -> None:
         probe = Probe(part=name, diameter_mm=8.0, force_n=[(0.0, 0.0)])
         super().__init__(world, chance, probe, name)
+        self.name = name
+        #: When it was last pulled along its surface.
+        self.pulled_ns = -(1 << 62)
+
+    async def slip(self) -> None:
+        """Press an object to it that is pulled along the surface until it slides; then lift it."""
+        world = self._world
+        kpa = self._chance.uniform(30.0, 80.0)
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self.press(0.5 + PULL_S + SLIDE_S, kpa))
+            await world.clock.sleep(0.5)
+            world.note(f"pull {self._about}")
+            steps = round(PULL_S / 0.01)
+            for step in range(1, steps + 1):
+                world.move()
+                self._probe.pull(step / steps * PULL_SHARE * kpa * self._area_mm2 * 1e-3)
+                self.pulled_ns = world.clock.monotonic_ns()
+                await world.clock.sleep(0.01)
+            await world.clock.sleep(SLIDE_S)
+            self.pulled_ns = world.clock.monotonic_ns()

@@ -15,6 +15,7 @@ from skin_host.cli.common import load_skin
 from skin_host.demo import configuration
 from skin_host.evaluation.simulate.run import RunResult, simulate, simulate_all
 from skin_host.fingertip.events import FingertipEvent
+from skin_host.fingertip.slip import Floats, Seen, SlipWatch
 from skin_host.fingertip.tip import Tip
 
 pytestmark = pytest.mark.long
@@ -74,6 +75,30 @@ def test_a_fingertip_that_does_not_feel_what_presses_it_breaks_a_promise(
     assert "not touched while it is pressed" in result.broken
     # What the end of the run does is not shown.
     assert result.last[-1].endswith(f"BROKEN: {result.broken}")
+
+
+def test_a_fingertip_that_does_not_feel_what_slips_breaks_a_promise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    step = SlipWatch.step
+
+    def feel_no_slip(
+        watch: SlipWatch, load: Floats, normal: Floats | None, *, settled: bool
+    ) -> Seen:
+        return step(watch, load, normal, settled=False)
+
+    monkeypatch.setattr(SlipWatch, "step", feel_no_slip)
+    result = run(2, configuration("fingertips.toml"), until_s=11.0)
+    assert result.broken == "index: does not slip, and what presses it slides"
+
+
+def test_a_fingertip_that_slips_without_a_pull_breaks_a_promise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(SlipWatch, "step", lambda *_, settled: Seen(1.0, cause="rate"))
+    result = run(2, configuration("fingertips.toml"), until_s=11.0)
+    assert result.broken is not None
+    assert "slips, and nothing pulls" in result.broken
 
 
 def test_the_same_seed_gives_the_same_events_in_another_process(tmp_path: Path) -> None:

@@ -39,7 +39,7 @@ from skin_host.evaluation.simulate.promises.subscribers import Subscribers
 from skin_host.evaluation.simulate.promises.zeros import Zeros
 from skin_host.evaluation.simulate.troubles import Trouble, damaged_set_up
 from skin_host.evaluation.simulate.world import Life, Triangle, World
-from skin_host.fingertip.events import FingertipEvent
+from skin_host.fingertip.events import FingertipEvent, Slip
 from skin_host.layout import PadKind
 from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
@@ -176,6 +176,10 @@ class Promises:
         if isinstance(event, Touch):
             self.touches += 1
             self._hold(self._skin.touch(event))
+            if event.event == "begin":
+                self._fingertips.touches(event.part)
+        elif isinstance(event, Slip) and event.event == "begin":
+            self._hold(self._fingertips.slips(event.part))
 
     def _frame(self, frame: PressureFrame) -> None:
         valid = frame.valid.tobytes()

@@ -1,4 +1,6 @@
-"""A fingertip on a force/torque board whose zero is of no load is touched while it is loaded."""
+"""A fingertip on a force/torque board whose zero is of no load is touched while it is loaded, and
+slips while its load slides.
+"""
 
 import numpy as np
 
@@ -10,6 +12,9 @@ from skin_host.evaluation.simulate.promises.limits import (
     LONG_AGO_NS,
     NS,
     PAUSE_NS,
+    PULLED_NS,
+    SLID_MM,
+    SLID_NS,
 )
 from skin_host.evaluation.simulate.world import Life, World
 
@@ -27,6 +32,10 @@ class Fingertips:
         #: When each was last loaded, and was not loaded firmly.
         self._loaded_ns = dict.fromkeys(world.settings.fingertips, LONG_AGO_NS)
         self._eased_ns = dict.fromkeys(world.settings.fingertips, LONG_AGO_NS)
+        #: When the load of each had last not slid; and those that have slipped under the present
+        #: load, or whose board may not have been received then: a steady slide does not show.
+        self._held_ns = dict.fromkeys(world.settings.fingertips, LONG_AGO_NS)
+        self._slipped: set[str] = set()
 
     def note_loads(self, life: Life | None) -> None:
         """Note which are loaded, and which zeros may be of a load."""
@@ -37,22 +46,53 @@ class Fingertips:
             force_n = float(np.linalg.norm(tips.force_n(name, now_ns)))
             if force_n > LOADED_N:
                 self._loaded_ns[name] = now_ns
+            else:
+                self._slipped.discard(name)
+            if tips.slipped_mm(name) < SLID_MM:
+                self._held_ns[name] = now_ns
             if force_n < FELT_N:
                 self._eased_ns[name] = now_ns
             if calibrating and now_ns - self._loaded_ns[name] < NS:
                 self._accusations.loaded.add(name)
 
+    def slips(self, name: str) -> str | None:
+        """Take the begin of a slip; return what is wrong with it, or None."""
+        self._slipped.add(name)
+        if self._unknown(name):
+            return None
+        pulled_ns = max(
+            (tip.pulled_ns for tip in self._world.tips if tip.name == name), default=LONG_AGO_NS
+        )
+        if self._world.clock.monotonic_ns() - pulled_ns > PULLED_NS:
+            return f"{name}: slips, and nothing pulls"
+        return None
+
+    def touches(self, name: str) -> None:
+        """Take the begin of a touch."""
+        if name in self._held_ns and self._world.robot.fingertips.slipped_mm(name) > 0.0:
+            self._slipped.add(name)
+
+    def _unknown(self, name: str) -> bool:
+        return name in self._accusations.loaded or self._accusations.may_damage(name)
+
     def wrong(self, life: Life) -> str | None:
-        """Return one that is touched without a load, or is not touched with one, or None."""
+        """Return one that is touched without a load, or is not touched with one, or whose load
+        slides without a slip; or None.
+        """
         clock = self._world.clock
         now_ns = clock.monotonic_ns()
         engine = life.daemon.engine.fingertips
         for name, state in ({} if engine is None else engine.tips).items():
-            if name in self._accusations.loaded or self._accusations.may_damage(name):
+            if self._accusations.may_lose(name):
+                self._slipped.add(name)
+            if self._unknown(name):
                 continue
             # What it sent lately waits to be read after a stall.
             if not state.tip.feels or abs(clock.now_ns() - state.last_ns) > NS // 2:
                 continue
+            slides = now_ns - self._held_ns[name] > SLID_NS
+            if slides and state.tip.touched and name not in self._slipped:
+                return f"{name}: does not slip, and what presses it slides"
             if state.tip.touched and now_ns - self._loaded_ns[name] > CAUSE_NS:
                 return f"{name}: still touched, and nothing presses"
             threshold_n = state.tip.threshold_n

@@ -39,6 +39,9 @@ AGAIN_NS = 3 * NS // 2
 RESTING_NS = 8 * NS
 #: A fingertip is loaded from a small force on, and must be felt from a larger one on.
 LOADED_N, FELT_N = 0.05, 1.0
+#: What has slid so far over a fingertip is reported to slip within this time; and what slips was
+#: pulled no longer ago, a stall included.
+SLID_MM, SLID_NS, PULLED_NS = 1.0, NS // 4, 5 * NS
 #: A board that is set up has so many tasks, and all else no more than this.
 TASKS_OF_BOARD = 2
 MOST_TASKS = 60
