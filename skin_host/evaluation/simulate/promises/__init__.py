@@ -100,7 +100,7 @@ class Promises:
         if trouble.name == "clock_set":
             self._received.clock_set_ns = self._now_ns()
         if trouble.name == "stall":
-            self.subscribers.stalled_ns = self._now_ns()
+            self.subscribers.stalled_ns = self._received.stalled_ns = self._now_ns()
 
     def end(self, trouble: Trouble) -> None:
         """A trouble ends."""

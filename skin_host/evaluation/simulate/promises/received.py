@@ -67,12 +67,12 @@ class Received:
     """Compares frames with what was sent on the buses, and when it was read.
 
     Attributes:
-        clock_set_ns: when the time of day was last set.
+        clock_set_ns, stalled_ns: when the time of day was last set, and the last stall ended.
     """
 
     def __init__(self, world: World) -> None:
         self._world = world
-        self.clock_set_ns = LONG_AGO_NS
+        self.clock_set_ns = self.stalled_ns = LONG_AGO_NS
         layout = world.layout
         self._parts = {part.name: part for part in layout.parts}
         self._periods_ns = np.zeros(layout.n_taxels, np.int64)
@@ -123,6 +123,9 @@ class Received:
         """Return that a taxel is valid whose board has been silent for long."""
         name = frame.part
         now_ns = self._world.clock.monotonic_ns()
+        if now_ns - self.stalled_ns < NS:
+            # What waited in a stall is read piece by piece, and is of its time.
+            now_ns -= max(0, self._world.clock.now_ns() - frame.t_ns)
         cables = self._world.cables
         longest_ago_ns = min(int(cables[bus].read_ns[ids].min()) for bus, ids in self._ids[name])
         if now_ns - longest_ago_ns <= STALE_PERIODS * self._fastest_ns[name]:
