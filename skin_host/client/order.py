@@ -6,6 +6,8 @@ are passed on as they arrive.
 
 from dataclasses import dataclass, field
 
+from msgspec.structs import replace
+
 from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.messages import Frame
 from skin_host.mqtt.order import Stamp
@@ -102,6 +104,9 @@ class EventOrder:
             if not _have_vanished(known.older_s, now_s):
                 known.older_s = now_s if known.older_s is None else known.older_s
                 return []
+            if chain is not None and count > chain.last + 1:
+                # What came meanwhile was passed over, for the sake of greater numbers.
+                event = replace(event, missed=count - chain.last - 1)
             left = known.follow(_Chain(run, count, count - 1) if chain is None else chain)
         elif count in known.held:
             return []

@@ -85,12 +85,14 @@ class Stream(AsyncIterator[T], Generic[T]):
     def _missed(self, item: Touch | Slip | Over | Frame, number: int) -> int | None:
         """Return how many numbers are missing before this one; None if it was received before."""
         kind = type(item), item.part
+        # What was lost behind greater numbers that were forged, only the order of all events knows.
+        lost = item.missed if kind in self._last else 0
         last, last_ns = self._last.get(kind, (number - 1, item.t_ns))
         if number <= last and item.t_ns <= last_ns and last - number < DUPLICATE_SPAN:
             return None
         self._last[kind] = number, item.t_ns
         # A smaller number at a later time means that the node was restarted.
-        return max(0, number - last - 1)
+        return lost or max(0, number - last - 1)
 
 
 def _taxels_of(item: object) -> int:

@@ -21,7 +21,7 @@ from skin_host.config.fingertips import Fingertip as Fingertip  # noqa: PLC0414 
 from skin_host.config.relaxation import RelaxationSettings, with_file, wrong_parameters
 from skin_host.errors import ConfigurationError, RequestError, visible
 from skin_host.files import read_whole
-from skin_host.mqtt.topics import wrong_topic
+from skin_host.mqtt.topics import wrong_base
 
 Byte = Annotated[int, Meta(ge=0, le=255)]
 T = TypeVar("T", bound=Struct)
@@ -193,7 +193,7 @@ class Mqtt(_Table, frozen=True):
     brokers: Annotated[list[Annotated[str, Meta(pattern=_ADDRESS)]], Meta(max_length=16)] = []
     protocol: Literal["5", "3.1.1"] = "5"
     base: str = "skin"
-    username: str | None = None
+    username: Annotated[str, Meta(max_length=1000, pattern=r"^[^\x00]+$")] | None = None
     #: A file with the password; otherwise systemd's credential `mqtt-password`.
     password_file: str | None = None
     tls: bool = False
@@ -206,7 +206,9 @@ class Mqtt(_Table, frozen=True):
     event_queue: Annotated[int, Meta(ge=16, le=1_000_000)] = 10_000
     commands: bool = True
     #: Publish the parts to Home Assistant below this prefix, usually "homeassistant".
-    discovery_prefix: Annotated[str, Meta(pattern=r"^[a-zA-Z0-9_/-]+(?!\n)$")] | None = None
+    discovery_prefix: (
+        Annotated[str, Meta(pattern=r"^[a-zA-Z0-9_/-]+(?!\n)$", max_length=256)] | None
+    ) = None
 
 
 class Receive(_Table, frozen=True):
@@ -330,7 +332,7 @@ def _check_references(path: Path, settings: Settings) -> None:
     def wrong(where: str, what: str) -> ConfigurationError:
         return ConfigurationError(f"{path}: {where}: {visible(what)}")
 
-    if (what := wrong_topic(settings.mqtt.base)) is not None:
+    if (what := wrong_base(settings.mqtt.base)) is not None:
         raise wrong("mqtt.base", what)
     addresses: dict[tuple[str, int], str] = {}
     boards: list[tuple[str, str, Board | Fingertip]] = [

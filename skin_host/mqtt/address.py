@@ -18,13 +18,21 @@ if TYPE_CHECKING:
     from skin_host.config.settings import Mqtt
 
 
+#: Of a text in MQTT.
+MAX_BYTES = 65_535
+
+
 class CredentialError(ConfigurationError):
     """The file with the password cannot be read, which may change."""
 
 
 @dataclass(frozen=True)
 class Broker:
-    """How to reach a broker. The password is never shown."""
+    """How to reach a broker. The password is never shown.
+
+    Raises:
+        RequestError: name or password cannot be sent.
+    """
 
     host: str = "localhost"
     port: int = 1883
@@ -33,6 +41,16 @@ class Broker:
     password: str | None = field(default=None, repr=False)
     tls: ssl.SSLContext | None = field(default=None, repr=False)
     keepalive_s: int = 10
+
+    def __post_init__(self) -> None:
+        for what, text in (("user name", self.username), ("password", self.password)):
+            size = len((text or "").encode(errors="surrogatepass"))
+            if size > MAX_BYTES:
+                raise RequestError(
+                    f"the {what} at the broker has {size} bytes; wanted at most {MAX_BYTES}"
+                )
+        if "\0" in (self.username or ""):
+            raise RequestError("the user name at the broker has a zero byte; wanted none")
 
     def __str__(self) -> str:
         return f"{self.host}:{self.port}"

@@ -372,7 +372,7 @@ class Connection(aiomqtt.Client):
         """
         try:
             await clock.in_thread(self._open)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # the latter of names that no host can have
             raise MqttError(str(error)) from None
         self._is_open = True
         sock: Any = self._client.socket()

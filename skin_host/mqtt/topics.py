@@ -17,6 +17,10 @@ _REPLY = re.compile(r"[A-Za-z0-9_.:@-]{1,64}(/[A-Za-z0-9_.:@-]{1,64}){0,3}")
 
 _PIECE = re.compile(r"[1-9][0-9]{0,4}")
 
+#: Of what all topics begin with.
+MAX_BASE_BYTES = 256
+MAX_BASE_LEVELS = 32
+
 ONLINE = b"online"
 OFFLINE = b"offline"
 
@@ -30,6 +34,17 @@ def wrong_topic(text: str) -> str | None:
         f'"{visible(text, 80)}" cannot start a topic; wanted words such as skin or lab/skin, '
         "without +, #, control characters and a slash at either end"
     )
+
+
+def wrong_base(text: str) -> str | None:
+    """Return what is wrong with what all topics begin with; None if nothing is."""
+    size, levels = len(text.encode()), text.count("/") + 1
+    if size > MAX_BASE_BYTES or levels > MAX_BASE_LEVELS:
+        return (
+            f"seen {size} bytes in {levels} levels, wanted at most {MAX_BASE_BYTES} in "
+            f"{MAX_BASE_LEVELS}: brokers do not take longer topics"
+        )
+    return wrong_topic(text)
 
 
 class Subject(NamedTuple):
@@ -51,7 +66,7 @@ class Topics:
 
     def __init__(self, base: str, robot: str) -> None:
         for what, text in (("mqtt.base", base), ("robot", robot)):
-            wrong = wrong_topic(text)
+            wrong = wrong_base(text)
             if wrong is not None:
                 raise ConfigurationError(f"{what}: {wrong}")
         self.base = f"{base}/{robot}"

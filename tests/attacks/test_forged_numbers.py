@@ -5,10 +5,12 @@ import asyncio
 import aiomqtt
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
 from skin_host.client.order import EventOrder, Newest
+from skin_host.client.streams import Stream
 from skin_host.mqtt.messages import Frame, encode_event
 from skin_host.mqtt.order import Numbers, Stamp, put_run, put_stamp, stamp_of
 from skin_host.processing.events import Touch
@@ -147,3 +149,26 @@ async def test_a_program_hears_its_robot_again_after_a_forged_run(
                 heard = task.result()
         numbers = [one.seq for one in heard]
         assert numbers == [*range(numbers[0], numbers[0] + 20)]
+
+
+@pytest.mark.parametrize("hold_s", [0.0, 10.0])
+async def test_what_a_forged_run_hides_is_counted(hold_s: float) -> None:
+    order, stream = EventOrder(hold_s), Stream[Touch](None, "touch")
+    now_s, n_sent = 0.0, 600
+    for count in range(1, n_sent + 1):
+        now_s += 0.1
+        for item in order.expire(now_s):
+            stream.put(item)
+        sent = [(RUN, replace(event(count), t_ns=10 * count))]
+        if count == 50:
+            sent.append((4 * 10**18, replace(event(7), t_ns=10 * count + 1)))
+        for run, one in sent:
+            for item in order.take(one, run, now_s):
+                stream.put(item)
+    stream.close()
+    told = [item async for item in stream]
+    after = next(item for item in told if item.t_ns > 501)
+    assert 501 in [item.t_ns for item in told]
+    assert after.count > 300
+    assert after.missed == after.count - 51
+    assert [item.missed for item in told if item.t_ns > after.t_ns] == [0] * (n_sent - after.count)

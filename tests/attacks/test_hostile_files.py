@@ -223,3 +223,40 @@ def test_a_recording_of_more_channels_than_any_robot_has_is_refused_in_a_line(
     assert main(["replay", str(log), "--config", str(CONFIG), "--output", "-"]) == 2
     (said,) = capsys.readouterr().err.splitlines()
     assert "more than 1000 channels" in said
+
+
+LONG = "x" * 70_000
+
+
+@pytest.mark.parametrize(
+    ("line", "wanted"),
+    [
+        (f'base = "{LONG}"', "mqtt.base: seen 70000 bytes in 1 levels, wanted at most 256"),
+        (f'base = "{"a/" * 100}a"', "mqtt.base: seen 201 bytes in 101 levels"),
+        (f'discovery_prefix = "{LONG}"', "mqtt.discovery_prefix: "),
+        (f'username = "{LONG}"', "mqtt.username: "),
+        ('username = "a\\u0000b"', "mqtt.username: "),
+    ],
+)
+def test_a_name_that_no_broker_takes_is_refused_in_a_line(
+    line: str, wanted: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The daemon started, and published nothing for ever."""
+    path = tmp_path / "x.toml"
+    path.write_text(CONFIG.read_text() + f"\n[mqtt]\n{line}\n")
+    assert main(["check", str(path)]) == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert wanted in said
+    assert len(said) < 1500
+
+
+@pytest.mark.parametrize(
+    "url", [f"mqtt://{LONG}@x", f"mqtt://u:{LONG}@x", "mqtt://a%00b@x", f"mqtt://x/{LONG}"]
+)
+def test_a_broker_with_names_that_cannot_be_sent_is_refused_in_a_line(
+    url: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["status", "--broker", url, "--robot", "x"]) == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert "wanted" in said
+    assert LONG[:1000] not in said

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from skin_host.mqtt.address import Broker
-from skin_host.mqtt.connection import connect
+from skin_host.mqtt.connection import MqttError, connect
 from tests.support.waiting import PATIENCE_S, until
 
 
@@ -41,3 +41,10 @@ def test_a_connection_that_is_made_after_its_loop_has_ended_is_closed(
         with ours:
             ours.settimeout(PATIENCE_S)
             assert ours.recv(1) == b""
+
+
+async def test_a_host_that_no_computer_can_have_is_no_connection() -> None:
+    broker, _ = Broker.from_url("mqtt://" + "x" * 70 + ".local")
+    with pytest.raises(MqttError, match="too long"):
+        async with connect(broker):
+            pass
