@@ -227,7 +227,7 @@ def _run_workers(arguments: argparse.Namespace, settings: "Settings") -> int:
     if not shares:
         raise RequestError(f'{arguments.config}: no part belongs to node "{node}"')
     if len(shares) < n:
-        log.info("%d workers: no more of the buses can be read apart", len(shares))
+        log.info("workers: %d; the buses cannot be shared among more", len(shares))
     _show_running(settings)
     options = ["--calibrate"] * arguments.calibrate + ["--verbose"] * arguments.verbose
     if arguments.duration is not None:
