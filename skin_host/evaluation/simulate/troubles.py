@@ -85,6 +85,9 @@ _SWAPPED = _CHIPS | _SET_UP | {"part_temperature"}
 FOR_EVER_S = 1e6
 #: Health sees few intervals at a time: one that is as far as this beyond its limit is named.
 SURE_SCATTER = 1.25
+#: A pad is surely noisier than it was calibrated from so much noise on (rms in units of 2.88 fF),
+#: and so many times what it had then; no fault is larger than the last.
+SURE_NOISE_UNITS, SURE_NOISE, MOST_NOISE_UNITS = 5.0, 8.0, 20.0
 #: By when so many frames of boards are damaged, all but one bus in ten thousand shows it: of one
 #: triangle, at rest (docs/found.md).
 SURE_DAMAGED = 36
@@ -236,6 +239,10 @@ def _emulated(
             value = float((triangle % 4 + chance.randrange(1, 4)) % 4)
         if name == "swapped_lines":
             value = float((triangle // 4 + chance.randrange(1, 4)) % 4)
+        surely = sure
+        if name == "noisy_taxel":
+            surely = _noise_that_shows(world, board, triangle, int(str(targets["taxel"])))
+            value = round(min(surely, MOST_NOISE_UNITS), 4) if plain else None
         if value is not None:
             targets["value"] = value
         world.move()
@@ -280,7 +287,8 @@ def _emulated(
             shows = _scatters(world, board)
         elif name == "temperature_step" and value is not None and value > 0.0:
             shows = _differs_from_a_load(world)
-        is_sure = (value is None or abs(value) >= sure) and bound_s < math.inf
+        strength = kind.value if value is None else value
+        is_sure = (strength is None or abs(strength) >= surely) and bound_s < math.inf
         return Trouble(
             name,
             about,
@@ -298,6 +306,20 @@ def _emulated(
         )
 
     return begin
+
+
+def _noise_that_shows(world: World, board: str, triangle: int, pad: int) -> float:
+    """Return from how much noise on (rms in units of 2.88 fF) a pad is noisier than it was
+    calibrated: on real skin some are calibrated with six units.
+    """
+    calibration = None if world.life is None else world.life.daemon.engine.calibration
+    if calibration is None:
+        return SURE_NOISE_UNITS
+    where = next(one for one in world.layout.boards if one.name == board)
+    taxel = where.taxel_index[triangle, pad]
+    if not calibration.usable[taxel]:
+        return math.inf
+    return max(SURE_NOISE_UNITS, SURE_NOISE * float(calibration.noise[taxel]))
 
 
 def _scatters(world: World, board: str) -> Callable[[], bool]:

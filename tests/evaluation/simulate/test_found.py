@@ -4,6 +4,7 @@ import asyncio
 import json
 import random
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -879,3 +880,28 @@ def test_what_presses_of_300_kpa_leave_in_the_foam_is_not_taken_for_a_wrong_pres
         left_kpa, wrong = runner.run(live())
     assert left_kpa > UNTOUCHED_KPA
     assert wrong is None
+
+
+@pytest.mark.parametrize(
+    ("own_units", "least_units", "must"), [(1.0, 8.0, True), (6.0, 20.0, False)]
+)
+def test_noise_must_be_named_where_a_pad_had_much_less_when_it_was_calibrated(
+    world: World, own_units: float, least_units: float, must: bool
+) -> None:
+    """The demo's 4004: recorded noise of a pad was six units, a fault of three made it quieter."""
+
+    async def live() -> Trouble:
+        _, life = start_watched(world)
+        await world.clock.sleep(8.0)
+        engine = life.daemon.engine
+        assert engine.calibration is not None
+        noise = np.full_like(engine.calibration.noise, own_units)
+        engine.calibration = replace(engine.calibration, noise=noise)
+        trouble = KINDS["noisy_taxel"](world, random.Random(1), True)
+        life.kill()
+        return trouble
+
+    with world.clock.runner() as runner:
+        trouble = runner.run(live())
+    assert trouble.about.endswith(f"value={least_units}")
+    assert bool(trouble.must) == must
