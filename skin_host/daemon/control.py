@@ -156,6 +156,7 @@ class Control:
             "time": found.time,
             "verdicts": calibrations.summary(found, layout),
             "unchanged": calibrations.unchanged(found, layout),
+            "damaged": calibrations.damaged(found, layout),
             "kept": "calibration" not in daemon.unkept,
         }
 

@@ -246,6 +246,8 @@ class Daemon:
                 found = calibrations.with_pressures_of(found, before)
             for name, taxels in calibrations.unchanged(found, self.layout).items():
                 log.warning("%s of %s: not calibrated, received too rarely", named(taxels), name)
+            for name, taxels in calibrations.damaged(found, self.layout).items():
+                log.warning("%s of %s: calibrated without damaged bytes", named(taxels), name)
             doubted = self.engine.zero_at_risk(touched=False)
             self.engine.use(found, boards)
             self._use_usable()

@@ -92,6 +92,16 @@ BISECTIONS = 24
 #: A pad with this much noise does not send the same byte for seconds.
 LIVELY_UNITS = 0.6
 
+#: A byte was damaged if it was off for one sweep by more than this many units, and this multiple of
+#: the noise of the others: recorded skin at rest never is.
+DAMAGED_UNITS = 7
+DAMAGED_SIGMAS = 8.0
+#: A pad that was so often more than twice, and this many times as often as the others of its
+#: triangle in the mean, jumps itself.
+OFTENER = 4.0
+#: Of a pad with more such bytes none is kept apart: that is its noise.
+MOST_OFF = 64
+
 #: Channels of a force/torque board.
 CHANNELS = 6
 
@@ -149,6 +159,7 @@ class Calibration:
         curves: of the pads and their foam, from a recording under known pressure, if there was one.
         unchanged: bool[n], taxels of which too little was received and that go on with what was
             known of them; None without a calibration before, and of a stored one.
+        damaged: bool[n], taxels of which damaged bytes were left out; None of a stored one.
     """
 
     configuration: str
@@ -164,6 +175,7 @@ class Calibration:
     zeros: dict[str, Zero] = field(default_factory=dict)
     curves: Curves | None = None
     unchanged: Mask | None = None
+    damaged: Mask | None = None
 
     @cached_property
     def usable(self) -> NDArray[np.bool_]:
@@ -217,6 +229,11 @@ class Calibrator:
         self._received = np.zeros(n, dtype=np.int64)
         self._counts = np.zeros((n, 256), dtype=np.int64)
         self._course = _Course(n)
+        #: The last two bytes of each taxel, the newest first, and those that were off alone.
+        self._last, self._earlier = np.zeros(n, np.int16), np.zeros(n, np.int16)
+        self._off: list[_Off] = []
+        self._was_off = np.zeros(n, np.bool_)
+        self._times_off = np.zeros(n, np.int64)
         self._conversions = [Conversions(part.n_taxels) for part in layout.parts]
         self._at_ns: list[int | None] = [None] * len(layout.parts)
 
@@ -238,6 +255,7 @@ class Calibrator:
         part = self._layout.parts[part_index]
         taxels = np.arange(part.start, part.stop)
         received = taxels[present]
+        self._note_off(received, raw[present])
         self._received[received] += 1
         self._course.add(received, raw[present])
         new = present
@@ -253,6 +271,8 @@ class Calibrator:
         self._received[taxels] = 0
         self._counts[taxels] = 0
         self._course.forget(taxels)
+        self._times_off[taxels] = 0
+        self._off = [one.of(~np.isin(one.taxel, taxels)) for one in self._off]
 
     def finish(self, configuration: str, time: str, known: Known | None = None) -> Calibration:
         """Return the calibration from the added sweeps.
@@ -263,6 +283,7 @@ class Calibrator:
             known: of this skin from before. A taxel of which too little was received goes on with
                 it, and noise is not lowered by few samples.
         """
+        damaged = self._leave_out_damage()
         counts, received = self._counts, self._received
         samples = counts.sum(axis=1)
         some = np.maximum(samples, 1)
@@ -329,8 +350,70 @@ class Calibrator:
             gain=np.ones(len(samples)),
             bend=np.ones(len(samples)),
             verdict=verdict,
+            damaged=damaged,
         )
         return _identified(found if known is None else _going_on(found, known, few))
+
+    def _note_off(self, taxels: NDArray[np.intp], raw: NDArray[np.uint8]) -> None:
+        """Note which bytes the new ones [m] show to have been off alone: mostly the last ones."""
+        new, last, earlier = raw.astype(np.int16), self._last[taxels], self._earlier[taxels]
+        number = self._received[taxels]
+        off = np.minimum(np.abs(last - earlier), np.abs(last - new))
+        alone = (off > DAMAGED_UNITS) & (np.abs(new - earlier) <= DAMAGED_UNITS) & (number > 1)
+        self._keep_off(alone, _Off(taxels, last, _middle(earlier, new), off, number - 1))
+        off = np.abs(earlier - last)
+        first = (off > DAMAGED_UNITS) & (np.abs(new - last) <= DAMAGED_UNITS) & (number == 2)
+        self._keep_off(first, _Off(taxels, earlier, _middle(last, last), off, number - 2))
+        self._was_off[taxels] = alone
+        self._earlier[taxels] = last
+        self._last[taxels] = new
+
+    def _note_last_off(self) -> None:
+        """Note which taxels' last byte was off, as far as the one before it shows that."""
+        last, earlier, number = self._last, self._earlier, self._received
+        off = np.abs(last - earlier)
+        alone = (off > DAMAGED_UNITS) & ~self._was_off & (number > 2)
+        self._keep_off(
+            alone, _Off(np.arange(len(last)), last, _middle(earlier, earlier), off, number - 1)
+        )
+
+    def _keep_off(self, alone: Mask, found: "_Off") -> None:
+        if not alone.any():
+            return
+        found = found.of(alone)
+        self._times_off[found.taxel] += 1
+        self._off.append(found.of(self._times_off[found.taxel] <= MOST_OFF))
+
+    def _leave_out_damage(self) -> Mask:
+        """Leave damaged bytes out of what was added, and return whose they were, bool[n]."""
+        n = len(self._received)
+        self._note_last_off()
+        kept = [one for one in self._off if len(one.taxel)]
+        self._off.clear()
+        if not kept:
+            return np.zeros(n, np.bool_)
+        one = _Off.joined(kept)
+        damaged = self._times_off[one.taxel] <= MOST_OFF
+        some, row = np.unique(one.taxel, return_inverse=True)
+        more = True
+        while more:
+            # The fewer are left out, the larger the noise of the others, until both agree.
+            counts = self._counts[some]
+            np.subtract.at(counts, (row[damaged], one.raw[damaged]), 1)
+            far = one.off > DAMAGED_SIGMAS * _deviation(counts)[row]
+            more = bool((damaged & ~far).any())
+            damaged &= far
+        times = np.bincount(one.taxel[damaged], minlength=n)
+        triangle = self._layout.triangle_of
+        mates = np.maximum(np.bincount(triangle)[triangle] - 1, 1)
+        others = (np.bincount(triangle, times)[triangle] - times) / mates
+        damaged &= (times <= 2.0 + OFTENER * others)[one.taxel]
+        left = one.of(damaged)
+        np.subtract.at(self._counts, (left.taxel, left.raw), 1)
+        self._course.replace(left.taxel, left.number, left.between - left.raw)
+        found = np.zeros(n, np.bool_)
+        found[left.taxel] = True
+        return found
 
     def _froze(self, variance: Floats) -> Mask:
         """Return the taxels [n] whose triangle was no longer received, and no pad of it had sent
@@ -505,6 +588,46 @@ def _going_on(found: Calibration, known: Known, few: Mask) -> Calibration:
     )
 
 
+class _Off(NamedTuple):
+    """Bytes that were off for one sweep, arrays [m].
+
+    Attributes:
+        taxel: whose.
+        raw: the byte.
+        between: mean of the one before and the one after.
+        off: how far it was from the nearer of them.
+        number: which byte of the taxel.
+    """
+
+    taxel: NDArray[np.intp]
+    raw: NDArray[np.int16]
+    between: Floats
+    off: NDArray[np.int16]
+    number: NDArray[np.int64]
+
+    def of(self, mask: Mask) -> "_Off":
+        """Return some of them, bool[m]."""
+        return _Off._make(array[mask] for array in self)
+
+    @classmethod
+    def joined(cls, those: list["_Off"]) -> "_Off":
+        return cls(*map(np.concatenate, zip(*those, strict=True)))
+
+
+def _deviation(counts: NDArray[np.int64]) -> Floats:
+    """Return the standard deviation [m] of bytes, of which int64[m, 256] is how often each came."""
+    number = np.maximum(counts.sum(axis=1), 1)
+    codes = np.arange(256.0)
+    mean = counts @ codes / number
+    found: Floats = np.sqrt(np.maximum(counts @ codes**2 / number - mean**2, 0.0))
+    return found
+
+
+def _middle(one: NDArray[np.int16], other: NDArray[np.int16]) -> Floats:
+    found: Floats = (one.astype(np.float64) + other) / 2.0
+    return found
+
+
 class _Course:
     """The course of n taxels over a calibration of any length, as means of blocks of samples."""
 
@@ -541,6 +664,15 @@ class _Course:
         self._count[taxels] = 0
         self.length[taxels] = BLOCK
         self.number[taxels] = 0
+
+    def replace(
+        self, taxels: NDArray[np.intp], numbers: NDArray[np.int64], changes: Floats
+    ) -> None:
+        """Change bytes that were added, each of a taxel by its number since the begin."""
+        block = numbers // self.length[taxels]
+        full = block < self.number[taxels]
+        taxels, block = taxels[full], block[full]
+        np.add.at(self.means, (taxels, block), changes[full] / self.length[taxels])
 
     @property
     def _begun(self) -> Floats:
@@ -664,6 +796,7 @@ def merge(
             bend=old.bend,
             verdict=np.where(renewed, new.verdict, old.verdict),
             unchanged=None if new.unchanged is None else new.unchanged & renewed,
+            damaged=None if new.damaged is None else new.damaged & renewed,
             zeros=old.zeros | new.zeros if zeros else old.zeros,
         )
     )
@@ -706,11 +839,20 @@ def summary(calibration: Calibration, layout: Layout) -> dict[str, dict[str, int
 
 def unchanged(calibration: Calibration, layout: Layout) -> dict[str, list[int]]:
     """Return by part the numbers of the pressure taxels that go on as before: see `Calibration`."""
-    if calibration.unchanged is None:
+    return _by_part(calibration.unchanged, layout)
+
+
+def damaged(calibration: Calibration, layout: Layout) -> dict[str, list[int]]:
+    """Return by part the numbers of the pressure taxels of which bytes were left out."""
+    return _by_part(calibration.damaged, layout)
+
+
+def _by_part(taxels: Mask | None, layout: Layout) -> dict[str, list[int]]:
+    if taxels is None:
         return {}
-    these = calibration.unchanged & (layout.pad_kind == PadKind.PRESSURE)
+    these = taxels & (layout.pad_kind == PadKind.PRESSURE)
     found = {p.name: np.flatnonzero(these[p.start : p.stop]).tolist() for p in layout.parts}
-    return {name: taxels for name, taxels in found.items() if taxels}
+    return {name: numbers for name, numbers in found.items() if numbers}
 
 
 #: Of a byte.
@@ -921,6 +1063,7 @@ def load(path: Path, layout: Layout, configuration: str) -> Calibration:
         zeros=zeros,
         curves=curves,
         unchanged=None,
+        damaged=None,
         **arrays,
     )
 

@@ -8,6 +8,7 @@ from emulator.chips.noise import SampledNoise
 from skin_host.config.settings import Processing
 from skin_host.errors import CalibrationError
 from skin_host.evaluation.rig import flat_skin
+from skin_host.layout import PadKind
 from skin_host.processing import calibration
 from skin_host.processing.calibration import Calibrator, Known, Verdict
 from skin_host.processing.curves import KNOTS_UNITS, Curves, CurveVerdict, Memory, rising
@@ -394,6 +395,85 @@ def test_a_pad_that_was_refused_before_does_not_go_on():
     found = recalibrated(before, noisy(rng), present)
     assert not found.unchanged.any()
     assert np.all(found.verdict[24:36] == Verdict.ABSENT)
+
+
+def spoilt(sweeps, share, rng, bits=(4, 5, 6, 7)):
+    """Sweeps in which this share of the bytes has one wrong bit, and where."""
+    sweeps = sweeps.astype(np.uint8)
+    wrong = rng.random(sweeps.shape) < share
+    wrong[1:] &= ~wrong[:-1]
+    flipped = np.where(wrong, 1 << rng.choice(bits, sweeps.shape), 0)
+    return sweeps ^ flipped.astype(np.uint8), wrong
+
+
+@pytest.mark.parametrize("sd", [0.1, 0.5, 0.9])
+@pytest.mark.parametrize("share", [0.0006, 0.0025, 0.0125])
+def test_damaged_bytes_are_no_noise(sd, share):
+    rng = np.random.default_rng(31)
+    sweeps = noisy(rng, sweeps=100, sd=sd, level=210.3)
+    received, wrong = spoilt(sweeps, share, rng)
+    clean, found = calibrated(sweeps), calibrated(received)
+    right = np.abs(found.noise - clean.noise) < 0.1
+    assert np.mean(right) > 0.95
+    assert np.mean(np.abs(found.spread - clean.spread)[right] < 0.3) > 0.95
+    assert np.abs(found.baseline - clean.baseline)[right].max() < 0.2
+    assert (found.verdict[right] == clean.verdict[right]).all()
+    assert (found.damaged == wrong.any(axis=0))[right].mean() > 0.99
+    named = calibration.damaged(found, LAYOUT)
+    assert sum(map(len, named.values())) == np.count_nonzero(
+        found.damaged & (LAYOUT.pad_kind == PadKind.PRESSURE)
+    )
+
+
+@pytest.mark.parametrize("at", [0, 1, 2, 60, 97, 98, 99])
+def test_a_damaged_byte_is_found_wherever_it_is(at):
+    sweeps = noisy(np.random.default_rng(32), sweeps=100)
+    received = sweeps.copy()
+    received[at, 7] -= 128
+    found = calibrated(received)
+    assert found.noise == pytest.approx(calibrated(sweeps).noise, abs=0.05)
+    assert np.flatnonzero(found.damaged).tolist() == [7]
+    assert found.verdict[7] == Verdict.OK
+
+
+def test_damaged_bytes_are_left_out_of_the_course_of_a_calibration_of_any_length():
+    rng = np.random.default_rng(33)
+    received, wrong = spoilt(noisy(rng, sweeps=3000), 0.003, rng)
+    received[1500:, 7] -= 30
+    found = calibrated(received)
+    assert np.flatnonzero(found.verdict == Verdict.TOUCHED).tolist() == [7]
+    assert wrong.any(axis=0).mean() > 0.99
+    assert np.median(found.noise) < 0.6
+
+
+@pytest.mark.parametrize("sd", [0.1, 1.0, 3.0, 8.0])
+def test_nothing_of_clean_noise_is_called_damaged(sd):
+    sweeps = noisy(np.random.default_rng(34), sweeps=400, sd=sd, level=180.0)
+    found = calibrated(sweeps)
+    assert not found.damaged.any()
+    assert found.noise == pytest.approx(sweeps.std(axis=0))
+
+
+def test_what_a_single_pad_does_again_and_again_is_its_noise():
+    sweeps = noisy(np.random.default_rng(35), sweeps=100)
+    sweeps[10::20, 7] -= 20
+    found = calibrated(sweeps)
+    assert not found.damaged.any()
+    assert found.noise[7] == pytest.approx(sweeps[:, 7].std())
+
+
+def test_nothing_is_called_damaged_of_what_was_forgotten():
+    sweeps = noisy(np.random.default_rng(36), sweeps=100)
+    calibrator = Calibrator(LAYOUT)
+    for number, raw in enumerate(sweeps):
+        if number == 50:
+            calibrator.forget(np.arange(N // 2))
+        received = raw.copy()
+        received[[7, N - 1]] -= 64 * (number == 30)
+        calibrator.add(0, received.astype(np.uint8), PRESENT)
+    found = calibrator.finish("abc", TIME)
+    assert np.flatnonzero(found.damaged).tolist() == [N - 1]
+    assert found.noise[7] == pytest.approx(sweeps[50:, 7].std())
 
 
 def test_lost_sweeps_do_not_shift_the_baseline():
