@@ -1,5 +1,6 @@
 """Builds the health record of a part from what `watch` has noted."""
 
+from collections import deque
 from statistics import fmean, median
 from typing import TYPE_CHECKING, Any, cast
 
@@ -46,6 +47,8 @@ SIGMA = 1.4826
 FEWEST_RESTING = 8
 #: Taxels beside a press move with it, so all of a part with fewer must be untouched.
 MANY_RESTING = 12
+#: A shift counts for so long though the baselines have followed it.
+FORMER_NS = 3_000_000_000
 #: A triangle is missing when it was absent from this many sweeps in a row.
 ABSENT_SWEEPS = 3
 #: That a triangle has not changed since its calibration is known after this.
@@ -68,6 +71,8 @@ class Describer:
         self._watch = watch
         #: For each part the shifts of its thermal and of its resting pads at the last look.
         self._shifts: dict[int, Temperatures] = {}
+        #: For each part its baselines at the last looks, their times, and which zeros they are of.
+        self._baselines: dict[int, deque[tuple[int, int, Calibration, NDArray[np.float64]]]] = {}
         #: Since when triangles, by board and number, have not changed after a calibration in which
         #: they did not either, or which has not seen them.
         self._unproven_ns: dict[tuple[int, int], int] = {}
@@ -293,8 +298,11 @@ class Describer:
         # Pads in doubt are not valid, and nobody knows that they are untouched.
         usable = pressure & calibration.usable[span]
         if rests is not None and enough_rest(rests, usable):
-            shift = units - pipeline.baseline[span]
-            common = common_shift(shift, rests, self._layout.triangle_of[span])
+            shifts = [units - pipeline.baseline[span]]
+            if (rests == watch.valid).all() and (former := self._former(part, span)) is not None:
+                shifts.append(units - former)
+            triangle_of = self._layout.triangle_of[span]
+            common = max((common_shift(one, rests, triangle_of) for one in shifts), key=abs)
             found["common_units"] = round(common, 1)
         # A temperature lasts. Noise that the pads of a triangle share, and what a chip sends that
         # has just stopped answering, pass from one sweep to the next.
@@ -303,6 +311,25 @@ class Describer:
             "thermal_units": _nearer_zero(before["thermal_units"], found["thermal_units"]),
             "common_units": min(before["common_units"], found["common_units"], key=abs),
         }
+
+    def _former(self, part: int, span: slice) -> NDArray[np.float64] | None:
+        """Return the baselines [m] that a part had some seconds ago, of the zeros that it has now.
+
+        What all pads read too little is followed within a second: two looks would not agree on it.
+        """
+        pipeline, calibration = self._engine.pipeline, self._engine.calibration
+        assert pipeline is not None
+        assert calibration is not None
+        now_ns, changes = self._watch.parts[part].sample_ns, self._engine.zero_changes
+        known = self._baselines.setdefault(part, deque())
+        while known and not (
+            0 <= now_ns - known[0][0] <= FORMER_NS
+            and known[0][1] == changes
+            and known[0][2] is calibration
+        ):
+            known.popleft()
+        known.append((now_ns, changes, calibration, pipeline.baseline[span].copy()))
+        return known[0][3]
 
     def _verdicts(self, part: int, pressure: NDArray[np.bool_]) -> dict[str, list[int]]:
         calibration = self._engine.calibration

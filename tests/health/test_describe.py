@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from skin_host.health.describe import _period, common_shift, enough_rest
+from skin_host.health.diagnosis import COMMON_UNITS
 from skin_host.health.watch import FOAM_NS, PartWatch
 from skin_host.processing.calibration import Verdict
 from skin_host.processing.core import Step
@@ -72,6 +73,40 @@ def test_a_small_part_with_a_refused_pad_shows_its_temperature() -> None:
     bench.inject("temperature_step", value=-3.0)
     bench.run(3.0)
     assert "part_temperature" in {code for code, _ in bench.told}
+
+
+def test_a_fall_of_temperature_is_named_though_the_baselines_have_followed_it() -> None:
+    """They do within a second or two, and no two looks would agree on it."""
+    bench = FaultBench(config=CONFIG.with_name("fingertips.toml"))
+    bench.run(8.0)
+    part = bench.layout.parts[0]
+    watch, pipeline = bench.health._watch.parts[0], bench.engine.pipeline
+    assert watch.raw is not None
+    assert pipeline is not None
+
+    def fallen() -> bool:
+        watch.sample_ns += 1_000 * MS
+        warmth = bench.health.record(0, bench.now_ns, {}, {})["warmth"]
+        return warmth is not None and warmth["common_units"] < -COMMON_UNITS
+
+    def fall(units: int) -> None:
+        assert watch.raw is not None
+        watch.raw = watch.raw + np.uint8(units)
+        pipeline.baseline[part.start : part.stop] -= units
+
+    assert not fallen()
+    fall(4)
+    assert [fallen() for _ in range(6)] == [False, True, True] + 3 * [False]
+    bench.engine.zero_changes += 1
+    fall(4)
+    # A board that was zeroed again has other baselines.
+    assert not any(fallen() for _ in range(4))
+    watch.touched = np.arange(part.stop - part.start) == 3
+    watch.any_touched = True
+    fallen()
+    fall(4)
+    # Pads beside a press read less.
+    assert not any(fallen() for _ in range(4))
 
 
 @pytest.mark.parametrize(
