@@ -34,6 +34,8 @@ PAIR_NS = 12_000_000
 #: A longer pause separates two sweeps of a board, half of its period as for the daemon. Boards of
 #: more urgent identifiers may hold up the rest of a sweep for nearly as long.
 PAUSE_NS = 24_000_000
+#: Frames of sweeps that passed close together have come after this time.
+CROWDED_NS = 100_000_000
 #: The part of a status word that names an error.
 ERROR = 0xF
 #: Sweeps of a triangle that are kept: those of two boards at one address while the computer stalls.
@@ -99,9 +101,11 @@ class Sent:
     Attributes:
         bursts: by address, how many sweeps began.
         begun_ns: by address, when the last ones began.
+        crowded_ns: when two sweeps of a board last passed close together.
     """
 
     def __init__(self) -> None:
+        self.crowded_ns = -(1 << 62)
         self._half: dict[int, tuple[int, bytes, int]] = {}
         #: By address and triangle: (12 bytes, status, time in ns).
         self._whole: dict[int, deque[tuple[bytes, int, int]]] = {}
@@ -222,6 +226,7 @@ class Sent:
                 first, second = half[1], payload
             elif (half[0], header) == (HEADER_B, HEADER_A) and apart_ns <= PAIR_NS:
                 first, second = payload, half[1]
+                self.crowded_ns = t_ns
             else:
                 continue
             whole = self._whole.get(key)
@@ -298,8 +303,8 @@ class Cable:
         mischief: what happens to frames.
         state: of the interface, as the port is to find it.
         damaged_ns: when a frame was last damaged.
-        blurred_ns: when frames last came late while a second board sent at their address: what
-            belongs to which sweep cannot be known then.
+        blurred_ns: when frames last came late while a second board sent at their address, or a
+            board's sweeps passed close together: what belongs to which cannot be known then.
         fate: what became of the frames since the port was opened.
         sent: what passed over the bus.
     """
@@ -376,10 +381,12 @@ class Cable:
         if self._port is None or self.state in (LinkState.GONE, LinkState.DOWN):
             fate.unheard += n
             return
-        if self.mischief.twin is not None and (self.mischief.late or self._late):
-            self.blurred_ns = self._clock.monotonic_ns()
         if n:
             self.sent.note(batch)
+        if self.mischief.late or self._late:
+            now_ns = self._clock.monotonic_ns()
+            if self.mischief.twin is not None or now_ns - self.sent.crowded_ns < CROWDED_NS:
+                self.blurred_ns = now_ns
         if n and self.mischief.any():
             batch = self._spoil(batch)
         if self._late:

@@ -87,3 +87,16 @@ def test_an_irregular_board_shows_by_when_its_sweeps_begin() -> None:
     assert sent.scatter_ms(1, 25 * 50 * MS) < 0.1
     assert sent.scatter_ms(1, 95 * 50 * MS) == 0.0
     assert sent.scatter_ms(2, 0) == 0.0
+
+
+@pytest.mark.parametrize(("apart_ms", "crowded"), [(1, True), (50, False)])
+def test_sweeps_that_a_full_bus_passes_close_together_are_known(
+    apart_ms: int, crowded: bool
+) -> None:
+    sent = Sent()
+    triangles, status = np.arange(2), np.zeros(2, np.uint16)
+    for k in range(4):
+        ids, data = encode_sweep(3, triangles, np.full((2, 12), k, np.uint8), status)
+        times_ns = (1000 + k * apart_ms) * MS + 120_000 * np.arange(len(ids))
+        sent.note(FrameBatch(ids, np.full(len(ids), 8, np.uint8), data, times_ns))
+    assert (sent.crowded_ns > 0) is crowded
