@@ -69,8 +69,9 @@ class Describer:
         self._engine = engine
         self._layout = engine.layout
         self._watch = watch
-        #: For each part the shifts of its thermal and of its resting pads at the last look.
-        self._shifts: dict[int, Temperatures] = {}
+        #: For each part the time of the last sample that was looked at, the shifts of its thermal
+        #: and of its resting pads in it, and those that it and the one before agree on.
+        self._shifts: dict[int, tuple[int, Temperatures, Temperatures]] = {}
         #: For each part its baselines at the last looks, their times, and which zeros they are of.
         self._baselines: dict[int, deque[tuple[int, int, Calibration, NDArray[np.float64]]]] = {}
         #: Since when triangles, by board and number, have not changed after a calibration in which
@@ -282,6 +283,9 @@ class Describer:
         watch = self._watch.parts[part]
         if pipeline is None or calibration is None or watch.raw is None or watch.valid is None:
             return None
+        known = self._shifts.get(part)
+        if known is not None and known[0] == watch.sample_ns:
+            return known[2]
         layout = self._layout.parts[part]
         span = slice(layout.start, layout.stop)
         units = self._layout.no_load[span].astype(np.float64) - watch.raw
@@ -305,12 +309,15 @@ class Describer:
             common = max((common_shift(one, rests, triangle_of) for one in shifts), key=abs)
             found["common_units"] = round(common, 1)
         # A temperature lasts. Noise that the pads of a triangle share, and what a chip sends that
-        # has just stopped answering, pass from one sweep to the next.
-        before, self._shifts[part] = self._shifts.get(part, found), found
-        return {
+        # has just stopped answering, pass from one sweep to the next; a board that is being set up
+        # sends none.
+        before = found if known is None else known[1]
+        agreed: Temperatures = {
             "thermal_units": _nearer_zero(before["thermal_units"], found["thermal_units"]),
             "common_units": min(before["common_units"], found["common_units"], key=abs),
         }
+        self._shifts[part] = watch.sample_ns, found, agreed
+        return agreed
 
     def _former(self, part: int, span: slice) -> NDArray[np.float64] | None:
         """Return the baselines [m] that a part had some seconds ago, of the zeros that it has now.

@@ -331,6 +331,9 @@ class Calibrator:
         verdict[touch.decides > USELESS_MARGINS * margin] = Verdict.TOO_NOISY
         verdict[ends > SATURATED_SHARE * samples] = Verdict.OUT_OF_RANGE
         verdict[(counts[:, 0] == samples) | (counts[:, 255] == samples)] = Verdict.STUCK
+        # Bytes that come to an end of the scale and go differ by more than noise.
+        jumps = (verdict == Verdict.OUT_OF_RANGE) & (steady_noise > 0.0)
+        noise = np.where(jumps, np.minimum(noise, steady_noise), noise)
         few = (received < FEWEST_SAMPLES) | self._froze(variance)
         uncertain = spread > ERROR_SHARE * touch.enter * np.sqrt(some)
         few |= (unknown | uncertain) & (verdict < Verdict.STUCK)

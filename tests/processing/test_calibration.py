@@ -279,6 +279,21 @@ def test_a_taxel_that_is_often_at_an_end_of_the_scale_is_out_of_range():
     assert calibrated(sweeps).verdict[9] == Verdict.OUT_OF_RANGE
 
 
+@pytest.mark.parametrize("share", [0.3, 0.4, 0.5])
+def test_the_noise_of_a_taxel_that_goes_out_of_range_is_that_between_its_readings(share):
+    """A board was zeroed under a press: its pad is at the end of the scale once that is lifted. In
+    so few measurements this is not distinguished from noise otherwise.
+    """
+    rng = np.random.default_rng(7)
+    sweeps = noisy(rng, 45, sd=0.8)
+    usual = calibrated(sweeps).noise[9]
+    lifted = round(45 * (1 - share))
+    sweeps[lifted:, 9] = np.minimum(254.5 + rng.normal(0.0, 0.7, 45 - lifted), 255).round()
+    found = calibrated(sweeps)
+    assert found.verdict[9] == Verdict.OUT_OF_RANGE
+    assert 0.3 * usual < found.noise[9] < 3.0 * usual
+
+
 def test_what_was_never_received_is_absent():
     present = np.ones((125, N), bool)
     present[:, 24:36] = False
