@@ -311,7 +311,8 @@ class Describer:
         # A temperature lasts. Noise that the pads of a triangle share, and what a chip sends that
         # has just stopped answering, pass from one sweep to the next; a board that is being set up
         # sends none.
-        before = found if known is None else known[1]
+        none: Temperatures = {"thermal_units": None, "common_units": 0.0}
+        before = none if known is None else known[1]
         agreed: Temperatures = {
             "thermal_units": _nearer_zero(before["thermal_units"], found["thermal_units"]),
             "common_units": min(before["common_units"], found["common_units"], key=abs),

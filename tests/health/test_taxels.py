@@ -7,6 +7,7 @@ import pytest
 
 from emulator.probes.scene import Air, Fault, Scene, load
 from skin_host.bus.compensation import thermal_gains
+from skin_host.health.describe import Describer
 from skin_host.health.diagnosis import diagnose
 from skin_host.layout import PadKind
 from tests.support.fault_bench import FaultBench
@@ -122,6 +123,11 @@ def test_a_temperature_that_one_sweep_shows_is_none(bench: FaultBench) -> None:
     assert "part_temperature" not in look(12, later_ns=0)
     assert "part_temperature" in look(12)
     assert "part_temperature" in look(12, later_ns=0)
+    # A configuration that is read again, or a command, makes a new one.
+    bench.health._describer = Describer(bench.engine, bench.health._watch)
+    bench.health._held.clear()
+    assert "part_temperature" not in look(12)
+    assert "part_temperature" in look(12)
 
 
 def test_a_temperature_pad_that_is_stuck_is_named(bench: FaultBench) -> None:
