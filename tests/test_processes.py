@@ -25,6 +25,8 @@ from skin_host.processes import Processes
 from tests.test_processes import works_on
 
 if __name__ == "__main__":
+    # What starts the tests may have Ctrl-C ignored, as background jobs of a shell have.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with Processes(2) as processes:
         for future in [processes.submit(works_on, Path(sys.argv[1])) for _ in range(8)]:
             future.result()

@@ -472,6 +472,8 @@ class Describer:
         if sweep is None or self._engine.ledger.flagged[self._engine.ledger.row[index]]:
             return False
         for part, fitted in self._fitted.items():
+            if part in self._engine.disabled:
+                continue  # No samples of it are taken.
             watch = self._watch.parts[part]
             if index in fitted and watch.lost is not None and sweep.t_ns > watch.sample_ns:
                 taxels = self._layout.boards[index].taxel_index[fitted[index], 0]

@@ -30,3 +30,19 @@ def test_a_board_that_died_before_the_clock_was_set_is_told_after_it(
     bench.run(0.1)
     # It stays silent until it sends.
     assert ("board_silent", "hand") in bench.told
+
+
+def test_a_board_that_sends_again_is_not_silent_though_its_part_was_disabled_meanwhile(
+    bench: FaultBench,
+) -> None:
+    """No samples of that part are taken, so none shows that the board is back."""
+    back = bench.inject("board_silent", board="forearm_outer")
+    bench.run(2.0)
+    bench.engine.disabled.add([part.name for part in bench.layout.parts].index("left_forearm"))
+    bench.run(1.0)
+    back()
+    bench.robot.bring_up()
+    bench.run(8.0)
+    assert "board_silent" not in {
+        fault["code"] for fault in bench.records["left_forearm"]["faults"]
+    }
