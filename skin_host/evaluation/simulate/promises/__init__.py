@@ -24,7 +24,7 @@ from skin_host.daemon.daemon import Daemon
 from skin_host.evaluation.simulate.accusations import Accusations
 from skin_host.evaluation.simulate.promises.accounts import Accounts
 from skin_host.evaluation.simulate.promises.excuses import Excuses
-from skin_host.evaluation.simulate.promises.fingertips import Fingertips
+from skin_host.evaluation.simulate.promises.fingertips import FingertipCheck
 from skin_host.evaluation.simulate.promises.limits import (
     MORE_OBJECTS,
     MOST_TASKS,
@@ -34,9 +34,9 @@ from skin_host.evaluation.simulate.promises.limits import (
     TOUCHING_KPA,
 )
 from skin_host.evaluation.simulate.promises.received import Received
-from skin_host.evaluation.simulate.promises.skin import Skin
+from skin_host.evaluation.simulate.promises.skin import SkinCheck
 from skin_host.evaluation.simulate.promises.subscribers import Subscribers
-from skin_host.evaluation.simulate.promises.zeros import Zeros
+from skin_host.evaluation.simulate.promises.zeros import ZeroCheck
 from skin_host.evaluation.simulate.troubles import Trouble, damaged_set_up
 from skin_host.evaluation.simulate.world import Life, Triangle, World
 from skin_host.fingertip.events import FingertipEvent, Slip
@@ -65,9 +65,9 @@ class Promises:
         self.accusations = Accusations(world)
         self.excuses = Excuses(world)
         self.subscribers = Subscribers(world)
-        self._skin = Skin(world, self.excuses)
-        self._zeros = Zeros(world, self.excuses)
-        self._fingertips = Fingertips(world, self.accusations)
+        self._skin = SkinCheck(world, self.excuses)
+        self._zeros = ZeroCheck(world, self.excuses)
+        self._fingertips = FingertipCheck(world, self.accusations)
         self._received = Received(world)
         self._accounts = Accounts(world)
         self._parts = {part.name: part for part in world.layout.parts}

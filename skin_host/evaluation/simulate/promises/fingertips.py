@@ -19,7 +19,7 @@ from skin_host.evaluation.simulate.promises.limits import (
 from skin_host.evaluation.simulate.world import Life, World
 
 
-class Fingertips:
+class FingertipCheck:
     """Compares what fingertips report with their loads.
 
     Args:

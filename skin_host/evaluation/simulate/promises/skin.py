@@ -31,7 +31,7 @@ from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
 
 
-class Skin:
+class SkinCheck:
     """Frames and touches of all parts against the true pressure.
 
     Args:

@@ -9,7 +9,7 @@ from skin_host.evaluation.simulate.world import Life, World
 from skin_host.processing.rezero import Rezero
 
 
-class Zeros:
+class ZeroCheck:
     """Follows the zeros that boards take, and those that the daemon observes.
 
     Args:
