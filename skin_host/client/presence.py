@@ -8,7 +8,7 @@ a node of which no part is received in time.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
@@ -46,9 +46,13 @@ MAX_TOUCHED = 200_000
 DISTANCE_S = 120.0
 
 
-def too_many(touches: Iterable[Touch]) -> bool:
-    """Return whether touches are of more taxels together than any robot's."""
-    return sum(len(touch.taxels) for touch in touches) > MAX_TOUCHED
+def too_many(touches: Collection[Touch], most: int) -> bool:
+    """Return whether the oldest of some touches is to be forgotten: there are more than `most`, or
+    several of more taxels together than any robot's.
+    """
+    return len(touches) > most or (
+        len(touches) > 1 and sum(len(touch.taxels) for touch in touches) > MAX_TOUCHED
+    )
 
 
 class Lateness:
@@ -162,9 +166,7 @@ class Presence:
             part.touches.pop(touch.id, None)
         else:
             part.touches[touch.id] = touch, now_s
-            while len(part.touches) > MAX_TOUCHES or (
-                len(part.touches) > 1 and too_many(one for one, _ in part.touches.values())
-            ):
+            while too_many([one for one, _ in part.touches.values()], MAX_TOUCHES):
                 del part.touches[next(iter(part.touches))]
 
     def take_node(

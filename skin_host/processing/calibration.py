@@ -287,9 +287,7 @@ class Calibrator:
         counts, received = self._counts, self._received
         samples = counts.sum(axis=1)
         some = np.maximum(samples, 1)
-        codes = np.arange(256.0)
-        mean_raw = counts @ codes / some
-        variance = np.maximum(counts @ codes**2 / some - mean_raw**2, 0.0)
+        mean_raw, variance = _mean_and_variance(counts)
         no_load = self._layout.no_load.astype(np.float64)
         baseline = no_load - mean_raw
         # Activation falls as raw rises: count from the top of the scale.
@@ -403,7 +401,7 @@ class Calibrator:
             # The fewer are left out, the larger the noise of the others, until both agree.
             counts = self._counts[some]
             np.subtract.at(counts, (row[damaged], one.raw[damaged]), 1)
-            far = one.off > DAMAGED_SIGMAS * _deviation(counts)[row]
+            far = one.off > DAMAGED_SIGMAS * np.sqrt(_mean_and_variance(counts)[1])[row]
             more = bool((damaged & ~far).any())
             damaged &= far
         times = np.bincount(one.taxel[damaged], minlength=n)
@@ -617,13 +615,12 @@ class _Off(NamedTuple):
         return cls(*map(np.concatenate, zip(*those, strict=True)))
 
 
-def _deviation(counts: NDArray[np.int64]) -> Floats:
-    """Return the standard deviation [m] of bytes, of which int64[m, 256] is how often each came."""
+def _mean_and_variance(counts: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """Return those of bytes, [m] each, of which int64[m, 256] is how often each came."""
     number = np.maximum(counts.sum(axis=1), 1)
     codes = np.arange(256.0)
-    mean = counts @ codes / number
-    found: Floats = np.sqrt(np.maximum(counts @ codes**2 / number - mean**2, 0.0))
-    return found
+    mean: Floats = counts @ codes / number
+    return mean, np.maximum(counts @ codes**2 / number - mean**2, 0.0)
 
 
 def _middle(one: NDArray[np.int16], other: NDArray[np.int16]) -> Floats:

@@ -130,9 +130,7 @@ class Picture:
         else:
             part.contacts[touch.id] = touch
             # Whoever may publish could go on for ever.
-            while len(part.contacts) > MAX_CONTACTS or (
-                len(part.contacts) > 1 and too_many(part.contacts.values())
-            ):
+            while too_many(part.contacts.values(), MAX_CONTACTS):
                 del part.contacts[next(iter(part.contacts))]
         part.changed["contacts"] += 1
 

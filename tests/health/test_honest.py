@@ -164,15 +164,19 @@ def test_two_boards_at_one_address_are_called_by_name(quiet: bool) -> None:
     assert pads_of(bench, 0).sum() >= before.sum() - 2
 
 
-def test_what_pressed_one_of_two_boards_as_it_took_its_zero_accuses_no_pad() -> None:
-    """Sweep by sweep its pads read far below zero, and as those of the other board."""
-    press = Probe(
+def press_on_hand(start_s: float) -> Probe:
+    return Probe(
         part="left_hand",
         at=Place(triangle=4),
         diameter_mm=12,
         pressure_kpa=[(0, 0), (0.2, 60), (2.0, 60), (2.2, 0)],
-        start_s=4.0,
+        start_s=start_s,
     )
+
+
+def test_what_pressed_one_of_two_boards_as_it_took_its_zero_accuses_no_pad() -> None:
+    """Sweep by sweep its pads read far below zero, and as those of the other board."""
+    press = press_on_hand(4.0)
     bench = FaultBench(3.0, Scene(quiet=True, seed=1))
     other = TwoBoards(bench, Scene(quiet=True, seed=7, probe=[press])).other
     name = bench.layout.boards[0].name
@@ -198,13 +202,7 @@ def test_one_board_that_sends_far_too_often_is_not_called_two(
 
 
 def test_what_pressed_as_a_board_took_its_zero_is_no_fault_of_its_triangle() -> None:
-    press = Probe(
-        part="left_hand",
-        at=Place(triangle=4),
-        diameter_mm=12,
-        pressure_kpa=[(0, 0), (0.2, 60), (2.0, 60), (2.2, 0)],
-        start_s=9.0,
-    )
+    press = press_on_hand(9.0)
     bench = FaultBench(3.0, Scene(quiet=True, probe=[press]), settle_s=5.0)
     bench.run(10.0 - bench.t_s)
     assert bench.touched["left_hand"].any()
