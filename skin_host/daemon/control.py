@@ -190,7 +190,14 @@ class Control:
             wanted = known | {key: value for key, value in changes.items() if value is not None}
             daemon.set_thresholds(Thresholds(**wanted))
         answer = dict(await self.keep()) if request.reset or request.set is not None else {}
-        return answer | {"touch": msgspec.to_builtins(daemon.settings.processing.touch)}
+        touch = msgspec.to_builtins(daemon.settings.processing.touch)
+        pipeline = daemon.engine.pipeline
+        names = {daemon.layout.parts[i].name: i for i in daemon.engine.parts}
+        decides = {
+            name: None if pipeline is None else round(pipeline.decides_kpa(i), 1)
+            for name, i in names.items()
+        }
+        return answer | {"touch": touch, "decides_kpa": decides}
 
     async def _configure(self, payload: bytes) -> Answer:
         request = _decode(payload, _Configure)

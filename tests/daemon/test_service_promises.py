@@ -56,7 +56,9 @@ async def test_commands_work_and_say_so_where_nothing_can_be_written(
     async with living(can_bus_settings, blocked / "state", clock=clock) as live:
         handle = live.daemon.control.handle
         await clock.sleep(0.3)  # the first calibration is still being kept
+        usual_kpa = (await handle("thresholds", b"{}"))["decides_kpa"]["left_hand"]
         answer = await handle("thresholds", b'{"set":{"margin_units":5}}')
+        assert answer["decides_kpa"]["left_hand"] > usual_kpa > 0.0
         assert answer["kept"] is False
         assert answer["touch"]["margin_units"] == 5.0
         assert (await handle("disable", b'{"part":"left_hand"}'))["disabled"] == ["left_hand"]
