@@ -27,6 +27,8 @@ class BoardRecord:
         alive: it sends.
         configurations: how often it was set up.
         unanswered: queries in a row to which it sent no answer.
+        stopped_sweeps: how many sweeps of it had been received when it answered a query that
+            nobody waits for, another program's or one that waited for the bus: an MTB3 has stopped.
         asked: how often it was asked what it is.
         claim: its last answer, if that was that it is in its bootloader or reads no skin, with
             `asked` at that time.
@@ -50,6 +52,7 @@ class BoardRecord:
     life_s: float | None = None
     answered_ns: int = 0
     unanswered: int = 0
+    stopped_sweeps: int | None = None
     asked: int = 0
     claim: tuple[Message, int] | None = None
     claimed_ns: int = 0

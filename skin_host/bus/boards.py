@@ -230,15 +230,17 @@ class Boards:
             record.configurations > 0 or self._is_in_use(record)
         )
 
-        def announced(zeroing: list[tuple[int, bytes]]) -> Iterator[tuple[int, bytes]]:
+        def announced(
+            zeroing: list[tuple[int, bytes]], believed: bool
+        ) -> Iterator[tuple[int, bytes]]:
             # Drawn when this board's turn on the bus comes. Set-ups of others take seconds; until
             # then the board sends with the zero that it has.
             self._zeroed(record.index, believed)
             yield from zeroing
 
-        await self._port.send(announced(frames), gap_s)
+        await self._port.send(announced(frames, believed), gap_s)
         await self._clock.sleep(max(gap_s, NEW_OFFSET_S))
-        await self._port.send(announced(frames[-1:]))
+        await self._port.send(announced(frames[-1:], believed=True))
         await self._clock.sleep(max(gap_s, NEW_OFFSET_S))
         await self._port.send([command_frame(SetTxMode(TxMode.START), address)])
         record.configurations += 1
@@ -416,8 +418,8 @@ class Boards:
         for.
         """
         address = record.layout.settings.address
-        asked_ns = self._clock.monotonic_ns()
-        # An MTB3 does not report its uptime; one that answers and does not send was reset.
+        # An MTB3 does not report its uptime; one that answers and does not send was reset, or has
+        # been stopped by a query before.
         tells_age = not record.is_mtb3
         questions: list[Message] = [Discover()]
         if tells_age:
@@ -426,6 +428,7 @@ class Boards:
         record.answered_ns, record.life_s = 0, None
         record.asked += 1
         await self._port.send([command_frame(question, address) for question in questions])
+        asked_ns = self._clock.monotonic_ns()
         sweeps = self._ledger.sweeps[record.row]
         while self._clock.monotonic_ns() - asked_ns < ANSWER_S * 1e9:
             if record.answered_ns and (record.life_s is not None or not tells_age):
@@ -440,7 +443,8 @@ class Boards:
         mute = record.board_type is None and record.retries % MUTE_QUESTIONS == 0
         if record.in_bootloader or not (record.answered_ns or mute):
             return
-        reset = record.answered_ns != 0 and not tells_age
+        stopped = self._is_stopped(record)
+        reset = record.answered_ns != 0 and not tells_age and not stopped
         if record.life_s is not None:
             reset = asked_ns - int(record.life_s * 1e9) > record.configured_at_ns
         self._ledger.resets[record.row] += reset and record.configurations > 0
@@ -448,6 +452,11 @@ class Boards:
             await self._port.send([command_frame(SetTxMode(TxMode.START), address)])
         else:
             await self._set_up(record)
+
+    def _is_stopped(self, record: BoardRecord) -> bool:
+        """Whether no more than the sweep that was on its way came since a query stopped a board."""
+        stopped = record.stopped_sweeps
+        return stopped is not None and self._ledger.sweeps[record.row] - stopped <= 1
 
     async def stop(self) -> None:
         """Command every board to stop sending.
@@ -491,6 +500,9 @@ class Boards:
             record.in_bootloader = False
             if record.is_mtb3:
                 self._ledger.expect_pauses(record.row)
+                if record.busy is None and not self._is_stopped(record):
+                    record.stopped_sweeps = int(self._ledger.sweeps[record.row])
+                    record.retry_at_ns = 0
             if record.is_wrong_type:
                 record.claimed_ns = self._ledger.now_ns
                 self._warn(record, f"is of type {answer.board_type}, which is no skin board")

@@ -38,6 +38,7 @@ from skin_host.processing.pressure import PressureCurve, vertex
 from skin_host.processing.rezero import (
     BELOW_SWEEPS,
     JUMPS_NS,
+    STEADY_UNITS,
     Rezero,
     highest_rest,
     look_s,
@@ -485,10 +486,14 @@ class Engine:
                     self._run.samples[sender] = 0
         if self.calibration is None:
             return 0
-        touched: NDArray[np.bool_] = self._last_touched[taxels] | self._glimpsed(board)
-        touched &= (taxels >= 0) & believed
-        self._glimpses.pop(board, None)
         before = self._rezeros.get(board)
+        fitted = taxels >= 0
+        if believed:
+            touched = fitted & (self._last_touched[taxels] | self._glimpsed(board))
+        else:
+            touched = np.zeros_like(fitted)
+            self._last_touched[taxels[fitted]] = False
+        self._glimpses.pop(board, None)
         if before is not None:
             touched |= before.unknown.reshape(TRIANGLES, PADS)
         own = self.layout.boards[board].settings
@@ -497,9 +502,10 @@ class Engine:
         if self._pipeline is not None:
             seconds = look_s(self.calibration.spread, self._pipeline.enter)[taxels.ravel()]
             wanted = np.ceil(seconds * 1e3 / own.period_ms).astype(np.int64)
-        fitted = (taxels >= 0).ravel()
         period_s = own.period_ms * 1e-3
-        self._rezeros[board] = Rezero(touched.ravel(), no_load, fitted, wanted, period_s)
+        self._rezeros[board] = Rezero(
+            touched.ravel(), no_load, fitted.ravel(), wanted, period_s, believed
+        )
         self.intake.veto[self.ledger.row[board]] = np.ones((TRIANGLES, PADS), np.bool_)
         self.zero_changes += 1
         return int(np.count_nonzero(touched))
@@ -634,11 +640,14 @@ class Engine:
         """
         now = self.ledger.error[row] & StatusError.NO_ACK != 0
         before = self._unanswered.get(sweep.board)
+        if before is not None:
+            # Nobody knows of a triangle that was not received.
+            now |= before & ~self.ledger.present[row]
         if any_of(now):
             self._unanswered[sweep.board] = now
         else:
             self._unanswered.pop(sweep.board, None)
-        if before is not None and any_of(before & ~now & self.ledger.present[row]):
+        if before is not None and any_of(before & ~now):
             self.rezero(sweep.board)
 
     def _note_return(self, sweep: Sweep, silent_ns: int) -> None:
@@ -730,7 +739,12 @@ class Engine:
         spread = np.maximum(calibration.spread, calibration.noise)[taxels]
         baseline = pipeline.baseline[taxels]
         repeats = repeats_of(self.layout.boards[board].settings.period_ms * 1e-3)
-        highest = highest_rest(baseline, spread, repeats)[0]
+        highest, error = highest_rest(baseline, spread, repeats)
+        rezero = self._rezeros.get(board)
+        if rezero is not None and not rezero.believed:
+            # What it was set up to send before had other rests.
+            baseline = rezero.lowest()
+            highest = baseline + STEADY_UNITS + error
         highest = np.maximum(highest, baseline + pipeline.enter[taxels])
         fit = (taxels >= 0) & calibration.usable[taxels]
         pressed[:] = (fit & (np.median(glimpse.units, axis=0) > highest)).reshape(pressed.shape)

@@ -102,8 +102,10 @@ class Rezero:
         fitted: bool[n], taxels that there are.
         wanted: int[n], how many bytes of each are wanted; `FEWEST` by default.
         period_s: how often the board sends: it may repeat conversions.
+        believed: whether the board had been set up before, as it is now.
 
     Attributes:
+        believed: the same.
         doubted: bool[n], taxels whose zero is not known.
         cut_off: bool[n], taxels whose noise reaches the end of the scale: they are refused.
         moved: bool[n], taxels that something may have pressed while they were observed: they are
@@ -117,7 +119,9 @@ class Rezero:
         fitted: Mask,
         wanted: NDArray[np.int64] | None = None,
         period_s: float = CONVERSION_S,
+        believed: bool = True,
     ) -> None:
+        self.believed = believed
         self._no_load = no_load
         self._repeats = repeats_of(period_s)
         none = np.zeros(len(no_load), np.int64)
@@ -223,6 +227,17 @@ class Rezero:
         """Return whether any new zero has been found since a time."""
         return bool((self._found_ns >= t_ns).any())
 
+    def lowest(self) -> Floats:
+        """Return the lowest that each taxel [n] has rested at, in units: infinite if it was not
+        observed for `FEWEST_RESTING` readings.
+        """
+        units = self._no_load - self._raw[: int(self._count.max())]
+        lowest = np.full(len(self._no_load), np.inf)
+        for last in range(FEWEST_RESTING, len(units) + 1):
+            rest = np.median(units[last - FEWEST_RESTING : last], axis=0)
+            np.minimum(lowest, rest, out=lowest, where=self._count >= last)
+        return lowest
+
     def restart(self, t_ns: int) -> None:
         """The board was not received for a while, up to a time: what it sent before may have been
         of another zero.
@@ -298,7 +313,8 @@ class Rezero:
             spread: float64[n], see `finish`.
         """
         most, error = highest_rest(baseline, spread, self._repeats)
-        self._highest = np.minimum(self._highest, most)
+        if self.believed:
+            self._highest = np.minimum(self._highest, most)
         before = np.arange(1, len(units))[:, None]
         after = self._count - before
         sums = np.cumsum(units, axis=0)

@@ -7,7 +7,13 @@ import pytest
 
 from skin_host.bus.answers import Discovered, DiscoveredBootloader, answer_frame
 from skin_host.bus.boards import Boards
-from skin_host.bus.commands import BoardType, Message, SetTriangleConfig, parse_command
+from skin_host.bus.commands import (
+    BoardType,
+    Discover,
+    Message,
+    SetTriangleConfig,
+    parse_command,
+)
 from skin_host.bus.wire import FrameBatch, MessageClass, identifier
 from skin_host.clock import SteppedClock
 from skin_host.config.settings import load
@@ -63,7 +69,7 @@ class Heard:
         self.now_ns += S // 10
         self.health.tick(self.now_ns, {}, {"can0": self.boards})
 
-    def supervised(self, port: "Kept", clock: SteppedClock) -> None:
+    def supervised(self, port: "Kept | Slow", clock: SteppedClock) -> None:
         """From now on boards are queried over a port of their own."""
         layout, ledger = self.engine.layout, self.engine.ledger
         boards = [(i, layout.boards[i]) for i in self.engine.boards]
@@ -308,3 +314,42 @@ def test_forged_answers_fill_no_log(heard: Heard, caplog: pytest.LogCaptureFixtu
         heard.answer_again(Discovered(kind, 1, 25, 0), HAND)
         heard.answer_again(DiscoveredBootloader(BoardType.MTB4, 4, 0), HAND)
     assert len(caplog.records) == 1
+
+
+class Slow:
+    """A bus that is full: queries wait on it for two seconds, and the board answers at once.
+
+    Args:
+        heard: takes the answers.
+        clock: of the test.
+    """
+
+    def __init__(self, heard: Heard, clock: SteppedClock) -> None:
+        self._heard, self._clock = heard, clock
+        self.set_up = 0
+
+    async def send(self, frames: Iterable[tuple[int, bytes]], gap_s: float = 0.0) -> None:
+        for frame in frames:
+            command = parse_command(*frame)
+            assert command is not None
+            address, message = command
+            self.set_up += address == HAND and isinstance(message, SetTriangleConfig)
+            if isinstance(message, Discover) and address == HAND:
+                await self._clock.sleep(2.0)
+                asyncio.get_running_loop().call_soon(self._answer)
+
+    def _answer(self) -> None:
+        self._heard.answer(Discovered(BoardType.SKIN, 2, 17, 0), HAND)
+
+
+@stepped
+async def test_a_board_has_its_time_to_answer_from_when_the_query_is_sent(
+    heard: Heard, clock: SteppedClock
+) -> None:
+    port = Slow(heard, clock)
+    heard.supervised(port, clock)
+    await heard.boards.bring_up()
+    for _ in range(200):
+        await heard.pass_time(clock)
+    assert port.set_up
+    await heard.boards.stop()

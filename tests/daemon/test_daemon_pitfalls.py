@@ -2,10 +2,12 @@
 
 from pathlib import Path
 
+import can
 import numpy as np
 import pytest
 
 from emulator.probes.scene import Fault
+from skin_host.bus.commands import Discover, command_frame
 from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus
 from tests.support.live import CONFIG, Live, living
@@ -51,6 +53,23 @@ async def test_boards_of_the_mtb3_are_set_up_once_and_a_reset_one_is_found(
         await live.wait(lambda: counted(live)["hand"][0] == 2)
         await live.until_well(but=LATELY)
         assert counted(live)["forearm_outer"] == counted(live)["forearm_inner"] == (1, 0, 0)
+
+
+@stepped
+async def test_an_mtb3_that_another_program_queries_is_set_up_and_was_not_reset(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    """A query stops it, such as that of `skin scan`, or one of ours that comes late."""
+    config = changed(tmp_path, 'model = "mtb4"', 'model = "mtb3"')
+    async with living(can_bus_settings, tmp_path, config=config, clock=clock) as live:
+        await live.until_well(but=LATELY)
+        bus = can.Bus(interface=can_bus_settings.interface, channel=can_bus_settings.channel)
+        identifier, data = command_frame(Discover(), 14)
+        bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+        await live.wait(lambda: counted(live)["hand"][0] == 2)
+        await live.until_well(but=LATELY)
+        bus.shutdown()
+        assert not live.daemon.engine.ledger.resets.any()
 
 
 @stepped

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skin_host.bus.wire import FrameBatch, encode_sweep
+from skin_host.bus.wire import FrameBatch, StatusError, encode_sweep
 from skin_host.config.settings import load
 from skin_host.daemon.daemon import Daemon
 from skin_host.health import HealthWatch
@@ -36,6 +36,10 @@ class Hand:
         self.rest_units = np.zeros((len(self._board.triangles), 12), np.int64)
         #: What the pads of a second board at its address rest at, which sends 13 ms after each.
         self.other_units: np.ndarray | None = None
+        #: The error of the last triangle's chip.
+        self.error = 0
+        #: How many triangles are lost on their way, from the last on.
+        self.lost = 0
         #: Takes the outputs.
         self.deliver: Callable[[Output], None] = lambda output: None
         if rest_seed is not None:
@@ -57,6 +61,7 @@ class Hand:
         values = self._rng.integers(NO_LOAD - 1, NO_LOAD + 2, (len(triangles), 12))
         values -= rest_units
         status = np.zeros(len(triangles), np.uint16)
+        status[-1] = self.error
         for name, value in pads.items():
             values[0, int(name[1:])] = value
             if value == FAR_BELOW:
@@ -65,6 +70,7 @@ class Hand:
             self._board.settings.address, triangles, values.astype(np.uint8), status
         )
         frames = [(int(i), bytes(d), t_ns) for i, d in zip(ids, data, strict=True)]
+        frames = frames[: len(frames) - 2 * self.lost]
         self.deliver(self.engine.feed(self._board.settings.bus, FrameBatch.of(frames)))
 
     def pause(self, seconds: float) -> None:
@@ -183,6 +189,25 @@ def test_a_press_that_began_before_its_pad_was_valid_is_in_doubt_after_another_z
     assert hand.in_doubt == [3]
 
 
+@pytest.mark.parametrize(("rests", "pressed"), [(5, 10), (25, 10), (36, 7)])
+@pytest.mark.parametrize("offset", [0, 30])
+def test_a_press_that_began_between_the_zeros_of_a_first_set_up_is_in_doubt(
+    hand: Hand, rests: int, pressed: int, offset: int
+) -> None:
+    """Nothing that the board sent before is believed, and with another offset its first zero may be
+    far off. The second comes up to seconds later, when other boards have had their first.
+    """
+    hand.send(10, p5=200)
+    hand.engine.rezero(0, believed=False)
+    hand.rest_units[:] = offset
+    hand.send(rests)
+    hand.send(pressed, p3=200 - offset)
+    assert hand.engine.rezero(0) == 1
+    hand.rest_units[:] = 0
+    hand.send(60)
+    assert hand.in_doubt == [3]
+
+
 def test_a_press_that_a_board_brings_back_from_a_silence_is_in_doubt_after_a_zero(
     hand: Hand,
 ) -> None:
@@ -280,6 +305,21 @@ def test_a_board_that_was_zeroed_unheard_gets_new_baselines(
     expect_one_new_zero(hand, steps)
     assert not any(step.events for step in steps)
     assert hand.in_doubt == [3]
+
+
+@pytest.mark.parametrize("lost", [0, 1])
+def test_a_board_that_zeroed_itself_gets_new_baselines_though_what_shows_it_is_lost(
+    worn: tuple[Hand, list[Step]], lost: int
+) -> None:
+    """It does after five readings of a chip that did not answer, and then calls the chip well."""
+    hand, steps = worn
+    hand.error = StatusError.NO_ACK
+    hand.send(5)
+    hand.error, hand.lost = 0, lost
+    hand.rests_elsewhere(seed=2)
+    hand.send(1)
+    hand.lost = 0
+    expect_one_new_zero(hand, steps)
 
 
 def test_an_mtb3_that_was_zeroed_while_its_status_words_were_lost_gets_new_baselines(

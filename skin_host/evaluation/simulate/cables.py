@@ -274,6 +274,7 @@ class Fate:
     Attributes:
         sent: by the boards.
         unheard: while no port was open, or the adapter was unplugged or down.
+        forgotten: those of them that had passed, and waited to be read when it was.
         lost, damaged, doubled: by mischief.
         dropped: because the buffer was full.
         read: by the daemon.
@@ -281,6 +282,7 @@ class Fate:
 
     sent: int = 0
     unheard: int = 0
+    forgotten: int = 0
     lost: int = 0
     damaged: int = 0
     doubled: int = 0
@@ -358,6 +360,7 @@ class Cable:
 
     def _forget(self) -> None:
         self.fate.unheard += self._n_waiting
+        self.fate.forgotten += self._n_waiting
         self._waiting.clear()
         self._n_waiting = 0
         self._late.clear()

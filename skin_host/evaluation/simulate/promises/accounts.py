@@ -56,8 +56,9 @@ class Accounts:
                     f"bus {name}: {assembler.counters.frames} of {counters.frames} frames were "
                     "taken"
                 )
+            hidden = fate.forgotten + (fate.dropped if clock_set_ns >= life.began_ns else 0)
             wrong = self._wrong_frames(name, assembler) or self._wrong_sweeps(
-                life, name, assembler.counters, fate.dropped if clock_set_ns >= life.began_ns else 0
+                life, name, assembler.counters, hidden
             )
             if wrong is not None:
                 return wrong
@@ -95,8 +96,9 @@ class Accounts:
 
         Args:
             life, bus, counters: whose.
-            hidden: frames that were dropped in a life in which the clock was set: if it was set
-                back, time stamps do not show how many sweeps they were.
+            hidden: frames of which nothing shows how many sweeps they were: those that waited when
+                their adapter was unplugged, after which none may come; and those that were dropped
+                in a life in which the clock was set back.
         """
         bursts = (life.sent_before_end or {}).get(bus, self._world.cables[bus].sent.bursts)
         layout = self._world.layout
