@@ -21,7 +21,7 @@ from skin_host.health.record import (
 )
 from skin_host.health.watch import Watch
 from skin_host.layout import TAXELS_PER_TRIANGLE, PadKind
-from skin_host.processing.calibration import Calibration, Verdict
+from skin_host.processing.calibration import USUAL_SHIFT, Calibration, Verdict
 from skin_host.processing.core import Engine
 from skin_host.processing.intake import FAR_PADS, lifted
 from skin_host.processing.masks import Mask, any_of
@@ -72,6 +72,9 @@ class Describer:
         #: For each part the time of the last sample that was looked at, the shifts of its thermal
         #: and of its resting pads in it, and those that it and the one before agree on.
         self._shifts: dict[int, tuple[int, Temperatures, Temperatures]] = {}
+        shifts = np.array([triangle.shift for triangle in self._layout.triangles])
+        #: One unit of each taxel [n], in units of the usual shift.
+        self._unit = np.exp2(shifts - USUAL_SHIFT)[self._layout.triangle_of]
         #: For each part its baselines at the last looks, their times, and which zeros they are of.
         self._baselines: dict[int, deque[tuple[int, int, Calibration, NDArray[np.float64]]]] = {}
         #: Since when triangles, by board and number, have not changed after a calibration in which
@@ -290,13 +293,21 @@ class Describer:
         span = slice(layout.start, layout.stop)
         units = self._layout.no_load[span].astype(np.float64) - watch.raw
         heard = watch.raw > 0
+        unit = self._unit[span]
         # A triangle whose pressures are not valid has no valid temperature either.
         lives = watch.valid.reshape(-1, TAXELS_PER_TRIANGLE).any(axis=1)
         thermal = ~pressure & heard & calibration.usable[span]
         thermal &= np.repeat(lives, TAXELS_PER_TRIANGLE)
-        found: Temperatures = {"thermal_units": None, "common_units": 0.0}
+        none: Temperatures = {
+            "thermal_units": None,
+            "common_units": 0.0,
+            "coarsest_units": max(float(unit.max()), 1.0),
+        }
+        found = none.copy()
         if thermal.any():
-            shift = units[thermal] - calibration.baseline[span][thermal]
+            shift = (units - calibration.baseline[span])[thermal] * unit[thermal]
+            # At the end of its scale nobody can see how much colder a pad is: it counts twice.
+            shift[watch.raw[thermal] == 255] *= 2.0
             found["thermal_units"] = round(_middle(shift), 1)
         rests = watch.rests()
         # Pads in doubt are not valid, and nobody knows that they are untouched.
@@ -306,17 +317,15 @@ class Describer:
             if (rests == watch.valid).all() and (former := self._former(part, span)) is not None:
                 shifts.append(units - former)
             triangle_of = self._layout.triangle_of[span]
-            common = max((common_shift(one, rests, triangle_of) for one in shifts), key=abs)
+            common = max((common_shift(one * unit, rests, triangle_of) for one in shifts), key=abs)
             found["common_units"] = round(common, 1)
         # A temperature lasts. Noise that the pads of a triangle share, and what a chip sends that
         # has just stopped answering, pass from one sweep to the next; a board that is being set up
         # sends none.
-        none: Temperatures = {"thermal_units": None, "common_units": 0.0}
         before = none if known is None else known[1]
-        agreed: Temperatures = {
-            "thermal_units": _nearer_zero(before["thermal_units"], found["thermal_units"]),
-            "common_units": min(before["common_units"], found["common_units"], key=abs),
-        }
+        agreed = found.copy()
+        agreed["thermal_units"] = _nearer_zero(before["thermal_units"], found["thermal_units"])
+        agreed["common_units"] = min(before["common_units"], found["common_units"], key=abs)
         self._shifts[part] = watch.sample_ns, found, agreed
         return agreed
 
@@ -528,7 +537,7 @@ def common_shift(
     zero, moves the pads around it.
 
     Args:
-        shift: [m], from the baselines, in units.
+        shift: [m], from the baselines, in units of one shift.
         rests: bool[m], untouched taxels; some are.
         triangle_of: int[m].
     """

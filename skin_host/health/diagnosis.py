@@ -23,10 +23,11 @@ JITTER_SHARE = 0.06
 FEW_HALVES = 2
 #: So are this many pads of a bus that were off for one sweep, in the last ten seconds.
 FEW_SPIKED_PADS = 2
-#: Limit of the mean shift of the temperature pads since the calibration, in units.
+#: Limit of the median shift of the temperature pads since the calibration, in units of the usual
+#: shift, which are a temperature.
 THERMAL_UNITS = 8.0
-#: Limit of the median shift of all untouched taxels from their baselines, in units; used without
-#: temperature pads.
+#: Limit of the median shift of all untouched taxels from their baselines, in units as the part's
+#: coarsest triangle sends them; used without temperature pads. Less is noise, or rounding.
 COMMON_UNITS = 1.5
 #: Kinds of interface that no real board is on; the kernel's are named vcan.
 EMULATED = {"virtual", "socketpair"}
@@ -373,16 +374,18 @@ def _part(record: Record) -> Iterator[FoundFault]:
     warmth = record.get("warmth")
     if warmth is None:
         return
-    if warmth["thermal_units"] is not None and abs(warmth["thermal_units"]) > THERMAL_UNITS:
+    thermal_units, common_units = warmth["thermal_units"], warmth["common_units"]
+    least_units = COMMON_UNITS * warmth["coarsest_units"]
+    if thermal_units is not None and abs(thermal_units) > max(THERMAL_UNITS, least_units):
         yield fault(
             "part_temperature",
-            f": its thermal pads read {warmth['thermal_units']:+.0f} units since the "
+            f": its thermal pads read {thermal_units:+.0f} units since the "
             "calibration: its temperature has changed; pressures are corrected, less precisely",
         )
-    elif abs(warmth["common_units"]) > COMMON_UNITS:
+    elif abs(common_units) > least_units:
         yield fault(
             "part_temperature",
-            f": its untouched taxels all read {warmth['common_units']:+.1f} units off their "
+            f": its untouched taxels all read {common_units:+.1f} units off their "
             "baselines: its temperature is changing",
         )
 

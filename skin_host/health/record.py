@@ -111,10 +111,15 @@ class TriangleHealth(TypedDict):
 
 
 class Temperatures(TypedDict):
-    """Mean shift of the temperature pads, and of all untouched taxels, since the calibration."""
+    """Median shift of the temperature pads since the calibration, and of all untouched taxels from
+    their baselines, in units of the usual shift.
+
+    `coarsest_units`: what a unit of the part's coarsest bytes is of these, 1 at least.
+    """
 
     thermal_units: float | None
     common_units: float
+    coarsest_units: float
 
 
 class CalibrationName(TypedDict):

@@ -1,6 +1,7 @@
 """What the records of parts are made of."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -107,6 +108,58 @@ def test_a_fall_of_temperature_is_named_though_the_baselines_have_followed_it() 
     fall(4)
     # Pads beside a press read less.
     assert not any(fallen() for _ in range(4))
+
+
+HAND = CONFIG.with_name("icub_hand.toml").read_text()
+#: Two triangles without temperature pads, which their board does not compensate.
+PLAIN = """
+robot = "plain"
+[buses.can0]
+[boards.arm]
+bus = "can0"
+address = 14
+skin_type = 1
+[[parts.arm.patches]]
+board = "arm"
+triangles = "0"
+kind = "triangle"
+shift = 3
+[[parts.arm.patches]]
+board = "arm"
+triangles = "1"
+kind = "triangle"
+places = [{ x_mm = 40 }]
+shift = 3
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "shifts", "warmer_c", "named"),
+    [
+        (HAND, (3, 3), 3.5, True),
+        (HAND, (3, 3), -3.5, True),
+        (HAND, (3, 3), 2.5, False),
+        (HAND, (1, 1), 3.5, True),
+        (HAND, (1, 1), -3.5, True),  # to the end of the scale, and beyond
+        (HAND, (1, 1), 2.5, False),
+        (HAND, (3, 1), 2.5, False),
+        (PLAIN, (3, 3), -3.5, True),
+        (PLAIN, (3, 1), -3.5, True),
+        (PLAIN, (1, 1), -3.5, True),
+        (PLAIN, (0, 0), -0.4, False),
+    ],
+)
+def test_a_temperature_is_the_same_on_finer_and_on_coarser_bytes(
+    tmp_path: Path, text: str, shifts: tuple[int, int], warmer_c: float, named: bool
+) -> None:
+    first, *others = text.split("shift = 3")
+    of_patches = zip(shifts, others, strict=True)
+    config = tmp_path / "robot.toml"
+    config.write_text(first + "".join(f"shift = {shift}{rest}" for shift, rest in of_patches))
+    bench = FaultBench(config=config)
+    bench.inject("temperature_step", value=warmer_c)
+    bench.run(3.0)
+    assert ("part_temperature" in {code for code, _ in bench.first_told}) == named
 
 
 @pytest.mark.parametrize(

@@ -169,22 +169,36 @@ def test_a_board_may_be_off_by_a_twentieth_of_its_period_and_scatter_a_little_mo
 
 
 @pytest.mark.parametrize(
-    ("thermal_units", "common_units", "words"),
+    ("thermal_units", "common_units", "coarsest_units", "words"),
     [
-        (8.0, 1.5, None),
-        (-8.0, -1.5, None),
-        (8.1, 0.0, "thermal pads read +8"),
-        (-9.0, 9.0, "thermal pads read -9"),
-        (None, 1.5, None),
-        (None, 1.6, "all read +1.6"),
-        (None, -1.6, "all read -1.6"),
-        (0.0, 2.0, "all read +2.0"),
+        (8.0, 1.5, 1.0, None),
+        (-8.0, -1.5, 1.0, None),
+        (8.1, 0.0, 1.0, "thermal pads read +8"),
+        (-9.0, 9.0, 1.0, "thermal pads read -9"),
+        (None, 1.5, 1.0, None),
+        (None, 1.6, 1.0, "all read +1.6"),
+        (None, -1.6, 1.0, "all read -1.6"),
+        (0.0, 2.0, 1.0, "all read +2.0"),
+        # Less than 1.5 units as they were sent is noise.
+        (8.1, 3.0, 2.0, "thermal pads read +8"),
+        (8.0, 3.0, 2.0, None),
+        (None, -3.1, 2.0, "all read -3.1"),
+        (-12.0, 0.0, 8.0, None),
+        (-12.1, 0.0, 8.0, "thermal pads read -12"),
     ],
 )
 def test_a_temperature_that_has_changed_shows_in_the_thermal_pads_or_in_all(
-    calibrated: FaultBench, thermal_units: float | None, common_units: float, words: str | None
+    calibrated: FaultBench,
+    thermal_units: float | None,
+    common_units: float,
+    coarsest_units: float,
+    words: str | None,
 ) -> None:
-    warmth = {"thermal_units": thermal_units, "common_units": common_units}
+    warmth = {
+        "thermal_units": thermal_units,
+        "common_units": common_units,
+        "coarsest_units": coarsest_units,
+    }
     fault = found(calibrated, warmth=warmth).get("part_temperature")
     assert (fault is None) == (words is None)
     assert fault is None or str(words) in fault.sentence

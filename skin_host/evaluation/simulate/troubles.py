@@ -20,6 +20,8 @@ from skin_host.evaluation.simulate.world import Triangle, World
 from skin_host.health.describe import enough_rest
 from skin_host.health.diagnosis import JITTER_SHARE
 from skin_host.layout import PadKind
+from skin_host.processing.liveness import CONVERSION_S
+from skin_host.processing.stuck import CALIBRATED_SAMPLES, ODDS, longest_run, rate_in_run
 
 Mask = NDArray[np.bool_]
 
@@ -281,7 +283,10 @@ def _emulated(
             places = places_of(world, bus=bus)
         about = " ".join([name, *(f"{key}={value}" for key, value in targets.items())])
         shows, bound_s = _always, within_s
-        if name == "bit_errors" and value is not None:
+        if name == "stuck_taxel":
+            pad = int(str(targets["taxel"]))
+            bound_s = max(within_s, _longest_chance_s(world, board, triangle, pad))
+        elif name == "bit_errors" and value is not None:
             bound_s, shows = _until_damage_shows_s(world, bus, value), _rests(world, bus)
         elif name == "jittered_period":
             shows = _scatters(world, board)
@@ -320,6 +325,25 @@ def _noise_that_shows(world: World, board: str, triangle: int, pad: int) -> floa
     if not calibration.usable[taxel]:
         return math.inf
     return max(SURE_NOISE_UNITS, SURE_NOISE * float(calibration.noise[taxel]))
+
+
+def _longest_chance_s(world: World, board: str, triangle: int, pad: int) -> float:
+    """Return for how long a pad that works may send the same byte (s): very long, if its noise is
+    small beside one unit and it rests in the middle of a byte.
+
+    A calibration finds too much noise in such a pad at the edge of a byte, or too little in its
+    middle.
+    """
+    where = next(one for one in world.layout.boards if one.name == board)
+    taxel = where.taxel_index[triangle, pad]
+    own_units = float(world.robot.skin.noise_ff[taxel] / world.layout.unit_ff[taxel])
+    noise_units = math.hypot(own_units, 12**-0.5)
+    calibration = None if world.life is None else world.life.daemon.engine.calibration
+    if calibration is not None:
+        noise_units = min(noise_units, float(calibration.noise[taxel]))
+    rate = rate_in_run(np.array([noise_units]))
+    conversions = float(longest_run(rate, CALIBRATED_SAMPLES, ODDS)[0])
+    return conversions * max(where.settings.period_ms * 1e-3, CONVERSION_S)
 
 
 def _scatters(world: World, board: str) -> Callable[[], bool]:
