@@ -305,8 +305,9 @@ class Cable:
         mischief: what happens to frames.
         state: of the interface, as the port is to find it.
         damaged_ns: when a frame was last damaged.
-        blurred_ns: when frames last came late while a second board sent at their address, or a
-            board's sweeps passed close together: what belongs to which cannot be known then.
+        blurred_ns: when frames last came late or in another order while a second board sent at
+            their address, or a board's sweeps passed close together: what belongs to which cannot
+            be known then.
         fate: what became of the frames since the port was opened.
         sent: what passed over the bus.
     """
@@ -386,7 +387,7 @@ class Cable:
             return
         if n:
             self.sent.note(batch)
-        if self.mischief.late or self._late:
+        if self.mischief.late or self.mischief.swapped or self._late:
             now_ns = self._clock.monotonic_ns()
             if self.mischief.twin is not None or now_ns - self.sent.crowded_ns < CROWDED_NS:
                 self.blurred_ns = now_ns

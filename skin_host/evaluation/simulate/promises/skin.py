@@ -279,10 +279,12 @@ class SkinCheck:
                 f"taxel {taxel} is valid and reads {frame.pressure_kpa[taxel]:.1f} kPa while it is "
                 f"pressed with {self._truth[-1][mine][taxel]:.1f} kPa"
             )
-        untouched_kpa = np.maximum(UNTOUCHED_KPA, KEPT * self._hardest_kpa[mine])
+        kept_kpa = KEPT * self._hardest_kpa[mine]
+        untouched_kpa = np.maximum(UNTOUCHED_KPA, kept_kpa)
         false = fit & (most[mine] < 0.01) & (frame.pressure_kpa > untouched_kpa)
         if false.any():
-            false &= frame.pressure_kpa > self._noise_kpa(life, frame.part)
+            # What foam kept has noise too.
+            false &= frame.pressure_kpa > kept_kpa + self._noise_kpa(life, frame.part)
         if not false.any():
             return None
         taxel = int(np.flatnonzero(false)[0])
