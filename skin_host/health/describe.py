@@ -523,9 +523,11 @@ class Describer:
 def enough_rest(rests: Mask, usable: Mask) -> bool:
     """Return whether a shift of a part can be known, bool[m] each: by the untouched taxels of those
     that are usable.
+
+    If less than half are untouched, they may be those that are too noisy to feel an even load.
     """
-    resting = int(np.count_nonzero(rests))
-    return resting >= max(FEWEST_RESTING, min(MANY_RESTING, int(np.count_nonzero(usable))))
+    resting, all_pads = int(np.count_nonzero(rests)), int(np.count_nonzero(usable))
+    return resting >= max(FEWEST_RESTING, min(MANY_RESTING, all_pads), all_pads / 2)
 
 
 def common_shift(

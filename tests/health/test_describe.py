@@ -165,15 +165,18 @@ def test_a_temperature_is_the_same_on_finer_and_on_coarser_bytes(
 @pytest.mark.parametrize(
     ("resting", "valid", "enough"),
     [
-        (12, 200, True),
-        (11, 200, False),
+        (100, 200, True),
+        (99, 200, False),
+        (12, 24, True),
+        (12, 16, True),
+        (11, 16, False),
         (11, 11, True),
         (10, 11, False),
         (8, 8, True),
         (7, 7, False),
     ],
 )
-def test_of_a_part_twelve_pads_must_rest_or_all_of_a_small_one(
+def test_of_a_part_half_of_the_pads_and_twelve_must_rest_or_all_of_a_small_one(
     resting: int, valid: int, enough: bool
 ) -> None:
     pads = np.arange(300)

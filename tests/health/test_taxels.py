@@ -10,7 +10,7 @@ from skin_host.bus.compensation import thermal_gains
 from skin_host.health.describe import Describer
 from skin_host.health.diagnosis import diagnose
 from skin_host.layout import PadKind
-from tests.support.fault_bench import FaultBench
+from tests.support.fault_bench import CONFIG, FaultBench
 
 HELD_SCENE = """
 about = "Something is put on the forearm and stays."
@@ -95,6 +95,15 @@ def test_a_press_on_the_whole_part_is_no_change_of_its_temperature() -> None:
     bench.run(9.0)
     assert bench.touched["left_hand"].sum() > 60
     assert "part_temperature" not in codes(bench, "left_hand")
+
+
+def test_an_even_load_that_only_noisy_pads_do_not_feel_is_no_change_of_temperature() -> None:
+    air = Air(part="left_lower_arm", pressure_kpa=[(0, 0), (15, 0), (15.1, 8), (60, 8)])
+    scene = Scene(quiet=False, seed=1, air=[air])
+    bench = FaultBench(5.0, scene, config=CONFIG.with_name("nao.toml"), settle_s=9.0)
+    bench.run(4.0)
+    assert bench.touched["left_lower_arm"].sum() > 180
+    assert "part_temperature" not in {code for code, _ in bench.first_told}
 
 
 def test_a_temperature_that_one_sweep_shows_is_none(bench: FaultBench) -> None:
