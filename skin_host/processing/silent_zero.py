@@ -21,8 +21,9 @@ from skin_host.processing.drift import SLOW_UNITS_PER_S
 #: So many sweeps are compared; pads of which fewer than half were received do not count.
 SWEEPS = 10
 FEWEST = SWEEPS // 2
-#: A board was zeroed when its readings are so many times as probable then.
-ODDS = 1e4
+#: A board was zeroed when its readings are so many times as probable then: a zero taken for none
+#: makes untouched pads read touches, and none taken for one costs a second (docs/found.md).
+ODDS = 100
 #: Rounding, and what the baseline of a pad drifts by itself (units, standard deviation).
 OWN_UNITS = 0.5
 #: What all pads of a board drift by together (units, standard deviation), however short the

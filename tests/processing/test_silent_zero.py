@@ -91,6 +91,19 @@ def test_a_long_silence_in_which_it_became_warmer_is_no_zero(
     assert found is False
 
 
+def quiet(seed: int, zeroed: bool) -> bool | None:
+    """Return what is decided of a small board with little noise."""
+    skin = Skin(seed, n=24)
+    skin.noise = skin.fast = skin.spread = skin.rng.uniform(0.5, 0.8, 24)
+    skin.baseline = skin.noise * skin.rng.standard_normal(24)
+    return skin.evidence(zeroed, own_units=0.5, pressed=slice(0, 2))[0]
+
+
+def test_few_zeros_of_a_small_board_with_little_noise_are_missed_and_none_invented() -> None:
+    assert np.mean([quiet(seed, zeroed=True) is True for seed in range(200)]) > 0.8
+    assert not any(quiet(seed, zeroed=False) for seed in range(200))
+
+
 def test_slow_noise_hides_few_zeros() -> None:
     found = [Skin(seed, 0.05, 192).evidence(True)[0] for seed in range(100)]
     assert np.mean(np.array(found, np.bool_)) > 0.95
