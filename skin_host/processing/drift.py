@@ -201,7 +201,7 @@ class BaselineTracker:
         recovering = free & (self._touches.touched_s > RECOVERED_S)
         forecast = None
         if self._thermal is not None:
-            forecast = self._thermal.step(units, self.baseline, free, dt_s)
+            forecast = self._thermal.step(units, self.baseline, free, missing, dt_s)
             units = units - forecast
             self._former += forecast
 
@@ -249,6 +249,8 @@ class BaselineTracker:
         touched_s = self._touches.touched_s
         for memory in (self._fallen_s, self._former_s, self._taken_s, touched_s):
             memory[taxels] = 0.0
+        if self._thermal is not None:
+            self._thermal.forget(taxels)
 
     def renew(self, usable: Mask, zeroed: Mask, settings: Drift) -> None:
         """Continue with other settings, and from new baselines of the taxels `zeroed`, bool[n]."""
@@ -526,25 +528,39 @@ class _ThermalReference:
         self._triangle = triangle = np.unique(triangle, return_inverse=True)[1].astype(np.intp)
         self._pads = np.flatnonzero(thermal)
         self._pads_of = np.bincount(triangle[self._pads], minlength=int(triangle.max()) + 1)
-        self._temperature: Array | None = None
+        #: Of the triangle of each taxel, smoothed; NaN while it is not known.
+        self._temperature: Array = np.full(n, np.nan)
         #: Sums over time while untouched: 1, temperature, reading, and their products.
         self._sums: Array = np.zeros((5, n))
 
-    def step(self, units: Array, baseline: Array, free: Mask, dt_s: float) -> Array:
-        """Return the predicted change [n] of the baselines; learn from the untouched taxels."""
+    def forget(self, taxels: Mask) -> None:
+        """Some taxels, bool[n], have a new zero, and so have the temperature pads beside them."""
+        beside = np.zeros(len(self._pads_of), np.bool_)
+        beside[self._triangle[taxels]] = True
+        anew = beside[self._triangle]
+        self._temperature[anew] = np.nan
+        self._sums[:, anew] = 0.0
+
+    def step(self, units: Array, baseline: Array, free: Mask, missing: Mask, dt_s: float) -> Array:
+        """Return the predicted change [n] of the baselines; learn from the untouched taxels.
+
+        The temperature stays as it was where a pad that measures it is missing.
+        """
         if dt_s <= 0.0:  # two samples of one time, as after a stall: nothing has changed
             return np.zeros(len(baseline))
-        sums = np.bincount(
-            self._triangle[self._pads], units[self._pads], minlength=len(self._pads_of)
-        )
+        pads, triangles = self._pads, len(self._pads_of)
+        sums = np.bincount(self._triangle[pads], units[pads], minlength=triangles)
         now = (sums / np.maximum(self._pads_of, 1))[self._triangle]
-        if self._temperature is None:
-            self._temperature = now
-            return np.zeros(len(baseline))
-        change = -math.expm1(-dt_s / SMOOTHING_S) * (now - self._temperature)
+        absent = np.bincount(self._triangle[pads], missing[pads], minlength=triangles) > 0
+        known = ~absent[self._triangle]
+        new = known & np.isnan(self._temperature)
+        self._temperature[new] = now[new]
+        known &= ~new
+        share = -math.expm1(-dt_s / SMOOTHING_S)
+        change = np.where(known, share * (now - self._temperature), 0.0)
         temperature = self._temperature = self._temperature + change
         reading = baseline + units
-        new = np.array(
+        new_sums = np.array(
             [
                 np.ones(len(free)),
                 temperature,
@@ -554,7 +570,7 @@ class _ThermalReference:
             ]
         )
         kept = math.exp(-dt_s / MEMORY_S)
-        np.copyto(self._sums, kept * self._sums + dt_s * new, where=free)
+        np.copyto(self._sums, kept * self._sums + dt_s * new_sums, where=free & known)
         # Least squares: how much each untouched taxel follows the temperature.
         time_s, warm, read, cross, square = self._sums
         time_s = np.maximum(time_s, dt_s)

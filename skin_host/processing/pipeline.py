@@ -478,9 +478,10 @@ class _PartPipeline:
                 self._valid = self._always_valid
         valid = self._valid
         # Values that were not received are taken as unchanged: the foam does not forget.
-        self._last_raw = np.where(valid, raw, self._last_raw)
-        if valid is not self._always_valid:
-            np.logical_or(self._was_missing, ~valid, out=self._was_missing)
+        taken = valid | (present & self._thermal) if self._has_thermal else valid
+        self._last_raw = np.where(taken, raw, self._last_raw)
+        if valid is not self._always_valid or self._has_thermal:
+            np.logical_or(self._was_missing, ~taken, out=self._was_missing)
         return valid
 
     def _untouched_raw(self) -> NDArray[np.uint8]:

@@ -339,6 +339,37 @@ def test_two_samples_of_one_time_teach_nothing_of_the_temperature():
     assert (track.baseline == 0.0).all()
 
 
+def test_a_temperature_pad_that_is_missing_tells_of_no_drift():
+    """What it read last, or reads while nobody believes it, is no temperature."""
+    thermal = np.arange(N) % 12 >= 10
+    track = tracker(thermal=thermal)
+    for _ in range(2):
+        for warmth in (*np.arange(0.0, 4.0, 0.02), *np.arange(4.0, 0.0, -0.02)):
+            units = np.where(thermal, warmth, warmth - track.baseline)
+            track.step(units, NOBODY, NOBODY, 1.0)
+    begun = track.baseline.copy()
+    one = np.arange(N) == 10
+    for _ in range(20):
+        units = np.where(one, 240.0, np.where(thermal, 0.0, 30.0))
+        track.step(units, ~thermal, one, 1.0)
+    assert track.baseline == pytest.approx(begun, abs=0.2)
+
+
+def test_a_new_zero_says_nothing_of_how_a_taxel_followed_the_temperature():
+    """A jump of the readings with that of the temperature pads is no relation of the two."""
+    thermal = np.arange(N) % 12 >= 10
+    mine = np.arange(N) < 12
+    track = tracker(thermal=thermal)
+    for _ in range(30):
+        track.step(np.where(thermal, 80.0, -4.0 - track.baseline), NOBODY, NOBODY, 1.0)
+    track.baseline[mine & ~thermal] = 0.0
+    track.forget(mine & ~thermal)
+    for _ in range(30):
+        reads = np.where(mine, 0.0, np.where(thermal, 80.0, -4.0))
+        track.step(reads - track.baseline, NOBODY, NOBODY, 1.0)
+        assert track.baseline[mine & ~thermal] == pytest.approx(0.0, abs=0.1)
+
+
 def test_thermal_pads_that_do_not_feel_the_drift_do_no_harm():
     thermal = np.arange(N) % 12 >= 10
     track = tracker(thermal=thermal)

@@ -125,6 +125,31 @@ def test_thermal_pads_are_no_taxels():
     assert frame.touched[~thermal].all()
 
 
+@pytest.mark.parametrize("lost", [False, True])
+def test_temperature_pads_tell_of_drift_while_another_triangle_is_missing(lost):
+    rig = Rig(1, 0.0, kind="triangle_10pad", processing=NO_RELAXATION)
+    thermal = rig.layout.pad_kind == PadKind.THERMAL
+    here = np.ones(rig.n, bool)
+    here[:12] = not lost
+    t_s = warmth = 0.0
+
+    def pass_time(seconds, rate, press):
+        nonlocal t_s, warmth
+        for _ in range(seconds * 5):
+            t_s += 0.2
+            warmth += rate * 0.2
+            activation = warmth + np.where(thermal, 0.0, press)
+            raw = np.where(here, rig.read(activation), 0).astype(np.uint8)
+            rig.pipeline.step(0, raw, here, int(t_s * 1e9))
+
+    for rate in (0.03, -0.03, 0.03):
+        pass_time(200, rate, 0.0)
+    before = rig.pipeline.baseline.copy()
+    pass_time(300, -0.01, 30.0)
+    moved = (rig.pipeline.baseline - before)[12:][~thermal[12:]]
+    assert (moved < -0.5).all()
+
+
 def test_taxels_that_the_calibration_does_not_trust_are_not_valid():
     settings_, layout = flat_skin(1)
     calibrator = Calibrator(layout)
