@@ -85,7 +85,8 @@ MOST_WAITING = 2
 #: jumped lately, or jumps again so soon, is a fault of the pad, not of the bus.
 SPIKE_UNITS = 7.0
 SPIKE_SIGMAS = 8.0
-#: A spike that has not been counted when so many sweeps are missed has long been over.
+#: A spike that has not been counted when so many sweeps could not be compared, in a silence or one
+#: here and one there, is over: what is counted is what happens now.
 SPIKE_SWEEPS = 25
 
 
@@ -180,6 +181,8 @@ class Liveness:
         self._any_jumping = False
         #: Pads with a spike that are not known yet to stay calm.
         self._spiked = np.zeros(shape, np.bool_)
+        #: How many sweeps of each triangle could not be compared since its last spike.
+        self._uncompared = np.zeros(k, np.int64)
         self._felt: TouchedPads | None = None
         self._surprise = np.zeros(k)
         self._any_surprise = False
@@ -292,6 +295,9 @@ class Liveness:
         all_inside = 0 not in text and 255 not in text
         self._note_jumps(raw, changed, compared, whole)
         if any_of(self._spiked):
+            if not whole:
+                here = self._every if came is None else np.repeat(came, len(raw) // len(came))
+                self._uncompared += here & ~compared
             self._note_spikes(touched)
         felt = None if touched is None else self._what_is_felt(touched)
         self._note_triangles(raw, compared, erring, felt, whole, all_inside)
@@ -333,8 +339,7 @@ class Liveness:
         triangles = len(self._step) // self._boards
         mine = slice(triangles * board, triangles * (board + 1))
         self._step[mine] = 0
-        if missed >= SPIKE_SWEEPS:
-            self._spiked[mine] = False
+        self._uncompared[mine] += missed
 
     def keep(self, before: "Liveness", boards: Mask) -> None:
         """Take over the state of a predecessor for the same skin, for some boards
@@ -465,7 +470,9 @@ class Liveness:
         spike = jump & (both > self._spike) & (np.abs(step + self._step) <= self._jump_units)
         spike &= self._jumping < LATELY_MEAN
         self._spiked &= ~jump
-        self._spiked |= spike & (count_of(spike) == 1)[:, None]
+        alone = count_of(spike) == 1
+        self._spiked |= spike & alone[:, None]
+        self._uncompared[alone] = 0
         np.copyto(self._step, step, where=compared[:, None])
         jumped = jump * np.minimum(both / self._jump, MOST_JUMP)
         self._jumping += compared[:, None] * (jumped - self._jumping) / NOISE_MEMORY_SAMPLES
@@ -473,8 +480,9 @@ class Liveness:
 
     def _note_spikes(self, touched: Mask | None) -> None:
         """Count the spikes of pads that have stayed calm since, and forget those of touched
-        triangles.
+        triangles, and of what was not received too often to know that soon.
         """
+        self._spiked &= (self._uncompared < SPIKE_SWEEPS)[:, None]
         if touched is not None:
             self._spiked &= (count_of(touched) == 0)[:, None]
         calm = self._spiked & (self._jumping < LATELY_MEAN)

@@ -400,6 +400,21 @@ def test_a_byte_that_was_off_before_a_long_silence_is_not_counted_after_it(
     assert liveness.spikes.sum() == spikes
 
 
+@pytest.mark.parametrize(("lost_of_7", "spikes"), [(0, 1), (1, 1), (5, 0)])
+def test_a_byte_that_was_off_is_not_counted_long_after_it_where_most_sweeps_are_lost(
+    lost_of_7: int, spikes: int
+) -> None:
+    """Of sweeps that come one by one none can be compared with the one before."""
+    liveness = Liveness(K, np.full((K, 12), 0.4), PERIOD_S)
+    for number in range(200):
+        raw = np.full((K, 12), 240, np.uint8)
+        raw[1, 4] -= 12 * (number == 10)
+        present = HERE.copy()
+        present[1] = number < 12 or number % 7 >= lost_of_7
+        liveness.step(raw, present, NO)
+    assert liveness.spikes.sum() == spikes
+
+
 def test_triangles_are_valid_until_a_calibration_finds_them_constant() -> None:
     rng = np.random.default_rng(3)
     assert Liveness(K, None, PERIOD_S).doubted is None
