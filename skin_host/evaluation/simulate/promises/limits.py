@@ -19,8 +19,9 @@ PRESSED_KPA, FELT_KPA = 25.0, 2.0
 UNTOUCHED_KPA = 25.0
 #: Foam keeps less than this part of what pressed it, for seconds after it was lifted.
 KEPT = 0.15
-#: So many standard deviations of the noise of sums of a pad's readings are no press either.
-SIGMAS = 4.0
+#: So many standard deviations of the noise of sums of a pad's readings are no press either: by
+#: chance one reading in three million is more, and an hour has ten thousand looks at each pad.
+SIGMAS = 5.0
 #: A pad is pressed at all; and so long after it began, a touch may not be decided yet.
 TOUCHING_KPA = 0.2
 DECIDED_NS = NS // 2
