@@ -115,7 +115,8 @@ class SkinCheck:
         """Return whether a touch of some taxels of a part has a cause.
 
         What a press leaves in the foam looks like a light press to a daemon that did not receive
-        the press; and a touch that lasts, as long as foam takes, begins again after a silence.
+        the press; and a touch that lasts, as long as foam takes, begins again after a silence, or
+        when the computer was suspended.
         """
         mine = np.asarray(taxels, np.intp) + self._parts[part].start
         if self._excuses.of_touches(mine, CAUSE_NS).any():
@@ -142,6 +143,10 @@ class SkinCheck:
         part = self._parts[name]
         mine = slice(part.start, part.stop)
         before = self._frames.get(name)
+        if before is not None and abs(frame.t_ns - before.t_ns) > NS:
+            # Suspended, or another time of day: every touch begins again.
+            self._lost[mine] = before.touched
+            self._blind_ns[mine] = self._now_ns()
         if not frame.valid.all():
             if before is not None:
                 lost = before.valid & ~frame.valid
