@@ -192,10 +192,9 @@ class Control:
         answer = dict(await self.keep()) if request.reset or request.set is not None else {}
         touch = msgspec.to_builtins(daemon.settings.processing.touch)
         pipeline = daemon.engine.pipeline
-        names = {daemon.layout.parts[i].name: i for i in daemon.engine.parts}
         decides = {
             name: None if pipeline is None else round(pipeline.decides_kpa(i), 1)
-            for name, i in names.items()
+            for name, i in self._parts().items()
         }
         return answer | {"touch": touch, "decides_kpa": decides}
 
@@ -265,8 +264,12 @@ class Control:
                 answer["kept"] = False
         return answer
 
+    def _parts(self) -> dict[str, int]:
+        """Return the indices of the node's parts by their names."""
+        return {self._daemon.layout.parts[i].name: i for i in self._daemon.engine.parts}
+
     def _part(self, name: str) -> int:
-        names = {self._daemon.layout.parts[i].name: i for i in self._daemon.engine.parts}
+        names = self._parts()
         if name not in names:
             raise RequestError(f'no part "{name}" here; there are: {", ".join(names)}')
         return names[name]

@@ -20,7 +20,7 @@ from skin_host.evaluation.simulate.world import Triangle, World
 from skin_host.health.describe import enough_rest
 from skin_host.health.diagnosis import JITTER_SHARE
 from skin_host.layout import PadKind
-from skin_host.processing.liveness import CONVERSION_S
+from skin_host.processing.conversions import CONVERSION_S
 from skin_host.processing.stuck import CALIBRATED_SAMPLES, ODDS, longest_run, rate_in_run
 
 Mask = NDArray[np.bool_]
@@ -313,6 +313,11 @@ def _emulated(
     return begin
 
 
+def _taxel_of(world: World, board: str, triangle: int, pad: int) -> int:
+    where = next(one for one in world.layout.boards if one.name == board)
+    return int(where.taxel_index[triangle, pad])
+
+
 def _noise_that_shows(world: World, board: str, triangle: int, pad: int) -> float:
     """Return from how much noise on (rms in units of 2.88 fF) a pad is noisier than it was
     calibrated: on real skin some are calibrated with six units.
@@ -320,8 +325,7 @@ def _noise_that_shows(world: World, board: str, triangle: int, pad: int) -> floa
     calibration = None if world.life is None else world.life.daemon.engine.calibration
     if calibration is None:
         return SURE_NOISE_UNITS
-    where = next(one for one in world.layout.boards if one.name == board)
-    taxel = where.taxel_index[triangle, pad]
+    taxel = _taxel_of(world, board, triangle, pad)
     if not calibration.usable[taxel]:
         return math.inf
     return max(SURE_NOISE_UNITS, SURE_NOISE * float(calibration.noise[taxel]))
@@ -334,8 +338,7 @@ def _longest_chance_s(world: World, board: str, triangle: int, pad: int) -> floa
     A calibration finds too much noise in such a pad at the edge of a byte, or too little in its
     middle.
     """
-    where = next(one for one in world.layout.boards if one.name == board)
-    taxel = where.taxel_index[triangle, pad]
+    taxel = _taxel_of(world, board, triangle, pad)
     own_units = float(world.robot.skin.noise_ff[taxel] / world.layout.unit_ff[taxel])
     noise_units = math.hypot(own_units, 12**-0.5)
     calibration = None if world.life is None else world.life.daemon.engine.calibration
@@ -343,7 +346,8 @@ def _longest_chance_s(world: World, board: str, triangle: int, pad: int) -> floa
         noise_units = min(noise_units, float(calibration.noise[taxel]))
     rate = rate_in_run(np.array([noise_units]))
     conversions = float(longest_run(rate, CALIBRATED_SAMPLES, ODDS)[0])
-    return conversions * max(where.settings.period_ms * 1e-3, CONVERSION_S)
+    period_ms = world.settings.boards[board].period_ms
+    return conversions * max(period_ms * 1e-3, CONVERSION_S)
 
 
 def _scatters(world: World, board: str) -> Callable[[], bool]:

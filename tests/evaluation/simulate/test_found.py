@@ -882,6 +882,24 @@ def test_what_presses_of_300_kpa_leave_in_the_foam_is_not_taken_for_a_wrong_pres
     assert wrong is None
 
 
+def drawn(kind: str, world: World, calibrated_units: float) -> Trouble:
+    """Return a sure trouble of this kind on pads that were calibrated with so much noise."""
+
+    async def live() -> Trouble:
+        _, life = start_watched(world)
+        await world.clock.sleep(8.0)
+        engine = life.daemon.engine
+        assert engine.calibration is not None
+        noise = np.full_like(engine.calibration.noise, calibrated_units)
+        engine.calibration = replace(engine.calibration, noise=noise)
+        trouble = KINDS[kind](world, random.Random(1), True)
+        life.kill()
+        return trouble
+
+    with world.clock.runner() as runner:
+        return runner.run(live())
+
+
 @pytest.mark.parametrize(
     ("own_units", "least_units", "must"), [(1.0, 8.0, True), (6.0, 20.0, False)]
 )
@@ -890,19 +908,7 @@ def test_noise_must_be_named_where_a_pad_had_much_less_when_it_was_calibrated(
 ) -> None:
     """The demo's 4004: recorded noise of a pad was six units, a fault of three made it quieter."""
 
-    async def live() -> Trouble:
-        _, life = start_watched(world)
-        await world.clock.sleep(8.0)
-        engine = life.daemon.engine
-        assert engine.calibration is not None
-        noise = np.full_like(engine.calibration.noise, own_units)
-        engine.calibration = replace(engine.calibration, noise=noise)
-        trouble = KINDS["noisy_taxel"](world, random.Random(1), True)
-        life.kill()
-        return trouble
-
-    with world.clock.runner() as runner:
-        trouble = runner.run(live())
+    trouble = drawn("noisy_taxel", world, own_units)
     assert trouble.about.endswith(f"value={least_units}")
     assert bool(trouble.must) == must
 
@@ -916,20 +922,8 @@ def test_a_stuck_pad_must_be_named_once_chance_does_not_repeat_for_so_long(
 ) -> None:
     """`icub_hand.toml`, seed 5003: noise of a quarter unit seldom leaves the middle of a byte."""
 
-    async def live() -> Trouble:
-        _, life = start_watched(world)
-        await world.clock.sleep(8.0)
-        engine = life.daemon.engine
-        assert engine.calibration is not None
-        noise = np.full_like(engine.calibration.noise, calibrated_units)
-        engine.calibration = replace(engine.calibration, noise=noise)
-        world.robot.skin.noise_ff = own_units * world.layout.unit_ff
-        trouble = KINDS["stuck_taxel"](world, random.Random(1), True)
-        life.kill()
-        return trouble
-
-    with world.clock.runner() as runner:
-        trouble = runner.run(live())
+    world.robot.skin.noise_ff = own_units * world.layout.unit_ff
+    trouble = drawn("stuck_taxel", world, calibrated_units)
     assert trouble.must == {"taxel_stuck"}
     assert (trouble.within_s == 20.0) == at_once
     assert at_once or trouble.within_s > LONGEST_DRILL_S
