@@ -47,8 +47,8 @@ class PartSample(NamedTuple):
         part: index into `Layout.parts`.
         raw: uint8[m], 0 where nothing was received.
         present: bool[m], the value was received and is valid.
-        received: bool[m], the same without regard to a veto of the host: values that a new
-            calibration may use.
+        received: bool[m], the same without regard to a veto of the host, and to noise, which a
+            calibration measures: values that a new calibration may use.
         t_ns: time of the last CAN frame in it.
     """
 
@@ -276,7 +276,7 @@ class Intake:
         return [self._sample(state) for state in self._states if state.pending]
 
     def _valid(self, row: int, sweep: Sweep) -> tuple[Mask, Mask]:
-        """Return which taxels of a noted sweep are valid, and which would be without `veto`.
+        """Return which taxels of a noted sweep are valid, and which a calibration may use.
 
         Args:
             row: of the board.
@@ -285,9 +285,6 @@ class Intake:
         ledger = self._ledger
         if sweep.missed:
             self.note_gap(row, sweep.missed)
-        doubted = self.liveness.doubted
-        if doubted is not None:
-            doubted = doubted[TRIANGLES * row : TRIANGLES * (row + 1)]
         if row in ledger.twice:
             # Which of the two boards it is of, nobody knows: it shows neither that a chip lives nor
             # what is a zero.
@@ -298,31 +295,25 @@ class Intake:
             here = self._flagged(row, sweep.raw)
             # A copy: it may be judged after the ledger has noted the next sweep.
             self._erring[row] = ledger.error[row].copy()
-            received = np.repeat(here[:, None], PADS, axis=1)
-            received &= ~ledger.far[row]
-            if doubted is not None:
-                received &= ~doubted
-            received = received.ravel()
+            masks = self._without_doubt(row, here[:, None] & ~ledger.far[row])
             before = self._last[row]
             # The same arrays as before are known to be the same further on.
-            if before is not None and before[0].tobytes() == received.tobytes():
+            if before is not None and all(map(np.array_equal, before, masks)):
                 masks = before
             else:
-                masks = self._last[row] = received, received
+                self._last[row] = masks
             self._here[row] = here
             self._usual[row] = None
         else:
             # Most sweeps have nothing but the triangles of the one before.
-            key = None if doubted is None else doubted.tobytes()
+            key = self._doubts_of(row)
             usual = self._usual[row]
             if usual is None or usual[0] != sweep.present or usual[1] != key:
                 here = ledger.present[row]
-                received = np.repeat(here, PADS)
-                if doubted is not None:
-                    received &= ~doubted.ravel()
-                received.flags.writeable = False
+                every = np.broadcast_to(here[:, None], (TRIANGLES, PADS))
                 self._here[row] = here
-                self._usual[row] = usual = sweep.present, key, (received, received)
+                usual = sweep.present, key, self._without_doubt(row, every)
+                self._usual[row] = usual
             masks = usual[2]
         self._waiting[row] = True
         self._n_waiting += 1
@@ -334,8 +325,30 @@ class Intake:
         key = veto.tobytes()
         known = self._vetoed.get(row)
         if known is None or known[0] is not masks or known[1] != key:
-            self._vetoed[row] = known = masks, key, (masks[1] & ~veto.ravel(), masks[1])
+            self._vetoed[row] = known = masks, key, (masks[0] & ~veto.ravel(), masks[1])
         return known[2]
+
+    def _doubts_of(self, row: int) -> bytes | None:
+        """Return what is in doubt of a board's pads, as bytes; None if nothing is."""
+        if self.liveness.doubted is None or self.liveness.lifeless is None:
+            return None
+        mine = slice(TRIANGLES * row, TRIANGLES * (row + 1))
+        return self.liveness.doubted[mine].tobytes() + self.liveness.lifeless[mine].tobytes()
+
+    def _without_doubt(self, row: int, pads: Mask) -> tuple[Mask, Mask]:
+        """Return those of a board's pads (bool[16, 12]) that no doubt is in, and those that at most
+        noise is in, bool[192]: one mask twice where they are the same.
+        """
+        doubted, lifeless = self.liveness.doubted, self.liveness.lifeless
+        if doubted is None or lifeless is None:
+            present = pads.ravel().copy()
+            present.flags.writeable = False
+            return present, present
+        mine = slice(TRIANGLES * row, TRIANGLES * (row + 1))
+        present = (pads & ~doubted[mine]).ravel()
+        received = (pads & ~lifeless[mine]).ravel()
+        present.flags.writeable = received.flags.writeable = False
+        return (present, present) if np.array_equal(present, received) else (present, received)
 
     def _flagged(self, row: int, raw: NDArray[np.uint8]) -> Mask:
         """Return triangles bool[16] of a sweep with status words that were received, answer, and

@@ -122,6 +122,8 @@ class Liveness:
         noisy: bool[k, 12], pads that jump up and down much more than when calibrated.
         doubted: bool[k, 12], pads that are not valid, or None if all are. Of a noisy temperature
             pad those that its board compensates with it are not.
+        lifeless: bool[k, 12], doubted pads whose bytes show nothing of the skin, or None if none
+            are: not those that are only noisy.
         spikes: int64[k, 12], how often each pad, alone in its triangle, was off for one sweep and
             back in the next, and did not jump in some 25 sweeps before and after: a damaged frame
             does that, a sensor at rest does not. One is counted when that is known, if nothing
@@ -211,6 +213,7 @@ class Liveness:
         self.noisy: Mask = np.zeros(shape, np.bool_)
         self._any_noisy = False
         self.doubted: Mask | None = None
+        self.lifeless: Mask | None = None
         self.spikes = np.zeros(shape, np.int64)
         #: Sweeps of all boards that wait, with the touched pads; and how many may wait.
         self._waiting: list[tuple[NDArray[np.uint8], Mask | None]] = []
@@ -351,7 +354,7 @@ class Liveness:
         rows = np.repeat(boards, len(self.frozen) // len(boards))
         for mine, its in ((self, before), (self._pads, before._pads)):
             for name, array in vars(mine).items():
-                if not isinstance(array, np.ndarray) or name in {"spikes", "doubted"}:
+                if not isinstance(array, np.ndarray) or name in {"spikes", "doubted", "lifeless"}:
                     continue
                 if len(array) in {len(boards), len(rows)}:
                     chosen = boards if len(array) == len(boards) else rows
@@ -387,11 +390,12 @@ class Liveness:
 
     def _doubt(self) -> None:
         if not (self._any_to_show or self._pads.any_stuck or self._any_noisy):
-            self.doubted = None
+            self.doubted = self.lifeless = None
             return
-        self.doubted = self.unproven[:, None] | self.stuck | self.noisy
+        self.doubted = self.lifeless = self.unproven[:, None] | self.stuck
         if self._any_noisy:
-            self.doubted |= self._compensated & self.noisy[:, THERMAL_TAXEL, None]
+            compensated = self._compensated & self.noisy[:, THERMAL_TAXEL, None]
+            self.doubted = self.lifeless | self.noisy | compensated
 
     def _note_triangles(
         self,

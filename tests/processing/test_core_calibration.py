@@ -205,6 +205,30 @@ def test_a_pad_of_which_too_little_was_received_is_as_noisy_as_it_is_in_the_next
     assert found.verdict[pad] not in {Verdict.ABSENT, Verdict.TOO_FEW}
 
 
+def test_a_pad_that_was_calibrated_with_too_little_noise_is_calibrated_with_all_of_it(
+    engine: Engine,
+) -> None:
+    """As noisy, it was left out of each calibration, and kept the noise that made it so."""
+    sweeps_taken(engine, lambda number: 1.0 + 0.05 * number)
+    engine.use(engine.end_calibration("2026-01-01T00:00:00+00:00"))
+    board = engine.layout.boards[0]
+    pad = int(board.taxel_index[board.triangles[1], 4])
+    scattered = np.zeros((len(board.triangles), 12), np.int64)
+    rng = np.random.default_rng(2)
+
+    def shift(number: int) -> NDArray[np.int64]:
+        scattered[1, 4] = rng.integers(-8, 9)
+        return scattered
+
+    sweeps_taken(engine, lambda number: 10.0 + 0.05 * number, shift)
+    assert engine.intake.liveness.noisy.any()
+    engine.use(engine.end_calibration("2026-01-01T00:00:00+00:00"))
+    sweeps_taken(engine, lambda number: 20.0 + 0.05 * number, shift)
+    found = engine.end_calibration("2026-01-01T00:00:00+00:00")
+    assert not found.unchanged[pad]
+    assert found.noise[pad] > 3.0
+
+
 def test_a_zero_from_before_is_over_with_the_next_calibration(engine: Engine) -> None:
     sweeps_taken(engine, lambda number: 1.0 + 0.05 * number)
     engine.use(engine.end_calibration("2026-01-01T00:00:00+00:00"))
