@@ -226,9 +226,7 @@ class Boards:
         gap_s = record.gap_s
         frames = [command_frame(command, address) for command in record.commands]
 
-        believed = not self._ledger.missing(record.row) and (
-            record.configurations > 0 or self._is_in_use(record)
-        )
+        believed = record.configurations > 0 or self._is_in_use(record)
 
         def announced(
             zeroing: list[tuple[int, bytes]], believed: bool

@@ -444,8 +444,11 @@ class Describer:
         known_ms = -np.inf
         for other in self._engine.boards:
             one, row = self._layout.boards[other].settings, ledger.row[other]
-            if one.bus == own.bus and one.address < own.address and not ledger.is_silent(row):
-                theirs_ms, took_ms = _ends_ms(ledger, row), self._sweep_ms(other)
+            if one.bus != own.bus or one.address >= own.address:
+                continue
+            # One that is silent now has held up what was sent before.
+            theirs_ms, took_ms = _ends_ms(ledger, row), self._sweep_ms(other)
+            if theirs_ms:
                 known_ms = max(known_ms, theirs_ms[0])
                 sweeps += [(end_ms, took_ms) for end_ms in theirs_ms]
         if not sweeps:

@@ -85,13 +85,13 @@ class Heard:
         self.engine.ledger.look(self.now_ns)
         self.boards.supervise()
 
-    def send_sweep(self) -> None:
-        """The hand sends its triangles."""
+    def send_sweep(self, lost: int = 0) -> None:
+        """The hand sends its triangles, but for those that are lost, the last ones."""
         (hand,) = (one for one in self.engine.layout.boards if one.name == "hand")
         self.say(
             *(
                 (identifier(MessageClass.SKIN_STREAM, HAND, triangle), header + bytes([230] * 7))
-                for triangle in hand.triangles
+                for triangle in hand.triangles[: len(hand.triangles) - lost]
                 for header in (b"\x40", b"\xc0")
             )
         )
@@ -306,6 +306,30 @@ async def test_a_zero_is_announced_when_the_bus_is_free_for_it(clock: SteppedClo
             assert announced == address
             zeroed.append(address)
     assert set(zeroed) == set(addresses)
+
+
+@stepped
+async def test_what_touches_a_board_is_believed_though_a_triangle_is_missing(
+    clock: SteppedClock,
+) -> None:
+    """Frames are lost, too: what was touched then was forgotten, and became the new zero."""
+    heard, believed = Heard(), list[bool]()
+    listed = [(i, heard.engine.layout.boards[i]) for i in heard.engine.boards]
+    layout, ledger = heard.engine.layout, heard.engine.ledger
+
+    def announce(_: int, felt: bool) -> None:
+        believed.append(felt)
+
+    boards = Boards(
+        "can0", Taken(clock), listed, layout.triangles, ledger, zeroed=announce, clock=clock
+    )
+    await boards.set_up(HAND)
+    for _ in range(10):
+        heard.send_sweep(lost=1)
+    assert ledger.missing(boards.records[HAND].row)
+    believed.clear()
+    await boards.set_up(HAND)
+    assert believed == [True, True]
 
 
 def test_forged_answers_fill_no_log(heard: Heard, caplog: pytest.LogCaptureFixture) -> None:

@@ -74,6 +74,16 @@ def test_a_board_whose_frames_wait_for_those_of_an_irregular_one_is_not_called_i
     assert jittered == {"left_lower_arm_1", "left_upper_arm"}
 
 
+def test_a_board_that_one_held_up_which_is_silent_now_is_not_called_irregular() -> None:
+    bench = FaultBench(2.0, config=CONFIG.with_name("nao.toml"), settle_s=2.0)
+    bench.inject("late_period", board="left_lower_arm_1", value=25.3)
+    bench.run(1.5)
+    bench.inject("board_silent", board="right_lower_arm_2")
+    for _ in range(10):
+        bench.run(0.1)
+        assert "board_jitter" not in {code for code, _ in bench.told}
+
+
 def test_an_irregular_board_that_more_urgent_ones_hide_is_not_known() -> None:
     """All that it adds to its intervals passes while the bus is taken by the boards before it."""
     bench = FaultBench(2.0, config=CONFIG.with_name("kaspar.toml"), settle_s=2.0)
