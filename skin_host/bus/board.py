@@ -26,6 +26,9 @@ class BoardRecord:
         started: it has been set up and commanded to send.
         alive: it sends.
         configurations: how often it was set up.
+        configured_from_ns, configured_at_ns: when its last set-up began and ended.
+        queried_at_ns: when it was last asked for its uptime.
+        booted_at_ns: when it started at the earliest, by its last answer to that.
         unanswered: queries in a row to which it sent no answer.
         stopped_sweeps: how many sweeps of it had been received when it answered a query that
             nobody waits for, another program's or one that waited for the bus: an MTB3 has stopped.
@@ -34,8 +37,8 @@ class BoardRecord:
             `asked` at that time.
         claimed_ns: when such an answer was last believed.
 
-    Times ending in `_at_ns`, and `answered_ns`, are monotonic; the others are on the clock of
-    the ledger, which stands still while the bus is not read.
+    Times ending in `_at_ns` or `_from_ns`, and `answered_ns`, are monotonic; the others are on the
+    clock of the ledger, which stands still while the bus is not read.
     """
 
     index: int
@@ -48,8 +51,10 @@ class BoardRecord:
     alive: bool = False
     configurations: int = 0
     configured_ns: int = 0
+    configured_from_ns: int = 0
     configured_at_ns: int = 0
-    life_s: float | None = None
+    queried_at_ns: int = 0
+    booted_at_ns: int | None = None
     answered_ns: int = 0
     unanswered: int = 0
     stopped_sweeps: int | None = None
@@ -72,6 +77,16 @@ class BoardRecord:
         if self.board_type is None:
             return self.layout.settings.model == "mtb3"
         return self.board_type == BoardType.SKIN
+
+    @property
+    def was_reset(self) -> bool:
+        """Whether it has started since its last set-up began: that is lost, or parts of it."""
+        return self.booted_at_ns is not None and self.booted_at_ns > self.configured_from_ns
+
+    @property
+    def sends_by_itself(self) -> bool:
+        """Whether it started before its last set-up ended: it sends, by settings of its own."""
+        return self.was_reset and (self.booted_at_ns or 0) <= self.configured_at_ns
 
     @property
     def is_wrong_type(self) -> bool:

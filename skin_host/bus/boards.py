@@ -225,8 +225,11 @@ class Boards:
         address = record.layout.settings.address
         gap_s = record.gap_s
         frames = [command_frame(command, address) for command in record.commands]
+        began_ns = self._clock.monotonic_ns()
 
         believed = record.configurations > 0 or self._is_in_use(record)
+        # By its own settings, untouched pads may read as if they were pressed.
+        believed &= not record.sends_by_itself
 
         def announced(
             zeroing: list[tuple[int, bytes]], believed: bool
@@ -240,13 +243,23 @@ class Boards:
         await self._clock.sleep(max(gap_s, NEW_OFFSET_S))
         await self._port.send(announced(frames[-1:], believed=True))
         await self._clock.sleep(max(gap_s, NEW_OFFSET_S))
-        await self._port.send([command_frame(SetTxMode(TxMode.START), address)])
+        record.configured_from_ns = began_ns
+        # It answers before its first sweep. Nothing else shows that it was reset before its last
+        # commands came: it would send by its own settings.
+        questions: list[Message] = [] if record.is_mtb3 else [GetTimeOfLife()]
+        await self._port.send(self._asked(record, [SetTxMode(TxMode.START), *questions]))
         record.configurations += 1
         record.configured_ns = self._ledger.now_ns
         record.configured_at_ns = self._clock.monotonic_ns()
         self._ledger.set_up(record.row)
         record.wrong = ""
         record.started = True
+
+    def _asked(self, record: BoardRecord, questions: list[Message]) -> Iterator[tuple[int, bytes]]:
+        """Yield questions to a board, of which one may be for its uptime, when the bus is free."""
+        record.booted_at_ns, record.queried_at_ns = None, self._clock.monotonic_ns()
+        for question in questions:
+            yield command_frame(question, record.layout.settings.address)
 
     def _is_in_use(self, record: BoardRecord) -> bool:
         """Whether a board sends as one that an earlier start of the daemon has set up."""
@@ -281,6 +294,7 @@ class Boards:
                 and record.alive
                 and record.configurations
                 and not (record.wrong or record.wrong_tries or record.claims)
+                and not record.sends_by_itself
             ):
                 continue  # the usual case
             if self._ledger.overdue(record.row, record.configured_ns):
@@ -338,7 +352,9 @@ class Boards:
         if record.claims and now_ns - record.claimed_ns > CLAIM_S * 1e9:
             record.disclaim()
         self._judge(record, now_ns)
-        if not record.wrong or now_ns - record.wrong_since_ns < WRONG_S * 1e9:
+        # Its zero must not be observed; what else is wrong may be by frames that are lost.
+        wait_s = 0.0 if record.sends_by_itself else WRONG_S
+        if not record.wrong or now_ns - record.wrong_since_ns < wait_s * 1e9:
             if not record.wrong and now_ns - record.wrong_retry_ns > WRONG_RETRY_S[-1] * 1e9:
                 record.wrong_tries = 0
             return
@@ -361,6 +377,8 @@ class Boards:
         wrong = ""
         if not record.configurations:
             wrong = "sends without having been set up"
+        elif record.sends_by_itself:
+            wrong = "was reset while it was set up"
         elif self._ledger.missing(record.row):
             wrong = "does not send all of its triangles"
         else:
@@ -423,13 +441,13 @@ class Boards:
         if tells_age:
             questions.append(GetTimeOfLife())
         sent_before = self._ledger.since_set_up(record.row) > 0
-        record.answered_ns, record.life_s = 0, None
+        record.answered_ns = 0
         record.asked += 1
-        await self._port.send([command_frame(question, address) for question in questions])
+        await self._port.send(self._asked(record, questions))
         asked_ns = self._clock.monotonic_ns()
         sweeps = self._ledger.sweeps[record.row]
         while self._clock.monotonic_ns() - asked_ns < ANSWER_S * 1e9:
-            if record.answered_ns and (record.life_s is not None or not tells_age):
+            if record.answered_ns and (record.booted_at_ns is not None or not tells_age):
                 break
             if tells_age and self._ledger.sweeps[record.row] > sweeps and sent_before:
                 return  # it only paused
@@ -443,10 +461,10 @@ class Boards:
             return
         stopped = self._is_stopped(record)
         reset = record.answered_ns != 0 and not tells_age and not stopped
-        if record.life_s is not None:
-            reset = asked_ns - int(record.life_s * 1e9) > record.configured_at_ns
+        if record.booted_at_ns is not None:
+            reset = record.was_reset
         self._ledger.resets[record.row] += reset and record.configurations > 0
-        if sent_before and record.life_s is not None and not reset and record.retries == 1:
+        if sent_before and record.booted_at_ns is not None and not reset and record.retries == 1:
             await self._port.send([command_frame(SetTxMode(TxMode.START), address)])
         else:
             await self._set_up(record)
@@ -510,7 +528,7 @@ class Boards:
             record.claimed_ns = self._ledger.now_ns
             self._warn(record, "is in its bootloader")
         elif isinstance(answer, TimeOfLife):
-            record.life_s = answer.seconds
+            record.booted_at_ns = record.queried_at_ns - int(answer.seconds * 1e9)
         elif isinstance(answer, TxOverflow):
             # A board that must answer in the middle of a sweep drops the rest of it: no fault.
             is_queried = not record.started or record.busy is not None

@@ -1,5 +1,6 @@
 """Boards that reset, come late, stop or lose their set-up are set up again, alone."""
 
+import asyncio
 from pathlib import Path
 
 import can
@@ -19,7 +20,7 @@ from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus
 from skin_host.daemon.state import Zeros, load_kept
-from tests.support.live import living
+from tests.support.live import CONFIG, living
 from tests.support.stepped import stepped
 
 #: Told for a while afterwards.
@@ -48,6 +49,27 @@ async def test_a_board_that_resets_is_set_up_again_and_the_others_notice_nothing
         assert live.daemon.engine.calibration is known
         rezeros = live.daemon.engine.ledger.rezeros
         assert rezeros[0] == rezeros[1] + 1
+
+
+@stepped
+@pytest.mark.parametrize("after_s", np.arange(0.0, 0.26, 0.02).tolist())
+async def test_a_board_that_resets_while_it_is_set_up_is_set_up_again(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path, after_s: float
+) -> None:
+    """Its last commands came after that: it sent at half of the scale, and nobody noticed."""
+    config = CONFIG.with_name("icub_hand.toml")
+    async with living(can_bus_settings, tmp_path, config=config, clock=clock) as live:
+        await live.until_well(but=LATELY)
+        board = live.robot.boards["left_hand"]
+        before = board.shift.copy(), board.no_load
+        setting_up = asyncio.create_task(live.daemon.configure([0]))
+        await clock.sleep(after_s)
+        board.reset(live.robot.t_ns)
+        await setting_up
+        await clock.sleep(2.0)
+        await live.until_well(but=LATELY)
+        assert np.array_equal(board.shift, before[0])
+        assert board.no_load == before[1]
 
 
 @stepped
