@@ -685,7 +685,7 @@ class Engine:
             return
         ledger = self.ledger
         here = np.repeat(ledger.present[row] & (ledger.error[row] == 0), PADS)
-        zeroed = silent_zero.step(sweep.raw.ravel(), here & ~ledger.far[row].ravel())
+        zeroed = silent_zero.step(sweep.raw.ravel(), here & ~ledger.far[row].ravel(), sweep.t_ns)
         if zeroed is None:
             self.intake.veto[row] = np.ones((TRIANGLES, PADS), np.bool_)
             return

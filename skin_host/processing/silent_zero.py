@@ -8,6 +8,9 @@ untouched pad, but for the noise of one reading, and without a zero each reads i
 So the first sweeps after a silence are compared with both, over all pads that nothing touched. Both
 allow for what moves all pads together, as temperature does, and for pads that are pressed or fail.
 Where both fit alike, the baselines are near zero and nothing depends on the answer.
+
+What waited on the way, as behind a node that keeps the bus busy, comes at once afterwards and may
+be from before the zero: such sweeps are not compared.
 """
 
 import math
@@ -21,6 +24,10 @@ from skin_host.processing.drift import SLOW_UNITS_PER_S
 #: So many sweeps are compared; pads of which fewer than half were received do not count.
 SWEEPS = 10
 FEWEST = SWEEPS // 2
+#: A sweep waited if it comes sooner than this share of a period after the one before. No more than
+#: so many count as that: a board may send faster than it was set up to.
+WAITED_SHARE = 0.5
+MOST_WAITED = 20
 #: A board was zeroed when its readings are so many times as probable then: a zero taken for none
 #: makes untouched pads read touches, and none taken for one costs a second (docs/found.md).
 ODDS = 100
@@ -84,19 +91,29 @@ class SilentZero:
         self._sum = np.zeros(len(known))
         self._count = np.zeros(len(known), np.int64)
         self._sweeps = 0
+        self._waited = 0
+        self._last_ns: int | None = None
 
     @property
     def decided(self) -> bool:
         """Return whether enough sweeps have been compared."""
         return self._sweeps >= SWEEPS
 
-    def step(self, raw: NDArray[np.uint8], present: Mask) -> bool | None:
+    def step(self, raw: NDArray[np.uint8], present: Mask, t_ns: int) -> bool | None:
         """Take one sweep; return whether the board was zeroed, or None while that is not known.
 
         Args:
             raw: uint8[n], the bytes.
             present: bool[n], which of them were received and are readings.
+            t_ns: when it came.
         """
+        last_ns, self._last_ns = self._last_ns, t_ns
+        soon_ns = WAITED_SHARE * self._period_s * 1e9
+        soon = last_ns is not None and 0 <= t_ns - last_ns < soon_ns
+        if soon and self._waited < MOST_WAITED:
+            self._waited += 1
+            self._sum[:] = self._count[:] = self._sweeps = 0
+            return None
         self._sum += np.where(present, self._no_load - raw, 0.0)
         self._count += present
         self._sweeps += 1

@@ -56,7 +56,8 @@ class Skin:
         for sweep in range(SWEEPS):
             assert found is None, sweep
             raw = np.rint(NO_LOAD - rest - self.fast * self.rng.standard_normal(n))
-            found = test.step(np.clip(raw, 0, 255).astype(np.uint8), np.ones(n, np.bool_))
+            received = np.clip(raw, 0, 255).astype(np.uint8), np.ones(n, np.bool_)
+            found = test.step(*received, round(sweep * PERIOD_S * 1e9))
         return found, test.evidence()
 
 
@@ -139,6 +140,33 @@ def test_pads_that_are_hardly_received_do_not_count() -> None:
     skin = Skin(4)
     test = SilentZero(skin.baseline, skin.noise, skin.spread, skin.known, NO_LOAD, PERIOD_S, 3.0)
     raw = np.full(N, NO_LOAD).astype(np.uint8)
-    found = [test.step(raw, np.full(N, number < 4)) for number in range(SWEEPS)]
+    period_ns = round(PERIOD_S * 1e9)
+    found = [test.step(raw, np.full(N, number < 4), number * period_ns) for number in range(SWEEPS)]
     assert found == [None] * (SWEEPS - 1) + [False]
     assert test.evidence() == 0.0
+
+
+@pytest.mark.parametrize("apart_ms", [0.0, 2.0, 20.0])
+def test_sweeps_that_waited_on_the_way_may_be_from_before_the_zero(apart_ms: float) -> None:
+    """They were compared, too, and half of them hid the zero."""
+    skin = Skin(3)
+    test = SilentZero(skin.baseline, skin.noise, skin.spread, skin.known, NO_LOAD, PERIOD_S, 3.0)
+    rest = skin.noise * skin.rng.standard_normal(N)
+    t_ms, found = 0.0, None
+    for sweep in range(6 + SWEEPS):
+        before = sweep < 6
+        t_ms += apart_ms if before else 1e3 * PERIOD_S
+        units = (skin.baseline if before else rest) + skin.fast * skin.rng.standard_normal(N)
+        assert found is None
+        raw = np.rint(NO_LOAD - units).astype(np.uint8)
+        found = test.step(raw, skin.known, round(t_ms * 1e6))
+    assert found
+
+
+def test_a_board_that_sends_faster_than_it_was_set_up_to_is_decided_on() -> None:
+    skin = Skin(4)
+    test = SilentZero(skin.baseline, skin.noise, skin.spread, skin.known, NO_LOAD, PERIOD_S, 3.0)
+    raw = np.rint(NO_LOAD - skin.baseline).astype(np.uint8)
+    found = [test.step(raw, skin.known, 10_000_000 * sweep) for sweep in range(100)]
+    decided = [sweep for sweep, one in enumerate(found) if one is not None]
+    assert 0 < decided[0] < 60
