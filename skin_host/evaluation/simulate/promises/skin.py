@@ -145,7 +145,7 @@ class SkinCheck:
         before = self._frames.get(name)
         if before is not None and abs(frame.t_ns - before.t_ns) > NS:
             # Suspended, or another time of day: every touch begins again.
-            self._lost[mine] = before.touched
+            self._lost[mine] = before.touched | (self._lost[mine] & ~before.valid)
             self._blind_ns[mine] = self._now_ns()
         if not frame.valid.all():
             if before is not None:
