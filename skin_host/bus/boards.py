@@ -245,7 +245,7 @@ class Boards:
         await self._clock.sleep(max(gap_s, NEW_OFFSET_S))
         record.configured_from_ns = began_ns
         # It answers before its first sweep. Nothing else shows that it was reset before its last
-        # commands came: it would send by its own settings.
+        # commands came: it would send by its own settings. An MTB3 does not report its uptime.
         questions: list[Message] = [] if record.is_mtb3 else [GetTimeOfLife()]
         await self._port.send(self._asked(record, [SetTxMode(TxMode.START), *questions]))
         record.configurations += 1

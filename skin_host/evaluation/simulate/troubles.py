@@ -276,6 +276,10 @@ def _emulated(
             )
         if name == "brown_out":
             world.unpowered.add(board)
+        lasting_s = recovers_s
+        if name == "board_reset" and _is_set_up_unseen(world, board):
+            # It reports no uptime, and command 50 starts it: nothing shows what it lost.
+            spoiled, lasting_s = taxels_of(world, board=board), FOR_EVER_S
         places = None
         if "board" in targets:
             places = places_of(world, board=board)
@@ -304,13 +308,22 @@ def _emulated(
             places,
             blind,
             spoiled,
-            recovers_s,
+            lasting_s,
             lingers,
             shows=shows,
             lasts_s=lasts_s,
         )
 
     return begin
+
+
+def _is_set_up_unseen(world: World, board: str) -> bool:
+    """Return whether a board is an MTB3 that the daemon may be setting up now."""
+    own = world.settings.boards[board]
+    if world.life is None or own.model != "mtb3":
+        return False
+    link = world.life.daemon.link.boards
+    return own.bus not in link or link[own.bus].records[own.address].busy is not None
 
 
 def _taxel_of(world: World, board: str, triangle: int, pad: int) -> int:
