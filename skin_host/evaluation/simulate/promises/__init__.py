@@ -230,7 +230,7 @@ class Promises:
         life = world.life
         alone = life is None or life.began_ns >= self._sampled_ns
         self._sampled_ns = now_ns
-        self._zeros.note_taken(true_kpa, alone=alone)
+        self._zeros.note_taken(true_kpa, self._felt_ns, alone=alone)
         excuses.touched_ns[true_kpa > TOUCHING_KPA] = now_ns
         if life is not None:
             if life.daemon.engine.calibrating:

@@ -14,6 +14,10 @@ SAMPLES = 8
 SLACK = 3
 #: What comes of a board is valid for no longer than so many of its periods after its last frame.
 STALE_PERIODS = 8
+#: A board that zeroes itself has not been received for so many of its periods: only how its pads
+#: rest shows it, surely on boards with so many.
+UNHEARD_PERIODS = 3
+SURE_PADS = 48
 #: Pads that press at least so much and read less than that are felt wrong, and the reverse.
 PRESSED_KPA, FELT_KPA = 25.0, 2.0
 UNTOUCHED_KPA = 25.0

@@ -4,7 +4,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.evaluation.simulate.promises.excuses import Excuses
-from skin_host.evaluation.simulate.promises.limits import DECIDED_NS, LONG_AGO_NS, TOUCHING_KPA
+from skin_host.evaluation.simulate.promises.limits import (
+    DECIDED_NS,
+    LONG_AGO_NS,
+    SURE_PADS,
+    TOUCHING_KPA,
+    UNHEARD_PERIODS,
+)
 from skin_host.evaluation.simulate.world import Life, World
 from skin_host.processing.rezero import Rezero
 
@@ -31,23 +37,30 @@ class ZeroCheck:
         #: By board: the time of the first sweep that its zero was observed in, and when that was.
         self._observed: dict[int, tuple[int | None, int]] = {}
 
-    def note_taken(self, true_kpa: NDArray[np.float64], *, alone: bool) -> None:
-        """A board that zeroes itself while no daemon runs has what presses it in its zero.
+    def note_taken(
+        self, true_kpa: NDArray[np.float64], felt_ns: NDArray[np.int64], *, alone: bool
+    ) -> None:
+        """A board that zeroes itself while no daemon runs has what presses it in its zero. So has a
+        small one that does it unheard: how its few pads rest hardly shows it.
 
         Args:
             true_kpa: what presses each taxel [n].
+            felt_ns: when each was last received, as known at the sample before [n].
             alone: no daemon has run all the time since the sample before.
         """
-        boards = self._world.robot.boards
+        boards, now_ns = self._world.robot.boards, self._world.clock.monotonic_ns()
+        spoiled = self._excuses.spoiled()
         for board, base in zip(self._world.layout.boards, self._bases, strict=True):
             now = boards[board.name].base
             if np.array_equal(base, now):
                 continue
             base[:] = now
-            if alone:
-                taxels = board.taxel_index[board.taxel_index >= 0]
+            taxels = board.taxel_index[board.taxel_index >= 0]
+            quiet_ns = now_ns - int(felt_ns[taxels].max())
+            unheard = quiet_ns > UNHEARD_PERIODS * board.settings.period_ms * 1_000_000
+            if alone or (unheard and len(taxels) < SURE_PADS):
                 pressed = (true_kpa[taxels] > TOUCHING_KPA) | self._pressed[taxels]
-                self._excuses.exempt[taxels] |= pressed
+                self._excuses.exempt[taxels] |= pressed | (spoiled[taxels] & unheard)
 
     def note_observed(
         self,
