@@ -95,6 +95,8 @@ SURE_NOISE_UNITS, SURE_NOISE, MOST_NOISE_UNITS = 5.0, 8.0, 20.0
 SURE_DAMAGED = 36
 #: Of many more it is named within this.
 DAMAGED_S = 8.0
+#: Evidence of a touch is gone after 2.6 s in the mean, of a pad with noise of six units.
+RECOVERS_S = 5.0
 #: A broker ends the connection of a client from which nothing came for longer.
 KEEP_ALIVE_S = 10.0
 #: While it lasts, the chip that it names does not measure.
@@ -127,7 +129,8 @@ class Trouble:
         places: names of buses, boards and parts; None is everywhere.
         blind: triangles that do not measure meanwhile.
         spoils: bool[n], taxels whose values may be wrong meanwhile, without anybody being able to
-            know, and for `recovers_s` afterwards.
+            know, and for `recovers_s` afterwards: so long the noisiest pads stay touched by what
+            is over.
         lingers: what it did lasts until it is put right.
         writes: it shows only when something is written.
         shows: whether it differs so far, for the daemon, from what is no trouble.
@@ -145,7 +148,7 @@ class Trouble:
     places: frozenset[str] | None = None
     blind: frozenset[Triangle] = frozenset()
     spoils: Mask | None = None
-    recovers_s: float = 3.0
+    recovers_s: float = RECOVERS_S
     lingers: bool = False
     writes: bool = False
     shows: Callable[[], bool] = _always
@@ -200,7 +203,7 @@ def _emulated(
     within_s: float = 3.0,
     *,
     spoils: bool = False,
-    recovers_s: float = 3.0,
+    recovers_s: float = RECOVERS_S,
     values: tuple[float, float] | None = None,
     sure: float = 0.0,
     lingers: bool = False,
