@@ -481,7 +481,8 @@ def _address_twice(world: World, chance: random.Random, _: bool) -> Trouble:
         "address_twice",
         f"address_twice board={board.name}",
         end,
-        _TIMING | _SET_UP | {"board_twice", "taxel_unproven"},
+        # Each byte comes twice, which looks like one that stays for long.
+        _TIMING | _SET_UP | {"board_twice", "taxel_unproven", "taxel_stuck"},
         frozenset({"board_twice"}),
         5.0,
         places_of(world, board=board.name),
