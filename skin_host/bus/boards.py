@@ -10,7 +10,8 @@ Properties of the firmware decide the order (reference of the wire, sections 3 a
 
 - discovery comes first, because a streaming MTB3 stops sending after any class-7 frame;
 - command 4D disables all triangles, so the 50s follow it;
-- an MTB4 stops when it receives a 50, so the start comes last;
+- an MTB4 stops when it receives a 50, so the start comes last, with a query for its uptime: one
+  that was reset meanwhile has lost what came before;
 - an MTB4 takes its baseline before the first conversion with a new CDC offset, so the
   last 50 is sent once more after that conversion;
 - an MTB3 reads its five mailboxes newest first and blocks for two periods while it
