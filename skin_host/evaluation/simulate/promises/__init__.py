@@ -238,8 +238,9 @@ class Promises:
             self._skin.note_valid(true_kpa)
             self._zeros.note_observed(life, true_kpa, self._skin.valid_ns, self._felt_ns)
             self._felt_ns = self._received.last_ns()
-            if life.daemon.engine.calibration is not None:
-                self.subscribers.note_calibration(life.daemon.engine.calibration.id)
+            calibration = life.daemon.engine.calibration
+            if calibration is not None:
+                self.subscribers.note_calibration(calibration.id, calibration.time)
         self._fingertips.note_loads(life)
         if life is None or life.dead or not self._skin.sampled:
             return

@@ -40,7 +40,7 @@ class Subscribers:
         self.stalled_ns = LONG_AGO_NS
         self.kept = -1
         #: Calibrations in the order in which they were taken.
-        self._calibrations: list[str] = []
+        self._calibrations: list[tuple[str, str]] = []
         self._connected_ns: int | None = None
         self._connection = 0
         #: Since when no taxel of a part has been valid; and since when the broker has kept a wrong
@@ -102,27 +102,28 @@ class Subscribers:
         answer = msgspec.json.decode(payload)
         result = answer.get("result") or {}
         if answer["ok"] and answer["command"] == "calibrate" and result["kept"]:
-            self.note_calibration(result["id"])
+            self.note_calibration(result["id"], result["time"])
             self.kept = len(self._calibrations) - 1
 
-    def note_calibration(self, name: str) -> None:
+    def note_calibration(self, name: str, time: str) -> None:
         """The daemon has this calibration."""
-        # Calibrations of the same content, of boards that are not received, have the same name.
-        if self._calibrations[-1:] != [name]:
-            self._calibrations.append(name)
+        # Calibrations of the same content, of boards that are not received, have the same id.
+        if self._calibrations[-1:] != [(name, time)]:
+            self._calibrations.append((name, time))
 
     def lost_calibration(self, life: Life) -> str | None:
         """A daemon has started; return that it found an earlier calibration than the kept one."""
         found = life.daemon.engine.calibration
         if self.kept < 0:
             return None
-        kept = self._calibrations[self.kept]
+        kept = self._calibrations[self.kept][0]
         if found is None:
             return f"calibration {kept} was kept, and there is none at the next start"
-        if found.id in set(self._calibrations) - set(self._calibrations[self.kept :]):
+        now = found.id, found.time
+        if now in set(self._calibrations) - set(self._calibrations[self.kept :]):
             return f"calibration {kept} was kept, and the next start has {found.id}"
-        if found.id not in self._calibrations:
-            self.note_calibration(found.id)
+        if now not in self._calibrations:
+            self.note_calibration(*now)
         return None
 
     # ------------------------------------------------------------------ what is retained
