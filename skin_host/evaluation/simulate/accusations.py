@@ -26,9 +26,11 @@ LATELY_NS = 62 * NS
 #: Events go on being lost until the daemon has noticed that its broker is back.
 CONNECTED_NS = round((TIMEOUT_S + GRACE_S + LAST_RETRY_S) * NS)
 #: These last until the skin is calibrated at rest, is enabled, or something could be written: their
-#: sentences ask for that.
+#: sentences ask for that. That two boards sent at an address is true until one has sent for a
+#: second, however long its bus is away before.
 LASTING = {
     "board_in_doubt",
+    "board_twice",
     "part_disabled",
     "part_temperature",
     "state_not_kept",
