@@ -37,6 +37,9 @@ PATIENCE_NS = 100_000_000
 LONGEST_PATIENCE_NS = 2_000_000_000
 #: The end waits in steps of this until what came before it has been read.
 CATCH_UP_S = 0.005
+#: In so many turns all is read that waits when a board is zeroed, but where this computer is too
+#: slow for what comes.
+MOST_TURNS = 64
 #: A bus that does not take the set-up of its boards is tried again after this.
 RETRY_S = 2.0
 STOP_S = 1.0
@@ -143,6 +146,8 @@ class Link:
         #: How many sweeps of each board had been received when a turn was last held up.
         self._sweeps_then = engine.ledger.sweeps.copy()
         self._longest_pause_ns = 0
+        #: Reads the buses and passes the results on, once `read` does that.
+        self._work: Callable[[], None] = lambda: None
         try:
             for bus in engine.assemblers:
                 port = open_port(bus, settings.buses[bus], settings.receive, wait=wait, clock=clock)
@@ -178,6 +183,12 @@ class Link:
         return self._engine.intake.missing()
 
     def _zeroed(self, board: int, believed: bool) -> None:
+        # What waits unread, as after a stall, is of the zero before, and may show what touches it.
+        now_ns = self._clock.now_ns()
+        for _ in range(MOST_TURNS):
+            self._work()
+            if self.read_ns >= now_ns:
+                break
         self._engine.rezero(board, believed)
 
     async def read(
@@ -199,6 +210,7 @@ class Link:
                 self.turn(self._clock.now_ns(), deliver, record)
             self._engine.judge()
 
+        self._work = work
         await self._wake_up.run(work)
 
     def turn(

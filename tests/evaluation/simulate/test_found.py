@@ -927,3 +927,33 @@ def test_a_stuck_pad_must_be_named_once_chance_does_not_repeat_for_so_long(
     assert trouble.must == {"taxel_stuck"}
     assert (trouble.within_s == 20.0) == at_once
     assert at_once or trouble.within_s > LONGEST_DRILL_S
+
+
+@pytest.mark.parametrize("after_s", [0.1, 0.2, 0.3, 0.4])
+def test_what_waits_unread_when_a_board_is_zeroed_is_not_of_the_new_zero(
+    worn: World, after_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a stall the zero was observed in it. An MTB3 goes on sending while it is set up."""
+
+    async def live() -> None:
+        life = start(worn)
+        await worn.clock.sleep(20.0)
+        engine, zeroed_ns = life.daemon.engine, list[int]()
+        rezero = engine.rezero
+
+        def note(board: int, believed: bool = True) -> int:
+            zeroed_ns.append(worn.clock.now_ns())
+            return rezero(board, believed)
+
+        monkeypatch.setattr(engine, "rezero", note)
+        setting_up = asyncio.create_task(life.daemon.configure([0]))
+        await worn.clock.sleep(after_s)
+        worn.clock.advance(2.0)
+        await setting_up
+        await worn.clock.sleep(1.0)
+        assert len(zeroed_ns) == 2
+        assert engine._rezeros[0]._since_ns > zeroed_ns[-1]
+        await worn.end()
+
+    with worn.clock.runner() as runner:
+        runner.run(live())
