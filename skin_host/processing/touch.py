@@ -37,6 +37,10 @@ HOLD_SPANS = 1.5
 LOST_S = 0.5
 #: A firm press ends after at most this many measurements.
 RELEASE_MEASUREMENTS = 14
+#: Rounded at the edge of a byte, noise is up to so many times what it is in its middle, at most so
+#: many units (standard deviation).
+EDGE_NOISE = 1.5
+ROUNDED_UNITS = 0.5
 #: No threshold and no span is less, whatever the settings: rounding is not evidence.
 LEAST_UNITS = 0.1
 #: Residual that a press leaves in the foam and that no model removes: its share of the press, and
@@ -105,7 +109,9 @@ def levels(above: Floats, spread: Floats, settings: TouchSettings) -> Levels:
     # With n measurements a press of `enter` + span / n is detected; the least of that:
     best = spread * math.sqrt(math.log(ODDS) / 2 * CONVERSION_S / DECIDE_S)
     enter = np.maximum(margin - band / 2, best)
-    span = np.maximum(_span(enter, spread), np.maximum(band, LEAST_UNITS))
+    # A pad that rested in the middle of a byte may rest at its edge after the next zero.
+    noise = np.maximum(spread, np.minimum(EDGE_NOISE * spread, ROUNDED_UNITS))
+    span = np.maximum(_span(enter, noise), np.maximum(band, LEAST_UNITS))
     # A reading near its threshold must not flicker, and the sum of noise goes far.
     leave = enter - enter / 2 * (1.0 - band / span)
     hold = np.maximum(span, np.minimum(2 * (span - band), HOLD_SPANS * span))

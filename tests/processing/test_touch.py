@@ -324,6 +324,22 @@ def test_a_taxel_without_noise_has_the_thresholds_of_its_settings() -> None:
     assert found.decides == pytest.approx(found.enter + found.span * 0.0369, abs=1e-3)
 
 
+def test_a_quiet_taxel_that_rests_at_the_edge_of_a_byte_is_not_touched_by_it() -> None:
+    """Calibrated in the middle, with noise of 0.3 units, it reads 1.54 below its rest at times."""
+    found = levels(np.zeros(1), np.array([0.31]), TouchSettings())
+    detector = TouchDetector(found)
+    detector.renew(np.array([244.54]))
+    assert [bool(detector.step(np.array([raw], np.uint8), 0.05)[0]) for raw in (245, 243, 243)] == [
+        False,
+        False,
+        False,
+    ]
+    assert [bool(detector.step(np.array([raw], np.uint8), 0.05)[0]) for raw in (239, 238)] == [
+        False,
+        True,
+    ]
+
+
 def test_the_least_threshold_and_the_hysteresis_bound_each_other() -> None:
     least = TouchSettings(margin_units=0.2, hysteresis_units=5.0, minimum_threshold_units=0.8)
     found = levels(np.zeros(1), np.zeros(1), least)
