@@ -258,9 +258,10 @@ def test_on_recorded_skin_everything_else_is_as_good_as_wanted() -> None:
     assert {goal["figure"] for goal in goals if not goal["reached"]} <= MISSED
 
 
+@pytest.mark.skipif(not real.RECORDINGS.exists(), reason=f"no recordings in {real.RECORDINGS}")
 def test_what_real_pads_do_under_pressure_is_no_damage_of_their_bus() -> None:
     """Two minutes in which pads of noisy triangles jumped for one sweep 33 times."""
-    found = insole.read(ROOT.parent / "shared" / "data" / "insole" / "left_validation_1.npz")
+    found = insole.read(real.RECORDINGS / "left_validation_1.npz")
     made = replace(found, t_ns=found.t_ns[:6200], counts=found.counts[:6200])
     settings, layout = insole.skin()
     engine = Engine(settings, layout, [0], real.calibrate(made, settings, layout))
