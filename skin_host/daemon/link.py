@@ -33,7 +33,8 @@ HELD_UP_NS = 25_000_000
 #: no sweep is closed and no board becomes silent, so that what is on its way is not missed.
 PATIENCE_NS = 100_000_000
 #: It may go on as late as it was held up: it may be as long again until every board that was
-#: received before is received again, up to this.
+#: received before is received again, up to this. Until then no board becomes silent; what has been
+#: received does not wait for it.
 LONGEST_PATIENCE_NS = 2_000_000_000
 #: The end waits in steps of this until what came before it has been read.
 CATCH_UP_S = 0.005
@@ -251,8 +252,10 @@ class Link:
         # What is behind is complete up to its last frame, whatever held this computer up.
         if self._held_up_at_ns is not None and not is_behind and self._is_patient(now_ns):
             self._engine.ledger.pass_over(read_ns)
-            return
-        self._engine.ledger.look(read_ns)
+            if 0 <= now_ns - self._held_up_at_ns < PATIENCE_NS:
+                return
+        else:
+            self._engine.ledger.look(read_ns)
         if not 0 <= read_ns - self._expired_ns < EXPIRE_NS:
             self._expired_ns = read_ns
             output = self._engine.expire(read_ns)

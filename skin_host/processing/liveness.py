@@ -73,7 +73,7 @@ NOISY_SIGMAS = 5.0
 #: A taxel is noisy when its jumps, as multiples of that limit (at most this large), exceed this on
 #: average over all samples; and calm again below. Large jumps are rarer by chance than many.
 MOST_JUMP = 2.0
-NOISY_MEAN = 0.4
+NOISY_MEAN = 0.5
 CALM_MEAN = 0.1
 NOISE_MEMORY_SAMPLES = 8
 #: A pad has jumped lately while that mean is above this: for some 25 samples.
@@ -334,7 +334,7 @@ class Liveness:
 
     def note_gap(self, board: int, missed: int = 0) -> None:
         """Sweeps of a board (its row) were lost, so many if that is known: the next step does not
-        follow the last one.
+        follow the last one, and what is received next is not compared with what was before them.
         """
         self.catch_up()
         self._settle_step()
@@ -343,6 +343,9 @@ class Liveness:
         mine = slice(triangles * board, triangles * (board + 1))
         self._step[mine] = 0
         self._uncompared[mine] += missed
+        if missed:
+            self._present[mine] = False
+            self._all_present = False
 
     def keep(self, before: "Liveness", boards: Mask) -> None:
         """Take over the state of a predecessor for the same skin, for some boards

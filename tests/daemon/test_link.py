@@ -132,6 +132,20 @@ def test_no_board_is_silent_because_what_brings_its_frames_was_held_up_too(
     assert not reader.engine.ledger.any_silent
 
 
+def test_half_a_sweep_is_not_kept_until_the_silence_after_a_long_pause_has_lasted_long(
+    reader: Reader,
+) -> None:
+    """Otherwise it is of its time no more when it is reported."""
+    for _ in range(3):
+        reader.period(ALL)
+    reader.now_ns += 9000 * MS
+    began_ns = reader.now_ns
+    reader.arrive(reader.frames()[:6])
+    while reader.counters.incomplete == 0:
+        reader.wait(1)
+    assert 100 * MS <= reader.now_ns - began_ns <= 150 * MS
+
+
 def test_a_board_that_sent_after_a_stall_and_died_is_silent_in_time(reader: Reader) -> None:
     for _ in range(3):
         reader.period(ALL)

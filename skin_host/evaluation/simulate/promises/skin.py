@@ -111,21 +111,24 @@ class SkinCheck:
             None,
         )
 
-    def _may_begin(self, part: str, taxels: Sequence[int]) -> bool:
+    def _may_begin(self, part: str, taxels: Sequence[int] | NDArray[np.intp]) -> bool:
         """Return whether a touch of some taxels of a part has a cause.
 
         What a press leaves in the foam looks like a light press to a daemon that did not receive
         the press; and a touch that lasts, as long as foam takes, begins again after a silence, or
-        when the computer was suspended.
+        when the computer was suspended, or is a piece of one that comes apart.
         """
-        mine = np.asarray(taxels, np.intp) + self._parts[part].start
+        taxels = np.asarray(taxels, np.intp)
+        mine = taxels + self._parts[part].start
         if self._excuses.of_touches(mine, CAUSE_NS).any():
             return True
         now_ns = self._now_ns()
         unheard = now_ns - self._unheard_ns[mine] < RELAXED_NS
         lasts = self._lost[mine] & (now_ns - self._excuses.touched_ns[mine] < RELAXED_NS)
         lasts &= now_ns - self._blind_ns[mine] < AGAIN_NS
-        return bool((unheard | lasts).any())
+        before = self._frames.get(part)
+        piece = before is not None and before.touched[taxels].any()
+        return bool(piece or (unheard | lasts).any())
 
     # ------------------------------------------------------------------ frames
 
