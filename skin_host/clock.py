@@ -61,8 +61,12 @@ class Clock:
     now_ns: Callable[[], int] = staticmethod(time.time_ns)
     #: A time that is never set.
     monotonic_ns: Callable[[], int] = staticmethod(time.monotonic_ns)
-    #: The same in seconds.
+    #: `monotonic_ns` in seconds.
     monotonic_s: Callable[[], float] = staticmethod(time.monotonic)
+
+    def since_boot_ns(self) -> int:
+        """A time that is never set, and goes on while the computer sleeps."""
+        return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
     def today(self) -> datetime:
         """Date and time of day in UTC."""
@@ -164,6 +168,7 @@ class SteppedClock(Clock):
         self._random = random.Random(seed)
         self._epoch_ns = EPOCH_NS
         self._t_ns = 0
+        self._slept_ns = 0
         self.threads_take_s = 0.0
 
     def now_ns(self) -> int:
@@ -171,6 +176,9 @@ class SteppedClock(Clock):
 
     def monotonic_ns(self) -> int:
         return self._t_ns
+
+    def since_boot_ns(self) -> int:
+        return self._slept_ns + self._t_ns
 
     def monotonic_s(self) -> float:
         return self._t_ns / NS_PER_S
@@ -186,6 +194,11 @@ class SteppedClock(Clock):
     def set(self, jump_s: float) -> None:
         """Set the time of day forward or back."""
         self._epoch_ns += round(jump_s * NS_PER_S)
+
+    def suspend(self, seconds: float) -> None:
+        """Let the computer sleep: `monotonic_ns` stands still."""
+        self._slept_ns += round(seconds * NS_PER_S)
+        self.set(seconds)
 
     def alarm(self, ring: Callable[[], object]) -> Alarm:
         return _LoopAlarm(ring)

@@ -38,6 +38,9 @@ PATIENCE_NS = 100_000_000
 LONGEST_PATIENCE_NS = 2_000_000_000
 #: The end waits in steps of this until what came before it has been read.
 CATCH_UP_S = 0.005
+#: The time of day was set where it has moved by this much more or less than the time since the
+#: computer was started, from turn to turn. Less is how a clock is corrected slowly.
+CLOCK_SET_NS = 100_000_000
 #: In so many turns all is read that waits when a board is zeroed, but where this computer is too
 #: slow for what comes.
 MOST_TURNS = 64
@@ -141,6 +144,7 @@ class Link:
         )
         self._expired_ns = 0
         self._turned_ns = self.read_ns
+        self._started_at_ns = self._now_started_at_ns()
         self._held_up_ns = max(LONGEST_NS, int(settings.receive.poll_ms * 1e6)) + HELD_UP_NS
         self._held_up_at_ns: int | None = None
         self._patience_ns = PATIENCE_NS
@@ -242,6 +246,7 @@ class Link:
                 read_ns = min(read_ns, int(batch.t_ns[-1]))
             record(bus, batch)
             batches.append((bus, batch))
+        self._note_clock()
         for bus, batch in batches if len(batches) < 2 else _by_time(batches, self._slice_ns):
             output = self._engine.feed(bus, batch)
             if output.answers:
@@ -275,6 +280,17 @@ class Link:
                 log.warning("ends with frames unread: they come faster than they are processed")
                 return
             await self._clock.sleep(CATCH_UP_S)
+
+    def _now_started_at_ns(self) -> int:
+        """Return the time of day at which this computer was started, by the present clock."""
+        return self._clock.now_ns() - self._clock.since_boot_ns()
+
+    def _note_clock(self) -> None:
+        """Tell the engine if the time of day was set before the last frames were stamped."""
+        before_ns, self._started_at_ns = self._started_at_ns, self._now_started_at_ns()
+        step_ns = self._started_at_ns - before_ns
+        if abs(step_ns) >= CLOCK_SET_NS:
+            self._engine.clock_set(step_ns)
 
     def _note_held_up(self, now_ns: int, pause_ns: int) -> None:
         """This turn was held up; what waits has not been read yet."""

@@ -433,6 +433,14 @@ class Engine:
         samples += self.intake.expire(now_ns)
         return Output(sweeps, self._process(samples) if samples else [], [], grasps, [])
 
+    def clock_set(self, step_ns: int) -> None:
+        """Take no time for passed that the clock of the time stamps was set forward by.
+
+        Without this a gap in time stamps is time in which the computer may have slept.
+        """
+        if self._pipeline is not None:
+            self._pipeline.clock_set(step_ns)
+
     def flush(self) -> Output:
         """Return everything that waits, at the end of a recording."""
         sweeps = [sweep for assembler in self.assemblers.values() for sweep in assembler.flush()]

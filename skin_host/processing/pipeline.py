@@ -167,6 +167,15 @@ class Pipeline:
         part.seq = number
         return frame
 
+    def clock_set(self, step_ns: int) -> None:
+        """Take no time for passed that the clock of the sweeps was set forward by.
+
+        Args:
+            step_ns: by how much, negative if it was set back. Sweeps of the time before may follow.
+        """
+        for part in self._parts:
+            part.clock_set(step_ns)
+
     def set_zero(self, taxels: NDArray[np.int32], baseline: NDArray[np.float64]) -> None:
         """Continue from new baselines, because a board was zeroed.
 
@@ -252,6 +261,8 @@ class _PartPipeline:
         self._name = part.name
         self.seq = 0
         self._t_ns: int | None = None
+        #: By how much the clock was set forward and no sweep has shown it yet.
+        self._set_ns = 0
         self._no_load = layout.no_load[mine].astype(np.float64)
         self._thermal = layout.pad_kind[mine] == PadKind.THERMAL
         self._has_thermal = bool(self._thermal.any())
@@ -406,6 +417,11 @@ class _PartPipeline:
             beyond = beyond if beyond is self._nowhere else beyond & valid
         return self._frame(t_ns, raw, valid, pressure, touched, beyond, True)
 
+    def clock_set(self, step_ns: int) -> None:
+        """See `Pipeline.clock_set`."""
+        if self._t_ns is not None:
+            self._set_ns = max(self._set_ns + step_ns, 0)
+
     def begin_anew(self, taxels: Mask) -> None:
         """Forget the last samples of some taxels, bool[n] over the skin: baselines are new."""
         anew = taxels[self._mine]
@@ -436,7 +452,11 @@ class _PartPipeline:
         last, self._t_ns = self._t_ns, t_ns
         if last is None:
             return 0.0, 0.0
-        dt_s = max((t_ns - last) * 1e-9, 0.0)
+        passed_ns = t_ns - last
+        if 0 < self._set_ns <= passed_ns:
+            passed_ns -= self._set_ns
+            self._set_ns = 0
+        dt_s = max(passed_ns * 1e-9, 0.0)
         return min(dt_s, LONGEST_STEP_S), max(dt_s - LONGEST_STEP_S, 0.0)
 
     def _bridge(self, gap_s: float) -> None:

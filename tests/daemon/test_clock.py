@@ -29,6 +29,18 @@ async def test_hours_pass_in_order_and_without_waiting(clock: SteppedClock) -> N
     assert time.monotonic() - began_s < HOUR_S
 
 
+def test_only_the_time_since_the_start_goes_on_in_sleep_and_is_not_set() -> None:
+    clock = SteppedClock()
+    clock.set(HOUR_S)
+    clock.suspend(2.0)
+    clock.advance(1.0)
+    assert clock.now_ns() - EPOCH_NS == (3600 + 2 + 1) * 10**9
+    assert clock.since_boot_ns() == (2 + 1) * 10**9
+    assert clock.monotonic_ns() == 10**9
+    began_ns = SYSTEM.since_boot_ns()
+    assert SYSTEM.since_boot_ns() >= began_ns > 0
+
+
 @stepped
 async def test_timeouts_of_libraries_are_stepped_too(clock: SteppedClock) -> None:
     with pytest.raises(TimeoutError):

@@ -128,6 +128,31 @@ async def test_a_clock_that_is_set_changes_no_contact(clock: SteppedClock, tmp_p
 
 
 @stepped
+@pytest.mark.parametrize("is_asleep", [False, True])
+async def test_foam_recovers_while_the_computer_sleeps_and_not_when_its_clock_is_set(
+    clock: SteppedClock, tmp_path: Path, is_asleep: bool
+) -> None:
+    held = Probe(
+        part="left_hand",
+        at=Place(triangle=4),
+        diameter_mm=10,
+        pressure_kpa=[(0, 0), (0.1, 60), (20, 60), (20.1, 0), (1000, 0)],
+        start_s=4.0,
+    )
+    async with well(clock, tmp_path, f"stepped-foam-{is_asleep}", held) as live:
+        await clock.sleep(24.0)
+        pipeline = live.daemon.engine.pipeline
+        assert pipeline is not None
+        before_kpa = float(pipeline.relaxation_kpa.max())
+        (clock.suspend if is_asleep else clock.set)(3600.0)
+        await clock.sleep(0.2)
+        after_kpa = float(pipeline.relaxation_kpa.max())
+        assert before_kpa > 1.0
+        assert (after_kpa < 0.6 * before_kpa) == is_asleep
+        assert (after_kpa > 0.8 * before_kpa) == (not is_asleep)
+
+
+@stepped
 async def test_a_contact_is_on_in_a_touch_only_also_where_many_frames_are_read_together(
     clock: SteppedClock, tmp_path: Path
 ) -> None:

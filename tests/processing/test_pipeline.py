@@ -303,6 +303,49 @@ def test_what_a_hard_press_left_has_gone_after_an_hour_without_data():
     assert any(frame.touched.any() for frame in press(rig, 2.0, 10))
 
 
+def left_in_foam_kpa(set_s, passed_s, sent_s=()):
+    """Highest pressure that is reported of what a hold left in foam, after the clock was set and
+    time has passed; frames stamped `sent_s` before it was set come after that is known.
+    """
+    rig = Rig(1, 0.3)
+    press(rig, 40.0, 500)
+    press(rig, 0.0, 5)
+    rig.pipeline.clock_set(round(set_s * 1e9))
+    for gap_s in sent_s:
+        rig.t_ns += round(gap_s * 1e9)
+        press(rig, 0.0, 1)
+    rig.t_ns += round((set_s + passed_s) * 1e9)
+    return rig.pipeline.relaxation_kpa[:6].max() if press(rig, 0.0, 1) else None
+
+
+def test_foam_does_not_recover_in_an_hour_by_which_the_clock_was_set():
+    unset_kpa = left_in_foam_kpa(0.0, 0.0)
+    assert unset_kpa > 1.0
+    assert left_in_foam_kpa(3600.0, 0.0) == pytest.approx(unset_kpa, rel=1e-3)
+    assert left_in_foam_kpa(3600.0, 0.0, sent_s=(0.04, 0.04)) == pytest.approx(
+        left_in_foam_kpa(0.0, 0.0, sent_s=(0.04, 0.04)), rel=1e-3
+    )
+
+
+def test_foam_recovers_in_the_time_that_passes_beside_a_clock_that_is_set():
+    assert left_in_foam_kpa(3600.0, 20.0) == pytest.approx(left_in_foam_kpa(0.0, 20.0), rel=1e-3)
+    assert left_in_foam_kpa(3600.0, 20.0) < 0.7 * left_in_foam_kpa(3600.0, 0.0)
+
+
+def test_a_clock_that_is_set_forward_and_back_before_any_sweep_changes_nothing():
+    left_kpa = []
+    for steps_s in ((), (3600, -3600)):
+        rig = Rig(1, 0.3)
+        press(rig, 40.0, 500)
+        press(rig, 0.0, 5)
+        for step_s in steps_s:
+            rig.pipeline.clock_set(step_s * 1_000_000_000)
+        rig.t_ns += 3_600_000_000_000
+        press(rig, 0.0, 1)
+        left_kpa.append(rig.pipeline.relaxation_kpa)
+    assert np.array_equal(*left_kpa)
+
+
 def test_a_byte_at_an_end_of_the_scale_is_told_beyond_range():
     rig = Rig(1, 0.3, processing={"pressure": {"a_kpa_per_ff2": 0.0}})
     raw = rig.read(0.0)

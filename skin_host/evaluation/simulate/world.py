@@ -169,7 +169,7 @@ class World:
         for name, batch in self.robot.step(seconds).items():
             self.cables[name].sleep_through(batch)
         self.slept_ns = self.robot.t_ns - self.clock.monotonic_ns()
-        self.clock.set(seconds)
+        self.clock.suspend(seconds)
 
     def taxels(self, place: Triangle) -> NDArray[np.intp]:
         """Return the taxels [m] of a triangle."""
