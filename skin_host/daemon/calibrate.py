@@ -3,16 +3,15 @@
 import asyncio
 import contextlib
 import logging
-import os
 from collections.abc import Callable
 from pathlib import Path
 
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Settings, skin_hash
 from skin_host.daemon.link import Link
-from skin_host.daemon.state import kept_path
+from skin_host.daemon.state import can_be_read, kept_path
 from skin_host.errors import CalibrationError, OtherSkinError, SkinError
-from skin_host.files import set_aside, why_unreadable
+from skin_host.files import set_aside
 from skin_host.layout import Layout
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration
@@ -129,10 +128,7 @@ def stored_calibration(settings: Settings, layout: Layout, node: str) -> Calibra
         BusyFileError: another program is writing it.
     """
     path = calibration_path(settings, node)
-    why = why_unreadable(path)
-    if why is not None:
-        log.error("%s: cannot be read: %s; a new one is taken", path, why)
-    if why is not None or not os.access(path, os.F_OK):
+    if not can_be_read(path, "a new one is taken"):
         return None
     try:
         return calibrations.load(path, layout, skin_hash(settings))

@@ -286,7 +286,7 @@ class Link:
         return self._clock.now_ns() - self._clock.since_boot_ns()
 
     def _note_clock(self) -> None:
-        """Tell the engine if the time of day was set before the last frames were stamped."""
+        """Report to the engine that the time of day was set before the last frames were stamped."""
         before_ns, self._started_at_ns = self._started_at_ns, self._now_started_at_ns()
         step_ns = self._started_at_ns - before_ns
         if abs(step_ns) >= CLOCK_SET_NS:

@@ -106,6 +106,20 @@ def kept_path(settings: Settings, node: str, what: str) -> Path:
     return directory / f"{settings.robot}-{node}.{what}.json"
 
 
+def can_be_read(path: Path, without: str) -> bool:
+    """Return whether there is a file that can be read; log if there is one that cannot.
+
+    Args:
+        path: of the file.
+        without: what the node does without it.
+    """
+    why = why_unreadable(path)
+    if why is not None:
+        log.error("%s: cannot be read: %s; %s", path, why, without)
+        return False
+    return os.access(path, os.F_OK)
+
+
 def load_kept(path: Path, kind: type[Kept]) -> Kept:
     """Read what a node keeps.
 
@@ -116,10 +130,7 @@ def load_kept(path: Path, kind: type[Kept]) -> Kept:
         BusyFileError: another program is writing it.
     """
     unchanged = kind()
-    why = why_unreadable(path)
-    if why is not None:
-        log.error("%s: cannot be read: %s; %s", path, why, kind.WITHOUT)
-    if why is not None or not os.access(path, os.F_OK):
+    if not can_be_read(path, kind.WITHOUT):
         return unchanged
     what = unchanged.schema.removeprefix("skin.").partition("/")[0]
     try:

@@ -140,8 +140,6 @@ class World:
         self.real_noise = not scene.quiet
         #: Boards of which a chip lost its set-up: they need their power switched off and on.
         self.unpowered: set[str] = set()
-        #: By how much the robot's time is ahead of the computer's, which was suspended.
-        self.slept_ns = 0
         self.spots = [Spot(self, self.chance) for _ in range(SPOTS)]
         self.tips = [
             PressedTip(self, self.chance, name)
@@ -155,12 +153,13 @@ class World:
 
     def move(self) -> None:
         """Bring the robot to the present; what its boards sent waits on the buses."""
-        passed_ns = self.clock.monotonic_ns() + self.slept_ns - self.robot.t_ns
+        passed_ns = self.clock.since_boot_ns() - self.robot.t_ns
         if passed_ns <= 0:
             return
+        slept_ns = self.clock.since_boot_ns() - self.clock.monotonic_ns()
         for name, batch in self.robot.step(passed_ns / NS).items():
-            if self.slept_ns and len(batch):
-                batch.t_ns = batch.t_ns - self.slept_ns
+            if slept_ns and len(batch):
+                batch.t_ns = batch.t_ns - slept_ns
             self.cables[name].arrive(batch)
 
     def suspend(self, seconds: float) -> None:
@@ -168,7 +167,6 @@ class World:
         self.move()
         for name, batch in self.robot.step(seconds).items():
             self.cables[name].sleep_through(batch)
-        self.slept_ns = self.robot.t_ns - self.clock.monotonic_ns()
         self.clock.suspend(seconds)
 
     def taxels(self, place: Triangle) -> NDArray[np.intp]:
