@@ -273,7 +273,21 @@ class Daemon:
         self._doubt_contacts(self.engine.may_be_touched(), [part])
 
     def set_thresholds(self, thresholds: Thresholds) -> None:
-        """Apply these changes to the configured touch thresholds; baselines are kept."""
+        """Apply these changes to the configured touch thresholds; baselines are kept.
+
+        Raises:
+            RequestError: no reading of some taxels would be a touch any more.
+        """
+        touch = thresholds.over(self._configured.processing.touch)
+        unreached = self.engine.unreached(touch)
+        for part in self.layout.parts:
+            taxels = np.flatnonzero(unreached[part.start : part.stop]).tolist()
+            if taxels:
+                raise RequestError(
+                    f"margin_units = {touch.margin_units:g}, minimum_threshold_units = "
+                    f"{touch.minimum_threshold_units:g}: no press would be felt by {named(taxels)} "
+                    f"of {part.name}, whose readings end before; wanted smaller ones"
+                )
         self.thresholds = thresholds
         self._swap(self._configured, self.layout)
 
@@ -355,12 +369,13 @@ class Daemon:
         self.settings, self.layout, self.engine = settings, layout, engine
         self.link.use(engine)
         self.health.use(engine)
+        self._use_usable()
 
     def _use_usable(self) -> None:
         """Let contacts wait only for taxels that can be valid again."""
-        calibration = self.engine.calibration
-        if calibration is not None:
-            usable = calibration.usable & ~self.engine.cut_off()
+        calibration, pipeline = self.engine.calibration, self.engine.pipeline
+        if calibration is not None and pipeline is not None:
+            usable = calibration.usable & ~self.engine.cut_off() & ~pipeline.unreached
             for index, contact in self._contacts.items():
                 part = self.layout.parts[index]
                 contact.use(usable[part.start : part.stop])

@@ -349,8 +349,8 @@ class Describer:
         return known[0][3]
 
     def _verdicts(self, part: int, pressure: NDArray[np.bool_]) -> dict[str, list[int]]:
-        calibration = self._engine.calibration
-        if calibration is None:
+        calibration, pipeline = self._engine.calibration, self._engine.pipeline
+        if calibration is None or pipeline is None:
             return {}
         known, changes = self._judged.get(part), self._engine.zero_changes
         if known is None or known[0] is not calibration or known[1] != changes:
@@ -365,6 +365,8 @@ class Describer:
                 for kind in map(Verdict, sorted(set(verdict.tolist())))
                 if kind != Verdict.OK
             }
+            if pipeline.unreached[mine].any():
+                found["unreached"] = np.flatnonzero(pipeline.unreached[mine]).tolist()
             self._judged[part] = known = calibration, changes, found
         return known[2]
 

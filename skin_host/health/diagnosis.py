@@ -140,6 +140,7 @@ def _invalidates(fault: FoundFault) -> bool:
         "taxel_noisy",
         "taxel_out_of_range",
         "taxel_refused",
+        "taxel_unreached",
     }
 
 
@@ -332,6 +333,13 @@ def _taxels(record: Record) -> Iterator[FoundFault]:
     if touched := verdicts.get("touched"):
         yield fault(
             "taxel_pressed", touched, "touched when calibrated; calibrate when nothing touches"
+        )
+    if unreached := verdicts.get("unreached"):
+        yield fault(
+            "taxel_unreached",
+            unreached,
+            "not valid: no reading of them would be a touch; lower margin_units and "
+            "minimum_threshold_units (skin command thresholds)",
         )
     # If the triangle is already reported as missing, its taxels were absent because of that.
     kinds = {"stuck": "stuck", "out_of_range": "out of range", "too_noisy": "too noisy"}

@@ -10,13 +10,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.bus.assembler import Assembler, Sweep
 from skin_host.bus.ledger import BoardLedger
 from skin_host.bus.wire import TRIANGLES, FrameBatch, StatusError
-from skin_host.config.settings import Settings, skin_hash
+from skin_host.config.settings import Settings, TouchSettings, skin_hash
 from skin_host.fingertip.events import FingertipEvent
 from skin_host.layout import Layout
 from skin_host.processing.calibration import (
@@ -33,7 +34,7 @@ from skin_host.processing.events import Touch
 from skin_host.processing.intake import Intake, PartSample, below_zero
 from skin_host.processing.liveness import PADS
 from skin_host.processing.masks import Mask, any_of
-from skin_host.processing.pipeline import Pipeline, PressureFrame
+from skin_host.processing.pipeline import Pipeline, PressureFrame, unreached
 from skin_host.processing.pressure import PressureCurve, vertex
 from skin_host.processing.rezero import (
     BELOW_SWEEPS,
@@ -555,6 +556,14 @@ class Engine:
         for board, rezero in self._rezeros.items():
             found[self._taxels_of(board).ravel()[rezero.cut_off]] = True
         return found
+
+    def unreached(self, touch: TouchSettings) -> Mask:
+        """Return the taxels bool[n] that no reading would touch any more by other thresholds."""
+        if self.calibration is None or self._pipeline is None:
+            return np.zeros(self.layout.n_taxels, np.bool_)
+        processing = msgspec.structs.replace(self.settings.processing, touch=touch)
+        found = unreached(self.layout, processing, self.calibration)
+        return found & ~self._pipeline.unreached
 
     def in_doubt(self, board: int) -> NDArray[np.bool_]:
         """Return taxels bool[16, 12] of a board whose zero is unknown."""

@@ -99,6 +99,7 @@ class Pipeline:
         baseline: float64[n], activation of the untouched taxels in units, drift included.
         relaxation_kpa: float32[n], pressure that the foam has lost by now.
         enter: float64[n], the threshold of touch, in units, see `touch.Levels`.
+        unreached: bool[n], taxels that are not used because no reading of them is a touch.
     """
 
     def __init__(self, layout: Layout, settings: Processing, calibration: Calibration) -> None:
@@ -107,6 +108,7 @@ class Pipeline:
         self.relaxation_kpa = np.zeros(layout.n_taxels, np.float32)
         rules = _Rules.of(layout, settings, calibration)
         self.enter = rules.levels.enter
+        self.unreached = rules.unreached
         self._parts = [_PartPipeline(self, layout, part, rules) for part in layout.parts]
 
     def renew(
@@ -130,6 +132,7 @@ class Pipeline:
         np.copyto(self.baseline, calibration.baseline, where=zeroed)
         rules = _Rules.of(self._layout, settings, calibration)
         self.enter = rules.levels.enter
+        self.unreached = rules.unreached
         for part in self._parts:
             part.renew(rules, zeroed)
 
@@ -214,6 +217,7 @@ class _Rules(NamedTuple):
 
     settings: Processing
     usable: Mask
+    unreached: Mask
     curve: Curve
     curves: Curves | None
     levels: Levels
@@ -230,7 +234,9 @@ class _Rules(NamedTuple):
             # Some seconds at rest show less noise than a whole recording under pressure.
             spread = np.where(curves.own, np.fmax(spread, curves.noise_units), spread)
         found = levels(above, spread, settings.touch)
-        return cls(settings, usable, curve, curves, found)
+        # A reading ends at 0: a larger threshold would leave a pressed taxel untouched.
+        unreached = usable & (found.decides > layout.no_load - calibration.baseline)
+        return cls(settings, usable & ~unreached, unreached, curve, curves, found)
 
     def part(self, mine: slice) -> "_Rules":
         """Return those of some of the taxels; unusable taxels are never touched."""
@@ -239,6 +245,7 @@ class _Rules(NamedTuple):
         return _Rules(
             self.settings,
             usable,
+            self.unreached[mine],
             self.curve.part(mine),
             self.curves,
             Levels(
@@ -250,6 +257,11 @@ class _Rules(NamedTuple):
                 found.votes[mine],
             ),
         )
+
+
+def unreached(layout: Layout, settings: Processing, calibration: Calibration) -> Mask:
+    """Return taxels bool[n] of which no reading would be a touch, see `Pipeline.unreached`."""
+    return _Rules.of(layout, settings, calibration).unreached
 
 
 class _PartPipeline:

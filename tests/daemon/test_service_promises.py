@@ -73,6 +73,37 @@ async def test_commands_work_and_say_so_where_nothing_can_be_written(
 
 
 @stepped
+async def test_thresholds_that_no_reading_reaches_are_refused(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    async with living(can_bus_settings, tmp_path, clock=clock) as live:
+        handle = live.daemon.control.handle
+        before = await handle("thresholds", b"{}")
+        for key in ("margin_units", "minimum_threshold_units"):
+            with pytest.raises(RequestError, match=r"no press would be felt by taxels 0-"):
+                await handle("thresholds", b'{"set":{"%s":255}}' % key.encode())
+        assert await handle("thresholds", b"{}") == before
+        await handle("thresholds", b'{"set":{"margin_units":40}}')
+
+
+@stepped
+async def test_taxels_of_which_no_reading_reaches_the_threshold_are_not_valid(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    kept = NodeState(thresholds=Thresholds(margin_units=255.0))
+    write_document(tmp_path / "demo-main.state.json", kept)
+    async with living(can_bus_settings, tmp_path, clock=clock) as live:
+        daemon = live.daemon
+        health = daemon.records()["left_hand"]
+        assert health["valid_taxels"] == 0
+        assert len(health["taxel_verdicts"]["unreached"]) == health["taxels"]
+        assert ("taxel_unreached", "left_hand") in live.faults()
+        daemon.set_thresholds(Thresholds())
+        await live.until_well()
+        assert daemon.records()["left_hand"]["valid_taxels"] == health["taxels"]
+
+
+@stepped
 async def test_an_empty_request_changes_nothing(
     clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
 ) -> None:

@@ -122,6 +122,7 @@ LASTING = {
     "taxel_refused": "calibrate",
     "taxel_saturates": "configure, calibrate",
     "taxel_unproven": "calibrate",
+    "taxel_unreached": "thresholds",
     "triangle_answers_again": "configure",
     "triangle_constant": "calibrate",
     "fingertip_noisy": "calibrate",
