@@ -33,7 +33,7 @@ class SkinCallbacks:
     The functions run one after the other in one thread, which is not the caller's: data that they
     share with it needs a lock, and while one of them runs nothing else is received. An exception in
     one of them is logged, and the next ones are called. In them `present` can be asked, and nothing
-    that waits: `info`, `command` and `on_...` raise a RequestError there.
+    that waits: `ready`, `info`, `command` and `on_...` raise a RequestError there.
 
     Raises (on entering): see `SkinClient`.
     """
@@ -105,6 +105,10 @@ class SkinCallbacks:
     def on_health(self, call: Callable[[Health], object], part: str | None = None) -> None:
         """Call with each record of a part's health, or of all parts' health."""
         self._on(lambda: self._skin.health(part), call)
+
+    def ready(self) -> None:
+        """Wait until what follows reaches the functions: the broker knows what they ask for."""
+        self._wait_for(self._skin.ready())
 
     def info(self, timeout_s: float = 5.0) -> dict[str, NodeInfo]:
         return self._wait_for(self._skin.info(timeout_s))
