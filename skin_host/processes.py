@@ -110,6 +110,8 @@ def _begin(parent: int) -> None:
 def _end(*_: object) -> None:
     global _is_ended  # noqa: PLW0603
     _is_ended = True
+    # The pool asks again when another one has ended, which would interrupt the cleaning up.
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     # An exception is lost where nothing can be raised, such as in a destructor: then once more.
     sys.unraisablehook = lambda _: None
     signal.setitimer(signal.ITIMER_REAL, AGAIN_S)

@@ -43,6 +43,17 @@ def works_on(folder: Path) -> None:
             time.sleep(0.01)
 
 
+def cleans_up_slowly(folder: Path) -> None:
+    (folder / "working").touch()
+    try:
+        while True:
+            time.sleep(0.01)
+    finally:
+        (folder / "cleaning").touch()
+        time.sleep(0.3)
+        (folder / "clean").touch()
+
+
 def wait_for(condition: Callable[[], object]) -> None:
     asyncio.run(until(condition))
 
@@ -83,6 +94,18 @@ def test_an_exception_ends_the_others_at_once_and_they_clean_up(tmp_path):
         raise KeyboardInterrupt
     assert all(map(is_gone, running))
     assert not workers(tmp_path)
+
+
+def test_one_that_is_told_twice_to_end_finishes_cleaning_up(tmp_path):
+    """When one of several has ended, the pool ends the others once more."""
+    with pytest.raises(KeyboardInterrupt), Processes(1) as processes:
+        processes.submit(cleans_up_slowly, tmp_path)
+        wait_for((tmp_path / "working").exists)
+        (child,) = multiprocessing.active_children()
+        child.terminate()
+        wait_for((tmp_path / "cleaning").exists)
+        raise KeyboardInterrupt
+    assert (tmp_path / "clean").exists()
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
