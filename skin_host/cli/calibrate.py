@@ -108,6 +108,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     from skin_host.files import refuse_newer
     from skin_host.layout import parts_of
     from skin_host.processing import calibration as calibrations
+    from skin_host.processing.calibration.file import SCHEMA, save_calibration, with_gains_of
 
     set_up_logging(arguments.verbose)
     if arguments.relaxation is not None or arguments.pressure is not None:
@@ -116,7 +117,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     warn_of_virtual(settings)
     parts = parts_of(layout, arguments.node)
     path = arguments.output or calibration_path(settings, arguments.node)
-    refuse_newer(path, calibrations.SCHEMA, "calibration")
+    refuse_newer(path, SCHEMA, "calibration")
     progress = Progress("calibrating, keep the skin untouched")
     try:
         found = asyncio.run(
@@ -124,8 +125,8 @@ def _calibrate(arguments: argparse.Namespace) -> int:
         )
     finally:
         progress.close()
-    found = calibrations.with_gains_of(found, path, layout)
-    calibrations.save(path, found, layout)
+    found = with_gains_of(found, path, layout)
+    save_calibration(path, found, layout)
     triangles = triangle_verdicts(found, layout, parts)
     tips = {
         name: name in found.zeros
@@ -208,7 +209,7 @@ def _relaxation(arguments: argparse.Namespace) -> int:
 
 def _pressure(arguments: argparse.Namespace) -> int:
     from skin_host.daemon.calibrate import calibration_path
-    from skin_host.processing import calibration as calibrations
+    from skin_host.processing.calibration.file import save_calibration
     from skin_host.recording import fitting
 
     if (arguments.load is None) == (not arguments.levels):
@@ -222,7 +223,7 @@ def _pressure(arguments: argparse.Namespace) -> int:
     samples = _read_samples(arguments.pressure, settings, layout, arguments.seconds)
     found, fit = fitting.fit_pressures(samples, settings, layout, arguments.levels)
     path = arguments.output or calibration_path(settings, arguments.node)
-    calibrations.save(path, found, layout)
+    save_calibration(path, found, layout)
     counts = {
         "fitted": int(fit.fitted.sum()),
         "bent": int(fit.bent.sum()),
@@ -258,7 +259,7 @@ def _course(arguments: argparse.Namespace) -> int:
 
     from skin_host.daemon.calibrate import calibration_path
     from skin_host.health.diagnosis import named
-    from skin_host.processing import calibration as calibrations
+    from skin_host.processing.calibration.file import save_calibration
     from skin_host.processing.curves import CurveVerdict
     from skin_host.recording import fitting
     from skin_host.recording.load_table import check_course, read_table
@@ -269,7 +270,7 @@ def _course(arguments: argparse.Namespace) -> int:
     samples = _read_samples(arguments.pressure, settings, layout, arguments.seconds)
     found, curves = fitting.fit_curves(samples, settings, layout, load, arguments.load)
     path = arguments.output or calibration_path(settings, arguments.node)
-    calibrations.save(path, found, layout)
+    save_calibration(path, found, layout)
     verdicts = curve_verdicts(curves, layout)
     counts = {
         verdict.name.lower(): sum(len(taxels[verdict.name.lower()]) for taxels in verdicts.values())

@@ -268,14 +268,14 @@ def _export(arguments: argparse.Namespace) -> int:
 
 def _plot(arguments: argparse.Namespace) -> int:
     from skin_host.config.settings import skin_hash
-    from skin_host.processing import calibration
+    from skin_host.processing.calibration.file import load_calibration
     from skin_host.recording import plots
 
     if arguments.what == "calibration":
         if arguments.config is None:
             raise RequestError("a calibration is drawn with --config, whose skin it is of")
         settings, layout = load_skin(arguments.config)
-        found = calibration.load(arguments.recording, layout, skin_hash(settings))
+        found = load_calibration(arguments.recording, layout, skin_hash(settings))
         plots.plot_calibration(found, layout, arguments.output)
     else:
         series = _series(arguments)

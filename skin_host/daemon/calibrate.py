@@ -13,8 +13,8 @@ from skin_host.daemon.state import can_be_read, kept_path
 from skin_host.errors import CalibrationError, OtherSkinError, SkinError
 from skin_host.files import set_aside
 from skin_host.layout import Layout
-from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration
+from skin_host.processing.calibration.file import load_calibration
 from skin_host.processing.core import Engine
 from skin_host.tasks import cancel
 
@@ -131,7 +131,7 @@ def stored_calibration(settings: Settings, layout: Layout, node: str) -> Calibra
     if not can_be_read(path, "a new one is taken"):
         return None
     try:
-        return calibrations.load(path, layout, skin_hash(settings))
+        return load_calibration(path, layout, skin_hash(settings))
     except OtherSkinError:
         raise
     except CalibrationError as error:

@@ -33,6 +33,7 @@ from skin_host.mqtt.info import CalibrationInfo, NodeInfo, node_info
 from skin_host.mqtt.publisher import Connect, Publisher
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration
+from skin_host.processing.calibration.file import find_calibration, save_calibration
 from skin_host.processing.core import SHORTEST_S, Engine, Output
 from skin_host.tasks import cancel
 
@@ -232,7 +233,7 @@ class Daemon:
             # Gains and curves are the file's: another program may have fitted them meanwhile.
             path = self._path("calibration")
             before = await self.clock.in_thread(
-                calibrations.find, path, self.layout, self.engine.configuration
+                find_calibration, path, self.layout, self.engine.configuration
             )
             log.info("calibrating for %g s: keep the skin untouched", max(seconds, SHORTEST_S))
             found = await collect(lambda: self.engine, seconds, clock=self.clock)
@@ -602,7 +603,7 @@ class Daemon:
                 return
             path = self._path("calibration")
             try:
-                await self.clock.in_thread(calibrations.save, path, found, self.layout)
+                await self.clock.in_thread(save_calibration, path, found, self.layout)
             except OSError as error:
                 self._note_unkept("calibration", error)
             else:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from emulator.chips.noise import SampledNoise
 from skin_host.config.settings import Settings
 from skin_host.layout import Layout, build_layout
-from skin_host.processing.calibration import KNOWN_SAMPLES, Calibrator
+from skin_host.processing.calibration.calibrator import KNOWN_SAMPLES, Calibrator
 from skin_host.processing.pipeline import Pipeline, PressureFrame
 
 BOARDS_PER_BUS = 14

@@ -21,7 +21,8 @@ from skin_host.health.record import (
 )
 from skin_host.health.watch import Watch
 from skin_host.layout import TAXELS_PER_TRIANGLE, PadKind
-from skin_host.processing.calibration import USUAL_SHIFT, Calibration, Verdict
+from skin_host.processing.calibration import Calibration, Verdict
+from skin_host.processing.calibration.calibrator import USUAL_SHIFT
 from skin_host.processing.core import Engine
 from skin_host.processing.intake import FAR_PADS, lifted
 from skin_host.processing.masks import Mask, any_of

@@ -20,14 +20,8 @@ from skin_host.bus.wire import TRIANGLES, FrameBatch, StatusError
 from skin_host.config.settings import Settings, TouchSettings, skin_hash
 from skin_host.fingertip.events import FingertipEvent
 from skin_host.layout import Layout
-from skin_host.processing.calibration import (
-    KNOWN_SAMPLES,
-    Calibration,
-    Calibrator,
-    Known,
-    Verdict,
-    with_zeros,
-)
+from skin_host.processing.calibration import Calibration, Verdict, with_zeros
+from skin_host.processing.calibration.calibrator import KNOWN_SAMPLES, Calibrator, Known
 from skin_host.processing.contacts import ContactTracker
 from skin_host.processing.conversions import CONVERSION_S
 from skin_host.processing.events import Touch

@@ -26,7 +26,7 @@ zero is in doubt.
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.processing.calibration import SATURATED_SHARE
+from skin_host.processing.calibration.calibrator import SATURATED_SHARE
 from skin_host.processing.conversions import CONVERSION_S
 
 #: The new zero is observed for this long, and for this many sweeps if the board is slow; then the

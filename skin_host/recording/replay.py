@@ -21,7 +21,9 @@ from skin_host.files import whole_file
 from skin_host.health import HealthWatch
 from skin_host.layout import Layout, load_skin
 from skin_host.processing import calibration as calibrations
-from skin_host.processing.calibration import NOISE_SAMPLES, Calibration
+from skin_host.processing.calibration import Calibration
+from skin_host.processing.calibration.calibrator import NOISE_SAMPLES
+from skin_host.processing.calibration.file import load_calibration
 from skin_host.processing.core import Engine, Output, Step
 from skin_host.recording import MCAP_SUFFIX
 from skin_host.recording.lines import LineWriter, health_line
@@ -91,7 +93,7 @@ def calibration_for(
     """
     known = None
     if file is not None:
-        known = calibrations.load(file, layout, skin_hash(settings))
+        known = load_calibration(file, layout, skin_hash(settings))
         if seconds is None:
             return known
     zero = calibrate_from_log(log, settings, layout, seconds or UNTOUCHED_S)

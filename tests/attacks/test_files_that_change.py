@@ -26,6 +26,7 @@ from skin_host.files import read_whole, write_atomic
 from skin_host.layout import build_layout
 from skin_host.mqtt.address import Broker
 from skin_host.processing import calibration as calibrations
+from skin_host.processing.calibration.file import load_calibration, save_calibration, with_gains_of
 from skin_host.recording.capture import CanLog, FrameRecorder, PageRecording
 from skin_host.recording.mcap import Recorder
 from tests.support.fault_bench import FaultBench
@@ -96,7 +97,7 @@ def test_a_calibration_that_another_program_is_writing_is_neither_used_nor_set_a
     layout = build_layout(settings, CONFIG.parent)
     path = calibration_path(settings, "main")
     assert calibrated.engine.calibration is not None
-    calibrations.save(path, calibrated.engine.calibration, layout)
+    save_calibration(path, calibrated.engine.calibration, layout)
     whole = path.read_bytes()
     with path.open("wb") as copy:
         copy.write(whole[: len(whole) // 2])
@@ -104,7 +105,7 @@ def test_a_calibration_that_another_program_is_writing_is_neither_used_nor_set_a
         with pytest.raises(BusyFileError, match=r"calibration\.json: another program is writing"):
             stored_calibration(settings, layout, "main")
         with pytest.raises(BusyFileError):
-            calibrations.with_gains_of(calibrated.engine.calibration, path, layout)
+            with_gains_of(calibrated.engine.calibration, path, layout)
         copy.write(whole[len(whole) // 2 :])
     assert [one.name for one in tmp_path.iterdir()] == [path.name]
     assert stored_calibration(settings, layout, "main") is not None
@@ -157,14 +158,14 @@ async def test_gains_that_another_program_fits_while_the_daemon_runs_are_not_los
     async with living(can_bus_settings, tmp_path, clock=clock) as live:
         daemon = live.daemon
         configuration = daemon.engine.configuration
-        stored = calibrations.load(path, daemon.layout, configuration)
+        stored = load_calibration(path, daemon.layout, configuration)
         fitted = calibrations.with_gains(stored, 1.25 * stored.gain, stored.bend)
-        calibrations.save(path, fitted, daemon.layout)
+        save_calibration(path, fitted, daemon.layout)
         for request in (b'{"seconds":0.5,"board":"hand"}', b'{"seconds":0.5}'):
             await daemon.control.handle("calibrate", request)
             for found in (
                 daemon.engine.calibration,
-                calibrations.load(path, daemon.layout, configuration),
+                load_calibration(path, daemon.layout, configuration),
             ):
                 assert found is not None
                 assert found.gain == pytest.approx(1.25 * stored.gain)

@@ -15,7 +15,7 @@ import pytest
 
 from skin_host.cli import build_parser, main, watch
 from skin_host.config.settings import skin_hash
-from skin_host.processing.calibration import Calibrator
+from skin_host.processing.calibration.calibrator import Calibrator
 from tests.support.broker import free_port
 from tests.support.waiting import PATIENCE_S
 

@@ -22,7 +22,7 @@ from skin_host.errors import NewerFileError, OtherSkinError
 from skin_host.files import write_document
 from skin_host.layout import PadKind, build_layout
 from skin_host.mqtt.publisher import Publisher
-from skin_host.processing import calibration as calibrations
+from skin_host.processing.calibration.file import save_calibration
 from tests.support.broker import Mosquitto, free_port
 from tests.support.fault_bench import FaultBench
 from tests.support.live import CONFIG, living
@@ -76,7 +76,7 @@ def kept(calibrated: FaultBench, tmp_path: Path) -> tuple[Any, Any, Path]:
     layout = build_layout(settings, CONFIG.parent)
     path = calibration_path(settings, "main")
     assert calibrated.engine.calibration is not None
-    calibrations.save(path, calibrated.engine.calibration, layout)
+    save_calibration(path, calibrated.engine.calibration, layout)
     return settings, layout, path
 
 

@@ -26,8 +26,8 @@ from skin_host.fingertip.health import FingertipHealth, FingertipRecord
 from skin_host.fingertip.service import StrainBoards
 from skin_host.layout import build_layout
 from skin_host.mqtt import messages
-from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Zero
+from skin_host.processing.calibration.file import load_calibration, save_calibration
 from skin_host.processing.core import Engine
 from skin_host.processing.events import Touch
 from tests.support.strain import encode_strain
@@ -349,8 +349,8 @@ async def test_a_fingertip_that_was_touched_when_calibrated_is_named_until_it_wa
     found = bench.engine.calibration
     assert found is not None
     layout, skin = bench.engine.layout, bench.engine.configuration
-    calibrations.save(tmp_path / "calibration.json", found, layout)
-    kept = calibrations.load(tmp_path / "calibration.json", layout, skin)
+    save_calibration(tmp_path / "calibration.json", found, layout)
+    kept = load_calibration(tmp_path / "calibration.json", layout, skin)
     assert {name: zero.touched for name, zero in kept.zeros.items()} == {
         "index": True,
         "thumb": False,

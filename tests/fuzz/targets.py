@@ -20,7 +20,7 @@ from skin_host.errors import NewerFileError, RequestError, SkinError
 from skin_host.health import HealthWatch
 from skin_host.layout import Layout, build_layout
 from skin_host.mqtt.commands import CommandHandler, decode_result
-from skin_host.processing import calibration as calibrations
+from skin_host.processing.calibration.file import load_calibration
 from skin_host.processing.core import Engine
 
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
@@ -111,7 +111,7 @@ def calibration_file(data: bytes) -> None:
     path.write_bytes(data)
     settings, layout = skin()
     with contextlib.suppress(RequestError):
-        calibrations.load(path, layout, skin_hash(settings))
+        load_calibration(path, layout, skin_hash(settings))
 
 
 def state_file(data: bytes) -> None:

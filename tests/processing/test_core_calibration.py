@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from skin_host.bus.wire import FrameBatch, encode_sweep
 from skin_host.config.settings import load
 from skin_host.layout import build_layout
-from skin_host.processing.calibration import KNOWN_SAMPLES, Verdict
+from skin_host.processing.calibration import Verdict
+from skin_host.processing.calibration.calibrator import KNOWN_SAMPLES
 from skin_host.processing.core import SHORTEST_S, Engine
 from tests.support.stack import ROOT
 

@@ -11,7 +11,8 @@ from skin_host.config.relaxation import MODELS
 from skin_host.config.settings import Processing, Settings
 from skin_host.evaluation.rig import Rig, flat_skin
 from skin_host.layout import PadKind, build_layout
-from skin_host.processing.calibration import Calibrator, Verdict
+from skin_host.processing.calibration import Verdict
+from skin_host.processing.calibration.calibrator import Calibrator
 from skin_host.processing.pipeline import Pipeline
 from skin_host.processing.pressure import PressureCurve
 

@@ -15,7 +15,7 @@ from skin_host.config.settings import load, skin_hash
 from skin_host.errors import ConfigurationError, RequestError
 from skin_host.evaluation.histories import record
 from skin_host.layout import build_layout
-from skin_host.processing import calibration
+from skin_host.processing.calibration.file import load_calibration
 from skin_host.processing.pressure import PressureCurve
 from skin_host.recording.fitting import plateaus
 
@@ -189,7 +189,7 @@ def test_levels_of_air_pressure_become_gains_that_halve_the_error(bench, tmp_pat
     assert told["rms_after_kpa"] < 0.5 * told["rms_before_kpa"]
     settings = load(bench)
     layout = build_layout(settings, bench.parent)
-    found = calibration.load(output, layout, skin_hash(settings))
+    found = load_calibration(output, layout, skin_hash(settings))
     assert found.gain.std() > 0.01
 
 

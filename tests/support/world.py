@@ -21,7 +21,7 @@ from skin_host.layout import build_layout
 from skin_host.mqtt.frames import encode_frame
 from skin_host.mqtt.info import encode_info, node_info
 from skin_host.mqtt.messages import encode_event
-from skin_host.processing import calibration
+from skin_host.processing.calibration.file import save_calibration
 from skin_host.processing.core import Engine
 from skin_host.recording.capture import CanLog
 from skin_host.recording.mcap import Recorder
@@ -98,7 +98,7 @@ class World:
                 for sink in (frames, same):
                     sink.put(self.channel("robot"), later)
         found = calibrate_from_log(log, settings, layout, 5.0)
-        calibration.save(self.folder / "robot-main.calibration.json", found, layout)
+        save_calibration(self.folder / "robot-main.calibration.json", found, layout)
         engine = Engine(settings, layout, [0, 1], found)
         info = node_info(layout, "main", version="1", configuration="x")
         with Recorder(self.folder / "grasp.mcap") as recorder:

@@ -29,7 +29,7 @@ from skin_host.evaluation.simulate.troubles import KINDS, Trouble
 from skin_host.evaluation.simulate.world import Life, World
 from skin_host.fingertip.events import FingertipEvent
 from skin_host.layout import PadKind
-from skin_host.processing import calibration as calibrations
+from skin_host.processing.calibration.file import save_calibration
 from skin_host.processing.events import Touch
 
 DEMO = configuration("demo.toml")
@@ -412,7 +412,7 @@ def test_a_calibration_of_one_board_keeps_the_zeros_of_the_others(
         path = calibration_path(settings, "main")
         for known in (life.daemon.engine.calibration, calibrated):
             assert known is not None
-            calibrations.save(path, known, layout)
+            save_calibration(path, known, layout)
             after = stored_calibration(settings, layout, "main")
             pipeline = Daemon(settings, layout, calibration=after).engine.pipeline
             assert pipeline is not None

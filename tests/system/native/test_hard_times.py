@@ -18,8 +18,8 @@ from skin_host.config.settings import skin_hash
 from skin_host.daemon.daemon import Daemon
 from skin_host.daemon.state import NodeState, load_kept
 from skin_host.errors import SkinError
-from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration
+from skin_host.processing.calibration.file import load_calibration
 from tests.support import scheduled_bus
 from tests.support.broker import Mosquitto
 from tests.support.programs import require
@@ -106,7 +106,7 @@ async def refused_by_the_disk(
     await sweeps_go_on(daemon)
     # Nothing is damaged, nothing half written lies about.
     assert contents(state) == kept
-    calibrations.load(
+    load_calibration(
         state / "load-main.calibration.json", daemon.layout, skin_hash(daemon.settings)
     )
     assert load_kept(state / "load-main.state.json", NodeState).thresholds.margin_units == 3.0

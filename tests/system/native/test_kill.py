@@ -18,7 +18,7 @@ import pytest
 from skin_host.config.settings import load, skin_hash
 from skin_host.daemon.state import NodeState
 from skin_host.layout import build_layout
-from skin_host.processing import calibration as calibrations
+from skin_host.processing.calibration.file import load_calibration
 from tests.support.broker import Mosquitto
 from tests.support.programs import require
 
@@ -113,7 +113,7 @@ def test_kill_9_at_any_moment_damages_nothing(mosquitto: Mosquitto, tmp_path: Pa
         finally:
             process.send_signal(signal.SIGKILL)
             process.wait()
-        calibrations.load(state / "demo-main.calibration.json", layout, skin_hash(settings))
+        load_calibration(state / "demo-main.calibration.json", layout, skin_hash(settings))
         kept = state / "demo-main.state.json"
         if kept.exists():
             content = json.loads(kept.read_bytes())

@@ -1,0 +1,217 @@
+"""A calibration outlives its program: what a file keeps, and what is refused."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skin_host.errors import CalibrationError
+from skin_host.processing import calibration
+from skin_host.processing.calibration import Verdict
+from skin_host.processing.calibration.file import load_calibration, save_calibration, with_gains_of
+from skin_host.processing.curves import KNOTS_UNITS, Curves, CurveVerdict, Memory, rising
+from tests.support.calibrated import LAYOUT, TIME, N, calibrated, noisy
+
+
+@pytest.fixture
+def untouched():
+    return calibrated(noisy(np.random.default_rng(0)))
+
+
+def test_a_file_brings_back_what_was_saved(untouched, tmp_path):
+    path = tmp_path / "new" / "calibration.json"
+    save_calibration(path, untouched, LAYOUT)
+    found = load_calibration(path, LAYOUT, "abc")
+    assert (found.id, found.time) == (untouched.id, TIME)
+    assert found.baseline == pytest.approx(untouched.baseline, abs=1e-6)
+    assert np.array_equal(found.verdict, untouched.verdict)
+    assert json.loads(path.read_text())["schema"] == "skin.calibration/1"
+
+
+def test_other_numbers_have_another_id(untouched):
+    other = calibration.with_gains(untouched, np.full(N, 1.1), untouched.bend)
+    assert other.id != untouched.id
+    assert calibration.with_gains(untouched, untouched.gain, untouched.bend).id == untouched.id
+
+
+def test_zeros_of_fingertips_are_kept_with_it_and_renewed_with_the_whole_skin(untouched, tmp_path):
+    zeros = {"index": calibration.Zero(np.arange(6.0), np.full(6, 1e-3))}
+    taken = calibration.with_zeros(untouched, zeros)
+    assert taken.id != untouched.id
+    path = tmp_path / "calibration.json"
+    save_calibration(path, taken, LAYOUT)
+    found = load_calibration(path, LAYOUT, "abc")
+    assert found.zeros["index"].offset.tolist() == list(range(6))
+    assert found.zeros["index"].noise.tolist() == [1e-3] * 6
+    newer = calibration.with_zeros(
+        untouched, {"index": calibration.Zero(np.ones(6), np.full(6, 1e-3))}
+    )
+    every = np.ones(N, bool)
+    assert calibration.merge(found, newer, every).zeros["index"].offset[0] == 1.0
+    assert calibration.merge(found, newer, ~every, zeros=False).zeros["index"].offset[0] == 0.0
+    # A board that was silent meanwhile keeps the zero that it had.
+    assert calibration.merge(found, untouched, every).zeros["index"].offset[0] == 0.0
+    text = path.read_text()
+    at = text.index('"fingertips"')
+    path.write_text(text[:at] + text[at:].replace('"noise": [', '"noise": [1,', 1))
+    with pytest.raises(CalibrationError, match=r"fingertips\.index: wanted twice 6 finite numbers"):
+        load_calibration(path, LAYOUT, "abc")
+
+
+def test_pads_that_are_not_used_may_have_any_noise(untouched, tmp_path):
+    path = tmp_path / "calibration.json"
+    spread, verdict = untouched.spread.copy(), untouched.verdict.copy()
+    spread[3], verdict[3] = 4000.0, Verdict.TOO_NOISY
+    save_calibration(path, replace(untouched, spread=spread, verdict=verdict), LAYOUT)
+    assert load_calibration(path, LAYOUT, "abc").spread[3] == 4000.0
+
+
+def test_gains_outlive_a_new_zero(untouched, tmp_path):
+    path = tmp_path / "calibration.json"
+    assert with_gains_of(untouched, path, LAYOUT) is untouched
+    fitted = calibration.with_gains(untouched, np.full(N, 1.2), np.full(N, 0.9))
+    save_calibration(path, fitted, LAYOUT)
+    renewed = calibrated(noisy(np.random.default_rng(77)))
+    kept = with_gains_of(renewed, path, LAYOUT)
+    assert kept.gain == pytest.approx(np.full(N, 1.2))
+    assert kept.bend == pytest.approx(np.full(N, 0.9))
+    assert kept.baseline == pytest.approx(renewed.baseline)
+
+
+def test_a_file_without_bends_is_understood(untouched, tmp_path):
+    path = tmp_path / "calibration.json"
+    save_calibration(path, untouched, LAYOUT)
+    document = json.loads(path.read_text())
+    del document["parts"]["skin"]["bend"]
+    path.write_text(json.dumps(document))
+    assert load_calibration(path, LAYOUT, "abc").bend == pytest.approx(np.ones(N))
+
+
+def test_a_file_without_spreads_is_understood(untouched, tmp_path):
+    path = tmp_path / "calibration.json"
+    save_calibration(path, untouched, LAYOUT)
+    document = json.loads(path.read_text())
+    del document["parts"]["skin"]["spread"]
+    path.write_text(json.dumps(document))
+    found = load_calibration(path, LAYOUT, "abc")
+    assert found.spread == pytest.approx(untouched.noise, abs=1e-6)
+
+
+def damaged(document, path):
+    path.write_text(json.dumps(document))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda d: d.update(schema="skin.relaxation/1"), "schema"),
+        (lambda d: d.update(configuration="xyz"), "belongs to configuration xyz"),
+        (lambda d: d["parts"].clear(), 'no part "skin"'),
+        (lambda d: d["parts"]["skin"]["baseline"].pop(), "parts.skin.baseline: wanted 192"),
+        (lambda d: d["parts"]["skin"]["gain"].__setitem__(3, -1.0), "parts.skin.gain"),
+        (lambda d: d["parts"]["skin"]["verdict"].__setitem__(3, "fine"), "parts.skin.verdict"),
+        (lambda d: d.pop("time"), "not a calibration file"),
+        # With these a pad would be valid and feel nothing, or anything.
+        (lambda d: d["parts"]["skin"]["baseline"].__setitem__(3, 300.0), "from -255 to 255"),
+        (lambda d: d["parts"]["skin"]["baseline"].__setitem__(3, -1e300), "from -255 to 255"),
+        (lambda d: d["parts"]["skin"]["noise"].__setitem__(3, -1.0), "from 0 to 255"),
+        (lambda d: d["parts"]["skin"]["spread"].__setitem__(3, 300.0), "taxel 3 has so much noise"),
+        (lambda d: d["parts"]["skin"]["gain"].__setitem__(3, 1e12), "from 0.01 to 100"),
+        (lambda d: d["parts"]["skin"]["bend"].__setitem__(3, 1e-300), "from 0.01 to 100"),
+        (lambda d: d["parts"]["skin"].update(verdict=["ok"]), "verdict: wanted 192 words"),
+        (lambda d: d.update(id="x\nERROR forged"), "not a calibration file"),
+        (lambda d: d.update(time="x" * 100_000), "not a calibration file"),
+    ],
+)
+def test_a_file_that_does_not_fit_is_refused_in_one_line_with_the_remedy(
+    untouched, tmp_path, damage, message
+):
+    path = tmp_path / "calibration.json"
+    save_calibration(path, untouched, LAYOUT)
+    document = json.loads(path.read_text())
+    damage(document)
+    damaged(document, path)
+    with pytest.raises(CalibrationError) as caught:
+        load_calibration(path, LAYOUT, "abc")
+    text = str(caught.value)
+    assert message in text
+    assert str(path) in text
+    assert "skin calibrate CONFIG" in text
+    assert "\n" not in text
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff\xfe", b"[1, 2]", b'{"schema": 3}'])
+def test_what_is_no_calibration_is_refused(tmp_path, content):
+    path = tmp_path / "calibration.json"
+    path.write_bytes(content)
+    with pytest.raises(CalibrationError, match="skin calibrate"):
+        load_calibration(path, LAYOUT, "abc")
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    with pytest.raises(CalibrationError, match="cannot be read"):
+        load_calibration(tmp_path / "none.json", LAYOUT, "abc")
+
+
+def own_curves(good=slice(None), noise=0.8):
+    kpa = np.tile(8.0 * KNOTS_UNITS, (N, 1)) + np.arange(N)[:, np.newaxis] * KNOTS_UNITS * 0.1
+    verdict = np.full(N, CurveVerdict.JUMPS, np.uint8)
+    verdict[good] = CurveVerdict.GOOD
+    return Curves(
+        rising(kpa),
+        np.full(N, 42.0),
+        np.full(N, noise),
+        np.where(verdict == CurveVerdict.GOOD, 4.2, np.nan),
+        verdict,
+        340.0,
+        -0.3,
+        Memory((20.0,), (0.25,)),
+    )
+
+
+def test_curves_are_kept_with_it_and_outlive_new_zeros(untouched, tmp_path):
+    fitted = calibration.with_curves(untouched, own_curves(slice(0, 7)))
+    assert fitted.id != untouched.id
+    assert np.array_equal(np.flatnonzero(fitted.usable), range(7))
+    path = tmp_path / "calibration.json"
+    save_calibration(path, fitted, LAYOUT)
+    renewed = with_gains_of(calibrated(noisy(np.random.default_rng(77))), path, LAYOUT)
+    every = np.ones(N, bool)
+    for found in (load_calibration(path, LAYOUT, "abc"), renewed):
+        assert found.curves.kpa[:7] == pytest.approx(fitted.curves.kpa[:7], abs=1e-5)
+        assert np.array_equal(found.curves.verdict, fitted.curves.verdict)
+        assert found.curves.memory == fitted.curves.memory
+        assert found.curves.lag_s == -0.3
+    assert calibration.merge(fitted, untouched, every).curves is fitted.curves
+    assert load_calibration(path, LAYOUT, "abc").id == fitted.id
+
+
+def test_a_lively_pad_that_sends_one_byte_all_the_time_is_stuck():
+    constant = calibrated(np.full((125, N), 240))
+    found = calibration.with_curves(constant, own_curves(noise=1.0))
+    assert (found.verdict == Verdict.STUCK).all()
+    quiet = calibration.with_curves(constant, own_curves(noise=0.3))
+    assert (quiet.verdict == Verdict.OK).all()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"jumps"', '"leaps"', "verdict"),
+        ('"weight": [', '"weight": [1.0,', "radii"),
+        ('"highest_kpa": 340.0', '"highest_kpa": -1.0', "curves"),
+        ('"kpa": [\n', '"kpa": [[1.0],\n', "entries"),
+        ('"noise_units": [\n', '"noise_units": [1e999,\n', "calibration"),
+    ],
+)
+def test_damaged_curves_are_refused(untouched, tmp_path, old, new, message):
+    path = tmp_path / "calibration.json"
+    save_calibration(path, calibration.with_curves(untouched, own_curves(slice(0, 7))), LAYOUT)
+    text = path.read_text()
+    at = text.index('"curves"')
+    assert old in text[at:]
+    path.write_text(text[:at] + text[at:].replace(old, new, 1))
+    with pytest.raises(CalibrationError, match=message):
+        load_calibration(path, LAYOUT, "abc")
