@@ -457,4 +457,5 @@ def _simulate(arguments: argparse.Namespace) -> int:
         print_json(outcome.document(results))
     elif arguments.seeds > 1:
         print(outcome.summary(results))
-    return 1 if any(result.broken for result in results) else 0
+    failed = any(result.broken for result in results) or outcome.touched_too_often(results)
+    return 1 if failed else 0

@@ -3,17 +3,21 @@
 from pathlib import Path
 from typing import Any
 
-from skin_host.evaluation.simulate.run import RunResult, coverage
+from skin_host.evaluation.simulate.promises.chance import too_many
+from skin_host.evaluation.simulate.run import RunResult, coverage, touched_by_chance
+from skin_host.processing.touch import ODDS
 
 
 def line(result: RunResult) -> str:
     """Return the outcome of one seed."""
     speed = result.simulated_s / max(result.cpu_s, 1e-9)
     outcome = "a promise was broken" if result.broken else "every promise held"
+    by_chance = f" ({result.by_chance} by noise alone)" if result.by_chance else ""
     return (
         f"seed {result.seed}: {outcome}; {result.simulated_s:.0f} s in {result.cpu_s:.1f} s of CPU "
         f"({speed:.0f} x), {sum(result.troubles.values())} troubles, {result.touches} touch "
-        f"events, {result.deaths} ends of the daemon; {result.events} events, hash {result.digest}"
+        f"events{by_chance}, {result.deaths} ends of the daemon; {result.events} events, "
+        f"hash {result.digest}"
     )
 
 
@@ -50,7 +54,16 @@ def summary(results: list[RunResult]) -> str:
         f"{what} (not {', '.join(kinds[missing])})" if kinds[missing] else what
         for what, missing in ((came, "never_injected"), (named, "never_named"))
     )
-    return f"{kept} of {len(results)} seeds kept every promise\n{covered}"
+    touches, measurements = touched_by_chance(results)
+    noise = f"noise alone made {touches} touches in {measurements:.2g} measurements of valid pads"
+    if touched_too_often(results):
+        noise += f": the touch decision allows one in {ODDS:.0e}"
+    return f"{kept} of {len(results)} seeds kept every promise\n{covered}\n{noise}"
+
+
+def touched_too_often(results: list[RunResult]) -> bool:
+    """Return whether noise made more touches than the odds of the touch decision explain."""
+    return too_many(*touched_by_chance(results))
 
 
 def document(results: list[RunResult]) -> dict[str, Any]:
@@ -72,6 +85,8 @@ def document(results: list[RunResult]) -> dict[str, Any]:
                 "named": result.named,
                 "touches": result.touches,
                 "deaths": result.deaths,
+                "touches_by_noise": result.by_chance,
+                "measurements": result.measurements,
             }
             for result in results
         ],

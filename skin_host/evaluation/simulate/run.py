@@ -84,6 +84,7 @@ class RunResult:
         troubles: how many of each kind were injected.
         required, named: kinds that health had to name if they lasted, and those that it named.
         touches, deaths: events of touch, and ends of the daemon.
+        by_chance, measurements: touches by noise alone, and measurements of valid taxels.
     """
 
     seed: int
@@ -99,6 +100,8 @@ class RunResult:
     named: list[str] = field(default_factory=list)
     touches: int = 0
     deaths: int = 0
+    by_chance: int = 0
+    measurements: int = 0
 
 
 def simulate(
@@ -167,6 +170,12 @@ def _quietly(
 ) -> RunResult:
     logging.disable(logging.CRITICAL)
     return simulate(settings, layout, config, seed, seconds)
+
+
+def touched_by_chance(results: Iterable[RunResult]) -> tuple[int, int]:
+    """Return the touches by noise alone of some runs together, and their measurements."""
+    pairs = [(result.by_chance, result.measurements) for result in results]
+    return sum(touches for touches, _ in pairs), sum(number for _, number in pairs)
 
 
 def coverage(results: Iterable[RunResult]) -> dict[str, list[str]]:
@@ -248,6 +257,8 @@ class _Run:
         result.required = sorted(self._promises.accusations.required)
         result.named = sorted(self._promises.accusations.named)
         result.touches = self._promises.touches
+        chance = self._promises.chance
+        result.by_chance, result.measurements = chance.touches, chance.measurements
 
     def _unexpected(self, _: object, context: dict[str, Any]) -> None:
         error = context.get("exception")

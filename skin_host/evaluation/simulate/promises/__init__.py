@@ -66,6 +66,7 @@ class Promises:
         self.excuses = Excuses(world)
         self.subscribers = Subscribers(world)
         self._skin = SkinCheck(world, self.excuses)
+        self.chance = self._skin.chance
         self._zeros = ZeroCheck(world, self.excuses)
         self._fingertips = FingertipCheck(world, self.accusations)
         self._received = Received(world)

@@ -36,6 +36,9 @@ FELT_SAMPLES, DEAF_SAMPLES = 6, 3
 PAUSE_NS = round(0.75 * NS)
 #: A touch that begins is of something that presses, or did no longer ago.
 CAUSE_NS = 3 * NS
+#: Touches by noise alone are not more than the odds of the decision give with this probability: a
+#: run of the demo's robot may have none in two minutes, and one in an hour.
+UNLIKELY = 1e-3
 #: Foam that was pressed still relaxes for so long.
 RELAXED_NS = 60 * NS
 #: A touch that lasted through a silence begins again within this time.

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.evaluation.simulate.promises.chance import Chance
 from skin_host.evaluation.simulate.promises.excuses import Excuses
 from skin_host.evaluation.simulate.promises.limits import (
     AGAIN_NS,
@@ -39,12 +40,14 @@ class SkinCheck:
         excuses: which taxels are not judged, and when each was pressed.
 
     Attributes:
+        chance: touches by noise alone.
         open: by part the touches that have begun and not ended.
         valid_ns: when each taxel was last valid [n].
     """
 
     def __init__(self, world: World, excuses: Excuses) -> None:
         self._world, self._excuses = world, excuses
+        self.chance = Chance()
         layout = world.layout
         n = layout.n_taxels
         self._parts = {part.name: part for part in layout.parts}
@@ -116,7 +119,8 @@ class SkinCheck:
 
         What a press leaves in the foam looks like a light press to a daemon that did not receive
         the press; and a touch that lasts, as long as foam takes, begins again after a silence, or
-        when the computer was suspended, or is a piece of one that comes apart.
+        when the computer was suspended, or is a piece of one that comes apart. Noise touches a
+        single pad at times.
         """
         taxels = np.asarray(taxels, np.intp)
         mine = taxels + self._parts[part].start
@@ -128,7 +132,9 @@ class SkinCheck:
         lasts &= now_ns - self._blind_ns[mine] < AGAIN_NS
         before = self._frames.get(part)
         piece = before is not None and before.touched[taxels].any()
-        return bool(piece or (unheard | lasts).any())
+        if piece or (unheard | lasts).any():
+            return True
+        return len(mine) == 1 and self.chance.explains(int(mine[0]), now_ns)
 
     # ------------------------------------------------------------------ frames
 
@@ -156,6 +162,7 @@ class SkinCheck:
                 self._lost[mine][lost] = before.touched[lost]
             self._blind_ns[mine][~frame.valid] = self._now_ns()
         self._frames[name] = frame
+        self.chance.measurements += valid.count(b"\1")
         pressure = frame.pressure_kpa
         # Neither comparison holds for what is no number.
         if not (pressure.min() >= 0 and pressure.max() < np.inf):
@@ -194,8 +201,12 @@ class SkinCheck:
             return None
         begun = np.flatnonzero(frame.touched if felt is None else frame.touched & ~felt)
         self._felt[name] = frame.touched
-        caused = self._excuses.of_touches(begun + self._parts[name].start, RELAXED_NS)
+        start = self._parts[name].start
+        caused = self._excuses.of_touches(begun + start, RELAXED_NS)
         if caused.all():
+            return None
+        (vain,) = np.nonzero(~caused)
+        if len(vain) == 1 and self.chance.explains(int(begun[vain[0]]) + start, self._now_ns()):
             return None
         return f"taxels {begun[~caused].tolist()} are touched, and nothing presses"
 
