@@ -104,6 +104,7 @@ def _add_fits(calibrate: argparse.ArgumentParser) -> None:
 def _calibrate(arguments: argparse.Namespace) -> int:
     import asyncio
 
+    from skin_host.client.serving import served_by_daemon
     from skin_host.daemon.calibrate import calibration_path, take_calibration
     from skin_host.files import refuse_newer
     from skin_host.layout import parts_of
@@ -118,6 +119,14 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     parts = parts_of(layout, arguments.node)
     path = arguments.output or calibration_path(settings, arguments.node)
     refuse_newer(path, SCHEMA, "calibration")
+    served = asyncio.run(
+        served_by_daemon(settings, arguments.config.parent, {layout.parts[i].name for i in parts})
+    )
+    if served is not None:
+        raise RequestError(
+            f"a daemon publishes {served} at broker {settings.mqtt.host}: calibrating beside it "
+            "would zero its boards; ask it with `skin command calibrate`, or stop it"
+        )
     progress = Progress("calibrating, keep the skin untouched")
     try:
         found = asyncio.run(

@@ -12,7 +12,7 @@ import pytest_asyncio
 from skin_host.cli import main
 from skin_host.config.settings import Bus
 from tests.support.broker import Mosquitto
-from tests.support.live import living
+from tests.support.live import CONFIG, living
 
 
 @pytest_asyncio.fixture
@@ -95,3 +95,19 @@ async def test_a_daemon_that_has_gone_leaves_no_part_that_looks_well(
         assert "rate_hz" not in after[part]
     assert await skin("status", "--broker", url) == 1
     assert "node main is offline" in capsys.readouterr().out
+
+
+async def test_a_skin_that_a_daemon_serves_is_calibrated_by_that_daemon_only(
+    mosquitto: Mosquitto, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Another calibration would zero the boards under it, and be kept where it does not look."""
+    bus = Bus(interface="virtual", channel=tmp_path.name)
+    config = tmp_path / "robot.toml"
+    text = CONFIG.read_text().replace("skin-demo", tmp_path.name)
+    config.write_text(f'{text}\n[mqtt]\nhost = "{mosquitto.host}"\nport = {mosquitto.port}\n')
+    words = ["calibrate", str(config), "--output", str(tmp_path / "other.json")]
+    async with living(bus, tmp_path, port=mosquitto.port):
+        assert await skin(*words) == 2
+        assert "skin command calibrate" in capsys.readouterr().err.splitlines()[-1]
+    assert await skin(*words) == 1
+    assert "no board sent a sweep" in capsys.readouterr().err

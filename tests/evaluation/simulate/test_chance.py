@@ -38,5 +38,7 @@ def test_one_touch_is_counted_once_and_a_second_one_is_not_explained() -> None:
     assert chance.explains(7, 100 * S)
     assert chance.explains(7, 101 * S)
     assert chance.touches == 1
+    assert chance.lately(102 * S) == [7]
+    assert chance.lately(104 * S) == []
     assert not chance.explains(8, 101 * S)
     assert not chance.explains(7, 200 * S)

@@ -30,16 +30,19 @@ class Chance:
     def __init__(self) -> None:
         self.measurements = 0
         self.touches = 0
-        self._last: tuple[int, int] | None = None
+        #: When each of these was touched last.
+        self._touched_ns: dict[int, int] = {}
+
+    def lately(self, now_ns: int) -> list[int]:
+        """Return the taxels that noise has touched, and that may be touched still."""
+        return [taxel for taxel, t_ns in self._touched_ns.items() if now_ns - t_ns < CAUSE_NS]
 
     def explains(self, taxel: int, now_ns: int) -> bool:
-        """Return whether noise may touch a pad now; of one touch this can be asked repeatedly."""
-        if self._last is not None:
-            last, at_ns = self._last
-            if taxel == last and now_ns - at_ns < CAUSE_NS:
-                return True
+        """Return whether noise may touch a taxel now; of one touch this can be asked repeatedly."""
+        if taxel in self.lately(now_ns):
+            return True
         if too_many(self.touches + 1, self.measurements):
             return False
         self.touches += 1
-        self._last = taxel, now_ns
+        self._touched_ns[taxel] = now_ns
         return True

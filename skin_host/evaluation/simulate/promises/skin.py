@@ -250,6 +250,7 @@ class SkinCheck:
         least, most = longer[-4:].min(axis=0), longer.max(axis=0)
         pressed = self.pressed()
         rested = self._now_ns() - self._excuses.touched_ns > RELAXED_NS
+        rested[self.chance.lately(self._now_ns())] = False
         judged = self._pads & ~self._excuses.exempt & ~spoiled
         wall_ns = self._world.clock.now_ns()
         for name, frame in self._frames.items():
