@@ -34,7 +34,8 @@ from skin_host.mqtt.publisher import Connect, Publisher
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration
 from skin_host.processing.calibration.file import find_calibration, save_calibration
-from skin_host.processing.core import SHORTEST_S, Engine, Output
+from skin_host.processing.calibration.run import SHORTEST_S
+from skin_host.processing.core import Engine, Output
 from skin_host.tasks import cancel
 
 log = logging.getLogger(__name__)
@@ -127,8 +128,8 @@ class Daemon:
             elif had_zeros and not self._zeros.calibration:
                 # It could not be read: any of them may have been touched when their zero was taken.
                 doubted = layout.pad_kind == PadKind.PRESSURE
-            self.engine.doubt(doubted)
-        self.engine.hold(self.engine.boards)
+            self.engine.zeros.doubt(doubted)
+        self.engine.zeros.hold(self.engine.boards)
         self.health = HealthWatch(self.engine)
         self.control = Control(self)
         self.publisher = Publisher(
@@ -166,7 +167,7 @@ class Daemon:
         #: How many of the zeros found are kept; and which change of what is known of zeros the
         #: contacts know.
         self._zeros_kept = 0
-        self._zero_changes = self.engine.zero_changes
+        self._zero_changes = self.engine.zeros.changes
         self._clock_ahead_ns = self._clock_against_ns()
 
     async def run(self, stop: asyncio.Event, *, calibrate: bool = False) -> None:
@@ -241,7 +242,7 @@ class Daemon:
             if known is not None:
                 chosen = self.engine.boards if boards is None else boards
                 found = calibrations.merge(
-                    known, found, self.engine.taxels_of(chosen), zeros=boards is None
+                    known, found, self.engine.layout.taxels_of(chosen), zeros=boards is None
                 )
             if before is not None:
                 found = calibrations.with_pressures_of(found, before)
@@ -249,7 +250,7 @@ class Daemon:
                 log.warning("%s of %s: not calibrated, received too rarely", named(taxels), name)
             for name, taxels in calibrations.damaged(found, self.layout).items():
                 log.warning("%s of %s: calibrated without damaged bytes", named(taxels), name)
-            doubted = self.engine.zero_at_risk(touched=False)
+            doubted = self.engine.zeros.at_risk(touched=False)
             self.engine.use(found, boards)
             self._use_usable()
             if known is not None and boards is not None:
@@ -271,7 +272,7 @@ class Daemon:
         """Publish everything of a part again."""
         self.engine.disabled.discard(part)
         # A board may have been zeroed meanwhile while something pressed the part.
-        self._doubt_contacts(self.engine.may_be_touched(), [part])
+        self._doubt_contacts(self.engine.zeros.may_be_touched(), [part])
 
     def set_thresholds(self, thresholds: Thresholds) -> None:
         """Apply these changes to the configured touch thresholds; baselines are kept.
@@ -376,7 +377,7 @@ class Daemon:
         """Let contacts wait only for taxels that can be valid again."""
         calibration, pipeline = self.engine.calibration, self.engine.pipeline
         if calibration is not None and pipeline is not None:
-            usable = calibration.usable & ~self.engine.cut_off() & ~pipeline.unreached
+            usable = calibration.usable & ~self.engine.zeros.cut_off() & ~pipeline.unreached
             for index, contact in self._contacts.items():
                 part = self.layout.parts[index]
                 contact.use(usable[part.start : part.stop])
@@ -423,12 +424,12 @@ class Daemon:
             self.fingertips.deliver(output.grasps)
         if output.steps:
             self._follow_clock()
-            if self._zero_changes != self.engine.zero_changes:
+            if self._zero_changes != self.engine.zeros.changes:
                 # Something may press a pad whose zero was not found, did before it was held, or
                 # was zeroed away and has shown that when it lifted.
-                self._zero_changes = self.engine.zero_changes
+                self._zero_changes = self.engine.zeros.changes
                 self._use_usable()
-                self._doubt_contacts(self.engine.may_be_touched(), self.engine.parts)
+                self._doubt_contacts(self.engine.zeros.may_be_touched(), self.engine.parts)
             # Touches leave before the frames are encoded, and each with its part's contact: that is
             # ON in a touch only, also where several frames of a part were read together.
             for step in output.steps:
@@ -469,13 +470,13 @@ class Daemon:
         said_s = dict.fromkeys(self.engine.parts, 0.0)
         of_parts: dict[tuple[str, str], str] = {}
         pulse: tuple[object, ...] = ()
-        zeroed = self.engine.zero_changes
+        zeroed = self.engine.zeros.changes
         while True:
             await self.clock.sleep(LOOK_S)
             self.link.supervise()
             engine = self.engine
-            if zeroed != engine.zero_changes:
-                zeroed = engine.zero_changes
+            if zeroed != engine.zeros.changes:
+                zeroed = engine.zeros.changes
                 # At once: what was pressed then must be doubted after a crash, too.
                 self._begin_to_keep_zeros()
             now_s = self.clock.monotonic_s()
@@ -563,7 +564,7 @@ class Daemon:
         if found is None:
             return
         unknown: dict[str, list[int]] = {}
-        at_risk = engine.zero_at_risk(touched)
+        at_risk = engine.zeros.at_risk(touched)
         if doubted is not None:
             at_risk |= doubted
         if at_risk.any():
@@ -571,7 +572,7 @@ class Daemon:
                 mine = np.flatnonzero(at_risk[part.start : part.stop]).tolist()
                 if mine:
                     unknown[part.name] = mine
-        baselines, n_found = self._zeros.baselines, engine.zeros_found
+        baselines, n_found = self._zeros.baselines, engine.zeros.found
         calibrated = bool(baselines) and self._zeros.calibration != found.id
         if touched or calibrated or n_found != self._zeros_kept:
             baselines = self._baselines()

@@ -194,7 +194,7 @@ class Link:
             self._work()
             if self.read_ns >= now_ns:
                 break
-        self._engine.rezero(board, believed)
+        self._engine.zeros.rezero(board, believed)
 
     async def read(
         self,
@@ -399,7 +399,7 @@ class Link:
                     # was away may have another when it is back; then they are set up.
                     before, sweeps = sweeps, self._sweeps_of(boards)
                     sending = [one for one, n in sweeps.items() if n > before.get(one, n)]
-                    self._engine.release(sending)
+                    self._engine.zeros.release(sending)
                 await self._clock.sleep(RETRY_S)
 
     def _sweeps_of(self, boards: Boards) -> dict[int, int]:

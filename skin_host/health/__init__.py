@@ -232,7 +232,7 @@ def _pulse_of_boards(engine: Engine) -> tuple[object, ...]:
         ledger.any_silent and ledger.silent.tobytes(),
         (ledger.sweeps > 0).tobytes(),
         ledger.all_complete or np.minimum(ledger.absent, ABSENT_SWEEPS).tobytes(),
-        (engine.doubts(), engine.zero_changes),
+        (engine.zeros.doubts(), engine.zeros.changes),
         *(counts.tobytes() for counts in events),
     )
     if any(ledger.flagged):

@@ -243,7 +243,7 @@ class Describer:
             return None
         # Single pads are listed with the taxels; only a whole triangle counts here. Pads that were
         # pressed while their board was zeroed are reported as `board_in_doubt`.
-        far = ledger.far[row, number] & ~self._engine.in_doubt(board)[number]
+        far = ledger.far[row, number] & ~self._engine.zeros.in_doubt(board)[number]
         many = np.count_nonzero(far) >= FAR_PADS
         other = lifted(sweep.raw[number], far)
         return "out of range" if many or other else None
@@ -266,7 +266,7 @@ class Describer:
             }
             if ledger.flagged[row] and row not in ledger.twice:
                 answered = (ledger.error[row] == 0)[:, None]
-                far = ledger.far[row] & ~self._engine.in_doubt(index)
+                far = ledger.far[row] & ~self._engine.zeros.in_doubt(index)
                 masks["out_of_range"] = far & answered
             for kind, mask in masks.items():
                 found[kind][taxels[mine & mask] - layout.start] = True
@@ -338,7 +338,7 @@ class Describer:
         pipeline, calibration = self._engine.pipeline, self._engine.calibration
         assert pipeline is not None
         assert calibration is not None
-        now_ns, changes = self._watch.parts[part].sample_ns, self._engine.zero_changes
+        now_ns, changes = self._watch.parts[part].sample_ns, self._engine.zeros.changes
         known = self._baselines.setdefault(part, deque())
         while known and not (
             0 <= now_ns - known[0][0] <= FORMER_NS
@@ -353,12 +353,12 @@ class Describer:
         calibration, pipeline = self._engine.calibration, self._engine.pipeline
         if calibration is None or pipeline is None:
             return {}
-        known, changes = self._judged.get(part), self._engine.zero_changes
+        known, changes = self._judged.get(part), self._engine.zeros.changes
         if known is None or known[0] is not calibration or known[1] != changes:
             layout = self._layout.parts[part]
             mine = slice(layout.start, layout.stop)
             # A set-up may leave a pad as near to the end of the scale as a calibration may find it.
-            cut_off = (self._engine.cut_off() & calibration.usable)[mine]
+            cut_off = (self._engine.zeros.cut_off() & calibration.usable)[mine]
             verdict = np.where(cut_off, Verdict.OUT_OF_RANGE, calibration.verdict[mine])
             verdict = np.where(pressure, verdict, Verdict.OK)
             found = {
@@ -397,7 +397,7 @@ class Describer:
             "period_seen_ms": period_seen_ms,
             "jitter_ms": jitter_ms,
             "rezeros": int(ledger.rezeros[row]),
-            "in_doubt": int(np.count_nonzero(self._engine.in_doubt(index))),
+            "in_doubt": int(np.count_nonzero(self._engine.zeros.in_doubt(index))),
         }
         manager = boards.get(board.settings.bus)
         if manager is not None:
@@ -407,7 +407,8 @@ class Describer:
                 "wrong_type": known.is_wrong_type,
                 "firmware": known.firmware,
                 "in_bootloader": known.in_bootloader,
-                "awaited": manager.awaits(board.settings.address) or self._engine.paused(index),
+                "awaited": manager.awaits(board.settings.address)
+                or self._engine.zeros.paused(index),
                 "configurations": known.configurations,
                 "silences": int(ledger.silences[row]),
                 "resets": int(ledger.resets[row]),
@@ -481,7 +482,7 @@ class Describer:
         """Whether a board that had timed out sends again, but no sample has its values yet, or it
         is not known yet whether it zeroed itself meanwhile.
         """
-        if self._engine.compares(index):
+        if self._engine.zeros.compares(index):
             return True
         sweep = self._engine.ledger.last[self._engine.ledger.row[index]]
         if sweep is None or self._engine.ledger.flagged[self._engine.ledger.row[index]]:

@@ -4,6 +4,7 @@ A part's taxels lie side by side in the flat arrays, in the order of its patches
 their triangles, twelve a triangle. All other packages index by this order.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from enum import IntEnum
 from functools import cache
@@ -121,6 +122,14 @@ class Layout:
     def n_taxels(self) -> int:
         """How many taxels the skin has, thermal pads included."""
         return len(self.triangle_of)
+
+    def taxels_of(self, boards: Iterable[int]) -> NDArray[np.bool_]:
+        """Which taxels bool[n] some boards read, given by their indices."""
+        found = np.zeros(self.n_taxels, np.bool_)
+        for board in boards:
+            taxels = self.boards[board].taxel_index
+            found[taxels[taxels >= 0]] = True
+        return found
 
     def part(self, name: str) -> PartLayout:
         """The part called `name`.

@@ -93,7 +93,7 @@ async def test_what_was_touched_at_a_new_zero_is_in_doubt_until_calibrated(
         await live.until_well(but=LATELY)
         engine = live.daemon.engine
         part = engine.layout.part("left_hand")
-        touched = engine._touched[part.start : part.stop]
+        touched = engine.zeros._touched[part.start : part.stop]
         probe = live.robot.touch(
             Probe(part="left_hand", at=Place(taxel=3), diameter_mm=4, force_n=[(0, 1)])
         )
@@ -143,7 +143,7 @@ async def test_one_board_is_calibrated_and_the_others_keep_theirs(
         await live.daemon.calibrate(1.0, [0])
         after = engine.calibration
         assert after is not None
-        hand = engine.taxels_of([0])
+        hand = engine.layout.taxels_of([0])
         assert np.array_equal(after.baseline[~hand], before.baseline[~hand])
         assert not np.array_equal(after.baseline[hand], before.baseline[hand])
 
@@ -234,7 +234,7 @@ async def test_a_robot_that_starts_after_its_daemon_is_set_up_whole(
         records = live.daemon.link.boards["can0"].records.values()
         assert all(record.configurations == 1 for record in records)
         assert not live.daemon.engine.ledger.resets.any()
-        assert not any(live.daemon.engine.in_doubt(record.index).any() for record in records)
+        assert not any(live.daemon.engine.zeros.in_doubt(record.index).any() for record in records)
 
 
 @stepped

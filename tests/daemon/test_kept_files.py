@@ -188,8 +188,8 @@ async def test_what_was_pressed_when_its_board_was_zeroed_is_in_a_file_at_once(
     """A crash a moment later must not make a pressed taxel look untouched."""
     async with living(can_bus_settings, tmp_path, scene=pressed_hand(), clock=clock) as live:
         engine = live.daemon.engine
-        await live.wait(lambda: bool(engine.zero_at_risk(touched=True).any()))
-        touched = np.flatnonzero(engine.zero_at_risk(touched=True))  # the hand begins at 0
+        await live.wait(lambda: bool(engine.zeros.at_risk(touched=True).any()))
+        touched = np.flatnonzero(engine.zeros.at_risk(touched=True))  # the hand begins at 0
         file = tmp_path / "demo-main.zeros.json"
         assert not file.exists()
         before = engine.ledger.rezeros.sum()
@@ -221,7 +221,7 @@ def test_baselines_of_another_skin_are_not_used(kept: tuple[Any, Any, Path]) -> 
 
 def doubted(daemon: Daemon) -> list[int]:
     """Numbers of the taxels whose zero is not known."""
-    return np.flatnonzero(daemon.engine.zero_at_risk(touched=False)).tolist()
+    return np.flatnonzero(daemon.engine.zeros.at_risk(touched=False)).tolist()
 
 
 def test_zeros_that_are_not_known_are_in_doubt_from_the_start(kept: tuple[Any, Any, Path]) -> None:
@@ -339,10 +339,12 @@ async def test_what_is_pressed_is_in_doubt_only_if_the_daemon_ends_then(
     file = tmp_path / "demo-main.zeros.json"
     async with living(can_bus_settings, tmp_path, scene=pressed_hand(), clock=clock) as live:
         engine = live.daemon.engine
-        await live.wait(lambda: bool(engine.zero_at_risk(touched=True).any()))
+        await live.wait(lambda: bool(engine.zeros.at_risk(touched=True).any()))
         await live.daemon.configure([1])  # the arm's, which is not pressed
         await clock.sleep(3.0)
         assert load_kept(file, Zeros).unknown == {}
-        touched = np.flatnonzero(engine.zero_at_risk(touched=True)).tolist()  # the hand begins at 0
+        touched = np.flatnonzero(
+            engine.zeros.at_risk(touched=True)
+        ).tolist()  # the hand begins at 0
         assert touched
     assert set(load_kept(file, Zeros).unknown["left_hand"]) >= set(touched)

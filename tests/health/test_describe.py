@@ -98,7 +98,7 @@ def test_a_fall_of_temperature_is_named_though_the_baselines_have_followed_it() 
     assert not fallen()
     fall(4)
     assert [fallen() for _ in range(6)] == [False, True, True] + 3 * [False]
-    bench.engine.zero_changes += 1
+    bench.engine.zeros.changes += 1
     fall(4)
     # A board that was zeroed again has other baselines.
     assert not any(fallen() for _ in range(4))

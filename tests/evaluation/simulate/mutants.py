@@ -139,15 +139,15 @@ MUTANTS = [
     ),
     Mutant(
         "a zero that a board took while nobody received it is not recognised",
-        "processing/core.py",
+        "processing/board_zeros.py",
         "        if zeroed:\n",
         "        if False:\n",
         DEMO,
     ),
     Mutant(
         "taxels of boards that are not zeroed yet are valid after a start",
-        "processing/core.py",
-        "        self._held = held if self._held is None else self._held | held\n",
+        "processing/board_zeros.py",
+        "        self.held = held if self.held is None else self.held | held\n",
         "",
     ),
     Mutant(

@@ -83,7 +83,7 @@ def test_a_daemon_that_died_in_a_touch_does_not_call_it_untouched_when_it_is_bac
         topic = life.daemon.publisher.topics.part("contact", spot.part)
         state = world.broker.retained[topic]
         board_doubts = [
-            life.daemon.engine.in_doubt(board).sum() for board in life.daemon.engine.boards
+            life.daemon.engine.zeros.in_doubt(board).sum() for board in life.daemon.engine.boards
         ]
         assert sum(board_doubts) > 0
         life.kill()
@@ -125,7 +125,7 @@ def test_a_daemon_that_was_asked_to_end_in_a_touch_does_not_zero_it_away(world: 
         life.kill()
         life = start(world)
         await world.clock.sleep(5.0)
-        assert sum(life.daemon.engine.in_doubt(i).sum() for i in life.daemon.engine.boards)
+        assert sum(life.daemon.engine.zeros.in_doubt(i).sum() for i in life.daemon.engine.boards)
         await life.daemon.calibrate(2.0)
         await world.clock.sleep(3.0)
         assert world.broker.retained[topic] == b"OFF"
@@ -162,7 +162,7 @@ def test_what_pressed_as_the_daemon_started_is_in_doubt_when_it_lifts_and_no_bro
         assert "board_in_doubt" in accused
         assert not accused & {"taxel_out_of_range", "triangle_out_of_range", "taxel_unproven"}
         # It is not believed when it is pressed as it was, nor after it is set up again.
-        doubted = np.flatnonzero(life.daemon.engine.zero_at_risk(touched=False))
+        doubted = np.flatnonzero(life.daemon.engine.zeros.at_risk(touched=False))
         assert len(doubted)
         pressing = asyncio.create_task(spot.press(3.0))
         await world.clock.sleep(2.0)
@@ -192,18 +192,18 @@ def test_a_press_that_begins_while_a_zero_is_observed_is_felt_when_it_comes_agai
         await world.clock.sleep(8.0)
         spot, engine = world.spots[0], life.daemon.engine
         topic = life.daemon.publisher.topics.part("contact", spot.part)
-        before = engine.zeros_found
+        before = engine.zeros.found
         await life.daemon.configure()
-        while not all(rezero.begun for rezero in engine._rezeros.values()):
+        while not all(rezero.begun for rezero in engine.zeros.rezeros.values()):
             await world.clock.sleep(0.01)
         await world.clock.sleep(0.5)
-        assert engine.zeros_found == before
+        assert engine.zeros.found == before
         pressing = asyncio.create_task(spot.press(3.0, 60.0))
         await world.clock.sleep(2.5)
-        assert engine.zeros_found > before
+        assert engine.zeros.found > before
         assert world.broker.retained[topic] == b"UNKNOWN"
         await pressing
-        while engine.may_be_touched().any():
+        while engine.zeros.may_be_touched().any():
             await world.clock.sleep(0.1)
         await world.clock.sleep(3.0)
         assert world.broker.retained[topic] == b"OFF"
@@ -305,7 +305,7 @@ def test_a_board_that_restarts_in_a_press_does_not_zero_it_away(world: World, nu
         world.robot.inject(Fault(name="board_reset", board=board))
         await world.clock.sleep(5.0)
         assert not pressing.done()
-        assert life.daemon.engine.in_doubt(triangle.board).any()
+        assert life.daemon.engine.zeros.in_doubt(triangle.board).any()
         topic = life.daemon.publisher.topics.part("contact", spot.part)
         assert world.broker.retained[topic] == b"UNKNOWN"
         life.kill()
@@ -338,7 +338,7 @@ def test_a_board_that_is_set_up_while_a_disabled_part_is_pressed_does_not_zero_t
         await world.clock.sleep(1.0)
         assert not pressing.done()
         board = world.layout.triangles[int(world.layout.triangle_of[part.start + spot.taxel])].board
-        assert life.daemon.engine.in_doubt(board).any()
+        assert life.daemon.engine.zeros.in_doubt(board).any()
         topic = life.daemon.publisher.topics.part("contact", spot.part)
         assert world.broker.retained[topic] == b"UNKNOWN"
         life.kill()
@@ -402,7 +402,7 @@ def test_a_calibration_of_one_board_keeps_the_zeros_of_the_others(
         await life.daemon.configure()
         await world.clock.sleep(8.0)
         first, *_ = life.daemon.engine.boards
-        others = ~life.daemon.engine.taxels_of([first])
+        others = ~life.daemon.engine.layout.taxels_of([first])
         calibrated = life.daemon.engine.calibration
         assert calibrated is not None
         assert np.abs(calibrated.baseline - baselines(life))[others].max() > 2.0
@@ -436,9 +436,9 @@ def test_pads_whose_noise_a_set_up_cuts_off_are_named_and_make_no_part_unknown(
         await worn.clock.sleep(8.0)
         engine, topics = life.daemon.engine, life.daemon.publisher.topics
         assert engine.calibration is not None
-        cut_off = engine.cut_off() & engine.calibration.usable
+        cut_off = engine.zeros.cut_off() & engine.calibration.usable
         assert cut_off.any()
-        assert not (engine.zero_at_risk(touched=False) & engine.calibration.usable).any()
+        assert not (engine.zeros.at_risk(touched=False) & engine.calibration.usable).any()
         for part in worn.layout.parts:
             refused = np.flatnonzero(cut_off[part.start : part.stop])
             record = life.daemon.records()[part.name]
@@ -939,20 +939,20 @@ def test_what_waits_unread_when_a_board_is_zeroed_is_not_of_the_new_zero(
         life = start(worn)
         await worn.clock.sleep(20.0)
         engine, zeroed_ns = life.daemon.engine, list[int]()
-        rezero = engine.rezero
+        rezero = engine.zeros.rezero
 
         def note(board: int, believed: bool = True) -> int:
             zeroed_ns.append(worn.clock.now_ns())
             return rezero(board, believed)
 
-        monkeypatch.setattr(engine, "rezero", note)
+        monkeypatch.setattr(engine.zeros, "rezero", note)
         setting_up = asyncio.create_task(life.daemon.configure([0]))
         await worn.clock.sleep(after_s)
         worn.clock.advance(2.0)
         await setting_up
         await worn.clock.sleep(1.0)
         assert len(zeroed_ns) == 2
-        assert engine._rezeros[0]._since_ns > zeroed_ns[-1]
+        assert engine.zeros.rezeros[0]._since_ns > zeroed_ns[-1]
         await worn.end()
 
     with worn.clock.runner() as runner:

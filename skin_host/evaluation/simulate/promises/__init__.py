@@ -147,7 +147,7 @@ class Promises:
         """
         keeping = daemon._keeping
         if "zeros" in daemon.unkept or (keeping is not None and not keeping.done()):
-            self.excuses.exempt |= daemon.engine.zero_at_risk(touched)
+            self.excuses.exempt |= daemon.engine.zeros.at_risk(touched)
 
     def over(self, life: Life, *, whole: bool) -> None:
         """A life has ended; `whole`: as it was asked to."""
@@ -269,7 +269,7 @@ class Promises:
         engine = life.daemon.engine
         if engine.calibration is not None:
             # A part whose other pads are valid has a contact, and health names those without one.
-            pads &= engine.calibration.usable & ~engine.cut_off()
+            pads &= engine.calibration.usable & ~engine.zeros.cut_off()
         self._hold(self.subscribers.pressed_off(self._skin.pressed() & pads))
 
     def _note_set_ups(self) -> None:

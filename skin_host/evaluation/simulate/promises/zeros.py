@@ -83,7 +83,7 @@ class ZeroCheck:
         self._pressed_ns[pressed & ~self._pressed] = now_ns
         self._pressed = pressed
         layout = self._world.layout
-        for board, rezero in life.daemon.engine._rezeros.items():
+        for board, rezero in life.daemon.engine.zeros.rezeros.items():
             taxels = layout.boards[board].taxel_index
             taxels = taxels[taxels >= 0]
             before = self._rezeros.get(board)

@@ -90,7 +90,7 @@ class Hand:
 
     @property
     def in_doubt(self) -> list[int]:
-        return np.flatnonzero(self.engine.in_doubt(0)[self._board.triangles[0]]).tolist()
+        return np.flatnonzero(self.engine.zeros.in_doubt(0)[self._board.triangles[0]]).tolist()
 
 
 @pytest.fixture
@@ -128,7 +128,7 @@ def test_a_part_is_not_off_when_a_pad_shows_that_it_was_pressed_when_zeroed(
     settings, layout = load(CONFIG), hand.engine.layout
     daemon = Daemon(settings, layout, calibration=hand.engine.calibration)
     hand.engine, hand.deliver = daemon.engine, daemon._deliver
-    hand.engine.release(hand.engine.boards)
+    hand.engine.zeros.release(hand.engine.boards)
     states: list[str] = []
     monkeypatch.setattr(
         daemon.publisher,
@@ -151,26 +151,26 @@ def test_a_pad_that_is_pressed_while_its_zero_is_observed_is_in_doubt_until_it_r
 ) -> None:
     valid: list[bool] = []
     hand.deliver = lambda output: valid.extend(bool(frame.valid[3]) for frame in output.frames)
-    hand.engine.rezero(0)
+    hand.engine.zeros.rezero(0)
     hand.send(10)
     hand.send(100, p3=NO_LOAD - 12)
     assert hand.in_doubt == [3]
-    assert np.flatnonzero(hand.engine.zero_at_risk(touched=False)).tolist() == [3]
+    assert np.flatnonzero(hand.engine.zeros.at_risk(touched=False)).tolist() == [3]
     assert not any(valid)
     hand.send(80)
     assert hand.in_doubt == []
-    assert not hand.engine.may_be_touched().any()
+    assert not hand.engine.zeros.may_be_touched().any()
     assert valid[-1]
     hand.send(10, p3=NO_LOAD - 12)
-    assert hand.engine.zero_at_risk(touched=True)[3]
+    assert hand.engine.zeros.at_risk(touched=True)[3]
 
 
 def test_a_pad_that_is_in_doubt_when_its_board_is_zeroed_again_stays_so(hand: Hand) -> None:
     """What pressed it while its zero was observed may be in the next."""
-    hand.engine.rezero(0)
+    hand.engine.zeros.rezero(0)
     hand.send(10)
     hand.send(30, p3=NO_LOAD - 12)
-    assert hand.engine.rezero(0) == 1
+    assert hand.engine.zeros.rezero(0) == 1
     hand.send(50)
     assert hand.in_doubt == [3]
 
@@ -180,11 +180,11 @@ def test_a_press_that_began_before_its_pad_was_valid_is_in_doubt_after_another_z
     hand: Hand, rests: int, pressed: int
 ) -> None:
     """No touch shows it: while the zero is observed, before it is used, and a sweep after that."""
-    hand.engine.rezero(0)
+    hand.engine.zeros.rezero(0)
     hand.send(rests)
     hand.send(pressed, p3=200)
-    assert hand.engine.zero_at_risk(touched=True).sum() == 1
-    assert hand.engine.rezero(0) == 1
+    assert hand.engine.zeros.at_risk(touched=True).sum() == 1
+    assert hand.engine.zeros.rezero(0) == 1
     hand.send(60)
     assert hand.in_doubt == [3]
 
@@ -198,11 +198,11 @@ def test_a_press_that_began_between_the_zeros_of_a_first_set_up_is_in_doubt(
     far off. The second comes up to seconds later, when other boards have had their first.
     """
     hand.send(10, p5=200)
-    hand.engine.rezero(0, believed=False)
+    hand.engine.zeros.rezero(0, believed=False)
     hand.rest_units[:] = offset
     hand.send(rests)
     hand.send(pressed, p3=200 - offset)
-    assert hand.engine.rezero(0) == 1
+    assert hand.engine.zeros.rezero(0) == 1
     hand.rest_units[:] = 0
     hand.send(60)
     assert hand.in_doubt == [3]
@@ -213,17 +213,17 @@ def test_a_press_that_a_board_brings_back_from_a_silence_is_in_doubt_after_a_zer
 ) -> None:
     hand.pause(3.0)
     hand.send(SWEEPS, p3=200)
-    assert hand.engine.rezero(0) == 1
+    assert hand.engine.zeros.rezero(0) == 1
     hand.send(60)
     assert hand.in_doubt == [3]
 
 
 def test_a_press_that_has_lifted_before_its_pad_was_valid_is_in_no_later_zero(hand: Hand) -> None:
-    hand.engine.rezero(0)
+    hand.engine.zeros.rezero(0)
     hand.send(25)
     hand.send(5, p3=200)
     hand.send(5)
-    assert hand.engine.rezero(0) == 0
+    assert hand.engine.zeros.rezero(0) == 0
 
 
 @pytest.mark.parametrize("sweeps", [3, 15, 30, 44])
@@ -232,10 +232,10 @@ def test_untouched_pads_are_in_no_doubt_when_their_board_is_zeroed_twice(
 ) -> None:
     hand, _ = worn
     for seed in range(20):
-        hand.engine.rezero(0)
+        hand.engine.zeros.rezero(0)
         hand.rests_elsewhere(seed)
         hand.send(sweeps)
-    assert hand.engine.rezero(0) == 0
+    assert hand.engine.zeros.rezero(0) == 0
 
 
 def test_a_triangle_with_pads_below_zero_when_calibrated_is_not_called_constant(hand: Hand) -> None:
@@ -346,7 +346,7 @@ def test_a_new_zero_is_not_that_of_two_if_the_board_was_silent_while_it_was_soug
     worn: tuple[Hand, list[Step]],
 ) -> None:
     hand, steps = worn
-    hand.engine.rezero(0)
+    hand.engine.zeros.rezero(0)
     hand.rests_elsewhere(seed=2)
     hand.send(15)
     hand.pause(3.0)
@@ -375,7 +375,7 @@ def test_what_two_boards_send_at_one_address_is_the_zero_of_neither(
     hand, steps = worn
     other = 4 + np.abs(hand.rest_units)
     hand.other_units = None if waits else other
-    hand.engine.rezero(0)
+    hand.engine.zeros.rezero(0)
     hand.rests_elsewhere(seed=2)
     hand.send(waits)
     hand.other_units = other
@@ -403,7 +403,7 @@ def test_a_calibration_takes_nothing_of_two_boards_at_one_address(
     hand.engine.begin_calibration(2.0)
     hand.send(80)
     assert hand.engine.calibration is not None
-    known = hand.engine.calibration.usable & hand.engine.taxels_of([0])
+    known = hand.engine.calibration.usable & hand.engine.layout.taxels_of([0])
     found = hand.engine.end_calibration("2026-01-01T00:00:00+00:00")
     assert found.unchanged is not None
     assert (found.unchanged | ~found.usable).all()
@@ -414,12 +414,12 @@ def test_a_calibration_takes_nothing_of_two_boards_at_one_address(
 def test_what_touched_pads_read_after_a_silence_shows_no_zero(hand: Hand) -> None:
     """Pressed more weakly than before, they may read as pads do that were just zeroed."""
     hand.rest_units[0] = -3
-    hand.engine.rezero(0)
+    hand.engine.zeros.rezero(0)
     hand.send(60)
     found = hand.engine.ledger.rezeros[0]
     pads = [f"p{number}" for number in range(12)]
     hand.send(30, **dict.fromkeys(pads, NO_LOAD - 15))
-    assert hand.engine.zero_at_risk(touched=True).sum() > 6
+    assert hand.engine.zeros.at_risk(touched=True).sum() > 6
     hand.pause(1.0)
     hand.send(2 * SWEEPS, **dict.fromkeys(pads, NO_LOAD))
     assert hand.engine.ledger.rezeros[0] == found

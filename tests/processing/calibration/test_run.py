@@ -12,7 +12,8 @@ from skin_host.config.settings import load
 from skin_host.layout import build_layout
 from skin_host.processing.calibration import Verdict
 from skin_host.processing.calibration.calibrator import KNOWN_SAMPLES
-from skin_host.processing.core import SHORTEST_S, Engine
+from skin_host.processing.calibration.run import SHORTEST_S
+from skin_host.processing.core import Engine
 from tests.support.stack import ROOT
 
 CONFIG = ROOT / "config" / "demo.toml"
@@ -97,7 +98,7 @@ def test_a_board_that_is_back_in_the_middle_is_waited_for() -> None:
         assert number < 200
     assert number >= 60 + KNOWN_SAMPLES
     found = engine.end_calibration("2026-01-01T00:00:00+00:00")
-    verdict = found.verdict[engine.taxels_of([late])]
+    verdict = found.verdict[engine.layout.taxels_of([late])]
     assert not np.isin(verdict, (Verdict.TOO_FEW, Verdict.ABSENT)).any()
 
 
@@ -117,7 +118,7 @@ def test_a_board_that_falls_silent_goes_on_with_its_zero(engine: Engine) -> None
     send(110)
     first = engine.end_calibration("2026-01-01T00:00:00+00:00")
     engine.use(first)
-    mine = engine.taxels_of([0])
+    mine = engine.layout.taxels_of([0])
     used = mine & first.usable
     assert engine.pipeline is not None
     engine.pipeline.baseline[used] += 1.0
@@ -130,7 +131,7 @@ def test_a_board_that_falls_silent_goes_on_with_its_zero(engine: Engine) -> None
     assert np.abs(found.baseline - first.baseline - 1.0)[used].max() < 0.3
     engine.use(found)
     assert (engine.pipeline.baseline[used] == found.baseline[used]).all()
-    engine.rezero(0)
+    engine.zeros.rezero(0)
     engine.begin_calibration(5.0)
     send(15)
     found = engine.end_calibration("2026-01-01T00:00:02+00:00")
@@ -147,7 +148,7 @@ def test_a_clock_that_is_set_shortens_no_calibration(engine: Engine, step_s: flo
     # One interval more, of which nobody knows how long it was.
     assert sweeps_taken(engine, time_s) == 82
     verdict = engine.end_calibration("2026-01-01T00:00:00+00:00").verdict
-    mine = engine.taxels_of([0])
+    mine = engine.layout.taxels_of([0])
     assert (verdict[mine] != Verdict.TOO_FEW).all()
 
 
@@ -158,13 +159,13 @@ def test_a_board_that_is_zeroed_during_a_calibration_is_calibrated_with_its_new_
 
     def shift(number: int) -> int:
         if number == 35:
-            engine.rezero(0)
+            engine.zeros.rezero(0)
         return 20 if number < 35 else 0
 
     # For all of its time: the zero of a noisy pad is not known from the rest of it.
     assert sweeps_taken(engine, lambda number: 1.0 + 0.05 * number, shift) >= 35 + 80
     found = engine.end_calibration("2026-01-01T00:00:00+00:00")
-    mine = engine.taxels_of([0])
+    mine = engine.layout.taxels_of([0])
     no_load = engine.layout.boards[0].settings.no_load
     assert (found.verdict[mine] == Verdict.OK).all()
     assert np.abs(found.baseline[mine] - (no_load - 239.5)).max() < 1.5
@@ -179,7 +180,7 @@ def test_a_board_that_is_zeroed_while_its_calibration_is_computed_finds_its_zero
         engine.use(engine.end_calibration("2026-01-01T00:00:00+00:00"))
     sweeps_taken(engine, lambda number: 10.0 + 0.05 * number)
     compute = engine.collected("2026-01-01T00:00:00+00:00")
-    engine.rezero(0)
+    engine.zeros.rezero(0)
     engine.use(compute())
     assert engine.intake.veto[0].all()
 
@@ -233,7 +234,7 @@ def test_a_pad_that_was_calibrated_with_too_little_noise_is_calibrated_with_all_
 def test_a_zero_from_before_is_over_with_the_next_calibration(engine: Engine) -> None:
     sweeps_taken(engine, lambda number: 1.0 + 0.05 * number)
     engine.use(engine.end_calibration("2026-01-01T00:00:00+00:00"))
-    engine.rezero(0)
+    engine.zeros.rezero(0)
     sweeps_taken(engine, lambda number: 10.0 + 0.05 * number)
     engine.use(engine.end_calibration("2026-01-01T00:00:00+00:00"))
     assert not engine.intake.veto

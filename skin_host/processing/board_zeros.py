@@ -1,0 +1,525 @@
+"""What is known of the zeros of boards: which are sought, which are in doubt, and what may press.
+
+A board that is set up, restarts, or loses a chip zeroes itself with whatever presses it then. None
+of its taxels is valid until the new untouched readings have been found (`rezero`); those that were
+touched just before stay in doubt until they are calibrated.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.bus.assembler import Sweep
+from skin_host.bus.ledger import BoardLedger
+from skin_host.bus.wire import TRIANGLES, StatusError
+from skin_host.layout import Layout
+from skin_host.processing.calibration import Calibration
+from skin_host.processing.intake import Intake, below_zero
+from skin_host.processing.liveness import PADS
+from skin_host.processing.masks import Mask, any_of
+from skin_host.processing.pipeline import Pipeline, PressureFrame
+from skin_host.processing.rezero import (
+    BELOW_SWEEPS,
+    JUMPS_NS,
+    STEADY_UNITS,
+    Rezero,
+    highest_rest,
+    look_s,
+    repeats_of,
+)
+from skin_host.processing.silent_zero import SilentZero
+
+#: So many conversions show that something presses a taxel which is not valid, ...
+GLIMPSED = 3
+#: ... or has become it less than this ago: a touch may not be decided yet.
+DECIDED_NS = 500_000_000
+
+
+@dataclass(slots=True)
+class _Glimpse:
+    """The last readings of a board of which taxels are not valid, or were not just now.
+
+    Attributes:
+        units: float64[192] each: of its taxels, away from its zero; -inf where there is none.
+        until_ns: then its touches are decided.
+    """
+
+    units: deque[NDArray[np.float64]]
+    until_ns: int = 0
+
+
+class BoardZeros:
+    """The zeros of some boards.
+
+    Args:
+        layout: the skin.
+        boards: indices of the boards.
+        ledger: of these boards.
+        intake: of their sweeps; it is given which taxels are not valid, and which are touched.
+        on_rezero: called with the index of each board that has a new zero, and `believed`, see
+            `rezero`.
+
+    Attributes:
+        found: how often new zeros have been found.
+        changes: how often what is known of zeros has changed.
+        rezeros: by board what is known of its zero since it was zeroed.
+        held: taxels bool[n] of boards that have not been zeroed yet, see `hold`; None if there are
+            none.
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        boards: list[int],
+        ledger: BoardLedger,
+        intake: Intake,
+        on_rezero: Callable[[int, bool], None],
+    ) -> None:
+        self._layout, self._boards = layout, boards
+        self._ledger, self._intake = ledger, intake
+        self._on_rezero = on_rezero
+        self._calibration: Calibration | None = None
+        self._pipeline: Pipeline | None = None
+        self.found = 0
+        self.changes = 0
+        self.rezeros: dict[int, Rezero] = {}
+        self.held: Mask | None = None
+        #: Boards that were silent and may have zeroed themselves meanwhile.
+        self._silent_zeros: dict[int, SilentZero] = {}
+        #: Boards of which taxels are not valid, or were not just now, as their zero is sought.
+        self._glimpses: dict[int, _Glimpse] = {}
+        self._unanswered: dict[int, Mask] = {}
+        #: For how many sweeps pads int64[16, 12] of a board have read far below zero, where any do.
+        self._below: dict[int, NDArray[np.int64]] = {}
+        #: When a board's pad last came back from there by itself.
+        self._jumped_ns: dict[int, int] = {}
+        self._touched = np.zeros(layout.n_taxels, np.bool_)
+        #: Whether each taxel was touched when it was last valid. A board that restarts in a touch
+        #: is silent before it is zeroed: its touches have ended as lost, and may still be there.
+        self._last_touched = np.zeros(layout.n_taxels, np.bool_)
+        #: By part: which of its taxels were touched and valid in its last frame.
+        self._noted: dict[int, tuple[Mask, Mask]] = {}
+        #: Boards that were zeroed since they were held: until then what came before is under way.
+        self._releasing: set[int] = set()
+
+    def go_on(self, before: "BoardZeros") -> None:
+        """Take over the state of a predecessor for the same boards."""
+        self._ledger = before._ledger
+        self.found, self.changes = before.found, before.changes
+        self.rezeros, self.held = before.rezeros, before.held
+        self._silent_zeros = before._silent_zeros
+        self._glimpses = before._glimpses
+        self._unanswered = before._unanswered
+        self._below = before._below
+        self._jumped_ns = before._jumped_ns
+        self._touched = before._touched
+        self._last_touched = before._last_touched
+        self._releasing = before._releasing
+
+    def adopt(self, calibration: Calibration, pipeline: Pipeline) -> None:
+        """Judge by a calibration, and by the baselines of a pipeline, from now on."""
+        self._calibration, self._pipeline = calibration, pipeline
+
+    def calibrated(self, boards: list[int]) -> None:
+        """The zeros of some boards have been measured: they are known."""
+        for board in boards:
+            self.rezeros.pop(board, None)
+            self._silent_zeros.pop(board, None)
+            self._glimpses.pop(board, None)
+        self.release(boards)
+        zeroed = self._layout.taxels_of(boards)
+        self._last_touched[zeroed] = self._touched[zeroed]
+
+    def note(self, sweep: Sweep, row: int, silent_ns: int) -> None:
+        """Take in a sweep of a board.
+
+        Args:
+            sweep: it; the ledger has noted it.
+            row: of its board in the ledger.
+            silent_ns: how long the board was silent before, if so long that it may have zeroed
+                itself; otherwise 0.
+        """
+        ledger = self._ledger
+        if silent_ns:
+            self._note_return(sweep, silent_ns)
+        if ledger.flagged[row] or self._unanswered:
+            self._note_unanswered(sweep, row)
+        if row in ledger.twice:
+            self._note_twice(sweep, row)
+            return
+        if ledger.flagged[row] or self._below:
+            self._note_below_zero(sweep, row)
+        if self.rezeros:
+            rezero = self.rezeros.get(sweep.board)
+            if rezero is not None:
+                self._find_zero(sweep, row, rezero)
+        if self._silent_zeros:
+            silent_zero = self._silent_zeros.get(sweep.board)
+            if silent_zero is not None:
+                self._find_silent_zero(sweep, row, silent_zero)
+        if self.rezeros or self._silent_zeros or self._glimpses:
+            self._note_glimpse(sweep, row)
+
+    def note_frame(self, index: int, frame: PressureFrame) -> None:
+        """Pass the touched pads to the liveness decision, but only when they change."""
+        noted = self._noted.get(index)
+        if noted is not None and noted[0] is frame.touched and noted[1] is frame.valid:
+            return
+        self._noted[index] = frame.touched, frame.valid
+        part = self._layout.parts[index]
+        touched = self._touched[part.start : part.stop]
+        np.copyto(self._last_touched[part.start : part.stop], frame.touched, where=frame.valid)
+        if touched.tobytes() == frame.touched.tobytes():
+            return
+        touched[:] = frame.touched
+        for board in part.boards:
+            taxels = self._of(board)
+            pads = self._touched[taxels] & (taxels >= 0)
+            row = self._ledger.row[board]
+            if any_of(pads):
+                self._intake.touched[row] = pads
+            else:
+                self._intake.touched.pop(row, None)
+
+    def hold(self, boards: list[int]) -> None:
+        """Report no taxel of some boards as valid until they are zeroed and their zero is found.
+
+        Their zero may be another than the calibration's: since that was taken, an earlier start of
+        the daemon may have zeroed them. What seems to touch them is noted all the same.
+        """
+        self._releasing.difference_update(boards)
+        held = self._layout.taxels_of(boards)
+        self.held = held if self.held is None else self.held | held
+
+    def release(self, boards: list[int]) -> None:
+        """Report taxels of some boards as valid again: they are zeroed, or cannot be."""
+        if self.held is not None:
+            left: Mask = self.held & ~self._layout.taxels_of(boards)
+            self.held = left if any_of(left) else None
+
+    def without_held(self, frame: PressureFrame, index: int) -> PressureFrame:
+        """Return a frame of a part, given by its index, in which taxels that are held are not valid."""
+        if self.held is None:
+            return frame
+        part = self._layout.parts[index]
+        fit = ~self.held[part.start : part.stop]
+        return replace(
+            frame,
+            pressure_kpa=frame.pressure_kpa * fit,
+            touched=frame.touched & fit,
+            valid=frame.valid & fit,
+            beyond_range=frame.beyond_range & fit,
+        )
+
+    def rezero(self, board: int, believed: bool = True) -> int:
+        """Find the new untouched readings after a board was zeroed.
+
+        For two seconds, longer for slow boards, none of its taxels is valid, and noisy ones are not
+        for up to six. Taxels that were touched just before stay invalid until they are calibrated,
+        and those whose noise reaches the end of the scale until they are zeroed again.
+
+        Args:
+            board: its index.
+            believed: whether touches just before are real. Touches of a board that was not set up,
+                by this start of the daemon or an earlier one, are not.
+
+        Returns:
+            How many taxels were touched.
+        """
+        taxels = self._of(board)
+        self._silent_zeros.pop(board, None)
+        self._releasing.add(board)
+        self._on_rezero(board, believed)
+        if self._calibration is None:
+            return 0
+        before = self.rezeros.get(board)
+        fitted = taxels >= 0
+        if believed:
+            touched = fitted & (self._last_touched[taxels] | self._glimpsed(board))
+        else:
+            touched = np.zeros_like(fitted)
+            self._last_touched[taxels[fitted]] = False
+        self._glimpses.pop(board, None)
+        if before is not None:
+            touched |= before.unknown.reshape(TRIANGLES, PADS)
+        own = self._layout.boards[board].settings
+        no_load = np.full(taxels.size, float(own.no_load))
+        wanted = None
+        if self._pipeline is not None:
+            seconds = look_s(self._calibration.spread, self._pipeline.enter)[taxels.ravel()]
+            wanted = np.ceil(seconds * 1e3 / own.period_ms).astype(np.int64)
+        period_s = own.period_ms * 1e-3
+        self.rezeros[board] = Rezero(
+            touched.ravel(), no_load, fitted.ravel(), wanted, period_s, believed
+        )
+        self._intake.veto[self._ledger.row[board]] = np.ones((TRIANGLES, PADS), np.bool_)
+        self.changes += 1
+        return int(np.count_nonzero(touched))
+
+    def doubt(self, taxels: Mask) -> None:
+        """The zero of these taxels, bool[n], is not known from before: see `rezero`."""
+        for board in self._boards:
+            mine = self._of(board)
+            doubted = taxels[mine] & (mine >= 0)
+            if doubted.any():
+                self.rezero(board)
+                if board in self.rezeros:
+                    self.rezeros[board].doubted |= doubted.ravel()
+
+    def at_risk(self, touched: bool) -> Mask:
+        """Return taxels bool[n] whose zero will not be known; with `touched`, also those which are
+        touched: after another zero, theirs would not be.
+        """
+        found = self._last_touched.copy() if touched else np.zeros_like(self._touched)
+        for board in self._glimpses if touched else ():
+            found[self._of(board)[self._glimpsed(board)]] = True
+        for board, rezero in self.rezeros.items():
+            found[self._of(board).ravel()[rezero.unknown]] = True
+        return found
+
+    def may_be_touched(self) -> Mask:
+        """Return taxels bool[n] that something may touch, because their zero is not known, or not
+        yet while their board is in use again.
+        """
+        found = self.at_risk(touched=False)
+        for board, rezero in self.rezeros.items():
+            if rezero.late is not None:
+                found[self._of(board).ravel()[rezero.late]] = True
+        return found
+
+    def cut_off(self) -> Mask:
+        """Return taxels bool[n] whose noise reaches the end of the scale since they were zeroed."""
+        found = np.zeros(self._layout.n_taxels, np.bool_)
+        for board, rezero in self.rezeros.items():
+            found[self._of(board).ravel()[rezero.cut_off]] = True
+        return found
+
+    def in_doubt(self, board: int) -> NDArray[np.bool_]:
+        """Return taxels bool[16, 12] of a board whose zero is unknown."""
+        found = np.zeros((TRIANGLES, PADS), np.bool_)
+        if board in self.rezeros:
+            found |= self.rezeros[board].unknown.reshape(TRIANGLES, PADS)
+        if board in self._below:
+            found |= self._below[board] > 0
+        return found
+
+    def compares(self, board: int) -> bool:
+        """Return whether it was not known before a board's last sweep if it zeroed itself while it
+        was silent.
+        """
+        return board in self._silent_zeros
+
+    def paused(self, board: int) -> bool:
+        """Return whether `compares` holds for a board that had not timed out."""
+        silent_zero = self._silent_zeros.get(board)
+        if silent_zero is None:
+            return False
+        limit_ns = int(self._ledger.silent_after_ns[self._ledger.row[board]])
+        return silent_zero.silent_s * 1e9 <= limit_ns
+
+    def doubts(self) -> dict[int, int]:
+        """Return how many taxels of each board that was zeroed have an unknown zero, by index."""
+        return {
+            board: int(np.count_nonzero(self.in_doubt(board)))
+            for board in sorted(self.rezeros.keys() | self._below.keys())
+        }
+
+    def _of(self, board: int) -> NDArray[np.int32]:
+        return self._layout.boards[board].taxel_index
+
+    def _note_twice(self, sweep: Sweep, row: int) -> None:
+        """Two boards send at an address: what both send is the zero of neither."""
+        self._glimpses.pop(sweep.board, None)
+        rezero = self.rezeros.get(sweep.board)
+        if rezero is None:
+            return
+        # What differed was another board's, and no press.
+        rezero.moved[:] = False
+        if rezero.found_since(self._ledger.twice[row]):
+            self.rezero(sweep.board)
+        else:
+            rezero.restart(sweep.t_ns)
+
+    def _note_unanswered(self, sweep: Sweep, row: int) -> None:
+        """Detect that a board zeroed itself, which it does after missing acknowledges (section
+        4.5).
+        """
+        now = self._ledger.error[row] & StatusError.NO_ACK != 0
+        before = self._unanswered.get(sweep.board)
+        if before is not None:
+            # Nobody knows of a triangle that was not received.
+            now |= before & ~self._ledger.present[row]
+        if any_of(now):
+            self._unanswered[sweep.board] = now
+        else:
+            self._unanswered.pop(sweep.board, None)
+        if before is not None and any_of(before & ~now):
+            self.rezero(sweep.board)
+
+    def _note_return(self, sweep: Sweep, silent_ns: int) -> None:
+        """A board sends again: for half a second, see whether it zeroed itself meanwhile."""
+        rezero = self.rezeros.get(sweep.board)
+        if rezero is not None:
+            rezero.restart(sweep.t_ns)
+        # What was set up since it was received last has a new zero, and one that is still sought
+        # is that of the board as it is now.
+        sought = rezero is not None and rezero.seeks_all
+        if self._pipeline is None or self._calibration is None or sought:
+            return
+        taxels = self._of(sweep.board).ravel()
+        known = (taxels >= 0) & self._calibration.usable[taxels] & ~self._last_touched[taxels]
+        known &= ~self.in_doubt(sweep.board).ravel()
+        if rezero is not None:
+            known &= ~rezero.cut_off
+            if rezero.late is not None:
+                known &= ~rezero.late
+        own = self._layout.boards[sweep.board].settings
+        self._silent_zeros[sweep.board] = SilentZero(
+            self._pipeline.baseline[taxels],
+            self._calibration.noise[taxels],
+            self._calibration.spread[taxels],
+            known,
+            float(own.no_load),
+            own.period_ms * 1e-3,
+            silent_ns * 1e-9,
+        )
+
+    def _find_silent_zero(self, sweep: Sweep, row: int, silent_zero: SilentZero) -> None:
+        if silent_zero.decided:
+            # Its last sweep is in a sample of its part by now.
+            del self._silent_zeros[sweep.board]
+            return
+        ledger = self._ledger
+        here = np.repeat(ledger.present[row] & (ledger.error[row] == 0), PADS)
+        zeroed = silent_zero.step(sweep.raw.ravel(), here & ~ledger.far[row].ravel(), sweep.t_ns)
+        if zeroed is None:
+            self._intake.veto[row] = np.ones((TRIANGLES, PADS), np.bool_)
+            return
+        if zeroed:
+            # What was read since is of the new zero.
+            self._glimpses.pop(sweep.board, None)
+            self.rezero(sweep.board)
+            return
+        rezero = self.rezeros.get(sweep.board)
+        if rezero is None:
+            self._intake.veto.pop(row, None)
+        else:
+            self._veto_unknown(sweep, row, rezero)
+
+    def _note_glimpse(self, sweep: Sweep, row: int) -> None:
+        """Keep what a board sends while its taxels are not valid, and until their touches are
+        decided: whatever presses them meanwhile must not become a zero unnoticed.
+        """
+        rezero = self.rezeros.get(sweep.board)
+        blind = sweep.board in self._silent_zeros
+        blind |= rezero is not None and rezero.unsettled(sweep.t_ns) is not None
+        glimpse = self._glimpses.get(sweep.board)
+        own = self._layout.boards[sweep.board].settings
+        if glimpse is None:
+            if not blind:
+                return
+            longest = math.ceil(GLIMPSED * repeats_of(own.period_ms * 1e-3))
+            glimpse = self._glimpses[sweep.board] = _Glimpse(deque(maxlen=longest))
+        if blind:
+            glimpse.until_ns = sweep.t_ns + DECIDED_NS
+        elif not 0 <= glimpse.until_ns - sweep.t_ns <= DECIDED_NS:
+            del self._glimpses[sweep.board]
+            return
+        ledger = self._ledger
+        here = (ledger.present[row] & (ledger.error[row] == 0))[:, None] & ~ledger.far[row]
+        units = np.where(here, float(own.no_load) - sweep.raw, -np.inf)
+        glimpse.units.append(units.ravel())
+
+    def _glimpsed(self, board: int) -> Mask:
+        """Return taxels bool[16, 12] of a board that something presses by its last readings, while
+        no touch could be decided.
+        """
+        glimpse = self._glimpses.get(board)
+        calibration, pipeline = self._calibration, self._pipeline
+        pressed = np.zeros((TRIANGLES, PADS), np.bool_)
+        if glimpse is None or calibration is None or pipeline is None:
+            return pressed
+        if len(glimpse.units) < GLIMPSED:
+            return pressed
+        taxels = self._of(board).ravel()
+        spread = np.maximum(calibration.spread, calibration.noise)[taxels]
+        baseline = pipeline.baseline[taxels]
+        repeats = repeats_of(self._layout.boards[board].settings.period_ms * 1e-3)
+        highest, error = highest_rest(baseline, spread, repeats)
+        rezero = self.rezeros.get(board)
+        if rezero is not None and not rezero.believed:
+            # What it was set up to send before had other rests.
+            baseline = rezero.lowest()
+            highest = baseline + STEADY_UNITS + error
+        highest = np.maximum(highest, baseline + pipeline.enter[taxels])
+        fit = (taxels >= 0) & calibration.usable[taxels]
+        pressed[:] = (fit & (np.median(glimpse.units, axis=0) > highest)).reshape(pressed.shape)
+        return pressed
+
+    def _note_below_zero(self, sweep: Sweep, row: int) -> None:
+        """Detect pads whose zero was taken while something pressed that has lifted now."""
+        answered = (self._ledger.error[row] == 0) & self._ledger.present[row]
+        below = below_zero(sweep.raw, self._ledger.far[row] & answered[:, None])
+        before = self._below.pop(sweep.board, None)
+        no_load = float(self._layout.boards[sweep.board].settings.no_load)
+        if before is not None:
+            back = (before > 0) & (before < BELOW_SWEEPS) & answered[:, None]
+            if sweep.board in self.rezeros:
+                # What is known to have been pressed comes back when it is pressed again.
+                back &= ~self.rezeros[sweep.board].unknown.reshape(TRIANGLES, PADS)
+            if any_of(back & (sweep.raw < (no_load + 255) / 2)):
+                # What was pressed and lifts stays below zero; what a bad wire brings does not.
+                self._jumped_ns[sweep.board] = sweep.t_ns
+        jumps = 0 <= sweep.t_ns - self._jumped_ns.get(sweep.board, -JUMPS_NS) < JUMPS_NS
+        if self._calibration is None or jumps or not any_of(below):
+            return
+        lasted = below.astype(np.int64) if before is None else (before + 1) * below
+        self._below[sweep.board] = lasted
+        sure = lasted >= BELOW_SWEEPS
+        if any_of(sure):
+            if sweep.board not in self.rezeros:
+                self.rezeros[sweep.board] = Rezero.over(np.full(sure.size, no_load), sweep.t_ns)
+            doubted = self.rezeros[sweep.board].doubted
+            if any_of(sure.ravel() & ~doubted):
+                doubted |= sure.ravel()
+                self.changes += 1
+
+    def _find_zero(self, sweep: Sweep, row: int, rezero: Rezero) -> None:
+        if self._pipeline is None or self._calibration is None:
+            return
+        ledger = self._ledger
+        here = np.repeat(ledger.present[row] & (ledger.error[row] == 0), PADS)
+        ledger.rezeros[row] += not rezero.begun
+        far, touched = ledger.far[row].ravel(), row in self._intake.touched
+        if rezero.step(sweep.raw.ravel(), here, far, sweep.t_ns, touched):
+            taxels = self._of(sweep.board).ravel()
+            baseline = np.where(taxels >= 0, self._pipeline.baseline[taxels], 0.0)
+            calibration = self._calibration
+            noise = calibration.noise[taxels]
+            spread = np.maximum(calibration.spread[taxels], noise)
+            spread[~calibration.usable[taxels]] = np.inf
+            found, baseline = rezero.finish(baseline, noise, spread)
+            self._pipeline.set_zero(taxels[found], baseline[found])
+            self.found += any_of(found)
+            self.changes += 1
+        if rezero.settled(sweep.t_ns):
+            if sweep.board in self._releasing:
+                self._releasing.discard(sweep.board)
+                self.release([sweep.board])
+            self._veto_unknown(sweep, row, rezero)
+            return
+        # What jumps while a board is set up was not damaged on its way.
+        self._intake.note_gap(row)
+
+    def _veto_unknown(self, sweep: Sweep, row: int, rezero: Rezero) -> None:
+        """Taxels whose zero is not known, or not yet, are not valid."""
+        veto = self.in_doubt(sweep.board)
+        veto |= rezero.cut_off.reshape(TRIANGLES, PADS)
+        unsettled = rezero.unsettled(sweep.t_ns)
+        if unsettled is not None:
+            veto |= unsettled.reshape(TRIANGLES, PADS)
+        self._intake.veto[row] = veto
