@@ -202,7 +202,7 @@ class BoardZeros:
             self.held = left if any_of(left) else None
 
     def without_held(self, frame: PressureFrame, index: int) -> PressureFrame:
-        """Return a frame of a part, given by its index, in which taxels that are held are not valid."""
+        """Return a frame of a part (its index) in which the taxels that are held are not valid."""
         if self.held is None:
             return frame
         part = self._layout.parts[index]
