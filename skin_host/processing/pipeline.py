@@ -28,12 +28,10 @@ from skin_host.processing.curves import (
     with_own,
 )
 from skin_host.processing.drift import BaselineTracker
-from skin_host.processing.erratic import Erratic, step_kpa
-from skin_host.processing.fitting.course import limit_kpa, make_memory
 from skin_host.processing.masks import Mask, any_of
-from skin_host.processing.relaxation import OWN_MEANS, PlayRelaxation, make_model, parameters_of
+from skin_host.processing.own_curves import OwnCurves
+from skin_host.processing.relaxation import OWN_MEANS, make_model, parameters_of
 from skin_host.processing.relaxation import Relaxation as Model
-from skin_host.processing.smoothing import StepFilter
 from skin_host.processing.touch import Levels, Residuals, TouchDetector, levels
 
 #: A longer step is a gap or a jump of the clock. The foam's model is advanced by it, under the
@@ -49,11 +47,6 @@ STRAIGHT_UNITS = 2.0
 RELAXED_KPA = 0.01
 #: Samples are stored and summed this many at a time, for fewer passes over the taxels.
 ROWS = 8
-#: Baselines of pads with own curves rise no faster above their calibrated zero (10 degrees in 10
-#: minutes are 0.008), and those of touched ones do not rise.
-RISE_UNITS_PER_S = 0.01
-#: A taxel that rests at this value or above sends 255 by noise alone.
-RESTING_NEAR_RAIL = 247.0
 
 Floats = NDArray[np.float32]
 _T = TypeVar("_T", bound=np.generic)
@@ -372,12 +365,12 @@ class _PartPipeline:
         """
         self._relaxation_kpa.fill(0.0)
         self._relaxation: Model | None = None
-        self._own: _OwnCurves | None = None
+        self._own: OwnCurves | None = None
         self._every_sample = False
         self._window_s = WINDOW_S
         if rules.curves is not None:
             smoothing_s = rules.settings.pressure.smoothing_s
-            self._own = _OwnCurves(rules.curve, rules.curves, self._mine, smoothing_s)
+            self._own = OwnCurves(rules.curve, rules.curves, self._mine, smoothing_s)
             return
         # A model that permits it is stepped once a window, because the pipeline takes means anyway.
         # Steps of a second are large enough for float32.
@@ -624,9 +617,8 @@ class _PartPipeline:
             units, self._was_touched, self._was_missing, self._elapsed_s, relaxed_units
         )
         if self._own is not None:
-            slow = RISE_UNITS_PER_S * self._elapsed_s
-            rise = np.where(self._was_touched, 0.0, slow)
-            ghosts = self._own.hold_rises(self.drift, before, rise, slow, ghosts)
+            touched, elapsed_s = self._was_touched, self._elapsed_s
+            ghosts = self._own.hold_rises(self.drift, before, touched, elapsed_s, ghosts)
         if ghosts is not None:
             self._detector.reset(ghosts)
         self._residuals.fade(self._elapsed_s)
@@ -686,166 +678,6 @@ class _PartPipeline:
         # At 0 the reading is cut off in any case.
         _as_bytes(np.fmax(np.ceil(offset - self._beyond_units), 1.0), self._beyond_raw)
         self._most_beyond_raw = int(self._beyond_raw.max(initial=0))
-
-
-class _OwnCurves:
-    """Extra state of taxels with own curves: smoothing, memory, and detection of jumps.
-
-    Cost follows touch: touched taxels, or all where more than a quarter is touched, are smoothed
-    and remembered in each sweep, the others from the means of `ROWS` sweeps. Their reported
-    pressures change as seldom.
-
-    Attributes:
-        erratic: which of them jump.
-    """
-
-    def __init__(self, curve: Curve, curves: Curves, mine: slice, smoothing_s: float) -> None:
-        own, noise = curves.own[mine], curves.noise_units[mine]
-        m = len(own)
-        self._own = own
-        limit = np.where(own, limit_kpa(curve, noise), 0.0)
-        self._smoother = StepFilter(limit, smoothing_s, np.float32)
-        self._memory = make_memory(m, curves.memory, np.float32)
-        self.erratic = Erratic(np.where(own, step_kpa(curve, noise), np.inf))
-        self._zeros = np.zeros(m, np.float32)
-        self._reported = self._zeros
-        self._touched: Mask | None = None
-        #: Taxels with a filter and a memory of their own: the touched ones, or all.
-        self._felt_memory: PlayRelaxation | None = None
-        self._set_apart(np.zeros(0, np.intp), 0)
-        #: Which were touched since the last fold.
-        self._felt: Mask = np.zeros(m, np.bool_)
-        self._touching = False
-        self._folded_s = 0.0
-
-    def step(self, momentary: Floats, dt_s: float, touched: Mask, relaxation_kpa: Floats) -> Floats:
-        """Return the pressures [m] to report; update the relaxation [m] of touched taxels.
-
-        The result is not written to again.
-        """
-        self._folded_s += dt_s
-        if touched is not self._touched:
-            self._touched = touched
-            self._felt |= touched
-            self._take_back()
-            felt = np.flatnonzero(touched)
-            if 4 * len(felt) <= len(touched):
-                self._set_apart(felt, len(felt))
-            else:
-                # Where much is touched, the rest is likely to feel something, too.
-                self._set_apart(slice(None), len(touched))
-            self._report(relaxation_kpa)
-        which = self._which
-        if not self._apart:
-            return self._reported
-        self._touching = True
-        mine = momentary if isinstance(which, slice) else momentary.take(which)
-        smooth = self._felt_smoother.step(mine, dt_s)
-        if self._felt_memory is not None:
-            self._felt_memory.step(smooth, dt_s, self._relaxed)
-            relaxation_kpa[which] = self._relaxed
-        pressure = smooth - self._relaxed
-        np.maximum(pressure, self._zeros[: self._apart], out=pressure)
-        if isinstance(which, slice):
-            return pressure
-        reported = self._reported.copy()
-        reported[which] = pressure
-        return reported
-
-    def _set_apart(self, which: NDArray[np.intp] | slice, count: int) -> None:
-        """Step so many taxels apart from the others, in steps that cost as much as they are."""
-        self._which, self._apart = which, count
-        self._relaxed = np.zeros(count, np.float32)
-        self._felt_smoother = self._smoother.part(which)
-        if self._memory is not None:
-            self._felt_memory = self._memory.part(which)
-
-    def _take_back(self) -> None:
-        """Bring the state of all taxels up to date."""
-        if self._apart:
-            self._smoother.take_back(self._which, self._felt_smoother)
-            if self._memory is not None and self._felt_memory is not None:
-                self._memory.take_back(self._which, self._felt_memory)
-
-    def fold(self, rows: Floats, sums: Floats, relaxation_kpa: Floats) -> None:
-        """Take the corrected pressures [k, m] of the last sweeps, and their sums [m]."""
-        if self._touching or self.erratic.suspects:
-            self.erratic.look(rows)
-        momentary = sums / np.float32(len(rows))
-        if self._touching:
-            # A mean over a press and its release is neither.
-            np.copyto(momentary, rows[-1], where=self._felt)
-        momentary += relaxation_kpa
-        self._smoother.step(momentary, self._folded_s)
-        if self._touching:
-            self._smoother.take_back(self._which, self._felt_smoother)
-            self._touching = self._apart > 0
-            if self._touched is not None:
-                np.copyto(self._felt, self._touched)
-        self._folded_s = 0.0
-        self._report(relaxation_kpa)
-
-    def end_window(self, elapsed_s: float, relaxation_kpa: Floats) -> None:
-        """Update the relaxation [m] of all taxels, in place, and forget jumps of long ago."""
-        if self._memory is not None:
-            # Plays do not move under a reading that they had: those apart stay as they are.
-            self._take_back()
-            self._memory.step(self._smoother.smooth, elapsed_s, relaxation_kpa)
-        self.erratic.pass_time(elapsed_s)
-
-    def _report(self, relaxation_kpa: Floats) -> None:
-        self._reported = np.fmax(self._smoother.smooth - relaxation_kpa, self._zeros)
-
-    def hold_rises(
-        self,
-        drift: BaselineTracker,
-        before: NDArray[np.float64],
-        rise: NDArray[np.float64],
-        slow: float,
-        drifted: NDArray[np.intp] | None,
-    ) -> NDArray[np.intp] | None:
-        """Limit baselines to a slow rise, in place.
-
-        A load that grows slowly, or has nearly gone, reads like drift; on a skin with known curves
-        it is more probable than drift.
-
-        Args:
-            drift: with the baselines [m] that it would have.
-            before: float64[m], the baselines of the window before.
-            rise: float64[m], how much they may rise.
-            slow: how much those of `drifted` may rise.
-            drifted: touched taxels whose touch would be drift.
-
-        Returns:
-            Those of `drifted` that are: the others stay touched while their baselines rise.
-        """
-        highest = before + rise
-        if drifted is not None:
-            slowly = before[drifted] + slow
-            highest[drifted] = np.maximum(slowly, drift.calibrated[drifted])
-            reached = drift.baseline[drifted] <= highest[drifted]
-            drifted = drifted[reached | ~self._own[drifted]]
-        np.minimum(drift.baseline, highest, out=drift.baseline, where=self._own)
-        return drifted if drifted is not None and len(drifted) else None
-
-    def reset(self, taxels: Mask) -> None:
-        """Forget the readings of taxels [m]."""
-        self._take_back()
-        self._smoother.reset(taxels)
-        self._reported = np.where(taxels, self._zeros, self._reported)
-        self.erratic.reset(taxels)
-        if self._memory is not None:
-            self._memory.reset(taxels)
-        self._set_apart(self._which, self._apart)
-
-    def without_rails(self, raw: NDArray[np.uint8], present: Mask, offset: Floats) -> Mask:
-        """Leave out bytes at the ends of the range: 0, and 255 far from rest, are not readings."""
-        data = raw.tobytes()
-        if 0 not in data and 255 not in data:
-            return present
-        rail = (raw == 0) | ((raw == 255) & (offset < RESTING_NEAR_RAIL))
-        left: Mask = present & ~(rail & self._own)
-        return left
 
 
 def _as_bytes(levels: Floats, out: NDArray[np.uint8]) -> None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from skin_host.config.settings import TouchSettings
 from skin_host.layout import Layout, PadKind
 from skin_host.processing.calibration import Calibration, Floats, Verdict, identified
-from skin_host.processing.calibration.course import JOINED, Course
+from skin_host.processing.calibration.block_means import JOINED, BlockMeans
 from skin_host.processing.conversions import Conversions
 from skin_host.processing.masks import Mask
 from skin_host.processing.touch import levels
@@ -130,7 +130,7 @@ class Calibrator:
         self._fineness = np.exp2(np.array(finer))[layout.triangle_of]
         self._received = np.zeros(n, dtype=np.int64)
         self._counts = np.zeros((n, 256), dtype=np.int64)
-        self._course = Course(n)
+        self._course = BlockMeans(n)
         #: The last two bytes of each taxel, the newest first, and those that were off alone.
         self._last, self._earlier = np.zeros(n, np.int16), np.zeros(n, np.int16)
         self._off: list[_Off] = []

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.processing.calibration import Floats
 from skin_host.processing.masks import Mask
 
 #: The course of a calibration is kept as means of this many samples, ...
@@ -12,10 +13,8 @@ MOST_BLOCKS = 128
 #: This many means are joined to measure how long noise lasts.
 JOINED = 4
 
-Floats = NDArray[np.float64]
 
-
-class Course:
+class BlockMeans:
     """The course of n taxels over a calibration of any length, as means of blocks of samples."""
 
     def __init__(self, n: int) -> None:
