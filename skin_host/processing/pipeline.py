@@ -415,7 +415,7 @@ class _PartPipeline:
         self._gather(touched, dt_s)
         if not quiet:
             repeated = None if idle else self._detector.repeated
-            touched = self._residuals.step(touched, corrected, repeated)
+            touched = self._residuals.step(touched, corrected, repeated, self._detector.lost)
         if valid is not self._always_valid:
             pressure = np.where(valid, pressure, self._zeros)
             touched = touched if touched is self._nowhere else touched & valid

@@ -147,6 +147,8 @@ class TouchDetector:
         touched: bool[n]; see `step`.
         any: whether any is.
         repeated: bool[n], which taxels only repeated a measurement in the last step; None if none.
+        lost: bool[n], taxels whose touch was lost, and that have neither been touched again nor
+            been released since; None if none.
     """
 
     def __init__(self, found: Levels, votes: int = 2) -> None:
@@ -167,6 +169,7 @@ class TouchDetector:
         self._bits = self.touched.tobytes()
         self._reads: Mask = np.empty(n, np.bool_)
         self.repeated: Mask | None = None
+        self.lost: Mask | None = None
         self.any = False
         self._clear = True
         self._skipped = True
@@ -249,6 +252,8 @@ class TouchDetector:
             self.any = 1 in bits
             self.touched = self._over.copy()
             self._set_limits()
+        if self.lost is not None:
+            self._keep_lost((evidence > 0.0) & ~self.touched)
         self._clear = False
         return self.touched
 
@@ -260,8 +265,19 @@ class TouchDetector:
         """
         if any_of(taxels):
             evidence = np.where(taxels, self._span - self._vote, self._evidence)
+            lost = taxels if self.lost is None else taxels | self.lost
             self.reset(taxels)
+            self.lost = lost
             np.copyto(self._evidence, evidence)
+
+    def _keep_lost(self, which: Mask) -> None:
+        """Keep only these of the lost taxels."""
+        assert self.lost is not None
+        lost = self.lost & which
+        if not any_of(lost):
+            self.lost = None
+        elif lost.tobytes() != self.lost.tobytes():
+            self.lost = lost
 
     def reset(self, taxels: NDArray[np.intp] | Mask) -> None:
         """Forget that some taxels, by number or mask [n], were touched."""
@@ -270,6 +286,10 @@ class TouchDetector:
         self._evidence[taxels] = 0.0
         self._bits = self.touched.tobytes()
         self.any = 1 in self._bits
+        if self.lost is not None:
+            others = np.ones(len(self.touched), np.bool_)
+            others[taxels] = False
+            self._keep_lost(others)
         self._set_limits()
 
     def _set_limits(self) -> None:
@@ -290,8 +310,9 @@ class Residuals:
     the residual: that of any press, or what was felt when this one fell. A firm press ends when it
     has fallen to its residual: by evidence alone that takes long, because the residual is nearly
     enough to keep a touch. The baselines still follow the decision before: what is left may be
-    drift, and then it lasts. While that decision holds on to a residual it is no new evidence: a
-    taxel is touched again when its mean rises further than noise carries it.
+    drift, and then it lasts. While that decision holds on to a residual it is no new evidence, nor
+    is it when it has lost it and finds it again: a taxel is touched again when its mean rises
+    further than noise carries it.
 
     Attributes:
         any: whether any is reported.
@@ -307,7 +328,9 @@ class Residuals:
         #: What the last firm press of each taxel left when it fell or ended, fading.
         self._left = np.zeros(n, np.float32)
         self._felt = np.zeros(n, np.float32)
+        #: For how many measurements it has fallen, and their sum.
         self._fallen = np.zeros(n, np.int64)
+        self._fallen_sum = np.zeros(n, np.float32)
         #: What noise adds to the mean at most; and which taxels have fallen to their residual and
         #: are still touched by the decision before.
         self._rise = np.zeros(n, np.float32)
@@ -316,6 +339,7 @@ class Residuals:
         self._any_fallen = False
         self._reported: Mask = np.zeros(n, dtype=np.bool_)
         self._seen = self._reported
+        self._lost: Mask | None = None
         self._which: NDArray[np.intp] | slice = np.zeros(0, np.intp)
         self.any = False
         self._undecided = False
@@ -336,7 +360,13 @@ class Residuals:
         rise = self._firmer * np.sqrt(votes / 2) * (own / FALL_DEVIATIONS)
         np.copyto(self._rise, rise, casting="same_kind")
 
-    def step(self, touched: Mask, signal: Array, repeated: Mask | None = None) -> Mask:
+    def step(
+        self,
+        touched: Mask,
+        signal: Array,
+        repeated: Mask | None = None,
+        lost: Mask | None = None,
+    ) -> Mask:
         """Take one decision [n] and the signal [n] that it was based on, in kPa.
 
         As with the decision, the result is the same array as long as nothing has changed.
@@ -345,14 +375,16 @@ class Residuals:
             touched: bool[n].
             signal: float[n].
             repeated: bool[n], which of them only repeat a measurement.
+            lost: see `TouchDetector`.
         """
-        if self._undecided or touched is not self._seen:
-            self._begin_and_end(touched, signal)
+        if self._undecided or touched is not self._seen or lost is not self._lost:
+            self._lost = lost
+            self._begin_and_end(touched, signal, lost)
         if self.any:
             self._end_fallen(signal, repeated)
         return self._reported
 
-    def _begin_and_end(self, touched: Mask, signal: Array) -> None:
+    def _begin_and_end(self, touched: Mask, signal: Array, lost: Mask | None) -> None:
         # A sample is noisy: a taxel's signal is its fading mean since it was touched.
         known = touched & self._seen
         felt = self._felt + np.where(known, MEAN_SHARE, 1.0) * (signal - self._felt)
@@ -360,7 +392,7 @@ class Residuals:
         self._seen = touched
         self._note_left(np.flatnonzero(self._reported & ~touched))
         left = np.fmax(RESIDUAL_SHARE * self._pressed, self._left)
-        self._held &= touched
+        self._held &= touched if lost is None else touched | lost
         enough = (left < LEAST_RESIDUAL * self._on) & ~self._held
         enough |= self._felt >= self._on + left + np.where(self._held, self._rise, 0.0)
         self._report(touched & (self._reported | enough))
@@ -392,22 +424,27 @@ class Residuals:
             self._felt[which] = mean
             return
         counts = np.where(fallen, self._fallen[which] + 1, 0)
+        sums = np.where(fallen, self._fallen_sum[which] + now, 0.0)
         # The earlier mean is kept while the fall is observed.
         felt = np.where(fallen, felt, felt + MEAN_SHARE * (now - felt))
         if repeated is not None:
             again = repeated[which]
             counts = np.where(again, self._fallen[which], counts)
+            sums = np.where(again, self._fallen_sum[which], sums)
             felt = np.where(again, self._felt[which], felt)
         self._fallen[which] = counts
+        self._fallen_sum[which] = sums
         self._any_fallen = any_of(counts > 0)
         self._felt[which] = felt
         ended = np.flatnonzero(counts >= self._votes[which])
         if len(ended):
             if not isinstance(which, slice):
                 ended = which[ended]
-            self._felt[ended] = signal[ended]
+            # The last of them may be low by noise.
+            left = self._fallen_sum[ended] / self._fallen[ended]
+            self._felt[ended] = left
             self._held[ended] = True
-            self._left[ended] = np.clip(signal[ended], 0.0, LARGEST_SHARE * self._pressed[ended])
+            self._left[ended] = np.clip(left, 0.0, LARGEST_SHARE * self._pressed[ended])
             reported = self._reported.copy()
             reported[ended] = False
             self._report(reported)
@@ -415,7 +452,9 @@ class Residuals:
 
     def _report(self, reported: Mask) -> None:
         if not np.array_equal(reported, self._reported):
-            self._fallen[reported & ~self._reported] = 0
+            began = reported & ~self._reported
+            self._fallen[began] = 0
+            self._fallen_sum[began] = 0.0
             self._reported = reported
             found = np.flatnonzero(reported)
             self._which = found if len(found) < len(reported) else slice(None)

@@ -462,6 +462,58 @@ def test_of_the_three_units_of_a_hard_press_one_is_left_after_five_seconds(
     assert bool(residuals.step(np.array([True]), np.array([reading]))[0]) is reported
 
 
+@pytest.mark.parametrize("last", [1.0, 4.5, 4.9])
+def test_what_a_press_left_is_the_mean_of_the_readings_in_which_it_fell(last: float) -> None:
+    """The last of them may be any: noise makes it low as often as high."""
+    residuals = residuals_of(votes=7)
+    on, off = np.array([True]), np.array([False])
+    for reading in [120.0] * 40 + [4.9, 4.1, 4.8, 4.2, 4.7, 4.6, last]:
+        reported = residuals.step(on, np.array([reading]))
+    assert not reported[0]
+    residuals.step(off, np.array([4.5]))
+    # Its mean is 4 to 4.6, and 2 units more are a touch.
+    assert not residuals.step(on.copy(), np.array([5.9]))[0]
+    residuals.step(off, np.array([4.5]))
+    assert residuals.step(on.copy(), np.array([6.7]))[0]
+
+
+@pytest.mark.parametrize(("reading", "reported"), [(5.0, False), (8.0, True)])
+def test_what_a_press_left_is_no_new_evidence_after_it_was_lost_either(
+    reading: float, reported: bool
+) -> None:
+    residuals = residuals_of(votes=7)
+    on, off = np.array([True]), np.array([False])
+    for value in [120.0] * 40 + [3.0] * 9:
+        residuals.step(on, np.array([value]))
+    residuals.fade(10.0)
+    assert not residuals.step(off, np.array([3.0]), lost=on)[0]
+    assert bool(residuals.step(on.copy(), np.array([reading]))[0]) is reported
+
+
+def test_a_touch_that_was_lost_is_new_evidence_once_it_was_released() -> None:
+    residuals = residuals_of(votes=7)
+    on, off = np.array([True]), np.array([False])
+    for value in [120.0] * 40 + [3.0] * 9:
+        residuals.step(on, np.array([value]))
+    residuals.fade(10.0)
+    residuals.step(off, np.array([3.0]), lost=on)
+    residuals.step(off, np.array([3.0]))
+    assert residuals.step(on.copy(), np.array([5.0]))[0]
+
+
+def test_a_lost_touch_is_lost_until_it_is_decided_again() -> None:
+    detector = detector_of(levels_of(*np.repeat([[1.75], [1.75], [0.5], [0.5]], 3, axis=1)))
+    for _ in range(3):
+        pressed(detector, [5, 5, 5])
+    detector.lose(np.array([True, True, True]))
+    assert detector.lost is not None
+    detector.reset(np.array([2]))
+    assert detector.lost.tolist() == [True, True, False]
+    pressed(detector, [5, 0, 0])
+    assert detector.touched.tolist() == [True, False, False]
+    assert detector.lost is None
+
+
 @pytest.mark.parametrize(("reading", "reported"), [(5.0, False), (8.0, True)])
 def test_what_a_noisy_touch_feels_at_last_is_no_touch_after_its_end(
     reading: float, reported: bool
