@@ -32,7 +32,7 @@ from skin_host.mqtt.contact import PartContact
 from skin_host.mqtt.info import CalibrationInfo, NodeInfo, node_info
 from skin_host.mqtt.publisher import Connect, Publisher
 from skin_host.processing import calibration as calibrations
-from skin_host.processing.calibration import Calibration
+from skin_host.processing.calibration import Calibration, by_part
 from skin_host.processing.calibration.file import find_calibration, save_calibration
 from skin_host.processing.calibration.run import SHORTEST_S
 from skin_host.processing.core import Engine, Output
@@ -281,15 +281,14 @@ class Daemon:
             RequestError: no reading of some taxels would be a touch any more.
         """
         touch = thresholds.over(self._configured.processing.touch)
-        unreached = self.engine.unreached(touch)
-        for part in self.layout.parts:
-            taxels = np.flatnonzero(unreached[part.start : part.stop]).tolist()
-            if taxels:
-                raise RequestError(
-                    f"margin_units = {touch.margin_units:g}, minimum_threshold_units = "
-                    f"{touch.minimum_threshold_units:g}: no press would be felt by {named(taxels)} "
-                    f"of {part.name}, whose readings end before; wanted smaller ones"
-                )
+        unreached = by_part(self.engine.unreached(touch), self.layout)
+        if unreached:
+            where = ", ".join(f"{named(taxels)} of {name}" for name, taxels in unreached.items())
+            raise RequestError(
+                f"margin_units = {touch.margin_units:g}, minimum_threshold_units = "
+                f"{touch.minimum_threshold_units:g}: no press would be felt by {where}, whose "
+                "readings end before; wanted smaller ones"
+            )
         self.thresholds = thresholds
         self._swap(self._configured, self.layout)
 
@@ -375,9 +374,8 @@ class Daemon:
 
     def _use_usable(self) -> None:
         """Let contacts wait only for taxels that can be valid again."""
-        calibration, pipeline = self.engine.calibration, self.engine.pipeline
-        if calibration is not None and pipeline is not None:
-            usable = calibration.usable & ~self.engine.zeros.cut_off() & ~pipeline.unreached
+        usable = self.engine.usable()
+        if usable is not None:
             for index, contact in self._contacts.items():
                 part = self.layout.parts[index]
                 contact.use(usable[part.start : part.stop])

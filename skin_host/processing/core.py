@@ -247,7 +247,8 @@ class Engine:
 
     def calibration_progress(self) -> float:
         """Share of the wanted time, and of the fewest samples, that has been collected, 0 to 1."""
-        return self._run.progress if self._run is not None and self.calibrating else 0.0
+        run = self._run
+        return 0.0 if run is None or run.is_over else run.progress
 
     def end_calibration(self, time: str) -> Calibration:
         """Return a calibration from the collected samples and stop collecting.
@@ -352,6 +353,12 @@ class Engine:
         processing = msgspec.structs.replace(self.settings.processing, touch=touch)
         found = unreached(self.layout, processing, self.calibration)
         return found & ~self._pipeline.unreached
+
+    def usable(self) -> Mask | None:
+        """Return the taxels bool[n] that can be valid, now or later; None without a calibration."""
+        if self.calibration is None or self._pipeline is None:
+            return None
+        return self.calibration.usable & ~self.zeros.cut_off() & ~self._pipeline.unreached
 
     def end_part(self, part: int, t_ns: int) -> list[Touch]:
         """End every contact of a part."""

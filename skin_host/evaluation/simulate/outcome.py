@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from skin_host.evaluation.simulate.promises.chance import too_many
-from skin_host.evaluation.simulate.run import RunResult, coverage, touched_by_chance
+from skin_host.evaluation.simulate.run import RunResult, coverage
 from skin_host.processing.touch import ODDS
 
 
@@ -54,16 +54,23 @@ def summary(results: list[RunResult]) -> str:
         f"{what} (not {', '.join(kinds[missing])})" if kinds[missing] else what
         for what, missing in ((came, "never_injected"), (named, "never_named"))
     )
-    touches, measurements = touched_by_chance(results)
+    touches, measurements = _touched_by_chance(results)
     noise = f"noise alone made {touches} touches in {measurements:.2g} measurements of valid pads"
-    if touched_too_often(results):
+    if too_many(touches, measurements):
         noise += f": the touch decision allows one in {ODDS:.0e}"
     return f"{kept} of {len(results)} seeds kept every promise\n{covered}\n{noise}"
 
 
 def touched_too_often(results: list[RunResult]) -> bool:
     """Return whether noise made more touches than the odds of the touch decision explain."""
-    return too_many(*touched_by_chance(results))
+    return too_many(*_touched_by_chance(results))
+
+
+def _touched_by_chance(results: list[RunResult]) -> tuple[int, int]:
+    """Return the touches by noise alone of all runs, and their measurements."""
+    return sum(result.by_chance for result in results), sum(
+        result.measurements for result in results
+    )
 
 
 def document(results: list[RunResult]) -> dict[str, Any]:

@@ -172,12 +172,6 @@ def _quietly(
     return simulate(settings, layout, config, seed, seconds)
 
 
-def touched_by_chance(results: Iterable[RunResult]) -> tuple[int, int]:
-    """Return the touches by noise alone of some runs together, and their measurements."""
-    pairs = [(result.by_chance, result.measurements) for result in results]
-    return sum(touches for touches, _ in pairs), sum(number for _, number in pairs)
-
-
 def coverage(results: Iterable[RunResult]) -> dict[str, list[str]]:
     """Return what came of the catalogue over some runs, as kinds of trouble.
 

@@ -191,15 +191,18 @@ def summary(calibration: Calibration, layout: Layout) -> dict[str, dict[str, int
 
 def unchanged(calibration: Calibration, layout: Layout) -> dict[str, list[int]]:
     """Return by part the numbers of the pressure taxels that go on as before: see `Calibration`."""
-    return _by_part(calibration.unchanged, layout)
+    return by_part(calibration.unchanged, layout)
 
 
 def damaged(calibration: Calibration, layout: Layout) -> dict[str, list[int]]:
     """Return by part the numbers of the pressure taxels of which bytes were left out."""
-    return _by_part(calibration.damaged, layout)
+    return by_part(calibration.damaged, layout)
 
 
-def _by_part(taxels: Mask | None, layout: Layout) -> dict[str, list[int]]:
+def by_part(taxels: Mask | None, layout: Layout) -> dict[str, list[int]]:
+    """Return by part the numbers of the pressure taxels among these, bool[n]; parts without are
+    left out.
+    """
     if taxels is None:
         return {}
     these = taxels & (layout.pad_kind == PadKind.PRESSURE)

@@ -14,11 +14,6 @@ from skin_host.processing.curves import KNOTS_UNITS, Curves, CurveVerdict, Memor
 from tests.support.calibrated import LAYOUT, TIME, N, calibrated, noisy
 
 
-@pytest.fixture
-def untouched():
-    return calibrated(noisy(np.random.default_rng(0)))
-
-
 def test_a_file_brings_back_what_was_saved(untouched, tmp_path):
     path = tmp_path / "new" / "calibration.json"
     save_calibration(path, untouched, LAYOUT)

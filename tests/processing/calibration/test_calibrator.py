@@ -19,11 +19,6 @@ from skin_host.processing.pipeline import Pipeline
 from tests.support.calibrated import LAYOUT, PRESENT, TIME, N, calibrated, noisy
 
 
-@pytest.fixture
-def untouched():
-    return calibrated(noisy(np.random.default_rng(0)))
-
-
 def test_baseline_is_the_mean_and_noise_the_deviation():
     sweeps = noisy(np.random.default_rng(1))
     found = calibrated(sweeps)

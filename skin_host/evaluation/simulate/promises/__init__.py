@@ -266,10 +266,10 @@ class Promises:
             return
         pads = self._world.layout.pad_kind == PadKind.PRESSURE
         pads &= ~self.excuses.exempt & ~self.excuses.spoiled()
-        engine = life.daemon.engine
-        if engine.calibration is not None:
+        usable = life.daemon.engine.usable()
+        if usable is not None:
             # A part whose other pads are valid has a contact, and health names those without one.
-            pads &= engine.calibration.usable & ~engine.zeros.cut_off()
+            pads &= usable
         self._hold(self.subscribers.pressed_off(self._skin.pressed() & pads))
 
     def _note_set_ups(self) -> None:
