@@ -48,8 +48,6 @@ HEALTH_S = 1.0
 _KEPT = ("calibration", "state", "zeros")
 #: Faults that are expected while a calibration is being taken.
 _UNTIL_CALIBRATED = {"part_not_calibrated", "fingertip_not_calibrated"}
-#: The time of day was set if it differs by more than this from the monotonic time.
-JUMP_NS = 50_000_000
 #: The end waits so long for a file that is being written.
 KEEPING_S = 2.0
 #: What could not be written, or was removed since, is written again after this time.
@@ -168,7 +166,6 @@ class Daemon:
         #: contacts know.
         self._zeros_kept = 0
         self._zero_changes = self.engine.zeros.changes
-        self._clock_ahead_ns = self._clock_against_ns()
 
     async def run(self, stop: asyncio.Event, *, calibrate: bool = False) -> None:
         """Run until `stop` is set and what was received by then is processed; then end every touch,
@@ -421,7 +418,6 @@ class Daemon:
         if self.engine.fingertips is not None:
             self.fingertips.deliver(output.grasps)
         if output.steps:
-            self._follow_clock()
             if self._zero_changes != self.engine.zeros.changes:
                 # Something may press a pad whose zero was not found, did before it was held, or
                 # was zeroed away and has shown that when it lifted.
@@ -445,18 +441,6 @@ class Daemon:
             if now_s - self._fed_s > 0.5 * self._feed_s:
                 self._fed_s = now_s
                 service.notify("WATCHDOG=1")
-
-    def _clock_against_ns(self) -> int:
-        return self.clock.now_ns() - self.clock.monotonic_ns()
-
-    def _follow_clock(self) -> None:
-        """Notice that the time of day was set, by which nothing has gone unfelt."""
-        ahead_ns = self._clock_against_ns()
-        jump_ns = ahead_ns - self._clock_ahead_ns
-        if abs(jump_ns) > JUMP_NS:
-            self._clock_ahead_ns = ahead_ns
-            for contact in self._contacts.values():
-                contact.follow_clock(jump_ns)
 
     def _record(self, bus: str, batch: FrameBatch) -> None:
         if self.control.recorder is not None:

@@ -42,7 +42,8 @@ class PartWatch:
             were.
         touched: bool[m], taxels that are touched, since `touched_ns` was renewed.
         touched_ns: when each taxel [m] was last touched before; None if none ever was.
-        sample_ns: time of the last sample.
+        sample_ns: time stamp of the last sample.
+        elapsed_ns: `PressureFrame.elapsed_ns` of it, as `touched_ns` and `rate_since_ns`.
         late: bool[m], taxels that are late and were valid before.
         doubted: bool[16 b, 12], pads that were in doubt after the last sample but one, and after
             the last one: its own doubts are between them.
@@ -52,7 +53,7 @@ class PartWatch:
     last_ns: int = 0
     frames: int = 0
     rate_hz: float = 0.0
-    rate_since_ns: int = 0
+    rate_since_ns: int | None = None
     rate_frames: int = 0
     valid: NDArray[np.bool_] | None = None
     touched: NDArray[np.bool_] | None = None
@@ -65,6 +66,7 @@ class PartWatch:
     late: NDArray[np.bool_] | None = None
     doubted: tuple[Mask | None, Mask | None] = (None, None)
     sample_ns: int = 0
+    elapsed_ns: int = 0
 
     def note(self, step: Step, doubted: Mask | None) -> None:
         """Take in a processed sample, with the pads that are in doubt now."""
@@ -83,16 +85,16 @@ class PartWatch:
             self._note_touched()
             self.touched = frame.touched
             self.any_touched = any_of(frame.touched)
-        self.sample_ns = frame.t_ns
+        self.sample_ns, self.elapsed_ns = frame.t_ns, frame.elapsed_ns
         self.beyond = frame.beyond_range
         self.raw = frame.raw
-        if not self.rate_since_ns:
-            self.rate_since_ns = frame.t_ns
+        if self.rate_since_ns is None:
+            self.rate_since_ns = frame.elapsed_ns
             self.rate_frames = 0
-        elapsed_s = (frame.t_ns - self.rate_since_ns) * 1e-9
-        if elapsed_s >= RATE_S or elapsed_s < 0.0:
-            self.rate_hz = self.rate_frames / elapsed_s if elapsed_s > 0.0 else 0.0
-            self.rate_since_ns = frame.t_ns
+        elapsed_s = (frame.elapsed_ns - self.rate_since_ns) * 1e-9
+        if elapsed_s >= RATE_S:
+            self.rate_hz = self.rate_frames / elapsed_s
+            self.rate_since_ns = frame.elapsed_ns
             self.rate_frames = 0
 
     def rests(self) -> Mask | None:
@@ -100,9 +102,7 @@ class PartWatch:
         self._note_touched()
         if self.valid is None or self.touched_ns is None:
             return self.valid
-        passed_ns = self.sample_ns - self.touched_ns
-        # A touch in the future was before the clock was set back.
-        rests: Mask = self.valid & ((passed_ns < 0) | (passed_ns >= FOAM_NS))
+        rests: Mask = self.valid & (self.elapsed_ns - self.touched_ns >= FOAM_NS)
         return rests
 
     def _note_touched(self) -> None:
@@ -111,7 +111,7 @@ class PartWatch:
             return
         if self.touched_ns is None:
             self.touched_ns = np.full(len(self.touched), -FOAM_NS, np.int64)
-        self.touched_ns[self.touched] = self.sample_ns
+        self.touched_ns[self.touched] = self.elapsed_ns
 
     def _note_lost(self, frame: PressureFrame) -> None:
         # Where nothing was received there is 0. A sample of nothing reports silence.

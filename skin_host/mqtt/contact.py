@@ -60,9 +60,6 @@ class PartContact:
         self._feels = np.zeros(len(pads), np.bool_)
         self._all_feel = False
         self._present: set[int] = set()
-        self._last_ns = 0
-        #: By how much the clock was set forward since the last frame.
-        self._jump_ns = 0
 
     def step(self, frame: PressureFrame, events: Iterable[Touch]) -> ContactState:
         """Take a frame and the events of its contacts; return the state."""
@@ -75,22 +72,16 @@ class PartContact:
                     self._is_unsure = True
             else:
                 self._present.add(event.id)
-        if frame.t_ns - self._last_ns > self._jump_ns > 0:
-            felt = self._felt_ns != _NEVER_NS
-            self._felt_ns[felt] += self._jump_ns
-            self._jump_ns = 0
-        self._last_ns = frame.t_ns
         if frame.valid is not self._valid:
             self._valid = frame.valid
             self._feels = np.logical_or.reduceat(frame.valid[self._pads], self._starts)
             self._all_feel = all_of(self._feels)
         if self._all_feel and not self._is_unsure:
-            self._felt_ns.fill(frame.t_ns)
+            self._felt_ns.fill(frame.elapsed_ns)
             return "ON" if self._present or any_of(frame.touched) else "OFF"
         feels = self._feels
-        np.minimum(self._felt_ns, frame.t_ns, out=self._felt_ns)  # the clock may be set back
-        self._felt_ns[feels] = frame.t_ns
-        self._unsure[frame.t_ns - self._felt_ns >= LOST_NS] = SURE_FRAMES
+        self._felt_ns[feels] = frame.elapsed_ns
+        self._unsure[frame.elapsed_ns - self._felt_ns >= LOST_NS] = SURE_FRAMES
         self._unsure -= feels & (self._unsure > 0)
         self._lost -= frame.valid & (self._lost > 0)
         self._is_unsure = any_of(self._unsure > 0) or any_of(self._lost > 0)
@@ -101,13 +92,6 @@ class PartContact:
         if self._present:  # frames of the touched place were lost, for less than `LOST_NS`
             return "ON"
         return "UNKNOWN" if self._is_unsure else "OFF"
-
-    def follow_clock(self, jump_ns: int) -> None:
-        """The clock by which frames have their times was set: no time has passed by that.
-
-        Some frames from before may come still.
-        """
-        self._jump_ns = max(0, self._jump_ns + jump_ns)
 
     def doubt(self, taxels: NDArray[np.bool_]) -> None:
         """Something may touch these taxels [m], as it did when an earlier daemon ended, or while

@@ -52,6 +52,9 @@ class _Contact:
     #: The same in rising order, intp.
     order: NDArray[np.intp]
     said: Touch
+    #: When that was, and when all its taxels were last received. All times here are those of
+    #: `PressureFrame.elapsed_ns`.
+    said_ns: int
     heard_ns: int
     #: The recent highest pressure.
     firm_kpa: float
@@ -100,7 +103,7 @@ class ContactTracker:
             self._places = _Places(layout, part_index, settings)
         self._contacts: dict[int, _Contact] = {} if before is None else before._contacts
         self._next_id: int = 1 if before is None else before._next_id
-        self._t_ns: int = 0 if before is None else before._t_ns
+        self._elapsed_ns: int = 0 if before is None else before._elapsed_ns
         self._known = _Grouping.of([], [], _Homes({}, 0), self._area_mm2, self._position_m)
         self._seen: bytes | None = None
 
@@ -138,7 +141,7 @@ class ContactTracker:
         home = _Homes(self._contacts, len(self._neighbours))
         if len(groups) == 1:
             home.note(groups[0], touched)
-        groups = self._kept_whole(self._kept_apart(groups, home, frame.t_ns), home, frame)
+        groups = self._kept_whole(self._kept_apart(groups, home, frame.elapsed_ns), home, frame)
         names = self._identify(groups, home)
         self._known = _Grouping.of(names, groups, home, self._area_mm2, self._position_m)
         # Whether contacts are kept together or apart, or are split by pressure, can change with any
@@ -156,7 +159,7 @@ class ContactTracker:
             return np.flatnonzero(frame.touched)
         touched = frame.touched
         for contact in self._contacts.values():
-            if 0 <= frame.t_ns - contact.heard_ns < LOST_NS:
+            if frame.elapsed_ns - contact.heard_ns < LOST_NS:
                 valid = frame.valid[contact.order]
                 if not all_of(valid):
                     touched = touched.copy() if touched is frame.touched else touched
@@ -204,7 +207,7 @@ class ContactTracker:
         return reached
 
     def _kept_apart(
-        self, groups: list[frozenset[int]], home: "_Homes", t_ns: int
+        self, groups: list[frozenset[int]], home: "_Homes", elapsed_ns: int
     ) -> list[frozenset[int]]:
         """Return the groups, with contacts kept apart that have only just grown together.
 
@@ -224,8 +227,8 @@ class ContactTracker:
             for name in (largest, *others):
                 contact = self._contacts[name]
                 if contact.merged_ns is None:
-                    contact.merged_ns = t_ns
-                if name != largest and 0 <= t_ns - contact.merged_ns < MERGED_NS:
+                    contact.merged_ns = elapsed_ns
+                if name != largest and elapsed_ns - contact.merged_ns < MERGED_NS:
                     own = group & contact.taxels
                     rest -= own
                     kept.append(own)
@@ -266,8 +269,8 @@ class ContactTracker:
                 kept.append(frozenset().union(*parts))
                 continue
             if contact.parted_ns is None:
-                contact.parted_ns = frame.t_ns
-            if 0 <= frame.t_ns - contact.parted_ns < PARTED_NS:
+                contact.parted_ns = frame.elapsed_ns
+            if frame.elapsed_ns - contact.parted_ns < PARTED_NS:
                 kept.append(frozenset().union(*parts))
             else:
                 strong.sort(key=len)
@@ -317,21 +320,23 @@ class ContactTracker:
             heard = np.logical_or.reduceat(valid, starts).tolist()
             all_heard = np.logical_and.reduceat(valid, starts).tolist()
         totals = total.tolist()
-        elapsed_ns = min(max(frame.t_ns - self._t_ns, 0), FADES_NS)
-        fading = math.exp(-elapsed_ns / FADES_NS)
-        self._t_ns = frame.t_ns
+        now_ns = frame.elapsed_ns
+        fading = math.exp((self._elapsed_ns - now_ns) / FADES_NS)
+        self._elapsed_ns = now_ns
         events = []
         for number, (name, taxels) in enumerate(zip(found.names, found.groups, strict=True)):
             known = self._contacts.get(name)
             before = None
+            silent_ns = 0
             if known is not None:
                 if known.taxels is not taxels:
                     known.taxels, known.order = taxels, found.order[found.spans[number]]
                 if all_heard[number]:
-                    known.heard_ns = frame.t_ns
+                    known.heard_ns = now_ns
                 before = known.said
                 known.firm_kpa = max(peaks[number], known.firm_kpa * fading)
-                if not heard[number] or 0 <= frame.t_ns - before.t_ns < self._shortest_ns:
+                silent_ns = now_ns - known.said_ns
+                if not heard[number] or silent_ns < self._shortest_ns:
                     continue
             peak = peaks[number]
             index = found.taxels[number]
@@ -349,7 +354,7 @@ class ContactTracker:
                     # Noise adds little to the uncertainty from the coarse pads.
                     sigma = GEOMETRY_PITCHES * self._pitch_m / math.sqrt(len(index))
             if before is not None and not _worth_reporting(
-                before, frame.t_ns, index, peak, centroid
+                before, silent_ns, index, peak, centroid
             ):
                 continue
             normal = before.normal if before is not None and kept else None
@@ -375,9 +380,9 @@ class ContactTracker:
             events.append(event)
             if known is None:
                 own = found.order[found.spans[number]]
-                self._contacts[name] = _Contact(taxels, own, event, frame.t_ns, peak)
+                self._contacts[name] = _Contact(taxels, own, event, now_ns, now_ns, peak)
             else:
-                known.said = event
+                known.said, known.said_ns = event, now_ns
         return events
 
     def _mean_normal(self, weight: Floats, taxels: NDArray[np.intp], total: float) -> Vector | None:
@@ -510,10 +515,10 @@ class _Grouping(NamedTuple):
 
 
 def _worth_reporting(
-    said: Touch, t_ns: int, taxels: list[int], peak_kpa: float, centroid_m: Vector | None
+    said: Touch, silent_ns: int, taxels: list[int], peak_kpa: float, centroid_m: Vector | None
 ) -> bool:
     """Return whether a contact has changed since its last event, or its next event is due."""
-    if taxels != said.taxels or t_ns - said.t_ns >= ALIVE_NS:
+    if taxels != said.taxels or silent_ns >= ALIVE_NS:
         return True
     said_kpa = said.peak_kpa or 0.0
     if abs(peak_kpa - said_kpa) > max(PRESSED_KPA, PRESSED_SHARE * said_kpa):

@@ -67,6 +67,8 @@ class PressureFrame:
         beyond_range: the pressure is above the calibrated range, or the byte at an end of its
             scale (0 or 255): its order is right, its value an estimate.
         computed: False if pressures were not requested and nothing touches: they are 0.
+        elapsed_ns: time that passed for the part since its first sweep. What waits or times out
+            counts by this: `t_ns` can be set, forward or back.
     """
 
     part: str
@@ -78,6 +80,7 @@ class PressureFrame:
     valid: Mask
     beyond_range: Mask
     computed: bool = True
+    elapsed_ns: int = 0
 
 
 class Pipeline:
@@ -266,6 +269,7 @@ class _PartPipeline:
         self._name = part.name
         self.seq = 0
         self._t_ns: int | None = None
+        self._elapsed_ns = 0
         #: By how much the clock was set forward and no sweep has shown it yet.
         self._set_ns = 0
         self._no_load = layout.no_load[mine].astype(np.float64)
@@ -450,7 +454,18 @@ class _PartPipeline:
         computed: bool,
     ) -> PressureFrame:
         seq, self.seq = self.seq, self.seq + 1
-        return PressureFrame(self._name, seq, t_ns, raw, pressure, touched, valid, beyond, computed)
+        return PressureFrame(
+            self._name,
+            seq,
+            t_ns,
+            raw,
+            pressure,
+            touched,
+            valid,
+            beyond,
+            computed,
+            self._elapsed_ns,
+        )
 
     def _dt_s(self, t_ns: int) -> tuple[float, float]:
         """Return the step to this sweep, and the time before it that is a gap."""
@@ -461,7 +476,9 @@ class _PartPipeline:
         if 0 < self._set_ns <= passed_ns:
             passed_ns -= self._set_ns
             self._set_ns = 0
-        dt_s = max(passed_ns * 1e-9, 0.0)
+        passed_ns = max(passed_ns, 0)
+        self._elapsed_ns += passed_ns
+        dt_s = passed_ns * 1e-9
         return min(dt_s, LONGEST_STEP_S), max(dt_s - LONGEST_STEP_S, 0.0)
 
     def _bridge(self, gap_s: float) -> None:

@@ -24,16 +24,21 @@ FIRST, SECOND = list(range(12)), list(range(12, 24))
 
 
 def note(
-    watch: PartWatch, t_ns: int, lost: tuple[int, ...] = (), valid: bool = True
+    watch: PartWatch,
+    t_ns: int,
+    lost: tuple[int, ...] = (),
+    valid: bool = True,
+    set_ns: int = 0,
 ) -> PressureFrame:
-    """A sample in which triangles were not received."""
+    """A sample in which triangles were not received, by a clock that was set by `set_ns`."""
     raw = np.full(N, 240, np.uint8)
     here = np.full(N, valid)
     for triangle in lost:
         raw[12 * triangle : 12 * (triangle + 1)] = 0
         here[12 * triangle : 12 * (triangle + 1)] = False
     none = np.zeros(N, np.bool_)
-    frame = PressureFrame("arm", 0, t_ns, raw, np.zeros(N, np.float32), none, here, none)
+    kpa = np.zeros(N, np.float32)
+    frame = PressureFrame("arm", 0, t_ns, raw, kpa, none, here, none, elapsed_ns=t_ns - set_ns)
     watch.note(Step(0, frame, []), None)
     return frame
 
@@ -53,12 +58,16 @@ def test_a_rate_is_the_mean_over_two_seconds_of_samples_with_a_valid_taxel() -> 
     assert watch.rate_hz == pytest.approx(10.0)
     assert watch.frames == 61
     assert watch.last_ns == 80 * PERIOD
-    # A clock that is set back begins a new mean.
-    note(watch, PERIOD)
-    assert watch.rate_hz <= 0.0
-    for turn in range(2, 42):
+
+
+@pytest.mark.parametrize("set_ns", [3600_000 * MS, -3600_000 * MS])
+def test_a_clock_that_is_set_changes_no_rate(set_ns: int) -> None:
+    watch = PartWatch(late_samples=3)
+    for turn in range(1, 42):
         note(watch, turn * PERIOD)
-    assert watch.rate_hz == pytest.approx(20.0)
+    for turn in range(42, 142):
+        note(watch, turn * PERIOD + set_ns, set_ns=set_ns)
+        assert watch.rate_hz == pytest.approx(20.0)
 
 
 def test_a_triangle_whose_frames_are_lost_is_late_for_a_few_samples_and_then_not() -> None:

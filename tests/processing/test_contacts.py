@@ -10,7 +10,13 @@ from hypothesis import strategies as st
 from skin_host.config.settings import Settings
 from skin_host.evaluation.rig import flat_skin
 from skin_host.layout import build_layout
-from skin_host.processing.contacts import LOST_NS, MERGED_NS, PARTED_NS, ContactTracker
+from skin_host.processing.contacts import (
+    ALIVE_NS,
+    LOST_NS,
+    MERGED_NS,
+    PARTED_NS,
+    ContactTracker,
+)
 from skin_host.processing.pipeline import PressureFrame
 
 SETTINGS, LAYOUT = flat_skin(1)
@@ -26,6 +32,8 @@ class Skin:
     def __init__(self, layout=LAYOUT):
         self.tracker = ContactTracker(layout, 0, SETTINGS)
         self.seq = 0
+        #: By how much the clock was set.
+        self.set_ns = 0
 
     def show(self, *taxels, kpa=20.0, lost=(), felt=(), unlike=None):
         """`felt` taxels feel something but have too few votes yet; `unlike` ones differ in kPa."""
@@ -41,12 +49,13 @@ class Skin:
         frame = PressureFrame(
             "skin",
             self.seq,
-            self.seq * SWEEP_NS,
+            self.seq * SWEEP_NS + self.set_ns,
             np.zeros(N, np.uint8),
             pressure,
             touched,
             valid,
             np.zeros(N, bool),
+            elapsed_ns=self.seq * SWEEP_NS,
         )
         self.seq += 1
         return self.tracker.step(frame)
@@ -272,6 +281,35 @@ def test_every_touched_taxel_is_in_one_contact_and_every_begin_has_its_end(frame
         assert sorted(said) == sorted(touched)
     ended = {event.id for event in skin.tracker.end_all(0, 0)}
     assert ended == set(alive)
+
+
+@pytest.mark.parametrize("set_s", [0, 3600, -3600])
+def test_a_contact_that_lasts_is_reported_each_second_though_the_clock_was_set(set_s):
+    skin = Skin()
+    skin.show(HERE)
+    skin.set_ns = set_s * 1_000_000_000
+    said = [kinds(skin.show(HERE)) for _ in range(ALIVE_NS // SWEEP_NS)]
+    assert said == [[]] * (len(said) - 1) + [[("move", 1)]]
+
+
+SHOWN = st.tuples(
+    st.sets(st.integers(0, 23), max_size=12),
+    st.sets(st.integers(0, 23), max_size=2),
+    st.sampled_from([1.0, 5.0, 20.0, 100.0]),
+    st.sampled_from([0, 0, 0, 100_000_000, -100_000_000, 3_600_000_000_000, -3_600_000_000_000]),
+)
+
+
+@given(st.lists(SHOWN, max_size=40))
+def test_a_clock_that_is_set_changes_nothing_of_an_event_but_its_time(frames):
+    followed, steady = Skin(), Skin()
+    for touched, lost, kpa, step_ns in frames:
+        followed.set_ns += step_ns
+        found = followed.show(touched, lost=lost, kpa=kpa)
+        expected = steady.show(touched, lost=lost, kpa=kpa)
+        assert expected == [
+            msgspec.structs.replace(event, t_ns=event.t_ns - followed.set_ns) for event in found
+        ]
 
 
 def test_a_press_of_the_whole_skin_keeps_the_name_of_the_larger_contact_that_it_covers():

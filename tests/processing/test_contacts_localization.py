@@ -85,7 +85,9 @@ class PressedPalm:
         self.seq += 1
         raw = np.clip(240 - units, 0, 255).astype(np.uint8)
         t_ns = 50_000_000 * self.seq
-        return PressureFrame("palm", self.seq, t_ns, raw, kpa, touched, valid, ~valid)
+        return PressureFrame(
+            "palm", self.seq, t_ns, raw, kpa, touched, valid, ~valid, elapsed_ns=t_ns
+        )
 
 
 def off_mm(event: Touch, place: np.ndarray) -> float:

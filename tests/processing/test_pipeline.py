@@ -334,6 +334,24 @@ def test_foam_recovers_in_the_time_that_passes_beside_a_clock_that_is_set():
     assert left_in_foam_kpa(3600.0, 20.0) < 0.7 * left_in_foam_kpa(3600.0, 0.0)
 
 
+def test_frames_tell_the_time_that_passed_whatever_the_clock_is_set_to():
+    rig = Rig(1, 0.3)
+    step_ns = round(1e9 * rig.dt_s)
+    first_ns = press(rig, 0.0, 1)[0].elapsed_ns
+    hour_ns = 3600 * 1_000_000_000
+    passed_ns = []
+    for set_ns in (0, hour_ns, -hour_ns):
+        rig.pipeline.clock_set(set_ns)
+        rig.t_ns += set_ns
+        frames = press(rig, 0.0, 3)
+        passed_ns += [frame.elapsed_ns - first_ns for frame in frames]
+        first_ns = frames[-1].elapsed_ns
+    # The step before a clock that is set back is not known.
+    assert passed_ns == [n * step_ns for n in (1, 2, 3, 1, 2, 3, 0, 1, 2)]
+    rig.t_ns += hour_ns
+    assert press(rig, 0.0, 1)[0].elapsed_ns - first_ns == hour_ns + step_ns
+
+
 def test_a_clock_that_is_set_forward_and_back_before_any_sweep_changes_nothing():
     left_kpa = []
     for steps_s in ((), (3600, -3600)):
