@@ -26,6 +26,7 @@ from concurrent.futures import Future
 from contextvars import Context
 from datetime import UTC, datetime
 from heapq import heapify, heappop, heappush
+from itertools import count
 from queue import SimpleQueue
 from typing import Any, Protocol, TypeVar, TypeVarTuple, Unpack
 
@@ -217,13 +218,6 @@ class SteppedClock(Clock):
         return asyncio.Runner(loop_factory=lambda: _SteppedLoop(self))
 
 
-class _When(float):
-    """When a timer is due. Numbers are compared at less cost than asyncio's timers."""
-
-    __slots__ = ("timer",)
-    timer: Any
-
-
 class _SteppedLoop(asyncio.SelectorEventLoop):
     """An event loop whose time is a stepped clock's, and that wakes up at little cost."""
 
@@ -232,8 +226,10 @@ class _SteppedLoop(asyncio.SelectorEventLoop):
         # Asked for several times in each turn.
         self.time = clock.monotonic_s  # type: ignore[method-assign]
         self._clock = clock
-        #: The timers that are set, a heap.
-        self._timers: list[_When] = []
+        #: The timers that are set: when they are due, their numbers, and they themselves; a heap.
+        #: Those of one time are due in the order in which they were set, whatever else is.
+        self._timers: list[tuple[float, int, Any]] = []
+        self._numbers = count()
         self._n_cancelled = 0
         #: The same with what asyncio's types do not declare.
         self._own: Any = self
@@ -247,9 +243,7 @@ class _SteppedLoop(asyncio.SelectorEventLoop):
     ) -> asyncio.TimerHandle:
         timer: Any = asyncio.TimerHandle(when, callback, args, self, context)
         timer._scheduled = True
-        at = _When(when)
-        at.timer = timer
-        heappush(self._timers, at)
+        heappush(self._timers, (when, next(self._numbers), timer))
         return timer  # type: ignore[no-any-return]
 
     def call_later(
@@ -269,14 +263,14 @@ class _SteppedLoop(asyncio.SelectorEventLoop):
         own, ready = self._own, self._own._ready
         timers = self._timers
         if len(timers) > MANY_TIMERS and 2 * self._n_cancelled > len(timers):
-            timers[:] = [when for when in timers if not when.timer._cancelled]
+            timers[:] = [timer for timer in timers if not timer[2]._cancelled]
             heapify(timers)
             self._n_cancelled = 0
-        while timers and timers[0].timer._cancelled:
+        while timers and timers[0][2]._cancelled:
             heappop(timers)
             self._n_cancelled -= 1
         clock = self._clock
-        wait_s = timers[0] - clock._t_ns / NS_PER_S if timers and not ready else 0.0
+        wait_s = timers[0][0] - clock._t_ns / NS_PER_S if timers and not ready else 0.0
         if len(own._selector._fd_to_key) > 1 or not (timers or ready) or own._stopping:
             is_idle = not (ready or own._stopping)
             longest_s = max(wait_s, 0.0) if timers else None
@@ -285,8 +279,8 @@ class _SteppedLoop(asyncio.SelectorEventLoop):
             clock.jump(wait_s)
         if timers:
             end_s = clock._t_ns / NS_PER_S + own._clock_resolution
-            while timers and timers[0] < end_s:
-                timer = heappop(timers).timer
+            while timers and timers[0][0] < end_s:
+                timer = heappop(timers)[2]
                 timer._scheduled = False
                 ready.append(timer)
         for _ in range(len(ready)):

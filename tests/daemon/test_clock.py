@@ -108,3 +108,22 @@ async def test_the_machines_clock_does_the_same_with_threads() -> None:
     executor = SYSTEM.executor("one")
     assert await asyncio.wrap_future(executor.submit(int, "8")) == 8
     executor.close()
+
+
+@pytest.mark.parametrize("others", range(20))
+def test_timers_of_one_time_ring_in_the_order_in_which_they_were_set(others: int) -> None:
+    """An end of the run that is set besides, or not, changes nothing that comes before it."""
+    rung: list[int] = []
+
+    async def ring() -> None:
+        loop = asyncio.get_running_loop()
+        for number in range(others):
+            loop.call_at(10.0 + number % 7, rung.append, -1)
+        for number in range(20):
+            loop.call_at(2.0, rung.append, number)
+            loop.call_at(1.0 + 0.01 * (number % 3), int)
+        await asyncio.sleep(3.0)
+
+    with SteppedClock().runner() as runner:
+        runner.run(ring())
+    assert rung == list(range(20))

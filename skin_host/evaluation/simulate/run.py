@@ -617,10 +617,7 @@ class _Run:
         world = self.world
         if first:
             world.note("the operator sets everything up")
-            for number, part in enumerate(world.layout.parts, 1):
-                self._ask("enable", f'{{"part": "{part.name}"}}')
-                if number % MAX_RUNNING == 0:  # it would refuse the next one
-                    await world.clock.sleep(0.5)
+            await self._enable([part.name for part in world.layout.parts])
             self._ask("thresholds", '{"reset": true}')
             for board in sorted(world.unpowered):
                 self._promises.begin(act("power"))
@@ -628,11 +625,21 @@ class _Run:
             world.unpowered.clear()
             self._ask("configure", "{}")
             await world.clock.sleep(6.0)
+        elif world.life is not None:
+            # While others ran, or the connection was lost, a request was refused or lost.
+            disabled = sorted(world.life.daemon.engine.disabled)
+            await self._enable([world.layout.parts[number].name for number in disabled])
         # Foam that was pressed for long relaxes for a while: then one calibration is not enough.
         world.note("the operator calibrates")
         self._ask("calibrate", "{}")
         await world.clock.sleep(7.0)
         self._promises.calibrated_at_rest()
+
+    async def _enable(self, parts: list[str]) -> None:
+        for number, part in enumerate(parts, 1):
+            self._ask("enable", f'{{"part": "{part}"}}')
+            if number % MAX_RUNNING == 0:  # it would refuse the next one
+                await self.world.clock.sleep(0.5)
 
     def _is_reachable(self) -> bool:
         life = self.world.life
