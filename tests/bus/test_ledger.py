@@ -197,6 +197,37 @@ def test_any_board_is_silent_exactly_when_one_of_them_is(turns: list[tuple[set[i
         assert known.any_silent == bool(known.silent.any())
 
 
+@pytest.mark.parametrize("looks", [False, True])
+@pytest.mark.parametrize(
+    ("missed", "pauses", "may_be_zeroed"),
+    [(2, True, False), (3, True, True), (7, True, True), (7, False, False)],
+)
+def test_a_board_that_pauses_where_it_zeroes_itself_may_have_done_so_from_three_periods_on(
+    looks: bool, missed: int, pauses: bool, may_be_zeroed: bool
+) -> None:
+    known = ledger()
+    if pauses:
+        known.expect_pauses(HAND)
+    if looks:
+        known.look(T0)
+    known.note(sweep(HAND, T0))
+    quiet_ns = (missed + 1) * PERIOD
+    if looks:
+        for turn in range(1, missed + 2):
+            known.look(T0 + turn * PERIOD)
+    after = sweep(HAND, T0 + quiet_ns)._replace(missed=missed)
+    assert known.zeroing_ns(after) == (quiet_ns if may_be_zeroed else 0)
+
+
+def test_a_clock_that_is_set_is_no_pause_in_which_a_board_zeroes_itself() -> None:
+    known = ledger()
+    known.expect_pauses(HAND)
+    known.look(T0)
+    known.note(sweep(HAND, T0))
+    known.look(T0 + PERIOD)
+    assert known.zeroing_ns(sweep(HAND, T0 + 100 * PERIOD)._replace(missed=99)) == 0
+
+
 def test_a_pause_counts_for_no_more_than_the_limit_and_the_poll() -> None:
     for poll_ms in (0.0, 40.0):
         known = ledger(poll_ms)

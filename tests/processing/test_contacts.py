@@ -243,6 +243,15 @@ def test_where_nothing_is_left_to_feel_the_place_stays():
     assert all(event.centroid_m == begin.centroid_m for event in events)
 
 
+def test_where_hardly_anything_is_left_to_feel_the_normal_stays():
+    tilted = LAYOUT.normal.copy()
+    tilted[0], tilted[1] = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
+    skin = Skin(replace(LAYOUT, normal=tilted))
+    (begin,) = skin.show({0, 1})
+    (moved,) = skin.show({0, 1}, kpa=0.3, unlike={0: 1.5})
+    assert moved.normal == begin.normal == pytest.approx([0.5**0.5, 0.5**0.5, 0.0])
+
+
 def test_stopping_ends_every_contact():
     skin = Skin()
     skin.show(HERE, THERE)
@@ -322,6 +331,13 @@ def test_a_press_of_the_whole_skin_keeps_the_name_of_the_larger_contact_that_it_
         for event in events:
             assert event.taxels == sorted(event.taxels)
     assert kinds(skin.show()) == [("end", 1)]
+
+
+@pytest.mark.parametrize("first", [0, 77, N - 1])
+def test_a_press_of_the_whole_skin_continues_the_contact_of_one_taxel(first):
+    skin = Skin()
+    assert kinds(skin.show({first})) == [("begin", 1)]
+    assert kinds(skin.show(set(range(N)))) == [("move", 1)]
 
 
 def test_a_press_of_the_whole_skin_is_one_contact_to_its_end():

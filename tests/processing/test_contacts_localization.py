@@ -1,5 +1,6 @@
 """Where a contact is said to be, from an emulated press to the event."""
 
+from dataclasses import replace
 from typing import Any, get_args
 
 import msgspec
@@ -182,6 +183,19 @@ def test_two_presses_on_one_patch_are_told_apart_unless_the_plain_mean_is_asked_
     assert not set(first.taxels) & set(second.taxels)
     assert off_mm(first, places[0]) < 1.0
     assert off_mm(second, places[1]) < 1.0
+
+
+def test_a_contact_that_becomes_two_on_the_same_taxels_parts(configured):
+    settings, layout = configured('localization = "template"')
+    palm = PressedPalm(layout)
+    tracker = ContactTracker(layout, 0, settings)
+    middle = palm.centre_mm.mean(axis=0)
+    two = palm.press((middle - SIDE_MM, 1.0), (middle + SIDE_MM, 0.8))
+    even = replace(two, pressure_kpa=np.where(two.touched, 20.0, 0.0).astype(np.float32))
+    events = []
+    for number, shown in enumerate([even] * 3 + [two] * 5):
+        events += tracker.step(replace(shown, elapsed_ns=50_000_000 * number))
+    assert [event.event for event in events if event.event != "move"] == ["begin", "begin"]
 
 
 def test_a_contact_that_parts_keeps_its_name_on_the_stronger_side(configured):
