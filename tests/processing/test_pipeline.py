@@ -334,6 +334,14 @@ def test_foam_recovers_in_the_time_that_passes_beside_a_clock_that_is_set():
     assert left_in_foam_kpa(3600.0, 20.0) < 0.7 * left_in_foam_kpa(3600.0, 0.0)
 
 
+@pytest.mark.parametrize(("margin_units", "felt"), [(2.0, True), (255.0, False)])
+def test_a_taxel_of_which_no_reading_is_a_touch_is_not_valid(margin_units, felt):
+    rig = Rig(1, 0.3, processing={"touch": {"margin_units": margin_units}})
+    (frame,) = press(rig, 0.0, 1)
+    assert frame.valid.all() == frame.valid.any() == felt
+    assert rig.pipeline.unreached.all() == rig.pipeline.unreached.any() == (not felt)
+
+
 def test_frames_tell_the_time_that_passed_whatever_the_clock_is_set_to():
     rig = Rig(1, 0.3)
     step_ns = round(1e9 * rig.dt_s)
