@@ -12,7 +12,6 @@ from skin_host.processing.events import Touch
 from skin_host.processing.masks import all_of, any_of
 from skin_host.processing.pipeline import PressureFrame
 
-_NEVER_NS = -(1 << 62)
 #: A place that was not valid counts as untouched from this many frames on: so many votes, and one
 #: more, decide whether something touches it (`processing.touch`).
 SURE_FRAMES = 4
@@ -44,7 +43,8 @@ class PartContact:
         #: Pressure pads triangle by triangle, and where each triangle begins among them.
         self._pads = np.concatenate(pads)
         self._starts = np.cumsum([0, *(len(one) for one in pads[:-1])])
-        self._felt_ns = np.full(len(pads), _NEVER_NS, np.int64)
+        #: When each triangle last felt, `PressureFrame.elapsed_ns`.
+        self._felt_ns = np.zeros(len(pads), np.int64)
         #: Valid frames that are still wanted of the taxels where a contact was lost, and of each
         #: triangle.
         self._lost = np.zeros(here.n_taxels, np.uint8)

@@ -125,15 +125,18 @@ def test_without_a_valid_taxel_it_is_unknown_at_once() -> None:
 def test_a_triangle_that_was_never_felt_makes_it_unknown() -> None:
     contact = PartContact(LAYOUT, PART)
     assert contact.step(frame(0, blind=slice(0, 12)), []) == "UNKNOWN"
-    assert contact.step(frame(50 * MS, [30], blind=slice(0, 12)), [begin([30])]) == "ON"
+    # Whether the contact of what is touched was reported before or not.
+    assert contact.step(frame(50 * MS, [30], blind=slice(0, 12)), []) == "ON"
+    assert contact.step(frame(100 * MS, [30], blind=slice(0, 12)), [begin([30])]) == "ON"
 
 
 @pytest.mark.parametrize("set_ns", [0, 3_600_000 * MS, -3_600_000 * MS])
-def test_only_time_that_passed_makes_anything_unfelt(set_ns: int) -> None:
-    contact = watched()
+@pytest.mark.parametrize("start_ns", [0, 777 * MS, 3_599_999 * MS])
+def test_only_time_that_passed_makes_anything_unfelt(start_ns: int, set_ns: int) -> None:
+    contact = watched(start_ns)
     states = [
-        contact.step(replace(frame(t_ns, blind=slice(0, 12)), t_ns=t_ns + set_ns), [])
-        for t_ns in range(50 * MS, LOST_NS + 50 * MS, 50 * MS)
+        contact.step(replace(frame(start_ns + passed_ns, blind=slice(0, 12)), t_ns=set_ns), [])
+        for passed_ns in range(50 * MS, LOST_NS + 50 * MS, 50 * MS)
     ]
     assert states == ["OFF"] * (len(states) - 1) + ["UNKNOWN"]
 

@@ -342,6 +342,20 @@ def test_a_taxel_of_which_no_reading_is_a_touch_is_not_valid(margin_units, felt)
     assert rig.pipeline.unreached.all() == rig.pipeline.unreached.any() == (not felt)
 
 
+def test_a_sweep_of_which_nothing_is_published_is_processed_and_takes_no_number():
+    published, followed = Rig(1, 0.0), Rig(1, 0.0)
+    for units in (0.0, 20.0, 20.0, 20.0, 0.0, 0.0):
+        (expected,) = press(published, units, 1)
+        activation = np.zeros(followed.n)
+        activation[:6] = units
+        raw, present = followed.read(activation), np.ones(followed.n, bool)
+        found = followed.pipeline.follow(0, raw, present, expected.t_ns)
+        assert np.array_equal(found.touched, expected.touched)
+        assert np.array_equal(found.valid, expected.valid)
+        assert found.seq == 0
+    assert expected.seq == 5
+
+
 def test_frames_tell_the_time_that_passed_whatever_the_clock_is_set_to():
     rig = Rig(1, 0.3)
     step_ns = round(1e9 * rig.dt_s)
