@@ -295,6 +295,10 @@ def test_an_interface_that_is_absent_or_down_at_the_start_is_waited_for(vcan):
 def test_a_frame_costs_less_than_half_of_what_it_costs_through_python_can(vcan):
     """Both read the same stream of one full bus; the benchmark tells how much less."""
     wire = StreamWire(vcan.name)
-    usual, ours = (measure(wire, path, 8000, 1.0) for path in ("notifier_async", "batch"))
+    usual, ours = (measure(wire, path, 8000, 5.0) for path in ("notifier_async", "batch"))
     logging.info("notifier_async %s; batch %s", usual, ours)
-    assert 0 < 2 * ours["ns_per_frame"] < usual["ns_per_frame"]
+    # The lane's kernel counts CPU time by its ticks of 10 ms. What wakes up just after a tick and
+    # sleeps before the next may be counted with none: that it ran is shown by its frames.
+    assert ours["lost"] == 0
+    assert ours["received_per_s"] > 7000
+    assert 2 * ours["ns_per_frame"] < usual["ns_per_frame"]
