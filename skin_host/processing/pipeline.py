@@ -306,7 +306,7 @@ class _PartPipeline:
         self._sum_kpa = np.zeros(m, np.float32)
         self._samples = 0
         self._skipped = 0
-        self._elapsed_s = 0.0
+        self._since_window_s = 0.0
         self._noted = self._nowhere
         self._was_missing = np.zeros(m, np.bool_)
         self._since_glance_s = 0.0
@@ -409,7 +409,7 @@ class _PartPipeline:
         touched = self._nowhere if idle else self._decide(valid, dt_s)
         quiet = touched is self._nowhere and not self._residuals.any and not self._every_sample
         if quiet and not pressures and not self._due(dt_s):
-            self._elapsed_s += dt_s
+            self._since_window_s += dt_s
             self._skipped += 1
             return self._frame(t_ns, raw, valid, self._zeros, self._nowhere, self._nowhere, False)
         self._since_glance_s = 0.0
@@ -505,7 +505,9 @@ class _PartPipeline:
     def _due(self, dt_s: float) -> bool:
         """Whether a quiet sweep is computed anyway: for the means, and at their end."""
         self._since_glance_s += dt_s
-        return self._since_glance_s >= IDLE_UPDATE_S or self._elapsed_s + dt_s >= self._window_s
+        return (
+            self._since_glance_s >= IDLE_UPDATE_S or self._since_window_s + dt_s >= self._window_s
+        )
 
     def _receive(self, raw: NDArray[np.uint8], present: Mask) -> Mask:
         """Take in the bytes; return which are valid."""
@@ -600,11 +602,11 @@ class _PartPipeline:
         if self._laid == ROWS:
             self._fold()
         self._samples += 1
-        self._elapsed_s += dt_s
+        self._since_window_s += dt_s
         if touched is not self._noted:
             np.logical_or(self._was_touched, touched, out=self._was_touched)
             self._noted = touched
-        if self._elapsed_s >= self._window_s:
+        if self._since_window_s >= self._window_s:
             self._end_window()
 
     def _end_window(self) -> None:
@@ -612,7 +614,7 @@ class _PartPipeline:
         self._fold()
         mean_kpa = np.divide(self._sum_kpa, self._samples, dtype=np.float64)
         if self._own is not None:
-            self._own.end_window(self._elapsed_s, self._relaxation_kpa)
+            self._own.end_window(self._since_window_s, self._relaxation_kpa)
         units = self._units(mean_kpa)
         relaxed_units = np.multiply(self._relaxation_kpa, self._units_per_kpa, dtype=np.float64)
         pressed = self._was_touched & self._usable
@@ -628,22 +630,22 @@ class _PartPipeline:
             np.multiply(self._sum_kpa, 1.0 / (self._samples + self._skipped), out=momentary)
             np.add(momentary, self._relaxation_kpa, out=momentary)
             np.fmax(momentary, self._zeros, out=momentary)
-            self._relaxation.step(momentary, self._elapsed_s, self._relaxation_kpa)
+            self._relaxation.step(momentary, self._since_window_s, self._relaxation_kpa)
         before = self.drift.baseline.copy()
         ghosts = self.drift.step(
-            units, self._was_touched, self._was_missing, self._elapsed_s, relaxed_units
+            units, self._was_touched, self._was_missing, self._since_window_s, relaxed_units
         )
         if self._own is not None:
-            touched, elapsed_s = self._was_touched, self._elapsed_s
+            touched, elapsed_s = self._was_touched, self._since_window_s
             ghosts = self._own.hold_rises(self.drift, before, touched, elapsed_s, ghosts)
         if ghosts is not None:
             self._detector.reset(ghosts)
-        self._residuals.fade(self._elapsed_s)
+        self._residuals.fade(self._since_window_s)
         self._renew_limits()
         self._sum_kpa.fill(0.0)
         self._samples = 0
         self._skipped = 0
-        self._elapsed_s = 0.0
+        self._since_window_s = 0.0
         self._was_touched.fill(False)
         self._noted = self._nowhere
         self._was_missing.fill(False)

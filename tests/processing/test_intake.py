@@ -389,3 +389,60 @@ def test_a_gap_before_a_sweep_is_no_gap_before_the_one_that_is_not_judged_yet():
         parts.feed([sweep(OUTER, turn * PERIOD), sweep(INNER, turn * PERIOD)])
     joined.judge()
     assert joined.liveness.spikes.sum() == 0
+
+
+def test_readings_of_two_boards_at_one_address_show_nothing_until_one_is_gone() -> None:
+    parts = intake()
+    joined, ledger = parts.engine.intake, parts.engine.ledger
+    for turn in range(1, 100):
+        two = 20 <= turn < 80
+        ledger.twice = {0: 0} if two else {}
+        outer, inner = sweep(OUTER, turn * PERIOD), sweep(INNER, turn * PERIOD)
+        if not two:
+            outer.raw[:] += turn % 3
+        inner.raw[:] += turn % 3
+        (sample,) = parts.feed([outer, inner])
+        joined.judge()
+        assert sample.present[16 * 12 :].all()
+        assert sample.present[: 16 * 12].all() != two
+        assert sample.received[: 16 * 12].any() != two
+        assert joined.takes(0, 3) != two
+        # Not even that its bytes repeat.
+        assert not joined.liveness.frozen.any()
+    # The board whose readings were taken before is judged again.
+    for turn in range(100, 140):
+        inner = sweep(INNER, turn * PERIOD)
+        inner.raw[:] += turn % 3
+        parts.feed([sweep(OUTER, turn * PERIOD), inner])
+        joined.judge()
+    assert np.flatnonzero(joined.liveness.frozen).tolist() == [*range(16)]
+
+
+def test_what_a_board_sent_last_is_judged_once_however_often_others_send() -> None:
+    parts = intake()
+    joined = parts.engine.intake
+    for turn in range(1, 60):
+        outer = sweep(OUTER, turn * PERIOD)
+        outer.raw[:] += turn % 3
+        parts.feed([outer])
+        joined.judge()
+    assert not joined.liveness.frozen.any()
+
+
+@pytest.mark.parametrize("status", [2, 0x30])
+def test_readings_of_a_triangle_are_not_taken_in_the_sweep_that_its_status_word_doubts(
+    status: int,
+) -> None:
+    parts = intake()
+    joined = parts.engine.intake
+    taken = []
+    for turn, word in enumerate((0, status, 0, 0), start=1):
+        outer = sweep(OUTER, turn * PERIOD)
+        outer.raw[:] += turn % 3
+        outer.status[3] = word
+        if word & 0x30:
+            outer.raw[3, :2] = 255
+        parts.feed([outer, sweep(INNER, turn * PERIOD)])
+        assert joined.takes(0, 4)
+        taken.append(joined.takes(0, 3))
+    assert taken == [True, False, True, True]

@@ -2,10 +2,18 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from skin_host.config.settings import Drift
 from skin_host.evaluation.rig import Rig
-from skin_host.processing.curves import CurveVerdict
+from skin_host.processing.curves import Curves, CurveVerdict, Memory
+from skin_host.processing.drift import BaselineTracker
+from skin_host.processing.fitting.course import limit_kpa, make_memory
+from skin_host.processing.own_curves import RISE_UNITS_PER_S, OwnCurves
 from skin_host.processing.pipeline import ROWS
+from skin_host.processing.pressure import PressureCurve
+from skin_host.processing.smoothing import StepFilter
 from tests.processing.fitting.test_course import use_own_curves
 
 PRESSED = np.arange(192) < 12
@@ -141,3 +149,172 @@ def test_a_pad_that_jumps_where_nothing_presses_makes_no_touch_and_stays_valid()
         frame = hold(rig, 30.0 * (sweep % 4 == 0), 1, np.arange(192) == 3)[0]
         assert not frame.touched.any()
         assert frame.valid.all()
+
+
+N, DT_S, SMOOTHING_S = 20, 0.02, 0.1
+CURVE = PressureCurve(np.full(N, 2.88))
+MEMORY = Memory((5.0, 20.0), (0.2, 0.1))
+#: Pads without an own curve.
+WITHOUT = [3, 5]
+
+
+def curves(memory=MEMORY):
+    verdict = np.full(N, CurveVerdict.GOOD, np.uint8)
+    verdict[WITHOUT] = CurveVerdict.UNKNOWN
+    noise = np.linspace(0.2, 1.0, N)
+    nothing = np.zeros((N, 1)), np.full(N, 60.0)
+    return Curves(*nothing, noise, np.zeros(N), verdict, 150.0, 0.0, memory)
+
+
+class OnePad:
+    """A pad with a filter and a memory of its own, as nothing but its readings decide.
+
+    Without an own curve its noise is not known, and nothing is smoothed.
+
+    Touched, or where much is, it is worked out in each sweep; otherwise from the mean of some.
+    """
+
+    def __init__(self, pad, memory):
+        limit = limit_kpa(CURVE, curves().noise_units)[pad : pad + 1]
+        limit = np.where(np.isin(pad, WITHOUT), 0.0, limit)
+        self.filter = StepFilter(limit, SMOOTHING_S, np.float32)
+        self.memory = make_memory(1, memory, np.float32)
+        self.relaxation = np.zeros(1, np.float32)
+        self.reported = 0.0
+
+    def report(self):
+        self.reported = max(float((self.filter.smooth - self.relaxation)[0]), 0.0)
+
+    def remember(self):
+        if self.memory is not None:
+            self.relaxation = self.memory.step(self.filter.smooth, DT_S).copy()
+
+    def follow(self, kpa):
+        self.filter.step(np.array([kpa], np.float32), DT_S)
+        self.remember()
+        self.report()
+
+    def fold(self, mean_kpa, elapsed_s):
+        self.filter.step(np.array([mean_kpa], np.float32) + self.relaxation, elapsed_s)
+        self.report()
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sets(st.integers(0, N - 1), max_size=7),
+            st.integers(1, 2 * ROWS),
+            st.integers(0, 2**32 - 1),
+        ),
+        min_size=1,
+        max_size=8,
+    ),
+    st.sampled_from([MEMORY, Memory()]),
+)
+def test_a_pads_pressure_is_that_of_its_own_filter_and_memory_whatever_others_feel(phases, memory):
+    own = OwnCurves(CURVE, curves(memory), slice(0, N), SMOOTHING_S)
+    pads = [OnePad(pad, memory) for pad in range(N)]
+    relaxation = np.zeros(N, np.float32)
+    rows, sweeps, felt = [], 0, set()
+    for touched, count, seed in phases:
+        rng = np.random.default_rng(seed)
+        mask = np.isin(np.arange(N), list(touched))
+        apart = touched if 4 * len(touched) <= N else set(range(N))
+        felt |= touched
+        for pad in pads:
+            pad.report()
+        level = rng.uniform(0.0, 60.0, N)
+        for _ in range(count):
+            kpa = (level + rng.normal(0.0, 2.0, N)).astype(np.float32)
+            reported = own.step(kpa, DT_S, mask, relaxation)
+            for pad in sorted(apart):
+                pads[pad].follow(kpa[pad])
+            wanted = [pad.reported for pad in pads]
+            assert reported == pytest.approx(wanted, rel=1e-4, abs=1e-3)
+            rows.append(kpa - relaxation)
+            sweeps += 1
+            if len(rows) == ROWS:
+                own.fold(np.array(rows), np.sum(rows, axis=0), relaxation)
+                for number, pad in enumerate(pads):
+                    if number not in apart:
+                        last = [rows[-1][number]] if number in felt else [r[number] for r in rows]
+                        pad.fold(np.mean(last), ROWS * DT_S)
+                    pad.report()
+                rows, felt = [], set(touched)
+            if sweeps % 25 == 0:
+                own.end_window(25 * DT_S, relaxation)
+                for number, pad in enumerate(pads):
+                    if number not in apart:
+                        pad.remember()
+            told = np.concatenate([pad.relaxation for pad in pads])
+            assert relaxation == pytest.approx(told, rel=1e-4, abs=1e-3)
+
+
+def test_what_is_reset_begins_anew_and_the_others_go_on():
+    own = OwnCurves(CURVE, curves(), slice(0, N), SMOOTHING_S)
+    relaxation = np.zeros(N, np.float32)
+    touched = np.arange(N) < 3
+    kpa = np.zeros(N, np.float32)
+    kpa[[7, 9]] = 3.0
+    for press in (40.0, 40.0, 40.0, 20.0):
+        kpa[touched] = press
+        for _ in range(4 * ROWS):
+            before = own.step(kpa, DT_S, touched, relaxation)
+            sums = ROWS * (kpa - relaxation)
+        own.fold(np.tile(kpa - relaxation, (ROWS, 1)), sums, relaxation)
+    assert relaxation[:3].min() > 1.0
+    assert before[[7, 9]] == pytest.approx(3.0, abs=0.1)
+    reset = np.isin(np.arange(N), [1, 2, 7])
+    own.reset(reset)
+    relaxation[reset] = 0.0
+    kpa[2] = 0.0
+    after = own.step(kpa, DT_S, touched, relaxation)
+    assert after[[0, 9]] == pytest.approx(before[[0, 9]], abs=0.1)
+    # Nothing is remembered of the harder press, nor smoothed with it: a press begins, or none.
+    assert after[1] > before[0] + 1.0
+    assert after[2] == after[7] == 0.0
+
+
+def tracker(calibrated):
+    return BaselineTracker(
+        np.array(calibrated, float),
+        np.ones(len(calibrated), np.bool_),
+        np.zeros(len(calibrated), np.int32),
+        np.zeros(len(calibrated), np.bool_),
+        Drift(),
+    )
+
+
+def test_a_baseline_rises_slowly_untouched_and_not_at_all_touched():
+    own = OwnCurves(CURVE, curves(), slice(0, N), SMOOTHING_S)
+    before = np.linspace(0.0, 4.0, N)
+    drift = tracker(before)
+    drift.baseline[:] = before + 1.0
+    drift.baseline[[7, 8]] = before[[7, 8]] - 1.0
+    touched = np.isin(np.arange(N), [2, 3, 8])
+    assert own.hold_rises(drift, before, touched, 4.0, None) is None
+    rise = drift.baseline - before
+    # Pads without an own curve rise as they did, and all may fall.
+    assert rise[[3, 5]] == pytest.approx([1.0, 1.0])
+    assert rise[[7, 8]] == pytest.approx([-1.0, -1.0])
+    assert rise[2] == 0.0
+    others = [0, 1, 4, 6, *range(9, N)]
+    assert rise[others] == pytest.approx(4.0 * RISE_UNITS_PER_S)
+
+
+def test_a_touch_is_drift_only_where_its_baseline_may_rise_as_far():
+    own = OwnCurves(CURVE, curves(), slice(0, N), SMOOTHING_S)
+    calibrated = np.full(N, 2.0)
+    before = calibrated.copy()
+    before[1] = 1.0
+    drift = tracker(calibrated)
+    drift.baseline[:] = before
+    #: As far as it was calibrated; slowly; too far; without an own curve.
+    drift.baseline[[1, 2, 4, 5]] = 1.9, 2.02, 2.5, 9.0
+    drifted = np.array([1, 2, 4, 5])
+    touched = np.isin(np.arange(N), drifted)
+    found = own.hold_rises(drift, before, touched, 4.0, drifted)
+    assert found.tolist() == [1, 2, 5]
+    assert drift.baseline[[1, 2, 4, 5]] == pytest.approx([1.9, 2.02, 2.0 + 4.0 * 0.01, 9.0])
+    drift.baseline[4] = 2.5
+    assert own.hold_rises(drift, before, touched, 4.0, np.array([4])) is None

@@ -201,7 +201,14 @@ class Calibrator:
         lasting = self._lasting(variance, received / some)
 
         course = self._course
-        touched = self._touched(variance, received / some)
+        repeats = received / some
+        error = course.error
+        if known is not None:
+            # Neighbouring blocks do not show noise that wanders for seconds, or seldom jumps.
+            before = known.calibration
+            expected = before.noise * np.sqrt(repeats / course.length)
+            error = np.where(before.usable, np.fmax(error, expected), error)
+        touched = self._touched(variance, repeats, error)
         steady_noise = course.error * np.sqrt(course.length * samples / np.maximum(received, 1))
         # The lowest activation is the best estimate of the untouched one.
         baseline = np.where(touched, no_load - course.highest, baseline)
@@ -227,9 +234,10 @@ class Calibrator:
         verdict = np.full(len(samples), Verdict.OK, dtype=np.uint8)
         verdict[touch.decides > NOISY_MARGINS * margin] = Verdict.NOISY
         verdict[cut_off] = Verdict.SATURATES
-        verdict[touched | self._pressed(baseline, counts)] = Verdict.TOUCHED
+        out = ends > SATURATED_SHARE * samples
+        verdict[touched | self._pressed(baseline, counts, ~out)] = Verdict.TOUCHED
         verdict[touch.decides > USELESS_MARGINS * margin] = Verdict.TOO_NOISY
-        verdict[ends > SATURATED_SHARE * samples] = Verdict.OUT_OF_RANGE
+        verdict[out] = Verdict.OUT_OF_RANGE
         verdict[(counts[:, 0] == samples) | (counts[:, 255] == samples)] = Verdict.STUCK
         # Bytes that come to an end of the scale and go differ by more than noise.
         jumps = (verdict == Verdict.OUT_OF_RANGE) & (steady_noise > 0.0)
@@ -364,7 +372,7 @@ class Calibrator:
                 lasting[mine] = np.maximum(lasting[mine], common)
         return lasting
 
-    def _touched(self, variance: Floats, repeats: Floats) -> Mask:
+    def _touched(self, variance: Floats, repeats: Floats, error: Floats) -> Mask:
         """Return the taxels [n] that were touched for a part of the time.
 
         Not those that jump between levels: such noise has no course, or one that goes up and down
@@ -373,9 +381,10 @@ class Calibrator:
         Args:
             variance: float64[n], of a measurement.
             repeats: float64[n], samples a measurement.
+            error: float64[n], standard error of a block's mean.
         """
         course = self._course
-        moved = course.highest - course.lowest > STEADY_UNITS + STEADY_ERRORS * course.error
+        moved = course.highest - course.lowest > STEADY_UNITS + STEADY_ERRORS * error
         # Few blocks of few measurements differ by chance.
         blocks = course.number // JOINED
         chance = 1.0 + SURE_DEVIATIONS * np.sqrt(2.0 / np.maximum(blocks - 1, 1))
@@ -394,9 +403,9 @@ class Calibrator:
                 pressed[taxel] |= shared > SHARED_CORRELATION
         return pressed
 
-    def _pressed(self, baseline: Floats, counts: NDArray[np.int64]) -> Mask:
+    def _pressed(self, baseline: Floats, counts: NDArray[np.int64], within: Mask) -> Mask:
         """Return the taxels [n] that were pressed all the time: they rest far from all other
-        pads.
+        pads that are within the scale.
 
         A board's zero is one reading of each pad, noise included. A noisy pad may thus rest as far
         from the others as its own readings lie apart; only what is farther away was pressed.
@@ -404,10 +413,11 @@ class Calibrator:
         Args:
             baseline: float64[n], mean activations.
             counts: int64[n, 256], how often each byte was measured.
+            within: bool[n], which do not rest at an end of the scale.
         """
         layout = self._layout
         seen = counts > 0
-        known = seen.any(axis=1) & (layout.pad_kind == PadKind.PRESSURE)
+        known = seen.any(axis=1) & within & (layout.pad_kind == PadKind.PRESSURE)
         apart = 255 - np.argmax(seen[:, ::-1], axis=1) - np.argmax(seen, axis=1)
         limit = np.maximum(PRESSED_UNITS, apart)
         found = np.zeros(len(baseline), np.bool_)

@@ -169,6 +169,12 @@ MUTANTS = [
         "return []",
     ),
     Mutant(
+        "a touch that lasts is reported only when it changes",
+        "processing/contacts.py",
+        "silent_ns >= ALIVE_NS",
+        "silent_ns >= 1000 * ALIVE_NS",
+    ),
+    Mutant(
         "identities are used again",
         "processing/contacts.py",
         "                self._next_id += 1\n",

@@ -219,6 +219,38 @@ def test_noise_of_real_skin_is_no_press_however_the_zero_caught_it(seconds, peri
     assert rest.max() > PRESSED_UNITS
 
 
+@pytest.mark.parametrize(
+    ("seed", "first", "pad"), [(30, 125, 103), (39, 500, 124), (42, 500, 38), (74, 500, 69)]
+)
+def test_noise_that_wanders_is_no_press_where_it_is_known(seed, first, pad):
+    """A pad that picks up a sine may go up and down once in two seconds."""
+    noise = SampledNoise(N // 12, seed)
+    zero = noise.at(0)
+    sweeps = np.array([240.0 + noise.at(50_000_000 * sweep) - zero for sweep in range(first + 50)])
+
+    def taken(sweeps, known=None):
+        calibrator = Calibrator(LAYOUT)
+        for sweep, raw in enumerate(np.clip(np.rint(sweeps), 0, 255).astype(np.uint8)):
+            calibrator.add(0, raw, PRESENT, 50_000_000 * sweep)
+        return calibrator.finish("abc", TIME, known)
+
+    before = taken(sweeps[:100])
+    known = Known(before, before.baseline, PRESENT)
+    usable = np.flatnonzero(before.usable)
+    quiet = usable[np.argmin(before.noise[usable])]
+    short = sweeps[first : first + (50 if seed == 42 else 40)]
+    # Nothing shows that these two seconds were of the same noise.
+    assert taken(short).verdict[pad] == Verdict.TOUCHED
+    assert not (taken(short, known).verdict == Verdict.TOUCHED).any()
+    # A press is still named, a light one of a quiet pad, too; or the zero from before is kept.
+    for units in (5.0, 40.0):
+        pressed = short.copy()
+        pressed[20:, [quiet, pad]] -= units
+        found = taken(pressed, known)
+        assert found.verdict[quiet] == Verdict.TOUCHED
+        assert found.baseline[pad] == pytest.approx(before.baseline[pad], abs=5.0)
+
+
 def test_a_noisy_pad_that_was_pressed_all_the_time_is_named():
     conversions = telegraph(np.random.default_rng(20), CONVERSIONS, 0.5, 1)
     conversions[:, 7] -= 60.0
@@ -231,6 +263,19 @@ def test_noise_beyond_use_has_no_vote():
     found = calibrated(sweeps)
     assert found.verdict[7] == Verdict.TOO_NOISY
     assert not found.usable[7]
+
+
+@pytest.mark.parametrize("code", [0, 255])
+def test_pads_at_an_end_of_the_scale_have_no_vote(code):
+    """A chip that fails may leave most pads of a part there."""
+    sweeps = noisy(np.random.default_rng(32), sweeps=40)
+    stuck = np.arange(N) % 12 < 7
+    sweeps[:, stuck] = code
+    verdict = calibrated(sweeps).verdict
+    assert (verdict[stuck] == Verdict.STUCK).all()
+    assert not (verdict == Verdict.TOUCHED).any()
+    sweeps[:, 8] -= 30
+    assert np.flatnonzero(calibrated(sweeps).verdict == Verdict.TOUCHED).tolist() == [8]
 
 
 def test_a_rest_so_near_an_end_of_the_scale_that_a_press_is_cut_off_is_named():

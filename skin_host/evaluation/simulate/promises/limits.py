@@ -43,6 +43,9 @@ UNLIKELY = 1e-3
 RELAXED_NS = 60 * NS
 #: A touch that lasted through a silence begins again within this time.
 AGAIN_NS = 3 * NS // 2
+#: A touch that lasts is reported within this time of frames that feel it, of which a pause counts
+#: for no more than so much.
+LASTS_NS, LASTS_PAUSE_NS = 3 * NS // 2, NS // 4
 #: A calibration at rest began no longer ago when it is noted.
 RESTING_NS = 8 * NS
 #: A fingertip is loaded from a small force on, and must be felt from a larger one on.

@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ from skin_host.evaluation.simulate.promises.limits import (
     FELT_KPA,
     FELT_SAMPLES,
     KEPT,
+    LASTS_NS,
+    LASTS_PAUSE_NS,
     LONG_AGO_NS,
     NS,
     PAUSE_NS,
@@ -32,6 +35,19 @@ from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
 
 
+@dataclass(slots=True)
+class _Open:
+    """A touch that has begun and not ended.
+
+    Attributes:
+        taxels: [k] those of the part that it touches, as reported last.
+        unsaid_ns: time of frames that felt it since then.
+    """
+
+    taxels: NDArray[np.intp]
+    unsaid_ns: int = 0
+
+
 class SkinCheck:
     """Frames and touches of all parts against the true pressure.
 
@@ -41,7 +57,7 @@ class SkinCheck:
 
     Attributes:
         chance: touches by noise alone.
-        open: by part the touches that have begun and not ended.
+        open: by part the touches that have begun and not ended, by their identities.
         valid_ns: when each taxel was last valid [n].
     """
 
@@ -52,10 +68,11 @@ class SkinCheck:
         n = layout.n_taxels
         self._parts = {part.name: part for part in layout.parts}
         self._pads: Mask = layout.pad_kind == PadKind.PRESSURE
-        self.open: dict[str, set[int]] = {}
+        self.open: dict[str, dict[int, _Open]] = {}
         self._last_id: dict[str, int] = {}
         self._seq: dict[str, int] = {}
         self._frames: dict[str, PressureFrame] = {}
+        self._frame_ns: dict[str, int] = {}
         #: Of each part, which taxels its last frame has as touched; and for how many samples each
         #: taxel has been pressed without that.
         self._felt: dict[str, Mask] = {}
@@ -75,7 +92,8 @@ class SkinCheck:
 
     def begin(self) -> None:
         """A life of the daemon begins."""
-        for known in (self.open, self._last_id, self._seq, self._frames, self._felt):
+        self.open.clear()
+        for known in (self._last_id, self._seq, self._frames, self._frame_ns, self._felt):
             known.clear()
 
     # ------------------------------------------------------------------ touches
@@ -83,11 +101,10 @@ class SkinCheck:
     def touch(self, event: Touch) -> str | None:
         """A touch event was put; return what is wrong with it, or None."""
         part = event.part
-        now = self.open.setdefault(part, set())
+        now = self.open.setdefault(part, {})
         if event.event == "begin":
             again = event.id <= self._last_id.get(part, -1)
             self._last_id[part] = event.id
-            now.add(event.id)
             if again:
                 return f"{part}: touch {event.id} begins again"
             if part in self._parts and not self._may_begin(part, event.taxels):
@@ -98,9 +115,11 @@ class SkinCheck:
         elif event.id not in now:
             return f"{part}: touch {event.id} has a {event.event} without a begin"
         if event.event == "end":
-            now.discard(event.id)
-        elif not event.taxels and part in self._parts:
-            return f"{part}: touch {event.id} has no taxel"
+            now.pop(event.id, None)
+        else:
+            now[event.id] = _Open(np.asarray(event.taxels, np.intp))
+            if not event.taxels and part in self._parts:
+                return f"{part}: touch {event.id} has no taxel"
         return None
 
     def endless(self) -> str | None:
@@ -171,7 +190,28 @@ class SkinCheck:
             pressure[~frame.valid].any() or (frame.touched & ~frame.valid).any()
         ):
             return "taxels that are not valid are touched, or have a pressure"
-        return self._valid_in_vain(frame, mine) or self._touched_in_vain(frame)
+        return (
+            self._valid_in_vain(frame, mine) or self._touched_in_vain(frame) or self._unsaid(frame)
+        )
+
+    def _unsaid(self, frame: PressureFrame) -> str | None:
+        """Return a touch that a frame feels and that has not been reported for too long.
+
+        Subscribers take it for over then. The time is that of the frames: the time of day may be
+        set, and what waited in a stall comes at once.
+        """
+        name, now_ns = frame.part, self._now_ns()
+        passed_ns = min(now_ns - self._frame_ns.get(name, now_ns), LASTS_PAUSE_NS)
+        self._frame_ns[name] = now_ns
+        for number, touch in self.open.get(name, {}).items():
+            if not frame.valid[touch.taxels].any():
+                continue
+            touch.unsaid_ns += passed_ns
+            if touch.unsaid_ns > LASTS_NS:
+                return (
+                    f"touch {number} lasts, and was not reported for {touch.unsaid_ns / NS:.1f} s"
+                )
+        return None
 
     def _valid_in_vain(self, frame: PressureFrame, mine: slice) -> str | None:
         """Return taxels of a frame that are valid without a chip, or of two boards."""
