@@ -12,6 +12,7 @@ from skin_host.daemon.daemon import Daemon
 from skin_host.health import HealthWatch
 from skin_host.layout import build_layout
 from skin_host.processing.core import Engine, Output, Step
+from skin_host.processing.pipeline import PressureFrame
 from skin_host.processing.silent_zero import SWEEPS
 from tests.support.stack import ROOT
 
@@ -103,8 +104,9 @@ def test_a_pad_that_stays_below_zero_was_pressed_when_its_board_was_zeroed(hand:
     assert hand.in_doubt == [3]
 
 
-def test_a_pad_that_comes_back_at_once_jumps(hand: Hand) -> None:
-    hand.send(2, p3=FAR_BELOW)
+@pytest.mark.parametrize("sweeps", [1, 2, 4])
+def test_a_pad_that_comes_back_at_once_jumps(hand: Hand, sweeps: int) -> None:
+    hand.send(sweeps, p3=FAR_BELOW)
     hand.send(1)
     hand.send(10, p4=FAR_BELOW)
     assert hand.in_doubt == []
@@ -423,3 +425,140 @@ def test_what_touched_pads_read_after_a_silence_shows_no_zero(hand: Hand) -> Non
     hand.pause(1.0)
     hand.send(2 * SWEEPS, **dict.fromkeys(pads, NO_LOAD))
     assert hand.engine.ledger.rezeros[0] == found
+
+
+def test_taxels_of_a_held_board_show_nothing_until_it_is_released(hand: Hand) -> None:
+    frames: list[PressureFrame] = []
+    hand.deliver = lambda output: frames.extend(output.frames)
+    zeros, own = hand.engine.zeros, hand.engine.layout.taxels_of([0])
+    for held in (False, True, False):
+        frames.clear()
+        if held:
+            zeros.hold([0])
+            assert zeros.held is not None
+            assert np.array_equal(zeros.held, own)
+        else:
+            zeros.release([0])
+            assert zeros.held is None
+        hand.send(20, p3=150, p4=1)
+        last = frames[-1]
+        assert last.touched[[3, 4]].tolist() == [not held, not held]
+        assert (last.pressure_kpa[[3, 4]] > 5.0).tolist() == [not held, not held]
+        assert last.beyond_range.any() != held
+        assert last.valid.any() != held
+        assert last.valid[[3, 4]].tolist() == [not held, not held]
+        # What it is in truth is noted for all that: a zero that is taken now has it in it.
+        assert zeros.at_risk(touched=True)[:6].tolist() == [False] * 3 + [True] * 2 + [False]
+    assert zeros.rezero(0) == 2
+
+
+def test_only_the_held_board_of_a_part_shows_nothing() -> None:
+    settings = load(CONFIG)
+    layout = build_layout(settings, CONFIG.parent)
+    part = layout.part("left_forearm")
+    index = layout.parts.index(part)
+    zeros = Engine(settings, layout, [index]).zeros
+    n = part.n_taxels
+    every = np.ones(n, np.bool_)
+    frame = PressureFrame(
+        part="left_forearm",
+        seq=1,
+        t_ns=1,
+        raw=np.zeros(n, np.uint8),
+        pressure_kpa=np.full(n, 9.0, np.float32),
+        touched=every,
+        valid=every,
+        beyond_range=every,
+        computed=True,
+    )
+    assert zeros.without_held(frame, index) is frame
+    first, second = part.boards
+    mine = slice(part.start, part.stop)
+    zeros.hold([first])
+    zeros.hold([second])
+    zeros.release([second])
+    held = layout.taxels_of([first])[mine]
+    shown = zeros.without_held(frame, index)
+    for array in (shown.touched, shown.valid, shown.beyond_range, shown.pressure_kpa > 0.0):
+        assert np.array_equal(array, ~held)
+    assert frame.valid.all()
+
+
+def test_a_pad_far_below_zero_is_in_doubt_only_while_it_is(hand: Hand) -> None:
+    hand.send(1, p3=FAR_BELOW)
+    assert hand.in_doubt == [3]
+    assert hand.engine.zeros.doubts() == {0: 1}
+    hand.send(1)
+    assert hand.in_doubt == []
+    assert hand.engine.zeros.doubts() == {}
+
+
+def test_a_noisy_pad_may_be_touched_until_its_zero_is_known() -> None:
+    """It is observed for longer than the others, which are valid by then."""
+    hand = Hand()
+    rng = np.random.default_rng(3)
+    zeros = hand.engine.zeros
+
+    def send(sweeps: int) -> None:
+        for _ in range(sweeps):
+            hand.send(1, p7=int(NO_LOAD - 10 + rng.integers(-9, 10)))
+
+    hand.engine.begin_calibration(2.0)
+    send(60)
+    hand.engine.use(hand.engine.end_calibration("2026-01-01T00:00:00+00:00"))
+    zeros.rezero(0)
+    send(40)
+    assert np.flatnonzero(zeros.may_be_touched()).tolist() == [7]
+    # Nobody doubts it: nothing has pressed it.
+    assert not zeros.at_risk(touched=False).any()
+    assert hand.in_doubt == []
+    send(80)
+    assert not zeros.may_be_touched().any()
+
+
+@pytest.mark.parametrize("lost", [0, 1])
+def test_what_was_hardly_received_while_nothing_is_valid_presses_nothing(
+    hand: Hand, lost: int
+) -> None:
+    hand.engine.zeros.rezero(0)
+    hand.send(2, p3=150)
+    assert hand.engine.zeros.rezero(0) == 0
+    hand.lost = lost
+    hand.send(8)
+    assert hand.engine.zeros.rezero(0) == 0
+
+
+def test_a_chip_whose_frames_are_lost_while_it_fails_has_not_come_back(hand: Hand) -> None:
+    """Its board zeroes itself when it answers again, and not before."""
+    zeros = hand.engine.zeros
+    hand.send(20)
+    for error, lost, changes in ((StatusError.NO_ACK, 0, 0), (0, 1, 0), (StatusError.NO_ACK, 0, 0)):
+        hand.error, hand.lost = error, lost
+        hand.send(6)
+        assert zeros.changes == changes
+    hand.error = 0
+    hand.send(1)
+    assert zeros.changes == 1
+
+
+def test_every_taxel_of_a_board_can_be_in_doubt(hand: Hand) -> None:
+    doubted = np.zeros(hand.engine.layout.n_taxels, np.bool_)
+    doubted[[0, 5]] = True
+    hand.engine.zeros.doubt(doubted)
+    hand.send(60)
+    assert hand.in_doubt == [0, 5]
+
+
+def test_a_pad_in_doubt_keeps_the_baseline_that_it_had(worn: tuple[Hand, list[Step]]) -> None:
+    hand, _ = worn
+    pipeline = hand.engine.pipeline
+    assert pipeline is not None
+    before = pipeline.baseline.copy()
+    hand.send(20, p3=150)
+    hand.engine.zeros.rezero(0)
+    hand.rests_elsewhere(7)
+    hand.send(60)
+    assert hand.in_doubt == [3]
+    assert pipeline.baseline[3] == pytest.approx(before[3], abs=0.3)
+    rests = hand.rest_units[0, [0, 1, 2, 4, 5, 6]]
+    assert pipeline.baseline[[0, 1, 2, 4, 5, 6]] == pytest.approx(rests, abs=0.8)

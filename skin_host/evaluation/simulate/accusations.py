@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from skin_host.evaluation.simulate.troubles import Trouble
+from skin_host.evaluation.simulate.troubles import LONGEST_STALL_S, Trouble
 from skin_host.evaluation.simulate.world import World
 from skin_host.mqtt.connection import GRACE_S, LAST_RETRY_S, TIMEOUT_S
 
@@ -22,7 +22,8 @@ LATELY = {
     "broker_refuses",
     "touches_dropped",
 }
-LATELY_NS = 62 * NS
+#: A board's set-up takes up to 10 s more, and the first record after a stall may be of before it.
+LATELY_NS = round((62.0 + 10.0 + LONGEST_STALL_S) * NS)
 #: Events go on being lost until the daemon has noticed that its broker is back.
 CONNECTED_NS = round((TIMEOUT_S + GRACE_S + LAST_RETRY_S) * NS)
 #: These last until the skin is calibrated at rest, is enabled, or something could be written: their

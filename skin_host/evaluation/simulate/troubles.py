@@ -515,6 +515,8 @@ def _interface(name: str, state: LinkState, must: str) -> Begin:
 #: What a buffer or the queue of events has no room for meanwhile is lost, and counted. What waits
 #: in them accuses nobody.
 _STALLED = {"host_stalls", "bus_drops", "touches_dropped"}
+#: No stall lasts for longer: nor does what passes wait to be read.
+LONGEST_STALL_S = 5.0
 
 
 def _stall(world: World, chance: random.Random, plain: bool) -> Trouble:

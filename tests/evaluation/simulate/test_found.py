@@ -25,7 +25,7 @@ from skin_host.evaluation.simulate.promises import Promises
 from skin_host.evaluation.simulate.promises.limits import UNTOUCHED_KPA
 from skin_host.evaluation.simulate.run import LONGEST_DRILL_S, _Run
 from skin_host.evaluation.simulate.trace import Trace
-from skin_host.evaluation.simulate.troubles import KINDS, Trouble
+from skin_host.evaluation.simulate.troubles import KINDS, Trouble, act
 from skin_host.evaluation.simulate.world import Life, World
 from skin_host.fingertip.events import FingertipEvent
 from skin_host.layout import PadKind
@@ -569,6 +569,51 @@ def test_what_is_retained_just_before_a_stall_is_at_the_broker_after_it(world: W
         promises.contacts()
         await world.clock.sleep(3.0)
         promises.contacts()
+        life.kill()
+        return promises.broken
+
+    with world.clock.runner() as runner:
+        assert runner.run(live()) is None
+
+
+def test_what_health_reports_for_a_minute_it_reports_for_longer_through_a_stall(
+    world: World,
+) -> None:
+    """A set-up takes seconds, and the first record after a stall may be of what was read before."""
+    accusations = Promises(world).accusations
+    fault = {"code": "board_rezeroed", "where": world.layout.boards[0].name}
+    record = {"faults": [fault], "sentences": ["board zeroed itself"]}
+    accusations.begin(act("configure"))
+    world.clock.advance(3.2 + 60.0 + 4.8)
+    assert accusations.note("left_hand", record) is None
+    accusations.restarted()
+    world.clock.advance(12.0)
+    assert "accused without a cause" in str(accusations.note("left_hand", record))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_what_was_damaged_and_waited_in_two_stalls_is_not_judged(world: World, seed: int) -> None:
+    """The bus has damaged nothing for seconds when it is read."""
+
+    async def live() -> str | None:
+        promises, life = start_watched(world)
+        await world.clock.sleep(8.0)
+        chance = random.Random(seed)
+        trouble = KINDS["frames_damaged"](world, chance, True)
+        promises.begin(trouble)
+        for over in (trouble.end, None):
+            stall = KINDS["stall"](world, random.Random(7), True)
+            assert stall.about == "stall 4.72 s"
+            promises.begin(stall)
+            if over is not None:
+                over()
+                promises.end(trouble)
+        spoiled = promises.excuses.spoiled()
+        assert trouble.spoils is not None
+        assert spoiled[trouble.spoils].all()
+        for _ in range(8):
+            await world.clock.sleep(0.25)
+            promises.sample()
         life.kill()
         return promises.broken
 

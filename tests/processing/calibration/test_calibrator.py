@@ -80,7 +80,8 @@ def test_a_touch_during_calibration_is_named_and_left_out_of_the_baseline(first,
     assert found.verdict[7] == Verdict.TOUCHED
     assert np.count_nonzero(found.verdict) == 1
     assert found.baseline[7] == pytest.approx(untouched, abs=0.6)
-    assert found.percentile[7] < untouched + 3.0
+    assert found.percentile[7] == pytest.approx(found.baseline[7] + 1.645 * found.noise[7])
+    assert found.noise[7] < 1.0
 
 
 def as_sent(conversions, period_s):

@@ -102,6 +102,7 @@ class Promises:
             self._received.clock_set_ns = self._now_ns()
         if trouble.name == "stall":
             self.subscribers.stalled_ns = self._received.stalled_ns = self._now_ns()
+            self.excuses.note_stall()
 
     def end(self, trouble: Trouble) -> None:
         """A trouble ends."""

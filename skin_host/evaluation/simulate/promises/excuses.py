@@ -9,9 +9,10 @@ from skin_host.evaluation.simulate.promises.limits import (
     RELAXED_NS,
     RESTING_NS,
     TOUCHING_KPA,
+    WAITED_NS,
     Mask,
 )
-from skin_host.evaluation.simulate.troubles import Trouble
+from skin_host.evaluation.simulate.troubles import RECOVERS_S, Trouble
 from skin_host.evaluation.simulate.world import Triangle, World
 
 
@@ -59,6 +60,12 @@ class Excuses:
         if trouble in self.known_twice:
             self.known_twice.remove(trouble)
 
+    def note_stall(self) -> None:
+        """A stall is over: what was wrong as it passed is read now."""
+        wrong, now_ns = self._spoiled_until_ns, self._now_ns()
+        lately = wrong > now_ns - WAITED_NS
+        wrong[lately] = np.maximum(wrong[lately], now_ns + int(RECOVERS_S * NS))
+
     def note_twice(self, trouble: Trouble) -> None:
         """Health has reported that two boards send at an address: none of it may be valid now."""
         if trouble not in self.known_twice:
@@ -101,7 +108,7 @@ class Excuses:
         long_ago = self.calibrated_touched_ns < self._now_ns() - RESTING_NS
         self.calibrated_touched_ns[long_ago] = LONG_AGO_NS
         self.exempt[:] = False
-        self._spoiled_until_ns[:] = self._now_ns()
+        self._spoiled_until_ns[:] = LONG_AGO_NS
 
     def _recover(self, trouble: Trouble) -> None:
         assert trouble.spoils is not None

@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.evaluation.simulate.troubles import LONGEST_STALL_S
+
 NS = 1_000_000_000
 LONG_AGO_NS = -(1 << 62)
 Mask = NDArray[np.bool_]
@@ -62,6 +64,9 @@ EVENTS = {"touch", "slip", "over"}
 MORE_OBJECTS = 60_000
 #: A sweep reaches the end of the core within so many of its periods, and this.
 FRESH_PERIODS, FRESH_NS = 3, 80_000_000
+#: So long after a frame was damaged on a bus, what passed is not compared with what was sent. It
+#: waits for no longer than this before it is read.
+WRONG_NS, WAITED_NS = 2 * NS, round(LONGEST_STALL_S * NS)
 #: What is retained is at the broker so long after it changed, or a connection began.
 RETAINED_NS = 2 * NS
 #: The broker keeps no `OFF` of a part without a valid taxel for longer.

@@ -12,6 +12,8 @@ from skin_host.evaluation.simulate.promises.limits import (
     LONG_AGO_NS,
     NS,
     STALE_PERIODS,
+    WAITED_NS,
+    WRONG_NS,
     Mask,
 )
 from skin_host.evaluation.simulate.world import World
@@ -148,14 +150,16 @@ class Received:
         world = self._world
         raw = frame.raw.tobytes()
         now_ns = world.clock.monotonic_ns()
-        clock_was_set = now_ns - self.clock_set_ns < 5 * NS
+        clock_was_set = now_ns - self.clock_set_ns < WAITED_NS
         taken_ns = frame.t_ns - (world.clock.now_ns() - now_ns)
+        # What waited in stalls was damaged long before it is read.
+        passed_ns = now_ns - WAITED_NS if clock_was_set else taken_ns
         for run in self._runs[frame.part]:
             if b"\1" not in valid[run.start : run.stop]:
                 continue
             cable = world.cables[run.bus]
             wrong_ns = max(cable.damaged_ns, cable.blurred_ns)
-            if cable.mischief.damaged or now_ns - wrong_ns < 2 * NS:
+            if cable.mischief.damaged or passed_ns - wrong_ns < WRONG_NS:
                 continue
             longest_ns = FRESH_PERIODS * run.period_ns + FRESH_NS
             t_ns = cable.sent.find_together(run.keys, raw[run.start : run.stop])
