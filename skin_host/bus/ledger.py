@@ -117,6 +117,8 @@ class BoardLedger:
         self.now_ns = 0
         self._newest_ns: int | None = None
         self._looked = False
+        #: Rows of the boards that sent since it was last looked.
+        self._came: list[int] = []
         self._longest_ns = LONGEST_PAUSE_NS + int(poll_ms * 1e6)
         self._period_ns = np.array([board.settings.period_ms for _, board in boards]) * 1_000_000
         self.silent_after_ns = (silent_periods * self._period_ns).astype(np.int64)
@@ -165,11 +167,13 @@ class BoardLedger:
         """Everything received up to `now_ns` has been read (clock of the time stamps)."""
         self._looked = True
         self._advance(now_ns)
+        self._came.clear()
 
     def pass_over(self, now_ns: int) -> None:
         """The time up to `now_ns` does not count: frames of it may still be on their way."""
         self._looked = True
         self._newest_ns = now_ns
+        self._came.clear()
 
     def note(self, sweep: Sweep) -> int:
         """Take in a sweep; return the row of its board."""
@@ -179,6 +183,8 @@ class BoardLedger:
         before = self.last[row]
         self.last[row] = sweep
         self.received_ns[row] = self.now_ns
+        if self._looked:
+            self._came.append(row)
         self.sweeps[row] += 1
         if before is not None and self._since_set_up[row]:
             self._note_interval(row, sweep.t_ns - before.t_ns)
@@ -357,7 +363,11 @@ class BoardLedger:
         if newest_ns is None:
             return
         passed_ns = now_ns - newest_ns
-        if passed_ns > 0:
-            self.now_ns += min(passed_ns, self._longest_ns)
+        if passed_ns > self._longest_ns:
+            # What waited in a pause was read at once: who sent in it did so until now.
+            self.now_ns += self._longest_ns
+            self.received_ns[self._came] = self.now_ns
+        elif passed_ns > 0:
+            self.now_ns += passed_ns
         elif passed_ns > -LONGEST_DISORDER_NS:
             self._newest_ns = newest_ns

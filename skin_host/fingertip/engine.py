@@ -59,6 +59,7 @@ class TipState:
         agreement: of its samples, which only together are a load.
         saturated_ns: when its load was last saturated, 0 if never.
         silenced: how often the board has timed out.
+        came: a frame of it was read since boards were last looked at.
         awaited: the board is being set up and has not had the time to send yet.
         zeroing, touching: samples of which a zero is taken, and whether it was touched in each.
     """
@@ -77,6 +78,7 @@ class TipState:
     saturated_ns: int = 0
     silenced: int = 0
     alive: bool = False
+    came: bool = False
     awaited: bool = False
     zeroing: list[Floats] = field(default_factory=list)
     touching: list[bool] = field(default_factory=list)
@@ -180,7 +182,7 @@ class FingertipEngine:
                 state.agreement.forget()
             state.last_ns = int(batch.t_ns[frames.row[mine[-1]]])
             state.received_ns = now_ns
-            state.alive = True
+            state.came = state.alive = True
             if state.assembler is not None:
                 for wrench in state.assembler.take(frames, batch.t_ns):
                     felt.samples.append((state.number, wrench.t_ns))
@@ -203,6 +205,9 @@ class FingertipEngine:
         self._now_ns = now_ns
         events: list[FingertipEvent] = []
         for state in self.tips.values():
+            if state.came:
+                # Until now: what waited in a pause of this computer is read at once.
+                state.came, state.received_ns = False, now_ns
             quiet_ns = now_ns - state.received_ns
             if state.alive and quiet_ns > SILENT_NS:
                 state.alive = False

@@ -237,6 +237,22 @@ def test_a_pause_counts_for_no_more_than_the_limit_and_the_poll() -> None:
         assert known.now_ns == LONGEST_PAUSE_NS + poll_ms * MS
 
 
+def test_who_sent_in_a_pause_whose_frames_are_read_at_once_is_not_silent() -> None:
+    """The clock counts a tenth of a second of it, which may be more than a board may be silent."""
+    known = BoardLedger(boards(), 1.0)
+    known.look(T0)
+    for row in (HAND, OUTER):
+        known.note(sweep(row, T0 + 5 * MS))
+    known.look(T0 + 10 * MS)
+    for number in range(1, 21):
+        known.note(sweep(HAND, T0 + number * PERIOD))
+    known.look(T0 + 1010 * MS)
+    assert not known.is_silent(HAND)
+    assert known.is_silent(OUTER)
+    known.look(T0 + 1010 * MS + LONGEST_PAUSE_NS + 1)
+    assert known.is_silent(HAND)
+
+
 def test_time_goes_by_the_reader_once_it_looks() -> None:
     known = ledger()
     known.note(sweep(HAND, T0))

@@ -422,6 +422,25 @@ frames = st.lists(
 )
 
 
+async def test_a_board_that_sent_while_this_computer_stood_still_has_not_stopped_sending() -> None:
+    """What waited may be read at once, and be of longer than a board may be silent."""
+    bench = Bench()
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    await bench.calibrate()
+    await bench.run(1.2)
+    index, thumb = bench.tips.tips["index"], bench.tips.tips["thumb"]
+    for sends in (True, False):
+        batch = bench.robot.step(1.2)["can0"]
+        if not sends:
+            rows = np.flatnonzero(batch.id >> 4 & 0xF != 1)
+            batch = FrameBatch(batch.id[rows], batch.dlc[rows], batch.data[rows], batch.t_ns[rows])
+        bench.engine.feed("can0", batch)
+        bench.engine.expire(bench.now_ns)
+        assert (index.alive, index.silenced) == (sends, 0 if sends else 1)
+        assert (thumb.alive, thumb.silenced) == (True, 0)
+
+
 @given(frames)
 def test_no_traffic_on_the_bus_breaks_the_engine_or_gives_numbers_that_are_none(
     traffic: list[tuple[int, bytes, int]],
