@@ -83,7 +83,8 @@ class Sweep(NamedTuple):
     Attributes:
         board: index into `Layout.boards`.
         raw: uint8[16, 12]; rows of missing triangles are 0.
-        status: uint16[16], S0 << 8 | S1; 0 where the frame had no status bytes.
+        status: uint16[16], S0 << 8 | S1; 0 where no B frame came, or one without status bytes.
+            Where only the B frame came it is there, and the triangle is not present.
         present: mask of triangles whose two frames came.
         t_ns: time of the sweep's last frame.
         missed: whole periods without any frame since the sweep before.
@@ -698,7 +699,10 @@ class Assembler:
         if got != state.wanted:
             self.counters.incomplete += state.missing != 0
             state.lone = got ^ present * _BOTH
-            triangles[[not present >> triangle & 1 for triangle in range(TRIANGLES)]] = 0
+            triangles[[not present >> triangle & 1 for triangle in range(TRIANGLES)], :TAXELS] = 0
+            # A status word is whole without the other half of its triangle.
+            second = got >> TRIANGLES
+            triangles[[not second >> triangle & 1 for triangle in range(TRIANGLES)], TAXELS:] = 0
             self._note_absent(state, present)
         else:
             if state.any_absent:

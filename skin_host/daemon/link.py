@@ -9,6 +9,7 @@ from itertools import chain, pairwise
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skin_host.bus.boards import Boards
 from skin_host.bus.opening import open_port
@@ -268,18 +269,25 @@ class Link:
             deliver(output)
 
     async def catch_up(self) -> None:
-        """Wait until `read` has read what came before now.
-
-        After a turn that was held up this lasts until every board was received again, or has had
-        the time for it: what a buffer had no room for shows in the boards' next sweeps.
+        """Wait until `read` has read what came before now, and then a sweep of every board, or for
+        as long as it may take: what a buffer had no room for shows in the boards' next sweeps.
         """
         asked_ns = self._clock.now_ns()
         end_s = self._clock.monotonic_s() + LONGEST_PATIENCE_NS / NS_PER_S
         while self.read_ns < asked_ns or self._held_up_at_ns is not None:
             if self._clock.monotonic_s() >= end_s:
-                log.warning("ends with frames unread: they come faster than they are processed")
+                if self.read_ns < asked_ns:
+                    log.warning("ends with frames unread: they come faster than they are processed")
                 return
             await self._clock.sleep(CATCH_UP_S)
+        before = self._engine.ledger.sweeps.copy()
+        while not self._are_back(before) and self._clock.monotonic_s() < end_s:
+            await self._clock.sleep(CATCH_UP_S)
+
+    def _are_back(self, before: NDArray[np.int64]) -> bool:
+        """Whether each board was received since its `before` sweeps, never before, or is silent."""
+        ledger = self._engine.ledger
+        return bool(((ledger.sweeps > before) | (before == 0) | ledger.silent).all())
 
     def _now_started_at_ns(self) -> int:
         """Return the time of day at which this computer was started, by the present clock."""
@@ -311,9 +319,7 @@ class Link:
         waited_ns = now_ns - self._held_up_at_ns
         if 0 <= waited_ns < PATIENCE_NS:
             return True
-        ledger = self._engine.ledger
-        back = (ledger.sweeps > self._sweeps_then) | (self._sweeps_then == 0) | ledger.silent
-        if 0 <= waited_ns < self._patience_ns and not back.all():
+        if 0 <= waited_ns < self._patience_ns and not self._are_back(self._sweeps_then):
             return True
         self._held_up_at_ns = None
         return False

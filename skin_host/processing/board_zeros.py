@@ -92,7 +92,9 @@ class BoardZeros:
         self._silent_zeros: dict[int, SilentZero] = {}
         #: Boards of which taxels are not valid, or were not just now, as their zero is sought.
         self._glimpses: dict[int, _Glimpse] = {}
-        self._unanswered: dict[int, Mask] = {}
+        #: Triangles bool[16] of a board whose chips did not answer when they were last heard of,
+        #: and whether nothing was heard of any in its last sweep.
+        self._unanswered: dict[int, tuple[Mask, bool]] = {}
         #: For how many sweeps pads int64[16, 12] of a board have read far below zero, where any do.
         self._below: dict[int, NDArray[np.int64]] = {}
         #: When a board's pad last came back from there by itself.
@@ -347,17 +349,23 @@ class BoardZeros:
     def _note_unanswered(self, sweep: Sweep, row: int) -> None:
         """Detect that a board zeroed itself, which it does after missing acknowledges (section
         4.5).
+
+        What calls its chip well again may be lost on its way: the zero may be another from the
+        first sweep on in which nothing is heard of the chip, and is another by when it is well.
         """
-        now = self._ledger.error[row] & StatusError.NO_ACK != 0
-        before = self._unanswered.get(sweep.board)
-        if before is not None:
-            # Nobody knows of a triangle that was not received.
-            now |= before & ~self._ledger.present[row]
-        if any_of(now):
-            self._unanswered[sweep.board] = now
+        silent = self._ledger.error[row] & StatusError.NO_ACK != 0
+        before, was_unheard = self._unanswered.get(sweep.board, (silent, False))
+        unheard = before & ~self._ledger.present[row]
+        is_unheard = any_of(unheard)
+        if any_of(silent) or is_unheard:
+            self._unanswered[sweep.board] = silent | unheard, is_unheard
         else:
             self._unanswered.pop(sweep.board, None)
-        if before is not None and any_of(before & ~now):
+        is_over = any_of(before & ~silent & ~unheard)
+        rezero = self.rezeros.get(sweep.board)
+        if is_over and was_unheard and rezero is not None and rezero.seeks_all:
+            rezero.restart(sweep.t_ns)
+        elif is_over or (is_unheard and not was_unheard):
             self.rezero(sweep.board)
 
     def _note_return(self, sweep: Sweep, silent_ns: int) -> None:

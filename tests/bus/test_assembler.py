@@ -115,6 +115,19 @@ def test_a_lost_frame_costs_its_triangle_and_is_counted():
     assert assembler.counters.halves == 1
 
 
+def test_a_status_word_comes_without_the_other_half_of_its_triangle() -> None:
+    """It may be the only one that says that the chip does not answer."""
+    words = np.array([0x0001, 0x0002, 0x0010, 0x0001], np.uint16)
+    sent = frames(values(4), PERIOD, status=words)
+    # The first loses its A frame, the second its B frame, the last both.
+    assembler = make()
+    feed(assembler, [sent[1], sent[2], *sent[4:6]])
+    (sweep,) = assembler.expire(2 * PERIOD)
+    assert sweep.present == 0b0100
+    assert sweep.status[:4].tolist() == [1, 0, 0x10, 0]
+    assert not sweep.raw[[0, 1, 3]].any()
+
+
 #: All A and then all B, or the reverse.
 @pytest.mark.parametrize("order", [[0, 2, 4, 6, 1, 3, 5, 7], [1, 3, 5, 7, 0, 2, 4, 6]])
 @pytest.mark.parametrize("cut", [1, 3, 6])

@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 _START_S = 30.0
@@ -111,9 +112,9 @@ async def break_at_random(broker: Mosquitto, chance: random.Random) -> None:
         await asyncio.sleep(chance.uniform(0.2, 2.0))
         match chance.choice(["restart", "kill", "freeze", "stop"]):
             case "restart":
-                await asyncio.to_thread(broker.restart)
+                await _whole(broker.restart)
             case "kill" | "stop" as how:
-                await asyncio.to_thread(broker.kill if how == "kill" else broker.stop)
+                await _whole(broker.kill if how == "kill" else broker.stop)
                 try:
                     await asyncio.sleep(chance.uniform(0.1, 2.0))
                 finally:
@@ -124,3 +125,12 @@ async def break_at_random(broker: Mosquitto, chance: random.Random) -> None:
                     await asyncio.sleep(chance.uniform(0.1, 5.0))
                 finally:
                     broker.resume()
+
+
+async def _whole(step: Callable[[], None]) -> None:
+    """Run a step in a thread; it has ended when this has, also where this is cancelled."""
+    step_done = asyncio.ensure_future(asyncio.to_thread(step))
+    try:
+        await asyncio.shield(step_done)
+    finally:
+        await asyncio.wait([step_done])
