@@ -92,8 +92,8 @@ class BoardZeros:
         self._silent_zeros: dict[int, SilentZero] = {}
         #: Boards of which taxels are not valid, or were not just now, as their zero is sought.
         self._glimpses: dict[int, _Glimpse] = {}
-        #: Triangles bool[16] of a board whose chips did not answer when they were last heard of,
-        #: and whether nothing was heard of any in its last sweep.
+        #: Triangles bool[16] of a board whose chips did not answer when they were last received,
+        #: and whether any of these was missing from its last sweep.
         self._unanswered: dict[int, tuple[Mask, bool]] = {}
         #: For how many sweeps pads int64[16, 12] of a board have read far below zero, where any do.
         self._below: dict[int, NDArray[np.int64]] = {}
@@ -351,21 +351,21 @@ class BoardZeros:
         4.5).
 
         What calls its chip well again may be lost on its way: the zero may be another from the
-        first sweep on in which nothing is heard of the chip, and is another by when it is well.
+        first sweep on from which the triangle is missing, and is another when it is back.
         """
         silent = self._ledger.error[row] & StatusError.NO_ACK != 0
-        before, was_unheard = self._unanswered.get(sweep.board, (silent, False))
-        unheard = before & ~self._ledger.present[row]
-        is_unheard = any_of(unheard)
-        if any_of(silent) or is_unheard:
-            self._unanswered[sweep.board] = silent | unheard, is_unheard
+        before, was_missing = self._unanswered.get(sweep.board, (silent, False))
+        missing = before & ~self._ledger.present[row]
+        is_missing = any_of(missing)
+        if any_of(silent) or is_missing:
+            self._unanswered[sweep.board] = silent | missing, is_missing
         else:
             self._unanswered.pop(sweep.board, None)
-        is_over = any_of(before & ~silent & ~unheard)
+        is_over = any_of(before & ~silent & ~missing)
         rezero = self.rezeros.get(sweep.board)
-        if is_over and was_unheard and rezero is not None and rezero.seeks_all:
+        if is_over and was_missing and rezero is not None and rezero.seeks_all:
             rezero.restart(sweep.t_ns)
-        elif is_over or (is_unheard and not was_unheard):
+        elif is_over or (is_missing and not was_missing):
             self.rezero(sweep.board)
 
     def _note_return(self, sweep: Sweep, silent_ns: int) -> None:

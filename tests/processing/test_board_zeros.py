@@ -528,7 +528,7 @@ def test_what_was_hardly_received_while_nothing_is_valid_presses_nothing(
     assert hand.engine.zeros.rezero(0) == 0
 
 
-def test_a_board_may_have_zeroed_itself_while_nothing_is_heard_of_a_chip_that_fails(
+def test_a_board_may_have_zeroed_itself_while_the_triangle_of_a_chip_that_fails_is_missing(
     worn: tuple[Hand, list[Step]],
 ) -> None:
     """It does so after some more readings, or has already; what is pressed reads untouched then."""
@@ -541,7 +541,7 @@ def test_a_board_may_have_zeroed_itself_while_nothing_is_heard_of_a_chip_that_fa
     hand.lost = 1
     steps.clear()
     hand.send(2, p3=200)
-    # Its fifth reading was the last with the old zero, which nobody heard.
+    # Its fifth reading was the last with the old zero, which nobody received.
     hand.error = 0
     hand.rests_elsewhere(seed=2)
     hand.send(8)
@@ -551,7 +551,7 @@ def test_a_board_may_have_zeroed_itself_while_nothing_is_heard_of_a_chip_that_fa
     assert hand.in_doubt == [3]
 
 
-def test_a_chip_of_which_nothing_is_heard_any_more_keeps_no_other_from_being_valid(
+def test_a_triangle_that_is_missing_for_good_keeps_no_other_from_being_valid(
     worn: tuple[Hand, list[Step]],
 ) -> None:
     hand, steps = worn
