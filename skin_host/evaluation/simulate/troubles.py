@@ -701,7 +701,11 @@ KINDS: dict[str, Begin] = {
         4.0,
         spoils=True,
     ),
-    "shorted_finger": _emulated("shorted_finger", _CHIPS | _SET_UP, _LINE, 1.0),
+    # A chip that does not answer may show in one sweep only, which may pass between two looks of
+    # health: then its board zeroes itself, and what follows does not show it.
+    "shorted_finger": _emulated(
+        "shorted_finger", _CHIPS | _SET_UP, _LINE | {"triangle_silenced"}, 1.0
+    ),
     # Where two chips drive one data line, their bytes mix, differently in each sweep.
     "wrong_address": _emulated(
         "wrong_address", _SWAPPED | {"bus_bit_errors"}, _ELSEWHERE, 1.0, spoils=True
@@ -712,9 +716,7 @@ KINDS: dict[str, Begin] = {
     "shared_address": _emulated(
         "shared_address", _SWAPPED | {"bus_bit_errors"}, _ELSEWHERE, 1.0, spoils=True
     ),
-    # Each of these two shows as an error in one sweep, which may pass between two looks of health:
-    # then its board zeroes itself, and what follows does not. The first sends bytes of other
-    # registers.
+    # The same of these two. The first sends bytes of other registers.
     "no_acknowledge": _emulated(
         "no_acknowledge", _SWAPPED, _LINE | {"triangle_silenced"}, 1.0, spoils=True
     ),

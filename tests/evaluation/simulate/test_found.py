@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from emulator.boards.mtb4 import NO_ACKS_TO_CALIBRATE
 from emulator.probes.scene import Fault, Scene
 from skin_host.bus.port import LinkState
 from skin_host.bus.wire import HEADER_A, HEADER_B, FrameBatch
@@ -20,6 +21,7 @@ from skin_host.config.settings import Bus
 from skin_host.daemon.calibrate import calibration_path, stored_calibration
 from skin_host.daemon.daemon import Daemon
 from skin_host.demo import configuration
+from skin_host.evaluation.simulate.accusations import STARTED_NS
 from skin_host.evaluation.simulate.cables import Cable, Sent, SimulatedPort
 from skin_host.evaluation.simulate.promises import Promises
 from skin_host.evaluation.simulate.promises.limits import UNTOUCHED_KPA
@@ -530,6 +532,29 @@ def test_a_shorted_data_line_that_two_parts_share_is_named_by_both(
 
     with world.clock.runner() as runner:
         runner.run(live())
+
+
+def test_a_short_whose_first_sweep_zeroes_its_board_may_be_named_by_what_follows(
+    world: World,
+) -> None:
+    """It has counted four missing acknowledges, and the chip is the only one of its line."""
+
+    async def live() -> str | None:
+        promises, life = start_watched(world)
+        await world.clock.sleep(STARTED_NS / 1e9 + 8.0)
+        for board in world.robot.boards.values():
+            board.no_acks = NO_ACKS_TO_CALIBRATE - 1
+        short = KINDS["shorted_finger"](world, random.Random(4), True)
+        assert short.about == "shorted_finger board=hand triangle=4"
+        promises.begin(short)
+        for _ in range(8):
+            await world.clock.sleep(0.25)
+            promises.sample()
+        life.kill()
+        return promises.broken
+
+    with world.clock.runner() as runner:
+        assert runner.run(live()) is None
 
 
 def test_a_frame_whose_other_half_was_lost_just_before_the_end_is_accounted_for(
