@@ -515,13 +515,16 @@ def _interface(name: str, state: LinkState, must: str) -> Begin:
 #: What a buffer or the queue of events has no room for meanwhile is lost, and counted. What waits
 #: in them accuses nobody.
 _STALLED = {"host_stalls", "bus_drops", "touches_dropped"}
-#: No stall lasts for longer: nor does what passes wait to be read.
-LONGEST_STALL_S = 5.0
+#: How long stalls last, times `_STALL_SHARES`; no stall lasts for longer, nor does what passes wait
+#: to be read.
+_STALLS_S, _LONG_STALLS_S = (0.05, 0.2, 0.5, 1.5, 4.0), (1.5, 4.0)
+_STALL_SHARES = (0.8, 1.2)
+LONGEST_STALL_S = math.ceil(max(_STALLS_S) * max(_STALL_SHARES))
 
 
 def _stall(world: World, chance: random.Random, plain: bool) -> Trouble:
-    seconds = chance.choice((1.5, 4.0) if plain else (0.05, 0.2, 0.5, 1.5, 4.0))
-    seconds *= chance.uniform(0.8, 1.2)
+    seconds = chance.choice(_LONG_STALLS_S if plain else _STALLS_S)
+    seconds *= chance.uniform(*_STALL_SHARES)
     world.clock.advance(seconds)
     must = frozenset({"host_stalls"} if seconds > 0.7 else ())
     about = f"stall {seconds:.2f} s"

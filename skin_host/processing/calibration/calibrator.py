@@ -202,14 +202,14 @@ class Calibrator:
 
         course = self._course
         repeats = received / some
-        error = course.error
-        if known is not None:
+        steady = error = course.error
+        before = None if known is None else known.calibration
+        if before is not None:
             # Neighbouring blocks do not show noise that wanders for seconds, or seldom jumps.
-            before = known.calibration
             expected = before.noise * np.sqrt(repeats / course.length)
             error = np.where(before.usable, np.fmax(error, expected), error)
         touched = self._touched(variance, repeats, error)
-        steady_noise = course.error * np.sqrt(course.length * samples / np.maximum(received, 1))
+        steady_noise = steady * np.sqrt(course.length * samples / np.maximum(received, 1))
         # The lowest activation is the best estimate of the untouched one.
         baseline = np.where(touched, no_load - course.highest, baseline)
         percentile = np.where(touched, baseline + 1.645 * steady_noise, percentile)
@@ -217,8 +217,7 @@ class Calibrator:
         upward = np.where(touched, noise**2, _upward_variance(counts, variance, self._touch))
         spread = np.sqrt(upward * np.where(touched, 1.0, lasting))
         unknown = samples < NOISE_SAMPLES
-        if known is not None:
-            before = known.calibration
+        if before is not None:
             unknown &= ~before.usable
             noisier = (samples < KNOWN_SAMPLES) & before.usable & (before.spread > spread)
             noise = np.where(noisier, np.fmax(noise, before.noise), noise)
