@@ -97,6 +97,9 @@ SURE_DAMAGED = 36
 DAMAGED_S = 8.0
 #: Evidence of a touch is gone after 2.6 s in the mean, of a pad with noise of six units.
 RECOVERS_S = 5.0
+#: A temperature pad that reads bytes of another chip moves the rests of its triangle. They go back
+#: as its temperature does, which is smoothed over 10 s: one that had moved by 2.7 units took 11 s.
+RESTS_AGAIN_S = 20.0
 #: A broker ends the connection of a client from which nothing came for longer.
 KEEP_ALIVE_S = 10.0
 #: While it lasts, the chip that it names does not measure.
@@ -711,17 +714,37 @@ KINDS: dict[str, Begin] = {
     ),
     # Where two chips drive one data line, their bytes mix, differently in each sweep.
     "wrong_address": _emulated(
-        "wrong_address", _SWAPPED | {"bus_bit_errors"}, _ELSEWHERE, 1.0, spoils=True
+        "wrong_address",
+        _SWAPPED | {"bus_bit_errors"},
+        _ELSEWHERE,
+        1.0,
+        spoils=True,
+        recovers_s=RESTS_AGAIN_S,
     ),
     "swapped_lines": _emulated(
-        "swapped_lines", _SWAPPED, _ELSEWHERE | _LINE | {"lines_swapped"}, 1.0, spoils=True
+        "swapped_lines",
+        _SWAPPED,
+        _ELSEWHERE | _LINE | {"lines_swapped"},
+        1.0,
+        spoils=True,
+        recovers_s=RESTS_AGAIN_S,
     ),
     "shared_address": _emulated(
-        "shared_address", _SWAPPED | {"bus_bit_errors"}, _ELSEWHERE, 1.0, spoils=True
+        "shared_address",
+        _SWAPPED | {"bus_bit_errors"},
+        _ELSEWHERE,
+        1.0,
+        spoils=True,
+        recovers_s=RESTS_AGAIN_S,
     ),
     # The same of these two. The first sends bytes of other registers.
     "no_acknowledge": _emulated(
-        "no_acknowledge", _SWAPPED, _LINE | {"triangle_silenced"}, 1.0, spoils=True
+        "no_acknowledge",
+        _SWAPPED,
+        _LINE | {"triangle_silenced"},
+        1.0,
+        spoils=True,
+        recovers_s=RESTS_AGAIN_S,
     ),
     "data_held_low": _emulated(
         "data_held_low",

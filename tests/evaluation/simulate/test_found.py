@@ -322,6 +322,35 @@ def test_a_board_that_restarts_in_a_press_does_not_zero_it_away(world: World, nu
         runner.run(live())
 
 
+@pytest.mark.parametrize("decides_kpa", [0.1, 100.0])
+def test_a_press_that_noisy_pads_had_not_felt_is_in_the_zero_of_their_board(
+    world: World, decides_kpa: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They detect it only if it is firmer, or lasts for longer than a second."""
+
+    async def live() -> None:
+        promises, life = start_watched(world)
+        await world.clock.sleep(12.0)
+        levels = {part.name: np.full(part.n_taxels, decides_kpa) for part in world.layout.parts}
+        monkeypatch.setattr(promises._skin, "decides_kpa", lambda _, part: levels[part])
+        promises.sample()
+        pressing = asyncio.create_task(world.spots[0].press(8.0, 50.0), name="press")
+        for _ in range(8):
+            await world.clock.sleep(0.25)
+            promises.sample()
+        pressed = world.robot.skin.true_pressure_kpa() > 1.0
+        assert pressed.any()
+        assert not promises.excuses.exempt.any()
+        await life.daemon.configure()
+        promises.sample()
+        assert promises.excuses.exempt[pressed].all() == (decides_kpa > 50.0)
+        pressing.cancel()
+        life.kill()
+
+    with world.clock.runner() as runner:
+        runner.run(live())
+
+
 def test_a_board_that_is_set_up_while_a_disabled_part_is_pressed_does_not_zero_that_away(
     world: World,
 ) -> None:
@@ -926,6 +955,22 @@ def test_a_calm_ends_though_pads_of_real_skin_that_were_stuck_from_the_first_are
 
     with worn.clock.runner() as runner:
         runner.run(live())
+
+
+@pytest.mark.parametrize("kind", ["swapped_lines", "wrong_address", "shared_address"])
+def test_pads_are_not_judged_until_their_rest_is_back_from_bytes_of_another_chip(
+    world: World, kind: str
+) -> None:
+    excuses = Promises(world).excuses
+    trouble = KINDS[kind](world, random.Random(1), True)
+    assert trouble.spoils is not None
+    excuses.begin(trouble)
+    trouble.end()
+    excuses.end(trouble)
+    world.clock.advance(15.0)
+    assert excuses.spoiled()[trouble.spoils].all()
+    world.clock.advance(6.0)
+    assert not excuses.spoiled().any()
 
 
 def test_what_presses_of_300_kpa_leave_in_the_foam_is_not_taken_for_a_wrong_pressure(

@@ -16,6 +16,7 @@ ends the run.
 import asyncio
 import gc
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -238,7 +239,8 @@ class Promises:
             if life.daemon.engine.calibrating:
                 excuses.note_calibrating(true_kpa)
             self._skin.note_valid(true_kpa)
-            self._zeros.note_observed(life, true_kpa, self._skin.valid_ns, self._felt_ns)
+            decides = partial(self._skin.decides_kpa, life)
+            self._zeros.note_observed(life, true_kpa, self._skin.valid_ns, self._felt_ns, decides)
             self._felt_ns = self._received.last_ns()
             calibration = life.daemon.engine.calibration
             if calibration is not None:

@@ -314,7 +314,7 @@ class SkinCheck:
             return f"taxels {np.flatnonzero(lasts).tolist()} are still touched, and nothing presses"
         deaf = fit & pressed[mine] & ~frame.touched
         if deaf.any():
-            deaf &= self._decides_kpa(life, frame.part) < PRESSED_KPA
+            deaf &= self.decides_kpa(life, frame.part) < PRESSED_KPA
         self._deaf[mine] = np.where(deaf, self._deaf[mine] + 1, 0)
         if self._deaf[mine].max() <= DEAF_SAMPLES:
             return None
@@ -363,7 +363,7 @@ class SkinCheck:
         found: NDArray[np.float64] = engine.pipeline._parts[index]._curve.kpa(units)
         return found
 
-    def _decides_kpa(self, life: Life, name: str) -> NDArray[np.float64]:
+    def decides_kpa(self, life: Life, name: str) -> NDArray[np.float64]:
         """Return what pressure each taxel [m] of a part detects within a second."""
         pipeline = life.daemon.engine.pipeline
         if pipeline is None:

@@ -1,5 +1,7 @@
 """What presses a pad when its board is zeroed: if nobody felt it begin, it is in the zero."""
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -68,6 +70,7 @@ class ZeroCheck:
         true_kpa: NDArray[np.float64],
         valid_ns: NDArray[np.int64],
         felt_ns: NDArray[np.int64],
+        decides_kpa: Callable[[str], NDArray[np.float64]],
     ) -> None:
         """What a board did not feel before it took a zero is in that zero: nobody can know.
 
@@ -76,6 +79,7 @@ class ZeroCheck:
             true_kpa: what presses each taxel [n].
             valid_ns: when each was last valid [n].
             felt_ns: when each was last received, as known at the sample before [n].
+            decides_kpa: by name of a part, what pressure each of its taxels [m] detects in time.
         """
         now_ns, wall_ns = self._world.clock.monotonic_ns(), self._world.clock.now_ns()
         spoiled = self._excuses.spoiled()
@@ -110,4 +114,10 @@ class ZeroCheck:
             unfelt = pressed[taxels] & (self._pressed_ns[taxels] > self._unfelt_ns[taxels])
             if rezero.begun:
                 unfelt &= self._pressed_ns[taxels] <= self._observed[board][1]
+            if finds.any():
+                unfelt |= pressed[taxels] & (true_kpa < self._decides_kpa(decides_kpa))[taxels]
             self._excuses.exempt[taxels] |= finds & (unfelt | spoiled[taxels])
+
+    def _decides_kpa(self, of_part: Callable[[str], NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Return what pressure each taxel [n] detects in time: noisy ones only a firm press."""
+        return np.concatenate([of_part(part.name) for part in self._world.layout.parts])
