@@ -350,18 +350,18 @@ class BoardZeros:
         """Detect that a board zeroed itself, which it does after missing acknowledges (section
         4.5).
 
-        What calls its chip well again may be lost on its way: the zero may be another from the
-        first sweep on from which the triangle is missing, and is another when it is back.
+        The first status word without that error may be lost on its way: the zero may be another as
+        soon as the triangle is missing, and is another when it comes without the error.
         """
         silent = self._ledger.error[row] & StatusError.NO_ACK != 0
         before, was_missing = self._unanswered.get(sweep.board, (silent, False))
-        missing = before & ~self._ledger.present[row]
+        missing = before & ~silent & ~self._ledger.present[row]
         is_missing = any_of(missing)
         if any_of(silent) or is_missing:
             self._unanswered[sweep.board] = silent | missing, is_missing
         else:
             self._unanswered.pop(sweep.board, None)
-        is_over = any_of(before & ~silent & ~missing)
+        is_over = any_of(before & ~silent & self._ledger.present[row])
         rezero = self.rezeros.get(sweep.board)
         if is_over and was_missing and rezero is not None and rezero.seeks_all:
             rezero.restart(sweep.t_ns)

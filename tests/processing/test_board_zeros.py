@@ -39,8 +39,10 @@ class Hand:
         self.other_units: np.ndarray | None = None
         #: The error of the last triangle's chip.
         self.error = 0
-        #: How many triangles are lost on their way, from the last on.
+        #: How many triangles are lost on their way, from the last on; and whether the first frame of
+        #: the last one that is not is lost.
         self.lost = 0
+        self.halved = False
         #: Takes the outputs.
         self.deliver: Callable[[Output], None] = lambda output: None
         if rest_seed is not None:
@@ -72,6 +74,8 @@ class Hand:
         )
         frames = [(int(i), bytes(d), t_ns) for i, d in zip(ids, data, strict=True)]
         frames = frames[: len(frames) - 2 * self.lost]
+        if self.halved:
+            del frames[-2]
         self.deliver(self.engine.feed(self._board.settings.bus, FrameBatch.of(frames)))
 
     def pause(self, seconds: float) -> None:
@@ -549,6 +553,19 @@ def test_a_board_may_have_zeroed_itself_while_the_triangle_of_a_chip_that_fails_
     hand.lost = 0
     expect_new_zeros(hand, steps)
     assert hand.in_doubt == [3]
+
+
+def test_a_chip_of_which_only_the_error_comes_is_not_missing(
+    worn: tuple[Hand, list[Step]],
+) -> None:
+    hand, steps = worn
+    hand.error, hand.halved = StatusError.NO_ACK, True
+    steps.clear()
+    hand.send(3)
+    assert min(map(valid_share, steps)) > 0.7
+    hand.error, hand.halved = 0, False
+    hand.rests_elsewhere(seed=2)
+    expect_new_zeros(hand, steps)
 
 
 def test_a_triangle_that_is_missing_for_good_keeps_no_other_from_being_valid(
