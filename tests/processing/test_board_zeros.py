@@ -39,9 +39,9 @@ class Hand:
         self.other_units: np.ndarray | None = None
         #: The error of the last triangle's chip.
         self.error = 0
-        #: How many triangles are lost on their way, from the last on; and whether the first frame of
-        #: the last one that is not is lost.
+        #: How many triangles are lost on their way, from the last on.
         self.lost = 0
+        #: Whether the first frame of the last triangle that comes is lost.
         self.halved = False
         #: Takes the outputs.
         self.deliver: Callable[[Output], None] = lambda output: None
