@@ -114,8 +114,8 @@ async def break_at_random(broker: Mosquitto, chance: random.Random) -> None:
             case "restart":
                 await _whole(broker.restart)
             case "kill" | "stop" as how:
-                await _whole(broker.kill if how == "kill" else broker.stop)
                 try:
+                    await _whole(broker.kill if how == "kill" else broker.stop)
                     await asyncio.sleep(chance.uniform(0.1, 2.0))
                 finally:
                     broker.start()

@@ -689,6 +689,9 @@ ACTS: dict[str, set[str]] = {
 }
 
 _LINE = {"line_shorted", "triangle_no_ack", "triangle_not_connected"}
+#: A chip that does not answer may show in one sweep only, which may pass between two looks of
+#: health: then its board zeroes itself, and what follows does not show it.
+_UNANSWERED = _LINE | {"triangle_silenced"}
 _WRONG_BITS = _LINE | {"board_rezeroed", "bus_bit_errors", "taxel_out_of_range"}
 _SILENCED = {"triangle_silenced", "triangle_answers_again"}
 _WRONG_BITS |= {"triangle_out_of_range", *_SILENCED}
@@ -707,11 +710,7 @@ KINDS: dict[str, Begin] = {
         4.0,
         spoils=True,
     ),
-    # A chip that does not answer may show in one sweep only, which may pass between two looks of
-    # health: then its board zeroes itself, and what follows does not show it.
-    "shorted_finger": _emulated(
-        "shorted_finger", _CHIPS | _SET_UP, _LINE | {"triangle_silenced"}, 1.0
-    ),
+    "shorted_finger": _emulated("shorted_finger", _CHIPS | _SET_UP, _UNANSWERED, 1.0),
     # Where two chips drive one data line, their bytes mix, differently in each sweep.
     "wrong_address": _emulated(
         "wrong_address",
@@ -737,11 +736,11 @@ KINDS: dict[str, Begin] = {
         spoils=True,
         recovers_s=RESTS_AGAIN_S,
     ),
-    # The same of these two. The first sends bytes of other registers.
+    # It sends bytes of other registers.
     "no_acknowledge": _emulated(
         "no_acknowledge",
         _SWAPPED,
-        _LINE | {"triangle_silenced"},
+        _UNANSWERED,
         1.0,
         spoils=True,
         recovers_s=RESTS_AGAIN_S,
