@@ -66,12 +66,13 @@ class FullScale(Analog):
 
 
 def scale_queries(board: int) -> list[tuple[int, bytes]]:
-    """Return the frames that query all full scales of a board."""
-    return [command_frame(GetFullScale(channel), board) for channel in range(CHANNELS)]
+    """Return the frames that query all full scales of a board, twice: one answer may be damaged."""
+    once = [command_frame(GetFullScale(channel), board) for channel in range(CHANNELS)]
+    return once + once
 
 
 def start_frames(board: int, period_ms: int) -> list[tuple[int, bytes]]:
-    """Return the frames that set a board up: query all full scales, set the period, start it."""
+    """Return the frames that set a board up: query its full scales, set the period, start it."""
     commands: list[Analog] = [SetTransmissionPeriod(period_ms), SetTxMode(StrainMode.CALIBRATED)]
     return scale_queries(board) + [command_frame(command, board) for command in commands]
 

@@ -51,7 +51,10 @@ class TipState:
 
     Attributes:
         number: among the fingertips of the configuration.
-        reported_scale: float64[6], the full scales that the board reported; 0 where it has not.
+        answered_scale: float64[6], its last answers to what its full scales are; 0 where it has
+            not answered.
+        reported_scale: float64[6], those on which two answers in a row agreed: a damaged one has
+            no checksum, and would be a wrong unit of everything.
         last_ns, received_ns: time of its last frame, and the same by the ledger's clock, which does
             not jump.
         touched_since_ns: the same of its touch, if there is one.
@@ -68,6 +71,7 @@ class TipState:
     number: int
     settings: Fingertip
     tip: Tip
+    answered_scale: Floats = field(default_factory=lambda: np.zeros(CHANNELS))
     reported_scale: Floats = field(default_factory=lambda: np.zeros(CHANNELS))
     assembler: WrenchAssembler | None = None
     agreement: Agreement = field(default_factory=Agreement)
@@ -286,7 +290,9 @@ class FingertipEngine:
         state = here.get(address)
         if state is None:
             return
-        state.reported_scale[answer.channel] = answer.value
+        if state.answered_scale[answer.channel] == answer.value:
+            state.reported_scale[answer.channel] = answer.value
+        state.answered_scale[answer.channel] = answer.value
         if state.assembler is None and (state.reported_scale > 0.0).all():
             self._assemble(state, state.reported_scale.copy())
 

@@ -186,11 +186,11 @@ def test_where_a_full_scale_is_not_known_no_unit_is_claimed() -> None:
 @pytest.mark.parametrize("database", [every_board, fingers])
 def test_commands_to_a_force_torque_board_are_decoded_alike(database: Any) -> None:
     seen = [decode(database(), can_id, payload) for can_id, payload in start_frames(2, 10)]
-    codes = [GetFullScale.CODE] * 6 + [SetTransmissionPeriod.CODE, SetTxMode.CODE]
+    codes = [GetFullScale.CODE] * 12 + [SetTransmissionPeriod.CODE, SetTxMode.CODE]
     assert [one["Code"] for one in seen] == codes
-    assert [one["C18_channel"] for one in seen[:6]] == list(range(6))
-    assert seen[6]["C08_period_ms"] == 10
-    assert seen[7]["C07_mode"] == StrainMode.CALIBRATED
+    assert [one["C18_channel"] for one in seen[:12]] == 2 * list(range(6))
+    assert seen[12]["C08_period_ms"] == 10
+    assert seen[13]["C07_mode"] == StrainMode.CALIBRATED
     # The one number with its high byte first.
     can_id, payload = answer_frame(FullScale(4, 0x1234), 2)
     seen_answer = decode(database(), can_id, payload)

@@ -66,6 +66,13 @@ def start_watched(world: World) -> tuple[Promises, Life]:
     return promises, life
 
 
+async def sampled(promises: Promises, seconds: float) -> None:
+    """Let time pass, and compare with the truth as a run does."""
+    for _ in range(round(seconds / 0.05)):
+        await promises._world.clock.sleep(0.05)
+        promises.sample()
+
+
 def test_a_daemon_that_died_in_a_touch_does_not_call_it_untouched_when_it_is_back(
     world: World,
 ) -> None:
@@ -316,6 +323,48 @@ def test_a_board_that_restarts_in_a_press_does_not_zero_it_away(world: World, nu
         assert life.daemon.engine.zeros.in_doubt(triangle.board).any()
         topic = life.daemon.publisher.topics.part("contact", spot.part)
         assert world.broker.retained[topic] == b"UNKNOWN"
+        life.kill()
+
+    with world.clock.runner() as runner:
+        runner.run(live())
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_a_press_that_began_while_a_chip_did_not_answer_is_in_the_zero_of_its_board(
+    world: World, before: bool
+) -> None:
+    """What was felt before is in doubt instead; so is what is felt since the chip answers again,
+    for half a second.
+    """
+
+    async def live() -> None:
+        promises, life = start_watched(world)
+        await sampled(promises, 12.0)
+        spot = world.spots[0]
+        part = world.layout.part(spot.part)
+        triangle = world.layout.triangles[world.layout.triangle_of[part.start + spot.taxel]]
+        name = world.layout.boards[triangle.board].name
+        short = Fault(name="shorted_finger", board=name, triangle=triangle.number)
+        pads = world.taxels((name, triangle.number))
+        pads = pads[world.layout.pad_kind[pads] == PadKind.PRESSURE]
+        if before:
+            pressing = asyncio.create_task(spot.press(20.0, 50.0), name="press")
+            await sampled(promises, 2.0)
+        world.move()
+        mend = world.robot.inject(short)
+        await sampled(promises, 0.5)
+        if not before:
+            pressing = asyncio.create_task(spot.press(20.0, 50.0), name="press")
+        await sampled(promises, 1.0)
+        world.move()
+        mend()
+        await sampled(promises, 0.1)
+        await life.daemon.configure()
+        await sampled(promises, 4.0)
+        pressed = pads[world.robot.skin.true_pressure_kpa()[pads] > 25.0]
+        assert len(pressed)
+        assert promises.excuses.exempt[pressed].all() != before
+        pressing.cancel()
         life.kill()
 
     with world.clock.runner() as runner:

@@ -33,6 +33,10 @@ class ZeroCheck:
         self._pressed = np.zeros(n, np.bool_)
         self._pressed_ns = np.zeros(n, np.int64)
         self._unfelt_ns = np.zeros(n, np.int64)
+        #: When the chip of each taxel last did not answer, and when it last had answered for so
+        #: long that what presses the taxel is felt.
+        self._deaf_ns = np.full(n, LONG_AGO_NS, np.int64)
+        self._answered_ns = np.zeros(n, np.int64)
         self._rezeros: dict[int, Rezero] = {}
         #: By board: the zero that it has itself, at the sample before.
         self._bases = [board.base.copy() for board in world.robot.boards.values()]
@@ -43,7 +47,8 @@ class ZeroCheck:
         self, true_kpa: NDArray[np.float64], felt_ns: NDArray[np.int64], *, alone: bool
     ) -> None:
         """A board that zeroes itself while no daemon runs has what presses it in its zero. So has a
-        small one that does it unheard: how its few pads rest hardly shows it.
+        small one that does it unheard: how its few pads rest hardly shows it. Note also which chips
+        answer.
 
         Args:
             true_kpa: what presses each taxel [n].
@@ -51,6 +56,9 @@ class ZeroCheck:
             alone: no daemon has run all the time since the sample before.
         """
         boards, now_ns = self._world.robot.boards, self._world.clock.monotonic_ns()
+        answers = self._world.robot.converters.signal.forced < 0
+        self._deaf_ns[~answers[self._world.layout.triangle_of]] = now_ns
+        self._answered_ns[now_ns - self._deaf_ns > DECIDED_NS] = now_ns
         spoiled = self._excuses.spoiled()
         for board, base in zip(self._world.layout.boards, self._bases, strict=True):
             now = boards[board.name].base
@@ -98,7 +106,8 @@ class ZeroCheck:
                 record = boards.records[own.address]
                 felt = record.configurations > 0 or boards._is_in_use(record)
                 last_ns = int(felt_ns[taxels].max()) if felt else LONG_AGO_NS
-                self._unfelt_ns[taxels] = last_ns - DECIDED_NS
+                answered_ns = np.minimum(self._answered_ns[taxels], last_ns)
+                self._unfelt_ns[taxels] = answered_ns - DECIDED_NS
                 if before is None or before.settled(wall_ns):
                     # Its chip has sent nothing valid since, and not because of the zero before.
                     since_ns = valid_ns[taxels] - DECIDED_NS
