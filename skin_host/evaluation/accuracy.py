@@ -27,6 +27,8 @@ Row = dict[str, Any]
 
 UNIT_FF = 2.88
 NOISE_UNITS = 0.4
+#: Of the default on the fitted foam. Thresholds, and so what is taken for drift, differ by draw.
+NOISE_DRAWS = 6
 #: A cycle holds and rests 5 s each, with moves of 0.3 s; the truth is computed in growing steps.
 CYCLE_KPA = 50.0
 CYCLE_STEPS_S = (0.3, 1.4, 3.3)
@@ -120,7 +122,39 @@ class HistoryPlan:
 
 def score(kind: TruthKind, scenario: Scenario, plan: HistoryPlan) -> list[Row]:
     """The rows of errors on a truth: all histories of the fitted foam, else those judged."""
-    names = HISTORIES if scenario == FITTED_FOAM else JUDGED_HISTORIES
+    names = tuple(HISTORIES) if scenario == FITTED_FOAM else JUDGED_HISTORIES
+    skin = _skin(kind, scenario, plan, names)
+    rows = []
+    for variant in VARIANTS if scenario == FITTED_FOAM else ELSEWHERE:
+        table = relaxation_table(variant, kind, scenario.fitted)
+        rows += skin.rows(variant, kind, scenario, table, seed=ord(kind))
+    return rows
+
+
+def noise_draws(kind: TruthKind, plan: HistoryPlan) -> list[Row]:
+    """The default's errors of real readings on the fitted foam, for each draw of the noise."""
+    skin = _skin(kind, FITTED_FOAM, plan, JUDGED_HISTORIES)
+    table = relaxation_table(DEFAULT, kind, FITTED_FOAM.fitted)
+    return [
+        row | {"draw": draw}
+        for draw in range(NOISE_DRAWS)
+        for row in skin.rows(DEFAULT, kind, FITTED_FOAM, table, seed=draw)
+        if row["noise_units"] > 0.0
+    ]
+
+
+def by_history(rows: list[Row]) -> dict[tuple[str, str], list[float]]:
+    """The RMS errors of rows, in kPa, by truth and history."""
+    found: dict[tuple[str, str], list[float]] = {}
+    for row in rows:
+        found.setdefault((row["truth"], row["history"]), []).append(row["rms_kpa"])
+    return found
+
+
+def _skin(
+    kind: TruthKind, scenario: Scenario, plan: HistoryPlan, names: tuple[str, ...]
+) -> "_Skin":
+    """Skin on which all the named histories are played."""
     pads = PRESSED_PADS if scenario.loss_spread else 1
 
     def foam() -> FoamTruth:
@@ -144,11 +178,7 @@ def score(kind: TruthKind, scenario: Scenario, plan: HistoryPlan) -> list[Row]:
     layer = Foam.uniform(PRESSED_PADS)
     if scenario.drawn:
         layer = Foam.drawn(PRESSED_PADS, np.random.default_rng(ord(kind) + 1))
-    skin = _Skin(records, typical, layer, plan.sample_hz, seed=ord(kind))
-    rows = []
-    for variant in VARIANTS if scenario == FITTED_FOAM else ELSEWHERE:
-        rows += skin.rows(variant, kind, scenario, relaxation_table(variant, kind, scenario.fitted))
-    return rows
+    return _Skin(records, typical, layer, plan.sample_hz)
 
 
 def relaxation_table(variant: Variant, kind: TruthKind, fitted: bool) -> dict[str, Any]:
@@ -237,12 +267,10 @@ class _Skin:
         typical: dict[str, PlayedHistory],
         foam: Foam,
         hz: float,
-        seed: int,
     ) -> None:
         self._records = records
         self._typical = typical
         self._hz = hz
-        self._seed = seed
         curve = PressureCurve(UNIT_FF)
         longest = max(len(one.resting) for one in records.values())
         self._taxels = np.concatenate(
@@ -257,10 +285,15 @@ class _Skin:
         self._exact_kpa = curve.kpa(self._units)
 
     def rows(
-        self, variant: Variant, kind: TruthKind, scenario: Scenario, table: dict[str, Any]
+        self,
+        variant: Variant,
+        kind: TruthKind,
+        scenario: Scenario,
+        table: dict[str, Any],
+        seed: int,
     ) -> list[Row]:
         """Run the pipeline with a model, and set its pressures against the truth's."""
-        rig = Rig(1, NOISE_UNITS, seed=self._seed, hz=self._hz, processing={"relaxation": table})
+        rig = Rig(1, NOISE_UNITS, seed=seed, hz=self._hz, processing={"relaxation": table})
         relaxation = np.empty(self._units.shape, np.float32)
         reported = np.empty(self._units.shape, np.float32)
         read = np.empty(self._units.shape, np.float64)

@@ -245,10 +245,11 @@ def _sections(report: Report) -> list[Section]:
                     "codes. The error of `perfect` is the limit of the 8-bit reading. In "
                     "`multistep` a grip is eased to 4 kPa for five minutes: that is below the "
                     "threshold of touch, the baseline follows it, and most of what the default "
-                    "adds there is this."
+                    "adds there is this. Noise decides which pads end their touch then, so the "
+                    "second table repeats the default with other draws of it."
                 ),
             ],
-            [tables.errors(report, 0.4, measure="rms_kpa")],
+            [tables.errors(report, 0.4, measure="rms_kpa"), tables.noise_draws(report)],
         ),
         Section(
             "Worst errors and rest",

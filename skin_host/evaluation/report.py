@@ -70,6 +70,7 @@ def run(quick: bool, output: Path | None, recordings: Path | None = None) -> Rep
         "default": key_of(DEFAULT),
         "real_skin": real_skin,
         "rows": [row for rows in found["errors"] for row in rows],
+        "noise_draws": [row for rows in found["noise draws"] for row in rows],
         "fits": [row for rows in found["fits"] for row in rows],
         "cycles": [row for rows in found["cycles"] for row in rows],
         "unwatched": found["unwatched"][0],
@@ -113,6 +114,8 @@ def jobs_of(quick: bool) -> list[Job]:
             ("cycles", accuracy.cycles, (kind, LAST_CYCLE_QUICK if quick else last, CYCLED))
         )
         jobs.append(("fits", accuracy.fit_rows, (kind,)))
+        if kind in accuracy.HELD_OUT:
+            jobs.append(("noise draws", accuracy.noise_draws, (kind, plan)))
         jobs += [
             ("errors", accuracy.score, (kind, scenario, plan))
             for scenario in accuracy.SCENARIOS
@@ -217,14 +220,17 @@ def goals(report: Report) -> list[Row]:
         name = f"default model on foam in no model's family, {scenario}, on {worst}, kPa RMS"
         lines.append(goal(name, rms[worst], must, aim))
     fitted = accuracy.FITTED_FOAM.name
-    noisy = [row["rms_kpa"] for row in select(mine, scenario=fitted) if row["noise_units"] > 0.0]
+    noisy = [_rms(values) for values in accuracy.by_history(report["noise_draws"]).values()]
     floor = [
         row["rms_kpa"]
         for row in select(report["rows"], model="perfect", scenario=fitted)
         if _is_judged(row) and row["noise_units"] > 0.0
     ]
-    name = f"with 0.4 units of noise and 8-bit steps, worst (a perfect model: {max(floor):.2f})"
-    lines.append(goal(name + ", kPa RMS", max(noisy), 1.1, 0.9))
+    name = (
+        f"with 0.4 units of noise and 8-bit steps, {accuracy.NOISE_DRAWS} draws of the noise, "
+        f"worst truth and history (a perfect model: {max(floor):.2f}), kPa RMS"
+    )
+    lines.append(goal(name, max(noisy), 1.1, 0.9))
     growth, last = growth_of_error(select(report["cycles"], model=default["model"]))
     lines.append(goal(f"growth of the error from cycle 100 to {last:,}, kPa", growth, 0.0, 0.0))
     for hz in NOISE_HZ:

@@ -8,11 +8,13 @@ from skin_host.evaluation.accuracy import (
     HELD_OUT,
     HINDSIGHT,
     JUDGED_HISTORIES,
+    NOISE_DRAWS,
     NOISE_UNITS,
     PERFECT,
     SCENARIOS,
     VARIANTS,
     Variant,
+    by_history,
 )
 from skin_host.evaluation.document import Table
 from skin_host.evaluation.histories import HISTORIES
@@ -151,6 +153,15 @@ def errors(report: Report, noise: float, measure: str) -> Table:
         numbers = ["" if cell is None else f"{cell:.2f}" for cell in cells]
         rows.append([variant.model, _states(variant.update_s), *numbers])
     return head, rows
+
+
+def noise_draws(report: Report) -> Table:
+    """Errors of real readings with each draw of the noise, the default on foam as fitted."""
+    rows = [
+        [truth, history, *(f"{value:.2f}" for value in values)]
+        for (truth, history), values in by_history(report["noise_draws"]).items()
+    ]
+    return ["truth", "history", *(f"draw {number + 1}" for number in range(NOISE_DRAWS))], rows
 
 
 def family(report: Report) -> Table:

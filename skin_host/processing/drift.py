@@ -28,7 +28,8 @@ What the readings can distinguish, and what they cannot:
   its triangle is learnt while it is untouched.
 - Foam that is late after a press reads too much for seconds: pauses of a grip are no time to
   recover. What reads more and more after a touch is a grip that was eased, against which the
-  foam pushes back: it is not followed, and what was taken for drift at the release is given back.
+  foam pushes back: it is not followed, and what was taken for drift since the touch ended is given
+  back.
 - What remains of a released contact, and a return to where the baseline was before a fall, is
   no touch: nothing latches.
 """
@@ -161,14 +162,18 @@ class BaselineTracker:
         #: For how long each taxel has been free of touch, and its lowest reading since.
         self._free_s: Array = np.full(n, np.inf)
         self._lowest: Array = np.full(n, np.inf)
-        #: Where a reading was taken for unseen drift when a touch was released: the baseline
-        #: before, for how long it may yet go back, the reading with and without relaxation, and by
-        #: how much the reading without it has risen since.
+        #: Where a touch was released, or has ended by itself, so that its reading is taken for
+        #: unseen drift: the baseline before, for how long it may yet go back, the reading with and
+        #: without relaxation, by how much the reading without it has risen since, and which of
+        #: the two it was.
         self._before: Array = np.zeros(n)
         self._taken_s: Array = np.zeros(n)
         self._taken_level: Array = np.zeros(n)
         self._taken_free: Array = np.zeros(n)
         self._risen: Array = np.zeros(n)
+        self._by_itself: Mask = np.zeros(n, np.bool_)
+        #: For how long a taxel that was given back its baseline yet counts as loaded.
+        self._loaded_s: Array = np.zeros(n)
         self._touches = _Touches(n)
 
     def step(
@@ -203,7 +208,7 @@ class BaselineTracker:
         if self._thermal is not None:
             forecast = self._thermal.step(units, self.baseline, free, missing, dt_s)
             units = units - forecast
-            self._former += forecast
+            self._note_drift(forecast)
 
         common = self._common(units, free & ~recovering, dt_s)
         if self._is_calm(units, common, hidden, dt_s):
@@ -211,13 +216,14 @@ class BaselineTracker:
             self._move(change + common, forecast)
             return None
         state = self._states(units, touched, hidden, recovering, dt_s)
-        state[recovering & ~self._remains(units, hidden, dt_s)] = State.DISTURBED
+        held = recovering & ~self._remains(units, hidden, dt_s)
+        state[held | (free & (self._loaded_s > 0.0))] = State.DISTURBED
         change = self._followed(units, common, state, dt_s)
         fallen = self._fallen_s >= SETTLE_S
         change[fallen] = units[fallen]
         self._expect_back(fallen if common > FALLEN_UNITS else free)
         if abs(common) <= QUICK_UNITS_PER_S * dt_s:
-            self._former += common
+            self._note_drift(common)
 
         level = self.baseline + units + relaxed_units
         still = (np.abs(level - self._last) < TOLERANCE_UNITS) & ~missing
@@ -228,7 +234,9 @@ class BaselineTracker:
             units, touched, relaxed_units if referenced else None
         )
         change[released] = units[released]
-        change += self._given_back(units, level, released, dt_s)
+        ended = recovering & (self._free_s <= dt_s) & (self._taken_s <= 0.0)
+        self._by_itself = (self._by_itself | ended) & ~released
+        change += self._given_back(units, level, touched, released | ended, dt_s)
         back = still & self._back(level, dt_s)
         change[back] = (self._former - self.baseline)[back]
         self._move(change, forecast)
@@ -236,6 +244,7 @@ class BaselineTracker:
             np.count_nonzero(self._fallen_s)
             or np.count_nonzero(self._former_s > 0.0)
             or np.count_nonzero(self._taken_s > 0.0)
+            or np.count_nonzero(self._loaded_s > 0.0)
         )
         found = np.flatnonzero((released | back) & touched)
         return found if len(found) else None
@@ -247,7 +256,7 @@ class BaselineTracker:
     def forget(self, taxels: Mask) -> None:
         """Start again with some taxels, bool[n]: their baselines are new."""
         touched_s = self._touches.touched_s
-        for memory in (self._fallen_s, self._former_s, self._taken_s, touched_s):
+        for memory in (self._fallen_s, self._former_s, self._taken_s, self._loaded_s, touched_s):
             memory[taxels] = 0.0
         if self._thermal is not None:
             self._thermal.forget(taxels)
@@ -335,33 +344,48 @@ class BaselineTracker:
         remains: Mask = calm & (self._free_s > SETTLE_S)
         return remains
 
-    def _given_back(self, units: Array, level: Array, released: Mask, dt_s: float) -> Array | float:
+    def _note_drift(self, change: Array | float) -> None:
+        """All readings have changed by this: those from before would be others now."""
+        self._former += change
+        self._before += change
+        self._taken_free += change
+        self._taken_level += change
+
+    def _given_back(
+        self, units: Array, level: Array, touched: Mask, ended: Mask, dt_s: float
+    ) -> Array | float:
         """Return the change [n] of baselines that took a load that had been eased for drift.
 
         Foam that is free comes back: its reading falls, relaxation included (`level` [n]), by what
         the model of the foam expects. Where it falls by less than half of that, the corrected
         reading rises: something still presses the foam.
         """
+        self._loaded_s -= dt_s
         free = self.baseline + units
-        self._before[released] = self.baseline[released]
-        self._taken_level[released] = level[released]
-        self._taken_free[released] = free[released]
-        self._risen[released] = 0.0
-        self._taken_s[released] = REGRET_S
+        self._before[ended] = self.baseline[ended]
+        self._taken_level[ended] = level[ended]
+        self._taken_free[ended] = free[ended]
+        self._risen[ended] = 0.0
+        self._taken_s[ended] = REGRET_S
         if not np.count_nonzero(self._taken_s > 0.0):
             return 0.0
         since_s = REGRET_S - self._taken_s
         settling = np.where(since_s < SETTLE_S, dt_s / (since_s + dt_s), 0.0)
         self._taken_free += settling * (free - self._taken_free)
         self._taken_level += settling * (level - self._taken_level)
+        # A press, which rises before its mean does, is no foam that pushes back. After a release it
+        # is a reason to doubt it: too much may have been taken at once.
+        pressed = touched & self._by_itself & (free - self._taken_free > UNSEEN_UNITS)
+        self._taken_s[pressed & ~ended] = 0.0
         share = -math.expm1(-dt_s / SMOOTHING_S)
         self._risen += share * (free - self._taken_free - self._risen)
         expected = (self._taken_level - self._taken_free) - (level - free)
-        load = (self._taken_s > 0.0) & (self._risen > TOLERANCE_UNITS) & ~released
+        load = (self._taken_s > 0.0) & (self._risen > TOLERANCE_UNITS) & ~ended
         load &= self._risen > HELD_SHARE * expected
         given = np.where(load, np.minimum(self._before - self.baseline, 0.0), 0.0)
         self._taken_s -= dt_s
         self._taken_s[load] = 0.0
+        self._loaded_s[load & ~touched] = REGRET_S
         return given
 
     def _states(

@@ -37,6 +37,7 @@ def small():
         "quick": True,
         "default": report.key_of(DEFAULT),
         "rows": rows,
+        "noise_draws": accuracy.noise_draws("F", PLAN),
         "fits": accuracy.fit_rows("F"),
         "cycles": accuracy.cycles("F", 200, ("published", DEFAULT.model)),
         "speed": speed.models(0.0, (192, 1920)),
@@ -122,6 +123,16 @@ def test_the_models_are_run_by_the_pipeline_that_ships(monkeypatch):
     assert len(set(map(id, stepped))) == len(accuracy.VARIANTS)
     models = {row["model"] for row in rows}
     assert models == {"perfect", "hindsight"} | {v.model for v in accuracy.VARIANTS}
+
+
+def test_the_error_of_real_readings_is_judged_by_several_draws_of_the_noise(small):
+    errors_kpa = accuracy.by_history(small["noise_draws"])
+    assert {history for _, history in errors_kpa} == set(accuracy.JUDGED_HISTORIES)
+    for values in errors_kpa.values():
+        assert len(values) == len(set(values)) == accuracy.NOISE_DRAWS
+    (line,) = [line for line in report.goals(small) if "draws of the noise" in line["figure"]]
+    means_kpa = [np.sqrt(np.mean(np.square(values))) for values in errors_kpa.values()]
+    assert line["measured"] == pytest.approx(max(means_kpa))
 
 
 def test_rows_have_what_readers_count_on(small):

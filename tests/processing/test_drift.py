@@ -256,6 +256,42 @@ def test_a_grip_that_is_eased_after_long_is_found_again_when_the_foam_pushes_bac
     assert touched[held].all()
 
 
+def test_a_touch_that_ends_while_the_foam_is_late_is_found_again_when_it_pushes_back():
+    """Its grip was eased, not released, and reads too little for seconds."""
+    track = tracker()
+    held = np.arange(N) < 6
+    for _ in range(1500):
+        follow(track, 0.0, held, 25.0)
+    for second in range(150):
+        eased = np.where(held, 0.7 + 1.8 * -np.expm1(-second / 30.0), 0.0)
+        track.step(eased - track.baseline, NOBODY, NOBODY, 1.0)
+    assert track.baseline[held] == pytest.approx(np.zeros(6), abs=0.2)
+
+
+def test_what_is_left_of_a_touch_is_followed_while_the_whole_part_drifts():
+    """The drift alone is no load that pushes back."""
+    track = tracker()
+    held = np.arange(N) < 6
+    for _ in range(1500):
+        follow(track, 0.0, held, 25.0)
+    for second in range(200):
+        follow(track, 0.008 * second + np.where(held, 1.2, 0.0))
+    assert track.baseline == pytest.approx(0.008 * 200 + np.where(held, 1.2, 0.0), abs=0.1)
+
+
+def test_a_press_after_a_touch_that_ended_by_itself_is_no_foam_that_pushes_back():
+    track = tracker()
+    held = np.arange(N) < 6
+    for _ in range(60):
+        follow(track, 0.0, held, 25.0)
+    for _ in range(60):
+        follow(track, np.where(held, 1.2, 0.0))
+    assert track.baseline[held] == pytest.approx(np.full(6, 1.2), abs=0.1)
+    for _ in range(20):
+        follow(track, np.where(held, 1.2, 0.0), held, 25.0)
+    assert track.baseline[held] == pytest.approx(np.full(6, 1.2), abs=0.1)
+
+
 def test_what_the_foam_is_late_with_in_short_pauses_is_no_drift():
     track = tracker()
     held = np.arange(N) < 6
