@@ -6,7 +6,6 @@ touched just before stay in doubt until they are calibrated.
 """
 
 import math
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -44,11 +43,12 @@ class _Glimpse:
     """The last readings of a board of which taxels are not valid, or were not just now.
 
     Attributes:
-        units: float64[192] each: of its taxels, away from its zero; -inf where there is none.
+        units: float64[k, 192], the last k that were received of each taxel, the newest first, away
+            from its zero; -inf where it was far below zero, NaN where there are fewer.
         until_ns: then its touches are decided.
     """
 
-    units: deque[NDArray[np.float64]]
+    units: NDArray[np.float64]
     until_ns: int = 0
 
 
@@ -431,16 +431,18 @@ class BoardZeros:
             if not blind:
                 return
             longest = math.ceil(GLIMPSED * repeats_of(own.period_ms * 1e-3))
-            glimpse = self._glimpses[sweep.board] = _Glimpse(deque(maxlen=longest))
+            none = np.full((longest, TRIANGLES * PADS), np.nan)
+            glimpse = self._glimpses[sweep.board] = _Glimpse(none)
         if blind:
             glimpse.until_ns = sweep.t_ns + DECIDED_NS
         elif not 0 <= glimpse.until_ns - sweep.t_ns <= DECIDED_NS:
             del self._glimpses[sweep.board]
             return
         ledger = self._ledger
-        here = (ledger.present[row] & (ledger.error[row] == 0))[:, None] & ~ledger.far[row]
-        units = np.where(here, float(own.no_load) - sweep.raw, -np.inf)
-        glimpse.units.append(units.ravel())
+        here = np.repeat(ledger.present[row] & (ledger.error[row] == 0), PADS)
+        units = np.where(ledger.far[row], -np.inf, float(own.no_load) - sweep.raw).ravel()
+        glimpse.units[1:, here] = glimpse.units[:-1, here]
+        glimpse.units[0, here] = units[here]
 
     def _glimpsed(self, board: int) -> Mask:
         """Return taxels bool[16, 12] of a board that something presses by its last readings, while
@@ -450,8 +452,6 @@ class BoardZeros:
         calibration, pipeline = self._calibration, self._pipeline
         pressed = np.zeros((TRIANGLES, PADS), np.bool_)
         if glimpse is None or calibration is None or pipeline is None:
-            return pressed
-        if len(glimpse.units) < GLIMPSED:
             return pressed
         taxels = self._of(board).ravel()
         spread = np.maximum(calibration.spread, calibration.noise)[taxels]
@@ -465,7 +465,10 @@ class BoardZeros:
             highest = baseline + STEADY_UNITS + error
         highest = np.maximum(highest, baseline + pipeline.enter[taxels])
         fit = (taxels >= 0) & calibration.usable[taxels]
-        pressed[:] = (fit & (np.median(glimpse.units, axis=0) > highest)).reshape(pressed.shape)
+        fit &= np.count_nonzero(~np.isnan(glimpse.units), axis=0) >= GLIMPSED
+        pressed[fit.reshape(pressed.shape)] = (
+            np.nanmedian(glimpse.units[:, fit], axis=0) > highest[fit]
+        )
         return pressed
 
     def _note_below_zero(self, sweep: Sweep, row: int) -> None:

@@ -520,6 +520,16 @@ def test_a_noisy_pad_may_be_touched_until_its_zero_is_known() -> None:
     assert not zeros.may_be_touched().any()
 
 
+def test_a_press_whose_last_frames_were_lost_before_another_zero_is_in_doubt(hand: Hand) -> None:
+    hand.engine.zeros.rezero(0)
+    hand.send(5)
+    hand.rest_units[-1, 3] = 40
+    hand.send(5)
+    hand.lost = 1
+    hand.send(9)
+    assert hand.engine.zeros.rezero(0) == 1
+
+
 @pytest.mark.parametrize("lost", [0, 1])
 def test_what_was_hardly_received_while_nothing_is_valid_presses_nothing(
     hand: Hand, lost: int
