@@ -95,7 +95,8 @@ class BoardZeros:
         #: Triangles bool[16] of a board whose chips did not answer when they were last received,
         #: and whether any of these was missing from its last sweep.
         self._unanswered: dict[int, tuple[Mask, bool]] = {}
-        #: For how many sweeps pads int64[16, 12] of a board have read far below zero, where any do.
+        #: In how many sweeps in a row that came pads int64[16, 12] of a board have read far below
+        #: zero, where any do.
         self._below: dict[int, NDArray[np.int64]] = {}
         #: When a board's pad last came back from there by itself.
         self._jumped_ns: dict[int, int] = {}
@@ -309,6 +310,23 @@ class BoardZeros:
             found |= self._below[board] > 0
         return found
 
+    def unclear(self, board: int) -> Mask | None:
+        """Return taxels bool[n] of which a calibration takes nothing that a board has sent until
+        its last sweep; None if there are none.
+
+        What two boards send at an address is the zero of neither. Until it is known whether a board
+        zeroed itself while it was silent, taxels in doubt may rest elsewhere than before. Others do
+        not, unless their readings show that it did.
+        """
+        if self._ledger.row[board] in self._ledger.twice:
+            return self._layout.taxels_of([board])
+        if board not in self._silent_zeros:
+            return None
+        taxels = self._of(board)
+        found = np.zeros(self._layout.n_taxels, np.bool_)
+        found[taxels[self.in_doubt(board) & (taxels >= 0)]] = True
+        return found
+
     def compares(self, board: int) -> bool:
         """Return whether it was not known before a board's last sweep if it zeroed itself while it
         was silent.
@@ -486,9 +504,13 @@ class BoardZeros:
                 # What was pressed and lifts stays below zero; what a bad wire brings does not.
                 self._jumped_ns[sweep.board] = sweep.t_ns
         jumps = 0 <= sweep.t_ns - self._jumped_ns.get(sweep.board, -JUMPS_NS) < JUMPS_NS
-        if self._calibration is None or jumps or not any_of(below):
+        if self._calibration is None or jumps:
             return
-        lasted = below.astype(np.int64) if before is None else (before + 1) * below
+        lasted = below.astype(np.int64)
+        if before is not None:
+            lasted += before * (below | ~self._ledger.present[row][:, None])
+        if not any_of(lasted > 0):
+            return
         self._below[sweep.board] = lasted
         sure = lasted >= BELOW_SWEEPS
         if any_of(sure):

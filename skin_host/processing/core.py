@@ -375,10 +375,11 @@ class Engine:
             if sweep.missed and not silent_ns:
                 silent_ns = self.ledger.zeroing_ns(sweep)
             row = self.ledger.note(sweep)
-            if row in self.ledger.twice and self._run is not None:
-                # What two boards send at an address is the zero of neither.
-                self._run.forget(sweep.board)
             self.zeros.note(sweep, row, silent_ns)
+            if self._run is not None:
+                unclear = self.zeros.unclear(sweep.board)
+                if unclear is not None:
+                    self._run.forget(unclear)
             samples += self.intake.take(sweep, row)
         return samples
 

@@ -41,6 +41,8 @@ class Hand:
         self.error = 0
         #: How many triangles are lost on their way, from the last on.
         self.lost = 0
+        #: Whether the first triangle is lost, too.
+        self.first_lost = False
         #: Whether the first frame of the last triangle that comes is lost.
         self.halved = False
         #: Takes the outputs.
@@ -76,6 +78,8 @@ class Hand:
         frames = frames[: len(frames) - 2 * self.lost]
         if self.halved:
             del frames[-2]
+        if self.first_lost:
+            del frames[:2]
         self.deliver(self.engine.feed(self._board.settings.bus, FrameBatch.of(frames)))
 
     def pause(self, seconds: float) -> None:
@@ -114,6 +118,20 @@ def test_a_pad_that_comes_back_at_once_jumps(hand: Hand, sweeps: int) -> None:
     hand.send(1)
     hand.send(10, p4=FAR_BELOW)
     assert hand.in_doubt == []
+
+
+@pytest.mark.parametrize(("below", "doubted"), [(4, []), (5, [3])])
+def test_whether_a_pad_stays_below_zero_shows_in_the_sweeps_that_came(
+    hand: Hand, below: int, doubted: list[int]
+) -> None:
+    for _ in range(below):
+        hand.first_lost = False
+        hand.send(1, p3=FAR_BELOW)
+        hand.first_lost = True
+        hand.send(2)
+    hand.first_lost = False
+    hand.send(1)
+    assert hand.in_doubt == doubted
 
 
 def test_a_pad_in_doubt_that_is_pressed_again_and_again_does_not_jump(hand: Hand) -> None:
@@ -371,6 +389,23 @@ def test_a_calibration_after_a_silence_decides_by_itself(worn: tuple[Hand, list[
     hand.engine.use(hand.engine.end_calibration("2026-01-01T00:00:00+00:00"))
     hand.send(20)
     assert hand.engine.ledger.rezeros.tolist() == [0]
+
+
+def test_a_calibration_takes_of_pads_in_doubt_only_what_comes_after_a_silence_is_judged(
+    hand: Hand,
+) -> None:
+    """Their board zeroed itself, which the other pads do not show: they rest where they did."""
+    hand.send(10, p3=FAR_BELOW)
+    hand.engine.begin_calibration(2.0)
+    hand.send(20, p3=252)
+    hand.pause(3.0)
+    hand.send(3, p3=252)
+    hand.send(80)
+    found = hand.engine.end_calibration("2026-01-01T00:00:00+00:00")
+    board = hand.engine.layout.boards[0]
+    taxel = int(board.taxel_index[board.triangles[0], 3])
+    assert found.usable[taxel]
+    assert found.baseline[taxel] == pytest.approx(0.0, abs=0.5)
 
 
 @pytest.mark.parametrize("waits", [0, 15, 45])

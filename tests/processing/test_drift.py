@@ -279,6 +279,16 @@ def test_what_is_left_of_a_touch_is_followed_while_the_whole_part_drifts():
     assert track.baseline == pytest.approx(0.008 * 200 + np.where(held, 1.2, 0.0), abs=0.1)
 
 
+def test_what_is_left_of_a_touch_is_followed_while_another_pad_is_touched():
+    track = tracker()
+    held, other = np.arange(N) < 6, np.arange(N) == 20
+    for _ in range(60):
+        follow(track, 0.0, held | other, 25.0)
+    for _ in range(60):
+        follow(track, np.where(held, 1.2, 0.0), other, 25.0)
+    assert track.baseline[held] == pytest.approx(np.full(6, 1.2), abs=0.1)
+
+
 def test_a_press_after_a_touch_that_ended_by_itself_is_no_foam_that_pushes_back():
     track = tracker()
     held = np.arange(N) < 6

@@ -9,7 +9,7 @@ from skin_host.processing.calibration import Calibration
 from skin_host.processing.calibration.calibrator import KNOWN_SAMPLES, Calibrator, Known
 from skin_host.processing.conversions import CONVERSION_S
 from skin_host.processing.intake import PartSample
-from skin_host.processing.masks import any_of
+from skin_host.processing.masks import Mask, any_of
 
 #: A calibration takes at least `KNOWN_SAMPLES` of each board, even if that is slow, and the time of
 #: so many conversions, even if less is asked for.
@@ -81,16 +81,16 @@ class CalibrationRun:
         if self.is_over:
             self.zeroed[board] = believed
             return
-        self.forget(board)
+        self.forget(self._layout.taxels_of([board]))
         self._passed_ns = 0
         for sender in self._samples:
             if sender[0] == board:
                 self._samples[sender] = 0
 
-    def forget(self, board: int) -> None:
-        """Leave out the samples of a board so far."""
+    def forget(self, taxels: Mask) -> None:
+        """Leave out the samples of taxels, bool[n], so far."""
         if not self.is_over:
-            self._calibrator.forget(np.flatnonzero(self._layout.taxels_of([board])))
+            self._calibrator.forget(np.flatnonzero(taxels))
 
     def end(self, configuration: str, time: str, known: Known | None) -> Callable[[], Calibration]:
         """Stop collecting; return what computes the calibration, see `Calibrator.finish`."""
