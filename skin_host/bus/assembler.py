@@ -51,6 +51,7 @@ _ALL_TRIANGLES = (1 << TRIANGLES) - 1
 #: The status words of a sweep without any.
 NO_STATUS = np.zeros(TRIANGLES, np.uint16)
 NO_STATUS.flags.writeable = False
+_NUMBERS = np.arange(TRIANGLES)
 _SMALLEST_DLC_B = 6
 #: Fewer frames are taken one by one: that costs no more. At a batch's end any number is a run, so
 #: that the rest of the sweep, with which the next batch begins, is one.
@@ -699,10 +700,9 @@ class Assembler:
         if got != state.wanted:
             self.counters.incomplete += state.missing != 0
             state.lone = got ^ present * _BOTH
-            triangles[[not present >> triangle & 1 for triangle in range(TRIANGLES)], :TAXELS] = 0
+            triangles[_without(present), :TAXELS] = 0
             # A status word is whole without the other half of its triangle.
-            second = got >> TRIANGLES
-            triangles[[not second >> triangle & 1 for triangle in range(TRIANGLES)], TAXELS:] = 0
+            triangles[_without(got >> TRIANGLES), TAXELS:] = 0
             self._note_absent(state, present)
         else:
             if state.any_absent:
@@ -754,6 +754,12 @@ class Assembler:
                     state.awaited &= ~(_BOTH << triangle)
         if not state.awaited:
             state.awaited = state.wanted
+
+
+def _without(bits: int) -> NDArray[np.bool_]:
+    """Return which triangles bool[16] have no bit in a mask."""
+    missing: NDArray[np.bool_] = bits >> _NUMBERS & 1 == 0
+    return missing
 
 
 def _spread(array: NDArray[_T], triangles: NDArray[np.intp]) -> NDArray[_T]:

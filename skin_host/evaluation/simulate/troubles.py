@@ -323,6 +323,11 @@ def _emulated(
     return begin
 
 
+def _mixed(name: str, may: set[str], must: set[str]) -> Begin:
+    """A fault of the emulator's catalogue that sends bytes of another chip, or register."""
+    return _emulated(name, may, must, 1.0, spoils=True, recovers_s=RESTS_AGAIN_S)
+
+
 def _is_set_up_unseen(world: World, board: str) -> bool:
     """Return whether a board is an MTB3 that the daemon may be setting up now."""
     own = world.settings.boards[board]
@@ -712,39 +717,10 @@ KINDS: dict[str, Begin] = {
     ),
     "shorted_finger": _emulated("shorted_finger", _CHIPS | _SET_UP, _UNANSWERED, 1.0),
     # Where two chips drive one data line, their bytes mix, differently in each sweep.
-    "wrong_address": _emulated(
-        "wrong_address",
-        _SWAPPED | {"bus_bit_errors"},
-        _ELSEWHERE,
-        1.0,
-        spoils=True,
-        recovers_s=RESTS_AGAIN_S,
-    ),
-    "swapped_lines": _emulated(
-        "swapped_lines",
-        _SWAPPED,
-        _ELSEWHERE | _LINE | {"lines_swapped"},
-        1.0,
-        spoils=True,
-        recovers_s=RESTS_AGAIN_S,
-    ),
-    "shared_address": _emulated(
-        "shared_address",
-        _SWAPPED | {"bus_bit_errors"},
-        _ELSEWHERE,
-        1.0,
-        spoils=True,
-        recovers_s=RESTS_AGAIN_S,
-    ),
-    # It sends bytes of other registers.
-    "no_acknowledge": _emulated(
-        "no_acknowledge",
-        _SWAPPED,
-        _UNANSWERED,
-        1.0,
-        spoils=True,
-        recovers_s=RESTS_AGAIN_S,
-    ),
+    "wrong_address": _mixed("wrong_address", _SWAPPED | {"bus_bit_errors"}, _ELSEWHERE),
+    "swapped_lines": _mixed("swapped_lines", _SWAPPED, _ELSEWHERE | _LINE | {"lines_swapped"}),
+    "shared_address": _mixed("shared_address", _SWAPPED | {"bus_bit_errors"}, _ELSEWHERE),
+    "no_acknowledge": _mixed("no_acknowledge", _SWAPPED, _UNANSWERED),
     "data_held_low": _emulated(
         "data_held_low",
         _CHIPS | _SET_UP,
