@@ -1,5 +1,6 @@
 """Builds the health record of a part from what `watch` has noted."""
 
+import math
 from collections import deque
 from statistics import fmean, median
 from typing import TYPE_CHECKING, Any, cast
@@ -48,6 +49,8 @@ SIGMA = 1.4826
 FEWEST_RESTING = 8
 #: Taxels beside a press move with it, so all of a part with fewer must be untouched.
 MANY_RESTING = 12
+#: A part has shifted if this share of its untouched taxels has moved by half of that, or more.
+TOGETHER_SHARE = 0.75
 #: A shift counts for so long though the baselines have followed it.
 FORMER_NS = 3_000_000_000
 #: A triangle is missing when it was absent from this many sweeps in a row.
@@ -542,8 +545,8 @@ def common_shift(
 ) -> float:
     """Return how far the untouched taxels of a part have moved together: 0 if they have not.
 
-    Temperature moves all triangles. A press near them, or the end of one that a board took for its
-    zero, moves the pads around it.
+    Temperature moves nearly all pads, of all triangles. A press near them, or the end of one that a
+    board took for its zero, moves the pads around it.
 
     Args:
         shift: [m], from the baselines, in units of one shift.
@@ -551,6 +554,9 @@ def common_shift(
         triangle_of: int[m].
     """
     common = _middle(shift[rests])
+    along = shift[rests] * math.copysign(1.0, common) >= abs(common) / 2
+    if np.count_nonzero(along) < TOGETHER_SHARE * len(along):
+        return 0.0
     # Most parts rest: then one of the first triangles has not moved like the others.
     own = (
         _middle(shift[rests & (triangle_of == one)])

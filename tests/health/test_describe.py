@@ -34,6 +34,14 @@ def test_what_moves_most_pads_of_some_triangles_only_is_none(units: float) -> No
     assert common_shift(shift, np.ones(30, np.bool_), TRIANGLES) == 0.0
 
 
+@pytest.mark.parametrize(("pads", "moved"), [(7, False), (10, True)])
+def test_what_moves_only_most_pads_of_a_part_of_one_triangle_is_none(
+    pads: int, moved: bool
+) -> None:
+    shift = np.where(np.arange(12) < pads, -5.0, 0.0)
+    assert (common_shift(shift, np.ones(12, np.bool_), np.zeros(12, np.int64)) != 0.0) is moved
+
+
 def test_a_pause_among_the_first_sweeps_is_no_longer_period() -> None:
     assert _period(np.array([50] * 7 + [200]) * MS, 50) == (None, None)
     assert _period(np.array([50] * 8 + [200]) * MS, 50) == (50.0, 0.0)

@@ -972,6 +972,36 @@ def test_damage_must_be_named_by_when_enough_of_it_came(world: World, kind: str)
         assert KINDS[kind](world, chance, True).within_s == 8.0
 
 
+def test_a_fingertip_that_was_free_between_two_samples_need_not_be_touched_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
+    config = DEMO.with_name("fingertips.toml")
+    one = World(*load_skin(config), config, 1, Scene(quiet=True))
+
+    async def live() -> None:
+        life = start(one)
+        await one.clock.sleep(8.0)
+        promises = Promises(one)
+        promises.watch(life)
+        tip = one.tips[0]
+        pressing = asyncio.create_task(tip.press(2.0, 80.0))
+        await sampled(promises, 2.0)
+        await pressing
+        await one.clock.sleep(0.1)
+        pressing = asyncio.create_task(tip.press(2.0, 80.0))
+        await one.clock.sleep(0.005)
+        promises.sample()
+        assert promises.broken is None
+        await sampled(promises, 1.0)
+        assert promises.broken is None
+        pressing.cancel()
+        life.kill()
+
+    with one.clock.runner() as runner:
+        runner.run(live())
+
+
 def test_a_calm_ends_though_pads_of_real_skin_that_were_stuck_from_the_first_are_named(
     worn: World, tmp_path: Path
 ) -> None:

@@ -79,7 +79,7 @@ class Promises:
         #: Chips that do not measure what they should.
         self._damaged: dict[Triangle, Trouble] = {}
         self._objects: int | None = None
-        world.before_press = self._skin.note_pause
+        world.before_press = self._note_pause
         world.broker.listeners.append(self._hear)
 
     # ------------------------------------------------------------------ what happens
@@ -90,6 +90,10 @@ class Promises:
             self.broken = what
             self._world.note(f"BROKEN: {what}")
             self.stopped.set()
+
+    def _note_pause(self) -> None:
+        self._skin.note_pause()
+        self._fingertips.note_pause()
 
     def _hold(self, wrong: str | None) -> None:
         if wrong is not None:

@@ -37,8 +37,19 @@ class FingertipCheck:
         self._held_ns = dict.fromkeys(world.settings.fingertips, LONG_AGO_NS)
         self._slipped: set[str] = set()
 
+    def note_pause(self) -> None:
+        """Note which are not loaded: also when one is about to be, as it may have been free only
+        between two samples.
+        """
+        now_ns = self._world.clock.monotonic_ns()
+        for name in self._eased_ns:
+            force_n = self._world.robot.fingertips.force_n(name, now_ns)
+            if float(np.linalg.norm(force_n)) < FELT_N:
+                self._eased_ns[name] = now_ns
+
     def note_loads(self, life: Life | None) -> None:
         """Note which are loaded, and which zeros may be of a load."""
+        self.note_pause()
         now_ns = self._world.clock.monotonic_ns()
         tips = self._world.robot.fingertips
         calibrating = life is not None and life.daemon.engine.calibrating
@@ -50,8 +61,6 @@ class FingertipCheck:
                 self._slipped.discard(name)
             if tips.slipped_mm(name) < SLID_MM:
                 self._held_ns[name] = now_ns
-            if force_n < FELT_N:
-                self._eased_ns[name] = now_ns
             if calibrating and now_ns - self._loaded_ns[name] < NS:
                 self._accusations.loaded.add(name)
 
