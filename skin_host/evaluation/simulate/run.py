@@ -237,11 +237,12 @@ class _Run:
         self.result.events, self.result.digest = world.trace.count, world.trace.digest()
         self.result.seconds = list(world.trace.seconds)
         self.result.last = list(world.trace.last)
+        ended = living.done()
         for task in (living, looking, stopped):
             task.cancel()
         outcome, *_ = await asyncio.gather(living, looking, stopped, return_exceptions=True)
-        if isinstance(outcome, Exception) and self._promises.broken is None:
-            raise outcome
+        if ended and outcome is not None and self._promises.broken is None:
+            raise outcome  # Whatever ended it early, this hour did not pass.
         if world.life is not None:
             world.life.kill()
         result = self.result
@@ -298,13 +299,19 @@ class _Run:
         if life is None:
             return
         self.world.note("the daemon is asked to end")
+        whole = True
         try:
-            await self.world.end()
+            whole = await self.world.end()
         except TimeoutError:
             self._promises.break_("the daemon did not end")
         except Exception as error:
             self._promises.break_(f"the daemon ended with {error!r}")
-        self._promises.over(life, whole=True)
+        if whole:
+            self._promises.over(life)
+        else:
+            # It was killed meanwhile, or its power failed.
+            self._promises.forget(life.daemon)
+            life.kill()
 
     def _kill(self, *, power: bool) -> None:
         world = self.world

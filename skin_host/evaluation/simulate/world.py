@@ -4,7 +4,6 @@ Everything is drawn from one seed and lives by one stepped clock. The daemon is 
 """
 
 import asyncio
-import contextlib
 import random
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +21,7 @@ from skin_host.daemon.calibrate import stored_calibration
 from skin_host.daemon.daemon import Daemon
 from skin_host.evaluation.simulate.broker import Living, MemoryBroker
 from skin_host.evaluation.simulate.cables import Cable, SimulatedPort
-from skin_host.evaluation.simulate.disk import SimulatedDisk
+from skin_host.evaluation.simulate.disk import PowerCut, SimulatedDisk
 from skin_host.evaluation.simulate.trace import Trace
 from skin_host.files import on_disk
 from skin_host.layout import Layout
@@ -207,11 +206,16 @@ class World:
         """The computer lost its power in the middle of writing."""
         self.power_failed.set()
 
-    async def end(self) -> None:
-        """Let the daemon end as it is asked to."""
+    async def end(self) -> bool:
+        """Let the daemon end as it is asked to; return whether it did: it may be killed meanwhile.
+
+        Raises:
+            TimeoutError: it does not end.
+            Exception: it failed.
+        """
         life = self.life
         if life is None:
-            return
+            return False
         self.move()
         life.sent_before_end = {
             name: dict(cable.sent.bursts) for name, cable in self.cables.items()
@@ -220,8 +224,11 @@ class World:
         async with self.clock.timeout(LONGEST_END_S):
             await asyncio.wait([life.task])
         self.life = None
-        with contextlib.suppress(asyncio.CancelledError):
+        try:
             life.task.result()
+        except (asyncio.CancelledError, PowerCut):
+            return False
+        return True
 
     def note(self, text: str) -> None:
         """Something happens that is worth showing."""

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from emulator.boards.mtb4 import NO_ACKS_TO_CALIBRATE
-from emulator.probes.scene import Fault, Scene
+from emulator.probes.scene import Fault, Place, Probe, Scene
 from skin_host.bus.port import LinkState
 from skin_host.bus.wire import HEADER_A, HEADER_B, FrameBatch
 from skin_host.cli.common import load_skin
@@ -23,6 +23,7 @@ from skin_host.daemon.daemon import Daemon
 from skin_host.demo import configuration
 from skin_host.evaluation.simulate.accusations import STARTED_NS
 from skin_host.evaluation.simulate.cables import Cable, Sent, SimulatedPort
+from skin_host.evaluation.simulate.disk import PowerCut
 from skin_host.evaluation.simulate.promises import Promises
 from skin_host.evaluation.simulate.promises.limits import UNTOUCHED_KPA
 from skin_host.evaluation.simulate.run import LONGEST_DRILL_S, _Run
@@ -242,7 +243,7 @@ def test_doubts_that_the_disk_refused_are_lost_with_a_daemon_that_was_asked_to_e
         if refused:
             KINDS["disk_read_only"](world, random.Random(1), False)
         await world.end()
-        promises.over(life, whole=True)
+        promises.over(life)
         part = world.layout.part(spot.part)
         assert promises.excuses.exempt[part.start : part.stop].any() == refused
         await pressing
@@ -272,6 +273,41 @@ def test_a_slow_disk_does_not_make_touches_last_when_the_daemon_ends(world: Worl
 
     with world.clock.runner() as runner:
         assert runner.run(live()) == b"UNKNOWN"
+
+
+@pytest.mark.parametrize("power", [True, False])
+def test_a_daemon_that_dies_while_it_is_asked_to_end_has_not_ended_the_run(
+    world: World, tmp_path: Path, power: bool
+) -> None:
+    """`icub_hand.toml` 9054: it was about to write, and the rest of the hour did not pass."""
+
+    async def live() -> None:
+        run = _Run(world, tmp_path, 2, 60.0, None)
+        run._promises = Promises(world)
+        life = start(world)
+        await world.clock.sleep(8.0)
+        stopping = asyncio.create_task(run._stop())
+        await world.clock.sleep(0.001)
+        assert not life.task.done()
+        run._kill(power=power)
+        await stopping
+        assert run._promises.broken is None
+        assert world.life is None
+        assert life.dead
+
+    with world.clock.runner() as runner:
+        runner.run(live())
+
+
+def test_a_run_that_ends_before_its_time_has_not_kept_its_promises(
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def end(_: object) -> None:
+        raise PowerCut
+
+    monkeypatch.setattr(_Run, "_storm", end)
+    with pytest.raises(PowerCut), world.clock.runner() as runner:
+        runner.run(_Run(world, tmp_path, 2, 60.0, None).live())
 
 
 @pytest.mark.parametrize(
@@ -364,6 +400,36 @@ def test_a_press_that_began_while_a_chip_did_not_answer_is_in_the_zero_of_its_bo
         pressed = pads[world.robot.skin.true_pressure_kpa()[pads] > 25.0]
         assert len(pressed)
         assert promises.excuses.exempt[pressed].all() != before
+        pressing.cancel()
+        life.kill()
+
+    with world.clock.runner() as runner:
+        runner.run(live())
+
+
+def test_a_press_just_before_a_zero_is_in_it_also_where_something_lay_on_the_pad(
+    world: World,
+) -> None:
+    """`icub_hand.toml` 9052: half a kPa, which nobody felt."""
+
+    async def live() -> None:
+        promises, life = start_watched(world)
+        await sampled(promises, 12.0)
+        spot = world.spots[0]
+        part = world.layout.part(spot.part)
+        at = Place(taxel=spot.taxel)
+        lies = Probe(kind="disc", part=spot.part, at=at, diameter_mm=8.0, force_n=[(0.0, 0.0)])
+        world.move()
+        world.robot.touch(lies).press(0.025)
+        await sampled(promises, 5.0)
+        pressing = asyncio.create_task(spot.press(20.0, 60.0), name="press")
+        await world.clock.sleep(0.02)
+        await life.daemon.configure()
+        await sampled(promises, 4.0)
+        pads = np.arange(part.start, part.stop)
+        pressed = pads[world.robot.skin.true_pressure_kpa()[pads] > 25.0]
+        assert len(pressed)
+        assert promises.excuses.exempt[pressed].all()
         pressing.cancel()
         life.kill()
 
@@ -654,7 +720,7 @@ def test_a_frame_whose_other_half_was_lost_just_before_the_end_is_accounted_for(
             for state in assembler._states.values()
         )
         promises.broken = None  # health names losses that nobody noted
-        promises.over(life, whole=True)
+        promises.over(life)
         return promises.broken
 
     with world.clock.runner() as runner:

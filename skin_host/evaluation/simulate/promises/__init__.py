@@ -155,11 +155,10 @@ class Promises:
         if "zeros" in daemon.unkept or (keeping is not None and not keeping.done()):
             self.excuses.exempt |= daemon.engine.zeros.at_risk(touched)
 
-    def over(self, life: Life, *, whole: bool) -> None:
-        """A life has ended; `whole`: as it was asked to."""
-        if whole:
-            self._hold(self._skin.endless())
-            self.forget(life.daemon, touched=True)
+    def over(self, life: Life) -> None:
+        """A life has ended as it was asked to."""
+        self._hold(self._skin.endless())
+        self.forget(life.daemon, touched=True)
         self.account(life)
 
     def account(self, life: Life) -> None:

@@ -9,6 +9,7 @@ from skin_host.evaluation.simulate.promises.excuses import Excuses
 from skin_host.evaluation.simulate.promises.limits import (
     DECIDED_NS,
     LONG_AGO_NS,
+    PRESSED_KPA,
     SURE_PADS,
     TOUCHING_KPA,
     UNHEARD_PERIODS,
@@ -28,9 +29,10 @@ class ZeroCheck:
     def __init__(self, world: World, excuses: Excuses) -> None:
         self._world, self._excuses = world, excuses
         n = world.layout.n_taxels
-        #: When each taxel began to be pressed, when its board was last received, and since when
-        #: what presses it may be in its zero.
+        #: When each taxel began to be pressed, or firmly so, when its board was last received, and
+        #: since when what presses it may be in its zero.
         self._pressed = np.zeros(n, np.bool_)
+        self._firmly = np.zeros(n, np.bool_)
         self._pressed_ns = np.zeros(n, np.int64)
         self._unfelt_ns = np.zeros(n, np.int64)
         #: When the chip of each taxel last did not answer, and when it last had answered for so
@@ -91,9 +93,10 @@ class ZeroCheck:
         """
         now_ns, wall_ns = self._world.clock.monotonic_ns(), self._world.clock.now_ns()
         spoiled = self._excuses.spoiled()
-        pressed = true_kpa > TOUCHING_KPA
-        self._pressed_ns[pressed & ~self._pressed] = now_ns
-        self._pressed = pressed
+        pressed, firmly = true_kpa > TOUCHING_KPA, true_kpa > PRESSED_KPA
+        # What pressed hardly before, and was not felt, may press firmly now.
+        self._pressed_ns[(pressed & ~self._pressed) | (firmly & ~self._firmly)] = now_ns
+        self._pressed, self._firmly = pressed, firmly
         layout = self._world.layout
         for board, rezero in life.daemon.engine.zeros.rezeros.items():
             taxels = layout.boards[board].taxel_index
