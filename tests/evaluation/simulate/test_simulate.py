@@ -72,7 +72,7 @@ def test_a_fingertip_that_does_not_feel_what_presses_it_breaks_a_promise(
         return step(tip, replace(wrench, force_n=offset[:3], torque_nm=offset[3:]))
 
     monkeypatch.setattr(Tip, "step", feel_nothing)
-    result = run(101, configuration("fingertips.toml"), until_s=11.0)
+    result = run(2, configuration("fingertips.toml"), until_s=11.0)
     assert result.broken is not None
     assert "not touched while it is pressed" in result.broken
     # What the end of the run does is not shown.
