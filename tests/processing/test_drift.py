@@ -21,6 +21,14 @@ def follow(track, true_baseline, touched=NOBODY, press=0.0, noise=0.0, rng=None)
     return track.step(units, touched, NOBODY, 1.0)
 
 
+def after_touch(touched, seconds):
+    """A tracker under a touch of 25 units that has lasted so long."""
+    track = tracker()
+    for _ in range(seconds):
+        follow(track, 0.0, touched, 25.0)
+    return track
+
+
 def test_the_papers_rule_moves_by_a_fixed_step_outside_its_dead_band():
     units = np.array([-3.0, -0.6, -0.5, -0.1, 0.0, 0.5, 0.6, 9.0])
     change = paper_step(units, 0.04, 0.1, 0.5)
@@ -258,10 +266,8 @@ def test_a_grip_that_is_eased_after_long_is_found_again_when_the_foam_pushes_bac
 
 def test_a_touch_that_ends_while_the_foam_is_late_is_found_again_when_it_pushes_back():
     """Its grip was eased, not released, and reads too little for seconds."""
-    track = tracker()
     held = np.arange(N) < 6
-    for _ in range(1500):
-        follow(track, 0.0, held, 25.0)
+    track = after_touch(held, 1500)
     for second in range(150):
         eased = np.where(held, 0.7 + 1.8 * -np.expm1(-second / 30.0), 0.0)
         track.step(eased - track.baseline, NOBODY, NOBODY, 1.0)
@@ -270,30 +276,24 @@ def test_a_touch_that_ends_while_the_foam_is_late_is_found_again_when_it_pushes_
 
 def test_what_is_left_of_a_touch_is_followed_while_the_whole_part_drifts():
     """The drift alone is no load that pushes back."""
-    track = tracker()
     held = np.arange(N) < 6
-    for _ in range(1500):
-        follow(track, 0.0, held, 25.0)
+    track = after_touch(held, 1500)
     for second in range(200):
         follow(track, 0.008 * second + np.where(held, 1.2, 0.0))
     assert track.baseline == pytest.approx(0.008 * 200 + np.where(held, 1.2, 0.0), abs=0.1)
 
 
 def test_what_is_left_of_a_touch_is_followed_while_another_pad_is_touched():
-    track = tracker()
     held, other = np.arange(N) < 6, np.arange(N) == 20
-    for _ in range(60):
-        follow(track, 0.0, held | other, 25.0)
+    track = after_touch(held | other, 60)
     for _ in range(60):
         follow(track, np.where(held, 1.2, 0.0), other, 25.0)
     assert track.baseline[held] == pytest.approx(np.full(6, 1.2), abs=0.1)
 
 
 def test_a_press_after_a_touch_that_ended_by_itself_is_no_foam_that_pushes_back():
-    track = tracker()
     held = np.arange(N) < 6
-    for _ in range(60):
-        follow(track, 0.0, held, 25.0)
+    track = after_touch(held, 60)
     for _ in range(60):
         follow(track, np.where(held, 1.2, 0.0))
     assert track.baseline[held] == pytest.approx(np.full(6, 1.2), abs=0.1)

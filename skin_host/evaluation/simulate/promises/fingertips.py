@@ -38,24 +38,25 @@ class FingertipCheck:
         self._slipped: set[str] = set()
 
     def note_pause(self) -> None:
-        """Note which are not loaded: also when one is about to be, as it may have been free only
-        between two samples.
-        """
-        now_ns = self._world.clock.monotonic_ns()
+        """One is about to be loaded, and may have been free only between two samples."""
         for name in self._eased_ns:
-            force_n = self._world.robot.fingertips.force_n(name, now_ns)
-            if float(np.linalg.norm(force_n)) < FELT_N:
-                self._eased_ns[name] = now_ns
+            self._load_n(name)
+
+    def _load_n(self, name: str) -> float:
+        """Return the present load of one, and note if there is none."""
+        now_ns = self._world.clock.monotonic_ns()
+        force_n = float(np.linalg.norm(self._world.robot.fingertips.force_n(name, now_ns)))
+        if force_n < FELT_N:
+            self._eased_ns[name] = now_ns
+        return force_n
 
     def note_loads(self, life: Life | None) -> None:
         """Note which are loaded, and which zeros may be of a load."""
-        self.note_pause()
         now_ns = self._world.clock.monotonic_ns()
         tips = self._world.robot.fingertips
         calibrating = life is not None and life.daemon.engine.calibrating
         for name in self._loaded_ns:
-            force_n = float(np.linalg.norm(tips.force_n(name, now_ns)))
-            if force_n > LOADED_N:
+            if self._load_n(name) > LOADED_N:
                 self._loaded_ns[name] = now_ns
             else:
                 self._slipped.discard(name)
