@@ -182,11 +182,9 @@ class Control:
     async def _set_thresholds(self, payload: bytes) -> Answer:
         request = _decode(payload, _Thresholds)
         daemon = self._daemon
-        if request.reset:
-            daemon.set_thresholds(Thresholds())
-        elif request.set is not None:
-            known = msgspec.structs.asdict(daemon.thresholds)
-            changes = msgspec.structs.asdict(request.set)
+        changes = {} if request.set is None else msgspec.structs.asdict(request.set)
+        if request.reset or request.set is not None:
+            known = {} if request.reset else msgspec.structs.asdict(daemon.thresholds)
             wanted = known | {key: value for key, value in changes.items() if value is not None}
             daemon.set_thresholds(Thresholds(**wanted))
         answer = dict(await self.keep()) if request.reset or request.set is not None else {}

@@ -3,6 +3,7 @@
 import asyncio
 import logging
 import os
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -157,6 +158,7 @@ class Daemon:
         #: How many reloads have begun, and why the last one failed.
         self._reloads = 0
         self._not_reloaded: SkinError | None = None
+        self._is_ending = False
         self._feed_s = service.watchdog_interval_s()
         self._fed_s = 0.0
         self._status_s = 0.0
@@ -165,6 +167,7 @@ class Daemon:
         #: How many of the zeros found are kept; and which change of what is known of zeros the
         #: contacts know.
         self._zeros_kept = 0
+        self._writing_zeros = threading.Lock()
         self._zero_changes = self.engine.zeros.changes
 
     async def run(self, stop: asyncio.Event, *, calibrate: bool = False) -> None:
@@ -199,6 +202,9 @@ class Daemon:
             await _first_failure(tasks, stopping)
         finally:
             service.notify("STOPPING=1")
+            self._is_ending = True
+            # What a command changes now would not be kept, and no board stopped that it sets up.
+            await self.publisher.end_commands()
             await cancel(*tasks, stopping)
             # Nothing is felt from now on, however long the disk takes.
             for part in self.engine.parts:
@@ -294,7 +300,10 @@ class Daemon:
 
         Raises:
             BusError: a bus does not take frames.
+            RequestError: the daemon is ending: it would not stop them again.
         """
+        if self._is_ending:
+            raise RequestError("the daemon is ending")
         chosen = self.engine.boards if boards is None else boards
         await self.link.set_up(chosen)
         return [self.layout.boards[board].name for board in chosen]
@@ -308,6 +317,8 @@ class Daemon:
         Raises:
             RequestError: the file is wrong, or changes what only a restart can change; then nothing
                 changes.
+            BusError: a bus does not take frames; the settings are in use, and its boards are set up
+                when it does.
         """
         begun = self._reloads
         async with self._reloading:
@@ -318,6 +329,13 @@ class Daemon:
                     await self._reload()
                 except SkinError as error:
                     self._not_reloaded = error
+                except Exception as error:
+                    # A file that the checks have let pass; the engine in use goes on.
+                    log.exception("reload failed")
+                    self._not_reloaded = RequestError(
+                        f"{self._configuration} cannot be used: {type(error).__name__}: {error}; "
+                        "see the log"
+                    )
             if self._not_reloaded is not None:
                 raise self._not_reloaded
 
@@ -332,11 +350,12 @@ class Daemon:
         what = needs_restart(self._configured, settings)
         if what is not None:
             raise RequestError(f"{self._configuration}: {what} changed; that needs a restart")
-        self._configured = settings
         self._swap(settings, layout)
+        self._configured = settings
         log.info("%s read again; the boards are set up again", self._configuration)
-        await self.configure()
+        # First: a bus that is down must not keep subscribers from where the taxels are now.
         self._put_info(await self.clock.in_thread(self._info))
+        await self.configure()
 
     def keep(self, state: NodeState) -> None:
         """Write what operators changed to the state directory.
@@ -499,8 +518,12 @@ class Daemon:
             (tuple(output.withheld), output.name_taken, tuple(self.unkept)),
         )
 
+    def _is_keeping(self) -> bool:
+        """Whether zeros are being written."""
+        return self._keeping is not None and not self._keeping.done()
+
     def _begin_to_keep_zeros(self) -> None:
-        if self._keeping is None or self._keeping.done():
+        if not self._is_keeping():
             self._keeping = asyncio.create_task(self._keep_zeros(), name="keep zeros")
 
     async def _kept(self) -> None:
@@ -565,18 +588,30 @@ class Daemon:
             baselines=baselines,
             written=self._zeros.written,
         )
-        if zeros == self._zeros or not (unknown or baselines or self._zeros.unknown):
+        # The end does not leave it to a write that may not have ended.
+        is_open = "zeros" in self.unkept or (touched and self._is_keeping())
+        is_news = zeros != self._zeros and (unknown or baselines or self._zeros.unknown)
+        if not (is_news or is_open):
             self._zeros_kept = n_found
             return
         zeros.written = self.clock.today().isoformat(timespec="seconds")
+        # What is being written counts as known: what is asked for later is written after it.
+        self._zeros = zeros
         try:
-            await self.clock.in_thread(write_document, self._path("zeros"), zeros)
+            await self.clock.in_thread(self._write_zeros, zeros)
         except OSError as error:
             self._note_unkept("zeros", error)
             return
         self._note_kept("zeros")
-        self._zeros = zeros
         self._zeros_kept = n_found
+
+    def _write_zeros(self, zeros: Zeros) -> None:
+        """Write these zeros, unless others were to be written meanwhile. In a thread: a disk that
+        stalls may have taken the ones before only when the daemon ends.
+        """
+        with self._writing_zeros:
+            if zeros is self._zeros:
+                write_document(self._path("zeros"), zeros)
 
     async def _save_calibration(self) -> None:
         """Write the calibration in use. If that fails it is used anyway, until a restart."""

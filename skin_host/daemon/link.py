@@ -217,7 +217,11 @@ class Link:
             self._engine.judge()
 
         self._work = work
-        await self._wake_up.run(work)
+        try:
+            await self._wake_up.run(work)
+        finally:
+            # Boards may still be set up, but nothing takes results any more.
+            self._work = lambda: None
 
     def turn(
         self,

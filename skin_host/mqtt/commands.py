@@ -35,6 +35,7 @@ Answer = Callable[[bytes], None]
 
 _log = logging.getLogger(__name__)
 _NAME = re.compile(r"[a-z0-9_-]{1,32}")
+_ENDING = "the daemon is ending"
 
 
 class Result(Struct, omit_defaults=True):
@@ -87,6 +88,7 @@ class CommandHandler:
         self._filled_s: float | None = None
         self._flooded = False
         self._met_retained = False
+        self._ending = False
         self.taken = 0
         self.refused = 0
 
@@ -128,8 +130,9 @@ class CommandHandler:
             )
         self.refused += 1
 
-    async def close(self) -> None:
-        """Cancel what is still running."""
+    async def end(self) -> None:
+        """Cancel what is running, and refuse what comes from now on; both are answered."""
+        self._ending = True
         await cancel(*self._running)
 
     async def _run(
@@ -142,6 +145,9 @@ class CommandHandler:
         except SkinError as error:
             _log.info("command %s refused: %s", name, one_line(str(error)))
             answer(_failure(name, identity, str(error)))
+        except asyncio.CancelledError:
+            answer(_failure(name, identity, f"{_ENDING}; this may not have been done"))
+            raise
         except Exception as error:
             # An error in one command must neither stop the service nor remain without an answer.
             _log.exception("command %s failed", name)
@@ -151,6 +157,8 @@ class CommandHandler:
             answer(encoded)
 
     def _refusal(self, name: str, payload: bytes) -> str | None:
+        if self._ending:
+            return _ENDING
         if not _NAME.fullmatch(name):
             return "a command's name has up to 32 of a-z, 0-9, _ and -"
         if len(payload) > MAX_REQUEST_BYTES:

@@ -20,10 +20,10 @@ SURE_FRAMES = 4
 class PartContact:
     """The contact state of one part.
 
-    ON: a taxel is touched. OFF: none is, and every triangle has a valid taxel, and where a contact
-    was lost all usable taxels are valid again, in each case for `SURE_FRAMES`. UNKNOWN: all other
-    cases. A triangle may miss frames for `LOST_NS`, as a contact may; a part without any valid
-    taxel is UNKNOWN at once.
+    ON: a taxel is touched. OFF: none is, and every triangle has a valid taxel, and all usable
+    taxels that were touched when they were last valid, or whose contact was lost, are valid again,
+    in each case for `SURE_FRAMES`. UNKNOWN: all other cases. A triangle may miss frames for
+    `LOST_NS`, as a contact may; a part without any valid taxel is UNKNOWN at once.
 
     Args:
         layout: the skin.
@@ -60,6 +60,8 @@ class PartContact:
         self._feels = np.zeros(len(pads), np.bool_)
         self._all_feel = False
         self._present: set[int] = set()
+        #: The touched taxels of the last frame.
+        self._touched: NDArray[np.bool_] = np.zeros(here.n_taxels, np.bool_)
 
     def step(self, frame: PressureFrame, events: Iterable[Touch]) -> ContactState:
         """Take a frame and the events of its contacts; return the state."""
@@ -76,6 +78,10 @@ class PartContact:
             self._valid = frame.valid
             self._feels = np.logical_or.reduceat(frame.valid[self._pads], self._starts)
             self._all_feel = all_of(self._feels)
+            if any_of(gone := self._touched & ~frame.valid):
+                # Whatever becomes of its contact, nobody has seen it released.
+                self.doubt(gone)
+        self._touched = frame.touched
         if self._all_feel and not self._is_unsure:
             self._felt_ns.fill(frame.elapsed_ns)
             return "ON" if self._present or any_of(frame.touched) else "OFF"
@@ -94,8 +100,8 @@ class PartContact:
         return "UNKNOWN" if self._is_unsure else "OFF"
 
     def doubt(self, taxels: NDArray[np.bool_]) -> None:
-        """Something may touch these taxels [m], as it did when an earlier daemon ended, or while
-        the part was disabled.
+        """Something may touch these taxels [m], as it did when they were last valid, when an
+        earlier daemon ended, or while the part was disabled.
         """
         self._lost[taxels & self._usable] = SURE_FRAMES
         self._is_unsure = True

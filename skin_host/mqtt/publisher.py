@@ -251,6 +251,11 @@ class Publisher:
         """Publish the health of a part: a record with keys that JSON can hold."""
         self._outbox.put_state(self.topics.part("health", part), encode_health(record))
 
+    async def end_commands(self) -> None:
+        """Cancel the commands that run, and refuse those that come from now on."""
+        if self._command_handler is not None:
+            await self._command_handler.end()
+
     async def __aenter__(self) -> Self:
         self._task = asyncio.create_task(self._run(), name="mqtt publisher")
         return self
@@ -262,8 +267,7 @@ class Publisher:
         await asyncio.wait([self._task], timeout=self._drain_s if hopeful else 0.0)
         self._task.cancel()
         await asyncio.gather(self._task, return_exceptions=True)
-        if self._command_handler is not None:
-            await self._command_handler.close()
+        await self.end_commands()
         if hopeful and self._outbox.pending:
             _log.warning(
                 "stopped before the broker took the last state of %d topics",

@@ -403,9 +403,14 @@ class Residuals:
         before. It ends them when noise has made some readings low, so more is left than they show.
         """
         if len(ended):
-            felt, most = self._felt[ended], LARGEST_SHARE * self._hardest[ended]
+            felt, on = self._felt[ended], self._on[ended]
+            most = LARGEST_SHARE * self._hardest[ended]
+            fallen = felt < on + most
             left = np.clip(felt + self._rise[ended], self._left[ended], most)
-            self._left[ended] = np.where(felt < self._on[ended] + most, left, self._left[ended])
+            self._left[ended] = np.where(fallen, left, self._left[ended])
+            # Only noise has kept a firm press that has fallen so far; if it was lost, it may be
+            # found again.
+            self._held[ended] = fallen & (self._hardest[ended] >= on + most + self._firmer[ended])
 
     def _end_fallen(self, signal: Array, repeated: Mask | None) -> None:
         """End touches that have fallen from a firm press to its residual."""

@@ -4,6 +4,7 @@ import asyncio
 import json
 import logging
 import socket
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -348,3 +349,39 @@ async def test_what_is_pressed_is_in_doubt_only_if_the_daemon_ends_then(
         ).tolist()  # the hand begins at 0
         assert touched
     assert set(load_kept(file, Zeros).unknown["left_hand"]) >= set(touched)
+
+
+@stepped
+async def test_of_two_writes_of_the_zeros_the_newer_one_stays_however_long_the_first_one_takes(
+    clock: SteppedClock,
+    can_bus_settings: Bus,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A disk that stalls had the first one take the name after the daemon had ended."""
+    file = tmp_path / "demo-main.zeros.json"
+    stalls, goes_on = threading.Event(), threading.Event()
+
+    def stall(path: Path, document: object) -> None:
+        if not stalls.is_set():
+            stalls.set()
+            goes_on.wait(PATIENCE_S)
+        write_document(path, document)
+
+    async with living(can_bus_settings, tmp_path, clock=clock) as live:
+        daemon = live.daemon
+        monkeypatch.setattr("skin_host.daemon.daemon.write_document", stall)
+        older, newer = (Zeros(calibration="x", unknown={"left_hand": [taxel]}) for taxel in (1, 2))
+        writing = []
+        for zeros in (older, newer):
+            daemon._zeros = zeros
+            writing.append(threading.Thread(target=daemon._write_zeros, args=[zeros]))
+            writing[-1].start()
+            assert stalls.wait(PATIENCE_S)
+        goes_on.set()
+        for one in writing:
+            one.join(PATIENCE_S)
+        assert load_kept(file, Zeros) == newer
+        # One that begins only now is not written any more.
+        daemon._write_zeros(older)
+        assert load_kept(file, Zeros) == newer

@@ -17,7 +17,7 @@ from skin_host.clock import SYSTEM, SteppedClock
 from skin_host.config.settings import Bus, TouchSettings, changed
 from skin_host.daemon import metrics, service
 from skin_host.daemon.state import NodeState, Thresholds, load_kept
-from skin_host.errors import RequestError
+from skin_host.errors import BusError, RequestError
 from skin_host.files import write_document
 from skin_host.health import LINE_S, FaultLog
 from skin_host.importing import configuration_text
@@ -285,6 +285,63 @@ async def test_a_reload_takes_what_it_can_and_refuses_the_rest(
         assert daemon.engine.calibration is known
         assert all(one.configurations == 2 for one in daemon.link.boards["can0"].records.values())
         await live.until_well(but=frozenset({"board_rezeroed"}))
+
+
+@stepped
+async def test_a_reload_that_fails_in_the_middle_leaves_what_is_in_use(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every change of the thresholds failed after it, until another reload."""
+    async with living(can_bus_settings, tmp_path / "state", clock=clock) as live:
+        daemon = live.daemon
+        running = daemon.settings
+        config = daemon._configuration = tmp_path / "demo.toml"
+        values = {"processing.touch.margin_units": 7.0}
+        config.write_text(configuration_text(changed(running, values)))
+
+        def fail(*_: object, **__: object) -> None:
+            raise ValueError("numbers of modes differ")
+
+        with monkeypatch.context() as patched:
+            patched.setattr("skin_host.daemon.daemon.Engine", fail)
+            with pytest.raises(RequestError, match="cannot be used: ValueError"):
+                await daemon.reload()
+        assert daemon.settings == running
+        daemon.set_thresholds(Thresholds(votes_of_3=3))
+        assert daemon.settings.processing.touch.margin_units == TouchSettings().margin_units
+
+
+@stepped
+async def test_subscribers_know_where_taxels_are_by_a_reload_while_a_bus_is_down(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with living(can_bus_settings, tmp_path / "state", clock=clock) as live:
+        daemon = live.daemon
+        config = daemon._configuration = tmp_path / "demo.toml"
+        values = {"parts.left_hand.foam_mm": 6.0}
+        config.write_text(configuration_text(changed(daemon.settings, values)))
+
+        async def down(_: object) -> None:
+            raise BusError("can0 is down")
+
+        monkeypatch.setattr(daemon.link, "set_up", down)
+        before = daemon.publisher._info
+        with pytest.raises(BusError):
+            await daemon.reload()
+        assert daemon.publisher._info is not before
+        assert daemon.publisher._info.configuration == daemon._info().configuration
+
+
+@stepped
+async def test_thresholds_are_reset_and_then_set_by_one_request(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    async with living(can_bus_settings, tmp_path / "state", clock=clock) as live:
+        handle = live.daemon.control.handle
+        await handle("thresholds", b'{"set":{"votes_of_3":3}}')
+        answer = await handle("thresholds", b'{"reset":true,"set":{"margin_units":3}}')
+        assert answer["touch"]["margin_units"] == 3.0
+        assert answer["touch"]["votes_of_3"] == TouchSettings().votes_of_3
 
 
 def test_lines_reach_the_journal_with_their_priority() -> None:

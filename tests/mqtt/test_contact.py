@@ -116,6 +116,28 @@ def test_a_temperature_pad_whose_zero_is_in_doubt_keeps_no_contact_unknown(
     assert contact.step(frame(50 * MS), []) == "OFF"
 
 
+def test_a_touched_taxel_of_a_larger_contact_is_not_off_until_it_is_valid_again() -> None:
+    """The contact goes on without it, and its release tells nothing of that taxel."""
+    contact = watched()
+    only = slice(3, 4)
+    assert contact.step(frame(50 * MS, [3, 8]), [begin([3, 8])]) == "ON"
+    for sweep in range(20):
+        assert contact.step(frame((100 + 50 * sweep) * MS, [8], blind=only), []) == "ON"
+    released = [begin([8]).ended(2, 1200 * MS)]
+    assert contact.step(frame(1200 * MS, blind=only), released) == "UNKNOWN"
+    states = [contact.step(frame((1250 + 50 * sweep) * MS), []) for sweep in range(SURE_FRAMES)]
+    assert states == ["UNKNOWN"] * (SURE_FRAMES - 1) + ["OFF"]
+
+
+def test_what_was_touched_when_a_part_was_disabled_is_not_off_until_it_is_valid_again() -> None:
+    contact = watched()
+    contact.step(frame(50 * MS, [3]), [begin([3])])
+    assert contact.stop([begin([3]).ended(2, 60 * MS)]) == "UNKNOWN"
+    for sweep in range(2 * SURE_FRAMES):
+        state = contact.step(frame((900 + 50 * sweep) * MS, blind=slice(3, 4)), [])
+        assert state == "UNKNOWN"
+
+
 def test_without_a_valid_taxel_it_is_unknown_at_once() -> None:
     contact = watched()
     assert contact.step(frame(50 * MS, blind=slice(0, N)), []) == "UNKNOWN"

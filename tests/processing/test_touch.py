@@ -490,6 +490,22 @@ def test_what_a_press_left_is_no_new_evidence_after_it_was_lost_either(
     assert bool(residuals.step(on.copy(), np.array([reading]))[0]) is reported
 
 
+@pytest.mark.parametrize(
+    ("press", "reading", "reported"),
+    [(100.0, 9.0, False), (100.0, 14.0, True), (3.0, 3.0, True)],
+)
+def test_a_touch_that_noise_kept_after_a_firm_press_is_no_new_evidence_after_it_was_lost(
+    press: float, reading: float, reported: bool
+) -> None:
+    """`gripper.toml` 9073: no seven readings in a row were as low as what is left."""
+    residuals = residuals_of(votes=7)
+    on, off = np.array([True]), np.array([False])
+    for value in [press] * 40 + [min(press, 7.0), min(press, 3.0)] * 25:
+        assert residuals.step(on, np.array([value]))[0]
+    assert not residuals.step(off, np.array([3.0]), lost=on)[0]
+    assert bool(residuals.step(on.copy(), np.array([reading]))[0]) is reported
+
+
 def test_a_touch_that_was_lost_is_new_evidence_once_it_was_released() -> None:
     residuals = residuals_of(votes=7)
     on, off = np.array([True]), np.array([False])

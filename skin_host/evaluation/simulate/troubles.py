@@ -63,7 +63,7 @@ _CHIPS = _TAXELS | _TRIANGLES
 #: Verdicts of a calibration that was taken meanwhile.
 _CALIBRATED = {"taxel_refused", "taxel_saturates", "taxel_drifting", "taxel_at_limit"}
 _DAMAGED = {"bus_bit_errors", "bus_stranger", "bus_babbling"}
-_DAMAGED |= {"fingertip_saturated", "fingertip_held", "fingertip_noisy"}
+_DAMAGED |= {"fingertip_saturated", "fingertip_held", "fingertip_noisy", "fingertip_unreached"}
 #: They change which chip answers where: what ends one would undo another.
 WIRING = {
     "chip_gone",
@@ -798,7 +798,8 @@ KINDS: dict[str, Begin] = {
         {"part_temperature"},
         3.0,
         values=(-4.0, 4.0),
-        sure=3.5,
+        # Where bytes are coarse the next lower one of a temperature pad must still show it.
+        sure=3.8,
         spoils=True,
         recovers_s=60.0,
     ),

@@ -32,6 +32,7 @@ from skin_host.evaluation.simulate.troubles import KINDS, Trouble, act
 from skin_host.evaluation.simulate.world import Life, World
 from skin_host.fingertip.events import FingertipEvent
 from skin_host.layout import PadKind
+from skin_host.mqtt.commands import Result, decode_result
 from skin_host.processing.calibration.file import save_calibration
 from skin_host.processing.events import Touch
 
@@ -273,6 +274,72 @@ def test_a_slow_disk_does_not_make_touches_last_when_the_daemon_ends(world: Worl
 
     with world.clock.runner() as runner:
         assert runner.run(live()) == b"UNKNOWN"
+
+
+def test_nothing_is_felt_by_boards_that_are_set_up_while_the_daemon_ends(world: World) -> None:
+    """`gripper.toml` 9071: a board's set-up reads its bus first, and a touch began without an end,
+    while a slow disk kept the daemon from ending.
+    """
+
+    async def live() -> None:
+        promises, life = start_watched(world)
+        await world.clock.sleep(8.0)
+        world.clock.threads_take_s = 3.0
+        ending = asyncio.create_task(world.end())
+        await world.clock.sleep(0.5)
+        pressing = asyncio.create_task(world.spots[0].press(2.0))
+        await world.clock.sleep(1.0)
+        assert not ending.done()
+        await life.daemon.link.set_up(life.daemon.engine.boards)
+        await asyncio.gather(ending, pressing)
+        assert promises._skin.endless() is None
+
+    with world.clock.runner() as runner:
+        runner.run(live())
+
+
+@pytest.mark.parametrize("asked_after_s", [-0.1, 0.5])
+def test_a_command_that_comes_while_the_daemon_ends_is_refused_and_starts_no_board_again(
+    world: World, asked_after_s: float
+) -> None:
+    """It would go on sending. One that runs when the daemon is asked to end is ended with it."""
+
+    async def live() -> None:
+        life = start(world)
+        await world.clock.sleep(8.0)
+        topics = life.daemon.publisher.topics
+        reply_to = topics.reply("main", "operator")
+        answers: list[Result] = []
+
+        def note(topic: str, payload: bytes) -> None:
+            if topic == reply_to:
+                answers.append(decode_result(payload))
+
+        world.broker.listeners.append(note)
+
+        def ask() -> None:
+            world.broker.request(topics.command("main", "configure"), b"{}", reply_to, b"1")
+
+        world.clock.threads_take_s = 3.0
+        if asked_after_s < 0.0:
+            ask()
+            await world.clock.sleep(-asked_after_s)
+        ending = asyncio.create_task(world.end())
+        if asked_after_s > 0.0:
+            await world.clock.sleep(asked_after_s)
+            assert not ending.done()
+            ask()
+        await ending
+        assert [(answer.ok, "the daemon is ending" in str(answer.error)) for answer in answers] == [
+            (False, True)
+        ]
+        sent = [dict(cable.sent.bursts) for cable in world.cables.values()]
+        await world.clock.sleep(1.0)
+        world.move()
+        assert [dict(cable.sent.bursts) for cable in world.cables.values()] == sent
+
+    with world.clock.runner() as runner:
+        runner.run(live())
 
 
 @pytest.mark.parametrize("power", [True, False])
