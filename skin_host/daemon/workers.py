@@ -5,8 +5,9 @@ daemon has notified, and it ends with the first that ends. Each daemon gets a se
 here, instead of systemd's.
 
 The node's buses are shared out among them, and what shares a bus stays together: parts with a board
-on it, and fingertips. Each share is a node of its own, named after the one that is shared:
-`main-1`, `main-2`, ... Together they make one robot, because topics of parts do not show the node.
+on it, and fingertips. So does a fingertip with the part that covers it. Each share has parts; it is
+a node of its own, named after the one that is shared: `main-1`, `main-2`, ... Together they make
+one robot, because topics of parts do not show the node.
 """
 
 import asyncio
@@ -78,11 +79,12 @@ async def run(commands: dict[str, list[str]]) -> int:
     merged = Merged(list(commands))
     processes: dict[str, asyncio.subprocess.Process] = {}
 
-    is_ending = False
+    ending: int | None = None  # the signal that asked for it
 
     def forward(number: int) -> None:
-        nonlocal is_ending
-        is_ending |= number != signal.SIGHUP
+        nonlocal ending
+        if number != signal.SIGHUP:
+            ending = number
         for process in processes.values():
             with contextlib.suppress(ProcessLookupError):
                 process.send_signal(number)
@@ -101,10 +103,14 @@ async def run(commands: dict[str, list[str]]) -> int:
                 # Ctrl-C of a terminal reaches only this process, which passes it on once.
                 start_new_session=True,
             )
+            if ending is not None:  # it came before this daemon could be told
+                with contextlib.suppress(ProcessLookupError):
+                    processes[name].send_signal(ending)
+                break
         service.take_hangups()
         waiting = [asyncio.ensure_future(process.wait()) for process in processes.values()]
         await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
-        if not is_ending:  # a second signal would end them at once
+        if ending is None:  # a second signal would end them at once
             forward(signal.SIGTERM)
         _, left = await asyncio.wait(waiting, timeout=STOP_S)
         if left:
@@ -138,7 +144,7 @@ def _environment(notify_socket: Path) -> dict[str, str]:
 
 
 def share_out(settings: Settings, node: str, n: int) -> list[frozenset[str]]:
-    """The buses of each share, as even as may be by triangles; no share is empty.
+    """The buses of each share, as even as may be by triangles; no share is without parts.
 
     Args:
         settings: of the robot.
@@ -152,12 +158,17 @@ def share_out(settings: Settings, node: str, n: int) -> list[frozenset[str]]:
             buses = frozenset(bus_of[patch.board] for patch in part.patches)
             triangles = sum(len(parse_triangles(patch.triangles)) for patch in part.patches)
             _join(weights, buses, triangles)
+    of_parts = frozenset().union(*weights)
     for tip in settings.fingertips.values():
         if tip.node == node:
-            _join(weights, frozenset([tip.bus]), 1)
-    shares: list[tuple[int, frozenset[str]]] = [(0, frozenset())] * min(n, len(weights))
-    # The largest first, each to the smallest share.
-    for buses in sorted(weights, key=lambda one: (-weights[one], sorted(one))):
+            covering = settings.parts[tip.array].patches if tip.array is not None else ()
+            _join(weights, frozenset([tip.bus, *(bus_of[patch.board] for patch in covering)]), 1)
+    n = min(n, sum(bool(buses & of_parts) for buses in weights))
+    if not n:
+        return []
+    shares: list[tuple[int, frozenset[str]]] = [(0, frozenset())] * n
+    # The largest first, each to the smallest share; fingertips alone when each share has parts.
+    for buses in sorted(weights, key=lambda one: (not one & of_parts, -weights[one], sorted(one))):
         smallest = min(range(len(shares)), key=lambda number: shares[number][0])
         weight, others = shares[smallest]
         shares[smallest] = weight + weights[buses], others | buses

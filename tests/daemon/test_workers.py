@@ -7,13 +7,16 @@ import os
 import signal
 import socket
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import aiomqtt
 import pytest
 
 from skin_host.config.settings import Settings, load
-from skin_host.daemon.workers import Merged, share_of, share_out
+from skin_host.daemon import workers
+from skin_host.daemon.workers import Merged, share_name, share_of, share_out
+from skin_host.layout import build_layout, parts_of
 from tests.support.broker import Mosquitto
 from tests.support.waiting import PATIENCE_S, until
 
@@ -27,10 +30,25 @@ state_directory = "{state}"
 """
 
 
-def body(path: Path, places: list[tuple[str, list[int]]], port: int = 1883) -> Path:
-    """A robot: of each part its name and the buses of its boards, of 16 triangles each."""
+def body(
+    path: Path,
+    places: list[tuple[str, list[int]]],
+    port: int = 1883,
+    tips: dict[int, int] | None = None,
+    arrays: dict[int, str] | None = None,
+) -> Path:
+    """A robot: of each part its name and the buses of its boards, of 16 triangles each.
+
+    Args:
+        path: of its configuration.
+        places: its parts.
+        port: of the broker.
+        tips: how many fingertips there are, by their bus.
+        arrays: which part covers the fingertips of a bus.
+    """
     lines = [ROBOT.format(port=port, state=path.parent)]
-    buses = sorted({bus for _, boards in places for bus in boards})
+    tips = tips or {}
+    buses = sorted({bus for _, boards in places for bus in boards} | tips.keys())
     lines += [
         f'[buses.can{bus}]\ninterface = "virtual"\nchannel = "workers-{bus}"' for bus in buses
     ]
@@ -40,6 +58,11 @@ def body(path: Path, places: list[tuple[str, list[int]]], port: int = 1883) -> P
             address[bus] += 1
             lines.append(f'[boards.{part}{number}]\nbus = "can{bus}"\naddress = {address[bus]}')
             lines.append(f'[[parts.{part}.patches]]\nboard = "{part}{number}"\ntriangles = "0-15"')
+    for bus, n in tips.items():
+        for number in range(1, n + 1):
+            lines.append(f'[fingertips.tip{bus}-{number}]\nbus = "can{bus}"\naddress = {number}')
+            lines.append('shape = "sphere"\nradius_mm = 10.0')
+            lines += [f'array = "{arrays[bus]}"'] if arrays and bus in arrays else []
     path.write_text("\n".join(lines))
     return path
 
@@ -69,6 +92,43 @@ def test_shares_are_nodes_that_have_every_part_once(tmp_path: Path) -> None:
     assert len({node for _, node in owners}) == 3
 
 
+def nodes_of_tips(whole: Settings, n: int) -> list[str]:
+    """The share of each fingertip, after a look whether every share has parts."""
+    shares = range(1, len(share_out(whole, "main", n)) + 1)
+    found = []
+    for number in shares:
+        share = share_of(whole, "main", number, n)
+        node = share_name("main", number)
+        assert parts_of(build_layout(share, Path()), node)
+        found += [tip.node for tip in share.fingertips.values() if tip.node == node]
+    return found
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 9])
+def test_a_bus_of_fingertips_alone_is_no_share_of_its_own(tmp_path: Path, n: int) -> None:
+    """No daemon can run without a part."""
+    config = body(tmp_path / "body.toml", [("a", [0]), ("b", [1])], tips={2: 1})
+    assert len(nodes_of_tips(load(config), n)) == 1
+
+
+def test_fingertips_alone_are_shared_with_the_fewest_triangles(tmp_path: Path) -> None:
+    """However many they are: here more than the triangles of either part."""
+    config = body(tmp_path / "body.toml", [("a", [0, 0]), ("b", [1])], tips={2: 14, 3: 14})
+    config.write_text(config.read_text().replace('"0-15"', '"0-3"'))
+    whole = load(config)
+    shares = share_out(whole, "main", 2)
+    assert [sorted(buses) for buses in shares] == [["can0", "can3"], ["can1", "can2"]]
+    assert sorted(nodes_of_tips(whole, 2)) == ["main-1"] * 14 + ["main-2"] * 14
+
+
+def test_a_fingertip_stays_with_the_part_that_covers_it(tmp_path: Path) -> None:
+    """Also if they lie on different buses: both contribute to one estimate."""
+    places = [("a", [0, 0]), ("b", [1])]
+    whole = load(body(tmp_path / "body.toml", places, tips={2: 1}, arrays={2: "a"}))
+    assert [sorted(buses) for buses in share_out(whole, "main", 2)] == [["can0", "can2"], ["can1"]]
+    assert nodes_of_tips(whole, 2) == ["main-1"]
+
+
 def test_the_service_is_ready_with_the_last_and_fed_by_all() -> None:
     merged = Merged(["main-1", "main-2"])
     assert merged.take("main-1", "READY=1") == []
@@ -87,6 +147,47 @@ def test_the_service_is_ready_with_the_last_and_fed_by_all() -> None:
     assert merged.take("main-1", "READY=1") == ["READY=1"]
     assert merged.take("main-2", "STOPPING=1") == ["STOPPING=1"]
     assert merged.take("main-1", "STOPPING=1") == []
+
+
+class Ends:
+    """A daemon that ends in good order when it is asked to, and otherwise only when killed."""
+
+    def __init__(self) -> None:
+        self.signals: list[int] = []
+        self._ended = asyncio.Event()
+
+    def send_signal(self, number: int) -> None:
+        self.signals.append(number)
+        self._ended.set()
+
+    async def wait(self) -> int:
+        await self._ended.wait()
+        return 0 if signal.SIGKILL not in self.signals else -signal.SIGKILL
+
+
+@pytest.mark.parametrize("asked", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("started", [1, 2, 3])
+async def test_a_stop_while_daemons_are_started_reaches_each_of_them(
+    started: int, asked: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also the one that is being started, and no other is started after it."""
+    on_signal: dict[int, Callable[[], object]] = {}
+    daemons: list[Ends] = []
+
+    def take(number: int, handler: Callable[..., object], *args: object) -> None:
+        on_signal[number] = lambda: handler(*args)
+
+    async def start(*_: object, **__: object) -> Ends:
+        daemons.append(Ends())
+        if len(daemons) == started:
+            on_signal[asked]()
+        return daemons[-1]
+
+    monkeypatch.setattr(asyncio.get_running_loop(), "add_signal_handler", take)
+    monkeypatch.setattr(asyncio, "create_subprocess_exec", start)
+    async with asyncio.timeout(PATIENCE_S):
+        assert await workers.run({f"main-{number}": ["run"] for number in (1, 2, 3)}) == 0
+    assert [daemon.signals for daemon in daemons] == [[asked]] * started
 
 
 async def states(broker: Mosquitto) -> dict[str, bytes]:
