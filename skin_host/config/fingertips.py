@@ -3,17 +3,25 @@
 from collections.abc import Iterator
 from typing import Annotated, Literal
 
+import numpy as np
 from msgspec import Meta, Struct
+from numpy.typing import NDArray
 
-from skin_host.config.fields import Name, Positive
+from skin_host.config.fields import Hertz, Millimetres, Name, Newtons, PlaceMm
 from skin_host.fingertip.intrinsic import Plane, Quadric, Surface, cylinder, ellipsoid, sphere
+from skin_host.fingertip.reach import reach_n
 
-Vector = tuple[float, float, float]
+Vector = tuple[PlaceMm, PlaceMm, PlaceMm]
 Six = tuple[float, float, float, float, float, float]
 
 #: Dimensions that a shape needs, and optional ones.
 _NEEDS = {"sphere": ["radius_mm"], "cylinder": ["radius_mm"], "ellipsoid": ["semi_axes_mm"]}
 _MAY = {"cylinder": ["half_length_mm"], "plane": ["reach_mm"]}
+#: The largest full scales that a board can answer.
+_ANSWERED = np.full(6, float(0xFFFF))
+#: Force rows that measure less than this share of the values in some direction depend on each
+#: other, but for rounding.
+_ROUNDING = 1e-9
 _DIMENSIONS = ("radius_mm", "semi_axes_mm", "half_length_mm", "reach_mm")
 
 
@@ -28,13 +36,13 @@ class Fingertip(Struct, forbid_unknown_fields=True, kw_only=True, frozen=True):
     address: Annotated[int, Meta(ge=1, le=14)]
     shape: Literal["sphere", "cylinder", "ellipsoid", "plane"]
     #: Of a sphere or cylinder.
-    radius_mm: Positive | None = None
+    radius_mm: Millimetres | None = None
     #: Of an ellipsoid.
-    semi_axes_mm: tuple[Positive, Positive, Positive] | None = None
+    semi_axes_mm: tuple[Millimetres, Millimetres, Millimetres] | None = None
     #: Distance from the middle to the ends of a cylinder; without it, the cylinder is infinite.
-    half_length_mm: Positive | None = None
+    half_length_mm: Millimetres | None = None
     #: Distance from the middle to the edge of a plane; without it, the plane is infinite.
-    reach_mm: Positive | None = None
+    reach_mm: Millimetres | None = None
     #: A part whose skin covers the fingertip, in the same frame: both contribute to one estimate.
     array: Name | None = None
     node: Name = "main"
@@ -42,7 +50,7 @@ class Fingertip(Struct, forbid_unknown_fields=True, kw_only=True, frozen=True):
     period_ms: Annotated[int, Meta(ge=1, le=255)] = 5
     #: N and N m that the largest value of each channel stands for; without it, the board is
     #: queried.
-    full_scale: tuple[Positive, Positive, Positive, Positive, Positive, Positive] | None = None
+    full_scale: tuple[Newtons, Newtons, Newtons, Newtons, Newtons, Newtons] | None = None
     #: Calibration matrix from the values of the board (N, N m) to the force and torque that the
     #: touching object exerts, along the axes of the fingertip's frame. Without it, the board's own
     #: axes are used.
@@ -51,15 +59,15 @@ class Fingertip(Struct, forbid_unknown_fields=True, kw_only=True, frozen=True):
     sensor_mm: Vector = (0.0, 0.0, 0.0)
     #: Coefficient of static friction, better too low than too high; without it, an abrupt fall of
     #: tangential over normal force is detected instead.
-    friction: Positive | None = None
+    friction: Annotated[float, Meta(ge=0.001, le=1000)] | None = None
     #: A contact begins at this force, and ends at 0.7 of it (F1).
-    threshold_n: Positive = 0.2
+    threshold_n: Newtons = 0.2
     #: Above this normal force the fingertip presses too hard (F2).
-    over_n: Positive = 10.0
+    over_n: Newtons = 10.0
     #: A faster change of the tangential force is a slip.
-    slip_n_s: Positive = 6.0
+    slip_n_s: Annotated[float, Meta(ge=0.001, le=1e9)] = 6.0
     #: Contacts are located on force and torque below this frequency.
-    filter_hz: Positive = 10.0
+    filter_hz: Hertz = 10.0
 
     def wrong_values(self) -> Iterator[tuple[str, str]]:
         """Values that are wrong beyond their types: the key, and the reason."""
@@ -69,6 +77,7 @@ class Fingertip(Struct, forbid_unknown_fields=True, kw_only=True, frozen=True):
             yield "filter_hz", what
         if self.over_n <= self.threshold_n:
             yield "over_n", f"{self.over_n:g}; wanted more than threshold_n"
+        yield from self._unreached()
         needs = _NEEDS.get(self.shape, [])
         for key in _DIMENSIONS:
             given = getattr(self, key) is not None
@@ -76,6 +85,25 @@ class Fingertip(Struct, forbid_unknown_fields=True, kw_only=True, frozen=True):
                 yield f"{key}", f"missing key; a {self.shape} needs it"
             if given and key not in [*needs, *_MAY.get(self.shape, [])]:
                 yield f"{key}", f"a {self.shape} does not have it"
+
+    def _unreached(self) -> Iterator[tuple[str, str]]:
+        """Why no load would be a touch, whatever the board answers and its zero is."""
+        to_force = self.to_wrench[:3]
+        if not reach_n(to_force, np.ones(6)) > _ROUNDING * np.abs(to_force).max():
+            what = "its first three rows give no force in some direction; wanted independent rows"
+            yield "matrix", what
+        limit_n = reach_n(to_force, np.array(self.full_scale or _ANSWERED))
+        if not self.threshold_n <= limit_n:
+            what = (
+                f"{self.threshold_n:g}; wanted at most {limit_n:g}, the force that is measured in "
+                "every direction, by full_scale and matrix"
+            )
+            yield "threshold_n", what
+
+    @property
+    def to_wrench(self) -> NDArray[np.float64]:
+        """float64[6, 6], from the values of the board to force (N) and torque (N m)."""
+        return np.eye(6) if self.matrix is None else np.array(self.matrix)
 
     @property
     def surface(self) -> Surface:

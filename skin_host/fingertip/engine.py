@@ -24,6 +24,7 @@ from skin_host.config.fingertips import Fingertip
 from skin_host.config.settings import Settings
 from skin_host.fingertip.agreement import Agreement
 from skin_host.fingertip.events import FingertipEvent
+from skin_host.fingertip.frozen import Frozen
 from skin_host.fingertip.tip import Tip
 from skin_host.layout import Layout
 from skin_host.processing.calibration import Zero
@@ -60,6 +61,7 @@ class TipState:
         touched_since_ns: the same of its touch, if there is one.
         assembler: of its samples; None until the full scales are known.
         agreement: of its samples, which only together are a load.
+        frozen: whether they repeat one.
         saturated_ns: when its load was last saturated, 0 if never.
         silenced: how often the board has timed out.
         came: a frame of it was read since boards were last looked at.
@@ -75,6 +77,7 @@ class TipState:
     reported_scale: Floats = field(default_factory=lambda: np.zeros(CHANNELS))
     assembler: WrenchAssembler | None = None
     agreement: Agreement = field(default_factory=Agreement)
+    frozen: Frozen = field(default_factory=Frozen)
     last_ns: int = 0
     received_ns: int = 0
     touched_since_ns: int | None = None
@@ -246,7 +249,7 @@ class FingertipEngine:
         self._zeroing = False
         found = {}
         for name, state in self.tips.items():
-            if len(state.zeroing) >= FEWEST_SAMPLES:
+            if len(state.zeroing) >= FEWEST_SAMPLES and not state.frozen.now:
                 assert state.assembler is not None
                 samples = np.array(state.zeroing)
                 whole = ~damaged(samples, state.assembler.full_scale / ZERO_WORD)
@@ -272,12 +275,16 @@ class FingertipEngine:
     def _step(self, state: TipState, wrench: Wrench) -> list[FingertipEvent]:
         events: list[FingertipEvent] = []
         load = state.agreement.take(wrench)
-        if load is not None:
+        frozen = state.frozen.take(wrench)
+        if frozen:
+            events = state.tip.lose(wrench.t_ns)
+            self._note_touch(state)
+        elif load is not None:
             if load.saturated:
                 state.saturated_ns = load.t_ns
             events = state.tip.step(load)
             self._note_touch(state)
-        if self._zeroing and not wrench.saturated:
+        if self._zeroing and not wrench.saturated and not frozen:
             state.zeroing.append(np.concatenate([wrench.force_n, wrench.torque_nm]))
             state.touching.append(state.tip.touched)
         return events
@@ -300,6 +307,7 @@ class FingertipEngine:
     def _assemble(state: TipState, full_scale: Floats) -> None:
         table = state.settings
         state.assembler = WrenchAssembler(table.address, table.period_ms, full_scale)
+        state.tip.set_range(full_scale)
 
 
 def damaged(samples: Floats, step: Floats) -> Mask:

@@ -128,6 +128,12 @@ class FingertipHealth:
                 f"{here} reports other full scales ({reported}) than fingertips.{name}.full_scale, "
                 "which is used",
             )
+        if state.alive and state.frozen.now:
+            yield fault(
+                "frozen",
+                f"{here} repeats the same bytes for longer than chance allows: its converter has "
+                "stopped; switch it off and on",
+            )
         if state.assembler is not None and not state.tip.zeroed:
             yield fault(
                 "not_calibrated",
@@ -140,6 +146,8 @@ class FingertipHealth:
                 f"{name}: touched when calibrated, by its zero before; calibrate it unloaded, "
                 "again if this stays: skin command calibrate",
             )
+        if state.tip.unreached:
+            yield fault("unreached", _unreached(state))
         if now_ns is None:
             return
         if state.saturated_ns and abs(now_ns - state.saturated_ns) < HOLD_NS:
@@ -163,6 +171,20 @@ class FingertipHealth:
                 f"{name}: contacts below {state.tip.threshold_n:.2f} N drown in the noise of its "
                 f"board; fingertips.{name}.threshold_n asks for {table.threshold_n:g} N",
             )
+
+
+def _unreached(state: TipState) -> str:
+    tip, here = state.tip, f"fingertips.{state.name}"
+    mend = f"correct threshold_n, full_scale or matrix of {here}"
+    if state.settings.threshold_n <= tip.reach_n:
+        mend = (
+            f"its zero was that noisy ({here}.threshold_n asks for "
+            f"{state.settings.threshold_n:g} N); calibrate it unloaded: skin command calibrate"
+        )
+    return (
+        f"{state.name}: contacts begin at {tip.threshold_n:.4g} N, and in some direction its board "
+        f"measures only {tip.reach_n:.4g} N; {mend}"
+    )
 
 
 _STATES = {

@@ -153,8 +153,8 @@ class FingertipPublisher:
 
     def _put_contacts(self) -> None:
         for name, state in ({} if self._engine is None else self._engine.tips).items():
-            known: ContactState = "ON" if state.tip.touched else "OFF"
-            self._publisher.put_contact(name, known if state.tip.feels else "UNKNOWN")
+            free: ContactState = "OFF" if state.tip.feels else "UNKNOWN"
+            self._publisher.put_contact(name, "ON" if state.tip.touched else free)
 
     def records(self, now_ns: int) -> dict[str, FingertipRecord]:
         return {} if self._health is None else self._health.records(now_ns)

@@ -27,6 +27,7 @@ from skin_host.fingertip.intrinsic import (
     point_covariance,
 )
 from skin_host.fingertip.low_pass import Butterworth2
+from skin_host.fingertip.reach import reach_n
 from skin_host.fingertip.slip import SlipWatch
 from skin_host.processing.calibration import Zero
 from skin_host.processing.contacts import ALIVE_NS, LOST_NS, MOVED_M, PRESSED_SHARE
@@ -127,21 +128,22 @@ class Tip:
 
     Attributes:
         threshold_n: least force of a contact; noise may raise the configured one.
+        reach_n: the greatest force that is measured in every direction, beside the load of the
+            zero; infinite while the full scales of the board are not known.
         samples: how many have been taken in since the zero was known.
-        feels: the zero is known, and samples arrive.
     """
 
     def __init__(
         self, name: str, settings: Fingertip, move_hz: float, array_period_ns: int = 0
     ) -> None:
         self.samples = 0
-        self.feels = False
         self.threshold_n = settings.threshold_n
+        self.reach_n = math.inf
         self._name = name
         self._settings = settings
         self._surface = settings.surface
         # Of the board's values (N, N m): force (N) and torque (N mm) on the fingertip.
-        self._to_load = np.eye(6) if settings.matrix is None else np.array(settings.matrix)
+        self._to_load = settings.to_wrench
         self._to_load[3:] *= 1e3
         self._to_load[3:] += cross_matrices(np.array([settings.sensor_mm]))[0] @ self._to_load[:3]
         self._rate_hz = 1000.0 / settings.period_ms
@@ -150,6 +152,9 @@ class Tip:
         self._skin: dict[int, Touch] = {}
         self._skin_ns = 0
         self._zero: Zero | None = None
+        self._full_scale: Floats | None = None
+        #: Samples arrive, and the zero is known.
+        self._arrives = False
         self._next_id = 1
         self._reported: Touch | None = None
         self._begun_ns = 0
@@ -186,16 +191,38 @@ class Tip:
         """Whether something touches the fingertip."""
         return self._reported is not None
 
+    @property
+    def unreached(self) -> bool:
+        """Whether there are directions in which no load within the board's range is a touch."""
+        return self.threshold_n > self.reach_n
+
+    @property
+    def feels(self) -> bool:
+        """Whether it would be touched if something pressed on it."""
+        return self._arrives and not self.unreached
+
+    def set_range(self, full_scale: Floats) -> None:
+        """Take the full scales of the board, float64[6]."""
+        self._full_scale = full_scale
+        self._find_reach()
+
+    def _find_reach(self) -> None:
+        if self._full_scale is not None:
+            offset = None if self._zero is None else self._zero.offset
+            self.reach_n = reach_n(self._to_load[:3], self._full_scale, offset)
+
     def use(self, zero: Zero | None) -> None:
         """Use this zero from now on. All contacts must have been ended before."""
         self._zero = zero
         self.samples = 0
-        self.feels = False
+        self._arrives = False
+        self.threshold_n = self._settings.threshold_n
         if zero is not None:
             per_channel = self._moved(np.eye(6))
             self._covariance = per_channel.T @ np.diag(zero.noise**2) @ per_channel
             self._noise_n = float(np.sqrt(np.trace(self._covariance[:3, :3]) / 3.0))
-            self.threshold_n = max(self._settings.threshold_n, LEAST_NOISES * self._noise_n)
+            self.threshold_n = max(self.threshold_n, LEAST_NOISES * self._noise_n)
+        self._find_reach()
         self._forget()
 
     def note_skin(self, events: Iterable[Touch], t_ns: int) -> None:
@@ -216,7 +243,7 @@ class Tip:
             self._restart()
         self._last_ns = wrench.t_ns
         self.samples += 1
-        self.feels = True
+        self._arrives = True
         measured = np.concatenate([wrench.force_n, wrench.torque_nm]) - self._zero.offset
         load = self._moved(measured[None])[0]
         least_n = self.threshold_n * (1.0 if self._reported is None else RELEASE)
@@ -248,12 +275,12 @@ class Tip:
 
     def expire(self, t_ns: int, quiet_ns: int) -> list[FingertipEvent]:
         """End a contact whose samples have stopped for too long: now, and for how long."""
-        if quiet_ns < LOST_NS:
-            return []
-        self.feels = False
-        if self._reported is None:
-            return []
-        return self.end_all(t_ns, "lost")
+        return [] if quiet_ns < LOST_NS else self.lose(t_ns)
+
+    def lose(self, t_ns: int) -> list[FingertipEvent]:
+        """End a contact, because samples have stopped or do not show it any more."""
+        self._arrives = False
+        return [] if self._reported is None else self.end_all(t_ns, "lost")
 
     def end_all(self, t_ns: int, reason: Reason = "stopped") -> list[FingertipEvent]:
         """End all contacts, because the fingertip will not send for a while."""

@@ -16,14 +16,15 @@ from emulator.faults import parse
 from emulator.probes.scene import Probe, Scene
 from emulator.robot import Robot
 from skin_host.bus.answers import answer_frame
-from skin_host.bus.strain import FullScale, StrainType
+from skin_host.bus.strain import FullScale, StrainType, Wrench
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import changed, load
 from skin_host.daemon import metrics
 from skin_host.fingertip.engine import FingertipEngine
 from skin_host.fingertip.events import FingertipEvent
+from skin_host.fingertip.frozen import OTHERS, REPEATS, Frozen
 from skin_host.fingertip.health import FingertipHealth, FingertipRecord
-from skin_host.fingertip.service import StrainBoards
+from skin_host.fingertip.service import FingertipPublisher, StrainBoards
 from skin_host.layout import build_layout
 from skin_host.mqtt import messages
 from skin_host.processing.calibration import Zero
@@ -84,6 +85,17 @@ class Bench:
     @property
     def now_ns(self) -> int:
         return self.robot.t_ns + self.ahead_ns
+
+    def contact(self, name: str = "index") -> str:
+        """What is published as the fingertip's contact."""
+        put: dict[str, str] = {}
+
+        class Put:
+            def put_contact(self, part: str, state: str) -> None:
+                put[part] = state
+
+        FingertipPublisher(self.tips, Put())  # type: ignore[arg-type]
+        return put[name]
 
     def record(self, name: str = "index") -> FingertipRecord:
         return self.health.records(self.now_ns)[name]
@@ -414,6 +426,174 @@ async def test_a_board_that_stops_sending_when_the_clock_is_set_has_timed_out(se
     await bench.run(0.8)
     assert bench.codes() == ["silent"]
     assert getattr(bench.felt[-1], "reason", None) == "lost"
+
+
+async def test_a_fingertip_whose_board_answers_too_small_a_range_does_not_feel() -> None:
+    """The emulated board answers 50 N."""
+    bench = Bench(threshold_n=60.0, over_n=100.0)
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    assert bench.codes() == ["not_calibrated", "unreached"]
+    await bench.calibrate()
+    await bench.run(0.1)
+    assert (bench.record()["state"], bench.codes()) == ("degraded", ["unreached"])
+    assert (bench.contact(), bench.contact("thumb")) == ("UNKNOWN", "OFF")
+    (sentence,) = bench.record()["sentences"]
+    assert "60 N" in sentence and "fingertips.index" in sentence
+    assert (bench.health.records(None)["index"]["sentences"]) == [sentence]
+
+
+async def test_what_is_felt_beyond_the_range_of_a_fingertip_that_does_not_feel_is_a_contact() -> (
+    None
+):
+    bench = Bench(
+        {"part": "index", "force_n": [[2.5, 0], [2.6, 70], [9.0, 70]]},
+        threshold_n=60.0,
+        over_n=100.0,
+    )
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    await bench.calibrate()
+    await bench.run(0.1)
+    assert bench.contact() == "UNKNOWN"
+    await bench.run(2.0)
+    assert bench.contact() == "ON"
+
+
+async def test_noise_that_raises_the_threshold_beyond_the_range_is_not_felt_through() -> None:
+    bench = Bench()
+    await bench.boards.bring_up()
+    await bench.calibrate()
+    await bench.run(0.1)
+    assert bench.contact() == "OFF"
+    noisy = Zero(np.zeros(6), np.array([9.0, 9.0, 9.0, 0.1, 0.1, 0.1]))
+    assert bench.engine.calibration is not None
+    bench.tips.use(bench.engine.calibration.zeros | {"index": noisy})
+    await bench.run(0.1)
+    assert bench.codes() == ["unreached", "noisy"]
+    assert "calibrate" in bench.record()["sentences"][0]
+    assert (bench.contact(), bench.contact("thumb")) == ("UNKNOWN", "OFF")
+    await bench.calibrate()
+    await bench.run(0.1)
+    assert (bench.codes(), bench.contact()) == ([], "OFF")
+
+
+class Latch:
+    """A converter that repeats its last sample from `begin` to `end`."""
+
+    def __init__(self, bench: Bench, board: int = 1) -> None:
+        self.holds = False
+        self._step = bench.robot.step
+        self._of = (0x30A | board << 4, 0x30B | board << 4)
+        self._last: dict[int, Any] = {}
+        bench.robot.step = self.step  # type: ignore[method-assign]
+
+    def step(self, seconds: float) -> dict[str, FrameBatch]:
+        batches = self._step(seconds)
+        batch = batches["can0"]
+        for row, can_id in enumerate(batch.id.tolist()):
+            if can_id in self._of:
+                if self.holds:
+                    batch.data[row] = self._last[can_id]
+                self._last[can_id] = batch.data[row].copy()
+        return batches
+
+
+@pytest.mark.parametrize("pressed_n", [0.0, 2.0])
+async def test_a_board_that_repeats_its_bytes_does_not_feel_until_they_change(
+    pressed_n: float,
+) -> None:
+    held = [[2.5, 0], [2.6, pressed_n], [99.0, pressed_n]]
+    bench = Bench({"part": "index", "force_n": held})
+    latch = Latch(bench)
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    await bench.calibrate()
+    await bench.run(2.0)
+    before = "ON" if pressed_n else "OFF"
+    assert (bench.codes(), bench.contact()) == ([], before)
+    latch.holds = True
+    await bench.run(0.8 * REPEATS * 3e-3)
+    assert (bench.codes(), bench.contact()) == ([], before)
+    await bench.run(0.4 * REPEATS * 3e-3)
+    assert (bench.record()["state"], bench.codes()) == ("degraded", ["frozen"])
+    assert (bench.contact(), bench.contact("thumb")) == ("UNKNOWN", "OFF")
+    ends = [event for event in bench.felt if isinstance(event, Touch) and event.event == "end"]
+    assert [event.reason for event in ends] == (["lost"] if pressed_n else [])
+    assert bench.health.records(None)["index"]["faults"] == bench.record()["faults"]
+    latch.holds = False
+    await bench.run(0.1)
+    assert (bench.codes(), bench.contact()) == ([], before)
+
+
+async def test_a_board_that_repeats_its_bytes_gets_no_zero() -> None:
+    bench = Bench()
+    latch = Latch(bench)
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    latch.holds = True
+    await bench.run(1.0)
+    bench.tips.begin_zero()
+    await bench.run(0.5)
+    assert set(bench.tips.end_zero()) == {"thumb"}
+    bench.tips.begin_zero()
+    latch.holds = False
+    await bench.run(0.4)
+    latch.holds = True
+    await bench.run(1.0)
+    assert set(bench.tips.end_zero()) == {"thumb"}
+
+
+async def test_a_board_that_has_stopped_sending_is_not_frozen_too() -> None:
+    bench = Bench()
+    latch = Latch(bench)
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    await bench.calibrate()
+    latch.holds = True
+    await bench.run(1.0)
+    assert bench.codes() == ["frozen"]
+    bench.robot.inject(parse("board_silent board=index"))
+    await bench.run(0.4)
+    assert bench.codes() == ["silent"]
+
+
+def sample(*words: int, saturated: bool = False) -> Wrench:
+    values = np.zeros(6)
+    values[: len(words)] = words
+    return Wrench(0, values[:3], values[3:], saturated)
+
+
+def frozen_after(*samples: Wrench) -> bool:
+    seen = Frozen()
+    return [seen.take(one) for one in samples][-1]
+
+
+def test_only_so_many_equal_samples_in_a_row_are_frozen() -> None:
+    same = [sample(5, 1)] * (REPEATS + 1)
+    assert frozen_after(*same)
+    assert not frozen_after(*same[1:])
+    assert not frozen_after(*same[1:], sample(5, 2), *same[1:])
+
+
+def test_single_damaged_frames_do_not_hide_that_a_board_is_frozen() -> None:
+    same = [sample(5, 1)] * (REPEATS + 1)
+    others = [sample(5, 2 + n) for n in range(OTHERS)]
+    assert frozen_after(*same, *others[:-1])
+    assert frozen_after(*same, *others[:-1], sample(5, 1), *others[:-1])
+    assert not frozen_after(*same, *others)
+
+
+def test_a_board_at_the_end_of_its_range_is_saturated_and_not_frozen() -> None:
+    assert not frozen_after(*[sample(5, 1, saturated=True)] * (2 * REPEATS))
+
+
+@pytest.mark.parametrize("noise_words", [0.25, 0.5, 1.6])
+def test_noise_does_not_repeat_for_so_long_by_chance(noise_words: float) -> None:
+    """Each channel rests in the middle of a word: there it repeats most often."""
+    one = math.erf(0.5 / noise_words / math.sqrt(2.0))
+    begun_in_a_year = 333 * 3600 * 24 * 365
+    assert begun_in_a_year * one ** (6 * REPEATS) < 0.01
 
 
 async def test_a_contact_without_end_makes_its_zero_uncertain() -> None:

@@ -119,6 +119,49 @@ def test_noise_raises_the_threshold_of_a_coarse_sensor() -> None:
     assert bench.hold(20, POINT, -0.5 * DIRECTION) == []
 
 
+def test_a_tip_feels_when_its_zero_is_known_and_samples_arrive() -> None:
+    bench = Bench()
+    assert not bench.tip.feels
+    bench.sample(NOWHERE, NOWHERE)
+    assert bench.tip.feels
+    bench.tip.use(None)
+    assert not bench.tip.feels
+
+
+@pytest.mark.parametrize(
+    ("threshold_n", "noises", "feels"),
+    [
+        (49.4, 1.0, True),
+        (49.6, 1.0, False),
+        (60.0, 1.0, False),
+        (1.0, 5e3, True),
+        (1.0, 1e4, False),
+    ],
+)
+def test_a_tip_does_not_feel_if_no_load_within_its_range_is_a_touch(
+    threshold_n: float, noises: float, feels: bool
+) -> None:
+    """The zero takes 0.5 N of the 50 N, and a threshold is six times the noise at least."""
+    bench = Bench(threshold_n=threshold_n, over_n=100.0)
+    bench.tip.set_range(np.array([50.0, 50.0, 50.0, 1.0, 1.0, 1.0]))
+    bench.tip.use(Zero(OFFSET, noises * NOISE))
+    bench.sample(NOWHERE, NOWHERE)
+    assert bench.tip.reach_n == pytest.approx(49.5, abs=0.01)
+    assert (bench.tip.feels, bench.tip.unreached) == (feels, not feels)
+    bench.tip.use(None)
+    assert bench.tip.threshold_n == threshold_n
+
+
+def test_what_no_direction_of_the_matrix_measures_is_not_felt() -> None:
+    rows = np.eye(6)
+    rows[1] = rows[0]
+    bench = Bench(matrix=rows.tolist())
+    bench.tip.set_range(np.array([50.0, 50.0, 50.0, 1.0, 1.0, 1.0]))
+    bench.sample(NOWHERE, NOWHERE)
+    assert not bench.tip.feels
+    assert bench.tip.reach_n == pytest.approx(0.0, abs=1e-9)
+
+
 def test_pressing_too_hard_is_told_with_the_touch_it_belongs_to() -> None:
     bench = Bench(over_n=5.0)
     events = bench.hold(10, POINT, -2 * DIRECTION) + bench.hold(10, POINT, -8 * DIRECTION)

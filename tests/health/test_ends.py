@@ -137,6 +137,7 @@ ELSEWHERE = {
     "bus_stranger": "tests/bus/test_boards.py",
     "host_stalls": "tests/health/test_honest.py",
     "fingertip_absent": "tests/fingertip/test_boards.py",
+    "fingertip_frozen": "tests/fingertip/test_boards.py",
     "fingertip_held": "tests/fingertip/test_boards.py",
     "fingertip_loses_frames": "tests/fingertip/test_boards.py",
     "fingertip_not_configured": "tests/fingertip/test_boards.py",
@@ -144,6 +145,7 @@ ELSEWHERE = {
     "fingertip_saturated": "tests/fingertip/test_boards.py",
     "fingertip_scale": "tests/fingertip/test_boards.py",
     "fingertip_silent": "tests/fingertip/test_boards.py",
+    "fingertip_unreached": "tests/fingertip/test_boards.py",
 }
 #: Codes of tests below.
 BELOW = {"taxel_held", "triangle_frozen", "triangle_missing", "triangle_silenced"}

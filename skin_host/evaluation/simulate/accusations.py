@@ -78,7 +78,7 @@ ALWAYS = {
 #: One pad in twenty of real skin is so noisy that a calibration refuses it.
 NOISE = {"taxel_refused", "taxel_noisy", "taxel_saturates"}
 #: A fingertip that was loaded when its zero was taken is as noisy as that, and touched afterwards.
-OF_LOADS = {"fingertip_noisy", "fingertip_held", "fingertip_pressed"}
+OF_LOADS = {"fingertip_noisy", "fingertip_unreached", "fingertip_held", "fingertip_pressed"}
 #: A trouble is plain if nothing else happened for so long before it, nor a start for longer.
 QUIET_NS = 10 * NS
 STARTED_NS = 15 * NS
