@@ -46,7 +46,7 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from skin_host.clock import SYSTEM, Clock
 from skin_host.mqtt.address import Broker
-from skin_host.mqtt.packets import KEPT_BYTES, numbered_packet, unfit
+from skin_host.mqtt.packets import KEPT_BYTES, numbered_packet, pack_number, unfit
 
 #: A broker that does not answer for this long is lost.
 TIMEOUT_S = 3.0
@@ -63,7 +63,7 @@ GOOD_S = 10.0
 #: server moved.
 _INNOCENT = {0x89, 0x8B, 0x8D, 0x8E, 0x9C, 0x9D}
 _TAKEN_OVER = 0x8E
-#: Of a packet besides topic and payload, at most: header, properties.
+#: Of a packet with a description besides topic and payload, at most: header, properties.
 _ENVELOPE_BYTES = 128
 #: What paho gives for a connection that was closed without a reason.
 _CLOSED = 0x80
@@ -439,15 +439,19 @@ class Connection(aiomqtt.Client):
                 self._loop.remove_writer(sock.fileno())
             self._loop.call_soon(self.when_clear)
 
-    def fits(self, topic: str, payload: bytes) -> bool:
-        """Return whether the broker takes a message of this size, as far as it states a limit (MQTT
-        5).
+    def fits(self, topic: str, payload: bytes, properties: Properties | None) -> bool:
+        """Return whether the broker takes a message with this as a packet with QoS 1, as far as it
+        states a limit (MQTT 5).
         """
-        room = self.room(topic)
-        return room is None or len(payload) <= room
+        if self.packet_limit is None:
+            return True
+        packed: bytes = _NONE if properties is None else properties.pack()  # type: ignore[no-untyped-call]
+        # The topic has its length before it, and a number behind it.
+        left = 2 + len(topic.encode()) + 2 + len(packed) + len(payload)
+        return 1 + len(pack_number(left)) + left <= self.packet_limit
 
     def room(self, topic: str) -> int | None:
-        """How many bytes of payload fit into a message to a topic, if there is a limit."""
+        """How many bytes of a description fit into a message to a topic, if there is a limit."""
         if self.packet_limit is None:
             return None
         return self.packet_limit - len(topic.encode()) - _ENVELOPE_BYTES

@@ -12,6 +12,7 @@ import asyncio
 import logging
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from itertools import islice
 from typing import Literal, NamedTuple
 
@@ -165,7 +166,7 @@ class Courier:
         events = out - answers
         if out + len(states) == 1 and not answers and self._works and states != [self._status]:
             topic = outbox.events[0].topic if events else states[0]
-            payload = outbox.events[0].payload if events else outbox.retained[topic]
+            payload = outbox.events[0].payload if events else outbox.retained[topic].payload
             if outbox.trials.strike(topic, payload):
                 if events:
                     outbox.give_up_event()
@@ -194,11 +195,17 @@ class Courier:
         self._frames_alone.pop(part, None)
         return topic
 
-    def _fits(self, connection: Connection, topic: str, payload: bytes) -> bool:
+    def _fits(
+        self,
+        connection: Connection,
+        topic: str,
+        payload: bytes,
+        properties: MessageProperties | None,
+    ) -> bool:
         """Whether the broker's limit lets a message through; names the topic if it does not."""
         if connection.packet_limit is None and not self.too_large:
             return True
-        if connection.fits(topic, payload):
+        if connection.fits(topic, payload, properties):
             if self.too_large:
                 self.too_large.pop(topic, None)
             return True
@@ -207,33 +214,40 @@ class Courier:
             _log.warning(
                 "not published: %s: %d bytes; the broker takes packets of up to %d",
                 topic,
-                len(payload),
+                len(payload) + (0 if properties is None else len(properties.pack())),  # type: ignore[no-untyped-call]
                 connection.packet_limit,
             )
         return False
 
     def _drop_large_event(self, number: int) -> None:
-        """Drop an event that is too large; the answer to a command becomes a short refusal."""
+        """Drop an event that is too large; the answer to a command becomes a short refusal, if that
+        is shorter.
+        """
         event = self._outbox.events[number]
         if event.is_touch:
             self._outbox.give_up_event(number)
+            return
+        refusal = answer_too_large(event.payload)
+        if len(refusal) < len(event.payload):
+            self._outbox.events[number] = event._replace(payload=refusal)
         else:
-            self._outbox.events[number] = event._replace(payload=answer_too_large(event.payload))
+            self._outbox.give_up_event(number)
+            self.too_large.pop(event.topic, None)  # whoever asks may name another one each time
 
     async def _try_alone(self, connection: Connection) -> None:
         """Send suspected messages, one at a time, after the others."""
         outbox = self._outbox
         if self._events_alone or self._states_alone or self._frames_alone:
             status = {self._status: outbox.retained[self._status]}
-            await within(
-                TIMEOUT_S, self._send_state(connection, self._status, status[self._status])
-            )
-            outbox.states_sent(status)
+            sent = self._send_state(connection, self._status, status[self._status].payload)
+            if sent is not None:
+                await within(TIMEOUT_S, sent)
+                outbox.states_sent(status)
+                self._works = True
             self._states_alone.pop(self._status, None)
-            self._works = True
         while self._events_alone and outbox.events:
             event = outbox.events[0]
-            if not self._fits(connection, event.topic, event.payload):
+            if not self._fits(connection, event.topic, event.payload, event.properties):
                 self._drop_large_event(0)
                 self._events_alone -= event.is_touch
                 continue
@@ -247,13 +261,12 @@ class Courier:
         while self._states_alone:
             topic = next(iter(self._states_alone))
             states = {topic: outbox.retained[topic]}
-            if not self._fits(connection, topic, states[topic]):
-                del self._states_alone[topic]
-                continue
-            self._states_out[topic] = self._send_state(connection, topic, states[topic])
-            await within(TIMEOUT_S, self._states_out[topic])
-            del self._states_out[topic]
-            outbox.states_sent(states)
+            sent = self._send_state(connection, topic, states[topic].payload)
+            if sent is not None:
+                self._states_out[topic] = sent
+                await within(TIMEOUT_S, sent)
+                del self._states_out[topic]
+                outbox.states_sent(states)
             del self._states_alone[topic]
         if self._frames_alone:
             try:
@@ -349,7 +362,8 @@ class Courier:
         """The payload of a frame; None for one that the broker does not take, which is counted."""
         raw = self._raw_until_s > 0.0 and self._clock.monotonic_s() < self._raw_until_s
         payload = encode_frame(frame, self._form.encoding, raw=raw)
-        if self._outbox.trials.withholds(topic) or not self._fits(connection, topic, payload):
+        withheld = self._outbox.trials.withholds(topic)
+        if withheld or not self._fits(connection, topic, payload, self._form.properties):
             self._outbox.counters.frames_skipped += 1
             return None
         return payload
@@ -363,7 +377,7 @@ class Courier:
         until_s = self._clock.monotonic_s() + TIMEOUT_S
         while len(in_flight) < min(len(outbox.events), TOUCH_WINDOW):
             event = outbox.events[len(in_flight)]
-            if not self._fits(connection, event.topic, event.payload):
+            if not self._fits(connection, event.topic, event.payload, event.properties):
                 self._drop_large_event(len(in_flight))
                 continue
             topic, payload, properties, _ = event
@@ -400,15 +414,18 @@ class Courier:
         outbox = self._outbox
         outbox.retained_put.set()
         while True:
-            await outbox.retained_put.wait()
+            with suppress(TimeoutError):  # a withheld one may go
+                async with self._clock.timeout_at(outbox.held_until_s()):
+                    await outbox.retained_put.wait()
             outbox.retained_put.clear()
             while states := outbox.take_states(RETAINED_WINDOW):
-                for topic, payload in list(states.items()):
-                    if not self._fits(connection, topic, payload):
+                for topic, state in list(states.items()):
+                    sent = self._send_state(connection, topic, state.payload)
+                    if sent is None:
                         outbox.give_up_state(topic)
                         del states[topic]
-                        continue
-                    self._states_out[topic] = self._send_state(connection, topic, payload)
+                    else:
+                        self._states_out[topic] = sent
                 for done in self._states_out.values():
                     await within(TIMEOUT_S, done)
                 self._states_out.clear()
@@ -418,6 +435,9 @@ class Courier:
 
     def _send_state(
         self, connection: Connection, topic: str, payload: bytes
-    ) -> "asyncio.Future[None]":
+    ) -> "asyncio.Future[None] | None":
+        """Send a state; None for one that the broker does not take."""
         properties = self._state_properties(topic, payload)
+        if not self._fits(connection, topic, payload, properties):
+            return None
         return connection.send(topic, payload, qos=1, retain=True, properties=properties)

@@ -48,7 +48,8 @@ class PublisherCounters(Struct):
             whenever they were sent.
         withheld: topics to which nothing is sent because of that, or of the size of the message.
         name_taken: connections are ended as if another client used this node's name.
-        answers_dropped: answers to commands that were lost with a connection.
+        answers_dropped: answers to commands that were lost with a connection, or that the broker
+            does not take.
     """
 
     connected: bool = False
@@ -79,6 +80,15 @@ class Event(NamedTuple):
     is_touch: bool
 
 
+class State(NamedTuple):
+    """A retained message. Two puts of the same payload are two states: what was on its way in
+    between, such as a last will, may have replaced the first one at the broker.
+    """
+
+    payload: bytes
+    version: int
+
+
 class Outbox:
     """Everything that a publisher still has to send.
 
@@ -89,12 +99,13 @@ class Outbox:
     Attributes:
         frames: the newest frame of each part.
         events: messages that must arrive, in order.
-        retained: the payload of every retained topic, sent or not.
+        retained: the newest state of every retained topic, sent or not.
         passed_on: recently acknowledged events.
-        pending: the topics of `retained` that are to be sent.
+        pending: the topics of `retained` that are to be sent, now or when they are no longer
+            withheld.
         on_put: called when there is a new frame or event.
         retained_put: set when there is something new to be retained.
-        emptied: set when no event and nothing retained is left to send.
+        emptied: set when no event, or nothing retained, is left to send now.
         counters: results of everything that was put.
         trials: which topics are withheld.
     """
@@ -102,7 +113,7 @@ class Outbox:
     def __init__(self, event_limit: int, frame_hz: float = 0.0, clock: Clock = SYSTEM) -> None:
         self.frames: dict[str, PressureFrame] = {}
         self.events: deque[Event] = deque()
-        self.retained: dict[str, bytes] = {}
+        self.retained: dict[str, State] = {}
         self.passed_on: deque[tuple[float, Event]] = deque(maxlen=REPEATED)
         self.pending: dict[str, None] = {}
         self.on_put: Callable[[], None] = lambda: None
@@ -117,8 +128,9 @@ class Outbox:
         self._counts: dict[str, int] = {}
         #: By topic and contact: its last event, if that is a move, and the event's number.
         self._last_moves: dict[tuple[str, int], tuple[Event, int]] = {}
-        #: Payloads that the broker did not take, by topic.
-        self._given_up: dict[str, bytes] = {}
+        self._version = 0
+        #: States that the broker did not take, by topic.
+        self._given_up: dict[str, State] = {}
         self._frame_ns = int(1e9 / frame_hz) if frame_hz else 0
         self._frame_due_ns: dict[str, int] = {}
 
@@ -220,7 +232,9 @@ class Outbox:
     def give_up_event(self, number: int = 0) -> None:
         """Drop the first event, or another one, which the broker does not take."""
         self.counters.rejected += 1
-        self.counters.touches_dropped += self.events[number].is_touch
+        is_touch = self.events[number].is_touch
+        self.counters.touches_dropped += is_touch
+        self.counters.answers_dropped += not is_touch
         del self.events[number]
         if not self.events:
             self.emptied.set()
@@ -251,28 +265,33 @@ class Outbox:
 
     def put_state(self, topic: str, payload: bytes) -> None:
         """Take a retained message; it replaces the one of the topic."""
-        self.retained[topic] = payload
-        if not self.trials.withholds(topic):
-            self.pending[topic] = None
-            self.retained_put.set()
+        self._version += 1
+        self.retained[topic] = State(payload, self._version)
+        self.pending[topic] = None
+        self.retained_put.set()
 
-    def take_states(self, most: int) -> dict[str, bytes]:
-        """Return up to `most` topics and payloads to be sent; they stay until `states_sent`."""
-        return {topic: self.retained[topic] for topic in islice(self.pending, most)}
+    def take_states(self, most: int) -> dict[str, State]:
+        """Return up to `most` topics and states to be sent now; they stay until `states_sent`."""
+        due = (topic for topic in self.pending if not self.trials.withholds(topic))
+        return {topic: self.retained[topic] for topic in islice(due, most)}
 
-    def states_sent(self, states: dict[str, bytes]) -> None:
-        """Note that these have arrived. Newer payloads of their topics are still to be sent, after
+    def held_until_s(self) -> float | None:
+        """Return when the first withheld state may be sent, by the clock that is never set."""
+        ends = map(self.trials.until_s, self.pending)
+        return min((end for end in ends if end is not None), default=None)
+
+    def states_sent(self, states: dict[str, State]) -> None:
+        """Note that these have arrived. Newer states of their topics are still to be sent, after
         all others that wait.
         """
         self.counters.retained_sent += len(states)
-        for topic, payload in states.items():
+        for topic, state in states.items():
             was_pending = topic in self.pending
             self.pending.pop(topic, None)
-            if was_pending and self.retained[topic] is not payload:
+            if was_pending and self.retained[topic].version != state.version:
                 self.pending[topic] = None
             self.trials.arrived(topic)
-        if not self.pending:
-            self.emptied.set()
+        self._note_emptied()
 
     def repeat_states(self) -> None:
         """Send all retained messages again, to a broker that may have lost them."""
@@ -284,15 +303,19 @@ class Outbox:
         self.counters.rejected += 1
         self._given_up[topic] = self.retained[topic]
         self.pending.pop(topic, None)
-        if not self.pending:
-            self.emptied.set()
+        self._note_emptied()
 
     def _is_given_up(self, topic: str) -> bool:
-        return self.trials.withholds(topic) or self._given_up.get(topic) is self.retained[topic]
+        given_up = self._given_up.get(topic)
+        return given_up is not None and given_up.version == self.retained[topic].version
+
+    def _note_emptied(self) -> None:
+        if not self.take_states(1):
+            self.emptied.set()
 
     async def drained(self) -> None:
-        """Wait until every event and everything retained has arrived."""
-        while self.events or self.pending:
+        """Wait until every event and everything retained has arrived, but for what is withheld."""
+        while self.events or self.take_states(1):
             self.emptied.clear()
             await self.emptied.wait()
 

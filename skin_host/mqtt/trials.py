@@ -38,6 +38,10 @@ class Trials:
         until_s = self._until_s.get(topic)
         return until_s is not None and self._now_s() < until_s
 
+    def until_s(self, topic: str) -> float | None:
+        """Until when this topic is or was withheld, if something has not arrived since."""
+        return self._until_s.get(topic)
+
     def strike(self, topic: str, payload: bytes) -> bool:
         """The connection ended while only this was in flight; return whether to drop it.
 

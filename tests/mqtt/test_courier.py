@@ -10,8 +10,15 @@ import pytest
 from msgspec import json
 
 from skin_host.clock import SteppedClock
+from skin_host.mqtt.address import Broker
 from skin_host.mqtt.commands import RESULT_SCHEMA, Result
-from skin_host.mqtt.connection import GRACE_S, TIMEOUT_S, MqttError
+from skin_host.mqtt.connection import (
+    GRACE_S,
+    TIMEOUT_S,
+    MessageProperties,
+    MqttError,
+    message_properties,
+)
 from skin_host.mqtt.courier import (
     FRAME_WINDOW,
     RETAINED_WINDOW,
@@ -66,8 +73,9 @@ class Link:
     writes: list[int] = field(default_factory=list)
     when_clear: Any = None
 
-    def fits(self, topic: str, payload: bytes) -> bool:
-        return self.packet_limit is None or len(payload) <= self.packet_limit
+    def fits(self, topic: str, payload: bytes, properties: Any) -> bool:
+        size = len(payload) + (0 if properties is None else len(properties.pack()))
+        return self.packet_limit is None or size <= self.packet_limit
 
     def send(
         self, topic: str, payload: bytes, *, qos: int = 0, retain: bool = False, **_: object
@@ -127,12 +135,14 @@ class Sender:
         self.outbox.counters.connected = True
         self.outbox.put_state(STATUS, ONLINE)
         self.acknowledged: list[Any] = []
+        #: Of the states that are sent.
+        self.properties: MessageProperties | None = None
         self.courier = Courier(
             self.outbox,
             TOPICS,
             STATUS,
             FrameForm("json", None),
-            lambda topic, payload: None,
+            lambda topic, payload: self.properties,
             self.acknowledged.append,
             clock,
         )
@@ -785,3 +795,108 @@ async def test_a_topic_is_withheld_for_some_time_after_rejections_in_a_row(
     clock.advance(HOLD_S)
     sender.put_touches([10])
     assert len(sender.outbox.events) == 1
+
+
+@stepped
+async def test_the_newest_of_the_states_put_while_their_topic_is_withheld_goes_when_that_ends(
+    clock: SteppedClock,
+) -> None:
+    sender, link = Sender(clock), Link(is_prompt=True)
+    async with sender.over(link) as carrying:
+        sender.outbox.trials.withhold("contact")
+        await sender.turn(1.0)
+        sender.outbox.trials.withhold("later")
+        for topic in ("later", "contact"):
+            for payload in (b"ON", b"OFF", b"ON"):
+                sender.outbox.put_state(topic, payload)
+        await sender.turn(HOLD_S - 1.5)
+        assert [one.topic for one in link.sent] == [STATUS]
+        await sender.turn(1.0)
+        assert [(one.topic, one.payload) for one in link.sent[1:]] == [("contact", b"ON")]
+        await sender.turn(1.0)
+        assert [(one.topic, one.payload) for one in link.sent[2:]] == [("later", b"ON")]
+        await sender.turn(2 * HOLD_S)
+        assert len(link.sent) == 3
+        assert not carrying.done()
+
+
+@stepped
+async def test_a_state_that_is_refused_again_after_its_topic_was_withheld_has_one_try(
+    clock: SteppedClock,
+) -> None:
+    sender = Sender(clock)
+    for number in range(REJECTIONS):
+        sender.outbox.put_state("contact", b"%d" % number)
+        while "contact" in sender.outbox.pending:
+            await sender.rejected()
+    sender.outbox.put_state("contact", b"ON")
+    clock.advance(HOLD_S)
+    # Over the first connection nothing shows that the broker works.
+    assert [await sender.rejected() for _ in range(2)] == [None, "contact"]
+    assert sender.outbox.trials.withheld == ["contact"]
+
+
+@stepped
+async def test_a_status_that_is_put_again_while_it_is_on_its_way_with_others_is_sent_again(
+    clock: SteppedClock,
+) -> None:
+    sender, link = Sender(clock), Link()
+    sender.outbox.put_state("state", b"1")
+    async with sender.over(link):
+        link.acknowledge(link.waiting(STATUS))
+        sender.outbox.put_state(STATUS, ONLINE)
+        link.acknowledge(link.waiting())
+        await sender.turn()
+        assert [one.topic for one in link.waiting()] == [STATUS]
+
+
+def answer(size: int) -> Event:
+    reply = Result(RESULT_SCHEMA, "status", ok=True, id="1", result={"text": "x" * size})
+    return Event("reply", json.encode(reply), None, is_touch=False)
+
+
+@pytest.mark.parametrize("size", [0, 2000])
+@stepped
+async def test_an_answer_is_dropped_if_not_even_its_refusal_fits_and_what_follows_goes(
+    clock: SteppedClock, size: int
+) -> None:
+    sender, link = Sender(clock), Link(packet_limit=50, is_prompt=True)
+    async with sender.over(link):
+        sender.outbox.put_event(answer(size))
+        sender.outbox.put_event(Event("other", b"{}", None, is_touch=False))
+        await sender.turn()
+    assert [one.topic for one in link.sent if one.topic != STATUS] == ["other"]
+    assert sender.outbox.counters.answers_dropped == 1
+    assert not sender.outbox.events
+    assert not sender.courier.too_large  # a reply's topic is used once
+
+
+@stepped
+async def test_what_fits_is_judged_with_the_properties(
+    clock: SteppedClock, caplog: pytest.LogCaptureFixture
+) -> None:
+    sender, link = Sender(clock), Link(packet_limit=1000, is_prompt=True)
+    sender.properties = message_properties(Broker("localhost", 1), "x" * 1000)
+    async with sender.over(link):
+        sender.outbox.put_state("state", b"1")
+        sender.outbox.put_event(answer(0)._replace(properties=sender.properties))
+        await sender.turn()
+    assert link.sent == []
+    assert sender.outbox.counters.answers_dropped == 1
+    assert "not published: state: 1008 bytes; the broker takes packets of up to" in caplog.text
+
+
+@stepped
+async def test_a_status_larger_than_the_broker_takes_does_not_keep_suspected_messages_waiting(
+    clock: SteppedClock,
+) -> None:
+    sender = Sender(clock)
+    sender.put_touches([1, 2])
+    await sender.rejected()
+    sender.properties = message_properties(Broker("localhost", 1), "x" * 1000)
+    sender.outbox.repeat_states()
+    link = Link(packet_limit=1000, is_prompt=True)
+    async with sender.over(link):
+        pass
+    assert [one.topic for one in link.sent] == [TOUCHES, TOUCHES]
+    assert list(sender.courier.too_large) == [STATUS]

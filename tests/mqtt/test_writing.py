@@ -15,7 +15,13 @@ from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 
 from skin_host.mqtt.address import Broker
-from skin_host.mqtt.connection import MAX_IN_FLIGHT, PackedProperties, connect, message_properties
+from skin_host.mqtt.connection import (
+    MAX_IN_FLIGHT,
+    Connection,
+    PackedProperties,
+    connect,
+    message_properties,
+)
 from skin_host.mqtt.packets import numbered_packet, publish_head, publish_packet
 from tests.support.certificates import authority, certificate
 from tests.support.packets import packet_with_flags
@@ -152,6 +158,34 @@ def test_an_event_has_the_bytes_that_paho_would_write(
     topic, payload = "skin/robot/palm/touch", b"x" * size
     mid, packed, expected = written_by_paho(version, topic, payload, 1, retain)
     assert numbered_packet(topic, mid, packed, payload, retain=retain) == expected
+
+
+@pytest.mark.parametrize("correlation", [None, 0, 100, 1024])
+@pytest.mark.parametrize("size", [0, 1, 100, 128, 16_384])
+async def test_a_message_fits_if_its_packet_is_not_longer_than_the_broker_takes(
+    size: int, correlation: int | None
+) -> None:
+    properties = None
+    if correlation is not None:
+        properties = message_properties(Broker(), "application/json")
+        assert properties is not None
+        properties.CorrelationData = b"c" * correlation
+    packed = b"\0" if properties is None else properties.pack()
+    topic, payload = "skin/robot/palm/t\u00e4uch", b"x" * size
+    connection = Connection(
+        Broker(),
+        identifier="fits",
+        will=None,
+        max_incoming=1,
+        max_packet=1000,
+        session_s=0,
+        resume=False,
+    )
+    assert connection.fits(topic, payload, properties)
+    length = len(numbered_packet(topic, 1, packed, payload, retain=False))
+    for spare, fits in ((0, True), (-1, False)):
+        connection.packet_limit = length + spare
+        assert connection.fits(topic, payload, properties) == fits
 
 
 @pytest.mark.parametrize("hold", [False, True])

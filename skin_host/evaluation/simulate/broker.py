@@ -256,7 +256,7 @@ class Line:
     def flush(self) -> None:
         """Nothing waits for the end of the turn."""
 
-    def fits(self, topic: str, payload: bytes) -> bool:
+    def fits(self, topic: str, payload: bytes, properties: Any) -> bool:
         """Every size does."""
         return True
 
