@@ -76,6 +76,11 @@ def visible(text: str, longest: int = 1000) -> str:
     return "".join(one if one.isprintable() else repr(one)[1:-1] for one in shown)
 
 
+def visible_lines(text: str) -> str:
+    """Return whole text of several lines, such as a traceback, each as `visible` shows it."""
+    return "\n".join(visible(line, len(line)) for line in text.split("\n"))
+
+
 def nearest(typed: str, known: Iterable[str]) -> str | None:
     """Return which of the known words was probably meant, if any."""
     import difflib

@@ -359,7 +359,7 @@ class SocketCanPort(Port):
 def _interface_exists(channel: str) -> bool:
     try:
         socket.if_nametoindex(channel)
-    except OSError:
+    except (OSError, ValueError):  # a name with a zero byte is no string of the system
         return False
     return True
 

@@ -126,7 +126,7 @@ def set_up_logging(verbose: bool) -> None:
     handler.setFormatter(
         service.JournalFormatter("%(message)s")
         if service.to_journal()
-        else logging.Formatter("%(levelname)-7s %(message)s")
+        else service.LogFormatter("%(levelname)-7s %(message)s")
     )
     logging.basicConfig(level=logging.DEBUG if verbose else logging.INFO, handlers=[handler])
     for noisy in ("mqtt", "asyncio"):

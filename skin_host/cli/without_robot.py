@@ -28,6 +28,7 @@ from skin_host.cli.common import (
     warn_of_virtual,
     whole,
 )
+from skin_host.daemon import service
 from skin_host.errors import RequestError, visible
 
 if TYPE_CHECKING:
@@ -430,7 +431,9 @@ def _simulate(arguments: argparse.Namespace) -> int:
     config: Path = arguments.config or configuration("demo.toml")
     settings, layout = load_skin(config)
     if arguments.until is not None:
-        logging.basicConfig(level=logging.DEBUG, format="%(levelname)-7s %(name)s: %(message)s")
+        handler = logging.StreamHandler()
+        handler.setFormatter(service.LogFormatter("%(levelname)-7s %(name)s: %(message)s"))
+        logging.basicConfig(level=logging.DEBUG, handlers=[handler])
     progress = Progress("simulating")
     results: list[RunResult] = []
     asked = settings, layout, config

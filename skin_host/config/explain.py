@@ -2,13 +2,14 @@
 
 import math
 import re
+import reprlib
 from collections.abc import Iterator
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
 from msgspec import Struct
 
-from skin_host.config.fields import Name
+from skin_host.config.fields import PATTERNS, Name
 from skin_host.errors import nearest
 
 Table = type[Struct]
@@ -17,6 +18,11 @@ Named = dict[str, Table]
 LONGEST_VALUE = 40
 #: No setting is larger: so many seconds in nanoseconds still fit into 64 bits.
 LARGEST = 1e9
+#: No document is nested deeper: the deepest key is `parts.NAME.patches[0].places[0].normal[0]`.
+DEEPEST = 16
+#: Shows any value at bounded cost, however deep or long it is.
+_SHOWN = reprlib.Repr()
+_SHOWN.maxstring = _SHOWN.maxother = _SHOWN.maxlong = 1000
 
 
 def explain(document: Any, error: msgspec.ValidationError, root: Table, named: Named) -> str:
@@ -65,6 +71,8 @@ def _readable(message: str, place: str, table: Table, document: Any) -> str:
         text = f"seen {seen}, wanted one of: {known}"
     else:
         text = text.replace("Object missing required field", "missing key")
+        for pattern, permitted in PATTERNS.items():
+            text = text.replace(f" matching regex {pattern!r}", f" of {permitted}")
         wanted, _, got = text.replace("Expected", "wanted").partition(", got ")
         seen = got if " of length " in wanted and got else _value(document, keys)
         text = f"seen {seen}, {wanted}" if wanted.startswith("wanted") and seen else wanted
@@ -81,7 +89,7 @@ def _value(document: Any, keys: str) -> str:
             value = value[key]
         else:
             return ""
-    text = repr(value)
+    text = _SHOWN.repr(value)
     return text if len(text) <= LONGEST_VALUE else text[: LONGEST_VALUE - 3] + "..."
 
 
@@ -92,6 +100,22 @@ def _innermost(hint: Any) -> Any:
     while get_origin(hint) not in (None, Literal):
         hint = next(inner for inner in reversed(get_args(hint)) if inner is not type(None))
     return hint
+
+
+def too_deep(document: Any) -> str | None:
+    """Return the place of a value that is nested deeper than `DEEPEST`, if there is one.
+
+    What walks through a document later may then call itself.
+    """
+    level = [("", document)]
+    for _ in range(DEEPEST + 1):
+        level = [
+            (f"{where}.{key}" if where else str(key), inner)
+            for where, value in level
+            if isinstance(value, dict | list)
+            for key, inner in (value.items() if isinstance(value, dict) else enumerate(value))
+        ]
+    return level[0][0] if level else None
 
 
 def out_of_bounds(

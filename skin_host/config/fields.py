@@ -1,10 +1,61 @@
-"""Types of single values that several files use."""
+"""Types of single values that several files use.
+
+Each quantity has a range: wider than any robot needs, narrow enough that what is computed from it
+stays finite and rises with the reading. A value outside of it is a mistake of units, or a typo.
+"""
 
 from typing import Annotated
 
 from msgspec import Meta
 
+#: What a pattern permits, for messages.
+PATTERNS: dict[str, str] = {}
+
+
+def _text(pattern: str, permitted: str) -> str:
+    PATTERNS[pattern] = permitted
+    return pattern
+
+
 #: Names end up in MQTT topics and in file names. `$` alone would also let a line end pass.
-Name = Annotated[str, Meta(pattern=r"^[a-z0-9_-]+(?!\n)$", max_length=64)]
-Positive = Annotated[float, Meta(gt=0)]
-NotNegative = Annotated[float, Meta(ge=0)]
+Name = Annotated[
+    str,
+    Meta(pattern=_text(r"^[a-z0-9_-]+(?!\n)$", "the characters a-z, 0-9, - and _"), max_length=64),
+]
+#: Free text: without what steers a terminal, and without the zero byte, which the system refuses.
+Printable = Annotated[
+    str,
+    Meta(
+        pattern=_text(
+            "^[^\\x00-\\x1f\\x7f-\\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]*$",
+            "characters that can be printed",
+        )
+    ),
+]
+#: host, host:port or [IPv6]:port
+Address = Annotated[
+    str,
+    Meta(
+        pattern=_text(
+            r"^([A-Za-z0-9_.-]+|\[[0-9A-Fa-f:.]+\])(:[0-9]{1,5})?(?!\n)$",
+            "host, host:port or [IPv6]:port",
+        )
+    ),
+]
+
+#: Sizes: of pads, foams, probes, fingertips.
+Millimetres = Annotated[float, Meta(ge=0.001, le=10_000)]
+SquareMillimetres = Annotated[float, Meta(ge=0.001, le=1_000_000)]
+#: Coordinates.
+PlaceMm = Annotated[float, Meta(ge=-1_000_000, le=1_000_000)]
+Seconds = Annotated[float, Meta(ge=0.001, le=1e9)]
+Hertz = Annotated[float, Meta(ge=0.001, le=1_000_000)]
+#: A byte has no more.
+Units = Annotated[float, Meta(ge=0, le=255)]
+#: In newtons, or newton metres.
+Newtons = Annotated[float, Meta(ge=1e-6, le=1e6)]
+#: Coefficients of capacitance and pressure; `PressureCurve` judges what becomes of them together.
+Coefficient = Annotated[float, Meta(ge=-1e6, le=1e6)]
+PositiveCoefficient = Annotated[float, Meta(ge=1e-6, le=1e6)]
+#: What a mode of the foam takes of the pressure.
+Share = Annotated[float, Meta(ge=0, le=1)]

@@ -8,6 +8,7 @@ name the file and the path inside it. `docs/configuration.md` explains every key
 
 import hashlib
 from collections.abc import Callable, Mapping
+from datetime import date, datetime, time
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -15,10 +16,30 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 from msgspec import Meta, Struct, field
 
-from skin_host.config.explain import Named, explain, out_of_bounds
-from skin_host.config.fields import Name, NotNegative, Positive
+from skin_host.config.explain import (
+    DEEPEST,
+    LARGEST,
+    LONGEST_VALUE,
+    Named,
+    explain,
+    out_of_bounds,
+    too_deep,
+)
+from skin_host.config.fields import (
+    Address,
+    Coefficient,
+    Hertz,
+    Millimetres,
+    Name,
+    PlaceMm,
+    PositiveCoefficient,
+    Printable,
+    Seconds,
+    SquareMillimetres,
+    Units,
+)
 from skin_host.config.fingertips import Fingertip as Fingertip  # noqa: PLC0414 (for others too)
-from skin_host.config.relaxation import RelaxationSettings, with_file, wrong_parameters
+from skin_host.config.relaxation import RelaxationSettings, with_file
 from skin_host.errors import ConfigurationError, RequestError, visible
 from skin_host.files import read_whole
 from skin_host.mqtt.topics import wrong_base
@@ -26,8 +47,8 @@ from skin_host.mqtt.topics import wrong_base
 Byte = Annotated[int, Meta(ge=0, le=255)]
 T = TypeVar("T", bound=Struct)
 TRIANGLES_PER_BOARD = 16
-#: host, host:port or [IPv6]:port
-_ADDRESS = r"^([A-Za-z0-9_.-]+|\[[0-9A-Fa-f:.]+\])(:[0-9]{1,5})?(?!\n)$"
+#: A rate of 0 lets everything pass; another one is at least this.
+LEAST_HZ = 0.001
 
 
 class _Table(Struct, forbid_unknown_fields=True, kw_only=True, frozen=True):
@@ -37,11 +58,11 @@ class _Table(Struct, forbid_unknown_fields=True, kw_only=True, frozen=True):
 class Bus(_Table, frozen=True):
     """One CAN bus, opened by python-can."""
 
-    interface: str = "socketcan"
-    channel: str = "can0"
-    bitrate: int = 1_000_000
+    interface: Printable = "socketcan"
+    channel: Printable = "can0"
+    bitrate: Annotated[int, Meta(ge=1000, le=10_000_000)] = 1_000_000
     #: Further keyword arguments for `can.Bus`, as python-can's own documentation names them.
-    options: dict[str, str | int | float | bool] = {}
+    options: dict[Printable, Printable | int | float | bool] = {}
     #: Ignore frames of other classes (motors, ...): they are neither read nor counted.
     skin_only: bool = False
 
@@ -66,9 +87,9 @@ class PlaceSettings(_Table, frozen=True):
     laid along `normal` by the shortest rotation, then moved to (x, y, z).
     """
 
-    x_mm: float = 0.0
-    y_mm: float = 0.0
-    z_mm: float = 0.0
+    x_mm: PlaceMm = 0.0
+    y_mm: PlaceMm = 0.0
+    z_mm: PlaceMm = 0.0
     turn_deg: float = 0.0
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
     mirror: bool = False
@@ -79,25 +100,25 @@ class Patch(_Table, frozen=True):
 
     board: Name
     #: Triangle numbers of the board, in the order of the part's taxels: "0-4,8".
-    triangles: str
+    triangles: Printable
     kind: Name = "triangle"
     shift: Annotated[int, Meta(ge=0, le=8)] = 2
     cdc_offset: Annotated[int, Meta(ge=0, le=0xFFFF)] = 0x2200
     #: One place per triangle. Without them the triangles are tiled side by side.
     places: list[PlaceSettings] = []
     #: Or a file of taxel positions: one row x y z nx ny nz (m) per taxel of the patch.
-    positions: str | None = None
+    positions: Printable | None = None
 
 
 class KindSettings(_Table, frozen=True):
     """A kind of sensor unit: 12 pads, or 24, 36, 48 where triangles are cut as one."""
 
-    about: str
-    pads_mm: list[tuple[float, float]]
-    pitch_mm: Positive
-    radius_mm: Positive
-    area_mm2: Positive
-    outline_mm: list[tuple[float, float]]
+    about: Printable
+    pads_mm: list[tuple[PlaceMm, PlaceMm]]
+    pitch_mm: Annotated[float, Meta(ge=0.001, le=1000)]
+    radius_mm: Millimetres
+    area_mm2: SquareMillimetres
+    outline_mm: list[tuple[PlaceMm, PlaceMm]]
     thermal: list[int] = []
 
 
@@ -109,7 +130,7 @@ class Part(_Table, frozen=True):
     node: Name = "main"
     #: Which objects the skin feels: any, or only grounded ones (no cover).
     covered: bool = True
-    foam_mm: Positive = 3.0
+    foam_mm: Millimetres = 3.0
     #: Whether frames of pressure are published. Without them, touches are still reported, and a
     #: part that nothing touches costs almost nothing.
     frames: bool = True
@@ -118,7 +139,7 @@ class Part(_Table, frozen=True):
     localization: Literal["centroid", "half_maximum", "peak", "template"] = "centroid"
     #: For `template`: diameters of touching objects. A single one is more precise if it is the
     #: right one.
-    probe_mm: Annotated[list[Positive], Meta(min_length=1)] = field(
+    probe_mm: Annotated[list[Millimetres], Meta(min_length=1)] = field(
         default_factory=lambda: [6.0, 8.0, 10.0, 12.0]
     )
 
@@ -126,7 +147,7 @@ class Part(_Table, frozen=True):
 class CalibrationSettings(_Table, frozen=True):
     """How a calibration is taken (paper, section V-A)."""
 
-    seconds: Positive = 5.0
+    seconds: Annotated[float, Meta(ge=0.001, le=86_400)] = 5.0
     percentile: Annotated[float, Meta(gt=0, le=1)] = 0.95
 
 
@@ -137,41 +158,41 @@ class Pressure(_Table, frozen=True):
     capacitors are: with the area of the pad over the thickness of the foam.
     """
 
-    code_ff: Positive = 0.36
-    a_kpa_per_ff2: float = -0.001132
-    b_kpa_per_ff: Positive = 0.8141
+    code_ff: PositiveCoefficient = 0.36
+    a_kpa_per_ff2: Coefficient = -0.001132
+    b_kpa_per_ff: PositiveCoefficient = 0.8141
     #: The palm of the paper: 2 mm of foam; the radius follows from its Figs. 11 to 13.
-    pad_radius_mm: Positive = 2.1
-    foam_mm: Positive = 2.0
+    pad_radius_mm: Millimetres = 2.1
+    foam_mm: Millimetres = 2.0
     #: Noise in pressures of pads with their own curve is smoothed over this time; larger steps pass
     #: at once. Touches are decided before that. 0 smooths nothing.
-    smoothing_s: NotNegative = 0.5
+    smoothing_s: Annotated[float, Meta(ge=0, le=3600)] = 0.5
 
 
 class TouchSettings(_Table, frozen=True):
     """The touch decision (paper, section V-B), in units of the 8-bit value."""
 
-    margin_units: NotNegative = 2.0
-    minimum_threshold_units: NotNegative = 1.0
-    hysteresis_units: NotNegative = 0.5
+    margin_units: Units = 2.0
+    minimum_threshold_units: Units = 1.0
+    hysteresis_units: Units = 0.5
     #: A touch begins and ends with at least this many measurements; noise or a weak press need
     #: more.
     votes_of_3: Literal[1, 2, 3] = 2
     #: `move` events are sent at most this often for a contact.
-    move_hz: Positive = 50.0
+    move_hz: Hertz = 50.0
 
 
 class Drift(_Table, frozen=True):
     """Baseline tracking (paper, section V-C, and the proportional rule of deployed hosts)."""
 
     rule: Literal["none", "paper", "proportional"] = "proportional"
-    rate_units_per_s: Positive = 0.1
-    dead_band_units: NotNegative = 0.5
-    gain_per_s: Positive = 0.2
+    rate_units_per_s: Annotated[float, Meta(ge=1e-6, le=100)] = 0.1
+    dead_band_units: Units = 0.5
+    gain_per_s: Annotated[float, Meta(ge=1e-6, le=100)] = 0.2
     #: A baseline is never moved farther than this from its calibrated value.
-    limit_units: Positive = 40.0
+    limit_units: Annotated[float, Meta(ge=0.001, le=10_000)] = 40.0
     #: A baseline held still by a touch for longer than this is reported.
-    frozen_report_s: Positive = 600.0
+    frozen_report_s: Seconds = 600.0
 
 
 class Processing(_Table, frozen=True):
@@ -187,22 +208,22 @@ class Processing(_Table, frozen=True):
 class Mqtt(_Table, frozen=True):
     """The broker. The password is never stored here: it is read from a file or credential."""
 
-    host: str = "localhost"
+    host: Printable = "localhost"
     port: Annotated[int, Meta(ge=1, le=65535)] = 1883
     #: Instead of `host`: nodes of a cluster or independent brokers, as "host" or "host:port".
-    brokers: Annotated[list[Annotated[str, Meta(pattern=_ADDRESS)]], Meta(max_length=16)] = []
+    brokers: Annotated[list[Address], Meta(max_length=16)] = []
     protocol: Literal["5", "3.1.1"] = "5"
     base: str = "skin"
-    username: Annotated[str, Meta(max_length=1000, pattern=r"^[^\x00]+$")] | None = None
+    username: Annotated[Printable, Meta(min_length=1, max_length=1000)] | None = None
     #: A file with the password; otherwise systemd's credential `mqtt-password`.
-    password_file: str | None = None
+    password_file: Printable | None = None
     tls: bool = False
-    ca_file: str | None = None
-    certificate_file: str | None = None
-    key_file: str | None = None
+    ca_file: Printable | None = None
+    certificate_file: Printable | None = None
+    key_file: Printable | None = None
     keepalive_s: Annotated[int, Meta(ge=5, le=3600)] = 10
     encoding: Literal["json", "cbor"] = "json"
-    frame_hz: Annotated[float, Meta(ge=0)] = 0.0
+    frame_hz: Annotated[float, Meta(ge=0, le=1_000_000)] = 0.0
     event_queue: Annotated[int, Meta(ge=16, le=1_000_000)] = 10_000
     commands: bool = True
     #: Publish the parts to Home Assistant below this prefix, usually "homeassistant".
@@ -214,18 +235,18 @@ class Mqtt(_Table, frozen=True):
 class Receive(_Table, frozen=True):
     """The receive path, see docs/receive.md."""
 
-    poll_ms: Annotated[float, Meta(gt=0, le=1000)] = 4.0
+    poll_ms: Annotated[float, Meta(ge=0.1, le=1000)] = 4.0
     buffer_bytes: Annotated[int, Meta(ge=65536)] = 4_194_304
     #: A sweep with missing triangles is closed after this many periods.
-    close_periods: Annotated[float, Meta(gt=0, le=10)] = 0.9
-    silent_periods: Annotated[float, Meta(gt=0, le=100)] = 4.0
+    close_periods: Annotated[float, Meta(ge=0.1, le=10)] = 0.9
+    silent_periods: Annotated[float, Meta(ge=0.1, le=100)] = 4.0
 
 
 class Service(_Table, frozen=True):
     """The daemon as a whole."""
 
     #: Calibrations and recordings; default: systemd's $STATE_DIRECTORY, otherwise XDG state.
-    state_directory: str | None = None
+    state_directory: Printable | None = None
     #: Prometheus text on this port of localhost; 0 is off.
     metrics_port: Annotated[int, Meta(ge=0, le=65535)] = 0
 
@@ -254,19 +275,29 @@ def parse_triangles(text: str) -> list[int]:
         ValueError: not such a list, a number outside 0..15, or one named twice.
     """
     numbers: list[int] = []
-    for item in text.split(","):
-        first, dash, last = item.strip().partition("-")
+    shown = visible(text, LONGEST_VALUE)
+    for item in map(str.strip, text.split(",")):
+        first, dash, last = item.partition("-")
         if not first.isdecimal() or (dash and not last.isdecimal()):
-            raise ValueError(f'"{text}": seen "{item.strip()}", wanted a list such as "0-4,8"')
-        low, high = int(first), int(last if dash else first)
+            seen = visible(item, LONGEST_VALUE)
+            raise ValueError(f'"{shown}": seen "{seen}", wanted a list such as "0-4,8"')
+        low, high = _triangle(first), _triangle(last if dash else first)
         if max(low, high) >= TRIANGLES_PER_BOARD:
-            raise ValueError(f'"{text}": a board has triangles 0 to {TRIANGLES_PER_BOARD - 1}')
+            raise ValueError(f'"{shown}": a board has triangles 0 to {TRIANGLES_PER_BOARD - 1}')
         if high < low:
-            raise ValueError(f'"{text}": the range "{item.strip()}" is reversed')
+            raise ValueError(f'"{shown}": the range "{item}" is reversed')
         numbers.extend(range(low, high + 1))
     if len(set(numbers)) != len(numbers):
-        raise ValueError(f'"{text}": a triangle is named twice')
+        raise ValueError(f'"{shown}": a triangle is named twice')
     return numbers
+
+
+def _triangle(digits: str) -> int:
+    """Return the number of these digits; where it has more than any board, one that no board has.
+
+    Python reads no number of thousands of digits.
+    """
+    return int(digits) if len(digits) <= LONGEST_VALUE else TRIANGLES_PER_BOARD
 
 
 def format_triangles(numbers: list[int]) -> str:
@@ -293,16 +324,31 @@ def read_toml(path: Path, table: type[T], named: Named) -> T:
     except OSError as error:
         raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from None
     try:
-        found = msgspec.toml.decode(data, type=table)
-    except msgspec.ValidationError as error:
-        what = explain(msgspec.toml.decode(data), error, table, named)
-        raise ConfigurationError(f"{path}: {visible(what)}") from None
-    except (msgspec.DecodeError, ValueError) as error:  # numbers of 4300 digits, too
-        raise ConfigurationError(f"{path}: not TOML: {error}") from None
+        document = msgspec.toml.decode(data)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise ConfigurationError(f"{path}: not TOML: {visible(str(error))}") from None
+    except ValueError:  # Python reads no number of more than 4300 digits
+        raise ConfigurationError(
+            f"{path}: not TOML: holds a number of thousands of digits; wanted numbers "
+            f"between {-LARGEST:g} and {LARGEST:g}"
+        ) from None
     except RecursionError:
         raise ConfigurationError(f"{path}: not a configuration: nested too deep") from None
-    for where, what in out_of_bounds(msgspec.toml.decode(data)):
-        raise ConfigurationError(f"{path}: {where}: {what}")
+    if (place := too_deep(document)) is not None:
+        raise ConfigurationError(
+            f"{path}: {visible(place, LONGEST_VALUE)}: nested too deep; wanted at most "
+            f"{DEEPEST} levels"
+        )
+    try:
+        # The same as `msgspec.toml.decode` with a type: a date is a value of its own.
+        found = msgspec.convert(
+            document, table, builtin_types=(datetime, date, time), str_keys=True
+        )
+    except msgspec.ValidationError as error:
+        what = explain(document, error, table, named)
+        raise ConfigurationError(f"{path}: {visible(what)}") from None
+    for where, what in out_of_bounds(document):
+        raise ConfigurationError(f"{path}: {visible(f'{where}: {what}')}")
     return found
 
 
@@ -322,10 +368,8 @@ def load(path: Path) -> Settings:
     }
     settings = read_toml(path, Settings, named)
     _check_references(path, settings)
-    processing = settings.processing
-    relaxation = with_file(processing.relaxation, path)
-    processing = msgspec.structs.replace(processing, relaxation=relaxation)
-    return msgspec.structs.replace(settings, processing=processing)
+    relaxation = with_file(settings.processing.relaxation, path)
+    return changed(settings, {"processing.relaxation": relaxation})
 
 
 def _check_references(path: Path, settings: Settings) -> None:
@@ -334,6 +378,9 @@ def _check_references(path: Path, settings: Settings) -> None:
 
     if (what := wrong_base(settings.mqtt.base)) is not None:
         raise wrong("mqtt.base", what)
+    if 0.0 < settings.mqtt.frame_hz < LEAST_HZ:
+        seen = f"seen {settings.mqtt.frame_hz:g}, wanted 0 or at least {LEAST_HZ:g}"
+        raise wrong("mqtt.frame_hz", seen)
     addresses: dict[tuple[str, int], str] = {}
     boards: list[tuple[str, str, Board | Fingertip]] = [
         *((f"boards.{name}", f'board "{name}"', board) for name, board in settings.boards.items()),
@@ -375,9 +422,6 @@ def _check_references(path: Path, settings: Settings) -> None:
     if unused:
         raise wrong(f"boards.{min(unused)}", "no part uses this board; remove it or add a patch")
     _check_fingertips(settings, wrong)
-    misfit = wrong_parameters(settings.processing.relaxation)
-    if misfit is not None:
-        raise wrong("processing.relaxation", misfit)
 
 
 def _check_fingertips(settings: Settings, wrong: Callable[[str, str], ConfigurationError]) -> None:

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from skin_host.errors import ConfigurationError
+from skin_host.errors import ConfigurationError, visible_lines
 
 if TYPE_CHECKING:
     from skin_host.clock import Clock
@@ -73,7 +73,16 @@ def with_priority(text: str, level: int) -> str:
     return "\n".join(f"<{priority}>{line}" for line in text.split("\n"))
 
 
-class JournalFormatter(logging.Formatter):
+class LogFormatter(logging.Formatter):
+    """Lines whose control characters are visible: names and errors that anybody may have written
+    are logged.
+    """
+
+    def format(self, record: logging.LogRecord) -> str:
+        return visible_lines(super().format(record))
+
+
+class JournalFormatter(LogFormatter):
     """Lines with priorities; the journal adds time and name."""
 
     def format(self, record: logging.LogRecord) -> str:

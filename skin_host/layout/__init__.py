@@ -20,6 +20,7 @@ from skin_host.config.settings import (
     Board,
     KindSettings,
     Patch,
+    Pressure,
     Settings,
     load,
     parse_triangles,
@@ -33,6 +34,7 @@ from skin_host.layout.geometry import (
     read_positions,
     tile,
 )
+from skin_host.processing.pressure import BENDS, SLOPES_KPA, PressureCurve
 
 TAXELS_PER_TRIANGLE = 12
 
@@ -169,7 +171,8 @@ def build_layout(settings: Settings, folder: Path) -> Layout:
     Relative file names in them start in `folder`, the configuration's own.
 
     Raises:
-        ConfigurationError: an unknown kind, wrong numbers of places, a bad positions file.
+        ConfigurationError: an unknown kind, wrong numbers of places, a bad positions file, or
+            taxels that would feel nothing.
     """
     kinds = builtin_kinds() | settings.kinds
     board_names = list(settings.boards)
@@ -185,6 +188,7 @@ def build_layout(settings: Settings, folder: Path) -> Layout:
     for part_number, (part_name, part) in enumerate(settings.parts.items()):
         start = taxel
         shelf_mm = 0.0
+        first_column = len(columns)
         used: list[int] = []
         for patch_number, patch in enumerate(part.patches):
             where = f"parts.{part_name}.patches[{patch_number}]"
@@ -203,6 +207,7 @@ def build_layout(settings: Settings, folder: Path) -> Layout:
                 reference.foam_mm / part.foam_mm
             )
             column.unit_ff[:] = settings.processing.pressure.code_ff * 2**patch.shift
+            _check_curve(where, column, reference)
             columns.append(column)
             board_number = board_names.index(patch.board)
             if board_number not in used:
@@ -224,6 +229,11 @@ def build_layout(settings: Settings, folder: Path) -> Layout:
                     )
                 )
             taxel += TAXELS_PER_TRIANGLE * len(numbers)
+        if all((column.pad_kind != PadKind.PRESSURE).all() for column in columns[first_column:]):
+            raise ConfigurationError(
+                f"parts.{part_name}: all of its pads are thermal; wanted one at least that "
+                "measures pressure"
+            )
         parts.append(
             PartLayout(part_name, part.node, start, taxel, tuple(used), part.covered, part.foam_mm)
         )
@@ -341,6 +351,28 @@ def _check_kind(name: str, kind: KindSettings) -> None:
         )
     if any(not 0 <= pad < n for pad in kind.thermal):
         raise ConfigurationError(f"kinds.{name}.thermal: {kind.thermal}; pads are 0 to {n - 1}")
+
+
+def _check_curve(where: str, taxels: _Columns, pressure: Pressure) -> None:
+    """Refuse taxels that would feel nothing, because one unit of their byte is too little or too
+    much.
+    """
+    seen_ff = float(taxels.unit_ff[0] / taxels.sensitivity[0])
+    a, b = pressure.a_kpa_per_ff2, pressure.b_kpa_per_ff
+    if not PressureCurve(seen_ff, 1.0, a, b).sound.all():
+        least, most = (slope / b for slope in SLOPES_KPA)
+        if a:
+            most = min(most, BENDS[int(a > 0.0)] * b / a)
+        if most < least:
+            raise ConfigurationError(
+                f"processing.pressure: a_kpa_per_ff2 {a:g} bends equation (1) more than it rises "
+                f"by b_kpa_per_ff {b:g}"
+            )
+        raise ConfigurationError(
+            f"{where}: one unit of its taxels' byte is {seen_ff:.3g} fF of a pad of "
+            f"processing.pressure, by its code_ff and the patch's shift, radius_mm and foam_mm; "
+            f"wanted {least:.3g} to {most:.3g} fF, where equation (1) rises"
+        )
 
 
 def _neighbours(

@@ -66,10 +66,18 @@ def lay(points_mm: Floats, place: PlaceSettings) -> tuple[Floats, Floats]:
     return position, np.broadcast_to(rotation[:, 2], position.shape)
 
 
+def unit_vectors(vectors: Floats) -> Floats:
+    """Vectors [..., 3] of any length but 0, however small or large, as those of length 1."""
+    # Squares of small numbers would be 0.
+    scaled = vectors / np.abs(vectors).max(axis=-1, keepdims=True)
+    unit: Floats = scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)
+    return unit
+
+
 @lru_cache  # most places of a skin have one normal
 def _rotation_from_z(normal: tuple[float, ...]) -> Floats:
     """Shortest rotation [3, 3] that lays the z axis along `normal` (Rodrigues)."""
-    x, y, z = np.array(normal) / np.linalg.norm(normal)
+    x, y, z = unit_vectors(np.array(normal))
     side = np.hypot(x, y)
     if side == 0:
         return np.diag([1.0, np.sign(z), np.sign(z)])
@@ -151,6 +159,6 @@ def read_positions(where: str, path: Path, n: int) -> tuple[Floats, Floats]:
             f"{where}.positions: {path}: seen {table.flat[np.abs(table).argmax()]:g}, wanted "
             f"numbers between -{LARGEST_NUMBER:g} and {LARGEST_NUMBER:g}"
         )
-    length = np.linalg.norm(table[:, 3:], axis=1, keepdims=True)
-    normal = np.where(length > 0, table[:, 3:] / np.where(length > 0, length, 1), [0.0, 0.0, 1.0])
-    return table[:, :3], normal
+    normal = table[:, 3:]
+    normal[~normal.any(axis=1)] = [0.0, 0.0, 1.0]
+    return table[:, :3], unit_vectors(normal)

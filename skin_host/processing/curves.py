@@ -126,15 +126,18 @@ class TableCurve:
     Args:
         table_kpa: float64[n, k], rising from 0.
         beyond_units: float64[n], activation up to which the curve was measured.
+        sound: bool[n], see the attribute; without it, all.
 
     Attributes:
+        sound: bool[n], which curves are those of their taxels, see `PressureCurve`.
         linear: float64[n], kPa per unit below zero.
         straight_kpa: float64[n], pressure up to which the curve goes on like that.
         beyond_units: float64[n], activation up to which the curve was measured.
     """
 
-    def __init__(self, table_kpa: Floats, beyond_units: Floats) -> None:
+    def __init__(self, table_kpa: Floats, beyond_units: Floats, sound: Mask | None = None) -> None:
         n, knots = table_kpa.shape
+        self.sound: Mask = np.ones(n, np.bool_) if sound is None else sound
         self._row = np.arange(n)
         #: Where each piece ends, filled up for a search by halves.
         self._end_kpa = np.full((n, 2 * HALF_KNOTS), np.inf)
@@ -160,6 +163,7 @@ class TableCurve:
         chosen.beyond_units = self.beyond_units[taxels]
         chosen.linear = self.linear[taxels]
         chosen.straight_kpa = self.straight_kpa[taxels]
+        chosen.sound = self.sound[taxels]
         return chosen
 
     def kpa(self, units: ArrayLike) -> Floats:
@@ -225,8 +229,11 @@ def with_own(common: PressureCurve, curves: Curves) -> Curve:
     own = curves.own
     if not own.any():
         return common
-    table = np.where(own[:, np.newaxis], curves.kpa, common.kpa(KNOTS_UNITS[:, np.newaxis]).T)
-    return TableCurve(rising(table), np.where(own, curves.beyond_units, common.beyond_units))
+    finite: Mask = np.asarray(np.isfinite(curves.kpa).all(axis=1))
+    table = common.kpa(KNOTS_UNITS[:, np.newaxis]).T
+    table = np.where((own & finite)[:, np.newaxis], curves.kpa, table)
+    beyond_units = np.where(own, curves.beyond_units, common.beyond_units)
+    return TableCurve(rising(table), beyond_units, np.where(own, finite, common.sound))
 
 
 class Reader(Protocol):

@@ -229,9 +229,13 @@ class _Rules(NamedTuple):
         if curves is not None:
             # Some seconds at rest show less noise than a whole recording under pressure.
             spread = np.where(curves.own, np.fmax(spread, curves.noise_units), spread)
-        found = levels(above, spread, settings.touch)
-        # A reading ends at 0: a larger threshold would leave a pressed taxel untouched.
-        unreached = usable & (found.decides > layout.no_load - calibration.baseline)
+        known = np.isfinite(above) & np.isfinite(spread)
+        found = levels(np.where(known, above, 0.0), np.where(known, spread, 0.0), settings.touch)
+        # A reading ends at 0: a larger threshold would leave a pressed taxel untouched. So would a
+        # curve that does not rise, and a noise that is no number.
+        reached = found.decides <= layout.no_load - calibration.baseline
+        reached &= known & curve.sound
+        unreached = usable & ~reached
         return cls(settings, usable & ~unreached, unreached, curve, curves, found)
 
     def part(self, mine: slice) -> "_Rules":
@@ -665,7 +669,8 @@ class _PartPipeline:
             curve, c = self._curve.part(far), kpa[far]
             # Below zero the bytes are converted by the parabola, too.
             below = np.minimum(c, 0.0)
-            root = np.sqrt(curve.linear**2 + 4.0 * curve.square * below)
+            # A parabola that bends up has no activation for pressures below its vertex.
+            root = np.sqrt(np.maximum(curve.linear**2 + 4.0 * curve.square * below, 0.0))
             units[far] = np.where(c < 0.0, 2.0 * below / (curve.linear + root), curve.units(c))
         return units
 

@@ -13,6 +13,12 @@ B_KPA_PER_FF = 0.8141
 #: Equation (1) turns back at its vertex. From this share of the vertex's pressure on, its tangent
 #: is used, and the reading counts as beyond the calibrated range.
 TANGENT_FROM = 0.9
+#: Of a taxel that feels: one unit is so many kPa at rest. Real ones have 0.01 to 100.
+SLOPES_KPA = (1e-6, 1e6)
+#: Its square term is at most these shares of its linear one at one unit: a curve that turns back
+#: before half a unit measures no pressure, and one that bends up more has no activation for what
+#: the foam keeps of a press.
+BENDS = (-1.0, 0.05)
 
 
 def vertex(square: ArrayLike, linear: ArrayLike) -> Array:
@@ -21,6 +27,14 @@ def vertex(square: ArrayLike, linear: ArrayLike) -> Array:
     bent = bend < 0.0
     turn = -np.asarray(linear, dtype=np.float64) / np.where(bent, 2.0 * bend, 1.0)
     return np.where(bent, turn, np.inf)
+
+
+def _is_sound(square: Array, linear: Array) -> NDArray[np.bool_]:
+    (least, most), (down, up) = SLOPES_KPA, BENDS
+    rises = (linear >= least) & (linear <= most)
+    # Compared this way round, a number that is none is not sound.
+    sound: NDArray[np.bool_] = rises & (square >= down * linear) & (square <= up * linear)
+    return sound
 
 
 class PressureCurve:
@@ -34,6 +48,8 @@ class PressureCurve:
         square, linear: coefficients [n] of the activation in units: C = square x^2 + linear x.
         beyond_units: activation [n] where the calibrated range ends; inf where a >= 0.
         tail_slope: kPa per unit [n] of the continuation.
+        sound: bool[n], which curves are finite and rise with every unit. The others are flat, so
+            nothing is known of what such a taxel feels.
     """
 
     def __init__(
@@ -49,8 +65,11 @@ class PressureCurve:
         )
         if np.any(unit < 0.0) or np.any(factor <= 0.0) or np.any(slope <= 0.0):
             raise ValueError("unit_ff must not be negative; gain and b must be positive")
-        self.square: Array = factor * curve * unit**2
-        self.linear: Array = factor * slope * unit
+        with np.errstate(over="ignore", invalid="ignore"):
+            square, linear = factor * curve * unit**2, factor * slope * unit
+        self.sound: NDArray[np.bool_] = _is_sound(square, linear)
+        self.square: Array = np.where(self.sound, square, 0.0)
+        self.linear: Array = np.where(self.sound, linear, 0.0)
         bent = self.square < 0.0
         self.beyond_units: Array = np.full(unit.shape, np.inf)
         vertex_units = vertex(self.square, self.linear)[bent]
@@ -64,6 +83,7 @@ class PressureCurve:
         chosen.linear = self.linear[taxels]
         chosen.beyond_units = self.beyond_units[taxels]
         chosen.tail_slope = self.tail_slope[taxels]
+        chosen.sound = self.sound[taxels]
         return chosen
 
     def kpa(self, units: ArrayLike) -> Array:

@@ -57,6 +57,12 @@ def ends():
     theirs.shutdown()
 
 
+@pytest.mark.parametrize("opening", [open_port, lambda *bus: socketcan.open_present(*bus[:2])])
+def test_a_channel_with_a_zero_byte_is_no_interface(opening):
+    with pytest.raises(BusError, match="no such network interface"):
+        opening("left", Bus(channel="a\0"), SMALL)
+
+
 def test_a_read_takes_everything_that_waits_in_order(ends):
     ours, theirs = ends
     port = port_on(ours)

@@ -1,14 +1,27 @@
 """What is wrong in a configuration file is said with its place."""
 
+import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, get_args, get_type_hints
 
+import msgspec
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from skin_host.cli import main
-from skin_host.config.settings import format_triangles, load, parse_triangles, skin_hash
+from skin_host.config.settings import (
+    Settings,
+    changed,
+    format_triangles,
+    load,
+    parse_triangles,
+    skin_hash,
+)
 from skin_host.errors import ConfigurationError
+from skin_host.importing import configuration_text
 from skin_host.layout import build_layout
 
 DEMO = Path(__file__).parents[2] / "config" / "demo.toml"
@@ -24,8 +37,23 @@ def edited(folder: Path, old: str, new: str) -> Path:
 
 
 TOP = 'robot = "demo"'
+LEFT = "wanted less than 1, or nothing is left of a press that lasts"
+BETWEEN = "wanted numbers between -1e+09 and 1e+09"
+OWN_KIND = """
+[kinds.row]
+about = "twelve in a row"
+pads_mm = [[0, 0], [5, 0], [9, 0], [15, 0], [20, 0], [25, 0],
+    [0, 5], [5, 5], [9, 5], [15, 5], [20, 5], [25, 5]]
+pitch_mm = 5
+radius_mm = 2
+area_mm2 = 18
+outline_mm = [[0, 0], [20, 0], [0, 20]]
+"""
 PATCH = "parts.left_hand.patches[1]"
 TIP = 'fingertips.tip]\nbus = "can0"\naddress = 3\nshape = '
+TIP_S = "fingertips.tip."
+DEPENDENT = "its first three rows give no force in some direction; wanted independent rows"
+REACHED = "the force that is measured in every direction, by full_scale and matrix"
 
 
 @pytest.mark.parametrize(
@@ -51,11 +79,21 @@ TIP = 'fingertips.tip]\nbus = "can0"\naddress = 3\nshape = '
             "normal = [0, 1]",
             f"{PATCH}.places[0].normal: seen 2, wanted `array` of length 3",
         ),
-        ("x_mm = -25", "x_mm = nan", f"{PATCH}.places[0].x_mm: seen nan, wanted a finite number"),
+        ("x_mm = -25", "x_mm = nan", f"{PATCH}.places[0].x_mm: seen nan, wanted `float` >= {-1e6}"),
         (
             "x_mm = -25",
             "x_mm = 1e308",
-            f"{PATCH}.places[0].x_mm: seen 1e+308, wanted a number between -1e+09 and 1e+09",
+            f"{PATCH}.places[0].x_mm: seen 1e+308, wanted `float` <= {1e6}",
+        ),
+        (
+            "x_mm = -25",
+            "turn_deg = nan",
+            f"{PATCH}.places[0].turn_deg: seen nan, wanted a finite number",
+        ),
+        (
+            "x_mm = -25",
+            "turn_deg = 1e308",
+            f"{PATCH}.places[0].turn_deg: seen 1e+308, wanted a number between -1e+09 and 1e+09",
         ),
         (
             'bus = "can0"',
@@ -87,7 +125,7 @@ TIP = 'fingertips.tip]\nbus = "can0"\naddress = 3\nshape = '
         (
             TOP,
             f"{TOP}\n[processing.calibration]\nseconds = -1",
-            "processing.calibration.seconds: seen -1, wanted `float` > 0.0",
+            "processing.calibration.seconds: seen -1, wanted `float` >= 0.001",
         ),
         (
             TOP,
@@ -98,6 +136,31 @@ TIP = 'fingertips.tip]\nbus = "can0"\naddress = 3\nshape = '
             TOP,
             f"{TOP}\n[processing.relaxation]\nbeta = [0.1]",
             "processing.relaxation: `beta` and `tau_s` go together",
+        ),
+        (
+            TOP,
+            f"{TOP}\n[processing.relaxation]\nbeta = [0.1]\ntau_s = [1, 2]",
+            "processing.relaxation: the lists of parameters differ in length",
+        ),
+        (
+            TOP,
+            f"{TOP}\n[processing.relaxation]\nbeta = [0.5, 0.5]\ntau_s = [1, 2]",
+            f"processing.relaxation: `beta`: the shares sum to 1; {LEFT}",
+        ),
+        (
+            TOP,
+            f"{TOP}\nmqtt.frame_hz = 1e-300",
+            "mqtt.frame_hz: seen 1e-300, wanted 0 or at least 0.001",
+        ),
+        (
+            '"8-11"',
+            f'"{"9" * 5000}"',
+            f'{PATCH}.triangles: "{"9" * 40} ...": a board has triangles 0 to 15',
+        ),
+        (
+            "x_mm = -25",
+            f"x_mm = {'9' * 5000}",
+            f"not TOML: holds a number of thousands of digits; {BETWEEN}",
         ),
         (
             TOP,
@@ -128,6 +191,27 @@ TIP = 'fingertips.tip]\nbus = "can0"\naddress = 3\nshape = '
             TOP,
             f'{TOP}\n[{TIP}"plane"\nfilter_hz = 100',
             "fingertips.tip.filter_hz: 100; wanted below 100, half of the samples' rate",
+        ),
+        (TOP, f'{TOP}\n[{TIP}"plane"\nmatrix = {[[0] * 6] * 6}', f"{TIP_S}matrix: {DEPENDENT}"),
+        (
+            TOP,
+            f'{TOP}\n[{TIP}"plane"\nmatrix = {[[1, 0, 0, 0, 0, 0]] * 6}',
+            f"{TIP_S}matrix: {DEPENDENT}",
+        ),
+        (
+            TOP,
+            f'{TOP}\n[{TIP}"plane"\nthreshold_n = 150\nover_n = 200\nfull_scale = {[100] * 6}',
+            f"{TIP_S}threshold_n: 150; wanted at most 99.9969, {REACHED}",
+        ),
+        (
+            TOP,
+            f'{TOP}\n[{TIP}"plane"\nfull_scale = {[1e-6] * 6}',
+            f"{TIP_S}threshold_n: 0.2; wanted at most 9.99969e-07, {REACHED}",
+        ),
+        (
+            TOP,
+            f'{TOP}\n[{TIP}"plane"\nmatrix = {np.diag([1e-6] * 6).tolist()}',
+            f"{TIP_S}threshold_n: 0.2; wanted at most 0.065533, {REACHED}",
         ),
         (
             TOP,
@@ -169,12 +253,147 @@ def test_what_would_only_fail_later_is_refused_by_the_check(
     assert said in line
 
 
-def test_what_a_channel_is_called_does_not_steer_the_terminal(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def written(folder: Path, key: str, value: object) -> Path:
+    """The demo's configuration and a kind, with one key of another value."""
+    path = folder / "robot.toml"
+    path.write_text(DEMO.read_text() + OWN_KIND)
+    path.write_text(configuration_text(changed(load(path), {key: value})))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("kinds.row.radius_mm", 1e-100),
+        ("kinds.row.radius_mm", 1e-5),
+        ("kinds.row.pitch_mm", 1e8),
+        ("kinds.row.area_mm2", 1e-320),
+        ("parts.left_hand.foam_mm", 1e-308),
+        ("processing.calibration.seconds", 1e8),
+        ("processing.pressure.pad_radius_mm", 1e-200),
+        ("processing.pressure.foam_mm", 1e-160),
+        ("processing.pressure.b_kpa_per_ff", 1e-300),
+        ("processing.pressure.a_kpa_per_ff2", -1e8),
+        ("processing.pressure.code_ff", 1e-300),
+        ("processing.pressure.smoothing_s", 1e8),
+        ("processing.relaxation.update_s", 1e8),
+        ("processing.touch.hysteresis_units", 256),
+        ("processing.touch.move_hz", 1e-9),
+        ("processing.drift.rate_units_per_s", 1e8),
+        ("processing.drift.gain_per_s", 1e8),
+        ("receive.silent_periods", 1e-9),
+        ("buses.can0.bitrate", 0),
+    ],
+)
+def test_a_number_that_would_make_the_skin_deaf_or_its_computation_overflow_is_refused(
+    tmp_path: Path, key: str, value: float
 ) -> None:
-    path = edited(tmp_path, 'channel = "skin-demo"', 'channel = "\\u001b[2J"')
-    assert main(["check", str(path)]) == 0
-    assert "\x1b" not in capsys.readouterr().out
+    path = written(tmp_path, key, value)
+    with pytest.raises(ConfigurationError, match=f"{key}: seen .*, wanted `(float|int)` [<>]= "):
+        load(path)
+
+
+def test_each_number_of_a_configuration_has_a_range() -> None:
+    """But for directions, angles and matrices, which may be any finite number."""
+    without = {
+        key.rpartition(".")[2]
+        for key, hint in numbers(Settings)
+        if not re.search(r"\b(ge|gt|le|lt)=", hint)
+    }
+    assert without == {"turn_deg", "normal", "matrix", "options", "thermal"}
+
+
+def numbers(table: type[msgspec.Struct], where: str = "") -> Iterator[tuple[str, str]]:
+    """Each key of a configuration that holds numbers, and how its type is written."""
+    for name, hint in get_type_hints(table, include_extras=True).items():
+        inner = [one for one in flat(hint) if isinstance(one, type)]
+        for struct in inner:
+            if issubclass(struct, msgspec.Struct):
+                yield from numbers(struct, f"{where}{name}.")
+        if {int, float} & set(inner):
+            yield f"{where}{name}", str(hint)
+
+
+def flat(hint: Any) -> Iterator[Any]:
+    """What a type consists of."""
+    yield hint
+    for one in get_args(hint):
+        yield from flat(one)
+
+
+@pytest.mark.parametrize(
+    ("key", "text"),
+    [
+        ("buses.can0.channel", "a\0"),
+        ("buses.can0.interface", "\x1b[2J"),
+        ("buses.can0.options", "a\0"),
+        ("kinds.row.about", "a\u202eb"),
+        ("processing.relaxation.file", "r\0.json"),
+        ("mqtt.host", "a\x1b[31m"),
+        ("mqtt.username", "a\rb"),
+        ("mqtt.ca_file", "a\nb"),
+        ("service.state_directory", "a\x9bb"),
+    ],
+)
+def test_text_that_cannot_be_printed_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], key: str, text: str
+) -> None:
+    path = written(tmp_path, key, {"app": text} if key.endswith("options") else text)
+    assert main(["check", str(path)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.isprintable()
+    assert f" {key}: seen " in line or f" {key}[...]: seen " in line
+    assert "of characters that can be printed" in line
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"robot.{'a.' * 3000}a = 1",
+        f"{TOP}\n[buses.can0]\noptions.{'a.' * 3000}a = 1",
+        f"{TOP}\n[{'x.' * 3000}y]\nz = 1",
+        f"{TOP}\nx = {'[' * 500}{']' * 500}",
+        f"{TOP}\nx = {'[' * 50}{']' * 50}",
+    ],
+)
+def test_a_document_that_is_nested_too_deep_is_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str
+) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text(text)
+    assert main(["check", str(path)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "nested too deep" in line
+    assert len(line) < 300
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"beta": [0.1]}, "the lists of parameters differ in length"),
+        ({"beta": [0.6, 0.6]}, "`beta`: the shares sum to 1.2; wanted less than 1"),
+        ({"beta_unload": [0.6, 0.6]}, "`beta_unload`: the shares sum to 1.2"),
+        ({"beta": [], "tau_s": []}, "`array` of length >= 1"),
+        ({"beta": [1e300, 0.1]}, "`float` <= 1.0"),
+        ({"tau_s": [1e-300, 1.0]}, "`float` >= 0.001"),
+        ({"tau_unload_s": [1.0, 1e308]}, "`float` <= 1000000000.0"),
+    ],
+)
+def test_the_numbers_of_a_file_of_a_foam_are_checked_as_those_of_a_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: dict[str, object], said: str
+) -> None:
+    foam: dict[str, object] = {"schema": "skin.relaxation/1", "model": "asymmetric"}
+    foam |= {"beta": [0.1, 0.2], "tau_s": [1, 9], "beta_unload": [0.1, 0.2], "tau_unload_s": [1, 9]}
+    file = tmp_path / "foam.json"
+    file.write_bytes(msgspec.json.encode(foam))
+    path = edited(tmp_path, TOP, f'{TOP}\n[processing.relaxation]\nfile = "foam.json"')
+    assert load(path).processing.relaxation.beta == [0.1, 0.2]
+    file.write_bytes(msgspec.json.encode(foam | change))
+    assert main(["check", str(path)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"processing.relaxation.file: {file}: " in line
+    assert said in line
+    assert line.endswith("make one with: skin calibrate CONFIG --relaxation LOG")
 
 
 def test_what_is_not_toml_is_named_with_its_line(tmp_path: Path) -> None:

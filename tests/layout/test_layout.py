@@ -1,6 +1,7 @@
 """Where taxels lie, who their neighbours are, and what a bad layout is told."""
 
 import os
+import re
 from pathlib import Path
 
 import msgspec
@@ -9,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skin_host.config.settings import PlaceSettings, Settings
+from skin_host.config.settings import PlaceSettings, Settings, changed
 from skin_host.errors import ConfigurationError
 from skin_host.layout import Layout, PadKind, build_layout, builtin_kinds
 from skin_host.layout.geometry import NEIGHBOUR_PITCHES, fitted_outline, lay, tile
@@ -290,9 +291,68 @@ def test_a_bad_kind_is_named(change: dict[str, object], said: str) -> None:
         ({"kind": "palml"}, '.triangles: 1 triangles; "palml" takes them by 4'),
         ({"places": [{}, {}]}, ".places: 2 places for 1 units"),
         ({"places": [{"normal": [0, 0, 0]}]}, ".places[0]: normal: [0.0, 0.0, 0.0]"),
+        ({"kind": "row"}, ": one unit of its taxels' byte is 9.53e+06 fF of a pad"),
     ],
 )
 def test_a_patch_that_cannot_be_laid_out_is_named(patch: dict[str, object], said: str) -> None:
+    tiny = KIND | {"radius_mm": 0.001}
     with pytest.raises(ConfigurationError) as caught:
-        build_layout(skin({"triangles": "0", **patch}), HERE)
+        build_layout(skin({"triangles": "0", **patch}, kinds={"row": tiny}), HERE)
     assert str(caught.value).startswith(f"parts.arm.patches[0]{said}")
+
+
+@pytest.mark.parametrize(
+    ("pressure", "wanted"),
+    [
+        ({"a_kpa_per_ff2": -9.0}, "1.23e-06 to 0.0905 fF"),
+        ({"a_kpa_per_ff2": 1.0}, "1.23e-06 to 0.0407 fF"),
+        ({"a_kpa_per_ff2": 0.0, "code_ff": 1e6}, "1.23e-06 to 1.23e+06 fF"),
+    ],
+)
+def test_a_curve_that_does_not_rise_with_each_unit_is_refused(
+    pressure: dict[str, float], wanted: str
+) -> None:
+    settings = skin({"triangles": "0"}, processing={"pressure": pressure})
+    with pytest.raises(ConfigurationError, match=re.escape(f"wanted {wanted}, where equation")):
+        build_layout(settings, HERE)
+
+
+def test_a_curve_that_bends_more_than_it_rises_is_refused() -> None:
+    settings = skin({"triangles": "0"}, processing={"pressure": {"b_kpa_per_ff": 1e-6}})
+    with pytest.raises(ConfigurationError, match=r"^processing\.pressure: a_kpa_per_ff2 -0\.0011"):
+        build_layout(settings, HERE)
+
+
+@pytest.mark.parametrize("shift", range(9))
+@pytest.mark.parametrize("kind", ["triangle", "fingertip", "fingertip_mid"])
+@pytest.mark.parametrize("foam_mm", [0.5, 3.0, 5.0])
+def test_each_shift_of_a_board_is_permitted_on_usual_foam(
+    kind: str, shift: int, foam_mm: float
+) -> None:
+    settings = skin({"triangles": "0", "kind": kind, "shift": shift})
+    layout = build_layout(changed(settings, {"parts.arm.foam_mm": foam_mm}), HERE)
+    assert layout.n_taxels == 12
+
+
+@pytest.mark.parametrize("length", [1e-320, 1e-200, 1.0, 1e9])
+def test_only_the_direction_of_a_normal_counts(tmp_path: Path, length: float) -> None:
+    place = {"normal": [0.0, length, 0.0]}
+    layout = build_layout(skin({"triangles": "0", "places": [place]}), HERE)
+    assert layout.normal == pytest.approx(np.tile([0.0, 1.0, 0.0], (12, 1)))
+    rows = np.tile([0.0, 0.0, 0.0, min(length, 1e6), 0.0, 0.0], (12, 1))
+    write_rows(tmp_path / "arm.txt", rows)
+    layout = build_layout(skin({"triangles": "0", "positions": "arm.txt"}), tmp_path)
+    assert layout.normal == pytest.approx(np.tile([1.0, 0.0, 0.0], (12, 1)))
+
+
+def test_a_part_without_a_pressure_pad_is_refused_and_a_triangle_without_one_is_not() -> None:
+    """It would have no contact state, and nothing would be felt there."""
+    thermal = {"thermal": KIND | {"thermal": list(range(12))}}
+    patch: dict[str, object] = {"triangles": "1", "kind": "thermal"}
+    with pytest.raises(ConfigurationError) as caught:
+        build_layout(skin(patch, kinds=thermal), HERE)
+    assert str(caught.value) == (
+        "parts.arm: all of its pads are thermal; wanted one at least that measures pressure"
+    )
+    layout = build_layout(skin({"triangles": "0"}, patch, kinds=thermal), HERE)
+    assert np.count_nonzero(layout.pad_kind == PadKind.THERMAL) == 12

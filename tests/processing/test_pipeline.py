@@ -13,6 +13,7 @@ from skin_host.evaluation.rig import Rig, flat_skin
 from skin_host.layout import PadKind, build_layout
 from skin_host.processing.calibration import Verdict
 from skin_host.processing.calibration.calibrator import Calibrator
+from skin_host.processing.curves import KNOTS_UNITS, Curves, CurveVerdict
 from skin_host.processing.pipeline import Pipeline
 from skin_host.processing.pressure import PressureCurve
 
@@ -114,6 +115,85 @@ def test_a_saturated_taxel_says_that_it_is_beyond_its_range():
     assert frame.beyond_range[0]
     assert frame.pressure_kpa[0] > 131.0
     assert not frame.beyond_range[1:].any()
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"bend": 1e4}, {"gain": 1e-30}, {"gain": np.inf}, {"bend": np.nan}]
+)
+def test_a_taxel_whose_curve_does_not_rise_is_unreached_and_not_valid(wrong):
+    """Read as untouched, a press on it would be denied."""
+    rig = Rig(1, 0.3)
+    values = {name: np.ones(rig.n) for name in ("gain", "bend")}
+    for name, value in wrong.items():
+        values[name][:3] = value
+    pipeline = Pipeline(rig.layout, rig.settings.processing, replace(rig.calibration, **values))
+    activation = np.where(np.arange(rig.n) < 6, 30.0, 0.0)
+    rig.pipeline = pipeline
+    for _ in range(60):
+        frame = rig.step(activation)
+    assert np.flatnonzero(pipeline.unreached).tolist() == [0, 1, 2]
+    assert np.flatnonzero(~frame.valid).tolist() == [0, 1, 2]
+    assert np.flatnonzero(frame.touched).tolist() == [3, 4, 5]
+    assert np.isfinite(frame.pressure_kpa).all()
+    assert 0.0 < pipeline.decides_kpa(0) < 10.0
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_a_taxel_whose_own_curve_is_not_finite_is_unreached_and_not_valid(wrong):
+    rig = Rig(1, 0.3)
+    knots = np.tile(CURVE.kpa(KNOTS_UNITS[:, np.newaxis])[:, 0], (rig.n, 1))
+    knots[:3, 40:] = wrong
+    curves = Curves(
+        knots,
+        np.full(rig.n, 80.0),
+        np.full(rig.n, 0.3),
+        np.full(rig.n, 1.0),
+        np.full(rig.n, CurveVerdict.GOOD, np.uint8),
+        80.0,
+        0.0,
+    )
+    own = replace(rig.calibration, curves=curves)
+    rig.pipeline = pipeline = Pipeline(rig.layout, rig.settings.processing, own)
+    for _ in range(60):
+        frame = rig.step(np.where(np.arange(rig.n) < 6, 30.0, 0.0))
+    assert np.flatnonzero(pipeline.unreached).tolist() == [0, 1, 2]
+    assert np.flatnonzero(~frame.valid).tolist() == [0, 1, 2]
+    assert np.flatnonzero(frame.touched).tolist() == [3, 4, 5]
+    assert np.isfinite(frame.pressure_kpa).all()
+
+
+@pytest.mark.parametrize("noise", [np.nan, np.inf])
+def test_a_taxel_that_would_decide_at_no_number_is_unreached(noise):
+    rig = Rig(1, 0.3)
+    spread = rig.calibration.spread.copy()
+    spread[4] = noise
+    loud = replace(rig.calibration, spread=spread)
+    pipeline = Pipeline(rig.layout, rig.settings.processing, loud)
+    assert np.flatnonzero(pipeline.unreached).tolist() == [4]
+    assert np.isfinite(pipeline.decides_kpa(0))
+
+
+@pytest.mark.parametrize(
+    "pressure",
+    [
+        {"a_kpa_per_ff2": -0.28},
+        {"a_kpa_per_ff2": 0.014},
+        {"code_ff": 1e-4},
+        {"a_kpa_per_ff2": 0.0, "b_kpa_per_ff": 1e-6},
+        {"a_kpa_per_ff2": 0.0, "b_kpa_per_ff": 3e5},
+        {"a_kpa_per_ff2": 0.0, "code_ff": 9e4},
+    ],
+)
+def test_a_press_begins_and_ends_at_the_ends_of_what_a_configuration_permits(pressure):
+    rig = Rig(1, 0.3, processing={"pressure": pressure})
+    frames = press(rig, 20.0, 200)
+    assert frames[5].touched[:6].all()
+    assert frames[-1].touched[:6].all()
+    assert not frames[-1].touched[6:].any()
+    frames += press(rig, 0.0, 500)
+    assert not frames[-1].touched.any()
+    assert all(np.isfinite(frame.pressure_kpa).all() for frame in frames)
+    assert frames[-1].valid.all()
 
 
 def test_thermal_pads_are_no_taxels():

@@ -59,3 +59,28 @@ def test_each_taxel_has_its_own_curve():
 def test_impossible_curves_are_refused(wrong):
     with pytest.raises(ValueError, match="positive"):
         PressureCurve(2.88, **wrong)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"unit_ff": 1e-300},
+        {"unit_ff": 1e300},
+        {"unit_ff": np.nan},
+        {"gain": np.inf},
+        {"gain": 1e-100},
+        {"a": -1.0},
+        {"a": 1.0},
+        {"a": np.nan},
+        {"b": 1e-300},
+    ],
+)
+def test_a_curve_that_is_not_finite_and_rising_is_not_sound_and_is_flat(wrong):
+    coefficients = {"unit_ff": 2.88, "gain": 1.0, "a": -0.001132, "b": 0.8141}
+    two = {key: np.array([value, wrong.get(key, value)]) for key, value in coefficients.items()}
+    curve = PressureCurve(**two)
+    assert curve.sound.tolist() == [True, False]
+    assert curve.part(np.array([1])).sound.tolist() == [False]
+    assert curve.kpa([255.0, 255.0])[0] == CURVE.kpa(255.0)[0]
+    assert curve.kpa([255.0, 255.0])[1] == 0.0
+    assert np.isfinite(curve.units([9.0, 9.0])).all()
