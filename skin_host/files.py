@@ -4,23 +4,30 @@ import contextlib
 import errno
 import fcntl
 import logging
+import math
 import os
 import secrets
+import select
 import signal
 import stat
+import time
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import IO, Protocol, TypeVar
 
 import msgspec
 
-from skin_host.errors import BusyFileError, NewerFileError, SkinError
+from skin_host.errors import BusyFileError, NewerFileError, RequestError, SkinError
 
 log = logging.getLogger(__name__)
 
 #: No valid document is larger: a calibration of 100 000 taxels has 20 MB.
 MAX_DOCUMENT_BYTES = 64 * 1024 * 1024
+#: What does not state its size, as a pipe or a device, is read for so long.
+PATIENCE_S = 10.0
+#: As many links as the system itself follows from one name.
+_MOST_LINKS = 40
 
 
 class _WithSchema(Protocol):
@@ -39,8 +46,9 @@ def read_whole(path: Path, most_bytes: int = MAX_DOCUMENT_BYTES) -> bytes:
     """Read a file that somebody names, whatever it is: a device without end, a pipe, a file that
     grows.
 
-    A named pipe that nobody has open for writing is refused, not waited for. A file that another
-    program is writing is refused, because half of it may look like a whole one.
+    A named pipe that nobody has open for writing is refused, not waited for. What does not state
+    its size is waited for until its end, but no longer than `PATIENCE_S` altogether. A file that
+    another program is writing is refused, because half of it may look like a whole one.
 
     Args:
         path: of the file.
@@ -48,38 +56,61 @@ def read_whole(path: Path, most_bytes: int = MAX_DOCUMENT_BYTES) -> bytes:
             `MAX_DOCUMENT_BYTES` are read.
 
     Raises:
-        OSError: the file cannot be read, or is larger; `strerror` is the reason.
+        OSError: the file cannot be read, is larger, or does not end in time; `strerror` is the
+            reason.
         BusyFileError: another program is writing it.
     """
-
-    def at_once(name: str, flags: int) -> int:
-        return os.open(name, flags | os.O_NONBLOCK)
-
     try:
-        file = open(path, "rb", opener=at_once)  # noqa: SIM115
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     except ValueError as error:  # a zero byte in the name
         raise OSError(errno.EINVAL, str(error), str(path)) from None
-    with file:
-        os.set_blocking(file.fileno(), True)
-        status = os.fstat(file.fileno())
-        if stat.S_ISREG(status.st_mode):
-            _refuse_busy(path, file.fileno())
+    try:
+        status = os.fstat(descriptor)
+        is_regular = stat.S_ISREG(status.st_mode)
+        if stat.S_ISDIR(status.st_mode):
+            raise OSError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        if is_regular:
+            _refuse_busy(path, descriptor)
         else:
             most_bytes = min(most_bytes, MAX_DOCUMENT_BYTES)
         # What states its size is refused unread; the rest is read up to the limit.
         left = most_bytes + 1 if status.st_size <= most_bytes else 0
         pieces = []
-        while left and (piece := file.read(min(left, _PIECE_BYTES))):
+        # The system's own files of /proc claim to be regular and empty, also the endless ones.
+        states_size = is_regular and status.st_size > 0
+        end_s = math.inf if states_size else time.monotonic() + PATIENCE_S
+        while left and (piece := _piece(path, descriptor, min(left, _PIECE_BYTES), end_s)):
             pieces.append(piece)
             left -= len(piece)
-        after = os.fstat(file.fileno())
-    if stat.S_ISREG(status.st_mode) and _version(after) != _version(status):
+        after = os.fstat(descriptor)
+    finally:
+        os.close(descriptor)
+    if is_regular and _version(after) != _version(status):
         raise _busy(path)
     if stat.S_ISFIFO(status.st_mode) and not pieces:
         raise OSError(errno.ENODATA, "a pipe that nobody writes to", str(path))
     if not left:
         raise OSError(errno.EFBIG, f"larger than {most_bytes} bytes", str(path))
     return b"".join(pieces)
+
+
+def _piece(path: Path, descriptor: int, most_bytes: int, end_s: float) -> bytes:
+    """Return the next bytes of what is open without waiting, none at its end; wait until `end_s`.
+
+    Raises:
+        OSError: it cannot be read, or the time is over.
+    """
+    while True:
+        left_s = end_s - time.monotonic()
+        if left_s <= 0:
+            why = f"it did not end within {PATIENCE_S:g} s"
+            raise OSError(errno.ETIMEDOUT, why, str(path))
+        try:
+            return os.read(descriptor, most_bytes)
+        except BlockingIOError:
+            waiting = select.poll()
+            waiting.register(descriptor, select.POLLIN)
+            waiting.poll(min(left_s, PATIENCE_S) * 1e3)
 
 
 def why_unreadable(path: Path) -> str | None:
@@ -165,6 +196,8 @@ def refuse_newer(path: Path, schema: str, what: str) -> None:
         BusyFileError: another program is writing it.
     """
     try:
+        if not path.is_file():
+            return
         data = read_whole(path)
     except OSError:
         return
@@ -253,19 +286,41 @@ def on_disk(disk: Disk) -> Iterator[None]:
 
 
 def write_document(path: Path, document: object) -> None:
-    """Replace `path` by a document as indented JSON; see `write_atomic`."""
-    write_atomic(path, msgspec.json.format(msgspec.json.encode(document), indent=1) + b"\n")
+    """Replace `path` by a document as indented JSON, in one step that survives a crash.
 
-
-def write_atomic(path: Path, data: bytes) -> None:
-    """Replace `path` by `data` in one step that survives a crash at any moment.
-
-    The bytes go to a temporary file in the same folder, are forced to disk, and
-    then take the name. Missing parent folders are made.
+    For what the program keeps under names of its own: whatever has the name is replaced, a link or
+    a pipe that somebody may have put there, too. Missing parent folders are made.
 
     Raises:
         OSError: the folder is read-only, the disk is full, ...; `path` is then unchanged.
     """
+    with _naming(path):
+        _replace(path, msgspec.json.format(msgspec.json.encode(document), indent=1) + b"\n")
+
+
+def write_atomic(path: Path, data: bytes) -> None:
+    """Write `data` where a user names it: a file is replaced in one step that survives a crash at
+    any moment.
+
+    The bytes go to a temporary file in the same folder, are forced to disk, and
+    then take the name. Missing parent folders are made. Links are followed to the file that they
+    name; a device, a pipe, or what this program has open (/dev/stdout) is written into.
+
+    Raises:
+        OSError: `path` is a folder, the folder is read-only, the disk is full, ...; a file is then
+            unchanged. `filename` is `path`.
+    """
+    with _naming(path):
+        end = _end_of(path)
+        file = _file_at(end)
+        if file is not None:
+            _replace(file, data)
+        else:
+            with _opened(end) as there:
+                there.write(data)
+
+
+def _replace(path: Path, data: bytes) -> None:
     disk = _disk.get() or _DISK
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = disk.create(path, data)
@@ -276,6 +331,86 @@ def write_atomic(path: Path, data: bytes) -> None:
         disk.remove(temporary)
         raise
     disk.sync(path.parent)
+
+
+def becomes_file(path: Path) -> bool:
+    """Whether what is written to `path` is a file of that name afterwards, not what a device, a
+    pipe or a descriptor has taken.
+
+    Raises:
+        OSError: `path` is a folder, or its links cannot be followed.
+    """
+    with _naming(path):
+        return _file_at(_end_of(path)) is not None
+
+
+@contextlib.contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Let errors name what the user has named, not a temporary file or the end of a link."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is None:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from None
+
+
+def _end_of(path: Path) -> Path | int:
+    """Follow the links of a name; return the last name, or the descriptor of this program that it
+    stands for, as /dev/stdout and /dev/fd/3 do.
+
+    Raises:
+        OSError: the links have no end, or another user has put one into a folder of all users.
+    """
+    own = f"/proc/{os.getpid()}/fd"
+    for _ in range(_MOST_LINKS):
+        folder = os.path.realpath(path.parent)
+        path = Path(folder, path.name)
+        try:
+            link = path.readlink()
+        except OSError:  # no link, or nothing
+            return path
+        if folder == own:
+            return int(path.name)
+        _refuse_link_of_others(path)
+        path = Path(folder, link)
+    raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
+
+
+def _refuse_link_of_others(link: Path) -> None:
+    """Where everybody may write, as in /tmp, follow only one's own links and the folder owner's.
+
+    So does the system itself, if it is set up so (fs.protected_symlinks).
+    """
+    folder, owner = link.parent.stat(), link.lstat().st_uid
+    for_all = stat.S_ISVTX | stat.S_IWOTH
+    if folder.st_mode & for_all == for_all and owner not in (os.geteuid(), folder.st_uid):
+        raise OSError(errno.EACCES, "a link of another user in a folder of all users", str(link))
+
+
+def _file_at(end: Path | int) -> Path | None:
+    """Return the regular file that is there, or can be made there; None where there is another
+    thing, which takes what is written.
+
+    Raises:
+        OSError: it is a folder, or cannot be looked at.
+    """
+    if isinstance(end, int):
+        return None
+    try:
+        mode = end.lstat().st_mode
+    except FileNotFoundError:
+        return end
+    if stat.S_ISDIR(mode):
+        raise OSError(errno.EISDIR, "it is a folder; wanted a file", str(end))
+    return end if stat.S_ISREG(mode) else None
+
+
+def _opened(end: Path | int) -> IO[bytes]:
+    """Open a device, a pipe (whose reader is waited for), or a descriptor of this program."""
+    if isinstance(end, int):
+        return os.fdopen(os.dup(end), "wb")
+    return os.fdopen(os.open(end, os.O_WRONLY | os.O_NOCTTY | os.O_NOFOLLOW), "wb")
 
 
 def growing(path: Path) -> Path:
@@ -305,26 +440,81 @@ def writing(path: Path) -> Iterator[None]:
     """Turn the error of a disk that is full, gone or read-only into one that names the file.
 
     Raises:
-        SkinError: in place of an OSError.
+        RequestError: in place of an OSError, if there is a folder of this name.
+        SkinError: in place of another OSError.
     """
     try:
         yield
     except OSError as error:
-        raise SkinError(f"{path}: cannot be written: {error.strerror}") from None
+        kind = RequestError if isinstance(error, IsADirectoryError) else SkinError
+        raise kind(f"{path}: cannot be written: {error.strerror}") from None
+
+
+class Draft:
+    """A file in progress that gets to where a user names it when it is complete, or not at all.
+
+    It lies beside the file that it replaces, links followed. Where it becomes no file, but goes
+    into a device, a pipe or what this program has open (/dev/stdout), it lies in the folder of
+    temporary files: it can be written in any order, and nobody reads half of it.
+
+    Args:
+        wanted: the name; missing parent folders are made.
+
+    Attributes:
+        path: where to write; its suffix is that of `wanted`.
+
+    Raises:
+        OSError: `wanted` is a folder, or no file can be made beside it.
+    """
+
+    def __init__(self, wanted: Path) -> None:
+        self._wanted = wanted
+        with _naming(wanted):
+            self._end = _end_of(wanted)
+            self._file = _file_at(self._end)
+            if self._file is not None:
+                self._file.parent.mkdir(parents=True, exist_ok=True)
+                self.path = growing(self._file.with_name(wanted.name))
+            else:
+                import tempfile  # which imports every way of compression
+
+                descriptor, name = tempfile.mkstemp(suffix=wanted.suffix)
+                os.close(descriptor)
+                self.path = Path(name)
+
+    def finish(self) -> None:
+        """Let it replace the wanted file, or write it into what is there.
+
+        Raises:
+            OSError: the disk is full, the file was removed, ...
+        """
+        with _naming(self._wanted):
+            if self._file is not None:
+                os.replace(self.path, self._file)
+                return
+            import shutil
+
+            with self.path.open("rb") as whole, _opened(self._end) as there:
+                shutil.copyfileobj(whole, there)
+            self.remove()
+
+    def remove(self) -> None:
+        """Remove it, if it is still in progress."""
+        self.path.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield where to write a file that appears complete or not at all.
+    """Yield where to write a file that appears complete or not at all; see `Draft`.
 
     Raises:
+        RequestError: there is a folder of this name.
         SkinError: it cannot be written.
     """
     with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = growing(path)
+        draft = Draft(path)
         try:
-            yield temporary
-            os.replace(temporary, path)
+            yield draft.path
+            draft.finish()
         finally:
-            temporary.unlink(missing_ok=True)
+            draft.remove()

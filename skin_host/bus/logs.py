@@ -417,13 +417,19 @@ def _reader(path: Path) -> "can.io.generic.MessageReader":
     from skin_host.bus.blf import BoundedBlfReader
 
     zipped = path.suffix.lower() == ".gz"
-    kind = can.io.player.MESSAGE_READERS[path.suffixes[-2 if zipped else -1].lower()]
+    kind = can.io.player.MESSAGE_READERS[_format([one.lower() for one in path.suffixes])]
     if kind is can.BLFReader:
         return BoundedBlfReader(path)
     if not issubclass(kind, can.io.generic.TextIOMessageReader):
         return can.LogReader(path)
     file = gzip.open(path) if zipped else path.open("rb")  # noqa: SIM115  # the reader closes it
     return kind(_Lines(cast(BinaryIO, file), errors="strict"))
+
+
+def _format(suffixes: list[str]) -> str:
+    """The suffix that names the format of a recording, zipped or not; empty if there is none."""
+    named = suffixes[:-1] if suffixes[-1:] == [".gz"] else suffixes
+    return named[-1] if named else ""
 
 
 def _messages(path: Path) -> Iterator[Block]:
@@ -459,11 +465,12 @@ def _check(path: Path, suffixes: list[str]) -> None:
     Raises:
         LogError: there is none.
     """
-    if ".log" not in suffixes[-2:]:
+    seen = _format(suffixes)
+    if seen != ".log":
         import can.io.player
 
         known = sorted(can.io.player.MESSAGE_READERS)
-        if not any(suffix in known for suffix in suffixes[-2:]):
+        if seen not in known:
             names = ", ".join(sorted({*known, ".mcap"}))
             raise LogError(f"{path}: unknown format of file name; known are {names}")
     open_recording(path).close()

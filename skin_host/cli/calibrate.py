@@ -109,7 +109,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     from skin_host.files import refuse_newer
     from skin_host.layout import parts_of
     from skin_host.processing import calibration as calibrations
-    from skin_host.processing.calibration.file import SCHEMA, save_calibration, with_gains_of
+    from skin_host.processing.calibration.file import SCHEMA, with_gains_of
 
     set_up_logging(arguments.verbose)
     if arguments.relaxation is not None or arguments.pressure is not None:
@@ -134,8 +134,9 @@ def _calibrate(arguments: argparse.Namespace) -> int:
         )
     finally:
         progress.close()
-    found = with_gains_of(found, path, layout)
-    save_calibration(path, found, layout)
+    if path.is_file():
+        found = with_gains_of(found, path, layout)
+    _keep(arguments, path, found, layout)
     triangles = triangle_verdicts(found, layout, parts)
     tips = {
         name: name in found.zeros
@@ -167,7 +168,22 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     return 1 if touched and arguments.strict else 0
 
 
+def _keep(
+    arguments: argparse.Namespace, path: Path, found: "Calibration", layout: "Layout"
+) -> None:
+    """Write a calibration to `path`: the node's own file, or what the user named."""
+    from skin_host.files import whole_file
+    from skin_host.processing.calibration.file import save_calibration
+
+    if arguments.output is None:
+        save_calibration(path, found, layout)
+        return
+    with whole_file(path) as growing:
+        save_calibration(growing, found, layout)
+
+
 def _relaxation(arguments: argparse.Namespace) -> int:
+    from skin_host.files import whole_file
     from skin_host.processing.pressure import PressureCurve
     from skin_host.recording import fitting
     from skin_host.recording.load_table import read_table
@@ -188,7 +204,8 @@ def _relaxation(arguments: argparse.Namespace) -> int:
     fits = fitting.fit_relaxation(record, FITTED)
     (chosen,) = [found for found in fits if found.model == model]
     path = arguments.output or arguments.config.with_suffix(".relaxation.json")
-    fitting.save_relaxation(path, chosen, settings, record)
+    with whole_file(path) as growing:
+        fitting.save_relaxation(growing, chosen, settings, record)
     if arguments.json:
         print_json(
             {
@@ -218,7 +235,6 @@ def _relaxation(arguments: argparse.Namespace) -> int:
 
 def _pressure(arguments: argparse.Namespace) -> int:
     from skin_host.daemon.calibrate import calibration_path
-    from skin_host.processing.calibration.file import save_calibration
     from skin_host.recording import fitting
 
     if (arguments.load is None) == (not arguments.levels):
@@ -232,7 +248,7 @@ def _pressure(arguments: argparse.Namespace) -> int:
     samples = _read_samples(arguments.pressure, settings, layout, arguments.seconds)
     found, fit = fitting.fit_pressures(samples, settings, layout, arguments.levels)
     path = arguments.output or calibration_path(settings, arguments.node)
-    save_calibration(path, found, layout)
+    _keep(arguments, path, found, layout)
     counts = {
         "fitted": int(fit.fitted.sum()),
         "bent": int(fit.bent.sum()),
@@ -268,7 +284,6 @@ def _course(arguments: argparse.Namespace) -> int:
 
     from skin_host.daemon.calibrate import calibration_path
     from skin_host.health.diagnosis import named
-    from skin_host.processing.calibration.file import save_calibration
     from skin_host.processing.curves import CurveVerdict
     from skin_host.recording import fitting
     from skin_host.recording.load_table import check_course, read_table
@@ -279,7 +294,7 @@ def _course(arguments: argparse.Namespace) -> int:
     samples = _read_samples(arguments.pressure, settings, layout, arguments.seconds)
     found, curves = fitting.fit_curves(samples, settings, layout, load, arguments.load)
     path = arguments.output or calibration_path(settings, arguments.node)
-    save_calibration(path, found, layout)
+    _keep(arguments, path, found, layout)
     verdicts = curve_verdicts(curves, layout)
     counts = {
         verdict.name.lower(): sum(len(taxels[verdict.name.lower()]) for taxels in verdicts.values())

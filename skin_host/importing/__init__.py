@@ -17,7 +17,7 @@ from msgspec import Struct
 from skin_host.config import settings as configuration
 from skin_host.config.settings import Patch, Settings
 from skin_host.errors import ConfigurationError
-from skin_host.files import write_atomic
+from skin_host.files import becomes_file, write_atomic, writing
 from skin_host.importing.positions import import_positions
 from skin_host.importing.report import Findings
 from skin_host.importing.skingui import import_places
@@ -122,12 +122,17 @@ def import_files(
     it may be `output` itself. Its comments are lost. `part` is what a positions file describes.
 
     Returns:
-        The files written; nothing is written if anything is wrong.
+        The files written; nothing is written if anything is wrong. A device or a pipe as `output`
+        takes the configuration and is none of them.
 
     Raises:
-        ConfigurationError: a file cannot be read, or the result is not a valid configuration.
+        ConfigurationError: a file cannot be read, or the result is not a valid configuration, or
+            is one with positions files and `output` is no file.
+        SkinError: a file cannot be written.
     """
     folder = output.parent
+    with writing(output):
+        is_file = becomes_file(output)
     base = None
     if config is not None:
         base = configuration.load(config)
@@ -148,10 +153,14 @@ def import_files(
     names = ", ".join(file.name for file in files)
     text = configuration_text(settings, f"Imported from {names} by `skin import {source}`.")
     _check(text, written, output)
-    for name, data in written.items():
-        write_atomic(folder / name, data)
-    write_atomic(output, text.encode())
-    return [output, *(folder / name for name in written)]
+    if written and not is_file:
+        raise ConfigurationError(
+            f"{output}: positions files go to a folder beside it; wanted a file"
+        )
+    for name, data in [*written.items(), (output.name, text.encode())]:
+        with writing(folder / name):
+            write_atomic(folder / name, data)
+    return [folder / name for name in [output.name, *written]] if is_file else []
 
 
 def _with_positions(settings: Settings, renamed: Callable[[str], str]) -> Settings:

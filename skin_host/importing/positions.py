@@ -24,7 +24,7 @@ from skin_host.config.settings import (
     parse_triangles,
 )
 from skin_host.errors import ConfigurationError
-from skin_host.importing.report import Findings, read_source, with_part
+from skin_host.importing.report import Findings, integer, read_source, with_part
 from skin_host.layout import TAXELS_PER_TRIANGLE, builtin_kinds
 from skin_host.layout.geometry import LARGEST_NUMBER, fit_unit
 
@@ -70,8 +70,9 @@ def read_table(path: Path, findings: Findings) -> Table:
         if not words or words[0].startswith(("#", "%", "[")):
             continue
         if words[0] == "taxel2Repr":
-            entries = re.findall(r"(?<![\w.])-?\d{1,6}(?![\w.])", line)
-            represented = np.array([int(entry) for entry in entries], np.int64)
+            entries = re.findall(r"(?<![\w.])-?[0-9]{1,6}(?![\w.])", line)
+            numbers = map(integer, entries)
+            represented = np.array([one for one in numbers if one is not None], np.int64)
         elif words[0] == "spatial_sampling":
             if words[1:] != ["taxel"]:
                 findings.dropped(

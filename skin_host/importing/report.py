@@ -1,5 +1,8 @@
-"""What imports share: reading a file, remarks with file and line, a part made from a file alone."""
+"""What imports share: reading a file and its numbers, remarks with file and line, a part made from
+a file alone.
+"""
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -12,6 +15,7 @@ from skin_host.files import read_whole
 
 #: Most remarks of a grade that are printed, and most characters of one.
 MOST, LONGEST = 100, 300
+_LONGEST_NUMBER = 12
 
 #: A file and a line of it; 0 means the file as a whole.
 Place = tuple[Path, int]
@@ -78,6 +82,18 @@ def read_source(path: Path, most_bytes: int) -> str:
         return read_whole(path, most_bytes).decode("utf-8", errors="replace")
     except OSError as error:
         raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def integer(word: str) -> int | None:
+    """A number as the robot's own readers take it: decimal, or hexadecimal with 0x.
+
+    None for any other word, and for a word longer than any number that such a file needs.
+    """
+    match = re.fullmatch(r"([+-]?)(0[xX][0-9a-fA-F]+|[0-9]+)", word[: _LONGEST_NUMBER + 1])
+    if match is None or len(word) > _LONGEST_NUMBER:
+        return None
+    value = int(match[2], 16 if match[2][:2].lower() == "0x" else 10)
+    return -value if match[1] == "-" else value
 
 
 def with_part(

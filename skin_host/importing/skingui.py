@@ -22,7 +22,7 @@ from skin_host.config.settings import (
     parse_triangles,
 )
 from skin_host.errors import ConfigurationError
-from skin_host.importing.report import Findings, read_source, with_part
+from skin_host.importing.report import Findings, integer, read_source, with_part
 from skin_host.layout import TAXELS_PER_TRIANGLE, builtin_kinds
 
 LARGEST_FILE = 1_000_000
@@ -120,7 +120,8 @@ def read_display(path: Path, findings: Findings) -> Display:
     if gains:
         findings.dropped((path, 0), f"gain {', '.join(sorted(gains))}: brightness of the display")
     part = (keys.get("robotPart") or [path.stem])[0].lower().replace(" ", "_")
-    addresses = [int(word) for word in keys.get("cardid", []) if word.isdecimal()]
+    numbers = map(integer, keys.get("cardid", []))
+    addresses = [address for address in numbers if address is not None]
     return Display(path, part, addresses, units)
 
 

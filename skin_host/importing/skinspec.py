@@ -20,7 +20,7 @@ import msgspec
 
 from skin_host.config.settings import Board, Bus, Part, Patch, Settings, format_triangles
 from skin_host.errors import ConfigurationError
-from skin_host.importing.report import Findings, Place, read_source
+from skin_host.importing.report import Findings, Place, integer, read_source
 
 #: The robot's own hosts ignore special sets beyond these numbers, with only a warning.
 HOSTS_READ_TRIANGLE_SETS = 20
@@ -54,7 +54,7 @@ class Document:
         self.groups: dict[str, list[Entry]] = {}
         self._group = ""
         self._entry: tuple[int, str] | None = None
-        self._text = ""
+        self._text: list[str] = []
         self._read()
 
     def take(self, other: "Document") -> None:
@@ -92,27 +92,28 @@ class Document:
     def _without_comments(self, text: str) -> str:
         """Blank the comments as the robot's own reader ends them: at the first -->."""
         result = []
-        rest = 0
+        rest, line = 0, 1  # of what is not read yet
         while (start := text.find("<!--", rest)) >= 0:
             result.append(text[rest:start])
             end = text.find("-->", start + 4)
-            line = text.count("\n", 0, start) + 1
+            line += text.count("\n", rest, start)
             if end < 0:
                 self.findings.odd((self.path, line), "a comment without an end; it takes the rest")
                 return "".join(result)
             inner = text.find("<!--", start + 4, end)
             if inner >= 0:
                 self.findings.odd(
-                    (self.path, text.count("\n", 0, inner) + 1),
+                    (self.path, line + text.count("\n", start, inner)),
                     f"a comment within the comment of line {line}; both end at the first -->, "
-                    f"line {text.count(chr(10), 0, end) + 1}",
+                    f"line {line + text.count(chr(10), start, end)}",
                 )
             if "triangleSetCfg" in text[start:end]:
                 self.findings.odd(
                     (self.path, line), "a comment with sets of triangles in it; they are not read"
                 )
-            result.append("\n" * text.count("\n", start, end))
-            rest = end + 3
+            n_lines = text.count("\n", start, end)
+            result.append("\n" * n_lines)
+            rest, line = end + 3, line + n_lines
         result.append(text[rest:])
         return "".join(result)
 
@@ -128,31 +129,23 @@ class Document:
             self._group = attributes.get("name", "")
         elif tag == "param":
             self._entry = (line, attributes.get("name", ""))
-            self._text = ""
+            self._text = []
         elif tag == "xi:include":
             self.includes.append((line, attributes.get("href", "")))
 
     def _characters(self, text: str) -> None:
-        self._text += text
+        if self._entry is not None:
+            self._text.append(text)
 
     def _end(self, tag: str) -> None:
         if tag == "group":
             self._group = ""
         elif tag == "param" and self._entry is not None:
             line, name = self._entry
-            words = self._text.replace("(", " ").replace(")", " ").split()
+            words = "".join(self._text).replace("(", " ").replace(")", " ").split()
             entry = Entry((self.path, line), name, words)
             self.groups.setdefault(self._group, []).append(entry)
             self._entry = None
-
-
-def integer(word: str) -> int | None:
-    """A number as the robot's own reader takes it: decimal, or hexadecimal with 0x."""
-    match = re.fullmatch(r"([+-]?)(0[xX][0-9a-fA-F]+|[0-9]+)", word)
-    if match is None or len(word) > 12:
-        return None
-    value = int(match[2], 16 if match[2][:2].lower() == "0x" else 10)
-    return -value if match[1] == "-" else value
 
 
 @dataclass(slots=True)
@@ -360,7 +353,7 @@ def _addresses(document: Document) -> dict[int, list[int]]:
     card = document.find("", "canDeviceNum")
     number = (integer(card.words[0]) if card and card.words else None) or 1
     for entry in [*document.group("patches"), *document.group("")]:
-        match = re.fullmatch(r"skinCanAddrsPatch(\d{1,2})|skinCanIds", entry.name)
+        match = re.fullmatch(r"skinCanAddrsPatch([0-9]{1,2})|skinCanIds", entry.name)
         if match is None:
             continue
         addresses = patches.setdefault(int(match[1]) if match[1] else number, [])
@@ -420,7 +413,7 @@ def _sets(
     first: dict[str, int] = {}
     sets = []
     for entry in document.group(group):
-        match = re.fullmatch(rf"{prefix}(\d{{1,4}})", entry.name.strip())
+        match = re.fullmatch(rf"{prefix}([0-9]{{1,4}})", entry.name.strip())
         if match is None:
             if entry.name != "numOfSets":
                 document.findings.odd(entry.at, f'"{entry.name}" is no {prefix}N; not read')

@@ -31,7 +31,7 @@ from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Settings
 from skin_host.errors import RequestError, SkinError
-from skin_host.files import growing, refuse_removed, writing
+from skin_host.files import Draft, refuse_removed, writing
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import Retry, connect, explain, first_error
 from skin_host.mqtt.payload import MAX_PACKET_BYTES
@@ -95,9 +95,8 @@ class CanLog:
         self.frames = 0
         self._path = path
         with writing(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._growing = growing(path)
-            self._logger = can.Logger(self._growing)
+            self._draft = Draft(path)
+            self._logger = can.Logger(self._draft.path)
 
     def __enter__(self) -> Self:
         return self
@@ -105,7 +104,7 @@ class CanLog:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None and not self.frames:
             self._logger.stop()
-            self._growing.unlink(missing_ok=True)
+            self._draft.remove()
         else:
             self.close()
 
@@ -116,7 +115,7 @@ class CanLog:
             SkinError: the disk is full or gone.
         """
         with writing(self._path):
-            refuse_removed(self._growing)
+            refuse_removed(self._draft.path)
             for row in range(len(batch)):
                 self._logger.on_message_received(message_at(batch, row, channel))
                 self.frames += 1
@@ -129,7 +128,7 @@ class CanLog:
         """
         with writing(self._path):
             self._logger.stop()
-            os.replace(self._growing, self._path)
+            self._draft.finish()
 
 
 async def capture_buses(settings: Settings, sink: CanSink, stop: asyncio.Event) -> int:

@@ -149,6 +149,26 @@ async def test_a_reload_of_half_a_configuration_changes_nothing(
         assert daemon.settings is before
 
 
+@pytest.mark.timeout(60)
+@stepped
+async def test_a_reload_of_a_configuration_that_became_a_silent_pipe_ends(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It never ended, and eight of them blocked all commands."""
+    monkeypatch.setattr(files, "PATIENCE_S", 0.2)
+    path = tmp_path / "demo.toml"
+    os.mkfifo(path)
+    writer = os.open(path, os.O_RDWR)
+    async with living(can_bus_settings, tmp_path / "state", clock=clock) as live:
+        daemon = live.daemon
+        daemon._configuration = path
+        before = daemon.settings
+        with pytest.raises(SkinError, match=r"demo\.toml: cannot be read: it did not end within"):
+            await daemon.control.handle("reload", b"{}")
+        assert daemon.settings is before
+    os.close(writer)
+
+
 @stepped
 async def test_gains_that_another_program_fits_while_the_daemon_runs_are_not_lost(
     clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path

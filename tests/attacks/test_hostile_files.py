@@ -1,11 +1,14 @@
 """Hostile files and arguments end in one line and exit status 2 or 1, never in a traceback."""
 
 import os
+import threading
+import time
 from pathlib import Path
 
 import pytest
 from msgspec import convert
 
+from skin_host import files
 from skin_host.cli import main
 from skin_host.config.settings import Mqtt
 from skin_host.daemon import metrics
@@ -163,6 +166,78 @@ def test_a_file_of_a_terabyte_is_refused_before_it_fills_the_memory(
 def test_a_device_without_end_is_not_read_to_its_end(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", "/dev/zero"]) == 2
     assert "/dev/zero: cannot be read: larger than" in capsys.readouterr().err
+
+
+@pytest.mark.timeout(60)
+def test_a_pipe_whose_writer_is_silent_is_not_waited_for_without_end(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Eight reloads of such a configuration blocked all commands of a daemon."""
+    monkeypatch.setattr(files, "PATIENCE_S", 0.2)
+    path = tmp_path / "x.toml"
+    os.mkfifo(path)
+    writer = os.open(path, os.O_RDWR)
+    os.write(writer, b"robot = ")
+    assert main(["check", str(path)]) == 2
+    os.close(writer)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == f"skin check: {path}: cannot be read: it did not end within 0.2 s"
+
+
+@pytest.mark.timeout(60)
+def test_a_pipe_that_drips_is_not_waited_for_without_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files, "PATIENCE_S", 0.5)
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    writer = os.open(path, os.O_RDWR)
+    ended = threading.Event()
+
+    def drip() -> None:
+        while not ended.wait(0.02):
+            os.write(writer, b"#")
+
+    dripping = threading.Thread(target=drip)
+    dripping.start()
+    try:
+        with pytest.raises(OSError, match="did not end within"):
+            read_whole(path)
+    finally:
+        ended.set()
+        dripping.join()
+        os.close(writer)
+
+
+@pytest.mark.timeout(60)
+def test_a_pipe_with_pauses_is_read_to_its_end(tmp_path: Path) -> None:
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    writer = os.open(path, os.O_RDWR)
+
+    def write() -> None:
+        for _ in range(3):
+            os.write(writer, b"abc" * 10_000)
+            time.sleep(0.1)
+        os.close(writer)
+
+    writing = threading.Thread(target=write)
+    writing.start()
+    assert read_whole(path) == b"abc" * 30_000
+    writing.join()
+
+
+@pytest.mark.timeout(60)
+def test_the_systems_log_which_has_no_end_is_not_waited_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It states that it is a regular file."""
+    monkeypatch.setattr(files, "PATIENCE_S", 0.2)
+    log = Path("/proc/kmsg")
+    if not os.access(log, os.R_OK):
+        pytest.skip("this user may not read it")
+    with pytest.raises(OSError, match=r"did not end within|not permitted"):
+        read_whole(log)
 
 
 def test_a_name_with_a_zero_byte_is_a_file_that_cannot_be_read() -> None:

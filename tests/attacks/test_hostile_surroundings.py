@@ -92,7 +92,7 @@ def test_a_state_directory_that_is_no_path_is_refused_in_a_line(
         assert main([*words, str(path)]) == 2
         (said,) = capsys.readouterr().err.splitlines()
         assert "service.state_directory: " in said
-        assert "wanted a" in said
+        assert "wanted " in said
 
 
 def test_without_a_home_a_line_states_what_is_to_be_set(monkeypatch: pytest.MonkeyPatch) -> None:

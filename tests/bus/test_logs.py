@@ -144,6 +144,9 @@ def test_what_cannot_be_read_is_one_line(tmp_path):
     assert "No such file" in message_of(tmp_path / "absent.log")
     assert "known are .asc, " in message_of(tmp_path / "a.wav")
     assert "known are .asc, " in message_of(tmp_path / "a")
+    for name in ("a.log.xyz", "a.asc.xyz", "a.xyz.gz", "a.log.xyz.gz", "a.gz"):
+        (tmp_path / name).touch()
+        assert "unknown format of file name; known are .asc, " in message_of(tmp_path / name)
     directory = tmp_path / "folder.log"
     directory.mkdir()
     assert "directory" in message_of(directory)

@@ -226,6 +226,29 @@ def test_sets_that_are_commented_out_are_named(tmp_path: Path) -> None:
     assert triangles(device.patches[1]) == {9: list(range(16))}
 
 
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize(
+    "filling",
+    ["<!---->", "<!----\n>-->", "\n", "<a/>\n", '<param name="x">' + "\n" * 99 + "</param>"],
+)
+def test_the_time_of_reading_grows_no_faster_than_the_file(tmp_path: Path, filling: str) -> None:
+    """Comments of 1.4 MB took 50 s, because each one counted the lines before it."""
+    body = filling * (3_500_000 // len(filling))
+    _, said = read(tmp_path, f"{HEAD}{DEFAULTS}{body}<!-- no end")
+    line = (HEAD + DEFAULTS + body).count("\n") + 1
+    assert f"FILE:{line}: a comment without an end; it takes the rest" in said
+
+
+def test_a_comments_line_counts_the_lines_of_the_comments_before(tmp_path: Path) -> None:
+    text = "<params>\n<!-- one\n\n --> <!-- \n<!-- two\n -->\n<!-- triangleSetCfg -->\n<!-- "
+    _, said = read(tmp_path, text)
+    assert (
+        "FILE:5: a comment within the comment of line 4; both end at the first -->, line 6" in said
+    )
+    assert "FILE:7: a comment with sets of triangles" in said
+    assert "FILE:8: a comment without an end" in said
+
+
 def test_the_oldest_form_names_only_addresses(tmp_path: Path) -> None:
     device, said = read(
         tmp_path,

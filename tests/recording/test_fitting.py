@@ -178,12 +178,14 @@ def test_levels_of_air_pressure_become_gains_that_halve_the_error(bench, tmp_pat
     log = tmp_path / "air.log"
     write_log(log, np.concatenate(rows))
     output = tmp_path / "palm.json"
+    output.symlink_to("kept.json")
     status, said = run(
         capsys,
         *("calibrate", bench, "--pressure", log, "--output", output, "--json", "--levels"),
         *levels,
     )
     assert status == 0
+    assert output.is_symlink()
     told = json.loads(said.out)
     assert told["fitted"] == N
     assert told["rms_after_kpa"] < 0.5 * told["rms_before_kpa"]
