@@ -20,9 +20,13 @@ def on_message(_client: mqtt.Client, _data: object, message: mqtt.MQTTMessage) -
 client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2, protocol=mqtt.MQTTv5)
 client.on_connect = on_connect
 client.on_message = on_message
-port = int(sys.argv[1]) if len(sys.argv) > 1 else 1883
+given = sys.argv[1] if len(sys.argv) > 1 else "1883"
+if not (given.isdecimal() and 0 < int(given) < 65536):
+    sys.exit(f"{given}: wanted the port of a broker, a number from 1 to 65535")
 try:
-    client.connect("localhost", port)
+    client.connect("localhost", int(given))
+    client.loop_forever()
 except OSError as error:
-    sys.exit(f"localhost:{port}: {error}; is a broker running there?")
-client.loop_forever()
+    sys.exit(f"localhost:{given}: {error}; is a broker running there?")
+except KeyboardInterrupt:
+    client.disconnect()

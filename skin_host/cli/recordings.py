@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import logging
 import sys
 from functools import partial
 from pathlib import Path
@@ -17,7 +18,7 @@ from skin_host.cli.common import (
     print_json,
     run,
 )
-from skin_host.errors import BrokerError, RequestError
+from skin_host.errors import RequestError
 
 if TYPE_CHECKING:
     import asyncio
@@ -107,7 +108,9 @@ def add_onto(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--speed", type=positive, default=1.0, help="2 is twice as fast")
     parser.add_argument("--broker", default=LOCAL, metavar="URL", help="for --onto broker")
-    parser.add_argument("--robot", help="a name in place of the recorded one")
+    parser.add_argument(
+        "--robot", help="play it under this name, not the recorded or configured one"
+    )
 
 
 def play(arguments: argparse.Namespace) -> int:
@@ -309,13 +312,15 @@ def _urdf(arguments: argparse.Namespace) -> int:
 
 
 def _write(text: str, output: Path | None) -> int:
-    from skin_host.files import write_atomic
+    from skin_host.files import becomes_file, write_atomic, writing
 
     if output is None:
         print(text, end="")
-    else:
+        return 0
+    with writing(output):
         write_atomic(output, text.encode())
-        print(output)
+        if becomes_file(output):
+            print(output)
     return 0
 
 
@@ -335,41 +340,39 @@ async def _play_on_buses(arguments: argparse.Namespace) -> int:
 
 async def _play_processed(arguments: argparse.Namespace) -> int:
     from skin_host.config.settings import changed
+    from skin_host.layout import build_layout
     from skin_host.mqtt.address import Broker
     from skin_host.processing.core import Engine
-    from skin_host.recording.playback import play_processed
+    from skin_host.recording.playback import play_processed, played_as, refuse_live
     from skin_host.recording.replay import calibration_for
 
     settings, layout = load_skin(arguments.config)
-    broker, base = Broker.from_url(arguments.broker)
-    settings = changed(
-        settings,
-        {
-            "mqtt.host": broker.host,
-            "mqtt.port": broker.port,
-            "mqtt.base": base or settings.mqtt.base,
-        },
-    )
+    broker, base = Broker.from_url(arguments.broker, settings.mqtt.protocol)
+    if base:
+        settings = changed(settings, {"mqtt.base": base})
+    if arguments.robot is not None and arguments.robot != settings.robot:
+        settings = played_as(settings, arguments.robot)
+        layout = build_layout(settings, arguments.config.parent)
+    await refuse_live(broker, settings.mqtt.base, settings.robot)
     found = calibration_for(
         arguments.log, settings, layout, arguments.calibration, arguments.calibrate_seconds
     )
     engine = Engine(settings, layout, list(range(len(layout.parts))), found)
-    n = await play_processed(arguments.log, engine, settings, arguments.speed)
-    print(f"{n} frames played")
+    # What goes wrong at the broker is told in one line at the end.
+    logging.getLogger("skin_host.mqtt").addHandler(logging.NullHandler())
+    played = await play_processed(arguments.log, engine, settings, broker, arguments.speed)
+    print(
+        f"{played.frames} frames played; delivered: {played.frames_sent} frames, "
+        f"{played.events_sent} touch events"
+    )
     return 0
 
 
 async def _play_said(arguments: argparse.Namespace) -> int:
-    from aiomqtt import MqttError
-
     from skin_host.mqtt.address import Broker
-    from skin_host.mqtt.connection import explain
     from skin_host.recording.playback import play_messages
 
     broker, _ = Broker.from_url(arguments.broker)
-    try:
-        n = await play_messages(arguments.log, broker, arguments.speed, arguments.robot)
-    except MqttError as error:
-        raise BrokerError(f"broker {broker}: {explain(error)}") from None
+    n = await play_messages(arguments.log, broker, arguments.speed, arguments.robot)
     print(f"{n} messages played")
     return 0

@@ -103,7 +103,7 @@ async def run(commands: dict[str, list[str]]) -> int:
                 # Ctrl-C of a terminal reaches only this process, which passes it on once.
                 start_new_session=True,
             )
-            if ending is not None:  # it came before this daemon could be told
+            if ending is not None:  # it came before this daemon was there
                 with contextlib.suppress(ProcessLookupError):
                     processes[name].send_signal(ending)
                 break

@@ -629,7 +629,8 @@ def _last_second(gained: dict[str, float], bitrate: int) -> LastSecond:
 
 
 def _age_ms(now_ns: int, then_ns: int | None) -> float | None:
-    return None if then_ns is None else round((now_ns - then_ns) / 1e6, 1)
+    """Return how old something is; what a clock dates after now has just been."""
+    return None if then_ns is None else max(0.0, round((now_ns - then_ns) / 1e6, 1))
 
 
 def _listed(mask: NDArray[np.bool_] | None) -> list[int]:

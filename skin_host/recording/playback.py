@@ -1,21 +1,26 @@
 """Plays recordings again: onto a CAN interface, or to a broker and so into the live page."""
 
 import asyncio
+import itertools
+import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
+from contextlib import AbstractAsyncContextManager
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import can
 
 from skin_host import __version__
 from skin_host.bus.port import ERROR_FLAG, REMOTE_FLAG
 from skin_host.bus.wire import FrameBatch
-from skin_host.config.settings import Settings, skin_hash
-from skin_host.errors import BusError, LogError
+from skin_host.client import SkinClient
+from skin_host.client.links import FIRST_RETAINED_S, RETAINED_S
+from skin_host.config.settings import Mqtt, Settings, changed, skin_hash
+from skin_host.errors import BrokerError, BusError, LogError, RequestError
 from skin_host.fingertip.service import FingertipPublisher
 from skin_host.mqtt.address import Broker
-from skin_host.mqtt.connection import connect
+from skin_host.mqtt.connection import Connection, MqttError, connect, explain
 from skin_host.mqtt.contact import PartContact
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
@@ -27,6 +32,12 @@ from skin_host.recording.replay import read_buses
 
 LONGEST_PAUSE_S = 600.0
 RETAINED = ("status", "info", "contact", "health")
+#: The node as which frames of CAN are played under another robot's name, with all of its parts.
+NODE = "main"
+#: How long to wait for a broker.
+PATIENCE_S = 5.0
+#: How long the broker may take for the last messages.
+DRAIN_S = 10.0
 _NO_DATA = ERROR_FLAG | REMOTE_FLAG
 
 T = TypeVar("T")
@@ -80,6 +91,36 @@ async def play_on_buses(
     return sent
 
 
+async def refuse_live(broker: Broker, base: str, robot: str) -> None:
+    """Refuse to play as a robot of which a node is online at the broker.
+
+    Its subscribers would take what was recorded for what touches it now.
+
+    Raises:
+        RequestError: a node is online, or no robot can have this name.
+        BrokerError: the broker cannot be reached.
+    """
+    loop = asyncio.get_running_loop()
+    async with SkinClient(broker, robot=robot, base=base, patience_s=PATIENCE_S) as skin:
+        until_s = loop.time() + FIRST_RETAINED_S
+        known = False
+        while loop.time() < until_s:
+            for name, node in skin.nodes.items():
+                if node.online:
+                    raise RequestError(
+                        f'robot "{robot}" is live at broker {broker}, its node "{name}" is '
+                        "online: play the recording under another name with --robot NAME"
+                    )
+            if not known and any(node.online is False for node in skin.nodes.values()):
+                known, until_s = True, loop.time() + RETAINED_S
+            await asyncio.sleep(0.02)
+
+
+def _identifier() -> str:
+    """Return a name at the broker that no daemon and no other playback has."""
+    return f"skin-playback-{secrets.token_hex(4)}"
+
+
 async def play_messages(
     recording: Path, broker: Broker, speed: float = 1.0, robot: str | None = None
 ) -> int:
@@ -89,54 +130,114 @@ async def play_messages(
 
     Raises:
         LogError: the recording cannot be read, or holds no messages.
-        MqttError: the broker cannot be reached, or is lost.
+        RequestError: the robot is live at this broker.
+        BrokerError: the broker cannot be reached, is lost, or does not take a message.
     """
+    messages = iter(read_messages_of(recording))
+    first = next(messages, None)
+    if first is None:
+        raise LogError(f"{recording}: holds no messages; it was recorded from a bus alone")
+    # Before the first is due, which would delay all others.
+    base, name = _whose(first.topic)
+    await refuse_live(broker, base, robot or name)
+    free = {(base, robot or name)}
     nodes: set[str] = set()
     n = 0
-    async with connect(broker, identifier="skin-play") as connection:
-        try:
-            async for said in paced(read_messages_of(recording), lambda said: said.t_ns, speed):
-                topic = said.topic if robot is None else _renamed(said.topic, robot)
-                kind = topic.rpartition("/")[2]
-                if kind == "status":
-                    nodes.add(topic)
-                await connection.publish(
-                    topic, said.payload, qos=0 if kind == "frame" else 1, retain=kind in RETAINED
-                )
-                n += 1
-        finally:
-            # A recording that was played is over, and its nodes must not look alive.
-            for topic in nodes:
-                await connection.publish(topic, OFFLINE, qos=1, retain=True)
-    if not n:
-        raise LogError(f"{recording}: holds no messages; it was recorded from a bus alone")
+    try:
+        async with connect(broker, identifier=_identifier()) as connection:
+            try:
+                all_of_them = itertools.chain([first], messages)
+                async for said in paced(all_of_them, lambda said: said.t_ns, speed):
+                    topic = said.topic if robot is None else _renamed(said.topic, robot)
+                    if (whose := _whose(topic)) not in free:
+                        await refuse_live(broker, *whose)
+                        free.add(whose)
+                    kind = topic.rpartition("/")[2]
+                    if kind == "status":
+                        nodes.add(topic)
+                    await connection.publish(
+                        topic,
+                        said.payload,
+                        qos=0 if kind == "frame" else 1,
+                        retain=kind in RETAINED,
+                    )
+                    n += 1
+            finally:
+                # A recording that was played is over, and its nodes must not look alive.
+                for topic in nodes:
+                    await connection.publish(topic, OFFLINE, qos=1, retain=True)
+    except MqttError as error:
+        raise BrokerError(
+            f"broker {broker}: {explain(error)}; {n} messages were delivered"
+        ) from None
+    if connection.refused:
+        raise BrokerError(
+            f"broker {broker}: refuses {connection.refused} of {n} messages: {connection.refusal}"
+        )
     return n
+
+
+def _robot_at(words: list[str]) -> int:
+    """Return where the name of the robot stands among the words of a topic, from the end."""
+    # Before the end stand <robot>/<part>/<kind>, or <robot>/nodes/<node>/<kind>, or, of an info in
+    # pieces, <robot>/nodes/<node>/<piece>/info.
+    return -4 if words[-3] == "nodes" else -5 if words[-4:-3] == ["nodes"] else -3
+
+
+def _whose(topic: str) -> tuple[str, str]:
+    """Return base and robot of a topic."""
+    words = topic.split("/")
+    at = _robot_at(words)
+    return "/".join(words[:at]), words[at]
 
 
 def _renamed(topic: str, robot: str) -> str:
     """Return the same topic for another robot: skin/<robot>/... with any base."""
     words = topic.split("/")
-    # Before the end stand <robot>/<part>/<kind>, or <robot>/nodes/<node>/<kind>, or, of an info in
-    # pieces, <robot>/nodes/<node>/<piece>/info.
-    at = -4 if words[-3] == "nodes" else -5 if words[-4:-3] == ["nodes"] else -3
-    words[at] = robot
+    words[_robot_at(words)] = robot
     return "/".join(words)
 
 
-async def play_processed(log: Path, engine: Engine, settings: Settings, speed: float = 1.0) -> int:
+def played_as(settings: Settings, robot: str) -> Settings:
+    """Return the settings with which a recording is played as another robot: of one node."""
+    return changed(
+        settings,
+        {"robot": robot}
+        | {f"parts.{name}.node": NODE for name in settings.parts}
+        | {f"fingertips.{name}.node": NODE for name in settings.fingertips},
+    )
+
+
+class Played(NamedTuple):
+    """How much was played: frames of pressure, and of these and of events what was delivered."""
+
+    frames: int
+    frames_sent: int
+    events_sent: int
+
+
+async def play_processed(
+    log: Path, engine: Engine, settings: Settings, broker: Broker, speed: float = 1.0
+) -> Played:
     """Process a recording of CAN frames with the pipeline and publish the results.
 
-    The engine is calibrated already; the table `mqtt` of the settings gives the broker.
+    The engine is calibrated already. Of the table `mqtt` of the settings the form of the messages
+    counts, not the broker. Contacts that last at the end of the recording are ended.
 
     Raises:
         LogError: the recording cannot be read.
+        BrokerError: the broker cannot be reached, or has not taken everything.
     """
-    n = 0
-    async with Publisher(settings.mqtt, engine.layout.robot) as publisher:
+    n = missed = 0
+    last_ns = 0
+    publisher = _publisher(settings.mqtt, engine.layout.robot, broker)
+    async with publisher:
+        await _connected(publisher, broker)
+        trouble = publisher.counters.last_error
         publisher.put_info(
             node_info(
                 engine.layout,
-                "main",
+                NODE,
                 version=__version__,
                 configuration=skin_hash(settings),
                 encoding=settings.mqtt.encoding,
@@ -158,7 +259,70 @@ async def play_processed(log: Path, engine: Engine, settings: Settings, speed: f
                 publisher.put_contact(step.frame.part, state)
             return len(output.steps)
 
-        async for bus, batch in paced(read_buses(log, settings), _last_ns, speed):
-            n += publish(engine.feed(bus, batch))
-        n += publish(engine.flush())
-    return n
+        def end() -> None:
+            for part, contact in contacts.items():
+                events = engine.end_part(part, last_ns)
+                for event in events:
+                    publisher.put_touch(event)
+                publisher.put_contact(engine.layout.parts[part].name, contact.stop(events))
+            fingertips.end(last_ns)
+
+        try:
+            async for bus, batch in paced(read_buses(log, settings), _last_ns, speed):
+                last_ns = int(batch.t_ns[-1])
+                new = publish(engine.feed(bus, batch))
+                n += new
+                missed += 0 if publisher.counters.connected else new
+            n += publish(engine.flush())
+        finally:
+            end()
+    counters = publisher.counters
+    played = Played(n, counters.frames_sent, counters.touches_sent)
+    losses = {
+        "touch events lost": counters.touches_dropped,
+        "messages refused": counters.refused,
+        "messages over which the broker ends the connection": counters.rejected,
+    }
+    nothing = n and not played.frames_sent
+    if missed or nothing or any(losses.values()) or counters.last_error != trouble:
+        told = [f"{count} {what}" for what, count in losses.items() if count]
+        raise BrokerError(
+            f"broker {broker}: not everything was taken: "
+            f"{counters.last_error or 'it is too slow'}; sent were {played.frames_sent} of {n} "
+            f"frames and {played.events_sent} touch events"
+            + (f"; {', '.join(told)}" if told else "")
+        )
+    return played
+
+
+def _publisher(settings: Mqtt, robot: str, broker: Broker) -> Publisher:
+    """Return a publisher to this broker, by another client identifier than a daemon's.
+
+    A broker has one client of each identifier: a daemon and a playback would end each other's
+    connections.
+    """
+
+    def connect_there(_: Broker, **options: Any) -> AbstractAsyncContextManager[Connection]:
+        return connect(broker, **(options | {"identifier": _identifier()}))
+
+    there = {"host": broker.host, "port": broker.port, "protocol": broker.protocol}
+    alone: dict[str, Any] = {"brokers": [], "tls": False, "commands": False}
+    # User, password and TLS are the URL's.
+    files = ("username", "password_file", "ca_file", "certificate_file", "key_file")
+    mqtt = changed(settings, there | alone | dict.fromkeys(files))
+    return Publisher(mqtt, robot, NODE, drain_s=DRAIN_S, connect=connect_there)
+
+
+async def _connected(publisher: Publisher, broker: Broker) -> None:
+    """Wait until the broker is there: frames before that would be lost.
+
+    Raises:
+        BrokerError: it is not.
+    """
+    try:
+        async with asyncio.timeout(PATIENCE_S):
+            while not publisher.counters.connected:  # noqa: ASYNC110
+                await asyncio.sleep(0.01)
+    except TimeoutError:
+        why = publisher.counters.last_error or "it does not answer"
+        raise BrokerError(f"broker {broker}: cannot connect: {why}; nothing was played") from None

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skin_host.health.describe import _period, common_shift, enough_rest
+from skin_host.health.describe import _age_ms, _period, common_shift, enough_rest
 from skin_host.health.diagnosis import COMMON_UNITS
 from skin_host.health.watch import FOAM_NS, PartWatch
 from skin_host.processing.calibration import Verdict
@@ -191,3 +191,11 @@ def test_of_a_part_half_of_the_pads_and_twelve_must_rest_or_all_of_a_small_one(
 ) -> None:
     pads = np.arange(300)
     assert enough_rest(pads < resting, pads < valid) == enough
+
+
+def test_nothing_is_younger_than_now() -> None:
+    """Not even by a clock that was set back, nor by one of another computer."""
+    assert str(_age_ms(5 * MS, 5 * MS + 1)) == "0.0"
+    assert _age_ms(5 * MS, 900 * MS) == 0.0
+    assert _age_ms(900 * MS, 5 * MS) == 895.0
+    assert _age_ms(5 * MS, None) is None

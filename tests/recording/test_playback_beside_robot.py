@@ -1,0 +1,284 @@
+"""A recording played to a broker disturbs no robot there, and tells what was delivered."""
+
+import asyncio
+import dataclasses
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from skin_host.cli import main
+from skin_host.config.settings import Mqtt
+from skin_host.mqtt.publisher import Publisher
+from skin_host.recording.mcap import Recorder
+from tests.support import programs
+from tests.support.broker import Mosquitto, free_port
+from tests.support.subscriber import Subscriber
+from tests.support.waiting import PATIENCE_S
+from tests.support.world import World
+
+ROOT = Path(__file__).parents[2]
+
+
+@dataclasses.dataclass
+class Recorded:
+    """A recording of the robot `demo` and its configuration, which names a broker that is gone."""
+
+    log: Path
+    config: Path
+
+    def replay(self, url: str, *more: str) -> int:
+        command = ["replay", str(self.log), "--config", str(self.config), "--onto", "broker"]
+        return main([*command, "--speed", "20", "--broker", url, *more])
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    folder = tmp_path_factory.mktemp("recorded")
+    world = World(folder, folder, Mosquitto("never started", folder))
+    world.write_recordings()
+    return Recorded(folder / "grasp.log", world.robot)
+
+
+def url_of(broker: Mosquitto) -> str:
+    return f"mqtt://{broker.host}:{broker.port}"
+
+
+def with_table(recorded: Recorded, folder: Path, text: str) -> Recorded:
+    """The same recording by a configuration with these lines in the table of the broker."""
+    config = folder / "robot.toml"
+    known = recorded.config.read_text()
+    assert "[mqtt]\n" in known
+    config.write_text(known.replace("[mqtt]\n", f"[mqtt]\n{text}\n"))
+    return Recorded(recorded.log, config)
+
+
+def robots(subscriber: Subscriber) -> set[str]:
+    subscriber.catch_up()
+    return {topic.split("/")[1] for topic, _ in subscriber._messages if topic.startswith("skin/")}
+
+
+def play_beside(recorded: Recorded, broker: Mosquitto, *more: str) -> tuple[int, Any]:
+    """Play while a node of `demo` is online; return the exit status and the node's counters."""
+
+    async def living() -> tuple[int, Any]:
+        settings = Mqtt(host=broker.host, port=broker.port)
+        async with Publisher(settings, "demo", "main") as live:
+            live.put_contact("left_hand", "ON")
+            while not live.counters.retained_sent:  # noqa: ASYNC110
+                await asyncio.sleep(0.01)
+            status = await asyncio.to_thread(recorded.replay, url_of(broker), *more)
+            return status, live.counters
+
+    return asyncio.run(living())
+
+
+def test_frames_played_as_another_robot_leave_the_live_one_alone(
+    written: Recorded, mosquitto: Mosquitto, capsys: pytest.CaptureFixture[str]
+) -> None:
+    listening = Subscriber(mosquitto.host, mosquitto.port, "skin/#")
+    status, live = play_beside(written, mosquitto, "--robot", "ghost")
+    assert status == 0
+    assert robots(listening) == {"demo", "ghost"}
+    assert set(listening.payloads("demo/left_hand/contact")) == {b"ON"}
+    assert not listening.payloads("demo/left_hand/frame")
+    assert listening.payloads("ghost/left_hand/frame")
+    (info, *_) = listening.documents("ghost/nodes/main/info")
+    assert info["robot"] == "ghost"
+    assert "left_hand" in info["parts"]
+    assert live.connections == 1
+    assert "delivered" in capsys.readouterr().out
+
+
+def test_the_player_has_a_name_at_the_broker_that_no_daemon_has(
+    written: Recorded, mosquitto: Mosquitto
+) -> None:
+    assert written.replay(url_of(mosquitto)) == 0
+    assert "skin-demo-main" not in mosquitto.log
+    assert "skin-playback-" in mosquitto.log
+
+
+@pytest.mark.parametrize("kind", ["frames", "messages"])
+def test_a_recording_is_not_played_as_a_robot_that_is_live(
+    written: Recorded,
+    mosquitto: Mosquitto,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    kind: str,
+) -> None:
+    listening = Subscriber(mosquitto.host, mosquitto.port, "skin/#")
+    recorded = written
+    if kind == "messages":
+        path = tmp_path / "a.mcap"
+        with Recorder(path) as recorder:
+            recorder.say("skin/demo/left_hand/contact", 1, b"OFF")
+        recorded = Messages(path, path)
+    status, live = play_beside(recorded, mosquitto)
+    assert status == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert '"demo"' in told
+    assert "--robot" in told
+    listening.catch_up()
+    assert set(listening.payloads("left_hand/contact")) == {b"ON"}
+    assert live.connections == 1
+
+
+class Messages(Recorded):
+    """A recording of messages, which needs no configuration."""
+
+    def replay(self, url: str, *more: str) -> int:
+        return main(["replay", str(self.log), "--onto", "broker", "--broker", url, *more])
+
+
+def test_the_url_outranks_the_brokers_of_the_configuration(
+    written: Recorded, mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    recorded = with_table(written, tmp_path, f'brokers = ["127.0.0.1:{free_port()}"]')
+    listening = Subscriber(mosquitto.host, mosquitto.port, "skin/#")
+    assert recorded.replay(url_of(mosquitto)) == 0
+    assert robots(listening) == {"demo"}
+
+
+def guarded(mosquitto: Mosquitto, folder: Path) -> Mosquitto:
+    """A broker that wants the name anna and her password."""
+    passwords = folder / "passwords"
+    tool = programs.find("mosquitto_passwd")
+    if tool is None:
+        pytest.skip("mosquitto_passwd is not installed")
+    subprocess.run([tool, "-b", "-c", passwords, "anna", "sesame"], check=True)
+    passwords.chmod(0o644)
+    place = folder / "guarded"
+    place.mkdir()
+    broker = Mosquitto(mosquitto.program, place, f"user root\npassword_file {passwords}\n")
+    configuration = place / "mosquitto.conf"
+    text = configuration.read_text().replace("allow_anonymous true", "allow_anonymous false")
+    configuration.write_text(text)
+    return broker
+
+
+@pytest.mark.parametrize("where", ["url", "environment", "file"])
+def test_user_and_password_are_taken_from_the_url_or_the_environment(
+    written: Recorded,
+    mosquitto: Mosquitto,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    where: str,
+) -> None:
+    broker = guarded(mosquitto, tmp_path)
+    broker.start()
+    password = ":sesame" if where == "url" else ""
+    if where == "environment":
+        monkeypatch.setenv("SKIN_MQTT_PASSWORD", "sesame")
+    if where == "file":
+        (tmp_path / "secret").write_text("sesame\n")
+        monkeypatch.setenv("SKIN_MQTT_PASSWORD_FILE", str(tmp_path / "secret"))
+    try:
+        url = f"mqtt://anna{password}@{broker.host}:{broker.port}?protocol=3.1.1"
+        assert written.replay(url) == 0
+    finally:
+        broker.kill()
+    lines = [line for line in broker.log.splitlines() if "as skin-playback-" in line]
+    assert lines
+    assert all("p2" in line and "u'anna'" in line for line in lines)  # so it writes MQTT 3.1.1
+
+
+@pytest.mark.parametrize("kind", ["frames", "messages"])
+def test_a_playback_without_a_broker_fails_in_one_line(
+    written: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
+) -> None:
+    recorded = written
+    if kind == "messages":
+        path = tmp_path / "a.mcap"
+        with Recorder(path) as recorder:
+            recorder.say("skin/demo/left_hand/contact", 1, b"OFF")
+        recorded = Messages(path, path)
+    assert recorded.replay(f"mqtt://127.0.0.1:{free_port()}") == 1
+    seen = capsys.readouterr()
+    assert seen.out == ""
+    assert seen.err.count("\n") == 1
+    assert "no broker listens there" in seen.err
+
+
+@pytest.mark.parametrize("kind", ["frames", "messages"])
+def test_a_playback_that_the_broker_refuses_fails_and_counts(
+    written: Recorded,
+    mosquitto: Mosquitto,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    kind: str,
+) -> None:
+    rules = tmp_path / "rules"
+    rules.write_text("topic read #\ntopic write skin/demo/left_hand/frame\n")
+    rules.chmod(0o644)
+    place = tmp_path / "strict"
+    place.mkdir()
+    broker = Mosquitto(mosquitto.program, place, f"user root\nacl_file {rules}\n")
+    broker.start()
+    recorded = written
+    if kind == "messages":
+        path = tmp_path / "a.mcap"
+        with Recorder(path) as recorder:
+            recorder.say("skin/demo/left_hand/contact", 1, b"OFF")
+        recorded = Messages(path, path)
+    try:
+        assert recorded.replay(url_of(broker)) == 1
+    finally:
+        broker.kill()
+    seen = capsys.readouterr()
+    assert seen.out == ""
+    assert "ot authori" in seen.err
+    assert ("messages refused" if kind == "frames" else "refuses 1 of 1 messages") in seen.err
+
+
+def test_every_touch_of_a_recording_that_ends_while_touched_is_ended(
+    written: Recorded, mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    lines = written.log.read_text().splitlines(keepends=True)
+    for share in (0.5, 0.6, 0.7, 0.8, 0.9):
+        cut = tmp_path / "cut.log"
+        cut.write_text("".join(lines[: int(len(lines) * share)]))
+        recorded = Recorded(cut, written.config)
+        output = tmp_path / "cut.jsonl"
+        command = ["replay", str(cut), "--config", str(written.config), "--output", str(output)]
+        assert main(command) == 0
+        touches = [json.loads(line) for line in output.read_text().splitlines()]
+        known = [one["event"] for one in touches if one["type"] == "touch"]
+        if known.count("begin") > known.count("end"):
+            break
+        output.unlink()
+    else:
+        raise AssertionError("no share of the recording ends while something touches")
+    listening = Subscriber(mosquitto.host, mosquitto.port, "skin/#")
+    assert recorded.replay(url_of(mosquitto)) == 0
+    listening.catch_up()
+    events = [one["event"] for one in listening.documents("/touch")]
+    assert events.count("begin") == events.count("end") > 0
+    assert listening.payloads("left_hand/contact")[-1] == b"UNKNOWN"
+
+
+def test_the_example_subscriber_explains_a_wrong_port() -> None:
+    program = [sys.executable, str(ROOT / "examples" / "subscriber.py")]
+    for port in ("many", "70000"):
+        ended = subprocess.run([*program, port], capture_output=True, text=True, check=False)
+        assert ended.returncode == 1
+        assert ended.stderr.count("\n") == 1
+        assert port in ended.stderr
+
+
+def test_the_example_subscriber_ends_quietly_with_ctrl_c(mosquitto: Mosquitto) -> None:
+    program = [sys.executable, str(ROOT / "examples" / "subscriber.py"), str(mosquitto.port)]
+    with subprocess.Popen(program, stderr=subprocess.PIPE) as running:
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not mosquitto.subscriptions("skin/+/+/touch"):
+            assert time.monotonic() < deadline_s
+            time.sleep(0.02)
+        running.send_signal(signal.SIGINT)
+        _, told = running.communicate(timeout=PATIENCE_S)
+    assert running.returncode == 0
+    assert told == b""
