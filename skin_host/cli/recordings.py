@@ -358,7 +358,7 @@ async def _play_processed(arguments: argparse.Namespace) -> int:
         arguments.log, settings, layout, arguments.calibration, arguments.calibrate_seconds
     )
     engine = Engine(settings, layout, list(range(len(layout.parts))), found)
-    # What goes wrong at the broker is told in one line at the end.
+    # What goes wrong at the broker is stated in one line at the end.
     logging.getLogger("skin_host.mqtt").addHandler(logging.NullHandler())
     played = await play_processed(arguments.log, engine, settings, broker, arguments.speed)
     print(
