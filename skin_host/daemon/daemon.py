@@ -518,18 +518,18 @@ class Daemon:
             (tuple(output.withheld), output.name_taken, tuple(self.unkept)),
         )
 
-    def _is_keeping(self) -> bool:
-        """Whether zeros are being written."""
-        return self._keeping is not None and not self._keeping.done()
+    def _under_way(self) -> asyncio.Task[None] | None:
+        """Return the task that is writing the zeros; None if none is."""
+        return None if self._keeping is None or self._keeping.done() else self._keeping
 
     def _begin_to_keep_zeros(self) -> None:
-        if not self._is_keeping():
+        if self._under_way() is None:
             self._keeping = asyncio.create_task(self._keep_zeros(), name="keep zeros")
 
     async def _kept(self) -> None:
         """Wait until the zeros are not being written."""
-        while self._keeping is not None and not self._keeping.done():
-            await asyncio.wait([self._keeping])
+        while (writing := self._under_way()) is not None:
+            await asyncio.wait([writing])
 
     def _use_baselines(self) -> None:
         """Continue from the baselines that were kept: boards send with these zeros."""
@@ -589,7 +589,7 @@ class Daemon:
             written=self._zeros.written,
         )
         # The end does not leave it to a write that may not have ended.
-        is_open = "zeros" in self.unkept or (touched and self._is_keeping())
+        is_open = "zeros" in self.unkept or (touched and self._under_way() is not None)
         is_news = zeros != self._zeros and (unknown or baselines or self._zeros.unknown)
         if not (is_news or is_open):
             self._zeros_kept = n_found

@@ -35,7 +35,7 @@ class Trials:
 
     def withholds(self, topic: str) -> bool:
         """Whether nothing is sent to this topic now."""
-        until_s = self._until_s.get(topic)
+        until_s = self.until_s(topic)
         return until_s is not None and self._now_s() < until_s
 
     def until_s(self, topic: str) -> float | None:

@@ -37,6 +37,23 @@ class Recorded:
         return main([*command, "--speed", "20", "--broker", url, *more])
 
 
+class Messages(Recorded):
+    """A recording of messages, which needs no configuration."""
+
+    def replay(self, url: str, *more: str) -> int:
+        return main(["replay", str(self.log), "--onto", "broker", "--broker", url, *more])
+
+
+def recorded_of(kind: str, frames: Recorded, folder: Path) -> Recorded:
+    """The recording of frames, or one of a message."""
+    if kind == "frames":
+        return frames
+    path = folder / "a.mcap"
+    with Recorder(path) as recorder:
+        recorder.say("skin/demo/left_hand/contact", 1, b"OFF")
+    return Messages(path, path)
+
+
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     folder = tmp_path_factory.mktemp("recorded")
@@ -112,12 +129,7 @@ def test_a_recording_is_not_played_as_a_robot_that_is_live(
     kind: str,
 ) -> None:
     listening = Subscriber(mosquitto.host, mosquitto.port, "skin/#")
-    recorded = written
-    if kind == "messages":
-        path = tmp_path / "a.mcap"
-        with Recorder(path) as recorder:
-            recorder.say("skin/demo/left_hand/contact", 1, b"OFF")
-        recorded = Messages(path, path)
+    recorded = recorded_of(kind, written, tmp_path)
     status, live = play_beside(recorded, mosquitto)
     assert status == 2
     told = capsys.readouterr().err
@@ -127,13 +139,6 @@ def test_a_recording_is_not_played_as_a_robot_that_is_live(
     listening.catch_up()
     assert set(listening.payloads("left_hand/contact")) == {b"ON"}
     assert live.connections == 1
-
-
-class Messages(Recorded):
-    """A recording of messages, which needs no configuration."""
-
-    def replay(self, url: str, *more: str) -> int:
-        return main(["replay", str(self.log), "--onto", "broker", "--broker", url, *more])
 
 
 def test_the_url_outranks_the_brokers_of_the_configuration(
@@ -192,12 +197,7 @@ def test_user_and_password_are_taken_from_the_url_or_the_environment(
 def test_a_playback_without_a_broker_fails_in_one_line(
     written: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
 ) -> None:
-    recorded = written
-    if kind == "messages":
-        path = tmp_path / "a.mcap"
-        with Recorder(path) as recorder:
-            recorder.say("skin/demo/left_hand/contact", 1, b"OFF")
-        recorded = Messages(path, path)
+    recorded = recorded_of(kind, written, tmp_path)
     assert recorded.replay(f"mqtt://127.0.0.1:{free_port()}") == 1
     seen = capsys.readouterr()
     assert seen.out == ""
@@ -220,12 +220,7 @@ def test_a_playback_that_the_broker_refuses_fails_and_counts(
     place.mkdir()
     broker = Mosquitto(mosquitto.program, place, f"user root\nacl_file {rules}\n")
     broker.start()
-    recorded = written
-    if kind == "messages":
-        path = tmp_path / "a.mcap"
-        with Recorder(path) as recorder:
-            recorder.say("skin/demo/left_hand/contact", 1, b"OFF")
-        recorded = Messages(path, path)
+    recorded = recorded_of(kind, written, tmp_path)
     try:
         assert recorded.replay(url_of(broker)) == 1
     finally:
