@@ -206,22 +206,6 @@ def test_thermal_pads_are_no_taxels():
     assert frame.touched[~thermal].all()
 
 
-@pytest.mark.parametrize(("hz", "rate", "loss"), [(50.0, 0.01, 0.05), (20.0, 0.03, 0.1)])
-def test_drift_is_followed_where_frames_are_lost(hz: float, rate: float, loss: float) -> None:
-    """Of each triangle's two frames a share is lost; the readings drift by `rate` units/s."""
-    rig = Rig(1, 0.4, hz=hz)
-    rng = np.random.default_rng(5)
-    touched = 0
-    for sweep in range(int(200 * hz)):
-        rig.t_ns += round(1e9 / hz)
-        came = (rng.random((rig.n // 12, 2)) >= loss).all(axis=1).repeat(12)
-        raw = np.where(came, rig.read(rate * sweep / hz), 0).astype(np.uint8)
-        touched += np.count_nonzero(rig.pipeline.step(0, raw, came, rig.t_ns).touched)
-    assert touched == 0
-    followed = np.mean(rig.pipeline.baseline - rig.calibration.baseline)
-    assert followed == pytest.approx(200 * rate, abs=0.3)
-
-
 @pytest.mark.parametrize("lost", [False, True])
 def test_temperature_pads_tell_of_drift_while_another_triangle_is_missing(lost):
     rig = Rig(1, 0.0, kind="triangle_10pad", processing=NO_RELAXATION)
