@@ -3,6 +3,7 @@
 A board on real chips and a real bus makes an MTB of a single-board computer.
 """
 
+import errno
 import logging
 from collections.abc import Iterator, Sequence
 
@@ -20,6 +21,9 @@ from skin_host.bus.wire import FrameBatch, MessageClass
 
 log = logging.getLogger(__name__)
 
+LONGEST_DATA = 8
+#: Codes of the system for an interface that is no more.
+_REMOVED = {errno.ENODEV, errno.ENXIO}
 #: Boards act on commands only, which come from address 0: class and sender of an identifier.
 _COMMANDS = {
     message_class << 4 for message_class in (MessageClass.ANALOG_COMMAND, MessageClass.MANAGEMENT)
@@ -30,6 +34,8 @@ _FILTERS: list[can.typechecking.CanFilter] = [
 ]
 #: How often the bus is looked at for commands.
 POLL_NS = 2_000_000
+#: Frames that are read at once: boards live on while others send without end.
+MOST_READS = 10_000
 #: Frames kept for a controller that does not take them now.
 WAITING_FRAMES = 2000
 
@@ -62,19 +68,24 @@ class BoardLink:
 
     def received(self) -> Iterator[tuple[int, bytes]]:
         """Commands that have come since the last call: identifier and data."""
-        while True:
+        for _ in range(MOST_READS):
             try:
                 message = self._bus.recv(timeout=0)
-            except can.CanOperationError as error:
+            except Exception as error:
+                if _is_damage(error):
+                    continue
                 self._complain(error)
                 return
             if message is None:
                 return
-            data_frame = not (message.is_remote_frame or message.is_error_frame or message.is_fd)
-            standard = data_frame and not message.is_extended_id
             # By multicast anybody may send numbers of other types.
-            standard = standard and isinstance(message.arbitration_id, int)
-            if standard and message.arbitration_id >> 4 in _COMMANDS:
+            is_frame = isinstance(message.arbitration_id, int) and (
+                len(message.data) == message.dlc <= LONGEST_DATA
+            )
+            is_other = message.is_remote_frame or message.is_error_frame or message.is_fd
+            if not is_frame or is_other or message.is_extended_id:
+                continue
+            if message.arbitration_id >> 4 in _COMMANDS:
                 yield message.arbitration_id, bytes(message.data)
 
     def send(
@@ -112,7 +123,7 @@ class BoardLink:
         for number, message in enumerate(messages):
             try:
                 self._bus.send(message)
-            except can.CanOperationError as error:
+            except (can.CanError, OSError) as error:
                 self._complain(error)
                 rest = messages[number:]
                 self._waiting = rest[:WAITING_FRAMES]
@@ -121,10 +132,21 @@ class BoardLink:
             self.sent += 1
         self._failing = False
 
-    def _complain(self, error: can.CanError) -> None:
+    def _complain(self, error: Exception) -> None:
         if not self._failing:
-            log.warning("bus %s: %s; frames wait or are lost until it works", self._name, error)
+            ends = "frames wait or are lost until it works"
+            if getattr(error, "error_code", None) in _REMOVED:
+                ends = "start the emulator again when it is back"
+            log.warning("bus %s: %s; %s", self._name, error, ends)
         self._failing = True
+
+
+def _is_damage(error: Exception) -> bool:
+    """Whether a library failed over what came, in one of its ways, and not over its bus."""
+    if isinstance(error, can.CanError):
+        cause = error.__cause__
+        return cause is not None and not isinstance(cause, OSError)
+    return not isinstance(error, OSError)
 
 
 async def run_board(

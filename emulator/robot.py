@@ -77,6 +77,7 @@ class Robot:
         fingertips: force/torque boards and what lies on them.
         converters: the chips.
         wires: the buses by name.
+        active: what faults do now.
         hung, late_ns, jitter_ns: faults of boards, by their index in the layout.
 
     Raises:
@@ -138,6 +139,7 @@ class Robot:
         self._in_bus_order = sorted(range(len(self._boards)), key=self._bus_of.__getitem__)
         self._bursts = Bursts(self._boards, self._bus_of, self.converters)
         self._rng = np.random.default_rng([scene.seed, 5])
+        self.active = faults.Active()
         self.hung: set[int] = set()
         self.late_ns: dict[int, int] = {}
         self.jitter_ns: dict[int, float] = {}
@@ -148,7 +150,7 @@ class Robot:
                 faults.check_targets(self, fault)
             except ConfigurationError as error:
                 raise ConfigurationError(f"fault[{number}].{error}") from None
-            self._plan(fault.at_s, partial(self.inject, fault))
+            self._plan(fault.at_s, partial(self._happen, number, fault))
         self._look_ahead()
 
     # ------------------------------------------------------------------ time
@@ -241,8 +243,9 @@ class Robot:
             board = self._boards[number]
             bus = self._bus_of[number]
             if board.advance(self.t_ns):
-                if board.next_ns is not None:
-                    board.next_ns += self.late_ns.get(number, 0)
+                if board.next_ns is not None and number in self.late_ns:
+                    next_ns = board.next_ns + self.late_ns[number]
+                    board.next_ns = max(next_ns, self.t_ns + TICK_NS)
                 alone = board.alone or number in self.jitter_ns or number in self._recordings
                 if not alone and self.converters.read_at_once(number):
                     together.setdefault(type(board).arithmetic, []).append(number)
@@ -398,6 +401,13 @@ class Robot:
             self._look_ahead()
 
         return end
+
+    def _happen(self, number: int, fault: Fault) -> None:
+        """Let a fault of the scene begin, unless another one has unplugged what it is of."""
+        try:
+            self.inject(fault)
+        except ConfigurationError as error:
+            log.warning("fault[%d] %s does not happen: %s", number, fault.name, error)
 
     def _plan(self, at_s: float, action: Callable[[], object]) -> None:
         self._planned += 1

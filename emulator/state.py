@@ -18,7 +18,7 @@ import msgspec
 from skin_host.errors import RequestError
 from skin_host.files import read_whole
 
-MAGIC = b"skin-emulator-state/7\n"
+MAGIC = b"skin-emulator-state/8\n"
 DIGEST_BYTES = 32
 #: More than a robot of 100 000 taxels needs.
 MOST_BYTES = 2_000_000_000
@@ -46,9 +46,25 @@ _OTHERS = {
 #: Functions of the emulator that a state may name: arithmetic of boards, and how faults end.
 _FUNCTIONS = {
     ("emulator.faults", name)
-    for name in ("_force", "_hold", "_set_noise", "_warm", "_hush", "_clear", "_separate")
+    for name in (
+        "_babble",
+        "_end_each",
+        "_hold",
+        "_latch",
+        "_move",
+        "_newest",
+        "_nothing",
+        "_put",
+        "_rewired",
+        "_set_noise",
+        "_set_wire",
+        "_silence",
+        "_silence_fingertip",
+        "_swap",
+        "_unplug",
+        "_warm",
+    )
 }
-_FUNCTIONS |= {("emulator.faults", "_nothing")}
 _FUNCTIONS |= {("emulator.boards.arithmetic", f"transmit_{bits}") for bits in (16, 32)}
 #: Modules whose classes a state may hold, and those that open devices or buses.
 _PARTS = (

@@ -12,6 +12,7 @@ import tempfile
 from collections import Counter
 from collections.abc import AsyncIterator
 from importlib.metadata import files
+from multiprocessing.resource_tracker import ensure_running
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,6 +29,7 @@ from skin_host.daemon.daemon import Daemon
 from skin_host.errors import ConfigurationError, SkinError
 from skin_host.layout import Layout, PadKind, build_layout, load_skin
 from skin_host.mqtt.broker import LocalBroker, local_broker
+from skin_host.processes import kept_from_children
 from skin_host.tasks import cancel
 from skin_host.viewer.server import Viewer
 
@@ -264,7 +266,9 @@ async def _robot(
     process = spawn.Process(
         target=_live, args=(settings, layout, scene, mujoco, ends, told), daemon=True
     )
-    process.start()
+    ensure_running()
+    with kept_from_children(signal.SIGINT, signal.SIGTERM):
+        process.start()
     told.close()
     for end in ends.values():
         end.close()
@@ -281,7 +285,7 @@ async def _robot(
     finally:
         loop.remove_reader(process.sentinel)
         failed = process.exitcode
-        process.terminate()
+        process.kill()
         await asyncio.to_thread(process.join)
         ready.close()
     if failed:
@@ -300,8 +304,6 @@ def _live(
     from emulator.probes.mujoco_model import MujocoModel
     from emulator.robot import Robot
 
-    # Ctrl-C is for the parent, which ends this process last.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         model = None if mujoco is None else MujocoModel(mujoco, layout)
         robot = Robot(settings, layout, scene, source=model)
@@ -312,7 +314,8 @@ def _live(
     except SkinError as error:
         told.send(error)
         return
-    told.send(None)
+    with contextlib.suppress(BrokenPipeError):  # the parent is gone, which ends this below
+        told.send(None)
 
     async def live() -> None:
         living = asyncio.create_task(robot.run(buses))

@@ -19,6 +19,7 @@ from typing import IO, Protocol, TypeVar
 import msgspec
 
 from skin_host.errors import BusyFileError, NewerFileError, RequestError, SkinError
+from skin_host.untrusted import from_json
 
 log = logging.getLogger(__name__)
 
@@ -170,8 +171,8 @@ def read_document(
         raise wrong(f"cannot be read: {error.strerror}") from None
     _refuse_newer(path, data, schema, what)
     try:
-        found = msgspec.json.decode(data, type=kind)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        found = from_json(data, kind)
+    except msgspec.DecodeError as error:
         if "unknown field" in str(error) and _is_whole(data):
             raise _newer(path, what, str(error)) from None
         raise wrong(f"not a {what} file: {error}") from None
@@ -182,8 +183,8 @@ def read_document(
 
 def _is_whole(data: bytes) -> bool:
     try:
-        msgspec.json.decode(data)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        from_json(data, object)
+    except msgspec.DecodeError:
         return False
     return True
 
@@ -206,8 +207,8 @@ def refuse_newer(path: Path, schema: str, what: str) -> None:
 
 def _refuse_newer(path: Path, data: bytes, schema: str, what: str) -> None:
     try:
-        seen = msgspec.json.decode(data, type=_Head).schema
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        seen = from_json(data, _Head).schema
+    except msgspec.DecodeError:
         return  # damaged, which others report
     name, _, number = schema.partition("/")
     seen_name, _, seen_number = seen.partition("/")
@@ -298,13 +299,16 @@ def write_document(path: Path, document: object) -> None:
         _replace(path, msgspec.json.format(msgspec.json.encode(document), indent=1) + b"\n")
 
 
-def write_atomic(path: Path, data: bytes) -> None:
+def write_atomic(path: Path, data: bytes) -> bool:
     """Write `data` where a user names it: a file is replaced in one step that survives a crash at
     any moment.
 
     The bytes go to a temporary file in the same folder, are forced to disk, and
     then take the name. Missing parent folders are made. Links are followed to the file that they
     name; a device, a pipe, or what this program has open (/dev/stdout) is written into.
+
+    Returns:
+        Whether there is a file of that name now: see `becomes_file`.
 
     Raises:
         OSError: `path` is a folder, the folder is read-only, the disk is full, ...; a file is then
@@ -318,6 +322,7 @@ def write_atomic(path: Path, data: bytes) -> None:
         else:
             with _opened(end) as there:
                 there.write(data)
+        return file is not None
 
 
 def _replace(path: Path, data: bytes) -> None:
@@ -413,7 +418,7 @@ def _opened(end: Path | int) -> IO[bytes]:
     return os.fdopen(os.open(end, os.O_WRONLY | os.O_NOCTTY | os.O_NOFOLLOW), "wb")
 
 
-def growing(path: Path) -> Path:
+def _growing(path: Path) -> Path:
     """Make an empty file that takes the name `path` when it is complete; return its name.
 
     No other program has it: of two that write the same file, the last one's is whole. And nobody
@@ -474,7 +479,7 @@ class Draft:
             self._file = _file_at(self._end)
             if self._file is not None:
                 self._file.parent.mkdir(parents=True, exist_ok=True)
-                self.path = growing(self._file.with_name(wanted.name))
+                self.path = _growing(self._file.with_name(wanted.name))
             else:
                 import tempfile  # which imports every way of compression
 
@@ -490,6 +495,7 @@ class Draft:
         """
         with _naming(self._wanted):
             if self._file is not None:
+                (_disk.get() or _DISK).sync(self.path)
                 os.replace(self.path, self._file)
                 return
             import shutil
@@ -497,6 +503,20 @@ class Draft:
             with self.path.open("rb") as whole, _opened(self._end) as there:
                 shutil.copyfileobj(whole, there)
             self.remove()
+
+    @contextlib.contextmanager
+    def keeping(self) -> Iterator[None]:
+        """If it cannot be completed, let the error name what there is of it.
+
+        Raises:
+            OSError: in place of one that the code inside raises.
+        """
+        try:
+            yield
+        except OSError as error:
+            if error.errno is None or not self.path.exists():
+                raise
+            raise OSError(error.errno, f"{error.strerror}; a part of it is {self.path}") from None
 
     def remove(self) -> None:
         """Remove it, if it is still in progress."""

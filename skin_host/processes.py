@@ -1,14 +1,16 @@
 """Work shared among processes, on all cores of this computer."""
 
+import contextlib
 import ctypes
 import multiprocessing
 import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.resource_tracker import ensure_running
 from types import TracebackType
 from typing import Any, TypeVar, TypeVarTuple, Unpack
 
@@ -46,6 +48,7 @@ class Processes:
     """
 
     def __init__(self, most: int | None = None) -> None:
+        ensure_running()
         self._pool = ProcessPoolExecutor(
             cores() if most is None else min(cores(), most),
             multiprocessing.get_context("spawn"),
@@ -57,7 +60,8 @@ class Processes:
 
     def submit(self, function: Callable[[Unpack[Ts]], T], *arguments: *Ts) -> "Future[T]":
         """Call a function, which can be pickled, in one of the processes."""
-        return self._pool.submit(_work, function, arguments)
+        with kept_from_children(signal.SIGINT):  # the first call starts them
+            return self._pool.submit(_work, function, arguments)
 
     def __enter__(self) -> "Processes":
         if threading.current_thread() is threading.main_thread():
@@ -82,6 +86,21 @@ class Processes:
             ) from None
 
 
+@contextlib.contextmanager
+def kept_from_children(*numbers: signal.Signals) -> Iterator[None]:
+    """Programs that are started in the block do not receive these signals, unless they unblock
+    them: a terminal sends Ctrl-C to all of them, but this process ends by it, and then ends them.
+
+    What comes meanwhile reaches this process after the block. The first start of a process by
+    `multiprocessing` unblocks SIGINT and SIGTERM (Python 3.11): call `ensure_running` before.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def end_with_parent() -> None:
     """Get SIGTERM when the parent ends, however it does."""
     if sys.platform == "linux":
@@ -98,8 +117,7 @@ _is_ended = False
 
 
 def _begin(parent: int) -> None:
-    """Leave Ctrl-C to the parent; end when it asks for that, or has ended."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """End when the parent asks for that, or has ended."""
     signal.signal(signal.SIGTERM, _end)
     signal.signal(signal.SIGALRM, _end)
     end_with_parent()

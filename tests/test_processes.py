@@ -15,7 +15,8 @@ import pytest
 
 from skin_host.errors import SkinError
 from skin_host.processes import Processes
-from tests.support.waiting import until
+from tests.support.moments import at_import
+from tests.support.waiting import PATIENCE_S, until
 
 #: It works until it is ended, in a folder that it removes then, and names itself in there.
 WORKS = """
@@ -27,9 +28,12 @@ from tests.test_processes import works_on
 if __name__ == "__main__":
     # What starts the tests may have Ctrl-C ignored, as background jobs of a shell have.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    with Processes(2) as processes:
-        for future in [processes.submit(works_on, Path(sys.argv[1])) for _ in range(8)]:
-            future.result()
+    try:
+        with Processes(2) as processes:
+            for future in [processes.submit(works_on, Path(sys.argv[1])) for _ in range(8)]:
+                future.result()
+    except KeyboardInterrupt:
+        sys.exit(128 + signal.SIGINT)
 """
 
 
@@ -46,8 +50,8 @@ def works_on(folder: Path) -> None:
 
 
 def cleans_up_slowly(folder: Path) -> None:
-    (folder / "working").touch()
     try:
+        (folder / "working").touch()
         while True:
             time.sleep(0.01)
     finally:
@@ -132,3 +136,24 @@ def test_they_end_with_their_parent_however_it_ends(tmp_path, number):
     if number == signal.SIGTERM:
         assert parent.returncode == 128 + number
         assert not said
+
+
+@pytest.mark.parametrize("module", ["multiprocessing.spawn", "skin_host.errors", "pytest"])
+def test_ctrl_c_while_they_are_being_started_ends_them_without_a_word(tmp_path, module):
+    """A terminal sends it to all of them, and the parent ends the others."""
+    folder = tmp_path / "work"
+    folder.mkdir()
+    program = tmp_path / "program.py"
+    program.write_text(WORKS)
+    act = "signal.raise_signal(signal.SIGINT); os.kill(os.getppid(), signal.SIGINT)"
+    environment = at_import(tmp_path, module, "--multiprocessing-fork", act)
+    environment["PYTHONPATH"] += f":{Path(__file__).parents[1]}"
+    ended = subprocess.run(
+        [sys.executable, str(program), str(folder)],
+        check=False,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+    )
+    assert (ended.returncode, ended.stderr) == (130, "")

@@ -48,9 +48,14 @@ OBJECT_KG = 0.2
 SLIDING_SHARE = 0.85
 #: Inner step of its motion; the contact's spring swings at some 16 Hz.
 STEP_S = 1e-3
+#: It is moved through no more than this of a time in which no board measured: then it rests, or is
+#: lost.
+MOST_UNSEEN_S = 1.0
 NS_PER_MS = 1_000_000
 _SET_MODE, _SET_PERIOD, _GET_FULL_SCALE = 0x07, 0x08, 0x18
 _STOP = 1
+#: Lowest bit of the types of frames with force, and with torque.
+FORCE, TORQUE = 0, 1
 #: Command FF of class 7, "who is there?", and the answer: FF, type of board STRAIN2, firmware.
 _DISCOVER = 0xFF
 _IDENTITY = bytes([_DISCOVER, 12, 2, 0, 9])
@@ -70,9 +75,13 @@ class StrainBoard:
         address: 1..14.
         load: gives force (N) and torque (N m) float64[6] on the sensor at a time in ns.
         rng: draws the noise.
-        full_scale: N and N m of each of the six channels; whole numbers are reported.
-        noise_share: standard deviation of a channel, as a share of its full scale.
+        full_scale: N and N m of each of the six channels; whole numbers are reported, of 16 bits.
+        noise_share: standard deviation of a channel, as a share of its full scale. With none, the
+            last bit of each word is 0 and 1 in turns: that of a converter is never still.
         torque_first: sends torque before force; the order is not promised.
+
+    Attributes:
+        latched: of `FORCE` and `TORQUE`, what it repeats instead of measuring it.
     """
 
     def __init__(
@@ -94,6 +103,9 @@ class StrainBoard:
         self._noise_share = noise_share
         self._torque_first = torque_first
         self._mode = _STOP
+        self.latched: set[int] = set()
+        #: By their types, the data of its last frames.
+        self._sent: dict[int, bytes] = {}
         self._mixing = np.eye(6) + 0.1 * rng.normal(size=(6, 6))
 
     def handle(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
@@ -115,7 +127,7 @@ class StrainBoard:
         elif command == _SET_PERIOD and argument > 0:
             self.period_ms = argument
         elif command == _GET_FULL_SCALE and argument < 6:
-            high, low = divmod(round(self._full_scale[argument]), 256)
+            high, low = divmod(min(round(self._full_scale[argument]), 0xFFFF), 256)
             answer = identifier(MessageClass.ANALOG_COMMAND, self.address, HOST_ADDRESS)
             return [(answer, bytes([_GET_FULL_SCALE, argument, high, low]))]
         return []
@@ -130,7 +142,7 @@ class StrainBoard:
 
     def _sample(self, t_ns: int) -> list[tuple[int, bytes, int]]:
         share = np.asarray(self._load(t_ns), np.float64) / self._full_scale
-        share = share + self._noise_share * self._rng.normal(size=6)
+        share = share + self._noise(t_ns)
         frames = []
         for force_type, torque_type, calibrated in _STREAMS[self._mode]:
             counts = np.round((share if calibrated else self._mixing @ share) * 0x8000) + 0x8000
@@ -146,6 +158,9 @@ class StrainBoard:
                 data = b"".join(int(word).to_bytes(2, "little") for word in three)
                 if flags.any():
                     data += bytes([sum(1 << i for i in np.flatnonzero(flags).tolist())])
+                if kind & 1 in self.latched:
+                    data = self._sent.get(kind, data)
+                self._sent[kind] = data
                 frames.append(
                     (
                         identifier(MessageClass.ANALOG_STREAM, self.address, kind),
@@ -154,6 +169,13 @@ class StrainBoard:
                     )
                 )
         return frames
+
+    def _noise(self, t_ns: int) -> Floats:
+        """Noise of a sample, as shares of the full scales."""
+        if not self._noise_share:
+            number = t_ns // (self.period_ms * NS_PER_MS)
+            return np.full(6, number % 2 / 0x8000)
+        return self._noise_share * self._rng.normal(size=6)
 
 
 class Fingertips:
@@ -224,6 +246,13 @@ class Fingertips:
                 SetTxMode(TxMode.START),
             ):
                 board.handle(*command_frame(message, board.address), t_ns)
+
+    def revive(self, name: str, t_ns: int) -> None:
+        """A board that was hung goes on: it samples from now on, and sends nothing of before."""
+        self.hung.discard(name)
+        board = self.boards[name]
+        if board.next_ns is not None:
+            board.next_ns = max(board.next_ns, t_ns)
 
     def slipped_mm(self, name: str) -> float:
         """How far what presses on a fingertip has slid over it since it was put there."""
@@ -361,7 +390,7 @@ class _Press:
 
     def _held_n(self, normal_n: float, pull_n: float, t_ns: int) -> float:
         """Tangential force (N) by which the object drags at the fingertip."""
-        dt_s = 1e-9 * (t_ns - self._last_ns)
+        dt_s = min(1e-9 * (t_ns - self._last_ns), MOST_UNSEEN_S)
         self._last_ns = t_ns
         if normal_n <= 0.0:
             self._object = None

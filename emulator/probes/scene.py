@@ -21,13 +21,15 @@ import numpy as np
 from msgspec import Meta, Struct, field
 from numpy.typing import NDArray
 
+from skin_host.config.fields import Millimetres
 from skin_host.config.settings import read_toml
 from skin_host.errors import ConfigurationError, visible
 from skin_host.files import read_whole
 from skin_host.layout import TAXELS_PER_TRIANGLE, Layout
 
 Seconds = Annotated[float, Meta(ge=0)]
-Positive = Annotated[float, Meta(gt=0)]
+#: Coefficients of static friction.
+Friction = Annotated[float, Meta(ge=0.001, le=1000)]
 #: Time (s) and value, straight lines between; no contact before the first and after the last.
 Keyframes = list[tuple[Seconds, float]]
 
@@ -70,15 +72,15 @@ class Probe(_Table):
     part: str
     at: Place = field(default_factory=Place)
     kind: Literal["disc", "grounded"] = "disc"
-    diameter_mm: Positive = 6.0
+    diameter_mm: Millimetres = 6.0
     #: Width and height of a rectangle (mm) instead of a disc.
-    size_mm: tuple[Positive, Positive] | None = None
+    size_mm: tuple[Millimetres, Millimetres] | None = None
     turn_deg: float = 0.0
     force_n: Keyframes | None = None
     pressure_kpa: Keyframes | None = None
     depth_mm: Keyframes | None = None
     #: Spring in series with a depth: load cell, arm, or the object itself.
-    compliance_mm_per_n: Annotated[float, Meta(ge=0)] = 0.0
+    compliance_mm_per_n: Annotated[float, Meta(ge=0, le=1000)] = 0.0
     #: The offset moves: time, x (mm), y (mm), added to the place.
     slide_mm: list[tuple[Seconds, float, float]] = []
     #: On fingertips with a force/torque board: an object hangs on the probe and is pulled along
@@ -87,7 +89,7 @@ class Probe(_Table):
     #: Direction of the pull, from the first of the two axes along the surface.
     tangential_deg: float = 0.0
     #: Coefficient of static friction between probe and fingertip.
-    friction: Positive = 0.6
+    friction: Friction = 0.6
     start_s: Seconds = 0.0
     #: The keyframes start again after this time; 0 is never.
     repeat_s: Seconds = 0.0
@@ -215,6 +217,11 @@ def check(scene: Scene) -> None:
         _check_times(f"{where}.pressure_kpa", [t_s for t_s, _ in air.pressure_kpa])
         if min((kpa for _, kpa in air.pressure_kpa), default=0.0) < 0:
             raise ConfigurationError(f"{where}.pressure_kpa: air cannot pull; wanted >= 0")
+        if (most_kpa := max((kpa for _, kpa in air.pressure_kpa), default=0.0)) > HIGHEST_KPA:
+            what = f"{most_kpa:g}; wanted up to {HIGHEST_KPA:g} kPa"
+            raise ConfigurationError(f"{where}.pressure_kpa: {what}")
+        if any(air.part == before.part for before in scene.air[:number]):
+            raise ConfigurationError(f'{where}.part: "{air.part}" has air already; wanted one')
         if any(probe.part == air.part for probe in scene.probe):
             raise ConfigurationError(f'{where}.part: "{air.part}" has probes too; wanted one')
     if not scene.temperature.keyframes_c:
@@ -442,6 +449,9 @@ def read_air(path: Path) -> list[tuple[float, float]]:
     """
     try:
         data = io.BytesIO(read_whole(path, MOST_BYTES))
+    except OSError as error:
+        raise ConfigurationError(f"{path}: cannot be read: {error.strerror}") from None
+    try:
         times_s, kpa = _npz(data) if path.suffix == ".npz" else _csv(data)
     except Exception as error:  # of zip, of each way of compression, of arrays
         reason = visible(str(error).partition("\n")[0] or type(error).__name__, 200)

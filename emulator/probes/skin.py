@@ -185,7 +185,9 @@ class Skin:
                 part = self._layout.part(air.part)
                 keyframes = read_air(Path(air.file)) if air.file else air.pressure_kpa
             except KeyError:
-                raise ConfigurationError(f'air[{number}].part: no part "{air.part}"') from None
+                known = ", ".join(one.name for one in self._layout.parts)
+                what = f'no part "{air.part}"; there are: {known}'
+                raise ConfigurationError(f"air[{number}].part: {what}") from None
             except ConfigurationError as error:
                 raise ConfigurationError(f"air[{number}].file: {error}") from None
             course = AirCourse.of(keyframes, air.start_s)

@@ -36,9 +36,11 @@ from skin_host.layout import BoardLayout
 
 _T = TypeVar("_T", bound=np.generic)
 
-#: A board sends the frames of a sweep in a burst; a pause of this share of the period, measured on
-#: one board, separates two sweeps.
+#: A board sends the frames of a sweep in a burst, so a frame begins the next sweep that comes later
+#: than this share of the period after the first of a sweep, and ...
 PAUSE_PERIODS = 0.5
+#: ... than this one after the last: measured from the last alone, a late frame would hide a pause.
+GAP_PERIODS = 1 / 3
 #: A triangle is awaited until it was missing in this many sweeps in a row.
 PATIENCE_SWEEPS = 3
 #: Expands a triangle's bit in a mask of triangles to its A and B bits in a mask of halves.
@@ -228,11 +230,13 @@ class _BoardState:
         stray: sweeps in succession with frames in another order.
         learn_after: so many sweeps pass before the order is learnt.
         crowded: see `Sweep`, since the last one that was returned.
+        set_ns: by how much the clock was set since the last sweep before that.
     """
 
     index: int
     period_ns: int
     pause_ns: int
+    gap_ns: int
     close_ns: int
     wanted: int
     awaited: int
@@ -244,6 +248,7 @@ class _BoardState:
     lone: int = 0
     sent_first_ns: int = -(1 << 62)
     sent_last_ns: int = 0
+    set_ns: int = 0
     last_place: int = -1
     values: list[bytes] = field(default_factory=lambda: [_NOTHING] * 2 * TRIANGLES)
     absent_for: list[int] = field(default_factory=lambda: [0] * TRIANGLES)
@@ -309,6 +314,7 @@ class Assembler:
                 index,
                 period_ns,
                 int(PAUSE_PERIODS * period_ns),
+                int(GAP_PERIODS * period_ns),
                 int(close_periods * period_ns),
                 wanted,
                 wanted,
@@ -406,6 +412,15 @@ class Assembler:
             if state.missing and now_ns - state.first_ns > state.close_ns:
                 self._close(state, sweeps)
         return sweeps
+
+    def clock_set(self, step_ns: int) -> None:
+        """Take no sweeps for missed in time that passed only on the clock of the time stamps.
+
+        Args:
+            step_ns: by how much it was set, negative if back. Frames of the time before may follow.
+        """
+        for state in self._states.values():
+            state.set_ns += step_ns
 
     def flush(self) -> list[Sweep]:
         """Return all sweeps in progress, at the end of a recording."""
@@ -635,8 +650,7 @@ class Assembler:
         """
         if state.missing and (
             state.awaited & ~state.missing & bit
-            or t_ns - state.last_ns > state.pause_ns
-            or t_ns - state.first_ns > state.close_ns
+            or t_ns > self._ends_ns(state, state.first_ns, state.last_ns)
             or t_ns < state.first_ns - _SET_BACK_NS
         ):
             self._close(state, sweeps)
@@ -664,8 +678,14 @@ class Assembler:
             state.missing = state.awaited
             state.first_ns = t_ns
             self._expect_order(state)
-        state.certain_until_ns = min(t_ns + state.pause_ns, state.first_ns + state.close_ns)
+        state.certain_until_ns = self._ends_ns(state, state.first_ns, t_ns)
         return True
+
+    @staticmethod
+    def _ends_ns(state: _BoardState, first_ns: int, last_ns: int) -> int:
+        """Return until when frames belong to a sweep with such a first and last frame."""
+        paused_ns = max(first_ns + state.pause_ns, last_ns + state.gap_ns)
+        return min(paused_ns, first_ns + state.close_ns)
 
     def _close_old(self, now_ns: int, sweeps: list[Sweep]) -> None:
         """End sweeps whose time has passed when another begins, which may be read much later.
@@ -726,6 +746,11 @@ class Assembler:
         """Count a sweep and those missed since the board's last one; return the latter."""
         missed = 0
         passed_ns = last_ns - state.sent_last_ns
+        if state.set_ns:
+            unset_ns = passed_ns - state.set_ns
+            # Not so while sweeps follow that were stamped before the clock was set.
+            if abs(unset_ns - state.period_ns) < abs(passed_ns - state.period_ns):
+                passed_ns, state.set_ns = unset_ns, 0
         if state.sent_last_ns and 2 * passed_ns >= 3 * state.period_ns:
             missed = round(passed_ns / state.period_ns) - 1
             self.counters.missed += missed

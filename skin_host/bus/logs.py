@@ -35,7 +35,7 @@ WINDOW_NS = 4_000_000
 _BLOCK = 4096
 #: Number of bytes that are read at a time.
 BLOCK_BYTES = 1 << 19
-#: No robot has more; looking for a name takes longer the more there are.
+#: No robot has more.
 MOST_CHANNELS = 1000
 #: Longer lines are damage.
 _LONGEST_LINE = 1 << 16
@@ -43,9 +43,15 @@ _LONGEST_LINE = 1 << 16
 _LONGEST_ALIKE = 100
 #: For lines of one length, this many forms are decoded together; others one by one.
 _MOST_FORMS = 8
+#: python-can has times as floats, which are exact to the microsecond up to here. Later lines are
+#: decoded one by one.
+_EXACT_S = 1 << 32
 _LINE = re.compile(
     rb"\((\d{1,10})\.(\d{6})\) ([!-~]+) ([0-9A-Fa-f]{3})#((?:[0-9A-Fa-f]{2}){0,8})\Z"
 )
+#: Candump writes error frames with a flag in the identifier, which python-can reads as that of an
+#: extended data frame, or, of errors on the bus, without the identifier and the data.
+_ERROR_LINE = re.compile(rb"(\s*\S+\s+\S+\s+)([23])(?=[0-9A-Fa-f]{7}#)")
 _INVALID = 255
 _HEX = np.full(256, _INVALID, np.uint8)
 _HEX[list(b"0123456789")] = range(10)
@@ -63,6 +69,9 @@ Convert = Callable[["can.Message"], tuple[str, Frame] | None]
 
 class DamageError(Exception):
     """A line that is not a message, or a file that cannot be read further."""
+
+
+_TOO_MANY = DamageError(f"more than {MOST_CHANNELS} channels")
 
 
 @dataclass(slots=True)
@@ -92,7 +101,7 @@ def read_blocks(file: BinaryIO, convert: Convert) -> Generator[Block, None, None
         convert: gives channel and frame of a message of python-can, or raises an exception.
     """
     read = getattr(file, "read1", file.read)
-    names: list[str] = []
+    names: dict[str, int] = {}
     rest = b""
     while True:
         try:
@@ -116,13 +125,41 @@ def read_blocks(file: BinaryIO, convert: Convert) -> Generator[Block, None, None
 
 
 def block_of(
-    frames: list[tuple[str, Frame]], names: list[str], messages: int, damage: Exception | None
+    frames: list[tuple[str, Frame]],
+    names: dict[str, int],
+    messages: int,
+    damage: Exception | None,
 ) -> Block:
-    """A block of frames that were read one by one, each with its channel."""
-    channel = np.array([code_of(name, names) for name, _ in frames], np.uint16)
+    """A block of frames that were read one by one, each with its channel.
+
+    `names` are the channels so far with their numbers; those of the block are put there.
+    """
+    known = len(names)
+    channel = np.array([_code_of(name, names) for name, _ in frames], np.uint16)
+    many = _one_too_many(channel, names, known)
+    if many is not None:
+        messages -= len(frames) - many
+        frames, channel, damage = frames[:many], channel[:many], _TOO_MANY
     batch = FrameBatch.of([frame for _, frame in frames])
     cut = RecordBatch(batch.id, batch.dlc, batch.data, batch.t_ns)
-    return Block(names, channel, cut, messages, damage)
+    return Block(list(names), channel, cut, messages, damage)
+
+
+def _code_of(name: str, names: dict[str, int]) -> int:
+    """The number of a channel, which is one of `names` afterwards."""
+    return names.setdefault(name, len(names))
+
+
+def _one_too_many(channel: NDArray[np.uint16], names: dict[str, int], known: int) -> int | None:
+    """Where the first channel begins that is more than `MOST_CHANNELS`; of the names, the first
+    `known` were there before.
+    """
+    if len(names) <= MOST_CHANNELS:
+        return None
+    codes, first = np.unique(channel, return_index=True)
+    new = np.sort(first[codes >= known])
+    left = MOST_CHANNELS - known
+    return int(new[left]) if len(new) > left else None
 
 
 class _Rows(NamedTuple):
@@ -141,7 +178,8 @@ class _Rows(NamedTuple):
 _EMPTY, _FRAME, _NO_FRAME = 1, 2, 3
 
 
-def _parse(text: bytes, names: list[str], convert: Convert) -> Block:
+def _parse(text: bytes, names: dict[str, int], convert: Convert) -> Block:
+    known = len(names)
     buffer = np.frombuffer(text, np.uint8)
     ends = np.flatnonzero(buffer == _NEWLINE)
     if not len(ends) or ends[-1] != len(buffer) - 1:
@@ -167,7 +205,7 @@ def _parse(text: bytes, names: list[str], convert: Convert) -> Block:
         else:
             lines = buffer[starts[of_length, None] + np.arange(length)]
         _decode_alike(lines, of_length, rows, names)
-    damage = None
+    damage: Exception | None = None
     for row in np.flatnonzero(rows.kind == 0).tolist():
         try:
             _decode_one(text[starts[row] : ends[row]], row, rows, names, convert)
@@ -175,16 +213,21 @@ def _parse(text: bytes, names: list[str], convert: Convert) -> Block:
             damage = error
             rows.kind[row:] = _EMPTY
             break
+    of_frames = np.flatnonzero(rows.kind == _FRAME)
+    many = _one_too_many(rows.channel[of_frames], names, known)
+    if many is not None:
+        damage = _TOO_MANY
+        rows.kind[of_frames[many] :] = _EMPTY
     messages = int(np.count_nonzero(rows.kind != _EMPTY))
     frames = rows.kind == _FRAME
     if not frames.all():
         rows = _Rows(*(column[frames] for column in rows))
     batch = RecordBatch(rows.id, rows.dlc, rows.data, rows.t_ns)
-    return Block(names, rows.channel, batch, messages, damage)
+    return Block(list(names), rows.channel, batch, messages, damage)
 
 
 def _decode_alike(
-    lines: NDArray[np.uint8], at: NDArray[np.intp], rows: _Rows, names: list[str]
+    lines: NDArray[np.uint8], at: NDArray[np.intp], rows: _Rows, names: dict[str, int]
 ) -> None:
     """Decode lines uint8[k, length], which belong to the rows `at`, form by form."""
     for _ in range(_MOST_FORMS):
@@ -196,11 +239,12 @@ def _decode_alike(
             lines, at = lines[1:], at[1:]
             continue
         name = found[3].decode()
-        channel = code_of(str(int(name)) if name.isdigit() else name, names)  # as in python-can
+        channel = _code_of(str(int(name)) if name.isdigit() else name, names)  # as in python-can
         seconds, decimals, _, identifier, data = (slice(*found.span(i)) for i in range(1, 6))
         digits = np.concatenate((lines[:, seconds], lines[:, decimals]), axis=1) - ord("0")
         nibbles = _HEX.take(lines[:, identifier])
         octets = _OCTET.take(np.ascontiguousarray(lines[:, data]).view(np.uint16))
+        whole_s, micros = _numbers(digits, found.end(1) - found.start(1))
         fixed = np.ones(len(first), np.bool_)
         for varying in (seconds, decimals, identifier, data):
             fixed[varying] = False
@@ -209,15 +253,16 @@ def _decode_alike(
             digits < 10,
             nibbles != _INVALID,
             octets <= 255,
+            whole_s[:, None] < _EXACT_S,
         )
         into: slice | NDArray[np.intp] = at if len(at) < len(rows.kind) else slice(None)
         left = at[:0]
         # Whole arrays are looked through in a twentieth of the time that their rows take.
         if not all(flags.all() for flags in fits):
             alike = np.logical_and.reduce([flags.all(axis=1) for flags in fits])
-            digits, nibbles, octets = digits[alike], nibbles[alike], octets[alike]
+            whole_s, micros, nibbles = whole_s[alike], micros[alike], nibbles[alike]
+            octets = octets[alike]
             into, left, lines = at[alike], at[~alike], lines[~alike]
-        whole_s, micros = _numbers(digits, found.end(1) - found.start(1))
         rows.kind[into] = _FRAME
         rows.channel[into] = channel
         high, middle, low = nibbles.T.astype(np.uint32)
@@ -237,10 +282,17 @@ def _numbers(digits: NDArray[np.uint8], n: int) -> NDArray[np.int64]:
     return (digits @ place).astype(np.int64).T
 
 
-def _decode_one(line: bytes, row: int, rows: _Rows, names: list[str], convert: Convert) -> None:
+def _decode_one(
+    line: bytes, row: int, rows: _Rows, names: dict[str, int], convert: Convert
+) -> None:
     import can
 
+    from skin_host.bus.port import ERROR_FLAG, EXTENDED_FLAG
+
     rows.kind[row] = _EMPTY
+    error = _ERROR_LINE.match(line)
+    if error is not None:
+        line = b"%b%d%b" % (error[1], int(error[2]) - 2, line[error.end() :])
     for message in can.CanutilsLogReader(io.StringIO(line.decode(), newline=None)):
         if rows.kind[row] != _EMPTY:
             raise DamageError("several messages in one line")
@@ -249,25 +301,14 @@ def _decode_one(line: bytes, row: int, rows: _Rows, names: list[str], convert: C
         if converted is None:
             continue
         name, (identifier, data, t_ns) = converted
-        rows.channel[row] = code_of(name, names)
+        if error is not None:
+            identifier = identifier & ~EXTENDED_FLAG | ERROR_FLAG
+        rows.channel[row] = _code_of(name, names)
         rows.kind[row] = _FRAME
         rows.id[row] = identifier
         rows.dlc[row] = len(data)
         rows.data[row, : len(data)] = np.frombuffer(data, np.uint8)
         rows.t_ns[row] = t_ns
-
-
-def code_of(name: str, names: list[str]) -> int:
-    """The number of a channel, which is one of `names` afterwards.
-
-    Raises:
-        DamageError: there are too many.
-    """
-    if name not in names:
-        if len(names) >= MOST_CHANNELS:
-            raise DamageError(f"more than {MOST_CHANNELS} channels")
-        names.append(name)
-    return names.index(name)
 
 
 def read_channels(
@@ -308,6 +349,8 @@ def read_channels(
                 begin = len(batch)
             rest, rest_channel, names = batch[begin:], channel[begin:], block.names
             damage = block.damage
+            if damage is not None:
+                break
     if damage is not None:
         from skin_host.bus.port import one_line
 
@@ -334,7 +377,7 @@ def _windows(
         else:
             end = next((row for row in range(begin + 1, n) if times[row] >= end_ns), n)
         if end - begin > CAPACITY:
-            for code in set(channel[begin:end].tolist()):
+            for code in np.flatnonzero(np.bincount(channel[begin:end]) > CAPACITY):
                 of_channel = np.flatnonzero(channel[begin:end] == code)
                 if len(of_channel) > CAPACITY:
                     end = begin + int(of_channel[CAPACITY])
@@ -435,7 +478,7 @@ def _format(suffixes: list[str]) -> str:
 def _messages(path: Path) -> Iterator[Block]:
     """The same by python-can's readers."""
 
-    names: list[str] = []
+    names: dict[str, int] = {}
     frames: list[tuple[str, Frame]] = []
     n = 0
     damage: Exception | None = None
@@ -474,6 +517,28 @@ def _check(path: Path, suffixes: list[str]) -> None:
             names = ", ".join(sorted({*known, ".mcap"}))
             raise LogError(f"{path}: unknown format of file name; known are {names}")
     open_recording(path).close()
+
+
+def candump_name(channel: str) -> str:
+    """Return what candump's logs call a channel: a word; they are read with numbers as such."""
+    word = "_".join(channel.split()) or "_"
+    return str(int(word)) if word.isdecimal() else word
+
+
+def name_in(path: Path, channel: str) -> str:
+    """Return what a recording of the format of `path` calls a channel; most formats know only
+    numbers.
+    """
+    match _format([suffix.lower() for suffix in path.suffixes]):
+        case ".log":
+            return candump_name(channel)
+        case ".csv":
+            return ""
+        case ".asc" | ".blf" | ".trc" as numbers:
+            from can.util import channel2int
+
+            return str((channel2int(channel) or 0) + (numbers == ".trc"))
+    return channel
 
 
 def open_recording(path: Path) -> BinaryIO:

@@ -414,7 +414,8 @@ def open_present(name: str, settings: Bus) -> can.BusABC:
             channel=settings.channel,
             ignore_config=True,
             can_filters=_FILTERS if settings.skin_only else None,
-            **settings.options,  # type: ignore[arg-type]
+            # No board sends frames of CAN FD; they are longer, and would be read as others, cut.
+            **(settings.options | {"fd": False}),  # type: ignore[arg-type]
         )
     except OSError as error:
         where = f'bus "{name}": {settings.channel}'

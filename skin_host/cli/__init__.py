@@ -13,7 +13,6 @@ import logging
 import os
 import re
 import select
-import signal
 import sys
 from collections.abc import Sequence
 from typing import NoReturn
@@ -148,6 +147,4 @@ def main(argv: Sequence[str] | None = None) -> int:
         where = f"{error.filename}: " if error.filename else ""
         _complain(f"{name}: {where}{error.strerror or error}")
         return 1
-    except KeyboardInterrupt:
-        return 128 + signal.SIGINT
     return status

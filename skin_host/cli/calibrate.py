@@ -4,9 +4,10 @@ Recordings give the foam's relaxation and the pressure curve of each taxel.
 """
 
 import argparse
+from collections.abc import Mapping
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING, Any
 
 from skin_host.cli.common import (
     Commands,
@@ -22,15 +23,24 @@ from skin_host.cli.common import (
     warn_of_virtual,
 )
 from skin_host.config.relaxation import FITTED
-from skin_host.errors import RequestError
+from skin_host.errors import RequestError, visible
 
 if TYPE_CHECKING:
     from skin_host.config.settings import Settings
     from skin_host.layout import Layout
     from skin_host.processing.calibration import Calibration
+    from skin_host.processing.calibration.outcome import Outcome, TriangleVerdict
     from skin_host.processing.curves import Curves
     from skin_host.processing.fitting.hold import Fit, HoldRecord
     from skin_host.recording import fitting
+
+#: Whether a fingertip was zeroed, in words.
+_TIPS = {
+    "ok": "zero taken",
+    "touched": "zero taken while it was touched",
+    "unchanged": "too few samples of its board; it keeps its zero",
+    "absent": "too few samples of its board; no zero",
+}
 
 
 def add_commands(commands: Commands) -> None:
@@ -108,8 +118,8 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     from skin_host.daemon.calibrate import calibration_path, take_calibration
     from skin_host.files import refuse_newer
     from skin_host.layout import parts_of
-    from skin_host.processing import calibration as calibrations
     from skin_host.processing.calibration.file import SCHEMA, with_gains_of
+    from skin_host.processing.calibration.outcome import outcome
 
     set_up_logging(arguments.verbose)
     if arguments.relaxation is not None or arguments.pressure is not None:
@@ -137,33 +147,42 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     if path.is_file():
         found = with_gains_of(found, path, layout)
     _keep(arguments, path, found, layout)
-    triangles = triangle_verdicts(found, layout, parts)
-    tips = {
-        name: name in found.zeros
-        for name, tip in settings.fingertips.items()
-        if tip.node == arguments.node
-    }
+    tips = [name for name, tip in settings.fingertips.items() if tip.node == arguments.node]
+    result = outcome(found, layout, parts, fingertips=tips)
+    return show(result, {"file": str(path), **result}, f"kept in {path}", arguments)
+
+
+def show(
+    found: "Outcome", document: Mapping[str, Any], where: str, arguments: argparse.Namespace
+) -> int:
+    """Print what a calibration found, and warn of what is wrong with it.
+
+    Args:
+        found: what it found.
+        document: the same and more, for `--json`.
+        where: what became of it, for people.
+        arguments: `json` and `strict`.
+
+    Returns:
+        The exit status.
+    """
+    from skin_host.health.diagnosis import named_by_part
+
     if arguments.json:
-        print_json(
-            {
-                "file": str(path),
-                "id": found.id,
-                "time": found.time,
-                "verdicts": calibrations.summary(found, layout),
-                "triangles": triangles,
-                "fingertips": tips,
-            }
-        )
+        print_json(document)
     else:
-        print(triangle_table(triangles))
-        for name, zeroed in tips.items():
-            print(f"{name}: " + ("zero taken" if zeroed else "its board sent nothing; no zero"))
-        print(f"calibration {found.id} kept in {path}")
-    touched = touched_taxels(triangles)
+        print(_table(found))
+        print(f"calibration {visible(found['id'])} {where}")
+    if found["unchanged"]:
+        warn(f"{named_by_part(found['unchanged'])}: received too rarely; they go on as before")
+    if found["damaged"]:
+        warn(f"{named_by_part(found['damaged'])}: calibrated without the bytes that were damaged")
+    tips = [name for name, verdict in found["fingertips"].items() if verdict == "touched"]
+    touched = "; ".join([named_by_part(found["touched"])] * bool(found["touched"]) + tips)
     if touched:
         warn(
-            f"the skin was touched while it was calibrated: {touched}; take away what touches it "
-            "and repeat: these read too little until then"
+            f"the skin was touched while it was calibrated: {touched}; take away "
+            "what touches it and repeat: these read too little until then"
         )
     return 1 if touched and arguments.strict else 0
 
@@ -373,10 +392,11 @@ def _read_samples(
     log: Path, settings: "Settings", layout: "Layout", seconds: float
 ) -> "fitting.Samples":
     from skin_host.recording.fitting import read_samples
+    from skin_host.recording.replay import doubts
 
     progress = Progress(f"reading {log.name}")
     try:
-        return read_samples(
+        samples = read_samples(
             log,
             settings,
             layout,
@@ -385,6 +405,9 @@ def _read_samples(
         )
     finally:
         progress.close()
+    for doubt in doubts(samples.calibration, layout):
+        warn(f"{log}: {doubt}")
+    return samples
 
 
 def _describe(fits: list["Fit"], model: str, record: "HoldRecord") -> str:
@@ -408,61 +431,22 @@ def _describe(fits: list["Fit"], model: str, record: "HoldRecord") -> str:
     return "\n".join(lines)
 
 
-class TriangleVerdict(TypedDict):
-    """One triangle of `pressure_taxels`: `verdict` is the worst; `taxels` are those not ok.
-
-    The taxels have their numbers within the part, grouped by their own verdicts.
-    """
-
-    part: str
-    board: str
-    triangle: int
-    pressure_taxels: int
-    verdict: str
-    taxels: dict[str, list[int]]
+def _table(found: "Outcome") -> str:
+    """Return lines for people: of the triangles, see `triangle_table`, and of each fingertip."""
+    tips = [f"{visible(name)}: {_TIPS[verdict]}" for name, verdict in found["fingertips"].items()]
+    return "\n".join([triangle_table(found["triangles"])] * bool(found["triangles"]) + tips)
 
 
-def triangle_verdicts(
-    calibration: "Calibration", layout: "Layout", parts: list[int]
-) -> list[TriangleVerdict]:
-    """The verdicts of the triangles of some parts, in the order of the layout."""
-    from skin_host.layout import TAXELS_PER_TRIANGLE, PadKind
-    from skin_host.processing.calibration import Verdict
-
-    found: list[TriangleVerdict] = []
-    for triangle in layout.triangles:
-        if triangle.part not in parts:
-            continue
-        part = layout.parts[triangle.part]
-        by_verdict: dict[Verdict, list[int]] = {}
-        for taxel in range(triangle.first, triangle.first + TAXELS_PER_TRIANGLE):
-            if layout.pad_kind[taxel] == PadKind.PRESSURE:
-                verdict = Verdict(calibration.verdict[taxel])
-                by_verdict.setdefault(verdict, []).append(taxel - part.start)
-        found.append(
-            {
-                "part": part.name,
-                "board": layout.boards[triangle.board].name,
-                "triangle": triangle.number,
-                "pressure_taxels": sum(map(len, by_verdict.values())),
-                "verdict": max(by_verdict, default=Verdict.OK).name.lower(),
-                "taxels": {
-                    verdict.name.lower(): taxels
-                    for verdict, taxels in sorted(by_verdict.items())
-                    if verdict is not Verdict.OK
-                },
-            }
-        )
-    return found
-
-
-def triangle_table(verdicts: list[TriangleVerdict]) -> str:
+def triangle_table(verdicts: list["TriangleVerdict"]) -> str:
     """Return a line for each triangle that is not ok, and one for those of a board that are."""
     from skin_host.config.check import columns
     from skin_host.config.settings import format_triangles
 
+    def place(one: "TriangleVerdict") -> tuple[str, str]:
+        return visible(one["part"]), visible(one["board"])
+
     rows: list[list[str | int]] = []
-    for (part, board), triangles in groupby(verdicts, lambda one: (one["part"], one["board"])):
+    for (part, board), triangles in groupby(verdicts, place):
         mine = list(triangles)
         well = [one["triangle"] for one in mine if not one["taxels"]]
         if well:
@@ -471,22 +455,10 @@ def triangle_table(verdicts: list[TriangleVerdict]) -> str:
     return columns(["part", "board", "triangles", "verdict"], rows)
 
 
-def touched_taxels(verdicts: list[TriangleVerdict]) -> str:
-    """Return which taxels were touched, by part: "taxels 3-5, 9 of left_hand"; empty if none
-    was.
-    """
-    from skin_host.health.diagnosis import named
-
-    by_part: dict[str, list[int]] = {}
-    for one in verdicts:
-        by_part.setdefault(one["part"], []).extend(one["taxels"].get("touched", []))
-    return "; ".join(f"{named(taxels)} of {part}" for part, taxels in by_part.items() if taxels)
-
-
-def _words(triangle: TriangleVerdict) -> str:
+def _words(triangle: "TriangleVerdict") -> str:
     return "; ".join(
-        name.replace("_", " ")
+        visible(name).replace("_", " ")
         if len(taxels) == triangle["pressure_taxels"]
-        else f"{len(taxels)} {name.replace('_', ' ')}: {', '.join(map(str, taxels))}"
+        else f"{len(taxels)} {visible(name).replace('_', ' ')}: {', '.join(map(str, taxels))}"
         for name, taxels in triangle["taxels"].items()
     )

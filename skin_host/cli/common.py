@@ -1,18 +1,21 @@
 """Helpers shared by several commands."""
 
 import argparse
+import contextlib
 import json
 import logging
 import math
 import os
 import signal
 import sys
-from collections.abc import Callable, Coroutine
+import threading
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from skin_host.cli import stderr
 from skin_host.daemon import service
+from skin_host.errors import RequestError, visible
 
 if TYPE_CHECKING:
     import asyncio
@@ -166,11 +169,24 @@ def visible_json(text: str) -> str:
 
 
 def warn(text: str) -> None:
-    """Print one line on stderr, in yellow on a terminal."""
-    line = f"warning: {text}"
+    """Print one line on stderr, in yellow on a terminal. Anybody may have written names in it."""
+    line = f"warning: {visible(text, len(text))}"
     if sys.stderr.isatty() and not os.environ.get("NO_COLOR"):
         line = f"\033[33m{line}\033[0m"
     print(line, file=sys.stderr)
+
+
+def refuse_input(output: Path | None, *inputs: Path | None) -> None:
+    """Protect what a command reads from being replaced by what it writes.
+
+    Raises:
+        RequestError: `output` is one of the inputs; None is none.
+    """
+    for one in inputs:
+        if output is not None and one is not None:
+            with contextlib.suppress(OSError):  # one of them is absent
+                if output.samefile(one):
+                    raise RequestError(f"{output}: is read by this command; choose another name")
 
 
 class Progress:
@@ -193,12 +209,44 @@ class Progress:
             print("\r" + " " * 79 + "\r", end="", file=sys.stderr)
 
 
+def leaving() -> tuple[signal.Signals, ...]:
+    """Return the signals that ask to end, of which the terminal sends one when it is closed; not
+    that if it is ignored, as under nohup.
+    """
+    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    return service.ENDING if ignored else (*service.ENDING, signal.SIGHUP)
+
+
+@contextlib.contextmanager
+def ended_in_good_order() -> Iterator[None]:
+    """Let a request to end leave the block as Ctrl-C does, so that no half a file stays.
+
+    Raises:
+        SystemExit: in place of the end by a signal, with the status that a shell gives it.
+    """
+
+    def end(number: int, _: object) -> None:
+        raise SystemExit(128 + number)
+
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        numbers = [number for number in leaving() if number != signal.SIGINT]
+        before = {number: signal.signal(number, end) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def run(
-    work: "Callable[[asyncio.Event], Coroutine[Any, Any, T]]", duration_s: float | None = None
+    work: "Callable[[asyncio.Event], Coroutine[Any, Any, T]]",
+    duration_s: float | None = None,
+    ending: Sequence[signal.Signals] = service.ENDING,
 ) -> T:
     """Work, and return the result.
 
-    The event is set by SIGTERM and SIGINT, a second one of which ends at once, and after
+    The event is set by the signals `ending`, a second one of which ends at once, and after
     `duration_s`.
     """
 
@@ -209,10 +257,10 @@ def run(
 
         def end() -> None:
             stop.set()
-            for number in (signal.SIGTERM, signal.SIGINT):
+            for number in ending:
                 loop.remove_signal_handler(number)
 
-        for number in (signal.SIGTERM, signal.SIGINT):
+        for number in ending:
             loop.add_signal_handler(number, end)
         if duration_s is not None:
             loop.call_later(duration_s, stop.set)

@@ -10,8 +10,11 @@ from skin_host.cli.common import (
     Progress,
     add_command,
     add_config,
+    ended_in_good_order,
     load_skin,
     print_json,
+    refuse_input,
+    warn,
 )
 from skin_host.cli.recordings import add_calibration, add_onto, play
 from skin_host.errors import RequestError, SkinError
@@ -120,8 +123,11 @@ def _replay(arguments: argparse.Namespace) -> int:
         progress.update(0.0, f"{number} frames")
 
     output = None if arguments.output == "-" else Path(arguments.output)
+    refuse_input(output, log, arguments.config, arguments.calibration)
     calibrated = arguments.calibration, arguments.calibrate_seconds
-    process(Task(log, arguments.config, output, *calibrated), told)
+    task = Task(log, arguments.config, output, *calibrated)
+    with ended_in_good_order():
+        process(task, told, lambda doubt: warn(f"{log}: {doubt}"))
     progress.close()
     return 0
 
@@ -145,6 +151,8 @@ def _replay_all(arguments: argparse.Namespace) -> int:
         for log in arguments.logs
     ]
     outputs = [task.output for task in tasks]
+    for output in outputs:
+        refuse_input(output, *arguments.logs, arguments.config, arguments.calibration)
     twice = next((one for one in outputs if outputs.count(one) > 1), None)
     if twice is not None:
         raise RequestError(f"{twice}: two LOGs of that name; process them one folder at a time")
@@ -155,12 +163,17 @@ def _replay_all(arguments: argparse.Namespace) -> int:
         raise RequestError(f"--output {folder}: {error.strerror}") from None
     progress = Progress("replay")
     worst = 0
-    for number, (task, result) in enumerate(process_all(tasks, arguments.scheduler), 1):
-        if isinstance(result, SkinError):
-            progress.close()
-            print(f"skin replay: {result}", file=sys.stderr)
-            worst = max(worst, result.exit_status)
-        progress.update(number / len(tasks), task.log.name)
+    with ended_in_good_order():
+        for number, (task, result) in enumerate(process_all(tasks, arguments.scheduler), 1):
+            if isinstance(result, SkinError):
+                progress.close()
+                print(f"skin replay: {result}", file=sys.stderr)
+                worst = max(worst, result.exit_status)
+            elif result:
+                progress.close()
+                for doubt in result:
+                    warn(f"{task.log}: {doubt}")
+            progress.update(number / len(tasks), task.log.name)
     progress.close()
     return worst
 

@@ -4,8 +4,10 @@ import argparse
 import gc
 import json
 import logging
+import math
 import re
 import signal
+from collections.abc import Iterator
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -24,11 +26,12 @@ from skin_host.cli.common import (
     print_json,
     run,
     set_up_logging,
+    warn,
     warn_of_virtual,
 )
 from skin_host.daemon import service
 from skin_host.errors import OtherSkinError, RequestError, SkinError, visible
-from skin_host.files import write_atomic
+from skin_host.files import write_document
 
 if TYPE_CHECKING:
     from skin_host.config.settings import Settings
@@ -39,6 +42,8 @@ log = logging.getLogger(__name__)
 #: Configuration of a running daemon, in systemd's folder for it: `skin check --running` compares
 #: with it.
 RUNNING = "configuration.json"
+#: An answer to a command is waited for so long.
+PATIENCE_S = 25.0
 
 
 def add_commands(commands: Commands) -> None:
@@ -93,6 +98,9 @@ def add_commands(commands: Commands) -> None:
     )
     command.add_argument("--reset", action="store_true", help="thresholds: as configured")
     command.add_argument("--json", action="store_true", help="one JSON document")
+    command.add_argument(
+        "--strict", action="store_true", help="calibrate: exit status 1 if the skin was touched"
+    )
     command.set_defaults(run=_command)
 
 
@@ -144,6 +152,12 @@ def reload_on_hangup(daemon: "Daemon") -> None:
 
 
 def _run(arguments: argparse.Namespace) -> int:
+    service.hold_hangups()
+    with service.ended_at_once():
+        return _run_node(arguments)
+
+
+def _run_node(arguments: argparse.Namespace) -> int:
     import asyncio
 
     from skin_host.config.settings import Settings
@@ -153,7 +167,6 @@ def _run(arguments: argparse.Namespace) -> int:
     from skin_host.layout import build_layout
     from skin_host.processes import end_with_parent
 
-    service.hold_hangups()
     set_up_logging(arguments.verbose)
     settings, layout = load_skin(arguments.config)
     if arguments.workers is not None:
@@ -211,7 +224,7 @@ def _show_running(settings: "Settings") -> None:
     if runtime is None:
         return
     try:
-        write_atomic(runtime / RUNNING, msgspec.json.encode(settings))
+        write_document(runtime / RUNNING, settings)
     except OSError as error:
         log.warning("%s: cannot be written: %s", runtime / RUNNING, error.strerror)
 
@@ -264,6 +277,8 @@ def _command(arguments: argparse.Namespace) -> int:
     from skin_host.client import SkinClient
     from skin_host.mqtt.messages import check_health
 
+    if arguments.strict and arguments.name != "calibrate":
+        raise RequestError(f"--strict belongs to calibrate; {arguments.name} has no such option")
     request: dict[str, Any] = {
         key: getattr(arguments, key)
         for key in ("part", "board", "seconds", "file")
@@ -277,23 +292,83 @@ def _command(arguments: argparse.Namespace) -> int:
 
     async def work() -> dict[str, Any]:
         async with SkinClient(arguments.broker, robot=arguments.robot) as skin:
-            patience_s = 15.0 + (arguments.seconds or 10.0)
             return await skin.command(
-                arguments.name, node=arguments.node, timeout_s=patience_s, **request
+                arguments.name, node=arguments.node, timeout_s=patience_s(arguments), **request
             )
 
     answer = asyncio.run(work())
-    if arguments.json:
+    status = 0
+    if arguments.name == "calibrate":
+        status = _show_calibration(answer, arguments)
+    elif arguments.json:
         print_json(answer)
     elif arguments.name == "status":
         for record in answer.values():
             check_health(record)
         print(status_table(answer))
     else:
-        for key, value in answer.items():
-            text = json.dumps(value) if isinstance(value, dict | list) else str(value)
-            print(f"{visible(key)}: {visible(text, len(text))}")
-    return 0
+        print("\n".join(_lines(answer)))
+    if answer.get("kept") is False:
+        warn(
+            "done, but it could not be written and is lost when the daemon restarts; `skin status` "
+            "gives the reason"
+        )
+        return 1
+    return status
+
+
+def patience_s(arguments: argparse.Namespace) -> float:
+    """Return how long to wait for the answer of a node that stays online."""
+    if arguments.name != "calibrate":
+        return PATIENCE_S
+    # What was collected of a board that is zeroed meanwhile is collected again, a few times; and
+    # how long the node calibrates by itself is in its configuration.
+    return 2 * PATIENCE_S + 4 * (arguments.seconds or 60.0)
+
+
+def _show_calibration(answer: dict[str, Any], arguments: argparse.Namespace) -> int:
+    """Print what a calibration found, as `skin calibrate` does; return the exit status."""
+    from skin_host.cli.calibrate import show
+    from skin_host.processing.calibration.outcome import Outcome
+
+    try:
+        found = msgspec.convert(answer, Outcome)
+    except msgspec.ValidationError as error:
+        raise SkinError(
+            f"calibrated, but the answer is not understood: {error}; is the daemon of another "
+            "version?"
+        ) from None
+    return show(found, answer, "is in use", arguments)
+
+
+def _lines(answer: dict[str, Any]) -> Iterator[str]:
+    """Yield the lines of an answer for people. Anybody may have written it."""
+    for key, value in answer.items():
+        if isinstance(value, dict) and value:
+            yield f"{visible(key)}:"
+            yield from (f"  {visible(name)}: {_words(one)}" for name, one in value.items())
+        else:
+            yield f"{visible(key)}: {_words(value)}"
+
+
+def _words(value: object) -> str:
+    """Return one value of an answer in words."""
+    if value in ([], {}):
+        return "none"
+    match value:
+        case True | False:
+            return "yes" if value else "no"
+        case None:
+            return "unknown"
+        case float():
+            return str(value).removesuffix(".0")
+        case str() | int():
+            text = str(value)
+        case list() if all(type(one) in (str, int) for one in value):
+            text = ", ".join(map(str, value))
+        case _:
+            text = json.dumps(value, ensure_ascii=False)
+    return visible(text, len(text))
 
 
 def _pair(text: str) -> tuple[str, float]:
@@ -301,8 +376,7 @@ def _pair(text: str) -> tuple[str, float]:
     try:
         number = float(value)
     except ValueError:
-        equals = ""
-        number = 0.0
-    if not equals:
+        number = math.nan
+    if not equals or not math.isfinite(number):  # JSON has only finite ones
         raise RequestError(f"--set {text}: wanted KEY=NUMBER such as margin_units=3")
     return key, int(number) if key == "votes_of_3" and number.is_integer() else number

@@ -12,18 +12,25 @@ from skin_host.cli.common import (
     Commands,
     add_command,
     add_config,
+    ended_in_good_order,
     finite,
+    leaving,
     load_skin,
     positive,
     print_json,
+    refuse_input,
     run,
+    warn,
 )
 from skin_host.errors import RequestError
 
 if TYPE_CHECKING:
     import asyncio
 
+    from skin_host.config.settings import Settings
+    from skin_host.layout import Layout
     from skin_host.mqtt.address import Broker
+    from skin_host.processing.calibration import Calibration
     from skin_host.recording.export import Series
 
 LOCAL = "mqtt://localhost"
@@ -154,6 +161,20 @@ def _add_recording(parser: argparse.ArgumentParser, about: str = "recording") ->
     add_calibration(parser)
 
 
+def _calibration(
+    arguments: argparse.Namespace, log: Path, settings: "Settings", layout: "Layout"
+) -> "Calibration":
+    """Return the calibration with which a recording is processed; print what is in doubt of it."""
+    from skin_host.recording.replay import calibration_for, doubts
+
+    found = calibration_for(
+        log, settings, layout, arguments.calibration, arguments.calibrate_seconds
+    )
+    for doubt in doubts(found, layout):
+        warn(f"{log}: {doubt}")
+    return found
+
+
 def _numbers(text: str) -> list[int]:
     try:
         return [int(word) for word in text.split(",")]
@@ -171,14 +192,17 @@ def _record(arguments: argparse.Namespace) -> int:
         raise RequestError(f"{file}: is there already; remove it or choose another name")
     if file.suffix == MCAP_SUFFIX:
         with Recorder(file) as recorder:
-            told = run(partial(_capture, arguments, recorder, None), arguments.seconds)
+            told = run(partial(_capture, arguments, recorder, None), arguments.seconds, leaving())
         told |= {"messages": recorder.messages, "unreadable": recorder.unreadable}
     else:
         if arguments.config is None or arguments.broker is not None:
             raise RequestError(f"{file}: holds CAN frames alone and needs --config; or use .mcap")
-        with CanLog(file) as log:
-            told = run(partial(_capture, arguments, None, log), arguments.seconds)
+        settings, _ = load_skin(arguments.config)
+        with CanLog(file, [bus.channel for bus in settings.buses.values()]) as log:
+            told = run(partial(_capture, arguments, None, log), arguments.seconds, leaving())
         told |= {"frames": log.frames}
+        told |= {"frames_left_out": log.left_out} if log.left_out else {}
+        told |= {"times_moved": log.moved} if log.moved else {}
     if arguments.config is not None and not told.get("frames", told.get("messages", {}).get("can")):
         print(
             f"no CAN frame came on the buses of {arguments.config}; is the bus up? "
@@ -211,6 +235,7 @@ async def _capture(
     async def from_broker() -> None:
         broker, base, robot = await _robot(arguments.broker or LOCAL, arguments.robot)
         told["gaps"] = await capture_broker(recorder, broker, base, robot, stop)
+        told["messages_lost"] = recorder.discarded
 
     async def from_buses() -> None:
         settings, _ = load_skin(arguments.config)
@@ -243,27 +268,24 @@ async def _robot(url: str, robot: str | None) -> tuple["Broker", str, str]:
 def _series(arguments: argparse.Namespace) -> "Series":
     from skin_host.recording import MCAP_SUFFIX
     from skin_host.recording.export import read_frames, read_messages
-    from skin_host.recording.replay import calibration_for
 
     if arguments.config is None:
         if arguments.recording.suffix != MCAP_SUFFIX:
             raise RequestError(f"{arguments.recording}: CAN frames need --config to be processed")
         return read_messages(arguments.recording)
     settings, layout = load_skin(arguments.config)
-    found = calibration_for(
-        arguments.recording, settings, layout, arguments.calibration, arguments.calibrate_seconds
-    )
+    found = _calibration(arguments, arguments.recording, settings, layout)
     return read_frames(arguments.recording, settings, layout, found)
 
 
 def _export(arguments: argparse.Namespace) -> int:
     from skin_host.recording.export import export
 
-    if arguments.output.exists() and arguments.output.samefile(arguments.recording):
-        raise RequestError(f"{arguments.output}: is the recording itself; choose another name")
-    written = export(
-        _series(arguments), arguments.output, arguments.recording, lerobot=arguments.lerobot
-    )
+    refuse_input(arguments.output, arguments.recording, arguments.config, arguments.calibration)
+    with ended_in_good_order():
+        written = export(
+            _series(arguments), arguments.output, arguments.recording, lerobot=arguments.lerobot
+        )
     for path in written:
         print(path)
     return 0
@@ -274,6 +296,7 @@ def _plot(arguments: argparse.Namespace) -> int:
     from skin_host.processing.calibration.file import load_calibration
     from skin_host.recording import plots
 
+    refuse_input(arguments.output, arguments.recording, arguments.config, arguments.calibration)
     if arguments.what == "calibration":
         if arguments.config is None:
             raise RequestError("a calibration is drawn with --config, whose skin it is of")
@@ -296,6 +319,7 @@ def _plot(arguments: argparse.Namespace) -> int:
 def _dbc(arguments: argparse.Namespace) -> int:
     from skin_host.bus.dbc import dbc_text
 
+    refuse_input(arguments.output, arguments.config)
     if arguments.config is None:
         text = dbc_text(bus=arguments.bus)
     else:
@@ -307,20 +331,21 @@ def _dbc(arguments: argparse.Namespace) -> int:
 def _urdf(arguments: argparse.Namespace) -> int:
     from skin_host.layout.urdf import urdf_text
 
+    refuse_input(arguments.output, arguments.config)
     _, layout = load_skin(arguments.config)
     return _write(urdf_text(layout), arguments.output)
 
 
 def _write(text: str, output: Path | None) -> int:
-    from skin_host.files import becomes_file, write_atomic, writing
+    from skin_host.files import write_atomic, writing
 
     if output is None:
         print(text, end="")
         return 0
     with writing(output):
-        write_atomic(output, text.encode())
-        if becomes_file(output):
-            print(output)
+        is_file = write_atomic(output, text.encode())
+    if is_file:
+        print(output)
     return 0
 
 
@@ -344,7 +369,6 @@ async def _play_processed(arguments: argparse.Namespace) -> int:
     from skin_host.mqtt.address import Broker
     from skin_host.processing.core import Engine
     from skin_host.recording.playback import play_processed, played_as, refuse_live
-    from skin_host.recording.replay import calibration_for
 
     settings, layout = load_skin(arguments.config)
     broker, base = Broker.from_url(arguments.broker, settings.mqtt.protocol)
@@ -354,9 +378,7 @@ async def _play_processed(arguments: argparse.Namespace) -> int:
         settings = played_as(settings, arguments.robot)
         layout = build_layout(settings, arguments.config.parent)
     await refuse_live(broker, settings.mqtt.base, settings.robot)
-    found = calibration_for(
-        arguments.log, settings, layout, arguments.calibration, arguments.calibrate_seconds
-    )
+    found = _calibration(arguments, arguments.log, settings, layout)
     engine = Engine(settings, layout, list(range(len(layout.parts))), found)
     # What goes wrong at the broker is stated in one line at the end.
     logging.getLogger("skin_host.mqtt").addHandler(logging.NullHandler())

@@ -74,6 +74,12 @@ def add_commands(commands: Commands) -> None:
     view.add_argument(
         "--port", type=port_number, help="port to listen on (8080; Foxglove 8765, Rerun 9090)"
     )
+    view.add_argument(
+        "--name",
+        action="append",
+        default=[],
+        help="the page: another name of this machine, such as that of a proxy",
+    )
     view.add_argument("--read-only", action="store_true", help="pages calibrate and record nothing")
     view.add_argument(
         "--recordings",
@@ -97,7 +103,7 @@ def _listen(arguments: argparse.Namespace) -> int:
         printed = 0
         async with contextlib.AsyncExitStack() as stack:
             skin = SkinClient(arguments.broker, robot=arguments.robot)
-            watching = asyncio.create_task(_report_absence(skin, arguments.part))
+            watching = asyncio.create_task(_report_absence(skin))
             stack.push_async_callback(cancel, watching)
             await stack.enter_async_context(skin)
             async for event in skin.events(arguments.part):
@@ -119,14 +125,14 @@ def _listen(arguments: argparse.Namespace) -> int:
     return 0
 
 
-async def _report_absence(skin: "SkinClient", part: str | None) -> None:
+async def _report_absence(skin: "SkinClient") -> None:
     """Print on stderr, whenever it changes, why no events can come."""
     import asyncio
 
     said = ""
     while True:
         await asyncio.sleep(1.0)  # what is retained comes soon
-        why = _absence(skin, part)
+        why = _absence(skin)
         if why != said:
             if why:
                 warn(f"{why}; waiting")
@@ -135,22 +141,19 @@ async def _report_absence(skin: "SkinClient", part: str | None) -> None:
             said = why
 
 
-def _absence(skin: "SkinClient", part: str | None) -> str:
+def _absence(skin: "SkinClient") -> str:
     if not skin.connected:
         return f"no broker at {skin.where}: {skin.last_error}" if skin.last_error else ""
     if all(node.online is False for node in skin.nodes.values()):
         return f'no node of robot "{skin.robot}" is online: is `skin run` running?'
-    infos = [node.info for node in skin.nodes.values() if node.info is not None]
-    parts = sorted(name for info in infos for name in [*info.parts, *info.fingertips])
-    if part is not None and parts and part not in parts:
-        return f'robot "{skin.robot}" has no part "{part}"; there are: {", ".join(parts)}'
     return ""
 
 
 async def health_of_all(broker: str, robot: str | None) -> dict[str, dict[str, Any]]:
     """Return the health record of every part that the robot's nodes list.
 
-    A retained record of a part whose node has gone does not describe its present state.
+    A retained record of a part whose node has gone, or lists it no longer, does not describe its
+    present state.
     """
     import asyncio
 
@@ -162,14 +165,13 @@ async def health_of_all(broker: str, robot: str | None) -> dict[str, dict[str, A
             part: name for name, node in nodes.items() for part in [*node.parts, *node.fingertips]
         }
         records: dict[str, dict[str, Any]] = {}
-        try:
+        stream = skin.health()
+        with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(5.0):
-                async for health in skin.health():
-                    records[health.part] = dict(health.record)
-                    if set(parts) <= set(records):
-                        break
-        except TimeoutError:
-            pass
+                while records.keys() != parts.keys():
+                    health = await anext(stream)
+                    if health.part in parts:
+                        records[health.part] = dict(health.record)
         for part, node in parts.items():
             if skin.nodes[node].online is False:
                 records[part] = _gone(part, node, records.get(part, {}))
@@ -213,7 +215,8 @@ def _status(arguments: argparse.Namespace) -> int:
         print_json(records)
     else:
         print(status_table(records))
-    return 0 if all(record.get("state") in ("ok", "warning") for record in records.values()) else 1
+    well = all(record.get("state") in ("ok", "warning") for record in records.values())
+    return 0 if records and well else 1
 
 
 def _view(arguments: argparse.Namespace) -> int:
@@ -231,6 +234,7 @@ def _view(arguments: argparse.Namespace) -> int:
         robot=arguments.robot,
         commands=not arguments.read_only,
         recordings=arguments.recordings,
+        names=arguments.name,
     )
 
     def show(url: str) -> None:

@@ -29,7 +29,7 @@ from skin_host.cli.common import (
     whole,
 )
 from skin_host.daemon import service
-from skin_host.errors import RequestError, visible
+from skin_host.errors import ConfigurationError, RequestError, visible
 
 if TYPE_CHECKING:
     import can
@@ -280,7 +280,12 @@ def _on_emulated_chips(
     if arguments.state is not None and arguments.state.exists():
         robot = Robot.read(arguments.state, settings, layout)
     else:
-        robot = Robot(settings, layout, scene, fidelity=fidelity, seed=arguments.seed, source=model)
+        try:
+            robot = Robot(
+                settings, layout, scene, fidelity=fidelity, seed=arguments.seed, source=model
+            )
+        except ConfigurationError as error:  # of what the scene names
+            raise ConfigurationError(f"{arguments.scene}: {error}") from None
     if arguments.state is not None:
         opened.callback(robot.write, arguments.state)
     devices: list[CuseBus] = []
@@ -357,7 +362,9 @@ def _take_command(
     elif verb == "ctrl":
         _set_control(model, rest)
     elif text:
-        mends[text] = robot.inject(faults.parse(text))
+        fault = faults.parse(text)
+        mends.pop(text, lambda: None)()  # the same again begins again
+        mends[text] = robot.inject(fault)
 
 
 def _set_control(model: "MujocoModel | None", text: str) -> None:
@@ -401,6 +408,8 @@ def _bench(arguments: argparse.Namespace) -> int:
 
 
 def _report(arguments: argparse.Namespace) -> int:
+    from skin_host.evaluation.steps import show_step
+
     if arguments.recordings is not None and (arguments.contacts or arguments.rig):
         raise RequestError("--recordings goes with --real, or with the whole report")
     kinds = {"papers.contacts_report": arguments.contacts, "rig_report": arguments.rig}
@@ -411,7 +420,10 @@ def _report(arguments: argparse.Namespace) -> int:
     if output is None and not arguments.json and not arguments.real:
         output = Path("report")
     on_recordings = {"recordings": arguments.recordings} if name in ("real", "report") else {}
-    document = module.run(quick=arguments.quick, output=output, **on_recordings)
+    try:
+        document = module.run(quick=arguments.quick, output=output, **on_recordings)
+    finally:
+        show_step("")
     if arguments.json:
         print_json(document)
         return 0

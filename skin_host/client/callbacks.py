@@ -36,6 +36,9 @@ class SkinCallbacks:
     that waits: `ready`, `info`, `command` and `on_...` raise a RequestError there.
 
     Raises (on entering): see `SkinClient`.
+    Raises (on leaving):
+        RequestError: the robot has no part of the name that an `on_...` was given. That is logged
+            when it is known.
     """
 
     def __init__(
@@ -60,6 +63,8 @@ class SkinCallbacks:
         self._ready: Future[tuple[SkinClient, asyncio.AbstractEventLoop]] = Future()
         self._end = asyncio.Event()
         self._calls: set[asyncio.Task[None]] = set()
+        #: By stream: that the robot has no part of its name.
+        self._missing: dict[Stream[Any], RequestError] = {}
         self._thread = threading.Thread(
             target=lambda: asyncio.run(self._serve()), name="skin callbacks", daemon=True
         )
@@ -124,9 +129,11 @@ class SkinCallbacks:
         self._skin, self._loop = self._ready.result()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None = None, *_: object) -> None:
         self._loop.call_soon_threadsafe(self._end.set)
         self._thread.join()
+        if kind is None and self._missing:
+            raise next(iter(self._missing.values()))
 
     async def _serve(self) -> None:
         try:
@@ -141,21 +148,28 @@ class SkinCallbacks:
     def _on(self, open_stream: Callable[[], Stream[T]], call: Callable[[T], object]) -> None:
         async def begin() -> None:
             # The stream is opened here, in its own thread, before `on_...` returns.
-            task = asyncio.create_task(_call_with_each(open_stream(), call))
-            self._calls.add(task)
+            self._calls.add(asyncio.create_task(self._call_with_each(open_stream(), call)))
 
         self._wait_for(begin())
+
+    async def _call_with_each(self, stream: Stream[T], call: Callable[[T], object]) -> None:
+        while True:
+            try:
+                item = await anext(stream)
+            except StopAsyncIteration:
+                return
+            except RequestError as error:
+                _log.error("%s", error)
+                self._missing[stream] = error
+                continue
+            self._missing.pop(stream, None)
+            try:
+                call(item)
+            except BaseException:  # SystemExit would end the thread, and what the others receive
+                _log.exception("a callback failed")
 
     def _wait_for(self, work: Coroutine[Any, Any, T]) -> T:
         if threading.current_thread() is self._thread:
             work.close()
             raise RequestError("a callback cannot wait for messages; ask in another thread")
         return asyncio.run_coroutine_threadsafe(work, self._loop).result()
-
-
-async def _call_with_each(stream: Stream[T], call: Callable[[T], object]) -> None:
-    async for item in stream:
-        try:
-            call(item)
-        except Exception:
-            _log.exception("a callback failed")

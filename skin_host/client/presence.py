@@ -108,6 +108,8 @@ class _Node:
     online: bool | None
     #: Brokers from which that came.
     over: set[int]
+    #: Of which it publishes, by its status, as far as that has room for them.
+    parts: frozenset[str]
 
 
 class Presence:
@@ -170,7 +172,13 @@ class Presence:
                 del part.touches[next(iter(part.touches))]
 
     def take_node(
-        self, node: str, online: bool | None, broker: int = 0, *, again: bool = False
+        self,
+        node: str,
+        online: bool | None,
+        broker: int = 0,
+        *,
+        again: bool = False,
+        parts: Iterable[str] = (),
     ) -> None:
         """Take the newest status of a node; None: its connection ended, or the status was deleted.
 
@@ -179,9 +187,10 @@ class Presence:
             online: whether it is, see `is_online`.
             broker: from which it came.
             again: it came from another broker before.
+            parts: of which it publishes, as far as the status names them.
         """
         over = self._nodes[node].over if again and node in self._nodes else set()
-        self._nodes[node] = _Node(online, over | {broker})
+        self._nodes[node] = _Node(online, over | {broker}, frozenset(parts))
 
     def take_info(self, node: str, parts: Iterable[str]) -> None:
         # Only what the last info of each node names: whoever may publish could go on for ever.
@@ -218,6 +227,18 @@ class Presence:
         ]
         stale = all(now_s - part.alive_s > self._stale_s for part in parts)
         return None if parts and stale else True
+
+    def named(self) -> set[str] | None:
+        """Return the parts that the robot's nodes name; None: that is not complete.
+
+        A node that has stopped may start again, so its parts count. While no node is online, nobody
+        knows with which configuration the robot will start.
+        """
+        nodes = self._nodes.values()
+        complete = self._nodes.keys() <= self._parts_of.keys()
+        if not complete or not any(node.online for node in nodes):
+            return None
+        return set().union(*self._parts_of.values(), *(node.parts for node in nodes))
 
     def brokers(self, node: str) -> set[int]:
         """Return the brokers from which the newest status of a node came."""

@@ -1,12 +1,15 @@
 """The client itself: receives for its streams, from all brokers of the robot."""
 
 import asyncio
+import contextlib
 import itertools
 import logging
+import math
 import re
 import secrets
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal, Self, TypeVar
 from weakref import WeakSet
 
@@ -15,7 +18,7 @@ from skin_host.client.links import RETAINED_S, ROBOT_S, BrokerLink, only_robot
 from skin_host.client.order import EventOrder, Newest
 from skin_host.client.presence import Contact, Presence
 from skin_host.client.streams import Stream
-from skin_host.errors import BrokerError, RequestError, SkinError
+from skin_host.errors import BrokerError, RequestError, SkinError, visible
 from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.commands import Result, decode_result, encode_request
@@ -28,7 +31,7 @@ from skin_host.mqtt.connection import (
 )
 from skin_host.mqtt.info import NodeInfo, decode_info, join_pieces
 from skin_host.mqtt.messages import Frame
-from skin_host.mqtt.order import run_of, stamp_of
+from skin_host.mqtt.order import parts_of, run_of, stamp_of
 from skin_host.mqtt.payload import JSON_TYPE, MessageError
 from skin_host.mqtt.topics import PartTopic, Topics
 from skin_host.processing.events import Touch
@@ -41,6 +44,11 @@ HOLD_S = 10.0
 MAX_NAMES = 256
 #: Of the infos of all its nodes; an iCub's has 0.4 MB.
 MAX_INFO_BYTES = 32 * 1024 * 1024
+#: Daemons find a broker that starts, or that comes back, within 3 s. This long after the last of
+#: them has named its parts there are no others.
+NAMED_S = 5.0
+#: Of more parts only so many are named.
+MOST_NAMED = 20
 #: Timeouts are checked this often.
 WATCH_S = 0.25
 #: Further topics that a stream needs: a contact state is valid only while its part lives.
@@ -96,7 +104,14 @@ class SkinClient:
 
     Raises (on entering):
         BrokerError: no broker, or one that refuses us.
-        RequestError: the URL is wrong, or it is not clear which robot is meant.
+        RequestError: the URL is wrong, a time is negative or no number, or it is not clear which
+            robot is meant.
+
+    Raises (on reading a stream, once):
+        RequestError: the robot has no part of this name, and had none since the stream was opened.
+            All nodes have named their parts for `NAMED_S`, and one of them is online; those of a
+            node that is offline are known from what the broker keeps. A part of a node that starts
+            later still is received by who reads on.
     """
 
     def __init__(
@@ -118,13 +133,15 @@ class SkinClient:
                 found = one
             brokers.append(found)
         _check_several(brokers, robot)
+        _check_times(patience_s=patience_s, stale_s=stale_s)
         self._base = base or "skin"
         self._topics = None if robot is None else Topics(self._base, robot)
         self._robot = robot
         self._patience_s = patience_s
         self._identifier = f"skin-client-{secrets.token_hex(4)}"
         self._numbers = itertools.count(1)
-        self._asked: dict[str, asyncio.Future[Result]] = {}
+        #: By number of the request: its answer, once it has come.
+        self._asked: dict[str, Result | None] = {}
         self._streams: WeakSet[Stream[Any]] = WeakSet()
         self._latest: dict[str, Health] = {}
         #: Names that were received: of parts, and of nodes.
@@ -133,6 +150,8 @@ class SkinClient:
         self._presence = Presence(stale_s)
         self._order = EventOrder(HOLD_S if len(brokers) > 1 else 0.0)
         self._newest = Newest()
+        #: When a node named its parts last.
+        self._named_s = -math.inf
         self._news = asyncio.Event()
         self._stopping = False
         self._tasks: list[asyncio.Task[None]] = []
@@ -191,7 +210,13 @@ class SkinClient:
         """Return the last event of each contact that lasts now, as far as known.
 
         They are followed while a stream of `contacts` or `touches` exists.
+
+        Raises:
+            RequestError: the robot has no such part.
         """
+        missing = self._missing(part, _now_s())
+        if missing is not None:
+            raise RequestError(missing)
         return self._presence.touches(part, _now_s())
 
     def health(self, part: str | None = None) -> Stream[Health]:
@@ -209,23 +234,31 @@ class SkinClient:
         await self._until(is_ready)
 
     async def info(self, timeout_s: float = 5.0) -> dict[str, NodeInfo]:
-        """Return the descriptions of the robot's nodes: parts, taxels, places. Waits for the first.
+        """Return the descriptions of the robot's nodes: parts, taxels, places.
+
+        Waits for those of all nodes that are online, and returns what there is after `timeout_s`.
 
         Raises:
             BrokerError: none was received within `timeout_s`.
+            RequestError: `timeout_s` is no time.
         """
-
-        def known() -> dict[str, NodeInfo]:
-            return {name: node.info for name, node in self.nodes.items() if node.info is not None}
-
-        try:
+        _check_times(timeout_s=timeout_s)
+        with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout_s):
-                return await self._until(known)
-        except TimeoutError:
+                await self._until(
+                    lambda: (
+                        self.nodes
+                        and all(node.info or not node.online for node in self.nodes.values())
+                        and any(node.info for node in self.nodes.values())
+                    )
+                )
+        known = {name: node.info for name, node in self.nodes.items() if node.info is not None}
+        if not known:
             raise BrokerError(
                 f'broker {self.where}: no node of robot "{self.robot}" published its info; '
                 "is `skin run` running?"
-            ) from None
+            )
+        return known
 
     async def command(
         self, name: str, *, node: str | None = None, timeout_s: float = 10.0, **arguments: Any
@@ -236,24 +269,33 @@ class SkinClient:
             name: of the command.
             node: which one; by default the robot's only node.
             timeout_s: how long to wait for the answer.
-            arguments: of the command.
+            arguments: of the command. The request's `id` is the client's, whatever is given.
 
         Raises:
-            CommandError: the node refused, failed, or did not answer in time.
-            RequestError: it is not clear which node is meant.
+            CommandError: the node is offline, takes no commands, refused, failed, or did not
+                answer in time.
+            RequestError: it is not clear which node is meant, or a name or a number cannot be sent.
         """
         if not _WORD.fullmatch(name) or not (node is None or _WORD.fullmatch(node)):
             raise RequestError(
                 "a command and a node have names of up to 64 of the characters a-z 0-9 _ -"
             )
+        _check_times(timeout_s=timeout_s)
         number = f"{self._identifier}-{next(self._numbers)}"
-        answer = self._asked[number] = asyncio.get_running_loop().create_future()
+        try:
+            request = encode_request(arguments | {"id": number})
+        except ValueError:
+            raise RequestError(f"{name}: seen nan or inf, wanted numbers") from None
+        self._asked[number] = None
         try:
             async with asyncio.timeout(timeout_s):
                 node = node or await self._only_node()
-                await self._ask(node, name, {"id": number} | arguments)
-                result = await answer
+                self._refuse_deaf(node)
+                await self._ask(node, name, request)
+                result = await self._until(partial(self._answer, node, number))
         except TimeoutError:
+            if not self.connected:
+                raise CommandError(f"broker {self.where}: {self.last_error}") from None
             raise CommandError(
                 f'no answer to "{name}" from node "{node or "?"}" of robot "{self.robot}" within '
                 f"{timeout_s:g} s; is `skin run` running there?"
@@ -265,6 +307,24 @@ class SkinClient:
         if not result.ok:
             raise CommandError(result.error or "refused without a reason")
         return result.result or {}
+
+    def _answer(self, node: str, number: str) -> Result | None:
+        """Return the answer to a request; None: it may still come."""
+        answer = self._asked[number]
+        if answer is None:
+            self._refuse_deaf(node)
+        return answer
+
+    def _refuse_deaf(self, node: str) -> None:
+        """Refuse to wait for the answer of a node that receives no request."""
+        known = self.nodes.get(node, Node())
+        why = None
+        if known.online is False:
+            why = "is offline; is `skin run` running there?"
+        elif known.info is not None and not known.info.commands:
+            why = "takes no commands: its configuration has `[mqtt] commands = false`"
+        if why is not None:
+            raise CommandError(f'node "{node}" of robot "{self.robot}" {why}')
 
     async def __aenter__(self) -> Self:
         self._tasks = [
@@ -324,12 +384,19 @@ class SkinClient:
     async def _stop(self) -> None:
         self._stopping = True
         await cancel(*self._tasks)
+        self._news.set()
         for stream in list(self._streams):
             stream.close()
 
-    async def _until(self, condition: Callable[[], T]) -> T:
-        """Wait until `condition` holds, and return its result."""
+    async def _until(self, condition: Callable[[], T | None]) -> T:
+        """Wait until `condition` holds, and return its result.
+
+        Raises:
+            RequestError: the client has ended.
+        """
         while not (found := condition()):
+            if self._stopping:
+                raise RequestError("the client has ended: what it is asked for cannot come")
             self._news.clear()
             await self._news.wait()
         return found
@@ -352,6 +419,35 @@ class SkinClient:
         for link in self._links:
             link.again.set()
 
+    def _missing(self, part: str | None, now_s: float) -> str | None:
+        """Return that the robot has no such part; None: it has, or may have.
+
+        A node that publishes it may have been started a moment later than the others, or be known
+        to a broker that is away.
+        """
+        if part is None or not all(link.connection for link in self._links):
+            return None
+        names = self._presence.named()
+        since_s = max(self._named_s, *(link.since_s for link in self._links))
+        if names is None or part in names or now_s - since_s < NAMED_S:
+            return None
+        listed = [visible(name, 64) for name in sorted(names)[:MOST_NAMED]]
+        if len(names) > len(listed):
+            listed.append(f"... ({len(names)} in all)")
+        return (
+            f'robot "{self.robot}" has no part "{visible(part, 64)}"; there are: '
+            f"{', '.join(listed) or 'none'}"
+        )
+
+    def _check_parts(self, now_s: float) -> None:
+        """Fail the streams of parts that the robot does not have, and never had."""
+        names = self._presence.named() or ()
+        for stream in self._streams:
+            stream.is_judged |= stream.part in names
+            missing = None if stream.is_judged else self._missing(stream.part, now_s)
+            if missing is not None:
+                stream.fail(missing)
+
     async def _only_node(self) -> str:
         await self._until(lambda: self.connected)
         # By then all retained messages have been received: there are no more nodes than these.
@@ -371,14 +467,14 @@ class SkinClient:
             f"{', '.join(online)}; name the node"
         )
 
-    async def _ask(self, node: str, name: str, arguments: dict[str, Any]) -> None:
+    async def _ask(self, node: str, name: str, request: bytes) -> None:
         connection = await self._until(lambda: self._way_to(node))
         assert connection is not None and self._topics is not None
         properties = message_properties(self._links[0].broker, JSON_TYPE)
         if properties is not None:
             properties.ResponseTopic = self._topics.reply(node, self._identifier)
         await connection.publish(
-            self._topics.command(node, name), encode_request(arguments), 1, properties=properties
+            self._topics.command(node, name), request, 1, properties=properties
         )
 
     def _way_to(self, node: str) -> Connection | None:
@@ -460,7 +556,8 @@ class SkinClient:
         except SkinError as error:
             self.unreadable += 1
             if self.unreadable == 1:
-                _log.warning("%s: %s; such messages are passed over", message.topic, error)
+                topic, why = visible(message.topic.value), visible(str(error))
+                _log.warning("%s: %s; such messages are passed over", topic, why)
 
     def _admit(self, is_node: bool, name: str) -> None:
         """Remember a name, so that what is known of names stays bounded: anybody may publish.
@@ -494,7 +591,9 @@ class SkinClient:
         said = is_online(
             payload, stamp_of(message.properties), is_only_broker=len(self._links) == 1
         )
-        self._presence.take_node(name, said, link.number, again=newness is None)
+        parts = parts_of(message.properties)
+        self._presence.take_node(name, said, link.number, again=newness is None, parts=parts)
+        self._named_s = _now_s()
         self.nodes.setdefault(name, Node())
         self._report_contacts()
         self._note_nodes()
@@ -518,13 +617,15 @@ class SkinClient:
         node.info = join_pieces(node.pieces)
         if node.info is not None:
             self._presence.take_info(name, [*node.info.parts, *node.info.fingertips])
+            self._named_s = _now_s()
         self._report_contacts()
         self._news.set()
 
     def _take_answer(self, result: Result) -> None:
-        answer = self._asked.get(str(result.id))
-        if answer is not None and not answer.done():
-            answer.set_result(result)
+        number = str(result.id)
+        if number in self._asked:
+            self._asked[number] = self._asked[number] or result
+            self._news.set()
 
     def _take_part(
         self, kind: PartTopic, part: str, payload: bytes, link: BrokerLink, message: Message
@@ -592,6 +693,7 @@ class SkinClient:
                 self._pass_on(event)
             self._report_contacts()
             self._note_nodes()
+            self._check_parts(_now_s())
 
 
 def _check_several(brokers: list[Broker], robot: str | None) -> None:
@@ -605,6 +707,13 @@ def _check_several(brokers: list[Broker], robot: str | None) -> None:
         raise RequestError(
             "several brokers need MQTT 5, which distinguishes new messages from old ones"
         )
+
+
+def _check_times(**times_s: float) -> None:
+    """Refuse what no time can be compared with: without a number nothing would ever be late."""
+    for name, time_s in times_s.items():
+        if not time_s >= 0:
+            raise RequestError(f"{name}: seen {time_s}, wanted seconds from 0 on")
 
 
 def _sent_s(message: Message) -> float | None:

@@ -7,6 +7,7 @@ from typing import Any, Generic, TypeVar, cast
 
 from msgspec.structs import replace
 
+from skin_host.errors import RequestError
 from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.messages import Frame
 from skin_host.mqtt.topics import PartTopic
@@ -31,11 +32,18 @@ T = TypeVar("T")
 
 
 class Stream(AsyncIterator[T], Generic[T]):
-    """Items of some kinds from the request on; made by `SkinClient`, ends with it."""
+    """Items of some kinds from the request on; made by `SkinClient`, ends with it.
+
+    Raises (on reading, once):
+        RequestError: the robot has no part of this name, see `SkinClient`.
+    """
 
     def __init__(self, part: str | None, *kinds: PartTopic) -> None:
         self.part = part
         self.kinds = kinds
+        #: Whether it is known that there is such a part, or was reported that there is none.
+        self.is_judged = part is None
+        self._failure: str | None = None
         self._items: deque[T] = deque(maxlen=max(HELD[kind] for kind in kinds))
         self._taxels = 0
         self._wake = asyncio.Event()
@@ -45,6 +53,7 @@ class Stream(AsyncIterator[T], Generic[T]):
 
     def put(self, item: T) -> None:
         """Add a received item."""
+        self.is_judged, self._failure = True, None
         if len(self._items) == self._items.maxlen:
             self._drop()
         self._items.append(item)
@@ -63,9 +72,17 @@ class Stream(AsyncIterator[T], Generic[T]):
         self._closed = True
         self._wake.set()
 
+    def fail(self, why: str) -> None:
+        """Let the reader get a RequestError: nothing will come, as far as is known."""
+        self.is_judged, self._failure = True, why
+        self._wake.set()
+
     async def __anext__(self) -> T:
         while True:
             while not self._items:
+                if self._failure is not None:
+                    why, self._failure = self._failure, None
+                    raise RequestError(why)
                 if self._closed:
                     raise StopAsyncIteration
                 self._wake.clear()

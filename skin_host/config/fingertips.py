@@ -19,8 +19,8 @@ _NEEDS = {"sphere": ["radius_mm"], "cylinder": ["radius_mm"], "ellipsoid": ["sem
 _MAY = {"cylinder": ["half_length_mm"], "plane": ["reach_mm"]}
 #: The largest full scales that a board can answer.
 _ANSWERED = np.full(6, float(0xFFFF))
-#: Force rows that measure less than this share of the values in some direction depend on each
-#: other, but for rounding.
+#: A row of a matrix of which less than this share is its own depends on the others, but for
+#: rounding.
 _ROUNDING = 1e-9
 _DIMENSIONS = ("radius_mm", "semi_axes_mm", "half_length_mm", "reach_mm")
 
@@ -52,8 +52,8 @@ class Fingertip(Struct, forbid_unknown_fields=True, kw_only=True, frozen=True):
     #: queried.
     full_scale: tuple[Newtons, Newtons, Newtons, Newtons, Newtons, Newtons] | None = None
     #: Calibration matrix from the values of the board (N, N m) to the force and torque that the
-    #: touching object exerts, along the axes of the fingertip's frame. Without it, the board's own
-    #: axes are used.
+    #: touching object exerts, along the axes of the fingertip's frame; its rows are independent.
+    #: Without it, the board's own axes are used.
     matrix: tuple[Six, Six, Six, Six, Six, Six] | None = None
     #: Position of the force/torque sensor's origin in the fingertip's frame.
     sensor_mm: Vector = (0.0, 0.0, 0.0)
@@ -77,6 +77,7 @@ class Fingertip(Struct, forbid_unknown_fields=True, kw_only=True, frozen=True):
             yield "filter_hz", what
         if self.over_n <= self.threshold_n:
             yield "over_n", f"{self.over_n:g}; wanted more than threshold_n"
+        yield from self._dependent()
         yield from self._unreached()
         needs = _NEEDS.get(self.shape, [])
         for key in _DIMENSIONS:
@@ -86,13 +87,21 @@ class Fingertip(Struct, forbid_unknown_fields=True, kw_only=True, frozen=True):
             if given and key not in [*needs, *_MAY.get(self.shape, [])]:
                 yield f"{key}", f"a {self.shape} does not have it"
 
+    def _dependent(self) -> Iterator[tuple[str, str]]:
+        """Why the matrix gives no force or torque in some direction."""
+        rows = self.to_wrench
+        sizes = np.linalg.norm(rows, axis=1, keepdims=True)
+        shares = rows / np.where(sizes > 0.0, sizes, 1.0)
+        own = np.abs(np.diag(np.linalg.qr(shares.T, mode="r")))
+        for row in np.flatnonzero(own < _ROUNDING)[:1].tolist():
+            what = (
+                f"row {row + 1} follows from those before it, or is 0; wanted six independent rows"
+            )
+            yield "matrix", what
+
     def _unreached(self) -> Iterator[tuple[str, str]]:
         """Why no load would be a touch, whatever the board answers and its zero is."""
-        to_force = self.to_wrench[:3]
-        if not reach_n(to_force, np.ones(6)) > _ROUNDING * np.abs(to_force).max():
-            what = "its first three rows give no force in some direction; wanted independent rows"
-            yield "matrix", what
-        limit_n = reach_n(to_force, np.array(self.full_scale or _ANSWERED))
+        limit_n = reach_n(self.to_wrench[:3], np.array(self.full_scale or _ANSWERED))
         if not self.threshold_n <= limit_n:
             what = (
                 f"{self.threshold_n:g}; wanted at most {limit_n:g}, the force that is measured in "

@@ -26,6 +26,9 @@ MODELS: tuple[Model, ...] = get_args(Model)
 Shares = Annotated[list[Share], Meta(min_length=1, max_length=64)]
 Times = Annotated[list[Seconds], Meta(min_length=1, max_length=64)]
 
+#: Means of a shorter time are too noisy for drift to be followed.
+SHORTEST_UPDATE_S = 0.2
+
 
 class RelaxationSettings(Struct, forbid_unknown_fields=True, kw_only=True, frozen=True):
     """Which viscoelastic model corrects the pressure, and its parameters.
@@ -39,8 +42,9 @@ class RelaxationSettings(Struct, forbid_unknown_fields=True, kw_only=True, froze
     tau_s: Times | None = None
     beta_unload: Shares | None = None
     tau_unload_s: Times | None = None
-    #: States are updated this often; 0 means at every sweep.
-    update_s: Annotated[float, Meta(ge=0, le=60)] = 1.0
+    #: States, and means from which drift is followed, are updated this often, every 0.2 to 5 s; 0
+    #: updates states at every sweep.
+    update_s: Annotated[float, Meta(ge=0, le=5)] = 1.0
     #: A file written by `skin calibrate --relaxation`; it replaces the numbers above.
     file: Printable | None = None
 
@@ -98,6 +102,11 @@ def with_file(table: RelaxationSettings, configuration: Path) -> RelaxationSetti
 
 def _misfit(table: RelaxationSettings) -> str | None:
     """Return what does not fit together in a table; None if everything does."""
+    if 0.0 < table.update_s < SHORTEST_UPDATE_S:
+        return (
+            f"`update_s`: {table.update_s:g}; wanted 0, or {SHORTEST_UPDATE_S:g} to 5 s: means of "
+            "fewer sweeps hardly show drift"
+        )
     if (table.beta is None) != (table.tau_s is None):
         return "`beta` and `tau_s` go together"
     given = (table.beta, table.tau_s, table.beta_unload, table.tau_unload_s)

@@ -43,8 +43,8 @@ from skin_host.config.relaxation import RelaxationSettings, with_file
 from skin_host.errors import ConfigurationError, RequestError, visible
 from skin_host.files import read_whole
 from skin_host.mqtt.topics import wrong_base
+from skin_host.untrusted import from_json
 
-Byte = Annotated[int, Meta(ge=0, le=255)]
 T = TypeVar("T", bound=Struct)
 TRIANGLES_PER_BOARD = 16
 #: A rate of 0 lets everything pass; another one is at least this.
@@ -75,9 +75,11 @@ class Board(_Table, frozen=True):
     #: Selects the board's known problems to work around on bring-up, and the emulated firmware.
     model: Literal["mtb3", "mtb4", "mtb4c"] = "mtb4"
     period_ms: Annotated[int, Meta(ge=10, le=209)] = 50
-    #: 0 with temperature compensation, 1 palm and fingertips, 2 without, 3 ergoHand, 7 raw, 8 V2.
-    skin_type: Literal[0, 1, 2, 3, 7, 8] = 0
-    no_load: Byte = 240
+    #: 0 with temperature compensation, 1 palm and fingertips, 2 without, 3 ergoHand, 8 V2. With 7,
+    #: a test mode, boards send the low byte of a word, which is no measure of pressure.
+    skin_type: Literal[0, 1, 2, 3, 8] = 0
+    #: At an end of the scale untouched pads would be cut off.
+    no_load: Annotated[int, Meta(ge=1, le=254)] = 240
 
 
 class PlaceSettings(_Table, frozen=True):
@@ -478,12 +480,12 @@ def load_running(path: Path) -> Settings:
         RequestError: it is absent or damaged.
     """
     try:
-        return msgspec.json.decode(read_whole(path), type=Settings)
+        return from_json(read_whole(path), Settings)
     except OSError as error:
         raise RequestError(
             f"{path}: {error.strerror}; a daemon that runs under systemd writes it"
         ) from None
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+    except msgspec.DecodeError as error:
         raise RequestError(f"{path}: damaged: {error}; restart the daemon") from None
 
 

@@ -21,10 +21,11 @@ from skin_host.daemon.state import NodeState, Thresholds
 from skin_host.errors import BusError, RequestError, SkinError
 from skin_host.layout import Layout
 from skin_host.mqtt.publisher import Publisher
-from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration
+from skin_host.processing.calibration.outcome import outcome
 from skin_host.processing.core import Engine
 from skin_host.recording.capture import FrameRecorder
+from skin_host.untrusted import from_json
 
 log = logging.getLogger(__name__)
 
@@ -86,6 +87,8 @@ class _Node(Protocol):
     thresholds: Thresholds
     unkept: dict[str, str]
 
+    @property
+    def is_reloading(self) -> bool: ...
     async def calibrate(self, seconds: float, boards: list[int] | None = None) -> Calibration: ...
     async def configure(self, boards: list[int] | None = None) -> list[str]: ...
     async def reload(self) -> None: ...
@@ -150,15 +153,13 @@ class Control:
         elif request.part is not None:
             boards = list(layout.parts[self._part(request.part)].boards)
         seconds = request.seconds or daemon.settings.processing.calibration.seconds
+        engine = daemon.engine
+        parts, tips, before = engine.parts, engine.fingertips, engine.calibration
         found = await daemon.calibrate(seconds, boards)
-        return {
-            "id": found.id,
-            "time": found.time,
-            "verdicts": calibrations.summary(found, layout),
-            "unchanged": calibrations.unchanged(found, layout),
-            "damaged": calibrations.damaged(found, layout),
-            "kept": "calibration" not in daemon.unkept,
-        }
+        zeroed = () if tips is None or boards is not None else tuple(tips.tips)
+        # A large skin takes a while, in which the boards' frames must be read.
+        answer = await daemon.clock.in_thread(outcome, found, layout, parts, boards, zeroed, before)
+        return {**answer, "kept": "calibration" not in daemon.unkept}
 
     async def _status(self, payload: bytes) -> Answer:
         _decode(payload, _Request)
@@ -207,6 +208,10 @@ class Control:
 
     async def _reload(self, payload: bytes) -> Answer:
         _decode(payload, _Request)
+        if self._daemon.is_reloading:  # commands that wait would leave no room for others
+            raise RequestError(
+                "the configuration is being read again already; ask again when that has ended"
+            )
         await self._daemon.reload()
         return {"configuration": self._daemon.engine.configuration}
 
@@ -281,16 +286,16 @@ class Control:
 
 def _decode(payload: bytes, kind: type[R]) -> R:
     try:
-        return msgspec.json.decode(payload, type=kind)
+        return from_json(payload, kind)
     except msgspec.ValidationError as error:
         raise RequestError(f"the request: {_why(payload, error, kind)}") from None
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+    except msgspec.DecodeError as error:
         raise RequestError(f"the request: {error}") from None
 
 
 def _why(payload: bytes, error: msgspec.ValidationError, kind: type[R]) -> str:
     """What is wrong with a request; other parts of it may be wrong in ways that are not JSON."""
     try:
-        return explain(msgspec.json.decode(payload), error, kind, {})
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return explain(from_json(payload, object), error, kind, {})
+    except msgspec.DecodeError:
         return str(error)

@@ -28,6 +28,7 @@ from skin_host.fingertip.service import FingertipPublisher
 from skin_host.health import FaultLog, HealthWatch, Record
 from skin_host.health.diagnosis import named
 from skin_host.layout import Layout, PadKind, build_layout, parts_of
+from skin_host.mqtt.commands import ENDING
 from skin_host.mqtt.connection import connect
 from skin_host.mqtt.contact import PartContact
 from skin_host.mqtt.info import CalibrationInfo, NodeInfo, node_info
@@ -303,10 +304,15 @@ class Daemon:
             RequestError: the daemon is ending: it would not stop them again.
         """
         if self._is_ending:
-            raise RequestError("the daemon is ending")
+            raise RequestError(ENDING)
         chosen = self.engine.boards if boards is None else boards
         await self.link.set_up(chosen)
         return [self.layout.boards[board].name for board in chosen]
+
+    @property
+    def is_reloading(self) -> bool:
+        """Whether the configuration is being read again and used."""
+        return self._reloading.locked()
 
     async def reload(self) -> None:
         """Read the configuration file again and send it to the boards.

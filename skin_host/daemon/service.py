@@ -1,9 +1,11 @@
 """systemd: readiness, watchdog, status line, directories, priorities in its journal."""
 
+import contextlib
 import logging
 import os
 import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,6 +22,10 @@ _PRIORITIES = (
     (logging.INFO, 6),
     (logging.NOTSET, 7),
 )
+
+
+#: Signals that ask a daemon to end.
+ENDING = (signal.SIGTERM, signal.SIGINT)
 
 
 def notify(message: str) -> None:
@@ -51,6 +57,23 @@ def hold_hangups() -> None:
 def take_hangups() -> None:
     """Take the SIGHUP that waits, and those that come."""
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGHUP})
+
+
+@contextlib.contextmanager
+def ended_at_once() -> Iterator[None]:
+    """A request to end, in the block, ends this process with status 0, until the daemon takes such
+    requests: nothing has begun yet that is to be ended in good order.
+
+    By default the status would be that of a failure; and a container would not end at all, because
+    its first process gets only the signals that it takes.
+    """
+    before = {number: signal.signal(number, lambda *_: os._exit(0)) for number in ENDING}
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def notify_reloading(clock: "Clock") -> None:

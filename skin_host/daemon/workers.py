@@ -23,6 +23,7 @@ from pathlib import Path
 from skin_host.config.settings import Settings, changed, parse_triangles
 from skin_host.daemon import service
 from skin_host.errors import RequestError
+from skin_host.processes import kept_from_children
 
 #: Daemons end touches, stop boards and disconnect within this time; systemd waits as long for all.
 STOP_S = 4.5
@@ -89,7 +90,7 @@ async def run(commands: dict[str, list[str]]) -> int:
             with contextlib.suppress(ProcessLookupError):
                 process.send_signal(number)
 
-    for caught in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+    for caught in (*service.ENDING, signal.SIGHUP):
         loop.add_signal_handler(caught, forward, caught)
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="skin-run-")))
@@ -97,12 +98,13 @@ async def run(commands: dict[str, list[str]]) -> int:
             path = folder / str(number)
             _listen(stack, path, name, merged)
             service.hold_hangups()  # until that daemon can take one
-            processes[name] = await asyncio.create_subprocess_exec(
-                *(sys.executable, "-m", "skin_host", *arguments),
-                env=_environment(path),
-                # Ctrl-C of a terminal reaches only this process, which passes it on once.
-                start_new_session=True,
-            )
+            with kept_from_children(*service.ENDING):  # until that daemon takes them
+                processes[name] = await asyncio.create_subprocess_exec(
+                    *(sys.executable, "-m", "skin_host", *arguments),
+                    env=_environment(path),
+                    # Ctrl-C of a terminal reaches only this process, which passes it on once.
+                    start_new_session=True,
+                )
             if ending is not None:  # it came before this daemon was there
                 with contextlib.suppress(ProcessLookupError):
                     processes[name].send_signal(ending)

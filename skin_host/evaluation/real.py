@@ -6,6 +6,7 @@ of the same foam, and from no other data.
 """
 
 import time
+from concurrent.futures import Future, as_completed
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import pairwise
@@ -23,6 +24,7 @@ from skin_host.evaluation.document import as_text, write
 from skin_host.evaluation.goals import goal
 from skin_host.evaluation.insole import InsoleRecording
 from skin_host.evaluation.machine import machine
+from skin_host.evaluation.steps import show_step
 from skin_host.layout import Layout, build_layout
 from skin_host.processes import Processes
 from skin_host.processing.calibration import Calibration, Verdict, with_pressures_of
@@ -138,6 +140,7 @@ def run(
     if quick:
         paths = [path for path in paths if path.stem in QUICK] or paths[:1]
     grasp_log = folder.parent / GRASPS
+    show_step("real skin")
     with Processes() as processes:
         grasping = processes.submit(grasps, grasp_log) if grasp_log.exists() else None
         known = {_foam(path): _calibration_path(_foam(path), folder) for path in paths}
@@ -152,6 +155,11 @@ def run(
         emulating = None
         if calibration is not None and with_emulation:
             emulating = processes.submit(insole.compare, calibration)
+        parts: list[Future[Any]] = [*measured]
+        parts += [part for part in (grasping, emulating) if part is not None]
+        for done, part in enumerate(as_completed(parts), 1):
+            part.result()
+            show_step(f"real skin: {done} of {len(parts)} parts")
         rows = [future.result() for future in measured]
         found = None if grasping is None else grasping.result()
         compared = [] if emulating is None else emulating.result()

@@ -5,7 +5,6 @@ spot. Errors are worked out in as many processes as there are cores; then, alone
 machine, what is timed, in the same run as a copy of the same numbers in memory.
 """
 
-import sys
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, as_completed
@@ -24,6 +23,7 @@ from skin_host.evaluation.goals import goal
 from skin_host.evaluation.histories import TRUTHS
 from skin_host.evaluation.localization_trials import Case, errors, localizer_for
 from skin_host.evaluation.machine import machine
+from skin_host.evaluation.steps import show_step
 from skin_host.processes import Processes
 
 Row = dict[str, Any]
@@ -59,7 +59,6 @@ def run(quick: bool, output: Path | None, recordings: Path | None = None) -> Rep
         OSError: the folder cannot be written.
     """
     start_s, here = time.perf_counter(), machine()
-    _tell("real skin")
     real_skin = real.run(quick, None, recordings, with_emulation=not quick)
     found, seconds_of = _worked_out(jobs_of(quick))
     report: Report = {
@@ -81,15 +80,14 @@ def run(quick: bool, output: Path | None, recordings: Path | None = None) -> Rep
         "hard_cases": [row for rows in found["hard cases"] for row in rows],
         "localization": found["localisation"][0],
     }
-    _tell("speed of models")
+    show_step("speed of models")
     report["speed"], seconds_of["speed"] = _timed(speed.models, (0.02 if quick else 0.15,))
-    _tell("speed of the pipeline")
+    show_step("speed of the pipeline")
     report["pipeline"], seconds_of["pipeline"] = _timed(speed.pipeline, (0.1 if quick else 0.6,))
-    _tell("speed of own curves")
+    show_step("speed of own curves")
     report["own_curves"], seconds_of["own curves"] = _timed(
         speed.own_curves, (0.1 if quick else 5.0,)
     )
-    _tell("")
     report["summary"] = summary(report)
     report["goals"] = goals(report)
     report["cycle_evidence"] = cycle_evidence(report)
@@ -147,7 +145,7 @@ def _worked_out(jobs: list[Job]) -> tuple[dict[str, list[Any]], dict[str, float]
         ]
         for done, future in enumerate(as_completed(running), 1):
             future.result()
-            _tell(f"{done} of {len(jobs)} parts")
+            show_step(f"{done} of {len(jobs)} parts")
     found: dict[str, list[Any]] = {}
     seconds_of: dict[str, float] = {}
     for (name, _, _), future in zip(jobs, running, strict=True):
@@ -394,10 +392,3 @@ def localization(presses: int) -> list[Row]:
 
 def key_of(variant: Variant) -> Row:
     return {"model": variant.model, "update_s": variant.update_s}
-
-
-def _tell(what: str) -> None:
-    """Show the present step on a terminal."""
-    if sys.stderr.isatty():
-        sys.stderr.write(f"\r\033[K{what}")
-        sys.stderr.flush()

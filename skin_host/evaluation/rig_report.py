@@ -24,6 +24,7 @@ from skin_host.evaluation.cup_grasp import Grasp
 from skin_host.evaluation.cup_grasp import run as grasp_cups
 from skin_host.evaluation.document import Section, Table, as_text, write
 from skin_host.evaluation.pictures import Corrected, Results, draw_rig
+from skin_host.evaluation.steps import show_step
 from skin_host.processing.fitting.hold import fit, merge
 from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.relaxation import make_model
@@ -69,19 +70,24 @@ def measure(*, quick: bool = False) -> Results:
     rig = PalmRig()
     step_mm = 1.0 if quick else 0.5
     x_mm, y_mm = np.meshgrid(np.arange(3.5, 30.1, step_mm), np.arange(-6.0, 9.1, step_mm))
+    show_step("map of an area")
     area = scan(rig, x_mm.ravel(), y_mm.ravel(), passes=4 if quick else 2)
+    show_step("line over a pad")
     line_x_mm = np.arange(7.5, 25.6, 0.5 if quick else 0.2)
     line_y_mm = np.full(len(line_x_mm), rig.centre_mm(2)[1])
     line = scan(rig, line_x_mm, line_y_mm, passes=4)
     contacts = [(2, diameter) for diameter in (2.0, 3.0, 4.0, 5.0, 6.0)]
     contacts += [(pad, diameter) for pad in (1, 3) for diameter in (3.0, 6.0)]
+    show_step("presses")
     presses = deepening_presses(rig, contacts)
     scale = 0.1 if quick else 1.0
+    show_step("holds")
     start = time.process_time()
     hour = hold(rig, [(depth, seconds * scale) for depth, seconds in HOUR])
     hour_s = time.process_time() - start
     steps = hold(rig, [(depth, seconds * scale) for depth, seconds in multistep_depths()])
     corrected = _correct(hour, steps, HOUR[0][1] * scale)
+    show_step("grasps")
     grasps = asyncio.run(grasp_cups(*load_skin(configuration("demo.toml")), 1 if quick else 10))
     return Results(area, line, presses, *corrected, hour_s, grasps)
 

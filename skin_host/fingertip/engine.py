@@ -61,7 +61,7 @@ class TipState:
         touched_since_ns: the same of its touch, if there is one.
         assembler: of its samples; None until the full scales are known.
         agreement: of its samples, which only together are a load.
-        frozen: whether they repeat one.
+        frozen: whether they are measured.
         saturated_ns: when its load was last saturated, 0 if never.
         silenced: how often the board has timed out.
         came: a frame of it was read since boards were last looked at.
@@ -187,6 +187,7 @@ class FingertipEngine:
             state.frames += len(mine)
             if now_ns - state.received_ns >= LOST_NS:
                 state.agreement.forget()
+                state.frozen.doubt()
             state.last_ns = int(batch.t_ns[frames.row[mine[-1]]])
             state.received_ns = now_ns
             state.came = state.alive = True
@@ -249,7 +250,7 @@ class FingertipEngine:
         self._zeroing = False
         found = {}
         for name, state in self.tips.items():
-            if len(state.zeroing) >= FEWEST_SAMPLES and not state.frozen.now:
+            if len(state.zeroing) >= FEWEST_SAMPLES and state.frozen.trusted:
                 assert state.assembler is not None
                 samples = np.array(state.zeroing)
                 whole = ~damaged(samples, state.assembler.full_scale / ZERO_WORD)
@@ -275,8 +276,8 @@ class FingertipEngine:
     def _step(self, state: TipState, wrench: Wrench) -> list[FingertipEvent]:
         events: list[FingertipEvent] = []
         load = state.agreement.take(wrench)
-        frozen = state.frozen.take(wrench)
-        if frozen:
+        state.frozen.take(wrench)
+        if not state.frozen.trusted:
             events = state.tip.lose(wrench.t_ns)
             self._note_touch(state)
         elif load is not None:
@@ -284,7 +285,7 @@ class FingertipEngine:
                 state.saturated_ns = load.t_ns
             events = state.tip.step(load)
             self._note_touch(state)
-        if self._zeroing and not wrench.saturated and not frozen:
+        if self._zeroing and not wrench.saturated and state.frozen.trusted:
             state.zeroing.append(np.concatenate([wrench.force_n, wrench.torque_nm]))
             state.touching.append(state.tip.touched)
         return events

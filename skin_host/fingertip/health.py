@@ -128,11 +128,11 @@ class FingertipHealth:
                 f"{here} reports other full scales ({reported}) than fingertips.{name}.full_scale, "
                 "which is used",
             )
-        if state.alive and state.frozen.now:
+        if state.alive and state.frozen.repeated:
             yield fault(
                 "frozen",
-                f"{here} repeats the same bytes for longer than chance allows: its converter has "
-                "stopped; switch it off and on",
+                f"{here} repeats the same {' and '.join(state.frozen.repeated)} for longer than "
+                "chance allows: its converter has stopped; switch it off and on",
             )
         if state.assembler is not None and not state.tip.zeroed:
             yield fault(
@@ -148,6 +148,13 @@ class FingertipHealth:
             )
         if state.tip.unreached:
             yield fault("unreached", _unreached(state))
+        # The load that came or went is in that noise.
+        if state.tip.threshold_n > table.threshold_n and not state.tip.zeroed_touched:
+            yield fault(
+                "noisy",
+                f"{name}: contacts below {state.tip.threshold_n:.2f} N drown in the noise of its "
+                f"board; fingertips.{name}.threshold_n asks for {table.threshold_n:g} N",
+            )
         if now_ns is None:
             return
         if state.saturated_ns and abs(now_ns - state.saturated_ns) < HOLD_NS:
@@ -163,13 +170,6 @@ class FingertipHealth:
                 "held",
                 f"{name} has been touched for so long that its zero is uncertain; calibrate it "
                 "unloaded",
-            )
-        # The load that came or went is in that noise.
-        if state.tip.threshold_n > table.threshold_n and not state.tip.zeroed_touched:
-            yield fault(
-                "noisy",
-                f"{name}: contacts below {state.tip.threshold_n:.2f} N drown in the noise of its "
-                f"board; fingertips.{name}.threshold_n asks for {table.threshold_n:g} N",
             )
 
 
@@ -196,6 +196,6 @@ _STATES = {
 
 
 def _state(tip: TipState, faults: list[FoundFault]) -> str:
-    if not tip.frames:
+    if not tip.frames or not (faults or tip.frozen.trusted):
         return "no data"
     return _STATES.get(faults[0].code, "degraded") if faults else "ok"

@@ -238,8 +238,9 @@ class Tip:
         """Take in a sample; return its events."""
         if self._zero is None:
             return []
-        if abs(wrench.t_ns - self._last_ns) > SILENT_NS and self.samples:
-            # A sample after a pause does not continue the samples before it.
+        if not 0 <= wrench.t_ns - self._last_ns <= SILENT_NS and self.samples:
+            # A sample after a pause, or after the clock was set back, does not continue the samples
+            # before it.
             self._restart()
         self._last_ns = wrench.t_ns
         self.samples += 1
@@ -308,7 +309,7 @@ class Tip:
     def _restart(self) -> None:
         """Forget the earlier samples, but keep contact and flags."""
         self._filter = Butterworth2(self._settings.filter_hz, self._rate_hz, 6)
-        self._watch = SlipWatch(self._settings, self._rate_hz, self._noise_n)
+        self._watch = SlipWatch(self._settings, self._noise_n)
 
     def _moved(self, measured: Floats) -> Floats:
         """Convert rows of the board's values (N, N m) to force (N) and torque (N mm) on the
@@ -340,7 +341,7 @@ class Tip:
         settled = self._reported is not None and not (0 <= t_ns - self._begun_ns <= SETTLING_NS)
         located = contact is not None and int(contact.verdict[0]) == ContactVerdict.CONTACT
         normal = contact.normal[0] if contact is not None and located else None
-        seen = self._watch.step(load, normal, settled=settled)
+        seen = self._watch.step(load, normal, t_ns, settled=settled)
         normal_n = seen.normal_n if touches else 0.0
         if seen.cause is not None and not self.flags & Flags.SLIP:
             self._cause = seen.cause

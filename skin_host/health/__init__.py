@@ -161,16 +161,16 @@ class HealthWatch:
         if output is not None:
             self._note_output(output, now_ns)
         found = diagnose(record, [name for name, at_ns in self._output_ns.items() if at_ns])
-        faults = self._hold(part, self._without_own_stalls(found, now_ns), now_ns)
-        if record["state"] == "ok" and faults:
-            record["state"] = "warning"
-        record["faults"] = [{"code": fault.code, "where": fault.where} for fault in faults]
-        record["sentences"] = [fault.sentence for fault in faults]
-        return record
+        return _with_faults(
+            record, self._hold(part, self._without_own_stalls(found, now_ns), now_ns)
+        )
 
     def replayed(self, part: int) -> Record:
-        """Return the record of a part at the end of a replay, without ages and without faults."""
-        return self._describer.part(part, None, {}, {})
+        """Return the record of a part at the end of a replay: without ages, and with the faults
+        that need none.
+        """
+        record = self._describer.part(part, None, {}, {})
+        return _with_faults(record, diagnose(record))
 
     def rates(self) -> dict[str, float]:
         """Return frames and sweeps per second, summed over all buses and boards."""
@@ -223,6 +223,15 @@ class HealthWatch:
             if abs(now_ns - seen_ns) > (HOLD_NS if fault.code in _PASSING else 0):
                 del held[key]
         return [fault for fault, _ in held.values()]
+
+
+def _with_faults(record: Record, faults: list[FoundFault]) -> Record:
+    """Put faults into a record, as codes and as sentences; return it."""
+    if record["state"] == "ok" and faults:
+        record["state"] = "warning"
+    record["faults"] = [{"code": fault.code, "where": fault.where} for fault in faults]
+    record["sentences"] = [fault.sentence for fault in faults]
+    return record
 
 
 def _pulse_of_boards(engine: Engine) -> tuple[object, ...]:

@@ -369,8 +369,9 @@ class Describer:
                 for kind in map(Verdict, sorted(set(verdict.tolist())))
                 if kind != Verdict.OK
             }
-            if pipeline.unreached[mine].any():
-                found["unreached"] = np.flatnonzero(pipeline.unreached[mine]).tolist()
+            for name, taxels in (("unreached", pipeline.unreached), ("flat", pipeline.flat)):
+                if taxels[mine].any():
+                    found[name] = np.flatnonzero(taxels[mine]).tolist()
             self._judged[part] = known = calibration, changes, found
         return known[2]
 
@@ -425,13 +426,13 @@ class Describer:
                 for name, at_ns in watch.event_ns.items()
                 if abs(now_ns - at_ns) < LATELY_NS
             }
-            record["held_up"] = (
-                period_seen_ms is not None
-                and jitter_ms is not None
-                and jitter_ms > JITTER_SHARE * board.settings.period_ms
-                and self._is_held_up(index, period_seen_ms)
-            )
-            record["twice"] = row in ledger.twice and not ledger.is_silent(row)
+        record["held_up"] = (
+            period_seen_ms is not None
+            and jitter_ms is not None
+            and jitter_ms > JITTER_SHARE * board.settings.period_ms
+            and self._is_held_up(index, period_seen_ms)
+        )
+        record["twice"] = row in ledger.twice and not ledger.is_silent(row)
         return record
 
     def _is_held_up(self, index: int, period_ms: float) -> bool:

@@ -5,7 +5,7 @@ A fault has a code for programs, the place where it is, and a sentence that a pe
 """
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 from msgspec import Struct
@@ -335,12 +335,8 @@ def _taxels(record: Record) -> Iterator[FoundFault]:
             "taxel_pressed", touched, "touched when calibrated; calibrate when nothing touches"
         )
     if unreached := verdicts.get("unreached"):
-        yield fault(
-            "taxel_unreached",
-            unreached,
-            "not valid: no reading of them would be a touch; lower margin_units and "
-            "minimum_threshold_units (skin command thresholds)",
-        )
+        reason = _why_unreached(unreached, verdicts.get("flat", ()))
+        yield fault("taxel_unreached", unreached, f"not valid: no press would be felt: {reason}")
     # If the triangle is already reported as missing, its taxels were absent because of that.
     kinds = {"stuck": "stuck", "out_of_range": "out of range", "too_noisy": "too noisy"}
     if not record["triangles"]:
@@ -368,6 +364,21 @@ def _taxels(record: Record) -> Iterator[FoundFault]:
             "touched for so long, or with so much drift during the touch, that the zero is "
             "uncertain",
         )
+
+
+def _why_unreached(unreached: Collection[int], flat: Collection[int]) -> str:
+    """Why no reading of taxels would be a touch: of some, or all, because their curve is flat."""
+    high = (
+        "the threshold is above all their readings; lower margin_units and "
+        "minimum_threshold_units: skin command thresholds"
+    )
+    curve = (
+        "the curve does not rise with each unit, by their gain and bend of the calibration and by "
+        "processing.pressure; correct that, or fit them again: skin calibrate --pressure"
+    )
+    if not flat:
+        return high
+    return curve if len(flat) == len(unreached) else f"{high}; of {named(flat)} {curve}"
 
 
 def _part(record: Record) -> Iterator[FoundFault]:
@@ -433,6 +444,11 @@ def _output(output: dict[str, Any] | None, lost_lately: Collection[str]) -> Iter
 def named(taxels: Collection[int]) -> str:
     """Taxels in words: "taxels 1, 4-7, 9"; the first eight runs of many."""
     return f"{'taxel' if len(taxels) == 1 else 'taxels'} {_list(taxels)}"
+
+
+def named_by_part(taxels: Mapping[str, Collection[int]]) -> str:
+    """Taxels of several parts in words: "taxels 3-5, 9 of left_hand; taxel 1 of palm"."""
+    return "; ".join(f"{named(numbers)} of {part}" for part, numbers in taxels.items())
 
 
 def _list(numbers: Iterable[int]) -> str:

@@ -26,7 +26,8 @@ from skin_host.importing.report import Findings, Place, integer, read_source
 HOSTS_READ_TRIANGLE_SETS = 20
 TRIANGLES = range(16)
 ADDRESSES = range(1, 15)
-SKIN_TYPES = (0, 1, 2, 3, 7, 8)
+#: Without 7, a test mode in which boards send no measure of pressure.
+SKIN_TYPES = (0, 1, 2, 3, 8)
 PERIODS_MS = range(10, 210)
 SHIFTS = range(9)
 #: Boards of these types correct their values with a temperature pad: their triangles have ten pads.
@@ -280,7 +281,7 @@ def _boards(document: Document) -> dict[int, list[BoardSpec]]:
         0,
         _number(document, "defaultCfgBoard", "period", 50, PERIODS_MS),
         _number(document, "defaultCfgBoard", "skinType", 0, SKIN_TYPES),
-        _number(document, "defaultCfgBoard", "noLoad", 240, range(256)),
+        _number(document, "defaultCfgBoard", "noLoad", 240, range(1, 255)),
     )
     shift = _number(document, "defaultCfgTriangle", "shift", 2, SHIFTS)
     offset = _number(document, "defaultCfgTriangle", "cdcOffset", 0x2200, range(0x10000))
@@ -464,7 +465,7 @@ def _set_up_boards(
     for column, value, allowed in (
         ("period", period_ms, PERIODS_MS),
         ("skinType", skin_type, SKIN_TYPES),
-        ("noLoad", no_load, range(256)),
+        ("noLoad", no_load, range(1, 255)),
     ):
         if value not in allowed:
             findings.odd(entry.at, f"{entry.name}: {column} {value}; not read")

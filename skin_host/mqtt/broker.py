@@ -7,6 +7,7 @@ import asyncio
 import logging
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import tempfile
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from skin_host.errors import BrokerError
+from skin_host.processes import kept_from_children
 from skin_host.tasks import in_tasks
 
 HOST = "127.0.0.1"
@@ -159,8 +161,8 @@ def _start_mosquitto(program: str, port: int, folder: Path) -> "subprocess.Popen
         f"listener {port} {HOST}\nallow_anonymous true\npersistence false\n"
         "log_dest stderr\nlog_type error\nlog_type warning\n"
     )
-    with (folder / "log").open("wb") as log:
-        # In a separate session Ctrl-C does not end it before its clients disconnect.
+    with (folder / "log").open("wb") as log, kept_from_children(signal.SIGINT):
+        # It must not end before its clients disconnect, also when the terminal is closed.
         return subprocess.Popen(
             [program, "-c", configuration],
             stdin=subprocess.DEVNULL,

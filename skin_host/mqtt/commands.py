@@ -7,6 +7,7 @@ key `id`, if it has one, comes back in the answer. The answer is a JSON object:
 """
 
 import asyncio
+import json
 import logging
 import re
 from collections.abc import Awaitable, Callable, Mapping
@@ -18,6 +19,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 from skin_host.errors import SkinError
 from skin_host.mqtt.payload import MessageError, decode, one_line
 from skin_host.tasks import cancel
+from skin_host.untrusted import from_json
 
 RESULT_SCHEMA = "skin.result/1"
 MAX_REQUEST_BYTES = 64 * 1024
@@ -33,9 +35,11 @@ Handler = Callable[[str, bytes], Awaitable[Mapping[str, Any]]]
 #: Sends the payload of an answer.
 Answer = Callable[[bytes], None]
 
+#: Why a daemon that ends refuses what it is asked for.
+ENDING = "the daemon is ending"
+
 _log = logging.getLogger(__name__)
 _NAME = re.compile(r"[a-z0-9_-]{1,32}")
-_ENDING = "the daemon is ending"
 
 
 class Result(Struct, omit_defaults=True):
@@ -57,8 +61,12 @@ _result_decoder = msgspec.json.Decoder(Result)
 
 
 def encode_request(arguments: Mapping[str, Any]) -> bytes:
-    """Write the request of a command."""
-    return msgspec.json.encode(dict(arguments))
+    """Write the request of a command.
+
+    Raises:
+        ValueError: a number is not finite; JSON has no such number.
+    """
+    return json.dumps(dict(arguments), allow_nan=False).encode()
 
 
 def decode_result(payload: bytes) -> Result:
@@ -107,8 +115,8 @@ class CommandHandler:
         identity: str | int | UnsetType = UNSET
         if refusal is None:
             try:
-                identity = msgspec.json.decode(payload or b"{}", type=_Identified).id
-            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+                identity = from_json(payload or b"{}", _Identified).id
+            except msgspec.DecodeError as error:
                 refusal = f"the request is not a JSON object as it should be: {error}"
         if refusal is not None:
             self.refused += 1
@@ -146,7 +154,7 @@ class CommandHandler:
             _log.info("command %s refused: %s", name, one_line(str(error)))
             answer(_failure(name, identity, str(error)))
         except asyncio.CancelledError:
-            answer(_failure(name, identity, f"{_ENDING}; this may not have been done"))
+            answer(_failure(name, identity, f"{ENDING}; this may not have been done"))
             raise
         except Exception as error:
             # An error in one command must neither stop the service nor remain without an answer.
@@ -158,7 +166,7 @@ class CommandHandler:
 
     def _refusal(self, name: str, payload: bytes) -> str | None:
         if self._ending:
-            return _ENDING
+            return ENDING
         if not _NAME.fullmatch(name):
             return "a command's name has up to 32 of a-z, 0-9, _ and -"
         if len(payload) > MAX_REQUEST_BYTES:
@@ -182,7 +190,7 @@ class CommandHandler:
 
 def answer_too_large(answer: bytes) -> bytes:
     """Return the replacement for an answer that is too large for the broker."""
-    result = msgspec.json.decode(answer, type=Result)
+    result = from_json(answer, Result)
     return _failure(result.command, result.id, "the answer is larger than the broker takes")
 
 

@@ -107,6 +107,12 @@ _silent.setLevel(logging.CRITICAL)
 _log = logging.getLogger(__name__)
 
 
+class UnansweredError(aiomqtt.MqttCodeError):
+    """The broker closed the connection before it answered who we are: it may be shutting down, or
+    take no packet as large as that.
+    """
+
+
 class Connection(aiomqtt.Client):
     """A client of the broker that can be cut off at any moment. Made by `connect`.
 
@@ -163,6 +169,7 @@ class Connection(aiomqtt.Client):
         self.ended_by_broker = self.without_reason = False
         self.taken_over = False
         self.packet_limit: int | None = None
+        self._takes_wildcards = True
         self._v5 = broker.v5
         self._max_packet = max_packet
         #: paho's client, with its private members.
@@ -180,9 +187,8 @@ class Connection(aiomqtt.Client):
         self._is_open = False
         self._client.connect_timeout = TIMEOUT_S
         # Retrieved in any case, or asyncio logs an exception that was never retrieved.
-        self._disconnected.add_done_callback(
-            lambda future: future.cancelled() or future.exception()
-        )
+        for future in (self._connected, self._disconnected):
+            future.add_done_callback(lambda future: future.cancelled() or future.exception())
 
     def send(
         self,
@@ -329,11 +335,14 @@ class Connection(aiomqtt.Client):
         return result
 
     async def listen_to(self, topic: str) -> bool:
-        """Subscribe with QoS 1; return whether the broker allows it.
+        """Subscribe with QoS 1; return whether the broker allows it. One that takes no wildcards is
+        not asked for any, because it would end the connection.
 
         With MQTT 5 messages show whether they were published as retained, also those that come
         while we listen.
         """
+        if not self._takes_wildcards and any(one in topic for one in "+#"):
+            return False
         if self._v5:
             options = SubscribeOptions(qos=1, retainAsPublished=True)
             codes: Any = await self.subscribe(topic, options=options)
@@ -465,6 +474,7 @@ class Connection(aiomqtt.Client):
         properties: Properties | None = None,
     ) -> None:
         self.packet_limit = getattr(properties, "MaximumPacketSize", None)
+        self._takes_wildcards = bool(getattr(properties, "WildcardSubscriptionAvailable", True))
         # paho knows no receive maximum of the broker's; what is above it waits in paho.
         self._paho._max_inflight_messages = min(
             MAX_IN_FLIGHT, getattr(properties, "ReceiveMaximum", MAX_IN_FLIGHT)
@@ -486,6 +496,8 @@ class Connection(aiomqtt.Client):
         self.without_reason = not self._cut and closed
         if self._connected.cancelled():
             return  # the attempt was given up; aiomqtt would raise
+        if not self._connected.done():  # aiomqtt would wait for the answer until its timeout
+            self._connected.set_exception(UnansweredError(reason_code, "closed"))
         super()._on_disconnect(client, userdata, flags, reason_code, properties)
 
     def _bounded_read(self) -> MQTTErrorCode:

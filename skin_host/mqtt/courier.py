@@ -136,7 +136,6 @@ class Courier:
         Raises:
             MqttError: the connection is lost.
         """
-        self._events_out.clear()
         self._states_out.clear()
         self._frames_out.clear()
         self._works = False
@@ -158,6 +157,8 @@ class Courier:
         outbox = self._outbox
         outbox.drop_frames()
         out = min(len(self._events_out), len(outbox.events))
+        # An acknowledgement that is read after this must not count for what moves up in the queue.
+        self._events_out.clear()
         answers = sum(not event.is_touch for event in islice(outbox.events, out))
         states = [topic for topic, done in self._states_out.items() if not done.done()]
         outbox.drop_answers()

@@ -17,7 +17,9 @@ finds it at the broker, and with it what an earlier configuration left there.
 """
 
 import re
-from collections.abc import Callable, Iterable
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 from paho.mqtt.packettypes import PacketTypes
@@ -120,16 +122,25 @@ def put_stamp(properties: Properties | None, stamp: Stamp) -> None:
         properties.UserProperty = (STAMP, f"{stamp.connection}.{stamp.message}")
 
 
-def put_parts(properties: Properties | None, parts: Iterable[str]) -> None:
+def that_fit(parts: Sequence[str], room_bytes: int | None = None) -> Sequence[str]:
+    """Return the first of these parts, as many as a status has room to name.
+
+    Args:
+        parts: of which the node publishes.
+        room_bytes: in a packet that the broker takes, if there is a limit.
+    """
+    most = MAX_PARTS_BYTES if room_bytes is None else min(MAX_PARTS_BYTES, room_bytes)
+    ends = accumulate(len(name) + 1 for name in parts)  # with a comma behind each
+    return parts[: bisect_right(list(ends), most + 1)]
+
+
+def put_parts(properties: Properties | None, parts: Sequence[str]) -> None:
     """Add to a status of which parts the node publishes; MQTT 3.1.1 has no place for it."""
-    names = ",".join(parts)
-    if len(names) > MAX_PARTS_BYTES:
-        names = names[:MAX_PARTS_BYTES].rpartition(",")[0]
-    if properties is not None and names:
-        properties.UserProperty = (PARTS, names)
+    if properties is not None and parts:
+        properties.UserProperty = (PARTS, ",".join(parts))
 
 
-def last_will(topic: str, payload: bytes, stamp: Stamp | None, parts: Iterable[str] = ()) -> Will:
+def last_will(topic: str, payload: bytes, stamp: Stamp | None, parts: Sequence[str] = ()) -> Will:
     """Return the broker's message for a node that vanishes; without a stamp for MQTT 3.1.1."""
     properties = None
     if stamp is not None:

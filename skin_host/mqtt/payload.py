@@ -11,6 +11,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skin_host.errors import SkinError
+from skin_host.untrusted import decoded
 
 #: No valid message is longer, with stated exceptions.
 MAX_BYTES = 4 * 1024 * 1024
@@ -54,8 +55,8 @@ def decode(
     """
     check_size(payload, what, max_bytes)
     try:
-        return decoder.decode(payload)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        return decoded(decoder, payload)
+    except msgspec.DecodeError as error:
         raise MessageError(f"{what}: {error}") from None
 
 

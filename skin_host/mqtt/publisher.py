@@ -6,7 +6,7 @@ arrive are sent again. Frames are encoded only while there is a connection.
 
 import asyncio
 import logging
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractAsyncContextManager, AbstractContextManager
 from functools import partial
 from pathlib import Path
@@ -30,6 +30,7 @@ from skin_host.mqtt.connection import (
     MqttError,
     PackedProperties,
     Retry,
+    UnansweredError,
     connect,
     explain,
     first_error,
@@ -54,6 +55,7 @@ from skin_host.mqtt.order import (
     put_run,
     put_stamp,
     stamp_of,
+    that_fit,
 )
 from skin_host.mqtt.outbox import Event, Outbox, PublisherCounters
 from skin_host.mqtt.payload import CBOR_TYPE, JSON_TYPE
@@ -152,6 +154,8 @@ class Publisher:
         #: Parts and fingertips of this node, and those of others in the configuration.
         self._parts: list[str] = []
         self._elsewhere: Collection[str] = ()
+        #: Brokers at which the last will names no part.
+        self._without_parts: set[str] = set()
         #: What an earlier configuration left at the broker, and the tries that remain.
         self._left: dict[str, int] = {}
         self._left_found = asyncio.Event()
@@ -297,7 +301,7 @@ class Publisher:
                 async with self._connect(
                     self._broker,
                     identifier=self._identifier,
-                    will=last_will(self._status, OFFLINE, stamp, self._parts),
+                    will=last_will(self._status, OFFLINE, stamp, self._parts_in_will()),
                     max_packet=MAX_PACKET_BYTES,
                     clock=clock,
                 ) as link:
@@ -312,7 +316,12 @@ class Publisher:
                 self._is_brief = since_s is not None and clock.monotonic_s() - since_s < GOOD_S
                 if since_s is not None and not self._is_brief:
                     said = ""
-                why = self._note_loss(first_error(group), said, was_connected=since_s is not None)
+                error = first_error(group)
+                if isinstance(error, UnansweredError):
+                    # A broker states its limit only in its answer: the next try is without them,
+                    # and the one after it with them again.
+                    self._without_parts ^= {str(self._broker)}
+                why = self._note_loss(error, said, was_connected=since_s is not None)
             finally:
                 self._forget_connection()
             if why is None or (self._closing.is_set() and not self._outbox.events):
@@ -388,8 +397,16 @@ class Publisher:
                 worker.cancel()
 
     def _note_connected(self, connection: Connection) -> None:
-        if connection is self._connection:
-            _log.info("broker %s: connected", self._broker)
+        if connection is not self._connection:
+            return
+        _log.info("broker %s: connected", self._broker)
+        named = min(len(self._parts_in_status()), len(self._parts_in_will()))
+        if self._broker.v5 and named < len(self._parts):
+            _log.warning(
+                "broker %s: the status names only %d of its %d parts: packets have no room for "
+                "more. When the configuration changes, what is retained of the others may stay",
+                *(self._broker, named, len(self._parts)),
+            )
 
     def _forget_connection(self) -> None:
         counters, connection = self._outbox.counters, self._connection
@@ -419,8 +436,15 @@ class Publisher:
         is_online = topic == self._status and payload == ONLINE
         put_stamp(properties, self._numbers.online if is_online else self._numbers.state())
         if topic == self._status:
-            put_parts(properties, self._parts)
+            put_parts(properties, self._parts_in_status())
         return properties
+
+    def _parts_in_status(self) -> Sequence[str]:
+        connection = self._connection
+        return that_fit(self._parts, None if connection is None else connection.room(self._status))
+
+    def _parts_in_will(self) -> Sequence[str]:
+        return () if str(self._broker) in self._without_parts else that_fit(self._parts)
 
     async def _subscribe(self, connection: Connection) -> None:
         wanted = [self._status]

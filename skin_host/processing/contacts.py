@@ -3,7 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate, chain, pairwise
 from statistics import median
@@ -42,7 +42,7 @@ PIECE_SHARE = 0.2
 FADES_NS = 10_000_000_000
 #: Contacts that have grown together become one after this time: a taxel between two may flicker.
 MERGED_NS = 1_000_000_000
-#: A touched taxel that is not received for less than this time still counts as touched.
+#: A taxel that is not received for less than this time counts as it was last received.
 LOST_NS = 500_000_000
 
 
@@ -52,12 +52,12 @@ class _Contact:
     #: The same in rising order, intp.
     order: NDArray[np.intp]
     said: Touch
-    #: When that was, and when all its taxels were last received. All times here are those of
-    #: `PressureFrame.elapsed_ns`.
+    #: When that was. All times here are those of `PressureFrame.elapsed_ns`.
     said_ns: int
-    heard_ns: int
     #: The recent highest pressure.
     firm_kpa: float
+    #: Taxels that it lost when they were not received for long: they may still be touched.
+    unseen: frozenset[int] = frozenset()
     #: Since when it has been in pieces.
     parted_ns: int | None = None
     #: Since when it has been connected with another contact.
@@ -104,67 +104,58 @@ class ContactTracker:
         self._contacts: dict[int, _Contact] = {} if before is None else before._contacts
         self._next_id: int = 1 if before is None else before._next_id
         self._elapsed_ns: int = 0 if before is None else before._elapsed_ns
+        self._held: _Held = _Held(part.n_taxels) if before is None else before._held
         self._known = _Grouping.of([], [], _Homes({}, 0), self._area_mm2, self._position_m)
         self._seen: bytes | None = None
 
     def step(self, frame: PressureFrame) -> list[Touch]:
         """Return the events since the last frame: ends first, then moves and begins."""
         if not self._contacts and not any_of(frame.touched):
+            self._held.forget()
             return []
-        found = self._grouping(frame)
+        felt = self._held.complete(frame)
+        found = self._grouping(felt, frame.valid)
         known = set(found.names)
         events = [
-            self._closed(name, frame.seq, frame.t_ns, self._reason(name, frame))
+            self._closed(name, frame.seq, frame.t_ns, self._reason(name, felt, frame.valid))
             for name in list(self._contacts)
             if name not in known
         ]
-        return events + self._reported(found, frame)
+        return events + self._reported(found, felt, frame.valid)
 
     def end_all(self, seq: int, t_ns: int) -> list[Touch]:
         """End every contact, because no data of the part will come for a while."""
         self._seen = None
+        self._held.forget()
         return [self._closed(name, seq, t_ns, "stopped") for name in list(self._contacts)]
 
-    def _grouping(self, frame: PressureFrame) -> "_Grouping":
-        """Return the contacts of this frame, or those of the last frame if nothing has changed."""
-        seen = frame.touched.tobytes()
-        if seen == self._seen and (
-            all_of(frame.valid) or all_of(frame.valid.take(self._known.order))
-        ):
+    def _grouping(self, felt: PressureFrame, received: Mask) -> "_Grouping":
+        """Return the contacts of this frame, or those of the last frame if nothing has changed.
+
+        Args:
+            felt: the frame, see `_Held.complete`.
+            received: bool[m], which taxels are valid without being held.
+        """
+        seen = felt.touched.tobytes()
+        if seen == self._seen:
             return self._known
-        touched = self._touched(frame)
+        touched = np.flatnonzero(felt.touched)
         groups = self._patches.find(touched)
         as_before = self._are_as_before(groups)
-        groups = self._joined(groups, frame)
+        groups = self._joined(groups, felt)
         if self._places is not None:
-            groups = self._places.look(frame, groups, self._neighbours)
+            groups = self._places.look(felt, groups, self._neighbours)
         home = _Homes(self._contacts, len(self._neighbours))
         if len(groups) == 1:
             home.note(groups[0], touched)
-        groups = self._kept_whole(self._kept_apart(groups, home, frame.elapsed_ns), home, frame)
+        groups = self._kept_apart(groups, home, felt.elapsed_ns)
+        groups = self._kept_whole(groups, home, felt, received)
         names = self._identify(groups, home)
         self._known = _Grouping.of(names, groups, home, self._area_mm2, self._position_m)
         # Whether contacts are kept together or apart, or are split by pressure, can change with any
         # frame.
-        decided = as_before and self._places is None and all_of(frame.valid[self._known.order])
-        self._seen = seen if decided else None
+        self._seen = seen if as_before and self._places is None else None
         return self._known
-
-    def _touched(self, frame: PressureFrame) -> NDArray[np.intp]:
-        """Return touched taxels in order, including those of a contact that were not received.
-
-        A lost frame is not the end of a touch.
-        """
-        if all_of(frame.valid):
-            return np.flatnonzero(frame.touched)
-        touched = frame.touched
-        for contact in self._contacts.values():
-            if frame.elapsed_ns - contact.heard_ns < LOST_NS:
-                valid = frame.valid[contact.order]
-                if not all_of(valid):
-                    touched = touched.copy() if touched is frame.touched else touched
-                    touched[contact.order[~valid]] = True
-        return np.flatnonzero(touched)
 
     def _joined(self, groups: list[frozenset[int]], frame: PressureFrame) -> list[frozenset[int]]:
         """Return the groups; a new group is joined with those that it will grow together with.
@@ -236,12 +227,17 @@ class ContactTracker:
         return sorted(kept, key=min) if len(kept) > 1 else kept
 
     def _kept_whole(
-        self, groups: list[frozenset[int]], home: "_Homes", frame: PressureFrame
+        self,
+        groups: list[frozenset[int]],
+        home: "_Homes",
+        felt: PressureFrame,
+        received: Mask,
     ) -> list[frozenset[int]]:
         """Return the groups, with the pieces of one contact joined that have only just come apart.
 
         While a contact begins or releases, its taxels pass their thresholds one by one, and for a
-        moment it is in pieces. Pieces that feel very little never become contacts.
+        moment it is in pieces. Pieces that feel very little never become contacts, and one that is
+        not received becomes none before it is.
         """
         if self._are_as_before(groups):
             for contact in self._contacts.values():
@@ -262,15 +258,17 @@ class ContactTracker:
                 kept += parts
                 continue
             least_kpa = max(FELT_KPA, PIECE_SHARE * contact.firm_kpa)
-            strong = [part for part in parts if frame.pressure_kpa[list(part)].max() >= least_kpa]
+            strong = [part for part in parts if felt.pressure_kpa[list(part)].max() >= least_kpa]
             if len(strong) < 2:
                 # What noise lifts for a moment is a remainder all the same.
                 contact.parted_ns = None
                 kept.append(frozenset().union(*parts))
                 continue
             if contact.parted_ns is None:
-                contact.parted_ns = frame.elapsed_ns
-            if frame.elapsed_ns - contact.parted_ns < PARTED_NS:
+                contact.parted_ns = felt.elapsed_ns
+            if felt.elapsed_ns - contact.parted_ns < PARTED_NS or not all(
+                any_of(received[list(part)]) for part in strong
+            ):
                 kept.append(frozenset().union(*parts))
             else:
                 strong.sort(key=len)
@@ -304,23 +302,24 @@ class ContactTracker:
                 self._next_id += 1
         return [names[number] for number in range(len(groups))]
 
-    def _reported(self, found: "_Grouping", frame: PressureFrame) -> list[Touch]:
-        """Return the events of the contacts of a frame, and update the contacts."""
+    def _reported(self, found: "_Grouping", felt: PressureFrame, received: Mask) -> list[Touch]:
+        """Return the events of the contacts of a frame, and update the contacts.
+
+        A contact of which nothing was received is not reported.
+        """
         if not found.names:
             return []
         order, starts = found.order, found.starts
-        pressure = frame.pressure_kpa.take(order).astype(np.float64)
+        pressure = felt.pressure_kpa.take(order).astype(np.float64)
         weight = pressure * found.pad_mm2
         total = np.add.reduceat(weight, starts)
         moments = np.add.reduceat(weight[:, None] * found.position_m, starts).tolist()
         peaks = np.maximum.reduceat(pressure, starts).tolist()
-        heard = all_heard = [True] * len(starts)
-        if not all_of(frame.valid):
-            valid = frame.valid.take(order)
-            heard = np.logical_or.reduceat(valid, starts).tolist()
-            all_heard = np.logical_and.reduceat(valid, starts).tolist()
+        is_received = [True] * len(starts)
+        if not all_of(received):
+            is_received = np.logical_or.reduceat(received.take(order), starts).tolist()
         totals = total.tolist()
-        now_ns = frame.elapsed_ns
+        now_ns = felt.elapsed_ns
         fading = math.exp((self._elapsed_ns - now_ns) / FADES_NS)
         self._elapsed_ns = now_ns
         events = []
@@ -329,14 +328,16 @@ class ContactTracker:
             before = None
             silent_ns = 0
             if known is not None:
-                if known.taxels is not taxels:
+                if known.unseen or known.taxels is not taxels:
+                    gone = (known.taxels | known.unseen) - taxels
+                    known.unseen = frozenset(
+                        one for one in gone if not received[one] and not felt.touched[one]
+                    )
                     known.taxels, known.order = taxels, found.order[found.spans[number]]
-                if all_heard[number]:
-                    known.heard_ns = now_ns
                 before = known.said
                 known.firm_kpa = max(peaks[number], known.firm_kpa * fading)
                 silent_ns = now_ns - known.said_ns
-                if not heard[number] or silent_ns < self._shortest_ns:
+                if not is_received[number] or silent_ns < self._shortest_ns:
                     continue
             peak = peaks[number]
             index = found.taxels[number]
@@ -365,8 +366,8 @@ class ContactTracker:
             event = Touch(
                 event="begin" if before is None else "move",
                 id=name,
-                seq=frame.seq,
-                t_ns=frame.t_ns,
+                seq=felt.seq,
+                t_ns=felt.t_ns,
                 part=self._name,
                 taxels=index,
                 centroid_m=centroid,
@@ -380,7 +381,7 @@ class ContactTracker:
             events.append(event)
             if known is None:
                 own = found.order[found.spans[number]]
-                self._contacts[name] = _Contact(taxels, own, event, now_ns, now_ns, peak)
+                self._contacts[name] = _Contact(taxels, own, event, now_ns, peak)
             else:
                 known.said, known.said_ns = event, now_ns
         return events
@@ -393,13 +394,69 @@ class ContactTracker:
         x, y, z = (direction / length).tolist()
         return x, y, z
 
-    def _reason(self, name: int, frame: PressureFrame) -> Reason:
-        """A contact is released only if all its taxels are valid and none is touched."""
-        known = frame.valid[list(self._contacts[name].taxels)].all()
-        return "released" if known else "lost"
+    def _reason(self, name: int, felt: PressureFrame, received: Mask) -> Reason:
+        """A contact is released only if each of its taxels is valid and untouched, or in another
+        contact.
+        """
+        contact = self._contacts[name]
+        mine = [*contact.taxels, *contact.unseen]
+        return "released" if all_of(received[mine] | felt.touched[mine]) else "lost"
 
     def _closed(self, name: int, seq: int, t_ns: int, reason: Reason) -> Touch:
         return self._contacts.pop(name).said.ended(seq, t_ns, reason)
+
+
+class _Held:
+    """What the taxels of a part last felt, for as long as lost frames do not end a touch.
+
+    It is needed while there are contacts. Frames are not written to, so the last one is kept as it
+    is; a taxel is copied from it when it is not received any more.
+
+    Args:
+        n: taxels of the part.
+    """
+
+    def __init__(self, n: int) -> None:
+        self._pressure_kpa = np.zeros(n, np.float32)
+        self._touched: Mask = np.zeros(n, np.bool_)
+        self._received_ns = np.full(n, -LOST_NS, np.int64)
+        self._last: PressureFrame | None = None
+        #: From when on none is held.
+        self._until_ns = 0
+
+    def complete(self, frame: PressureFrame) -> PressureFrame:
+        """Return the frame with taxels that are not received as they last were.
+
+        In it a taxel is valid, touched and has its pressure until it has not been received for
+        `LOST_NS`. If there is none such it is the frame itself.
+        """
+        last, self._last = self._last, frame
+        now_ns = frame.elapsed_ns
+        if last is not None and last.valid is not frame.valid:
+            gone = last.valid & ~frame.valid
+            if any_of(gone):
+                np.copyto(self._pressure_kpa, last.pressure_kpa, where=gone)
+                np.copyto(self._touched, last.touched, where=gone)
+                self._received_ns[gone] = last.elapsed_ns
+                self._until_ns = last.elapsed_ns + LOST_NS
+        if now_ns >= self._until_ns:
+            return frame
+        held = ~frame.valid & (now_ns - self._received_ns < LOST_NS)
+        if not any_of(held):
+            return frame
+        return replace(
+            frame,
+            pressure_kpa=np.where(held, self._pressure_kpa, frame.pressure_kpa),
+            touched=frame.touched | (held & self._touched),
+            valid=frame.valid | held,
+        )
+
+    def forget(self) -> None:
+        """Hold nothing of earlier frames."""
+        self._last = None
+        if self._until_ns:
+            self._received_ns.fill(-LOST_NS)
+            self._until_ns = 0
 
 
 class _Homes:

@@ -336,6 +336,8 @@ class Engine:
 
         Without this a gap in time stamps is time in which the computer may have slept.
         """
+        for assembler in self.assemblers.values():
+            assembler.clock_set(step_ns)
         if self._pipeline is not None:
             self._pipeline.clock_set(step_ns)
 

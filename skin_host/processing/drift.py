@@ -47,8 +47,8 @@ Array = NDArray[np.float64]
 
 #: Fewer untouched taxels than this do not represent the others.
 REFERENCES = 4
-#: A part moves alike when this share of its taxels stays within the tolerance of their median.
-#: On an evenly pressed insole 52 to 75 % do, on drifting pads with noise of 1 unit 98 %.
+#: A part moves alike when this share of its received taxels stays within the tolerance of their
+#: median. On an evenly pressed insole 52 to 75 % do, on drifting pads with noise of 1 unit 98 %.
 ALIKE_SHARE = 0.8
 #: Means of a window that differ by no more are the same: five times their noise on good pads.
 TOLERANCE_UNITS = 0.5
@@ -190,7 +190,7 @@ class BaselineTracker:
             units: mean activation [n] above the baseline in the last dt_s seconds. Entries
                 of temperature pads count too.
             touched: taxels [n] that were touched at any time in it.
-            missing: taxels [n] that were not received at some time in it.
+            missing: taxels [n] that were received too rarely in it for a mean.
             dt_s: that time.
             relaxed_units: the relaxation [n] that units was corrected for.
 
@@ -210,7 +210,8 @@ class BaselineTracker:
             units = units - forecast
             self._note_drift(forecast)
 
-        common = self._common(units, free & ~recovering, dt_s)
+        received = int(np.count_nonzero(self._usable & ~missing))
+        common = self._common(units, free & ~recovering, received, dt_s)
         if self._is_calm(units, common, hidden, dt_s):
             change = self._own(units - common, self._settings.rate_units_per_s * dt_s, dt_s)
             self._move(change + common, forecast)
@@ -269,7 +270,6 @@ class BaselineTracker:
 
     def _configure(self, usable: Mask, settings: Drift) -> None:
         self._usable = usable
-        self._n_usable = int(np.count_nonzero(usable))
         self._settings = settings
         self._low = self.calibrated - settings.limit_units
         self._high = self.calibrated + settings.limit_units
@@ -297,8 +297,14 @@ class BaselineTracker:
         edge = (self.baseline <= self._low) | (self.baseline >= self._high)
         return edge & self._usable
 
-    def _common(self, units: Array, free: Mask, dt_s: float) -> float:
-        """Return how much of the untouched taxels' common change is followed."""
+    def _common(self, units: Array, free: Mask, received: int, dt_s: float) -> float:
+        """Return how much of the untouched taxels' common change is followed.
+
+        Args:
+            units, dt_s: see `step`.
+            free: untouched taxels, bool[n].
+            received: how many usable taxels were received, touched ones as well.
+        """
         self._loaded = False
         reading = units[free]
         if len(reading) < REFERENCES:
@@ -306,7 +312,7 @@ class BaselineTracker:
         median = _median(reading)
         self._loaded = median > QUICK_UNITS_PER_S * dt_s
         alike = np.count_nonzero(np.abs(reading - median) < TOLERANCE_UNITS)
-        if alike >= ALIKE_SHARE * self._n_usable and not self._loaded:
+        if alike >= ALIKE_SHARE * received and not self._loaded:
             return median
         reading = reading[reading > FALLEN_UNITS]
         if len(reading) < REFERENCES:

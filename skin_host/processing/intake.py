@@ -66,6 +66,7 @@ class _PartState:
     Attributes:
         rows: of its boards, by their index.
         waits: boards (index: row) whose sweep it waits for.
+        faster: boards that send more often than its slowest: of several sweeps the newest counts.
         source: intp[m], where its values are among those of all boards.
         stamped_ns: time of the last sample that was returned.
         silence_ns: time of the first sample of silence after the last sweep.
@@ -76,6 +77,7 @@ class _PartState:
     index: int
     rows: dict[int, int]
     waits: dict[int, int]
+    faster: frozenset[int]
     source: NDArray[np.intp]
     period_ns: int
     silence_ns: int
@@ -202,7 +204,7 @@ class Intake:
         # Samples that the board's second sweep completes, before it replaces the first.
         completed: dict[int, PartSample] = {}
         for state in states:
-            if board not in state.waits or (
+            if (board not in state.waits and board not in state.faster) or (
                 state.pending and abs(t_ns - state.first_ns) > APART_PERIODS * state.period_ns
             ):
                 completed[state.index] = self._sample(state)
@@ -222,7 +224,7 @@ class Intake:
                 state.pending = True
             elif t_ns > state.last_ns:
                 state.last_ns = t_ns
-            del state.waits[board]
+            state.waits.pop(board, None)
             if not state.waits or (
                 self._ledger.any_silent and all(map(self._ledger.is_silent, state.waits.values()))
             ):
@@ -436,9 +438,12 @@ class Intake:
             flat = layout.boards[board].taxel_index.ravel()
             mine = np.flatnonzero((flat >= part.start) & (flat < part.stop))
             source[flat[mine] - part.start] = row * flat.size + mine
-        period_ns = 1_000_000 * max(layout.boards[board].settings.period_ms for board in rows)
+        period_ms = {board: layout.boards[board].settings.period_ms for board in rows}
+        slowest_ms = max(period_ms.values())
+        faster = frozenset(board for board in rows if period_ms[board] < slowest_ms)
+        period_ns = 1_000_000 * slowest_ms
         silence_ns = int(silent_periods * period_ns)
-        return _PartState(index, rows, rows.copy(), source, period_ns, silence_ns)
+        return _PartState(index, rows, rows.copy(), faster, source, period_ns, silence_ns)
 
     def _sample(self, state: _PartState) -> PartSample:
         """Return a part's sample in progress, and begin the next."""

@@ -348,8 +348,10 @@ class Liveness:
             self._all_present = False
 
     def keep(self, before: "Liveness", boards: Mask) -> None:
-        """Take over the state of a predecessor for the same skin, for some boards
-        (bool[boards]).
+        """Take over the state of a predecessor for the same skin, for some boards (bool[boards]).
+
+        Of the other boards, which were calibrated, triangles that had to show that they live still
+        have to: a calibration goes on with what was known of those that did not.
         """
         self._settle()
         before._settle()
@@ -365,6 +367,10 @@ class Liveness:
         self._repeats.keep(before._repeats, rows)
         self._any_jumping = any_of(self._jumping > 0.0)
         self._any_noisy = any_of(self.noisy)
+        self._to_show = np.maximum(self._to_show, before._to_show)
+        self.unproven = self._to_show > 0
+        self.frozen = self.frozen | before.frozen
+        self.silenced = self.silenced | before.silenced
         self._any_to_show = any_of(self.unproven)
         self._any_surprise = True
         self._all_present = self._present.tobytes() == self._fitted

@@ -96,6 +96,7 @@ class Pipeline:
         relaxation_kpa: float32[n], pressure that the foam has lost by now.
         enter: float64[n], the threshold of touch, in units, see `touch.Levels`.
         unreached: bool[n], taxels that are not used because no reading of them is a touch.
+        flat: bool[n], those of them whose curve of pressure does not rise with each unit.
     """
 
     def __init__(self, layout: Layout, settings: Processing, calibration: Calibration) -> None:
@@ -104,7 +105,7 @@ class Pipeline:
         self.relaxation_kpa = np.zeros(layout.n_taxels, np.float32)
         rules = _Rules.of(layout, settings, calibration)
         self.enter = rules.levels.enter
-        self.unreached = rules.unreached
+        self.unreached, self.flat = rules.unreached, rules.unreached & ~rules.curve.sound
         self._parts = [_PartPipeline(self, layout, part, rules) for part in layout.parts]
 
     def renew(
@@ -128,7 +129,7 @@ class Pipeline:
         np.copyto(self.baseline, calibration.baseline, where=zeroed)
         rules = _Rules.of(self._layout, settings, calibration)
         self.enter = rules.levels.enter
-        self.unreached = rules.unreached
+        self.unreached, self.flat = rules.unreached, rules.unreached & ~rules.curve.sound
         for part in self._parts:
             part.renew(rules, zeroed)
 
@@ -312,7 +313,8 @@ class _PartPipeline:
         self._skipped = 0
         self._since_window_s = 0.0
         self._noted = self._nowhere
-        self._was_missing = np.zeros(m, np.bool_)
+        #: How many sweeps of the window lacked each taxel.
+        self._lacking = np.zeros(m, np.int32)
         self._since_glance_s = 0.0
 
     def renew(self, rules: _Rules, zeroed: Mask) -> None:
@@ -529,7 +531,7 @@ class _PartPipeline:
         taken = valid | (present & self._thermal) if self._has_thermal else valid
         self._last_raw = np.where(taken, raw, self._last_raw)
         if valid is not self._always_valid or self._has_thermal:
-            np.logical_or(self._was_missing, ~taken, out=self._was_missing)
+            self._lacking += ~taken
         return valid
 
     def _untouched_raw(self) -> NDArray[np.uint8]:
@@ -636,8 +638,10 @@ class _PartPipeline:
             np.fmax(momentary, self._zeros, out=momentary)
             self._relaxation.step(momentary, self._since_window_s, self._relaxation_kpa)
         before = self.drift.baseline.copy()
+        # A frame is lost now and then; a mean of more repeated readings than others shows nothing.
+        missing = 2 * self._lacking > self._samples + self._skipped
         ghosts = self.drift.step(
-            units, self._was_touched, self._was_missing, self._since_window_s, relaxed_units
+            units, self._was_touched, missing, self._since_window_s, relaxed_units
         )
         if self._own is not None:
             touched, elapsed_s = self._was_touched, self._since_window_s
@@ -652,7 +656,7 @@ class _PartPipeline:
         self._since_window_s = 0.0
         self._was_touched.fill(False)
         self._noted = self._nowhere
-        self._was_missing.fill(False)
+        self._lacking.fill(0)
 
     def _units(self, kpa: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return mean activations [m] in units; the bend of the curve matters only far from

@@ -16,15 +16,16 @@ import logging
 import os
 import queue
 import secrets
-import threading
 import time
-from collections.abc import Awaitable, Callable
+from bisect import bisect_right
+from collections.abc import Awaitable, Callable, Collection
+from io import FileIO
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import can
-import numpy as np
 
+from skin_host.bus.logs import candump_name, name_in
 from skin_host.bus.opening import open_port
 from skin_host.bus.port import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Port
 from skin_host.bus.wire import FrameBatch
@@ -41,16 +42,23 @@ from skin_host.tasks import until
 
 #: Takes a batch of a channel.
 CanSink = Callable[[str, FrameBatch], None]
-CAN_SUFFIXES = (".log", ".asc", ".blf", ".trc", ".csv")
+CANDUMP_SUFFIX = ".log"
+CAN_SUFFIXES = (CANDUMP_SUFFIX, ".asc", ".blf", ".trc", ".csv")
 POLL_S = 0.02
+#: All buses have been read again within this time.
+HELD_S = 0.1
+#: More frames are not held back: their times stand still.
+MAX_HELD = 10_000
 MAX_INCOMING = 100_000
 WAITING_BATCHES = 4096
 #: A folder holds no more recordings than this, because requests for them come from the network.
 MAX_RECORDINGS = 100
 #: A disk that needs longer than this is no longer waited for.
 PATIENCE_S = 1.0
-_FLAGS = ERROR_FLAG | EXTENDED_FLAG | REMOTE_FLAG
+#: A recording looks this often whether its time is over.
+LOOK_S = 0.5
 _ID = 0x1FFFFFFF
+_ERROR_OR_ID = _ID | ERROR_FLAG
 #: Bounds of what a page records.
 PAGE_MAX_S = 3600.0
 PAGE_MAX_BYTES = 1024**3
@@ -80,30 +88,52 @@ def message_at(batch: FrameBatch, row: int, channel: str | None = None) -> can.M
 class CanLog:
     """CAN frames in a format of python-can; the file gets its name when it is closed.
 
+    Args:
+        path: the file; its suffix, one of `CAN_SUFFIXES`, gives the format.
+        channels: that will be recorded.
+
     Attributes:
         frames: recorded so far.
+        left_out: frames of a kind that the format does not know.
+        moved: frames whose time was before that of the frame before, where the format does not know
+            that: they have that time. A clock that is set back does so.
 
     Raises:
-        RequestError: the suffix is not one of `CAN_SUFFIXES`.
+        RequestError: an unknown suffix, or a format in which two channels are the same.
         SkinError: the file cannot be made.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, channels: Collection[str] = ()) -> None:
         if path.suffix not in CAN_SUFFIXES:
             known = ", ".join([*CAN_SUFFIXES, MCAP_SUFFIX])
             raise RequestError(f'{path}: suffix "{path.suffix}"; wanted one of {known}')
+        if len({name_in(path, channel) for channel in channels}) < len(channels):
+            raise RequestError(
+                f"{path}: channels {', '.join(channels)} are the same in this format; "
+                f"wanted {MCAP_SUFFIX}"
+            )
         self.frames = 0
         self._path = path
         with writing(path):
             self._draft = Draft(path)
-            self._logger = can.Logger(self._draft.path)
+            kind = _Candump if path.suffix == CANDUMP_SUFFIX else _PythonCan
+            self._file = kind(self._draft.path)
+
+    @property
+    def left_out(self) -> int:
+        return self._file.left_out
+
+    @property
+    def moved(self) -> int:
+        return self._file.moved
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None and not self.frames:
-            self._logger.stop()
+            with contextlib.suppress(OSError):
+                self._file.close()
             self._draft.remove()
         else:
             self.close()
@@ -116,19 +146,116 @@ class CanLog:
         """
         with writing(self._path):
             refuse_removed(self._draft.path)
-            for row in range(len(batch)):
-                self._logger.on_message_received(message_at(batch, row, channel))
-                self.frames += 1
+            self.frames += self._file.put(channel, batch)
 
     def close(self) -> None:
         """End the recording and give it its name.
 
         Raises:
-            SkinError: the disk is full or gone.
+            SkinError: the disk is full or gone; what there is of it keeps its interim name.
         """
-        with writing(self._path):
-            self._logger.stop()
+        with writing(self._path), self._draft.keeping():
+            self._file.close()
             self._draft.finish()
+
+
+class _Candump:
+    """A growing log of candump: whole lines, also on a full disk."""
+
+    left_out = moved = 0
+
+    def __init__(self, path: Path) -> None:
+        self._log = _Lines(path.open("wb", buffering=0))
+
+    def put(self, channel: str, batch: FrameBatch) -> int:
+        self._log.append(candump_lines(channel, batch))
+        return len(batch)
+
+    def close(self) -> None:
+        self._log.file.close()
+
+
+class _PythonCan:
+    """A growing file of python-can.
+
+    Some formats need frames in the order of their times. Buses are read in turn, so the newest
+    frames are held back for these until those of the others have come.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.left_out = self.moved = 0
+        self._logger = cast(can.io.generic.FileIOMessageWriter[Any], can.Logger(path))
+        self._knows_data_alone = path.suffix == ".trc"
+        self._needs_order = path.suffix in (".asc", ".blf")
+        self._held: list[can.Message] = []
+        self._last_s = 0.0
+
+    def put(self, channel: str, batch: FrameBatch) -> int:
+        messages = [message_at(batch, row, channel) for row in range(len(batch))]
+        if self._knows_data_alone:
+            data = [one for one in messages if not (one.is_remote_frame or one.is_error_frame)]
+            self.left_out += len(messages) - len(data)
+            messages = data
+        self._held += messages
+        n = len(self._held)
+        if self._needs_order and n:
+            self._held.sort(key=_time_of)
+            known = bisect_right(self._held, self._held[-1].timestamp - HELD_S, key=_time_of)
+            n = known if n - known <= MAX_HELD else n
+        self._write(n)
+        return len(messages)
+
+    def close(self) -> None:
+        try:
+            self._write(len(self._held))
+            self._logger.stop()
+        finally:
+            # It leaves the file open if the disk is full.
+            with contextlib.suppress(OSError):
+                self._logger.file.close()
+
+    def _write(self, n: int) -> None:
+        """Write the first `n` of those that are held back."""
+        for message in self._held[:n]:
+            if self._needs_order and message.timestamp < self._last_s:
+                message.timestamp = self._last_s
+                self.moved += 1
+            self._last_s = message.timestamp
+            self._logger.on_message_received(message)
+        del self._held[:n]
+
+
+def _time_of(message: can.Message) -> float:
+    return message.timestamp
+
+
+class _Lines:
+    """A file that grows by whole lines.
+
+    Attributes:
+        bytes: of the whole lines.
+    """
+
+    def __init__(self, file: FileIO) -> None:
+        self.file = file
+        self.bytes = 0
+
+    def append(self, lines: bytes) -> None:
+        """Write lines; none of them if not all.
+
+        Raises:
+            OSError: the disk is full or gone.
+        """
+        rest = memoryview(lines)
+        try:
+            while rest:
+                rest = rest[self.file.write(rest) :]
+        except OSError:
+            with contextlib.suppress(OSError):
+                self.file.truncate(self.bytes)
+                self.file.seek(self.bytes)
+            raise
+        self.bytes += len(lines)
 
 
 async def capture_buses(settings: Settings, sink: CanSink, stop: asyncio.Event) -> int:
@@ -182,11 +309,14 @@ async def _listen(recorder: Recorder, broker: Broker, topics: list[str]) -> None
                 max_incoming=MAX_INCOMING,
                 max_packet=MAX_PACKET_BYTES,
             ) as connection:
-                for topic in topics:
-                    await connection.subscribe(topic, qos=0 if topic.endswith("/frame") else 1)
-                async for message in connection.messages:
-                    if isinstance(message.payload, bytes):
-                        recorder.say(message.topic.value, time.time_ns(), message.payload)
+                try:
+                    for topic in topics:
+                        await connection.subscribe(topic, qos=0 if topic.endswith("/frame") else 1)
+                    async for message in connection.messages:
+                        if isinstance(message.payload, bytes):
+                            recorder.say(message.topic.value, time.time_ns(), message.payload)
+                finally:
+                    recorder.discarded += connection.discarded
         except* SkinError as group:
             raise first_error(group) from None
         except* Exception as group:
@@ -196,13 +326,19 @@ async def _listen(recorder: Recorder, broker: Broker, topics: list[str]) -> None
 
 
 def candump_lines(channel: str, batch: FrameBatch) -> bytes:
-    """A batch as lines of a candump log (`candump -l`); error and remote frames are left out."""
+    """A batch as lines of a candump log (`candump -L`), a line each frame of any kind."""
     lines = []
-    plain = np.flatnonzero((batch.id & np.uint32(_FLAGS)) == 0).tolist()
-    for row in plain:
-        seconds, rest = divmod(int(batch.t_ns[row]), 1_000_000_000)
-        data = batch.data[row, : min(int(batch.dlc[row]), 8)].tobytes().hex().upper()
-        lines.append(f"({seconds}.{rest // 1000:06d}) {channel} {int(batch.id[row]):03X}#{data}\n")
+    name = candump_name(channel)
+    for row, (number, dlc, t_ns) in enumerate(
+        zip(batch.id.tolist(), batch.dlc.tolist(), batch.t_ns.tolist(), strict=True)
+    ):
+        seconds, rest = divmod(t_ns, 1_000_000_000)
+        is_long = number & (EXTENDED_FLAG | ERROR_FLAG)
+        identifier = f"{number & _ERROR_OR_ID:08X}" if is_long else f"{number & _ID:03X}"
+        data = batch.data[row, : min(dlc, 8)].tobytes().hex().upper()
+        if number & REMOTE_FLAG:
+            data = f"R{dlc or ''}"
+        lines.append(f"({seconds}.{rest // 1000:06d}) {name} {identifier}#{data}\n")
     return "".join(lines).encode()
 
 
@@ -217,44 +353,61 @@ class FrameRecorder:
     It takes `seconds` at most, by `clock`, and `max_bytes`.
 
     Attributes:
-        frames: recorded.
-        lost: frames that the disk did not take in time.
+        frames: in the file.
         ended: why it has ended, None while it continues.
 
     Raises:
+        RequestError: the name is not that of a candump log, or the folder is full.
         SkinError: the file exists, or cannot be made.
     """
 
     def __init__(self, path: Path, seconds: float, max_bytes: int, clock: Clock = SYSTEM) -> None:
+        if path.suffix != CANDUMP_SUFFIX:
+            raise RequestError(f'{path.name}: wanted a name that ends in "{CANDUMP_SUFFIX}"')
         self.path = path
         self.frames = 0
-        self.bytes = 0
-        self.lost = 0
         self.ended: str | None = None
+        self._came = 0
         self._max_bytes = max_bytes
         self._clock = clock
         self._until_s = clock.monotonic_s() + seconds
-        self._finishing = threading.Event()
+        #: Why no more frames are taken.
+        self._over: str | None = None
         self._queue: queue.Queue[tuple[str, FrameBatch] | None] = queue.Queue(WAITING_BATCHES)
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             _check_room(path.parent, "*")
-            self._file = path.open("xb", buffering=0)
+            self._log = _Lines(path.open("xb", buffering=0))
+        self._append = self._log.append
         self._thread = clock.thread(self._write, "recorder")
+
+    @property
+    def bytes(self) -> int:
+        """Size of the file."""
+        return self._log.bytes
+
+    @property
+    def lost(self) -> int:
+        """Frames that came before its time was over and are not in the file: the disk did not take
+        them, or they are beyond `max_bytes`. While it continues, they may wait for the disk.
+        """
+        return self._came - self.frames
 
     def put(self, channel: str, batch: FrameBatch) -> None:
         """Record a batch; never waits."""
-        if self.ended is not None or self._finishing.is_set():
+        self._look_at_time()
+        if self._over is not None:
+            return
+        self._came += len(batch)
+        if self.ended is not None:
             return
         copy = FrameBatch(batch.id.copy(), batch.dlc.copy(), batch.data.copy(), batch.t_ns.copy())
-        try:
+        with contextlib.suppress(queue.Full):
             self._queue.put_nowait((channel, copy))
-        except queue.Full:
-            self.lost += len(batch)
 
     def finish(self) -> None:
         """End the recording, without waiting; frames already put are written first."""
-        self._finishing.set()
+        self._over = self._over or "stopped"
         with contextlib.suppress(queue.Full):
             self._queue.put_nowait(None)  # wakes the writer; a full queue does so, too
 
@@ -267,46 +420,52 @@ class FrameRecorder:
                 return
             await self._clock.sleep(0.01)
 
+    def _look_at_time(self) -> None:
+        if self._over is None and self._clock.monotonic_s() >= self._until_s:
+            self._over = "the time is over"
+
     def _write(self) -> None:
         level = logging.INFO
         try:
-            with self._file:
-                while True:
-                    left_s = self._until_s - self._clock.monotonic_s()
-                    if left_s <= 0:
-                        self.ended = "the time is over"
-                        return
-                    if self.ended is not None:
-                        return  # given up
-                    try:
-                        item = self._queue.get(timeout=min(left_s, 0.5))
-                    except queue.Empty:
-                        item = None
-                    if item is None:
-                        if not self._finishing.is_set() or not self._queue.empty():
-                            continue
-                        self.ended = "stopped"
-                        return
-                    lines = candump_lines(*item)
-                    if self.bytes + len(lines) > self._max_bytes:
-                        self.ended = f"it reached its {self._max_bytes} bytes"
-                        return
-                    refuse_removed(self.path)
-                    self._append(lines)
-                    self.bytes += len(lines)
-                    self.frames += len(item[1])
+            with self._log.file:
+                self._write_queue()
         except OSError as error:
             level = logging.WARNING
             self.ended = f"cannot write: {error.strerror}"
-            with contextlib.suppress(OSError):
-                os.truncate(self.path, self.bytes)  # whole lines, all of them counted
         finally:
-            _log.log(level, "recording %s ended: %s", self.path, self.ended)
+            _log.log(
+                level,
+                "recording %s ended: %s; %d frames, %d lost",
+                self.path,
+                self.ended,
+                self.frames,
+                self.lost,
+            )
 
-    def _append(self, lines: bytes) -> None:
-        rest = memoryview(lines)
-        while rest:
-            rest = rest[self._file.write(rest) :]
+    def _write_queue(self) -> None:
+        """Write what is put until it is over.
+
+        Raises:
+            OSError: the disk is full or gone.
+        """
+        while self.ended is None:  # given up otherwise
+            left_s = max(0.0, self._until_s - self._clock.monotonic_s())
+            try:
+                item = self._queue.get(timeout=min(left_s, LOOK_S))
+            except queue.Empty:
+                item = None
+            self._look_at_time()
+            if item is None:
+                if self._over is not None and self._queue.empty():
+                    self.ended = self._over
+                continue
+            lines = candump_lines(*item)
+            if self.bytes + len(lines) > self._max_bytes:
+                self.ended = f"it reached its {self._max_bytes} bytes"
+                return
+            refuse_removed(self.path)
+            self._append(lines)
+            self.frames += len(item[1])
 
 
 class PageRecording:
@@ -390,6 +549,7 @@ class PageRecording:
             "messages": sum(recorder.messages.values()),
             "marks": self._marks,
             "gaps": recorder.gaps,
+            "lost": recorder.discarded,
         }
 
     async def _run(self, capture: Awaitable[int]) -> None:
@@ -409,11 +569,14 @@ class PageRecording:
                     self._stop.set()
                 await asyncio.wait([working], timeout=WATCH_S)
             working.result()
-            recorder.close()
         except SkinError as error:
             self._ended = str(error)
         finally:
             working.cancel()
+            try:
+                recorder.close()
+            except SkinError as error:
+                self._ended = str(error)
             self._recorder = self._task = None
             _log.info("recording %s ended", self._path)
 

@@ -55,6 +55,11 @@ STEADY_KPA = 3.5
 #: Less than this, or than this share of the earlier press, is the residual of that press.
 PRESSED_KPA = 4.0
 IMPRINT_SHARE = 0.07
+#: Recordings have times in microseconds.
+LEAST_STEP_NS = 1000
+#: A recording lasts at most so many times as long as the samples that were received.
+MOST_MISSING = 10
+WANTED = "wanted a recording of one hold, or of levels, without such a step"
 #: The first part of a plateau, in which the pressure settles, is left out.
 SETTLING_SHARE = 0.3
 
@@ -117,7 +122,20 @@ def read_samples(
         raise LogError(f"{log}: ten sweeps or fewer; wanted a recording of a hold or of levels")
     first_ns = min(times_ns[part][0] for part in heard)
     last_ns = max(times_ns[part][-1] for part in heard)
-    step_ns = round(min(float(np.median(np.diff(times_ns[part]))) for part in heard))
+    steps_ns = [np.diff(times_ns[part]) for part in heard]
+    step_ns = round(min(float(np.median(mine)) for mine in steps_ns))
+    if (back_ns := min(int(mine.min()) for mine in steps_ns)) < 0:
+        raise LogError(
+            f"{log}: its time goes back by {-back_ns / 1e9:.0f} s: the clock was set; {WANTED}"
+        )
+    if step_ns < LEAST_STEP_NS:
+        raise LogError(f"{log}: its time stands still; {WANTED}")
+    if last_ns - first_ns > MOST_MISSING * step_ns * max(map(len, steps_ns)):
+        gap_ns = max(int(mine.max()) for mine in steps_ns)
+        raise LogError(
+            f"{log}: a gap of {gap_ns / 1e9:.0f} s: the clock was set, or the skin was not "
+            f"received; {WANTED}"
+        )
     grid_ns = np.arange(first_ns, last_ns, step_ns)
     raw = np.zeros((len(grid_ns), layout.n_taxels), dtype=np.uint8)
     usable = np.zeros(layout.n_taxels, dtype=np.bool_)

@@ -6,20 +6,20 @@ milliseconds per message. A recording is written under a temporary name and rena
 closed; an interrupted one can be repaired with `mcap recover`.
 """
 
+import contextlib
 import logging
-import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any, NamedTuple, Self, get_args
+from typing import IO, TYPE_CHECKING, Annotated, Any, NamedTuple, Self, get_args
 
 import msgspec
 import numpy as np
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from skin_host.bus.logs import open_recording
 from skin_host.bus.wire import FrameBatch
 from skin_host.errors import LogError, SkinError, required
-from skin_host.files import growing, refuse_removed, writing
+from skin_host.files import Draft, refuse_removed, writing
 from skin_host.fingertip.events import Over, Slip
 from skin_host.health.record import Record
 from skin_host.mqtt.frames import FRAME_SCHEMA, JsonFrame, decode_frame, encode_frame
@@ -28,15 +28,23 @@ from skin_host.mqtt.messages import HEALTH_SCHEMA, Frame, decode_over, decode_sl
 from skin_host.mqtt.topics import PartTopic, Topics, wrong_topic
 from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
+from skin_host.untrusted import from_json
+
+if TYPE_CHECKING:
+    from mcap.records import Channel, Chunk, Message, Schema
 
 CAN = "can/"
 MARKS = "marks"
+#: Nobody has as many parts; the format numbers topics in 16 bits.
+MAX_TOPICS = 10_000
 #: Nothing that is worth recording is longer.
 MAX_PAYLOAD = 32 * 1024 * 1024
 MAX_BATCH = 100_000
 LONGEST_TOPIC = 1024
 #: A chunk of a recording is no larger when decompressed; writers make chunks of some MB.
 MAX_CHUNK_BYTES = 64_000_000
+#: Nor is anything in the file that this program reads, nor what others may have attached to it.
+MAX_RECORD_BYTES = 1 << 30
 
 _log = logging.getLogger(__name__)
 
@@ -68,13 +76,18 @@ class _Health(Record):
     schema: str
 
 
+_Time = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+_Identifier = Annotated[int, Meta(ge=0, le=2**32 - 1)]
+_Count = Annotated[int, Meta(ge=0, le=2**53)]
+
+
 class _CanFrames(Struct):
     """CAN frames of one channel: times, identifiers (flags as SocketCAN's), data in hex."""
 
-    t_ns: list[int]
-    id: list[int]
+    t_ns: list[_Time]
+    id: list[_Identifier]
     data: list[str]
-    dropped: int = 0
+    dropped: _Count = 0
 
 
 class Recorder:
@@ -82,8 +95,10 @@ class Recorder:
 
     Attributes:
         messages: recorded so far, by kind.
-        unreadable: messages whose payload did not fit their topic; they are left out.
+        unreadable: messages whose payload did not fit their topic, or of too many topics; they are
+            left out.
         gaps: times that the broker was lost.
+        discarded: messages that came faster than they were recorded, or could not be read.
 
     Raises:
         SkinError: mcap is not installed, or the file cannot be made.
@@ -94,11 +109,11 @@ class Recorder:
         self.messages: dict[str, int] = {}
         self.unreadable = 0
         self.gaps = 0
+        self.discarded = 0
         self._path = path
         with writing(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._growing = growing(path)
-            self._file: IO[bytes] = self._growing.open("wb")
+            self._draft = Draft(path)
+            self._file: IO[bytes] = self._draft.path.open("wb")
         self._writer = mcap_writer.Writer(self._file)
         self._writer.start(profile="", library="skin-host")
         self._schemas: dict[str, int] = {}
@@ -110,8 +125,9 @@ class Recorder:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None and not self.messages:
-            self._file.close()
-            self._growing.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                self._file.close()
+            self._draft.remove()
         else:
             self.close()
 
@@ -122,7 +138,11 @@ class Recorder:
             SkinError: the disk is full or gone.
         """
         kind = _kind(topic)
-        if kind is None or len(payload) > MAX_PAYLOAD:
+        if kind is None:
+            return
+        is_more = topic not in self._channels and len(self._channels) >= MAX_TOPICS
+        if is_more or len(payload) > MAX_PAYLOAD:
+            self.unreadable += 1
             return
         try:
             data, sent_ns = _checked(topic, kind, payload, t_ns)
@@ -168,22 +188,22 @@ class Recorder:
         """End the recording and give it its name.
 
         Raises:
-            SkinError: the disk is full or gone.
+            SkinError: the disk is full or gone; what there is of it keeps its interim name.
         """
         if self._file.closed:
             return
-        with writing(self._path), self._file:
-            counts = {f"messages_{kind}": str(n) for kind, n in sorted(self.messages.items())}
-            told = counts | {"unreadable": str(self.unreadable), "gaps": str(self.gaps)}
-            self._writer.add_metadata("skin", told)
-            self._writer.finish()
-            self._file.flush()
-            os.fsync(self._file.fileno())
-            os.replace(self._growing, self._path)
+        with writing(self._path), self._draft.keeping():
+            with self._file:
+                counts = {f"messages_{kind}": str(n) for kind, n in sorted(self.messages.items())}
+                losses = ("unreadable", "gaps", "discarded")
+                told = counts | {name: str(getattr(self, name)) for name in losses}
+                self._writer.add_metadata("skin", told)
+                self._writer.finish()
+            self._draft.finish()
 
     def _add(self, topic: str, kind: str, t_ns: int, sent_ns: int, data: bytes) -> None:
         with writing(self._path):
-            refuse_removed(self._growing)
+            refuse_removed(self._draft.path)
             if topic not in self._channels:
                 if kind not in self._schemas:
                     name, content = _TYPES[kind]
@@ -204,7 +224,7 @@ class Recorder:
 
 
 def read_messages_of(path: Path) -> Iterator[RecordedMessage]:
-    """Yield the messages of a recording in the order of reception.
+    """Yield the messages of a recording in the order of reception, see `read_records`.
 
     Raises:
         LogError: it cannot be read, or breaks off.
@@ -234,12 +254,15 @@ def read_can(path: Path) -> Iterator[tuple[str, FrameBatch]]:
             raise LogError(f"{path}: {topic}: {n} identifiers, but another number of frames")
         try:
             rows = [
-                (can_id, bytes.fromhex(text)[:8], t_ns)
+                (can_id, bytes.fromhex(text), t_ns)
                 for can_id, text, t_ns in zip(frames.id, frames.data, frames.t_ns, strict=True)
             ]
-            batch = FrameBatch.of(rows)
-        except (ValueError, OverflowError) as error:
+        except ValueError as error:
             raise LogError(f"{path}: {topic}: {error}") from None
+        longest = max((len(data) for _, data, _ in rows), default=0)
+        if longest > 8:
+            raise LogError(f"{path}: {topic}: a frame of {longest} bytes; wanted at most 8")
+        batch = FrameBatch.of(rows)
         batch.dropped = frames.dropped
         yield topic.removeprefix(CAN), batch
     if not found:
@@ -249,14 +272,38 @@ def read_can(path: Path) -> Iterator[tuple[str, FrameBatch]]:
         )
 
 
-def _messages(path: Path) -> Iterator[tuple[str, int, bytes]]:
-    """(topic, time, data) of every message, in order of time."""
-    reader = _mcap("mcap.reader")
+def read_records(path: Path) -> "Iterator[tuple[Schema | None, Channel, Message]]":
+    """Yield the messages of any MCAP file with their channels and schemas, in the order of the
+    file, which is that of reception.
+
+    Sorted by their times, what was recorded after a clock was set back would be mixed into what was
+    recorded before. The file's index is not used: it may be wrong, or not be there.
+
+    Raises:
+        LogError: it cannot be read, or breaks off.
+    """
+    records, stream = _mcap("mcap.records"), _mcap("mcap.stream_reader")
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
     with open_recording(path) as file:
         try:
-            _check_chunks(path, file)
-            for _, channel, message in reader.make_reader(file).iter_messages():
-                yield channel.topic, message.log_time, message.data
+            reader = stream.StreamReader(file, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES)
+            for outer in reader.records:
+                is_chunk = isinstance(outer, records.Chunk)
+                if is_chunk:
+                    _check_chunk(path, outer)
+                for record in stream.breakup_chunk(outer) if is_chunk else (outer,):
+                    if isinstance(record, records.Message):
+                        if record.log_time >= 2**63:
+                            raise ValueError(f"a time of {record.log_time / 1e9:g} s")
+                        channel = channels.get(record.channel_id)
+                        if channel is None:
+                            raise ValueError(f"a message of no channel ({record.channel_id})")
+                        yield schemas.get(channel.schema_id), channel, record
+                    elif isinstance(record, records.Channel):
+                        channels[record.id] = record
+                    elif isinstance(record, records.Schema):
+                        schemas[record.id] = record
         except LogError:
             raise
         except Exception as error:  # whatever a damaged file makes of its readers
@@ -266,32 +313,32 @@ def _messages(path: Path) -> Iterator[tuple[str, int, bytes]]:
             ) from None
 
 
-def _check_chunks(path: Path, file: IO[bytes]) -> None:
-    """Refuse a recording with a chunk that decompresses to an unreasonable size.
+def _messages(path: Path) -> Iterator[tuple[str, int, bytes]]:
+    """(topic, time, data) of every message in JSON, which are all of ours."""
+    for _, channel, message in read_records(path):
+        if channel.message_encoding == "json":
+            yield channel.topic, message.log_time, message.data
 
-    The reader decompresses whole chunks.
+
+def _check_chunk(path: Path, record: "Chunk") -> None:
+    """Refuse a chunk that decompresses to an unreasonable size: it is decompressed as a whole.
 
     Raises:
-        LogError: there is such a chunk.
+        LogError: it does.
     """
-    chunk = _mcap("mcap.records").Chunk
-    for record in _mcap("mcap.stream_reader").StreamReader(file, emit_chunks=True).records:
-        if not isinstance(record, chunk):
-            continue
-        size = record.uncompressed_size
-        if record.compression == "zstd":
-            zstandard = _mcap("zstandard")
-            declared = zstandard.get_frame_parameters(record.data).content_size
-            size = max(size, 0 if declared == zstandard.CONTENTSIZE_UNKNOWN else declared)
-        elif record.compression == "lz4":
-            decompressor = _mcap("lz4.frame").LZ4FrameDecompressor()
-            size = max(size, len(decompressor.decompress(record.data, MAX_CHUNK_BYTES + 1)))
-        if size > MAX_CHUNK_BYTES:
-            raise LogError(
-                f"{path}: a chunk of {len(record.data)} bytes decompresses to more than "
-                f"{MAX_CHUNK_BYTES} bytes"
-            )
-    file.seek(0)
+    size = record.uncompressed_size
+    if record.compression == "zstd":
+        zstandard = _mcap("zstandard")
+        declared = zstandard.get_frame_parameters(record.data).content_size
+        size = max(size, 0 if declared == zstandard.CONTENTSIZE_UNKNOWN else declared)
+    elif record.compression == "lz4":
+        decompressor = _mcap("lz4.frame").LZ4FrameDecompressor()
+        size = max(size, len(decompressor.decompress(record.data, MAX_CHUNK_BYTES + 1)))
+    if size > MAX_CHUNK_BYTES:
+        raise LogError(
+            f"{path}: a chunk of {len(record.data)} bytes decompresses to more than "
+            f"{MAX_CHUNK_BYTES} bytes"
+        )
 
 
 def _kind(topic: str) -> str | None:
@@ -312,6 +359,13 @@ def _kind(topic: str) -> str | None:
     return None
 
 
+def robot_at(words: list[str]) -> int:
+    """Return where the name of the robot stands among the words of a topic, from the end."""
+    # Before the end stand <robot>/<part>/<kind>, or <robot>/nodes/<node>/<kind>, or, of an info in
+    # pieces, <robot>/nodes/<node>/<piece>/info.
+    return -4 if words[-3] == "nodes" else -5 if words[-4:-3] == ["nodes"] else -3
+
+
 def _checked(topic: str, kind: str, payload: bytes, t_ns: int) -> tuple[bytes, int]:
     """The data to record, and when it was sent."""
     if kind == "frame":
@@ -327,7 +381,7 @@ def _checked(topic: str, kind: str, payload: bytes, t_ns: int) -> tuple[bytes, i
         return payload, found.t_ns
     if kind in ("contact", "status"):
         return msgspec.json.encode(_Text(payload.decode())), t_ns
-    msgspec.json.decode(payload, type=dict[str, Any])
+    from_json(payload, dict[str, Any])
     return payload, t_ns
 
 
@@ -349,8 +403,8 @@ def _as_json(frame: Frame) -> bytes:
 
 def _decode(path: Path, topic: str, data: bytes, kind: type[Any]) -> Any:
     try:
-        return msgspec.json.decode(data, type=kind)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        return from_json(data, kind)
+    except msgspec.DecodeError as error:
         raise LogError(f"{path}: {topic}: {error}") from None
 
 

@@ -1,6 +1,7 @@
 """Plays recordings again: onto a CAN interface, or to a broker and so into the live page."""
 
 import asyncio
+import contextlib
 import itertools
 import secrets
 import time
@@ -23,11 +24,12 @@ from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import Connection, MqttError, connect, explain
 from skin_host.mqtt.contact import PartContact
 from skin_host.mqtt.info import node_info
+from skin_host.mqtt.order import last_will
 from skin_host.mqtt.publisher import Publisher
 from skin_host.mqtt.topics import OFFLINE
 from skin_host.processing.core import Engine, Output
 from skin_host.recording.capture import message_at
-from skin_host.recording.mcap import read_messages_of
+from skin_host.recording.mcap import read_messages_of, robot_at
 from skin_host.recording.replay import read_buses
 
 LONGEST_PAUSE_S = 600.0
@@ -129,7 +131,8 @@ async def play_messages(
     `robot` is a name in place of the recorded one, so that a live robot is not disturbed.
 
     Raises:
-        LogError: the recording cannot be read, or holds no messages.
+        LogError: the recording cannot be read, holds no messages, or is of several robots that
+            would get one name.
         RequestError: the robot is live at this broker.
         BrokerError: the broker cannot be reached, is lost, or does not take a message.
     """
@@ -141,60 +144,70 @@ async def play_messages(
     base, name = _whose(first.topic)
     await refuse_live(broker, base, robot or name)
     free = {(base, robot or name)}
-    nodes: set[str] = set()
+    #: The connections of nodes by the topics of their status, which are also their last wills.
+    nodes: dict[str, Connection] = {}
     n = 0
     try:
-        async with connect(broker, identifier=_identifier()) as connection:
-            try:
-                all_of_them = itertools.chain([first], messages)
-                async for said in paced(all_of_them, lambda said: said.t_ns, speed):
-                    topic = said.topic if robot is None else _renamed(said.topic, robot)
-                    if (whose := _whose(topic)) not in free:
-                        await refuse_live(broker, *whose)
-                        free.add(whose)
-                    kind = topic.rpartition("/")[2]
-                    if kind == "status":
-                        nodes.add(topic)
-                    await connection.publish(
-                        topic,
-                        said.payload,
-                        qos=0 if kind == "frame" else 1,
-                        retain=kind in RETAINED,
+        async with contextlib.AsyncExitStack() as stack:
+            common = await stack.enter_async_context(connect(broker, identifier=_identifier()))
+            all_of_them = itertools.chain([first], messages)
+            async for said in paced(all_of_them, lambda said: said.t_ns, speed):
+                recorded = _whose(said.topic)
+                if robot is not None and recorded != (base, name):
+                    raise LogError(
+                        f"{recording}: holds messages of {base}/{name} and of "
+                        f"{'/'.join(recorded)}; without --robot they are played as themselves"
                     )
-                    n += 1
-            finally:
-                # A recording that was played is over, and its nodes must not look alive.
-                for topic in nodes:
-                    await connection.publish(topic, OFFLINE, qos=1, retain=True)
+                topic = said.topic if robot is None else _renamed(said.topic, robot)
+                if (whose := _whose(topic)) not in free:
+                    await refuse_live(broker, *whose)
+                    free.add(whose)
+                kind = topic.rpartition("/")[2]
+                if kind == "status" and topic not in nodes:
+                    nodes[topic] = await stack.enter_async_context(_node(broker, topic))
+                await nodes.get(topic, common).publish(
+                    topic, said.payload, qos=0 if kind == "frame" else 1, retain=kind in RETAINED
+                )
+                n += 1
     except MqttError as error:
         raise BrokerError(
             f"broker {broker}: {explain(error)}; {n} messages were delivered"
         ) from None
-    if connection.refused:
-        raise BrokerError(
-            f"broker {broker}: refuses {connection.refused} of {n} messages: {connection.refusal}"
-        )
+    connections = [common, *nodes.values()]
+    refused = sum(connection.refused for connection in connections)
+    if refused:
+        why = next(connection.refusal for connection in connections if connection.refused)
+        raise BrokerError(f"broker {broker}: refuses {refused} of {n} messages: {why}")
     return n
 
 
-def _robot_at(words: list[str]) -> int:
-    """Return where the name of the robot stands among the words of a topic, from the end."""
-    # Before the end stand <robot>/<part>/<kind>, or <robot>/nodes/<node>/<kind>, or, of an info in
-    # pieces, <robot>/nodes/<node>/<piece>/info.
-    return -4 if words[-3] == "nodes" else -5 if words[-4:-3] == ["nodes"] else -3
+@contextlib.asynccontextmanager
+async def _node(broker: Broker, status: str) -> AsyncIterator[Connection]:
+    """Connect as a node that is played, for its status: it is `offline` afterwards, however that
+    ends, because a recording that was played is over.
+
+    Raises:
+        MqttError: there is no connection.
+    """
+    will = last_will(status, OFFLINE, None)
+    async with connect(broker, identifier=_identifier(), will=will) as connection:
+        try:
+            yield connection
+        finally:
+            await connection.publish(status, OFFLINE, qos=1, retain=True)
 
 
 def _whose(topic: str) -> tuple[str, str]:
     """Return base and robot of a topic."""
     words = topic.split("/")
-    at = _robot_at(words)
+    at = robot_at(words)
     return "/".join(words[:at]), words[at]
 
 
 def _renamed(topic: str, robot: str) -> str:
     """Return the same topic for another robot: skin/<robot>/... with any base."""
     words = topic.split("/")
-    words[_robot_at(words)] = robot
+    words[robot_at(words)] = robot
     return "/".join(words)
 
 

@@ -239,6 +239,7 @@ def _pyplot() -> Any:
     """
     mpl = required("matplotlib", "pictures", "plots")
     mpl.use("Agg")
+    mpl.rcParams["text.parse_math"] = False  # a recording's names may look like formulas
     from matplotlib import pyplot
 
     return pyplot

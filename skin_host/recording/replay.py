@@ -7,21 +7,25 @@ files; a cluster's workers must find them under the same absolute paths.
 """
 
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from skin_host.bus.logs import WINDOW_NS, read_channels
+import numpy as np
+
+from skin_host.bus.logs import WINDOW_NS, name_in, read_channels
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import Settings, skin_hash
 from skin_host.errors import LogError, RequestError, SkinError, required
 from skin_host.files import whole_file
 from skin_host.health import HealthWatch
+from skin_host.health.diagnosis import named_by_part
 from skin_host.layout import Layout, load_skin
 from skin_host.processing import calibration as calibrations
-from skin_host.processing.calibration import Calibration
+from skin_host.processing.calibration import Calibration, Verdict, by_part
 from skin_host.processing.calibration.calibrator import NOISE_SAMPLES
 from skin_host.processing.calibration.file import load_calibration
 from skin_host.processing.core import Engine, Output, Step
@@ -45,7 +49,8 @@ def read_buses(
     """Yield batches of a recording with the name of the configured bus they belong to.
 
     With one bus in the configuration all frames belong to it, whatever the recording calls its
-    channel. With several, channels go by name; others are ignored.
+    channel. With several, channels go by name, or by the number that the format has in its place;
+    others are ignored.
 
     A batch of a recording that is no MCAP spans `window_ns` at most.
 
@@ -64,7 +69,10 @@ def read_buses(
         for _, batch in channels:
             yield only, batch
         return
-    bus_of = {bus.channel: name for name, bus in settings.buses.items()}
+    called = {name: name_in(log, bus.channel) for name, bus in settings.buses.items()}
+    names = Counter(called.values())
+    bus_of = {channel: name for name, channel in called.items() if names[channel] == 1}
+    bus_of |= {bus.channel: name for name, bus in settings.buses.items()}
     seen: set[str] = set()
     for channel, batch in channels:
         seen.add(channel)
@@ -74,7 +82,7 @@ def read_buses(
     if not seen & set(bus_of):
         raise LogError(
             f"{log}: its channels are {', '.join(sorted(seen)) or 'unnamed'}; "
-            f"the configuration's are {', '.join(bus_of)}"
+            f"the configuration's are {', '.join(bus.channel for bus in settings.buses.values())}"
         )
 
 
@@ -125,6 +133,29 @@ def calibrate_from_log(
     # A recording's calibration carries the recording's time, so that replays stay equal.
     time = datetime.fromtimestamp(last_ns / 1e9, UTC).isoformat(timespec="seconds")
     return engine.end_calibration(time)
+
+
+def doubts(calibration: Calibration, layout: Layout) -> list[str]:
+    """Return what is in doubt of the zeros with which a recording is processed, a sentence each."""
+    found = []
+    if touched := by_part(calibration.verdict == Verdict.TOUCHED, layout):
+        found.append(
+            f"{named_by_part(touched)} were touched while their zero was taken, and read too "
+            "little; wanted some seconds of untouched skin, or a calibration file that has them"
+        )
+    refused = ~calibration.usable
+    if without := by_part(refused, layout):
+        reasons = {
+            Verdict(number).name.lower().replace("_", " ")
+            if number >= Verdict.STUCK
+            else "no usable curve"
+            for number in np.unique(calibration.verdict[refused])
+        }
+        found.append(
+            f"{named_by_part(without)} have no zero ({', '.join(sorted(reasons))}) and are not "
+            "valid"
+        )
+    return found
 
 
 def replay(log: Path, engine: Engine) -> Iterator[Output]:
@@ -201,14 +232,22 @@ def write_lines(
     return number
 
 
-def process(task: Task, progress: Callable[[int], None] = lambda _: None) -> int:
+def process(
+    task: Task,
+    progress: Callable[[int], None] = lambda _: None,
+    warn: Callable[[str], None] = lambda _: None,
+) -> int:
     """Do one task; return the number of frames of pressure.
+
+    `warn` is called with each of the `doubts` before anything is written.
 
     Raises:
         LogError, CalibrationError, ConfigurationError: a file is wrong.
     """
     settings, layout = load_skin(task.config)
     found = calibration_for(task.log, settings, layout, task.calibration, task.calibrate_seconds)
+    for doubt in doubts(found, layout):
+        warn(doubt)
     engine = Engine(settings, layout, list(range(len(layout.parts))), found)
     if task.output is None:
         return write_lines(task.log, engine, sys.stdout.buffer, progress)
@@ -218,8 +257,8 @@ def process(task: Task, progress: Callable[[int], None] = lambda _: None) -> int
 
 def process_all(
     tasks: Sequence[Task], scheduler: str | None = None
-) -> Iterator[tuple[Task, int | SkinError]]:
-    """Do many tasks in parallel; yield each with its result when it ends.
+) -> Iterator[tuple[Task, list[str] | SkinError]]:
+    """Do many tasks in parallel; yield each when it ends, with its `doubts` or what was wrong.
 
     The tasks have different outputs. Without the address of a Dask scheduler they are done by
     processes on all cores of this computer.
@@ -237,9 +276,15 @@ def process_all(
     from skin_host.processes import Processes
 
     with Processes(len(ordered)) as processes:
-        futures = {processes.submit(process, task): task for task in ordered}
+        futures = {processes.submit(_process, task): task for task in ordered}
         for future in as_completed(futures):
             yield futures[future], _result(future)
+
+
+def _process(task: Task) -> list[str]:
+    doubted: list[str] = []
+    process(task, warn=doubted.append)
+    return doubted
 
 
 def _size(task: Task) -> int:
@@ -249,16 +294,16 @@ def _size(task: Task) -> int:
         return 0
 
 
-def _result(future: "Future[int] | Any") -> int | SkinError:
+def _result(future: "Future[list[str]] | Any") -> list[str] | SkinError:
     """Return the result of a task; unexpected errors are raised."""
     try:
-        number: int = future.result()
+        doubted: list[str] = future.result()
     except SkinError as error:
         return error
-    return number
+    return doubted
 
 
-def _on_cluster(tasks: list[Task], scheduler: str) -> Iterator[tuple[Task, int | SkinError]]:
+def _on_cluster(tasks: list[Task], scheduler: str) -> Iterator[tuple[Task, list[str] | SkinError]]:
     distributed = required("distributed", "clusters", "cluster")
     try:
         client = distributed.Client(scheduler, timeout=SCHEDULER_S, set_as_default=False)
@@ -266,6 +311,6 @@ def _on_cluster(tasks: list[Task], scheduler: str) -> Iterator[tuple[Task, int |
         raise RequestError(f"--scheduler {scheduler}: no scheduler answers: {error}") from None
     with client:
         # Not pure: a task is done again, because its files may have changed.
-        futures = dict(zip(client.map(process, tasks, pure=False), tasks, strict=True))
+        futures = dict(zip(client.map(_process, tasks, pure=False), tasks, strict=True))
         for future in distributed.as_completed(futures, loop=client.loop):
             yield futures[future], _result(future)

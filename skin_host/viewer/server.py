@@ -6,14 +6,17 @@ listens on this machine only, and it takes requests from its own page only.
 
 import asyncio
 import contextlib
+import ipaddress
 import logging
 import os
-from collections.abc import AsyncIterator, Callable, Mapping
+import socket
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from functools import partial
 from http import HTTPStatus
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
+from urllib.parse import urlsplit
 
 import msgspec
 from msgspec import Meta, Struct
@@ -29,6 +32,7 @@ from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import first_error
 from skin_host.recording.capture import MAX_AGO_S, PageRecording
 from skin_host.tasks import cancel
+from skin_host.untrusted import from_json
 from skin_host.viewer.picture import Cursor, Picture
 
 #: Pages get new messages this often; screens show no more.
@@ -48,7 +52,6 @@ MAX_WISHES = 8
 COMMAND_S = 120.0
 #: Raw values are requested again before this time ends.
 RAW_LEASE_S = 30.0
-LOOPBACK = ("127.0.0.1", "::1", "localhost")
 TYPES = {
     "html": "text/html",
     "css": "text/css",
@@ -65,7 +68,7 @@ SECURITY = {
 }
 
 #: Errors of a request, and of what it asks for.
-_REFUSED = (SkinError, OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError)
+_REFUSED = (SkinError, OSError, msgspec.DecodeError)
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
@@ -86,19 +89,34 @@ class _Wish(Struct, forbid_unknown_fields=True):
 
 
 class _Visit(ServerConnection):
-    """A connection; of too many the last are closed before anything is read."""
+    """A connection; of too many the last are closed before anything is read.
+
+    While its peer does not read, nothing of it is read: the answers to its pings would wait in
+    memory without end.
+    """
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         super().connection_made(transport)
         if len(self.server.handlers) > MAX_CONNECTIONS:
             self.transport.abort()
 
+    def data_received(self, data: bytes) -> None:
+        super().data_received(data)
+        if self.paused:
+            self.transport.pause_reading()
+
+    def resume_writing(self) -> None:
+        super().resume_writing()
+        # Messages that wait to be handled hold the reading up, too.
+        if not self.recv_messages.paused:
+            self.transport.resume_reading()
+
 
 class Viewer:
     """The page of one robot.
 
     Pages may calibrate, ask for raw values and record if `commands` is true; what they record is
-    kept in `recordings`.
+    kept in `recordings`. It is served under addresses, the names of this machine, and `names`.
     """
 
     def __init__(
@@ -108,8 +126,10 @@ class Viewer:
         robot: str | None = None,
         commands: bool = True,
         recordings: Path = Path("recordings"),
+        names: Iterable[str] = (),
     ) -> None:
         self._broker = broker
+        self._names = {"localhost", *_own_names(), *map(str.lower, names)}
         self._recording = PageRecording(recordings)
         self._new_client: Callable[[], SkinClient] = lambda: SkinClient(broker, robot=robot)
         self._commands = commands
@@ -127,7 +147,6 @@ class Viewer:
         Raises:
             SkinError: the port is not available.
         """
-        local = host in LOOPBACK
         # It logs every file that it serves as a rejected connection ...
         logger = logging.getLogger("websockets.server")
         logger.setLevel(logging.WARNING)
@@ -137,7 +156,7 @@ class Viewer:
                 self._talk,
                 host,
                 port,
-                process_request=lambda connection, request: self._answer(request, local=local),
+                process_request=lambda connection, request: self._answer(request),
                 max_size=MAX_REQUEST_BYTES,
                 compression=None,
                 server_header=None,
@@ -170,16 +189,17 @@ class Viewer:
             ready(url)
             await stop.wait()
 
-    def _answer(self, request: Request, *, local: bool) -> Response | None:
+    def _answer(self, request: Request) -> Response | None:
         """Answer a request for a file; None lets a page's WebSocket through."""
         try:
             host = request.headers.get("Host", "")
             origin = request.headers.get("Origin")
         except MultipleValuesError:
             return _response(HTTPStatus.BAD_REQUEST, "text/plain", b"two hosts or origins\n")
-        if local and host.rpartition(":")[0].strip("[]") not in LOOPBACK:
-            # A page from another host whose name was made to point at this machine.
-            return _response(HTTPStatus.FORBIDDEN, "text/plain", b"not served under this name\n")
+        if not self._is_ours(host):
+            # A page from elsewhere, whose name was made to point at this machine.
+            text = b"not served under this name; `skin view --name NAME` allows one\n"
+            return _response(HTTPStatus.FORBIDDEN, "text/plain", text)
         path = request.path.partition("?")[0]
         if path == "/live":
             if origin not in (f"http://{host}", f"https://{host}"):
@@ -191,6 +211,16 @@ class Viewer:
         if file is None:
             return _response(HTTPStatus.NOT_FOUND, "text/plain", b"no such page\n")
         return _response(HTTPStatus.OK, *file)
+
+    def _is_ours(self, host: str) -> bool:
+        """Whether a header `Host` has an address, which nobody can make point elsewhere, or a name
+        of ours.
+        """
+        try:
+            name = urlsplit(f"//{host}").hostname or ""
+        except ValueError:
+            return False
+        return name in self._names or _is_address(name)
 
     async def _talk(self, page: ServerConnection) -> None:
         """Send one page its new messages until it closes, and take its requests."""
@@ -225,7 +255,7 @@ class Viewer:
     async def _take_wish(self, page: ServerConnection, message: bytes) -> None:
         answer: dict[str, Any] = {"type": "answer"}
         try:
-            wish = msgspec.json.decode(message, type=_Wish)
+            wish = from_json(message, _Wish)
             answer["do"] = wish.do
             if not self._commands:
                 raise RequestError("commands are switched off; start the page with them allowed")
@@ -314,6 +344,21 @@ class Viewer:
                 "recording": self._recording.state,
             }
         )
+
+
+def _own_names() -> set[str]:
+    """The names of this machine, the one of multicast DNS included."""
+    name = socket.gethostname().lower()
+    short = name.partition(".")[0]
+    return {name, short, f"{short}.local"}
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
 
 
 def _close_with(page: ServerConnection, telling: "asyncio.Task[None]") -> None:

@@ -2,6 +2,7 @@
 used, nothing is lost silently, and each ends in one line.
 """
 
+import asyncio
 import errno
 import json
 import os
@@ -25,6 +26,7 @@ from skin_host.errors import BusyFileError, NewerFileError, SkinError
 from skin_host.files import read_whole, write_atomic
 from skin_host.layout import build_layout
 from skin_host.mqtt.address import Broker
+from skin_host.mqtt.commands import MAX_RUNNING, CommandHandler, Result, decode_result
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration.file import load_calibration, save_calibration, with_gains_of
 from skin_host.recording.capture import CanLog, FrameRecorder, PageRecording
@@ -167,6 +169,44 @@ async def test_a_reload_of_a_configuration_that_became_a_silent_pipe_ends(
             await daemon.control.handle("reload", b"{}")
         assert daemon.settings is before
     os.close(writer)
+
+
+@stepped
+async def test_reloads_of_a_file_that_is_slow_to_read_leave_room_for_other_commands(
+    clock: SteppedClock, can_bus_settings: Bus, tmp_path: Path
+) -> None:
+    """As a pipe may be: as many as may run waited for one another."""
+    path = tmp_path / "demo.toml"
+    path.write_text("damaged")
+    async with living(can_bus_settings, tmp_path / "state", clock=clock) as live:
+        daemon = live.daemon
+        daemon._configuration = path
+        handler = CommandHandler(daemon.control.handle)
+        answers: list[Result] = []
+
+        def ask(name: str) -> None:
+            handler.take(name, b"{}", lambda answer: answers.append(decode_result(answer)))
+
+        clock.threads_take_s = 10.0
+        for _ in range(MAX_RUNNING):
+            ask("reload")
+        await clock.sleep(1.0)
+        ask("status")
+        await clock.sleep(1.0)
+        *refused, status = answers
+        assert status.ok
+        assert len(refused) == MAX_RUNNING - 1
+        for answer in refused:
+            assert "being read again already" in str(answer.error)
+        await clock.sleep(10.0)
+        assert "demo.toml" in str(answers[-1].error)
+        # Another one may begin now; a SIGHUP is never refused, as it comes with a newer file.
+        ask("reload")
+        waiting = [asyncio.create_task(daemon.reload()) for _ in range(2)]
+        await clock.sleep(25.0)
+        assert "demo.toml" in str(answers[-1].error)
+        for task in waiting:
+            assert "demo.toml" in str(task.exception())
 
 
 @stepped

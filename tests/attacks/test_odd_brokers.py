@@ -6,20 +6,22 @@ does not fill the log.
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
+from typing import Any
 
 import pytest
 
 from skin_host.config.settings import Mqtt
 from skin_host.mqtt import connection
+from skin_host.mqtt.commands import Handler
 from skin_host.mqtt.publisher import Publisher
 from tests.support.packets import PUBLISH, SUBSCRIBE, packet_with_flags, suback
 from tests.support.waiting import until
 
 QOS_1 = 2
 DISCONNECT, PUBACK = 0xE0, 0x40
-RECEIVE_MAXIMUM_EXCEEDED, QOS_NOT_SUPPORTED = 0x93, 0x9B
+RECEIVE_MAXIMUM_EXCEEDED, QOS_NOT_SUPPORTED, WILDCARDS_NOT_SUPPORTED = 0x93, 0x9B, 0xA2
 
 
 class Odd:
@@ -35,11 +37,13 @@ class Odd:
         properties: bytes = b"",
         *,
         subscribes: bool = True,
+        wildcards: bool = True,
         judge: Callable[["Odd", int], int] = lambda *_: 0,
         connack_s: float = 0.0,
     ) -> None:
         self._properties, self._subscribes, self._judge = properties, subscribes, judge
         self._connack_s = connack_s
+        self._wildcards = wildcards
         self.connections = self.in_flight = self.most = 0
         self.topics: list[str] = []
 
@@ -62,6 +66,9 @@ class Odd:
             await asyncio.sleep(self._connack_s)
         while True:
             first, body = await packet_with_flags(reader)
+            if first >> 4 == SUBSCRIBE and b"+" in body and not self._wildcards:
+                writer.write(bytes([DISCONNECT, 1, WILDCARDS_NOT_SUPPORTED]))
+                return
             if first >> 4 == SUBSCRIBE and self._subscribes:
                 writer.write(suback(body))
             elif first >> 4 == PUBLISH and first & QOS_1:
@@ -84,14 +91,18 @@ class Odd:
 
 
 @asynccontextmanager
-async def publishing(broker: Odd) -> AsyncIterator[Publisher]:
+async def publishing(broker: Odd, handler: Handler | None = None) -> AsyncIterator[Publisher]:
     server = await asyncio.start_server(broker.serve, "127.0.0.1", 0)
     settings = Mqtt(host="127.0.0.1", port=server.sockets[0].getsockname()[1])
-    async with Publisher(settings, "robot", drain_s=0.0) as publisher:
+    async with Publisher(settings, "robot", handler=handler, drain_s=0.0) as publisher:
         for part in range(12):
             publisher.put_contact(f"p{part}", "OFF")
         yield publisher
     server.close()
+
+
+async def answer(name: str, request: bytes) -> Mapping[str, Any]:
+    return {}
 
 
 def lines(caplog: pytest.LogCaptureFixture) -> list[str]:
@@ -120,6 +131,20 @@ async def test_touches_reach_a_broker_that_never_acknowledges_a_subscription(
         assert publisher.counters.connected
     assert broker.connections == 1
     said = [line for line in lines(caplog) if "no commands are received" in line]
+    assert len(said) == 1
+
+
+async def test_a_broker_without_wildcards_takes_everything_but_commands(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """It ends the connection over a subscription with one (MQTT 5.0, 3.2.2.3.11)."""
+    broker = Odd(b"\x28\0", wildcards=False)
+    async with publishing(broker, answer):
+        await until(lambda: len(set(broker.topics)) >= 13)
+    assert broker.connections == 1
+    said = [
+        line for line in lines(caplog) if "may not subscribe to skin/robot/nodes/main/cmd/+" in line
+    ]
     assert len(said) == 1
 
 

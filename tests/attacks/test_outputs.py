@@ -186,7 +186,7 @@ def test_a_recording_of_frames_into_a_link_replaces_the_linked_file(tmp_path: Pa
     with CanLog(tmp_path / "x.log") as log:
         log.put("can0", FRAMES)
     assert (tmp_path / "x.log").is_symlink()
-    assert (tmp_path / "data" / "frames").read_text().endswith(" can0 4E0#0000000000000000 R\n")
+    assert (tmp_path / "data" / "frames").read_text().endswith(" can0 4E0#0000000000000000\n")
     assert [file.name for file in (tmp_path / "data").iterdir()] == ["frames"]
 
 

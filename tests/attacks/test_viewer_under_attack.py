@@ -17,7 +17,7 @@ from tests.support.broker import Mosquitto
 from tests.viewer import test_picture as pictures
 from tests.viewer.test_server import fetch, heard, node, nowhere, of_type, page, pressed, skin
 
-_TEXT, _MORE = 0x01, 0x00
+_TEXT, _MORE, _PING = 0x01, 0x00, 0x89
 
 
 def piece(kind: int, data: bytes = b"") -> bytes:
@@ -40,22 +40,54 @@ async def answer(url: str, request: str) -> bytes:
         writer.close()
 
 
+async def open_page(url: str) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    """A page's WebSocket without a library that keeps to the rules."""
+    reader, writer = await asyncio.open_connection(*place(url), limit=256)
+    key = base64.b64encode(bytes(16)).decode()
+    writer.write(
+        f"GET /live HTTP/1.1\r\nHost: localhost:1\r\nOrigin: http://localhost:1\r\n"
+        "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+        f"Sec-WebSocket-Key: {key}\r\n\r\n".encode()
+    )
+    await reader.readuntil(b"\r\n\r\n")
+    return reader, writer
+
+
 async def test_a_message_in_endless_empty_pieces_ends_its_connection() -> None:
     async with Viewer(nowhere(), robot="demo").serving(port=0) as url:
-        reader, writer = await asyncio.open_connection(*place(url))
-        key = base64.b64encode(bytes(16)).decode()
-        writer.write(
-            f"GET /live HTTP/1.1\r\nHost: localhost:1\r\nOrigin: http://localhost:1\r\n"
-            "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
-            f"Sec-WebSocket-Key: {key}\r\n\r\n".encode()
-        )
-        await reader.readuntil(b"\r\n\r\n")
+        reader, writer = await open_page(url)
         writer.write(piece(_TEXT, b"{") + piece(_MORE) * 10 * MAX_PIECES)
         async with asyncio.timeout(30):
             said = await reader.read()
         writer.close()
         assert b"\x88\x02\x03\xf1" in said  # closed: 1009, message too big
         assert (await fetch(url))[0] == 200
+
+
+async def test_who_sends_pings_and_reads_no_answer_is_not_read_either() -> None:
+    """The answers would wait in memory, as many as there are pings."""
+    many = piece(_PING, bytes(125)) * 2000
+    async with Viewer(nowhere(), robot="demo").serving(port=0) as url:
+        _, writer = await open_page(url)
+        with pytest.raises(TimeoutError):
+            for _ in range(400):  # 100 MB: far more than waits between two programs
+                writer.write(many)
+                async with asyncio.timeout(1.0):
+                    await writer.drain()
+        writer.transport.abort()
+        assert (await fetch(url))[0] == 200
+
+
+async def test_who_reads_slowly_is_read_again_when_it_has() -> None:
+    many = 4000
+    async with Viewer(nowhere(), robot="demo").serving(port=0) as url:
+        reader, writer = await open_page(url)
+        writer.write(piece(_PING, bytes(125)) * many)
+        answer = bytes([0x8A, 125]) + bytes(125)
+        async with asyncio.timeout(30):
+            for _ in range(many):
+                await reader.readuntil(answer)
+        writer.close()
 
 
 async def test_more_connections_than_files_may_be_open_are_survived_in_silence(

@@ -115,6 +115,19 @@ def test_a_lost_frame_costs_its_triangle_and_is_counted():
     assert assembler.counters.halves == 1
 
 
+def test_halves_of_two_sweeps_are_not_joined_where_a_late_frame_hides_the_pause() -> None:
+    """The last frame of the first sweep is late, and the next comes early: the period scatters."""
+    first, second = values(4, 1), values(4, 2)
+    sent = frames(first, PERIOD)
+    lost = sent.pop(0)
+    sent[-1] = (*sent[-1][:2], PERIOD + 7 * MS)
+    sent += frames(second, PERIOD + 29 * MS)
+    assert sent[7][0] == lost[0]
+    one, two = feed(make(), sent)
+    assert one.present == 0b1110
+    np.testing.assert_array_equal(two.raw[:4], second)
+
+
 def test_a_status_word_comes_without_the_other_half_of_its_triangle() -> None:
     """It may be the only one that says that the chip does not answer."""
     words = np.array([0x0001, 0x0002, 0x0010, 0x0001], np.uint16)
@@ -462,7 +475,9 @@ def test_the_most_frequent_motor_frame_is_named_when_these_are_most_of_what_come
 
 
 def test_the_frames_of_a_slow_burst_are_one_sweep_until_it_is_too_old() -> None:
-    """No pause is longer than half of a period, and the last frame is 0.9 periods old."""
+    """No pause is longer than a third of a period where its first frame is older than half of one,
+    and its last frame is 0.9 periods old.
+    """
     raw = values(2)
 
     def cut(*times_ms: float) -> list[int]:
@@ -477,7 +492,8 @@ def test_the_frames_of_a_slow_burst_are_one_sweep_until_it_is_too_old() -> None:
     assert cut(0, 15, 30, 45) == [0b11]
     assert cut(0, 25, 30, 45) == [0b11]
     assert cut(0, 1, 26.001, 27) == [0b01, 0b10]
-    assert cut(0, 20, 40, 45.001) == [0b01]
+    assert cut(0, 20, 36, 45.001) == [0b01]
+    assert cut(0, 8.3, 25.001, 26) == [0b01, 0b10]
     # Stamps that step back a little end no sweep.
     assert cut(3, 2, 1, 0) == [0b11]
 
@@ -713,3 +729,24 @@ def test_a_short_frame_amid_a_known_order_is_counted_and_is_no_value() -> None:
     sweeps = feed(assembler, sent) + assembler.flush()
     assert [sweep.present for sweep in sweeps] == [0b1011]
     assert assembler.counters.short == 1
+
+
+@pytest.mark.parametrize("step_s", [3600, -3600, 0.2])
+@pytest.mark.parametrize("buffered", [0, 2])
+@pytest.mark.parametrize("lost", [0, 3])
+def test_sweeps_are_not_missed_in_time_that_only_the_clock_passed(
+    step_s: float, buffered: int, lost: int
+) -> None:
+    """Some sweeps may follow that were stamped before it was set; what was lost is counted."""
+    begun_ns, step_ns = 10_000 * 1_000_000_000, round(step_s * 1e9)
+    assembler = make()
+    for number in range(5 + buffered):
+        if number == 5:
+            assembler.clock_set(step_ns)
+        feed(assembler, frames(values(4, number), begun_ns + number * PERIOD))
+    if not buffered:
+        assembler.clock_set(step_ns)
+    for number in range(5 + buffered + lost, 15):
+        feed(assembler, frames(values(4, number), begun_ns + number * PERIOD + step_ns))
+    assert assembler.counters.missed == lost
+    assert assembler.counters.sweeps == 15 - lost

@@ -191,3 +191,16 @@ def test_cut_files_are_told(tmp_path):
     cut = tmp_path / "cut.blf"
     cut.write_bytes(whole_blf(blf)[:-1000])
     assert "cut off" in message_of(cut)
+
+
+def test_error_frames_of_candump_are_no_data_frames(tmp_path):
+    """Played onto a bus, they would be sent."""
+    lines = [
+        "(1.0) can0 20000004#000C000000000000",
+        "(1.0) can0 20000080#0000000000000000",
+        "(1.0) can0 3FFFFFFF#00",
+        "(1.0) can0 1FFFFFFF#00",
+    ]
+    (batch,) = read(candump(tmp_path / "a.log", lines))
+    assert batch.id.tolist() == [0x20000004, 0x20000080, 0x3FFFFFFF, 0x9FFFFFFF]
+    assert batch.data[0].tolist() == [0, 12, 0, 0, 0, 0, 0, 0]

@@ -17,6 +17,7 @@ from skin_host.cli import build_parser, main, watch
 from skin_host.config.settings import skin_hash
 from skin_host.processing.calibration.calibrator import Calibrator
 from tests.support.broker import free_port
+from tests.support.moments import at_import
 from tests.support.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
@@ -211,6 +212,13 @@ def test_a_wrong_command_is_one_line_and_status_2(arguments):
 
 def test_the_program_ends_with_the_status_of_its_command():
     refused(skin("check", "nope.toml"), 2, "nope.toml")
+
+
+@pytest.mark.parametrize("module", ["skin_host.cli", "skin_host.files", "skin_host.layout"])
+def test_ctrl_c_while_a_command_is_being_imported_shows_no_traceback(module, tmp_path):
+    act = "signal.signal(signal.SIGINT, signal.default_int_handler); signal.raise_signal(2)"
+    result = skin("check", str(DEMO), **at_import(tmp_path, module, "check", act))
+    assert (result.returncode, result.stderr) == (130, "")
 
 
 def help_of(capsys: pytest.CaptureFixture[str], *command: str) -> str:

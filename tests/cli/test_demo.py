@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,19 +15,28 @@ from skin_host import demo
 from skin_host.errors import SkinError
 from skin_host.viewer.server import Viewer
 from tests.support.broker import free_port
+from tests.support.moments import at_import
 from tests.support.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
+ENV = shutil.which("env")
+#: In the command line of a process that multiprocessing starts.
+CHILD = "--multiprocessing-fork"
 
 
-def start(tmp_path, *options):
+def start(tmp_path, *options, env=os.environ):
     """The demo, where no program is installed."""
     script = "import sys, skin_host.mqtt.broker as broker; broker._MORE_PLACES = (); "
     script += "from skin_host.cli import main; sys.exit(main())"
     return subprocess.Popen(
-        [sys.executable, "-c", script, "demo", "--page-port", "0", *options],
+        # What runs in the background ignores Ctrl-C, and so would all that it starts.
+        [
+            *(ENV, "--default-signal=INT", sys.executable, "-c", script),
+            *("demo", "--page-port", "0", *options),
+        ],
         cwd=ROOT,
-        env=os.environ | {"PATH": str(tmp_path)},
+        env=env | {"PATH": str(tmp_path)},
+        start_new_session=True,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -55,6 +65,28 @@ def test_the_demo_tells_touches_and_ends_with_a_summary_of_them(tmp_path):
     # What its broker has not taken in time at the end is given up.
     assert 1 <= summary["touches_ended"] <= summary["touches_begun"]
     assert summary["bus"] in {"socketpair", "socketcan"}
+
+
+@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize(
+    "module",
+    ["multiprocessing.spawn", "numpy", "skin_host.demo", "emulator.robot", "emulator.chips.ad7147"],
+)
+def test_a_demo_whose_robot_is_being_started_ends_in_good_order(tmp_path, module, number):
+    """Ctrl-C of a terminal reaches both processes, and so do the signals of some supervisors."""
+    act = f"os.killpg(0, signal.{number})"
+    demo = start(tmp_path, env=at_import(tmp_path, module, CHILD, act))
+    out, err = demo.communicate(timeout=PATIENCE_S)
+    assert demo.returncode == 0
+    assert "Traceback" not in err
+    assert json.loads(out.splitlines()[-1])["touches_begun"] == 0
+
+
+def test_a_robot_whose_demo_was_killed_ends_without_a_word(tmp_path):
+    act = "os.kill(os.getppid(), signal.SIGKILL)"
+    demo = start(tmp_path, env=at_import(tmp_path, "emulator.robot", CHILD, act))
+    out, err = demo.communicate(timeout=PATIENCE_S)  # its pipes end with the last process
+    assert (demo.returncode, out, err) == (-signal.SIGKILL, "", "")
 
 
 def test_the_demo_of_any_configuration_ends_by_itself(tmp_path):

@@ -5,13 +5,16 @@ import json
 import sys
 from pathlib import Path
 
+import pytest
 from msgspec.structs import replace
 
+from skin_host.cli import main
 from skin_host.cli.lines import missed_line
+from skin_host.client import session
 from skin_host.config.settings import Mqtt, load
 from skin_host.fingertip.events import Over, Slip
 from skin_host.layout import build_layout
-from skin_host.mqtt.info import node_info
+from skin_host.mqtt.info import NodeInfo, node_info
 from skin_host.mqtt.publisher import Publisher
 from tests.support.broker import Mosquitto, free_port
 from tests.support.said import touch_event
@@ -45,6 +48,17 @@ index          end   #4    (   1.0,   2.0) mm
 """.splitlines()
 
 
+def info() -> NodeInfo:
+    settings = load(CONFIG)
+    return node_info(
+        build_layout(settings, CONFIG.parent),
+        "main",
+        version="1",
+        configuration="x",
+        fingertips=settings.fingertips,
+    )
+
+
 async def listened(broker: Mosquitto, *options: str) -> list[str]:
     """What the command prints of a grasp in which something slips, ten lines of it."""
     command = await asyncio.create_subprocess_exec(
@@ -56,8 +70,7 @@ async def listened(broker: Mosquitto, *options: str) -> list[str]:
     said = asyncio.create_task(command.communicate())
     settings = Mqtt(host=broker.host, port=broker.port)
     async with Publisher(settings, "fingertips", "main") as publisher:
-        layout = build_layout(load(CONFIG), CONFIG.parent)
-        publisher.put_info(node_info(layout, "main", version="1", configuration="x"))
+        publisher.put_info(info())
         # Events are not retained: they are told again until the command listens.
         async with asyncio.timeout(PATIENCE_S):
             while not said.done():
@@ -111,14 +124,19 @@ async def test_why_no_events_come_is_on_stderr(mosquitto: Mosquitto) -> None:
     assert missing.startswith(f"warning: no broker at {gone}: Connection refused")
     nobody = 'warning: no node of robot "fingertips" is online: is `skin run` running?; waiting\n'
     assert await first_warning(*where) == nobody
+
+
+async def test_a_part_that_the_robot_does_not_have_ends_it(
+    mosquitto: Mosquitto, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(session, "NAMED_S", 0.0)
     settings = Mqtt(host=mosquitto.host, port=mosquitto.port)
+    words = ["listen", "--broker", f"mqtt://{mosquitto.host}:{mosquitto.port}", "--part", "indx"]
     async with Publisher(settings, "fingertips", "main") as publisher:
-        layout = build_layout(load(CONFIG), CONFIG.parent)
-        publisher.put_info(node_info(layout, "main", version="1", configuration="x"))
-        parts = await first_warning(*where, "--part", "indx")
-    known = "thumb_skin"
-    assert parts == (
-        f'warning: robot "fingertips" has no part "indx"; there are: {known}; waiting\n'
+        publisher.put_info(info())
+        assert await asyncio.to_thread(main, [*words, "--robot", "fingertips"]) == 2
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        'skin listen: robot "fingertips" has no part "indx"; there are: index, thumb, thumb_skin'
     )
 
 

@@ -8,19 +8,31 @@ from typing import Any
 
 import pytest
 import pytest_asyncio
+from msgspec.structs import replace
 
+from emulator.probes.scene import Place, Probe
 from skin_host.cli import main
-from skin_host.config.settings import Bus
+from skin_host.config.settings import Bus, Mqtt, load
+from skin_host.layout import build_layout
+from skin_host.mqtt.info import node_info
+from skin_host.mqtt.publisher import Publisher
 from tests.support.broker import Mosquitto
-from tests.support.live import CONFIG, living
+from tests.support.live import CONFIG, Live, living
+from tests.support.waiting import until
 
 
 @pytest_asyncio.fixture
-async def url(mosquitto: Mosquitto, tmp_path: Path) -> AsyncIterator[str]:
-    """The broker of a robot that lives and is calibrated."""
+async def live(mosquitto: Mosquitto, tmp_path: Path) -> AsyncIterator[Live]:
+    """A robot that lives and is calibrated."""
     bus = Bus(interface="virtual", channel=tmp_path.name)
-    async with living(bus, tmp_path, port=mosquitto.port):
-        yield f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    async with living(bus, tmp_path, port=mosquitto.port) as found:
+        yield found
+
+
+@pytest.fixture
+def url(live: Live, mosquitto: Mosquitto) -> str:
+    """The broker of such a robot."""
+    return f"mqtt://{mosquitto.host}:{mosquitto.port}"
 
 
 async def skin(*words: str) -> int:
@@ -37,7 +49,7 @@ async def test_a_running_daemon_answers_and_refuses_in_one_line(
         parts = {line.split()[0] for line in lines if not line.startswith(" ")}
         assert parts == {"left_hand", "left_forearm"}
     assert await skin("command", "thresholds", "--set", "margin_units=3", "--broker", url) == 0
-    assert '"margin_units": 3' in capsys.readouterr().out
+    assert "  margin_units: 3\n" in capsys.readouterr().out
     words = ["command", "thresholds", "--set", "margin_unit=3"]
     assert await skin(*words, "--broker", url) == 1
     assert "set: unknown key `margin_unit`; meant `margin_units`?" in capsys.readouterr().err
@@ -76,6 +88,84 @@ async def test_every_command_can_be_given_to_a_running_daemon(
     assert "foot" in capsys.readouterr().err
 
 
+async def test_what_a_daemon_answers_is_printed_for_people(
+    url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async def lines(*words: str) -> list[str]:
+        assert await skin("command", *words, "--broker", url) == 0
+        shown = capsys.readouterr()
+        assert shown.err == ""
+        return shown.out.splitlines()
+
+    path = tmp_path / "recordings/run.log"
+    assert await lines("record", "--file", "run.log", "--seconds", "60") == [
+        f"file: {path}",
+        "seconds: 60",
+    ]
+    file, _, lost, ended = await lines("stop_recording")
+    assert (file, lost, ended) == (f"file: {path}", "lost: 0", "ended: stopped")
+    assert await lines("configure") == ["boards: hand, forearm_outer, forearm_inner"]
+    assert await lines("disable", "--part", "left_hand") == ["disabled: left_hand", "kept: yes"]
+    assert await lines("enable", "--part", "left_hand") == ["disabled: none", "kept: yes"]
+    assert await lines("raw", "--seconds", "0.5") == ["seconds: 0.5"]
+    disabled, kept, *thresholds = await lines("thresholds", "--set", "margin_units=3")
+    assert (disabled, kept) == ("disabled: none", "kept: yes")
+    assert thresholds[:2] == ["touch:", "  margin_units: 3"]
+    assert "decides_kpa:" in thresholds
+    head, *rows, known = await lines("calibrate", "--board", "hand", "--seconds", "0.5")
+    assert head.split() == ["part", "board", "triangles", "verdict"]
+    assert {tuple(row.split()[:2]) for row in rows} == {("left_hand", "hand")}
+    assert known.startswith("calibration ")
+
+
+@pytest.mark.parametrize(("options", "status"), [((), 0), (("--strict", "--json"), 1)])
+async def test_a_running_daemon_that_calibrates_touched_skin_names_the_taxels(
+    live: Live, url: str, capsys: pytest.CaptureFixture[str], options: tuple[str, ...], status: int
+) -> None:
+    part = live.daemon.layout.part("left_hand")
+    weight = Probe(part="left_hand", at=Place(taxel=3), diameter_mm=4, force_n=[(0, 1)])
+    live.robot.touch(weight).press(2.0)
+    await live.wait(lambda: bool(live.daemon.engine.zeros._touched[part.start + 3]))
+    words = ["command", "calibrate", "--seconds", "0.5", "--broker", url]
+    assert await skin(*words, *options) == status
+    shown = capsys.readouterr()
+    (warning,) = shown.err.splitlines()
+    assert "taxel 3 of left_hand" in warning
+    assert "repeat" in warning
+    if options:
+        assert json.loads(shown.out)["touched"] == {"left_hand": [3]}
+    else:
+        assert any(line.endswith("touched: 3") for line in shown.out.splitlines())
+    # Those of another board are of the calibration before.
+    assert await skin(*words, "--board", "forearm_outer", "--strict") == 0
+    assert capsys.readouterr().err == ""
+
+
+async def test_a_running_daemon_that_zeroes_fingertips_names_them(
+    mosquitto: Mosquitto, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bus = Bus(interface="virtual", channel=tmp_path.name)
+    config = CONFIG.with_name("fingertips.toml")
+    url = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    words = ["command", "calibrate", "--seconds", "0.5", "--broker", url]
+    async with living(bus, tmp_path, port=mosquitto.port, config=config) as live:
+        assert await skin(*words) == 0
+        out = capsys.readouterr().out
+        assert "\nindex: zero taken\nthumb: zero taken\n" in out
+        weight = Probe(part="index", force_n=[(0.0, 0.0)])
+        live.robot.touch(weight).press(2.0)
+        tips = live.daemon.engine.fingertips
+        assert tips is not None
+        await live.wait(lambda: tips.tips["index"].tip.touched)
+        assert await skin(*words, "--strict") == 1
+        shown = capsys.readouterr()
+        assert "\nindex: zero taken while it was touched\n" in shown.out
+        assert "while it was calibrated: index; take away" in shown.err
+        # Of one board no fingertip is zeroed.
+        assert await skin(*words, "--board", live.daemon.layout.boards[0].name) == 0
+        assert "zero taken" not in capsys.readouterr().out
+
+
 async def test_a_daemon_that_has_gone_leaves_no_part_that_looks_well(
     mosquitto: Mosquitto, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -95,6 +185,27 @@ async def test_a_daemon_that_has_gone_leaves_no_part_that_looks_well(
         assert "rate_hz" not in after[part]
     assert await skin("status", "--broker", url) == 1
     assert "node main is offline" in capsys.readouterr().out
+
+
+async def test_status_is_of_the_parts_that_the_nodes_list(
+    mosquitto: Mosquitto, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A broker may keep the health of a part that an earlier configuration had."""
+    layout = build_layout(load(CONFIG), CONFIG.parent)
+    info = node_info(layout, "main", version="1", configuration="x")
+    words = ["status", "--json", "--broker", f"mqtt://{mosquitto.host}:{mosquitto.port}"]
+    async with Publisher(Mqtt(host=mosquitto.host, port=mosquitto.port), "demo") as publisher:
+        for part in ("arm_of_last_year", *info.parts):
+            publisher.put_health(part, {"state": "ok"})
+        publisher.put_info(info)
+        await until(lambda: publisher.counters.retained_sent >= 5)
+        assert await skin(*words) == 0
+        assert set(json.loads(capsys.readouterr().out)) == set(info.parts)
+        # Nothing is not "all is well".
+        publisher.put_info(replace(info, parts={}))
+        await until(lambda: publisher.counters.retained_sent >= 6)
+        assert await skin(*words) == 1
+        assert json.loads(capsys.readouterr().out) == {}
 
 
 async def test_a_skin_that_a_daemon_serves_is_calibrated_by_that_daemon_only(

@@ -1,6 +1,7 @@
 """A program hears the skin through a real broker, and through what happens to it."""
 
 import asyncio
+import math
 import socket
 import threading
 from collections.abc import AsyncIterator, Mapping
@@ -13,6 +14,7 @@ import aiomqtt
 import numpy as np
 import pytest
 from msgspec import json
+from msgspec.structs import replace
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
@@ -181,6 +183,25 @@ async def test_streams_end_with_the_client(mosquitto: Mosquitto) -> None:
     assert [touch async for touch in touches] == []
 
 
+async def test_who_waits_for_a_client_that_ends_waits_no_longer(mosquitto: Mosquitto) -> None:
+    async with hearing(mosquitto) as skin:
+        mosquitto.kill()
+        await until(lambda: not skin.connected)
+        waiting = [
+            asyncio.create_task(asked)
+            for asked in (
+                skin.ready(),
+                skin.info(10 * PATIENCE_S),
+                skin.command("status", node="main", timeout_s=10 * PATIENCE_S),
+            )
+        ]
+        await asyncio.sleep(0)
+    async with asyncio.timeout(PATIENCE_S):
+        for task in waiting:
+            with pytest.raises(RequestError, match="the client has ended"):
+                await task
+
+
 async def test_nodes_say_what_they_are_and_whether_they_live(mosquitto: Mosquitto) -> None:
     layout = build_layout(load(CONFIG), CONFIG.parent)
     async with hearing(mosquitto) as skin:
@@ -190,6 +211,25 @@ async def test_nodes_say_what_they_are_and_whether_they_live(mosquitto: Mosquitt
             assert list(info["main"].parts) == ["left_hand", "left_forearm"]
             assert skin.nodes["main"].online
         await until(lambda: skin.nodes["main"].online is False)
+
+
+async def test_info_is_of_all_nodes_that_are_online(mosquitto: Mosquitto) -> None:
+    """One that has just connected sends its info a moment after its status."""
+    layout = build_layout(load(CONFIG), CONFIG.parent)
+    info = node_info(layout, "main", version="1", configuration="x")
+    async with hearing(mosquitto) as skin, publishing(mosquitto) as publisher:
+        async with publishing(mosquitto, node="arm") as arm:
+            publisher.put_info(info)
+            await until(lambda: skin.nodes and skin.nodes["main"].info)
+            await until(lambda: "arm" in skin.nodes)
+            asked = asyncio.create_task(skin.info(PATIENCE_S))
+            await asyncio.sleep(0)
+            arm.put_info(replace(info, node="arm"))
+            assert set(await asked) == {"main", "arm"}
+            # What is known when the time is over is better than nothing.
+            async with publishing(mosquitto, node="leg"):
+                await until(lambda: "leg" in skin.nodes)
+                assert set(await skin.info(0.1)) == {"main", "arm"}
 
 
 async def test_without_a_node_info_says_what_to_start(mosquitto: Mosquitto) -> None:
@@ -218,6 +258,87 @@ async def test_a_command_that_fails_says_why(mosquitto: Mosquitto) -> None:
             await skin.command("sleep", node="main", timeout_s=0.2)
         with pytest.raises(CommandError, match='node "other"'):
             await skin.command("calibrate", node="other", timeout_s=0.2)
+
+
+async def test_a_request_has_the_clients_own_number(mosquitto: Mosquitto) -> None:
+    async with publishing(mosquitto), hearing(mosquitto) as skin:
+        assert await skin.command("calibrate", node="main", id="mine", timeout_s=PATIENCE_S) == {
+            "arguments": {}
+        }
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf])
+async def test_a_number_that_json_does_not_have_is_refused(
+    mosquitto: Mosquitto, number: float
+) -> None:
+    """It would be null in the request, which stands for what is not given."""
+    async with publishing(mosquitto) as publisher, hearing(mosquitto) as skin:
+        with pytest.raises(RequestError, match="thresholds: seen nan or inf, wanted numbers"):
+            await skin.command("thresholds", node="main", set={"margin_units": number})
+        assert publisher.counters.commands_taken == 0
+
+
+async def test_a_command_to_a_node_that_is_or_goes_offline_is_not_waited_for(
+    mosquitto: Mosquitto,
+) -> None:
+    async with hearing(mosquitto) as skin:
+        async with publishing(mosquitto) as publisher:
+            asked = asyncio.create_task(
+                skin.command("sleep", node="main", timeout_s=10 * PATIENCE_S)
+            )
+            await until(lambda: publisher.counters.commands_taken == 1)
+            publisher._task.cancel()  # type: ignore[union-attr]  # its connection is cut
+            with pytest.raises(CommandError, match='node "main" of robot "robot" is offline'):
+                await asked
+        with pytest.raises(CommandError, match='node "main" of robot "robot" is offline'):
+            await skin.command("status", node="main", timeout_s=10 * PATIENCE_S)
+
+
+async def test_a_command_to_a_node_that_takes_none_is_refused(mosquitto: Mosquitto) -> None:
+    layout = build_layout(load(CONFIG), CONFIG.parent)
+    info = node_info(layout, "main", version="1", configuration="x", commands=False)
+    settings = Mqtt(host=mosquitto.host, port=mosquitto.port)
+    async with Publisher(settings, "robot") as publisher, hearing(mosquitto) as skin:
+        publisher.put_info(info)
+        await skin.info(PATIENCE_S)
+        refusal = r"takes no commands: its configuration has `\[mqtt\] commands = false`"
+        with pytest.raises(CommandError, match=refusal):
+            await skin.command("status", timeout_s=PATIENCE_S)
+
+
+async def test_a_command_whose_answer_cannot_come_names_the_broker_that_is_gone(
+    mosquitto: Mosquitto,
+) -> None:
+    async with publishing(mosquitto), hearing(mosquitto) as skin:
+        asked = asyncio.create_task(skin.command("sleep", node="main", timeout_s=1.0))
+        await until(lambda: skin._asked)
+        mosquitto.kill()
+        with pytest.raises(CommandError, match=f"broker 127.0.0.1:{mosquitto.port}: "):
+            await asked
+
+
+@pytest.mark.parametrize("twice", [True, False])
+async def test_an_answer_that_comes_twice_or_is_of_another_request_harms_nobody(
+    mosquitto: Mosquitto, twice: bool
+) -> None:
+    async with hearing(mosquitto) as skin:
+
+        async def forge() -> None:
+            topic = f"skin/robot/nodes/main/replies/{skin._identifier}"
+            head = {"schema": "skin.result/1", "command": "status", "ok": True}
+            async with aiomqtt.Client(mosquitto.host, mosquitto.port) as stranger:
+                await until(lambda: skin._asked)
+                (number,) = skin._asked
+                for other in ("", f"{number}0", 1, [], None):
+                    await stranger.publish(topic, json.encode({**head, "id": other}), qos=1)
+                for result in ({"n": 1}, {"n": 2})[: 1 + twice]:
+                    answer = {**head, "id": number, "result": result}
+                    await stranger.publish(topic, json.encode(answer), qos=1)
+
+        forging = asyncio.create_task(forge())
+        assert await skin.command("status", node="main", timeout_s=PATIENCE_S) == {"n": 1}
+        await forging
+        assert skin.connections == 1
 
 
 async def test_a_command_to_one_of_two_nodes_names_it(mosquitto: Mosquitto) -> None:
@@ -253,6 +374,21 @@ async def test_nonsense_on_a_topic_is_counted_and_passed_over(mosquitto: Mosquit
         publisher.put_touch(touch(1, part="arm"))
         assert (await take(touches, 1))[0].part == "arm"
         assert skin.unreadable == 2  # the third was for somebody else
+
+
+async def test_what_cannot_be_read_steers_no_terminal(
+    mosquitto: Mosquitto, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with hearing(mosquitto) as skin:
+        touches = skin.touches()
+        await skin.ready()
+        async with aiomqtt.Client(mosquitto.host, mosquitto.port) as stranger:
+            payload = json.encode(touch(1, part="\x1b[2J").published(1))
+            await stranger.publish("skin/robot/palm/touch", payload, qos=1)
+        await until(lambda: skin.unreadable)
+        del touches
+    (line,) = (line for line in caplog.messages if "passed over" in line)
+    assert r'a touch of "\x1b[2J"' in line
 
 
 async def test_a_bomb_of_properties_stops_no_client(mosquitto: Mosquitto) -> None:
@@ -370,6 +506,50 @@ async def test_a_callback_that_would_wait_for_messages_is_told_so(mosquitto: Mos
         told = await asyncio.to_thread(use)
     refusal = "a callback cannot wait for messages; ask in another thread"
     assert told == [[1], *4 * [refusal]]
+
+
+@pytest.mark.parametrize("error", [SystemExit, asyncio.CancelledError])
+async def test_a_callback_that_ends_its_thread_does_not_silence_the_others(
+    mosquitto: Mosquitto, error: type[BaseException], caplog: pytest.LogCaptureFixture
+) -> None:
+    seen: list[Contact] = []
+
+    def fail(contact: Contact) -> None:
+        raise error
+
+    def use(ready: threading.Event, sent: threading.Event) -> None:
+        with SkinCallbacks(f"mqtt://{mosquitto.host}:{mosquitto.port}", robot="robot") as skin:
+            skin.on_contact(fail)
+            skin.on_contact(seen.append)
+            ready.set()
+            assert sent.wait(PATIENCE_S)
+
+    async with publishing(mosquitto) as publisher:
+        ready, sent = threading.Event(), threading.Event()
+        user = asyncio.create_task(asyncio.to_thread(use, ready, sent))
+        await asyncio.to_thread(ready.wait, PATIENCE_S)
+        for n, state in enumerate(("ON", "OFF"), 1):
+            publisher.put_contact("palm", state)
+            await until(lambda n=n: len(seen) == n)  # type: ignore[misc]
+        sent.set()
+        await user
+    assert caplog.text.count("a callback failed") >= 2
+
+
+@pytest.mark.parametrize("name", ["patience_s", "stale_s"])
+@pytest.mark.parametrize("seconds", [math.nan, -1.0])
+def test_a_time_that_is_none_is_refused(name: str, seconds: float) -> None:
+    """Without a number no part would ever be stale."""
+    with pytest.raises(RequestError, match=f"{name}: seen {seconds}, wanted seconds from 0 on"):
+        SkinClient(robot="robot", **{name: seconds})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("seconds", [math.nan, -1.0])
+async def test_no_time_to_wait_is_refused(mosquitto: Mosquitto, seconds: float) -> None:
+    async with hearing(mosquitto) as skin:
+        for asked in (skin.info(seconds), skin.command("status", timeout_s=seconds)):
+            with pytest.raises(RequestError, match=f"timeout_s: seen {seconds}, wanted seconds"):
+                await asked
 
 
 def test_callbacks_raise_what_entering_raises() -> None:

@@ -6,7 +6,18 @@ import sys
 #: What the daemon and the emulator need, and a subscriber of touches never does.
 HEAVY = {"numpy", "can", "smbus2", "emulator", "fastapi", "aiohttp", "matplotlib", "mcap"}
 #: Packages of ours that the client is made of.
-OURS = {"client", "clock", "config", "errors", "files", "fingertip", "mqtt", "processing", "tasks"}
+OURS = {
+    "client",
+    "clock",
+    "config",
+    "errors",
+    "files",
+    "fingertip",
+    "mqtt",
+    "processing",
+    "tasks",
+    "untrusted",
+}
 MOST_MODULES = 240
 
 PROGRAM = """

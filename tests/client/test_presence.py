@@ -1,27 +1,31 @@
 """What a client knows of contacts fails safe: whatever is not known now is UNKNOWN."""
 
 import asyncio
+import threading
 from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
-from skin_host.client import Contact, SkinCallbacks
+from skin_host.client import Contact, SkinCallbacks, session
 from skin_host.client.heard import is_online
 from skin_host.client.order import Newest
 from skin_host.client.presence import DISTANCE_S, MAX_TOUCHES, Lateness, Presence
+from skin_host.client.session import NAMED_S
 from skin_host.config.settings import load
+from skin_host.errors import RequestError
 from skin_host.layout import build_layout
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.order import Stamp
 from skin_host.mqtt.publisher import Publisher
 from skin_host.mqtt.topics import OFFLINE, ONLINE
 from skin_host.processing.events import Touch
-from tests.client.test_client import hearing, publishing, take, touch
+from tests.client.test_client import frame, hearing, publishing, take, touch
 from tests.support.broker import Mosquitto
-from tests.support.waiting import until
+from tests.support.waiting import PATIENCE_S, until
 
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
 
@@ -404,3 +408,100 @@ async def test_callbacks_for_what_is_unknown(mosquitto: Mosquitto) -> None:
         await until(lambda: unknown == [Contact("left_forearm", "UNKNOWN", "not_felt")])
         assert await asyncio.to_thread(skin.present) == []
         await asyncio.to_thread(skin.__exit__)
+
+
+def test_the_parts_are_known_when_all_nodes_have_named_theirs_and_one_is_online() -> None:
+    presence = Presence(stale_s=3.0)
+    assert presence.named() is None
+    presence.take_node("main", online=True)
+    assert presence.named() is None
+    presence.take_info("main", ["palm"])
+    assert presence.named() == {"palm"}
+    presence.take_node("arm", online=True, parts={"upper"})
+    assert presence.named() is None  # its info may name more
+    presence.take_info("arm", ["lower"])
+    assert presence.named() == {"palm", "upper", "lower"}
+    # A node that has stopped may start again.
+    presence.take_node("arm", online=False, parts={"upper"})
+    assert presence.named() == {"palm", "upper", "lower"}
+    # Without a node that is online nobody knows with what the robot will start.
+    presence.take_node("main", online=False)
+    assert presence.named() is None
+    presence.take_node("main", online=True)
+    presence.take_loss()
+    assert presence.named() is None
+
+
+async def test_a_part_that_no_node_has_is_an_error_that_names_those_there_are(
+    mosquitto: Mosquitto, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "NAMED_S", 1000.0)
+    layout = build_layout(load(CONFIG), CONFIG.parent)
+    info = node_info(layout, "main", version="1", configuration="x")
+    async with hearing(mosquitto) as skin, publishing(mosquitto) as publisher:
+        streams = [skin.touches("palm"), skin.frames("left_hnd"), skin.contacts("left_hand")]
+        await skin.ready()
+        publisher.put_touch(touch(1))
+        assert (await take(streams[0], 1))[0].count == 1
+        publisher.put_info(info)
+        await until(lambda: skin.nodes["main"].info)
+        now_s = asyncio.get_running_loop().time()
+        skin._check_parts(now_s + 800.0)  # a further node may just have been started
+        assert not any(stream._failure for stream in streams)
+        assert skin.present("left_hnd") == []
+        skin._check_parts(now_s + 1200.0)
+        missing = 'robot "robot" has no part "left_hnd"; there are: left_forearm, left_hand'
+        with pytest.raises(RequestError, match=missing):
+            await anext(streams[1])
+        # What was received exists, whatever nodes name; what they once named does not fail later.
+        publisher.put_info(replace(info, parts={}))
+        await until(lambda: not skin._presence.named())
+        skin._check_parts(now_s + 1e6)
+        assert not any(stream._failure for stream in streams)
+        # It is raised once: who goes on reading gets what a node that starts much later has.
+        publisher.put_frame(frame(1, "left_hnd"))
+        assert (await take(streams[1], 1))[0].seq == 1
+
+
+async def test_a_wrong_part_reaches_who_has_no_asyncio(
+    mosquitto: Mosquitto, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(session, "NAMED_S", 0.0)
+    layout = build_layout(load(CONFIG), CONFIG.parent)
+    info = node_info(layout, "main", version="1", configuration="x")
+    reported = threading.Event()
+
+    def use() -> None:
+        with SkinCallbacks(f"mqtt://{mosquitto.host}:{mosquitto.port}", robot="robot") as skin:
+            skin.on_touch(print, part="left_hnd")
+            skin.on_touch(late.append, part="late")
+            assert reported.wait(PATIENCE_S)
+            with pytest.raises(RequestError, match="has no part"):
+                skin.present("left_hnd")
+
+    late: list[Touch] = []
+    async with publishing(mosquitto) as publisher:
+        publisher.put_info(info)
+        user = asyncio.create_task(asyncio.to_thread(use))
+        for part in ("left_hnd", "late"):
+            await until(lambda part=part: f'has no part "{part}"' in caplog.text)  # type: ignore[misc]
+        publisher.put_touch(touch(1, "late"))
+        await until(lambda: late)
+        reported.set()
+        with pytest.raises(RequestError, match='robot "robot" has no part "left_hnd"'):
+            await user
+
+
+async def test_what_anybody_names_steers_no_terminal_and_is_cut(mosquitto: Mosquitto) -> None:
+    presence_names = {"\x1b[2J": None} | {f"part{n:04}": None for n in range(1000)}
+    async with hearing(mosquitto) as skin:
+        await skin.ready()
+        skin._presence.take_node("main", online=True)
+        skin._presence.take_info("main", presence_names)
+        stream = skin.touches("a\x07b")
+        skin._check_parts(asyncio.get_running_loop().time() + NAMED_S + 1.0)
+        with pytest.raises(RequestError) as raised:
+            await anext(stream)
+    assert str(raised.value).isprintable()
+    assert len(str(raised.value)) < 500
+    assert "(1001 in all)" in str(raised.value)

@@ -17,7 +17,8 @@ from skin_host.config.settings import Settings, load
 from skin_host.daemon import workers
 from skin_host.daemon.workers import Merged, share_name, share_of, share_out
 from skin_host.layout import build_layout, parts_of
-from tests.support.broker import Mosquitto
+from tests.support.broker import Mosquitto, free_port
+from tests.support.moments import at_import
 from tests.support.waiting import PATIENCE_S, until
 
 ROBOT = """
@@ -188,6 +189,30 @@ async def test_a_stop_while_daemons_are_started_reaches_each_of_them(
     async with asyncio.timeout(PATIENCE_S):
         assert await workers.run({f"main-{number}": ["run"] for number in (1, 2, 3)}) == 0
     assert [daemon.signals for daemon in daemons] == [[asked]] * started
+
+
+@pytest.mark.parametrize("number", ["SIGTERM", "SIGINT"])
+@pytest.mark.parametrize(
+    "module", ["skin_host.__main__", "skin_host.cli", "skin_host.daemon.daemon", "can"]
+)
+async def test_a_stop_before_a_daemon_has_begun_is_a_clean_end(
+    tmp_path: Path, module: str, number: str
+) -> None:
+    config = body(tmp_path / "body.toml", [("a", [0]), ("b", [1])], free_port())
+    act = f"""
+            os.kill(os.getppid(), signal.{number})
+            while signal.{number} not in signal.sigpending():
+                time.sleep(0.01)
+    """
+    process = await asyncio.create_subprocess_exec(
+        *("env", "--default-signal=INT", sys.executable, "-m", "skin_host"),
+        *("run", config, "--workers", "2"),
+        env=at_import(tmp_path, module, "1/2", act),
+        stderr=asyncio.subprocess.PIPE,
+    )
+    _, told = await asyncio.wait_for(process.communicate(), PATIENCE_S)
+    assert process.returncode == 0, told
+    assert b"Traceback" not in told
 
 
 async def states(broker: Mosquitto) -> dict[str, bytes]:

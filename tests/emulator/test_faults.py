@@ -1,6 +1,7 @@
 """Every fault by name, on a robot of the demo configuration, seen in the frames it sends."""
 
 import errno
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,13 +19,20 @@ from skin_host.errors import ConfigurationError
 from skin_host.layout import build_layout
 
 CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
+FINGERTIPS = CONFIG.with_name("fingertips.toml")
 
 
-def make(scene: Scene | None = None, fidelity: str = "signal", *, by_bus: bool = False) -> Robot:
-    settings = configurations.load(CONFIG)
+def make(
+    scene: Scene | None = None,
+    fidelity: str = "signal",
+    *,
+    by_bus: bool = False,
+    config: Path = CONFIG,
+) -> Robot:
+    settings = configurations.load(config)
     robot = Robot(
         settings,
-        build_layout(settings, CONFIG.parent),
+        build_layout(settings, config.parent),
         scene or Scene(noise=False),
         fidelity=fidelity,
     )
@@ -157,6 +165,16 @@ def test_a_late_period_sends_fewer_bursts(robot: Robot) -> None:
     of_hand = (sent.id >> 4 & 0xF) == 14
     assert np.count_nonzero(of_hand) / 18 == pytest.approx(20, abs=1)
     assert np.count_nonzero(~of_hand) / 48 == pytest.approx(40, abs=1)
+
+
+def test_a_period_that_is_shortened_to_less_than_nothing_is_a_millisecond(robot: Robot) -> None:
+    robot.inject(Fault(name="late_period", board="hand", value=-40))
+    sent = frames(robot, 1.0)
+    assert np.count_nonzero((sent.id >> 4 & 0xF) == 14) / 18 == pytest.approx(96, abs=6)
+    robot.inject(Fault(name="late_period", board="hand", value=-1000))
+    robot.step(0.05)
+    due_ns = robot.boards["hand"].next_ns
+    assert due_ns == pytest.approx(robot.t_ns, abs=1_000_000)
 
 
 def test_a_jittered_period_spreads_the_bursts_and_loses_none(robot: Robot) -> None:
@@ -335,10 +353,15 @@ def test_i2c_clients_on_a_line_of_the_robot_meet_its_faults(line: str, error: in
 @pytest.mark.parametrize("name", KINDS)
 def test_every_fault_can_be_named_in_a_scene(name: str) -> None:
     kind = KINDS[name]
-    targets = {"board": "hand", "triangle": 0, "taxel": 0, "bus": "can0"}
+    tip = kind.on == "fingertip"
+    targets = {"board": "index" if tip else "hand", "triangle": 0, "taxel": 0, "bus": "can0"}
     fault = Fault(name=name, **{key: targets[key] for key in kind.needs})
-    robot = make(Scene(noise=False, fault=[fault]))
+    robot = make(Scene(noise=False, fault=[fault]), config=FINGERTIPS if tip else CONFIG)
     robot.step(0.5)
+
+
+def refused_value(value: float) -> str:
+    return re.escape(f"fault[0].value: {value:g}; wanted")
 
 
 @pytest.mark.parametrize(
@@ -360,6 +383,52 @@ def test_every_fault_can_be_named_in_a_scene(name: str) -> None:
             r"fault\[0\].value: 2; wanted 0 to 1",
         ),
         (Fault(name="bus_off", bus="can0", at_s=2, until_s=1), r"fault\[0\].until_s: wanted"),
+        (
+            Fault(name="bus_off", bus="can0", board="hand", triangle=3),
+            r'fault\[0\].board: hand; fault "bus_off" has no board',
+        ),
+        (
+            Fault(name="bus_off", bus="can0", value=1),
+            r'fault\[0\].value: 1; fault "bus_off" has no',
+        ),
+        (
+            Fault(name="wrong_address", board="hand", triangle=3),
+            r"fault\[0\].value: is the chip's own address",
+        ),
+        (
+            Fault(name="swapped_lines", board="hand", triangle=4, value=1),
+            r"fault\[0\].value: is the triangle's own line",
+        ),
+        *(
+            (Fault(name=name, board="hand", value=value), refused_value(value))
+            for name, least in (("late_period", -1001.0), ("jittered_period", -1.0))
+            for value in (least, 1e9, np.nan, np.inf)
+        ),
+        *(
+            (Fault(name=name, bus="can0", value=value), refused_value(value) + " 0 to 1")
+            for name in ("frame_loss", "bit_errors", "babbling_node")
+            for value in (-0.1, 1.1, np.nan)
+        ),
+        *(
+            (
+                Fault(name=name, board="hand", triangle=0, taxel=taxel, value=value),
+                refused_value(value),
+            )
+            for name, taxel, values in (
+                ("chip_gone", None, (-1.0, 0x10000)),
+                ("stuck_taxel", 0, (-1e5, 1e9)),
+                ("noisy_taxel", 0, (-1.0, 1e9)),
+                ("wrong_address", None, (-1.0, 4.0)),
+                ("swapped_lines", None, (-1.0, 4.0)),
+                ("no_acknowledge", None, (-1.0, 1e9)),
+                ("clock_stretched", None, (-1.0, 1e9)),
+            )
+            for value in values
+        ),
+        *(
+            (Fault(name="temperature_step", value=value), refused_value(value))
+            for value in (-1e6, 1e6)
+        ),
     ],
 )
 def test_a_fault_that_cannot_happen_is_refused(fault: Fault, message: str) -> None:
@@ -374,7 +443,18 @@ def test_a_fault_can_be_given_as_a_line() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "chip_gone", "chip_gone board", "chip_gone bord=hand", "bus_off bus=a value=x"]
+    "text",
+    [
+        "",
+        "chip_gone",
+        "chip_gone board",
+        "chip_gone bord=hand",
+        "bus_off bus=a value=x",
+        "bus_off bus=a triangle=3",
+        "bus_off bus=a until_s=inf",
+        "bus_off bus=a at_s=1e300",
+        "late_period board=hand value=nan",
+    ],
 )
 def test_a_line_that_is_no_fault_is_refused(text: str) -> None:
     with pytest.raises(ConfigurationError):
@@ -389,6 +469,121 @@ def test_a_fault_in_the_middle_of_a_run_can_be_mended_by_its_answer() -> None:
     assert triangle(frames(robot), 14, 3) == UNTOUCHED
 
 
+def measures(robot: Robot) -> bool:
+    """Whether the third chip of the hand does."""
+    words = robot.boards["hand"].chips.read()[2]
+    return bool(((words > 0) & (words < 0xFFFF)).all())
+
+
+#: Pairs of faults of one thing, and whether it is as it was.
+OVERLAPS: list[tuple[str, str, Callable[[Robot], bool]]] = [
+    (
+        "chip_gone board=hand triangle=2",
+        "chip_gone board=hand triangle=2 value=0",
+        measures,
+    ),
+    (
+        "chip_gone board=hand triangle=2",
+        "shorted_finger board=hand triangle=1",
+        measures,
+    ),
+    (
+        "stuck_taxel board=hand triangle=0 taxel=5 value=144",
+        "stuck_taxel board=hand triangle=0 taxel=5 value=72",
+        lambda robot: triangle(frames(robot), 14, 0) == UNTOUCHED,
+    ),
+    (
+        "noisy_taxel board=hand triangle=0 taxel=5",
+        "noisy_taxel board=hand triangle=0 taxel=5 value=30",
+        lambda robot: not robot.skin.noise_ff[:12].any(),
+    ),
+    (
+        "swapped_lines board=forearm_outer triangle=0",
+        "wrong_address board=forearm_outer triangle=5 value=3",
+        lambda robot: triangle(frames(robot), 13, 0) == triangle(frames(robot), 13, 5) == UNTOUCHED,
+    ),
+    (
+        "shared_address board=hand triangle=0",
+        "swapped_lines board=hand triangle=1 value=2",
+        lambda robot: (robot.converters.chip_of_slot[0] == make().converters.chip_of_slot[0]).all(),
+    ),
+    (
+        "no_acknowledge board=hand triangle=2",
+        "no_acknowledge board=hand triangle=2 value=0",
+        lambda robot: not robot.converters.i2c_wire(0).lines[0].faulty,
+    ),
+    (
+        "board_silent board=hand",
+        "board_silent board=hand",
+        lambda robot: 14 in frames(robot).id >> 4 & 0xF,
+    ),
+    (
+        "late_period board=hand",
+        "late_period board=hand value=50",
+        lambda robot: not robot.late_ns,
+    ),
+    (
+        "frame_loss bus=can0",
+        "frame_loss bus=can0 value=1",
+        lambda robot: robot.wires["can0"].loss_share == 0.0,
+    ),
+    ("bus_off bus=can0", "bus_off bus=can0", lambda robot: len(frames(robot)) > 100),
+    (
+        "babbling_node bus=can0",
+        "babbling_node bus=can0 value=0.1",
+        lambda robot: not robot.step(0.1) or not (frames(robot).id == 0).any(),
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "is_well"), OVERLAPS, ids=lambda value: str(value)[:24]
+)
+@pytest.mark.parametrize("ends_first", [0, 1])
+def test_of_two_faults_of_one_thing_it_is_well_again_when_both_have_ended(
+    first: str, second: str, is_well: Callable[[Robot], bool], ends_first: int
+) -> None:
+    robot = make()
+    mends = [robot.inject(parse(line)) for line in (first, second)]
+    robot.step(0.1)
+    mends[ends_first]()
+    robot.step(0.1)
+    assert not is_well(robot)
+    mends[ends_first]()  # it has ended already
+    robot.step(0.1)
+    assert not is_well(robot)
+    mends[1 - ends_first]()
+    # Boards may have taken another zero meanwhile.
+    robot.bring_up()
+    robot.step(0.3)
+    assert is_well(robot)
+
+
+def test_a_pad_that_was_dead_from_the_first_is_dead_again_after_a_fault() -> None:
+    robot = make(Scene())
+    dead = int(np.flatnonzero(~np.isnan(robot.skin.held_ff))[0])
+    held_ff = robot.skin.held_ff[dead]
+    place = robot.layout.triangles[dead // 12]
+    board = robot.layout.boards[place.board].name
+    mend = robot.inject(
+        Fault(name="stuck_taxel", board=board, triangle=place.number, taxel=dead % 12, value=50.0)
+    )
+    assert robot.skin.held_ff[dead] != held_ff
+    mend()
+    assert robot.skin.held_ff[dead] == held_ff
+
+
+def test_a_fault_of_a_scene_that_cannot_happen_any_more_is_logged_and_the_robot_goes_on(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    gone = Fault(name="wrong_address", board="hand", triangle=0, at_s=1.5)
+    late = Fault(name="chip_gone", board="hand", triangle=0, at_s=1.6)
+    robot = make(Scene(noise=False, fault=[gone, late]))
+    assert len(frames(robot, 1.0)) > 1000
+    (line,) = [record.getMessage() for record in caplog.records]
+    assert line == 'fault[1] chip_gone does not happen: triangle: 0 is not fitted on "hand"'
+
+
 def test_every_fault_is_explained_in_the_documentation() -> None:
     page = (CONFIG.parents[1] / "docs" / "scenes.md").read_text()
     for name in KINDS:
@@ -400,7 +595,8 @@ def test_the_page_of_faults_has_a_result_in_time_for_each_on_every_firmware() ->
     rows = [line.strip("|").split("|") for line in page.splitlines() if line.startswith("| `")]
     cells = [[cell.strip() for cell in row] for row in rows]
 
-    assert sorted(row[0].strip("`") for row in cells) == sorted([*KINDS, *KINDS])
+    skin = [name for name, kind in KINDS.items() if kind.on != "fingertip"]
+    assert sorted(row[0].strip("`") for row in cells) == sorted([*skin, *skin])
     assert all(len(row) == 9 for row in cells)
     for _, _, within, *measured in cells:
         assert all(float(one.split(" s")[0]) <= float(within.split(" s")[0]) for one in measured)

@@ -1,8 +1,14 @@
 """The emulator's side of a bus that python-can reads frame by frame."""
 
-import can
+import errno
+from collections import deque
 
-from emulator.link import BoardLink
+import can
+import numpy as np
+import pytest
+
+from emulator.link import MOST_READS, BoardLink
+from skin_host.bus.wire import FrameBatch
 
 
 def message(identifier: int, data: bytes = b"", **kind: bool) -> can.Message:
@@ -29,3 +35,98 @@ def test_a_command_behind_any_number_of_other_frames_is_received_at_once() -> No
         others.send(message(0x20E, b"\x07\x00"))
         others.send(message(0x70E, b"\xff"))
         assert list(link.received()) == [(0x20E, b"\x07\x00"), (0x70E, b"\xff")]
+
+
+class Adapter(can.BusABC):
+    """Gives what it is given to give, and fails as it is told to."""
+
+    def __init__(self, *gives: can.Message | Exception) -> None:
+        super().__init__(channel=None)
+        self.gives = deque(gives)
+        self.send_fails: Exception | None = None
+        self.took: list[int] = []
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if not self.gives:
+            return None, False
+        given = self.gives.popleft()
+        if isinstance(given, Exception):
+            raise given
+        return given, False
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        if self.send_fails is not None:
+            raise self.send_fails
+        self.took.append(msg.arbitration_id)
+
+
+def unpacked(cause: Exception) -> can.CanOperationError:
+    """As python-can fails over what anybody may send by multicast."""
+    error = can.CanOperationError("could not unpack received message")
+    error.__cause__ = cause
+    return error
+
+
+COMMAND = message(0x20E, b"\x07\x00")
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        unpacked(ValueError("not msgpack")),
+        unpacked(TypeError("unexpected keyword argument")),
+        ValueError("invalid literal for int() with base 16"),
+        IndexError("bytearray index out of range"),
+        message(0x20E, bytes(20)),
+        can.Message(arbitration_id=0x20E, data=b"\x07\x00", dlc=8, is_extended_id=False),
+        can.Message(arbitration_id=0x20E, data=b"\x07", dlc="x", is_extended_id=False),  # type: ignore[arg-type]
+        can.Message(arbitration_id=526.0, data=b"\x07", is_extended_id=False),  # type: ignore[arg-type]
+        message(0x20E, b"\x07\x00", is_error_frame=True),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_damaged_frames_neither_end_the_emulator_nor_hide_the_commands_behind_them(
+    damage: can.Message | Exception, caplog: pytest.LogCaptureFixture
+) -> None:
+    with Adapter(damage, damage, COMMAND) as bus:
+        assert list(BoardLink("can0", bus).received()) == [(0x20E, b"\x07\x00")]
+    assert not caplog.records
+
+
+@pytest.mark.parametrize(
+    "failure",
+    [
+        can.CanOperationError("failed", errno.ENETDOWN),
+        can.CanTimeoutError("not sent"),
+        OSError(errno.ENETUNREACH, "Network is unreachable"),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_a_bus_that_fails_is_logged_once_and_works_again(
+    failure: Exception, caplog: pytest.LogCaptureFixture
+) -> None:
+    frames = FrameBatch.of([(0x4E0, bytes(8), 5), (0x4E1, bytes(8), 5)])
+    with Adapter(failure, COMMAND) as bus:
+        link = BoardLink("can0", bus)
+        assert list(link.received()) == []
+        bus.send_fails = failure
+        link.send(frames, np.array([5, 5]))
+        assert len(caplog.records) == 1
+        assert "frames wait or are lost until it works" in caplog.records[0].getMessage()
+        bus.send_fails = None
+        assert list(link.received()) == [(0x20E, b"\x07\x00")]
+        link.send(FrameBatch.of([(0x4E2, bytes(8), 6)]), np.array([6]))
+        assert bus.took == [0x4E0, 0x4E1, 0x4E2]
+    assert (link.sent, link.lost) == (3, 0)
+
+
+def test_an_interface_that_was_removed_is_named(caplog: pytest.LogCaptureFixture) -> None:
+    with Adapter(can.CanOperationError("No such device", errno.ENODEV)) as bus:
+        assert list(BoardLink("can0", bus).received()) == []
+    assert "start the emulator again" in caplog.records[0].getMessage()
+
+
+def test_a_bus_on_which_commands_never_end_lets_the_boards_live() -> None:
+    with Adapter(*[COMMAND] * (MOST_READS + 5)) as bus:
+        link = BoardLink("can0", bus)
+        assert [len(list(link.received())) for _ in range(3)] == [MOST_READS, 5, 0]

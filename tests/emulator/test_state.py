@@ -25,7 +25,19 @@ FAULTS = (
     "no_acknowledge board=hand triangle=0",
     "bit_flipped board=forearm_inner triangle=0",
     "shared_address board=forearm_outer triangle=6",
+    "wrong_address board=forearm_outer triangle=9 value=0",
+    "swapped_lines board=forearm_inner triangle=2 value=1",
+    "shorted_finger board=forearm_outer triangle=13",
+    "slow_rise board=hand triangle=9",
+    "clock_stretched board=hand triangle=8",
+    "data_held_low board=forearm_outer triangle=0",
+    "late_period board=hand",
+    "jittered_period board=forearm_outer",
+    "board_silent board=forearm_inner",
+    "babbling_node bus=can0 value=0.1",
+    "temperature_step value=3",
 )
+OF_FINGERTIPS = ("board_silent board=index", "board_latched board=thumb value=1")
 
 
 def skin(name: str = "demo") -> tuple[Settings, Layout]:
@@ -51,7 +63,7 @@ def test_branches_from_one_state_send_the_same_bytes(
     robot = Robot(*configuration, scene, fidelity=fidelity)
     robot.bring_up()
     robot.step(7.0 - robot.t_ns * 1e-9)
-    for line in FAULTS if name == "demo" else ():
+    for line in FAULTS if name == "demo" else OF_FINGERTIPS:
         fault = parse(line)
         fault.at_s, fault.until_s = 0.0, 0.8
         robot.inject(fault)

@@ -1,6 +1,10 @@
 """Recordings of real skin: read as they are, measured as defined, said to be absent."""
 
 import json
+import os
+import pty
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -184,6 +188,19 @@ def test_one_json_document_has_a_row_for_each_recording(
     assert row["why_no_pressure"] == "left_calibration.npz is missing"
     assert "left_made_up" in (tmp_path / "o" / "real.md").read_text()
     assert "left_made_up" in (tmp_path / "o" / "real.html").read_text()
+
+
+def test_a_terminal_shows_what_is_done(pressed: InsoleRecording, tmp_path: Path) -> None:
+    write(tmp_path, pressed)
+    program = [sys.executable, "-m", "skin_host", "report", "--real", "--recordings", tmp_path]
+    terminal, end = pty.openpty()
+    ran = subprocess.run(program, check=True, stdout=subprocess.PIPE, stderr=end)
+    os.close(end)
+    assert b"left_made_up" in ran.stdout
+    shown = os.read(terminal, 4096).decode().split("\r\x1b[K")
+    assert [step for step in shown if step.startswith("real skin: 1 of ")]
+    assert shown[-1] == ""  # removed
+    os.close(terminal)
 
 
 def test_a_recording_is_measured_with_the_curves_that_its_foams_calibration_gave(

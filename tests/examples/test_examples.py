@@ -5,16 +5,20 @@ import math
 import runpy
 import subprocess
 import sys
+import threading
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
+from functools import partial
 from itertools import count, repeat
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from skin_host.client import session
 from skin_host.config.settings import Mqtt, load
 from skin_host.layout import build_layout
 from skin_host.mqtt.info import node_info
@@ -23,7 +27,7 @@ from skin_host.processing.pipeline import PressureFrame
 from tests.support import ros
 from tests.support.broker import Mosquitto, free_port
 from tests.support.said import touch_event
-from tests.support.waiting import PATIENCE_S
+from tests.support.waiting import PATIENCE_S, until
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
@@ -134,6 +138,34 @@ async def test_a_contact_pushes_against_the_normal_and_turns_the_part_about_its_
     assert vars(said.wrench.force) == {"x": 0, "y": 0, "z": -2.0}
     # 2 N down at x = 0.1 m: the x side goes down, which is a positive turn about y.
     assert vars(said.wrench.torque) == {"x": 0, "y": pytest.approx(0.2), "z": 0}
+
+
+async def test_a_wrong_part_stops_the_motor_and_is_named(
+    mosquitto: Mosquitto,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(session, "NAMED_S", 0.0)
+    url = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    monkeypatch.setattr(sys, "argv", ["stop_on_touch.py", "left_hnd", url])
+    ended = threading.Event()
+    monkeypatch.setattr(sys, "stdin", SimpleNamespace(read=partial(ended.wait, PATIENCE_S)))
+    missing = 'robot "demo" has no part "left_hnd"; there are: left_forearm, left_hand'
+
+    def run() -> None:
+        with pytest.raises(SystemExit, match=missing):
+            runpy.run_path(str(EXAMPLES / "stop_on_touch.py"))
+
+    async with node(mosquitto):
+        program = asyncio.create_task(asyncio.to_thread(run))
+        await until(lambda: missing in caplog.text)
+        ended.set()
+        await program
+    assert capsys.readouterr().out.splitlines() == [
+        "stop until something is known",
+        "stop the program ends",
+    ]
 
 
 async def test_the_motor_stops_for_what_is_touched_and_for_what_is_not_known(

@@ -34,7 +34,7 @@ from skin_host.processing.events import Touch
 from tests.support.strain import encode_strain
 
 CONFIG = Path(__file__).parents[2] / "config"
-FORCE_OF_INDEX = 0x31A
+FORCE_OF_INDEX, TORQUE_OF_INDEX = 0x31A, 0x31B
 
 
 class Bench:
@@ -323,14 +323,16 @@ async def test_a_press_is_felt_with_its_second_sample_and_over_with_the_second_w
     bench.tips.use(dict.fromkeys(bench.tips.tips, Zero(np.zeros(6), noise)))
     state = bench.tips.tips["index"]
     t_ns, seen = 0, []
-    for force_n in (0.0, 0.0, 0.0, 2.0, 2.0, 2.0, 0.0, 0.0, 0.0):
+    for force_n in (0.0, 0.0, 0.0, 0.0, 2.0, 2.0, 2.0, 0.0, 0.0, 0.0):
         t_ns += 3_000_000
-        force = encode_strain(1, StrainType.FORCE, [0, 0, round(-force_n / 50.0 * 0x8000)])
-        torque = encode_strain(1, StrainType.TORQUE, [0, 0, 0])
+        noise_words = len(seen) % 2
+        force_words = round(-force_n / 50.0 * 0x8000) + noise_words
+        force = encode_strain(1, StrainType.FORCE, [0, 0, force_words])
+        torque = encode_strain(1, StrainType.TORQUE, [0, 0, noise_words])
         batch = FrameBatch.of([(*force, t_ns), (*torque, t_ns + 100_000)])
         bench.tips.feed("can0", batch, t_ns)
         seen.append(state.tip.touched)
-    assert seen == [False] * 4 + [True] * 3 + [False] * 2
+    assert seen == [False] * 5 + [True] * 3 + [False] * 2
 
 
 @pytest.mark.parametrize("bit", [0x01, 0x10])
@@ -365,6 +367,7 @@ async def test_a_load_that_comes_during_a_calibration_counts_as_noise() -> None:
     await bench.run(0.4)
     await bench.calibrate()
     assert bench.codes() == ["noisy"]
+    assert bench.health.records(None)["index"]["faults"] == bench.record()["faults"]
 
 
 async def test_a_fingertip_that_was_touched_when_calibrated_is_named_until_it_was_not(
@@ -479,12 +482,14 @@ async def test_noise_that_raises_the_threshold_beyond_the_range_is_not_felt_thro
 
 
 class Latch:
-    """A converter that repeats its last sample from `begin` to `end`."""
+    """A converter of the index finger that repeats its last frames while it `holds`."""
 
-    def __init__(self, bench: Bench, board: int = 1) -> None:
+    def __init__(
+        self, bench: Bench, of: tuple[int, ...] = (FORCE_OF_INDEX, TORQUE_OF_INDEX)
+    ) -> None:
         self.holds = False
         self._step = bench.robot.step
-        self._of = (0x30A | board << 4, 0x30B | board << 4)
+        self._of = of
         self._last: dict[int, Any] = {}
         bench.robot.step = self.step  # type: ignore[method-assign]
 
@@ -493,7 +498,7 @@ class Latch:
         batch = batches["can0"]
         for row, can_id in enumerate(batch.id.tolist()):
             if can_id in self._of:
-                if self.holds:
+                if self.holds and can_id in self._last:
                     batch.data[row] = self._last[can_id]
                 self._last[can_id] = batch.data[row].copy()
         return batches
@@ -544,6 +549,79 @@ async def test_a_board_that_repeats_its_bytes_gets_no_zero() -> None:
     assert set(bench.tips.end_zero()) == {"thumb"}
 
 
+async def contacts(bench: Bench, seconds: float) -> set[str]:
+    """What is published as the contact of the index finger meanwhile."""
+    seen = set()
+    for _ in range(round(seconds / 0.02)):
+        await bench.run(0.02)
+        seen.add(bench.contact())
+    return seen
+
+
+@pytest.mark.parametrize("pressed_n", [0.0, 2.0])
+async def test_a_board_that_repeats_its_bytes_from_the_start_is_never_free_nor_touched(
+    pressed_n: float,
+) -> None:
+    before = Bench()
+    await before.boards.bring_up()
+    await before.calibrate()
+    bench = Bench({"part": "index", "force_n": [[0.0, pressed_n], [99.0, pressed_n]]})
+    latch = Latch(bench)
+    latch.holds = True
+    await bench.boards.bring_up()
+    assert before.engine.calibration is not None
+    bench.tips.use(before.engine.calibration.zeros)
+    assert await contacts(bench, 0.9 * REPEATS * 3e-3) == {"UNKNOWN"}
+    assert (bench.record()["state"], bench.codes()) == ("no data", [])
+    assert await contacts(bench, 1.5) == {"UNKNOWN"}
+    assert (bench.record()["state"], bench.codes()) == ("degraded", ["frozen"])
+    assert [event for event in bench.felt if event.part == "index"] == []
+    latch.holds = False
+    await bench.run(0.1)
+    free = "ON" if pressed_n else "OFF"
+    assert (bench.record()["state"], bench.contact()) == ("ok", free)
+
+
+async def test_a_board_that_comes_back_with_the_same_bytes_is_not_free() -> None:
+    bench = Bench()
+    latch = Latch(bench)
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    await bench.calibrate()
+    assert await contacts(bench, 0.2) == {"OFF"}
+    mend = bench.robot.inject(parse("board_silent board=index"))
+    await bench.run(1.0)
+    latch.holds = True
+    mend()
+    assert await contacts(bench, 0.9 * REPEATS * 3e-3) == {"UNKNOWN"}
+    latch.holds = False
+    await bench.run(0.1)
+    assert (bench.codes(), bench.contact()) == ([], "OFF")
+
+
+@pytest.mark.parametrize(("of", "what"), [(FORCE_OF_INDEX, "force"), (TORQUE_OF_INDEX, "torque")])
+async def test_a_board_that_repeats_only_one_of_its_frames_does_not_feel(
+    of: int, what: str
+) -> None:
+    bench = Bench()
+    latch = Latch(bench, (of,))
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    await bench.calibrate()
+    await bench.run(0.2)
+    latch.holds = True
+    await bench.run(1.2 * REPEATS * 3e-3)
+    assert (bench.record()["state"], bench.codes()) == ("degraded", ["frozen"])
+    assert f"repeats the same {what} " in bench.record()["sentences"][0]
+    assert (bench.contact(), bench.contact("thumb")) == ("UNKNOWN", "OFF")
+    bench.tips.begin_zero()
+    await bench.run(0.5)
+    assert set(bench.tips.end_zero()) == {"thumb"}
+    latch.holds = False
+    await bench.run(0.1)
+    assert (bench.codes(), bench.contact()) == ([], "OFF")
+
+
 async def test_a_board_that_has_stopped_sending_is_not_frozen_too() -> None:
     bench = Bench()
     latch = Latch(bench)
@@ -558,42 +636,78 @@ async def test_a_board_that_has_stopped_sending_is_not_frozen_too() -> None:
     assert bench.codes() == ["silent"]
 
 
-def sample(*words: int, saturated: bool = False) -> Wrench:
-    values = np.zeros(6)
-    values[: len(words)] = words
-    return Wrench(0, values[:3], values[3:], saturated)
+def sample(force: float, torque: float, *, saturated: bool = False) -> Wrench:
+    return Wrench(0, np.array([force, 1.0, 1.0]), np.array([torque, 1.0, 1.0]), saturated)
 
 
-def frozen_after(*samples: Wrench) -> bool:
+def after(*samples: Wrench) -> Frozen:
     seen = Frozen()
-    return [seen.take(one) for one in samples][-1]
+    for one in samples:
+        seen.take(one)
+    return seen
 
 
-def test_only_so_many_equal_samples_in_a_row_are_frozen() -> None:
-    same = [sample(5, 1)] * (REPEATS + 1)
-    assert frozen_after(*same)
-    assert not frozen_after(*same[1:])
-    assert not frozen_after(*same[1:], sample(5, 2), *same[1:])
+REPEATED = [sample(5, 1)] * (REPEATS + 1)
+
+
+def test_only_so_many_equal_frames_in_a_row_are_frozen() -> None:
+    assert after(*REPEATED).repeated == ["force", "torque"]
+    assert after(*REPEATED[1:]).repeated == []
+    assert after(*REPEATED[1:], sample(6, 2), *REPEATED[1:]).repeated == []
+    assert after(*REPEATED[1:], sample(5, 2)).repeated == ["force"]
+    assert after(*REPEATED[1:], sample(6, 1)).repeated == ["torque"]
 
 
 def test_single_damaged_frames_do_not_hide_that_a_board_is_frozen() -> None:
-    same = [sample(5, 1)] * (REPEATS + 1)
-    others = [sample(5, 2 + n) for n in range(OTHERS)]
-    assert frozen_after(*same, *others[:-1])
-    assert frozen_after(*same, *others[:-1], sample(5, 1), *others[:-1])
-    assert not frozen_after(*same, *others)
+    others = [sample(6 + n, 2 + n) for n in range(OTHERS)]
+    assert after(*REPEATED, *others[:-1]).repeated
+    assert after(*REPEATED, *others[:-1], sample(5, 1), *others[:-1]).repeated
+    assert not after(*REPEATED, *others).repeated
+
+
+def test_what_was_sent_is_trusted_once_force_and_torque_have_changed_several_times_in_a_row() -> (
+    None
+):
+    assert not after().trusted
+    changing = [sample(n, n) for n in range(10, 11 + OTHERS)]
+    assert not after(*changing[:-1]).trusted
+    assert after(*changing).trusted
+    assert not after(*[sample(n, 0) for n in range(99)]).trusted
+    assert not after(*[sample(0, n) for n in range(99)]).trusted
+    # A damaged frame differs from the one before and from the one after it.
+    assert not after(*[sample(n % 3 == 0, n % 3 == 0) for n in range(99)]).trusted
+    assert after(*changing, *REPEATED[1:]).trusted
+    assert not after(*changing, *REPEATED).trusted
+    assert after(*changing, *REPEATED, *changing).trusted
+    seen = after(*changing)
+    seen.doubt()
+    assert not seen.trusted
+    for one in changing:
+        seen.take(one)
+    assert seen.trusted
 
 
 def test_a_board_at_the_end_of_its_range_is_saturated_and_not_frozen() -> None:
-    assert not frozen_after(*[sample(5, 1, saturated=True)] * (2 * REPEATS))
+    assert not after(*[sample(5, 1, saturated=True)] * (2 * REPEATS)).repeated
 
 
 @pytest.mark.parametrize("noise_words", [0.25, 0.5, 1.6])
-def test_noise_does_not_repeat_for_so_long_by_chance(noise_words: float) -> None:
+def test_noise_does_not_repeat_for_so_long_by_chance_and_is_soon_trusted(
+    noise_words: float,
+) -> None:
     """Each channel rests in the middle of a word: there it repeats most often."""
     one = math.erf(0.5 / noise_words / math.sqrt(2.0))
-    begun_in_a_year = 333 * 3600 * 24 * 365
-    assert begun_in_a_year * one ** (6 * REPEATS) < 0.01
+    begun_in_a_year = 2 * 333 * 3600 * 24 * 365
+    assert begun_in_a_year * one ** (3 * REPEATS) < 0.01
+    rng = np.random.default_rng(1)
+    for _ in range(100):
+        seen, taken = Frozen(), 0
+        while not seen.trusted:
+            force, torque = np.round(noise_words * rng.normal(size=(2, 3)))
+            seen.take(Wrench(0, force, torque, saturated=False))
+            taken += 1
+            assert not seen.repeated
+        assert taken <= 2 * REPEATS
 
 
 async def test_a_contact_without_end_makes_its_zero_uncertain() -> None:

@@ -1,8 +1,10 @@
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from skin_host.evaluation.papers.grasp_loops import DETECTORS, false_alarms_per_hour, slip_trials
-from skin_host.fingertip.slip import RatioDrop, ShearRate, friction_used
+from skin_host.fingertip.slip import RatioDrop, SampleAges, ShearRate, friction_used
 
 
 def test_the_used_friction_is_the_ratio_over_its_limit():
@@ -98,3 +100,73 @@ def test_the_threshold_for_a_wished_rate_of_false_alarms_holds():
     for _ in range(6):
         rate = detector.step(0.013 * rng.normal(size=(20_000, 2)))
     assert (rate > threshold).mean() == pytest.approx(0.01, rel=0.2)
+
+
+PERIOD_NS = 10_000_000
+#: Which samples arrive, as the number of periods after the one before.
+GAPS = st.lists(st.integers(1, 10), min_size=7, max_size=20)
+
+
+def rates(taken, shear_n, late_ns):
+    """|dFs/dt| at each sample, from when it was taken (periods), its force and its lateness."""
+    ages, detector = SampleAges(6, PERIOD_NS), ShearRate(1, 1e9 / PERIOD_NS)
+    times = np.maximum.accumulate(PERIOD_NS * taken + late_ns)
+    return [
+        float(detector.step(force[None], ages.step(int(t_ns)))[0])
+        for t_ns, force in zip(times, shear_n, strict=True)
+    ]
+
+
+@given(GAPS, st.integers(0, 2**60), st.integers(0, 4_999_999))
+def test_any_samples_of_a_steady_rise_have_its_rate(gaps, begin_ns, most_late_ns):
+    """Exactly, as long as they come less than half a period late."""
+    taken = np.cumsum(gaps)
+    rng = np.random.default_rng(sum(gaps))
+    late_ns = begin_ns + rng.integers(0, most_late_ns, len(gaps), endpoint=True)
+    found = rates(taken, 0.01 * taken[:, None] * [3.0, 4.0], late_ns)
+    assert found[:5] == [0.0] * 5
+    np.testing.assert_allclose(found[5:], 5.0, rtol=1e-9)
+
+
+@given(GAPS, st.integers(0, 2**32))
+def test_a_force_that_changes_no_faster_is_never_found_to_whatever_is_lost(gaps, seed):
+    taken = np.cumsum(gaps)
+    change = np.random.default_rng(seed).uniform(-0.05, 0.05, taken[-1] + 1)
+    shear_n = np.stack([np.cumsum(change)[taken], np.zeros(len(taken))], axis=-1)
+    assert max(rates(taken, shear_n, np.zeros(len(taken), np.int64))) <= 5.0 + 1e-9
+
+
+def test_a_window_without_losses_has_no_ages_and_the_same_rate():
+    ages = SampleAges(6, PERIOD_NS)
+    late_ns = [0, 900_000, 0, 4_999_999, 0, 0, 4_999_999, 4_999_999, 3_000_000, 0]
+    assert [ages.step(i * PERIOD_NS + late) for i, late in enumerate(late_ns)] == [None] * 10
+    regular, with_ages = ShearRate(3, 100.0), ShearRate(3, 100.0)
+    for force in np.random.default_rng(7).normal(size=(20, 3, 2)):
+        expected = regular.step(force)
+        np.testing.assert_array_equal(with_ages.step(force, (5, 4, 3, 2, 1, 0)), expected)
+
+
+def test_samples_that_arrive_together_were_taken_one_after_the_other():
+    ages = SampleAges(4, PERIOD_NS)
+    for t_ms in (0, 10, 20, 30):
+        assert ages.step(t_ms * 1_000_000) is None
+    # Two are lost; what is held up comes at once.
+    assert [ages.step(t_ms * 1_000_000) for t_ms in (91, 91, 91, 92, 101)] == [
+        (8, 7, 6, 0),
+        (7, 6, 1, 0),
+        (6, 2, 1, 0),
+        None,
+        None,
+    ]
+
+
+def test_a_slow_fall_of_the_ratio_is_none_and_an_abrupt_one_is_one_whatever_is_lost():
+    slow, abrupt = RatioDrop(1, force_sd_n=0.001), RatioDrop(1, force_sd_n=0.001)
+    ages = SampleAges(4, PERIOD_NS)
+    found = []
+    for taken in np.cumsum([1, 2, 1, 3, 1, 1, 4, 2, 1, 1]).tolist():
+        now = ages.step(taken * PERIOD_NS)
+        assert not slow.step([5.0], [[5.0 * (0.5 - 0.015 * taken), 0.0]], now).any()
+        ratio = 0.5 if taken < 10 else 0.35
+        found.append(bool(abrupt.step([5.0], [[5.0 * ratio, 0.0]], now)[0]))
+    assert any(found)

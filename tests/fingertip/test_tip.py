@@ -207,6 +207,102 @@ def test_no_slip_is_told_of_an_object_that_is_only_carried_about() -> None:
     assert not slips(events)
 
 
+def slipping(rate_n_s: float, lateness_ns: list[int | None]) -> list[Slip]:
+    """Return the slips of a pull that swings between -2 and 2 N at a steady rate.
+
+    Sample k is taken at 10 k ms; it arrives so much later (ns), or is lost (None).
+    """
+    bench = Bench()
+    bench.hold(20, POINT, -5.0 * DIRECTION)
+    along = np.array([0.8, -0.6, 0.0])
+    begun_ns = bench.t_ns
+    events = []
+    for k, late_ns in enumerate(lateness_ns):
+        if late_ns is None:
+            continue
+        pull_n = abs((0.01 * k * rate_n_s - 2.0) % 8.0 - 4.0) - 2.0
+        bench.t_ns = begun_ns + k * 10 * MS + late_ns
+        events += bench.sample(POINT, -5.0 * DIRECTION + pull_n * along)
+    return slips(events)
+
+
+LOSSES: dict[str, list[int | None]] = {
+    "none": [0] * 200,
+    "every second": [0, None] * 100,
+    "two of three": [0, None, None] * 70,
+    "a gap of 80 ms": [*[0] * 100, *[None] * 7, *[0] * 100],
+    "one of twenty": [None if u < 0.05 else 0 for u in np.random.default_rng(1).random(200)],
+    "one of five": [None if u < 0.2 else 0 for u in np.random.default_rng(2).random(200)],
+}
+
+
+@pytest.mark.parametrize("losses", LOSSES)
+@pytest.mark.parametrize("rate_n_s", [2.0, 3.0, 5.0])
+def test_a_pull_that_changes_slower_than_a_slip_is_none_whatever_is_lost(
+    losses: str, rate_n_s: float
+) -> None:
+    assert slipping(rate_n_s, LOSSES[losses]) == []
+
+
+@pytest.mark.parametrize("losses", LOSSES)
+def test_a_pull_that_changes_faster_than_a_slip_is_one_whatever_is_lost(losses: str) -> None:
+    found = slipping(8.0, LOSSES[losses])
+    assert found[0].event == "begin" and found[0].cause == "rate"
+    assert found[0].shear_rate_n_s == pytest.approx(7.0, abs=1.3)
+
+
+def test_samples_that_are_held_up_and_arrive_together_are_no_slip() -> None:
+    """A computer that stalls for 90 ms stamps what it then reads with nearly one time."""
+    held_up = [(90 - 10 * k) * MS for k in range(10)]
+    assert slipping(5.0, [*[0] * 40, *held_up] * 4) == []
+    late_ns = np.random.default_rng(3).integers(0, 4 * MS, 400)
+    assert slipping(5.0, late_ns.tolist()) == []
+
+
+@pytest.mark.parametrize("step_ms", [-3_600_000, -90, -30, -5, 30, 90, 3_600_000])
+def test_a_clock_that_is_set_makes_no_slip(step_ms: int) -> None:
+    for losses in ([0] * 100, [0, None] * 50):
+        stepped = [None if late is None else step_ms * MS for late in losses]
+        assert slipping(5.0 if None not in losses else 3.0, losses + stepped) == []
+
+
+def test_a_ratio_that_falls_slowly_is_no_slip_when_samples_are_lost() -> None:
+    for lost in ([], range(100, 107), range(1, 400, 2)):
+        bench = Bench(slip_n_s=1e3)
+        events = bench.hold(20, POINT, -2.0 * DIRECTION + np.array([0.8, -0.6, 0.0]))
+        for k in range(400):
+            if k in lost:
+                bench.t_ns += 10 * MS
+                continue
+            pull_n = 1.0 - 2.5 * abs((0.01 * k + 0.4) % 0.8 - 0.4)
+            events += bench.sample(POINT, -2.0 * DIRECTION + pull_n * np.array([0.8, -0.6, 0.0]))
+        assert slips(events) == []
+
+
+def test_a_ratio_that_is_not_known_for_a_while_is_not_compared_with_that_before() -> None:
+    """Where the contact has no place there is no ratio; it may fall slowly meanwhile."""
+    bench = Bench(slip_n_s=1e3)
+    along = np.array([0.8, -0.6, 0.0])
+    events = bench.hold(40, POINT, -2.0 * DIRECTION + 1.0 * along)
+    for pull_n in np.linspace(1.0, 0.4, 60):
+        events += bench.sample(POINT, -2.0 * DIRECTION + pull_n * along, saturated=True)
+    for pull_n in np.linspace(0.4, 0.3, 40):
+        events += bench.sample(POINT, -2.0 * DIRECTION + pull_n * along)
+    assert slips(events) == []
+
+
+@pytest.mark.parametrize("lost", [set(), {80}, {81}, set(range(1, 120, 2))])
+def test_a_ratio_that_falls_at_once_is_a_slip_although_samples_are_lost(lost: set[int]) -> None:
+    bench = Bench(slip_n_s=1e3)
+    events = []
+    for k, pull_n in enumerate([*np.linspace(0.0, 1.1, 80), *[0.8] * 40]):
+        if k in lost:
+            bench.t_ns += 10 * MS
+        else:
+            events += bench.sample(POINT, -2 * DIRECTION + pull_n * np.array([0.8, -0.6, 0.0]))
+    assert [one.cause for one in slips(events) if one.event == "begin"] == ["fall"]
+
+
 def test_a_board_that_falls_silent_ends_its_touch_and_slip() -> None:
     bench = Bench(friction=0.2)
     bench.hold(20, POINT, -2 * DIRECTION + np.array([0.8, -0.6, 0.0]))

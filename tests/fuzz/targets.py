@@ -143,6 +143,7 @@ class Commands:
             calibrate=calibrate,
             configure=nothing,
             reload=nothing,
+            is_reloading=False,
             disable=engine.disabled.add,
             enable=engine.disabled.discard,
             thresholds=load_kept(folder() / "none", NodeState).thresholds,

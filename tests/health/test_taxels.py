@@ -10,6 +10,7 @@ from skin_host.bus.compensation import thermal_gains
 from skin_host.health.describe import Describer
 from skin_host.health.diagnosis import diagnose
 from skin_host.layout import PadKind
+from skin_host.processing.calibration import with_gains
 from tests.support.fault_bench import CONFIG, FaultBench
 
 HELD_SCENE = """
@@ -72,6 +73,39 @@ def test_a_touch_that_never_ends_hides_a_zero_and_that_is_told(tmp_path: Path) -
     # It is touched all the same, and believed.
     assert bench.touched["left_forearm"][27]
     assert bench.valid["left_forearm"][27]
+
+
+def test_taxels_that_no_press_reaches_are_named_with_the_reason_and_what_mends_it(
+    bench: FaultBench,
+) -> None:
+    def sentence() -> str:
+        bench.run(0.5)
+        faults = bench.records["left_hand"]["faults"]
+        (at,) = [n for n, fault in enumerate(faults) if fault["code"] == "taxel_unreached"]
+        return bench.records["left_hand"]["sentences"][at]
+
+    calibration = bench.engine.calibration
+    assert calibration is not None
+    part = bench.layout.part("left_hand")
+    flat = [part.start + 3, part.start + 5]
+    bend = calibration.bend.copy()
+    bend[flat] = 1e4
+    bench.engine.use(with_gains(calibration, calibration.gain, bend))
+    said = sentence()
+    assert said.startswith("taxels 3, 5 of left_hand: not valid: ")
+    for words in ("gain and bend", "processing.pressure", "skin calibrate --pressure"):
+        assert words in said
+    assert "margin_units" not in said
+    assert bench.records["left_hand"]["taxel_verdicts"]["flat"] == [3, 5]
+
+    bench.reload({"processing.touch.margin_units": 240.0})
+    said = sentence()
+    assert "; of taxels 3, 5 the curve" in said and "skin calibrate --pressure" in said
+    assert "margin_units" in said and "skin command thresholds" in said
+
+    bench.engine.use(calibration)
+    said = sentence()
+    assert "skin command thresholds" in said and "curve" not in said
 
 
 def test_a_part_that_is_degraded_always_says_why(bench: FaultBench) -> None:

@@ -533,6 +533,23 @@ async def test_an_answer_is_lost_with_the_connection_and_no_touch_is_accused_for
 
 
 @stepped
+async def test_an_acknowledgement_that_is_read_after_the_end_counts_for_no_other_event(
+    clock: SteppedClock,
+) -> None:
+    """The answer before the touch is gone from the queue by then."""
+    sender, link, other = Sender(clock), Link(), Link()
+    async with sender.over(link):
+        sender.outbox.put_event(Event("reply", b"{}", None, is_touch=False))
+        sender.put_touches([1])
+        await sender.turn()
+    sender.courier.note_end(link)  # type: ignore[arg-type]
+    link.acknowledge(link.waiting("reply"))
+    await sender.turn()
+    async with sender.over(other):
+        assert [one.number for one in other.waiting(TOUCHES)] == [1]
+
+
+@stepped
 async def test_touches_on_their_way_with_an_answer_are_suspected_without_it(
     clock: SteppedClock,
 ) -> None:

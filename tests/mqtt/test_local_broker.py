@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import socket
 import sys
+from pathlib import Path
 from typing import Any
 
 import aiomqtt
@@ -90,6 +91,19 @@ async def test_without_any_broker_the_error_says_what_to_install(
 async def test_a_mosquitto_that_does_not_start_is_an_error_that_says_so() -> None:
     with pytest.raises(BrokerError, match="did not start"):
         async with local.mosquitto_broker("/bin/false"):
+            pass
+
+
+async def test_a_mosquitto_that_ctrl_c_reaches_as_it_starts_goes_on(tmp_path: Path) -> None:
+    """It is for the program that has started it, whose clients are to disconnect first."""
+    mosquitto = local.find_mosquitto()
+    if mosquitto is None:
+        pytest.skip("mosquitto is not installed")
+    program = tmp_path / "mosquitto"
+    program.write_text(f'#!/bin/sh\nkill -INT $$\nexec {mosquitto} "$@"\n')
+    program.chmod(0o755)
+    async with local.mosquitto_broker(str(program)) as broker:
+        async with aiomqtt.Client(broker.host, broker.port):
             pass
 
 

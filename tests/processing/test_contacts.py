@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skin_host.config.settings import Settings
-from skin_host.evaluation.rig import flat_skin
+from skin_host.evaluation.rig import Rig, flat_skin
 from skin_host.layout import build_layout
 from skin_host.processing.contacts import (
     ALIVE_NS,
@@ -234,6 +234,172 @@ def test_a_touch_of_which_nothing_is_heard_for_long_ends():
     sweeps = LOST_NS // SWEEP_NS + 2
     events = [event for _ in range(sweeps) for event in skin.show(HERE, lost=HERE)]
     assert kinds(events) == [("end", 1)]
+
+
+@pytest.mark.parametrize("comes_back", [False, True])
+def test_a_contact_of_which_a_part_was_not_received_to_its_end_is_lost(comes_back: bool) -> None:
+    """What was not received may still be touched, however long it has not been."""
+    skin = Skin()
+    away = set(list(HERE)[:3])
+    skin.show(HERE)
+    for _ in range(3 * (LOST_NS // SWEEP_NS)):
+        skin.show(HERE, lost=away)
+    skin.show(HERE - away, lost=set() if comes_back else away)
+    (end,) = skin.show(lost=set() if comes_back else away)
+    assert end.reason == ("released" if comes_back else "lost")
+
+
+#: Two triangles next to each other, a taxel of the second harder pressed than all others.
+WIDE, SECOND, UNEVEN = set(range(24)), set(range(12, 24)), {13: 60.0}
+
+
+def measured(event):
+    """What an event reports of its contact, without what names and dates it."""
+    return msgspec.structs.replace(event, event="move", seq=0, t_ns=0)
+
+
+@given(st.lists(st.sets(st.integers(0, 23), max_size=23), max_size=80))
+def test_lost_frames_change_nothing_of_a_steady_contact(losses):
+    skin = Skin()
+    (begun,) = skin.show(WIDE, unlike=UNEVEN)
+    missing = dict.fromkeys(WIDE, 0)
+    for lost in losses:
+        missing = {taxel: missing[taxel] + 1 if taxel in lost else 0 for taxel in WIDE}
+        away = {taxel for taxel in lost if missing[taxel] < LOST_NS // SWEEP_NS}
+        pressed = {taxel: UNEVEN[taxel] for taxel in UNEVEN if taxel not in away}
+        for moved in skin.show(WIDE, lost=away, unlike=pressed):
+            assert moved.event == "move"
+            assert measured(moved) == measured(begun)
+
+
+def test_a_contact_is_measured_by_what_was_received_and_what_was_last_received_of_the_rest():
+    skin = Skin()
+    skin.show(WIDE, kpa=20.0)
+    skin.show(WIDE, kpa=20.0, lost=SECOND)
+    (moved,) = skin.show(WIDE, kpa=40.0, lost=SECOND)
+    area_mm2 = LAYOUT.area_mm2[:24].sum()
+    assert moved.taxels == sorted(WIDE)
+    assert moved.area_mm2 == pytest.approx(area_mm2)
+    assert moved.mean_kpa == pytest.approx(30.0)
+    assert moved.force_n == pytest.approx(30.0 * area_mm2 * 1e-3)
+
+
+def test_the_most_pressed_taxel_is_the_peak_of_its_contact_while_it_is_not_received():
+    skin = Skin()
+    skin.show(WIDE, unlike=UNEVEN)
+    (moved,) = skin.show(WIDE, kpa=40.0, lost=SECOND)
+    assert moved.peak_kpa == 60.0
+
+
+def test_taxels_that_are_not_received_for_long_leave_their_contact_one_by_one():
+    skin = Skin()
+    skin.show(WIDE)
+    sweeps = LOST_NS // SWEEP_NS
+    left = {}
+    for number in range(2 * sweeps):
+        lost = SECOND if number >= 5 else set(range(12, 18))
+        for event in skin.show(WIDE, lost=lost):
+            assert event.event == "move"
+            assert event.mean_kpa == pytest.approx(20.0)
+            left[number] = len(event.taxels)
+    assert left == {sweeps - 1: 18, sweeps + 4: 12}
+
+
+def test_a_taxel_that_is_received_again_untouched_has_left_its_contact():
+    skin = Skin()
+    skin.show(WIDE)
+    assert skin.show(WIDE, lost=SECOND) == []
+    (moved,) = skin.show(WIDE - SECOND)
+    assert set(moved.taxels) == WIDE - SECOND
+    (end,) = skin.show()
+    assert end.reason == "released"
+
+
+def test_a_contact_released_after_all_its_lost_taxels_came_back_is_released_with_any_loss():
+    skin = Skin()
+    skin.show(WIDE)
+    for _ in range(LOST_NS // SWEEP_NS + 2):
+        skin.show(WIDE, lost=SECOND)
+    skin.show(WIDE - SECOND)
+    (end,) = skin.show(lost=SECOND)
+    assert end.reason == "released"
+
+
+def test_a_piece_that_is_not_received_begins_no_contact_until_it_is():
+    skin = Skin()
+    small, large = {0}, {4, 5, 6}
+    skin.show(set(range(12)))
+    skin.show(small, large)
+    for _ in range(2 * (PARTED_NS // SWEEP_NS)):
+        assert skin.show(small, large, lost=small) == []
+    events = skin.show(small, large)
+    assert {(event.event, *event.taxels) for event in events} == {("begin", 0), ("move", 4, 5, 6)}
+
+
+def test_the_tracker_that_replaces_another_knows_what_its_contacts_felt():
+    skin = Skin()
+    (begun,) = skin.show(WIDE, unlike=UNEVEN)
+    skin.tracker = ContactTracker(LAYOUT, 0, SETTINGS, skin.tracker)
+    for _ in range(LOST_NS // SWEEP_NS - 1):
+        assert skin.show(WIDE, lost=SECOND) == []
+        skin.tracker = ContactTracker(LAYOUT, 0, SETTINGS, skin.tracker)
+    for number in range(ALIVE_NS // SWEEP_NS):
+        for moved in skin.show(WIDE, lost=SECOND if number % 2 else (), unlike=UNEVEN):
+            assert measured(moved) == measured(begun)
+
+
+def test_what_was_felt_before_all_contacts_were_ended_is_forgotten():
+    skin = Skin()
+    skin.show(WIDE, kpa=60.0)
+    skin.tracker.end_all(0, 0)
+    (begun,) = skin.show({0}, lost=SECOND)
+    assert (begun.taxels, begun.peak_kpa) == ([0], 20.0)
+    assert skin.show({0}) == []
+
+
+def test_a_contact_that_merges_while_taxels_are_not_received_is_not_lost():
+    """They are in the contact that continues."""
+    skin = Skin()
+    skin.show({0}, {4, 5, 6})
+    for _ in range(MERGED_NS // SWEEP_NS):
+        skin.show(set(range(12)))
+    ended, moved = skin.show(set(range(12)), lost={0})
+    assert (ended.event, ended.reason) == ("end", "released")
+    assert moved.taxels == list(range(12))
+
+
+def test_a_contact_whose_piece_became_another_while_it_was_not_received_is_not_lost():
+    skin = Skin()
+    small, large = {0, 1}, {4, 5, 6}
+    skin.show(set(range(12)))
+    for _ in range(PARTED_NS // SWEEP_NS + 2):
+        skin.show(small, large, lost={1})
+    (end,) = skin.show(small, lost={1})
+    assert (end.id, end.reason) == (1, "released")
+
+
+def test_a_wide_press_is_one_contact_though_a_third_of_all_can_frames_is_lost():
+    """Each of the ten triangles misses half of the sweeps, since it takes two frames."""
+    rig = Rig(1, 0.4, hz=50)
+    tracker = ContactTracker(rig.layout, 0, rig.settings)
+    rng = np.random.default_rng(5)
+    pressed = np.where(np.arange(rig.n) < 120, 20.0, 0.0)
+    forces_n, ends = [], []
+    begun = 0
+    for sweep in range(60 * 50):
+        rig.t_ns += SWEEP_NS
+        loss = 0.3 if sweep >= 150 else 0.0
+        present = np.repeat((rng.random((16, 2)) >= loss).all(axis=1), 12)
+        raw = np.where(present, rig.read(pressed if sweep >= 100 else 0.0), 0).astype(np.uint8)
+        for event in tracker.step(rig.pipeline.step(0, raw, present, rig.t_ns)):
+            begun += event.event == "begin"
+            if event.event == "end":
+                ends.append(event.reason)
+            elif sweep >= 150:
+                forces_n.append(event.force_n)
+    assert (begun, ends) == (1, [])
+    assert len(forces_n) >= 57
+    assert np.abs(np.diff(forces_n)).max() < 0.03 * min(forces_n)
 
 
 def test_where_nothing_is_left_to_feel_the_place_stays():

@@ -225,6 +225,47 @@ def test_a_lost_taxel_is_not_believed_to_be_untouched(configured):
     assert np.sqrt(np.mean(np.square(found))) < 0.6
 
 
+@pytest.mark.parametrize("method", get_args(Method))
+def test_lost_frames_change_nothing_of_the_place_of_a_steady_contact(configured, method):
+    settings, layout = configured(f'localization = "{method}"')
+    palm = PressedPalm(layout)
+    frame = palm.press((palm.inside(), 1.0))
+    tracker = ContactTracker(layout, 0, settings)
+    (begun,) = tracker.step(frame)
+    for number in range(1, 60):
+        valid = np.ones(layout.n_taxels, np.bool_)
+        # Each triangle in turn, then half of the palm.
+        first = 12 * (number % 16)
+        valid[first : first + (12 if number < 32 else 96)] = False
+        lossy = replace(
+            frame,
+            pressure_kpa=np.where(valid, frame.pressure_kpa, np.float32(0.0)),
+            touched=frame.touched & valid,
+            valid=valid,
+            elapsed_ns=frame.elapsed_ns + 20_000_000 * number,
+        )
+        for moved in tracker.step(lossy):
+            assert moved.event == "move"
+            assert (moved.centroid_m, moved.sigma_m) == (begun.centroid_m, begun.sigma_m)
+            assert (moved.force_n, moved.taxels) == (begun.force_n, begun.taxels)
+    assert [event.id for event in tracker.end_all(0, 0)] == [begun.id]
+
+
+def test_a_taxel_lost_before_a_press_is_not_believed_to_be_untouched(configured):
+    settings, layout = configured('localization = "template"')
+    palm = PressedPalm(layout)
+    place = palm.inside()
+    away = np.linalg.norm(palm.centre_mm - place, axis=1)
+    lossy = palm.press((place, 1.0), lost=[int(np.argsort(away)[1])])
+    used = ContactTracker(layout, 0, settings)
+    pressed, rest = palm.press((place, 1.0)), palm.press((place, 0.0))
+    for number, frame in enumerate([pressed, rest, rest]):
+        used.step(replace(frame, elapsed_ns=lossy.elapsed_ns + 20_000_000 * number))
+    (begun,) = used.step(replace(lossy, elapsed_ns=lossy.elapsed_ns + 60_000_000))
+    (expected,) = first_events(ContactTracker(layout, 0, settings), lossy)
+    assert (begun.taxels, begun.centroid_m) == (expected.taxels, expected.centroid_m)
+
+
 def test_an_end_tells_where_the_contact_was_and_how_surely(configured):
     settings, layout = configured('localization = "template"')
     palm = PressedPalm(layout)

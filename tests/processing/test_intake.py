@@ -4,6 +4,7 @@ import dataclasses
 from functools import cache
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,8 +12,11 @@ from hypothesis import strategies as st
 
 from skin_host.bus.assembler import Sweep
 from skin_host.cli.common import load_skin
+from skin_host.config.settings import Settings
+from skin_host.layout import Layout, build_layout
 from skin_host.processing.core import Engine
 from skin_host.processing.intake import PartSample, below_zero, lifted, unpressable
+from skin_host.processing.liveness import PROBATION_CHANGES
 
 MS = 1_000_000
 PERIOD = 50 * MS
@@ -28,8 +32,12 @@ def skin():
 class Joined:
     """Ledger and intake of an engine, as its sweeps pass through them."""
 
-    def __init__(self, parts: tuple[int, ...] = (1,)) -> None:
-        configuration, layout = skin()
+    def __init__(
+        self,
+        parts: tuple[int, ...] = (1,),
+        configured: tuple[Settings, Layout] | None = None,
+    ) -> None:
+        configuration, layout = configured or skin()
         self.engine = Engine(configuration, layout, list(parts))
 
     def feed(self, sweeps: list[Sweep]) -> list[PartSample]:
@@ -62,6 +70,37 @@ def test_a_part_of_two_boards_waits_for_both():
     assert sample.t_ns == PERIOD + 3 * MS
     assert sample.present.all()
     assert (sample.raw == 240).all()
+
+
+@pytest.mark.parametrize(("fast_ms", "slow_ms"), [(20, 25), (20, 50), (10, 200)])
+def test_boards_of_a_part_with_different_periods_are_valid_in_every_sample(
+    fast_ms: int, slow_ms: int
+) -> None:
+    """A sample comes with each sweep of the slower board, and has the newest of the other one."""
+    configured, _ = skin()
+    boards = dict(configured.boards)
+    for name, period_ms in zip(("forearm_outer", "forearm_inner"), (fast_ms, slow_ms), strict=True):
+        boards[name] = msgspec.structs.replace(boards[name], period_ms=period_ms)
+    configured = msgspec.structs.replace(configured, boards=boards)
+    parts = Joined(configured=(configured, build_layout(configured, DEMO.parent)))
+    sent = [
+        sweep(OUTER, (t_ms + 1) * MS, fill=230 + t_ms // fast_ms % 9)
+        for t_ms in range(0, 2000, fast_ms)
+    ]
+    sent += [
+        sweep(INNER, (t_ms + 4) * MS, fill=230 + t_ms // slow_ms % 9)
+        for t_ms in range(0, 2000, slow_ms)
+    ]
+    sent.sort(key=lambda one: one.t_ns)
+    samples: list[PartSample] = []
+    newest = 0
+    for one in sent:
+        newest = one.raw[0, 0] if one.board == OUTER else newest
+        came = parts.feed([one])
+        assert len(came) == (one.board == INNER)
+        assert all(sample.present.all() and sample.raw[0] == newest for sample in came)
+        samples += came + parts.expire(one.t_ns)
+    assert len(samples) == 2000 // slow_ms
 
 
 def test_a_dead_board_is_waited_for_no_longer_than_its_second_turn():
@@ -255,8 +294,8 @@ def test_a_chip_that_reported_an_error_in_one_sweep_is_invalid_until_its_bytes_c
 
 
 @pytest.mark.parametrize("eager", [False, True])
-def test_an_error_before_a_calibration_is_none_after_it(eager: bool) -> None:
-    """Judged already or not, and of the calibrated board only."""
+def test_what_had_an_error_is_not_valid_after_a_calibration_before_it_changes(eager: bool) -> None:
+    """Judged already or not: a calibration goes on with what was known of a chip that is mute."""
     parts = intake()
     joined = parts.engine.intake
     parts.feed([sweep(board, PERIOD, status=2) for board in (OUTER, INNER)])
@@ -265,6 +304,11 @@ def test_an_error_before_a_calibration_is_none_after_it(eager: bool) -> None:
     noise = np.full(parts.engine.layout.n_taxels, 0.5)
     joined.use(noise, np.array([True, False]))
     (sample,) = parts.feed([sweep(board, 2 * PERIOD) for board in (OUTER, INNER)])
+    assert not sample.present.any()
+    for turn in range(3, 3 + PROBATION_CHANGES + 1):
+        outer, inner = (sweep(board, turn * PERIOD) for board in (OUTER, INNER))
+        outer.raw[:] += turn % 2
+        (sample,) = parts.feed([outer, inner])
     assert sample.present[: 16 * 12].all()
     assert not sample.present[16 * 12 :].any()
 

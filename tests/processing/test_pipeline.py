@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from emulator.probes.viscoelastic import FoamTruth
 from skin_host.config.relaxation import MODELS
 from skin_host.config.settings import Processing, Settings
 from skin_host.evaluation.rig import Rig, flat_skin
@@ -196,6 +197,24 @@ def test_a_press_begins_and_ends_at_the_ends_of_what_a_configuration_permits(pre
     assert frames[-1].valid.all()
 
 
+@pytest.mark.parametrize("a_kpa_per_ff2", [-0.001132, 0.0, 0.005, 0.014])
+def test_a_touch_does_not_begin_again_after_a_long_press_however_the_curve_bends(a_kpa_per_ff2):
+    """The foam, which no compensator models exactly, gives back its residual over minutes."""
+    rig = Rig(1, 0.3, processing={"pressure": {"a_kpa_per_ff2": a_kpa_per_ff2}})
+    curve = PressureCurve(2.88, a=a_kpa_per_ff2)
+    foam = FoamTruth("S", 1)
+
+    def lasts(kpa, sweeps):
+        for _ in range(sweeps):
+            elastic_kpa = foam.step_pressure(np.full(1, kpa), rig.dt_s)
+            yield press(rig, curve.units(elastic_kpa)[0], 1)[0].touched[:6]
+
+    held = list(lasts(60.0, 750))
+    assert np.all(held[5:])
+    released = np.array(list(lasts(0.0, 2000)))
+    assert not released[10:].any()
+
+
 def test_thermal_pads_are_no_taxels():
     rig = Rig(1, 0.2, kind="triangle_10pad")
     thermal = rig.layout.pad_kind == PadKind.THERMAL
@@ -204,6 +223,22 @@ def test_thermal_pads_are_no_taxels():
     assert not frame.touched[thermal].any()
     assert not frame.pressure_kpa[thermal].any()
     assert frame.touched[~thermal].all()
+
+
+@pytest.mark.parametrize(("hz", "rate", "loss"), [(50.0, 0.01, 0.05), (20.0, 0.03, 0.1)])
+def test_drift_is_followed_where_frames_are_lost(hz: float, rate: float, loss: float) -> None:
+    """Of each triangle's two frames a share is lost; the readings drift by `rate` units/s."""
+    rig = Rig(1, 0.4, hz=hz)
+    rng = np.random.default_rng(5)
+    touched = 0
+    for sweep in range(int(200 * hz)):
+        rig.t_ns += round(1e9 / hz)
+        came = (rng.random((rig.n // 12, 2)) >= loss).all(axis=1).repeat(12)
+        raw = np.where(came, rig.read(rate * sweep / hz), 0).astype(np.uint8)
+        touched += np.count_nonzero(rig.pipeline.step(0, raw, came, rig.t_ns).touched)
+    assert touched == 0
+    followed = np.mean(rig.pipeline.baseline - rig.calibration.baseline)
+    assert followed == pytest.approx(200 * rate, abs=0.3)
 
 
 @pytest.mark.parametrize("lost", [False, True])

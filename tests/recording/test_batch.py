@@ -4,33 +4,21 @@ import logging
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from skin_host.bus.logs import WINDOW_NS
-from skin_host.bus.wire import TAXELS, TRIANGLES, encode_sweep
+from skin_host.bus.wire import TAXELS
 from skin_host.cli import main
 from skin_host.recording import replay
+from tests.support.candump import write_config, write_log
 
 PERIODS = 140
 
 
 def recording(path: Path, seed: int) -> Path:
-    """Seven seconds of a board at 20 Hz that is pressed at the end."""
-    rng = np.random.default_rng(seed)
-    lines = []
-    for period in range(PERIODS):
-        raw = rng.integers(239, 242, (TRIANGLES, TAXELS))
-        raw[seed : seed + 2] -= 60 * (period > 110)
-        ids, data = encode_sweep(
-            1, np.arange(TRIANGLES), raw.astype(np.uint8), np.zeros(TRIANGLES, np.uint16)
-        )
-        for row, (identifier, payload) in enumerate(zip(ids.tolist(), data, strict=True)):
-            t_us = 1_700_000_000_000_000 + period * 50_000 + row * 125
-            stamp = f"{t_us // 1_000_000}.{t_us % 1_000_000:06d}"
-            lines.append(f"({stamp}) can0 {identifier:X}#{payload.tobytes().hex()}\n")
-    path.write_text("".join(lines))
-    return path
+    """Seven seconds of a board of which two triangles are pressed at the end."""
+    taxels = range(TAXELS * seed, TAXELS * (seed + 2))
+    return write_log(path, PERIODS, lambda period: taxels if period > 110 else (), seed)
 
 
 @pytest.fixture
@@ -40,12 +28,7 @@ def logs(tmp_path: Path) -> list[Path]:
 
 @pytest.fixture
 def config(tmp_path: Path) -> Path:
-    path = tmp_path / "skin.toml"
-    path.write_text(
-        'robot = "fleet"\n[buses.can0]\nchannel = "can0"\n[boards.b]\nbus = "can0"\naddress = 1\n'
-        '[[parts.arm.patches]]\nboard = "b"\ntriangles = "0-15"\n'
-    )
-    return path
+    return write_config(tmp_path / "skin.toml")
 
 
 @pytest.fixture

@@ -1,6 +1,9 @@
 """Recordings as other tools open them: read back by those tools' own loaders."""
 
 import json
+import pickle
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -197,4 +200,35 @@ def test_a_recording_is_not_written_over_itself(
     recording = tmp_path / "grasp.mcap"
     recording.write_bytes(b"")
     assert main(["export", str(recording), str(recording)]) == 2
-    assert "is the recording itself" in capsys.readouterr().err
+    assert "is read by this command" in capsys.readouterr().err
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("name", ["a.rrd", "a.mcap", "a.npz", "a.parquet", "tables", "set"])
+def test_an_export_to_a_full_disk_ends_in_a_line_and_leaves_what_was_there(
+    series: Series, tmp_path: Path, name: str
+) -> None:
+    """Rerun's own writer neither reported it nor ended."""
+    output = tmp_path / name
+    old = output if output.suffix else output / "touches.csv"
+    old.parent.mkdir(exist_ok=True)
+    old.write_text("old")
+    script = (
+        "import resource, sys, pickle\n"
+        "from pathlib import Path\n"
+        "from skin_host.errors import SkinError\n"
+        "from skin_host.recording.export import export\n"
+        "series = pickle.loads(Path(sys.argv[1]).read_bytes())\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (100, resource.RLIM_INFINITY))\n"
+        "try:\n"
+        "    export(series, Path(sys.argv[2]), lerobot=sys.argv[2].endswith('set'))\n"
+        "except SkinError as error:\n"
+        "    print(error)\n"
+    )
+    pickled = tmp_path / "pickled"
+    pickled.write_bytes(pickle.dumps(series))
+    command = [sys.executable, "-c", script, str(pickled), str(output)]
+    ran = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert ran.stdout.endswith("cannot be written: File too large\n")
+    assert old.read_text() == "old"
+    assert list(tmp_path.rglob(".*")) == []

@@ -17,7 +17,7 @@ from skin_host.bus.logs import read_channels
 from skin_host.bus.wire import FrameBatch
 from skin_host.client import SkinClient
 from skin_host.config.settings import Bus, Mqtt, Settings, changed, load
-from skin_host.errors import RequestError
+from skin_host.errors import LogError, RequestError
 from skin_host.layout import Layout, build_layout
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.info import encode_info, node_info
@@ -282,3 +282,14 @@ async def test_an_emulated_robot_can_be_recorded(tmp_path: Path) -> None:
     ids = {frame[0] >> 8 for frame in frames_of(path)}
     assert ids == {4}
     assert np.unique([frame[0] for frame in frames_of(path)]).size == 33
+
+
+async def test_two_robots_are_not_played_as_one(tmp_path: Path, mosquitto: Mosquitto) -> None:
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        for n, robot in enumerate(("icub", "kaspar")):
+            recorder.say(f"skin/{robot}/palm/contact", n, b"ON")
+    broker = Broker(mosquitto.host, mosquitto.port)
+    with pytest.raises(LogError, match=r"holds messages of skin/icub and of skin/kaspar"):
+        await play_messages(path, broker, robot="ghost")
+    assert await play_messages(path, broker) == 2

@@ -16,6 +16,7 @@ from skin_host.cli import main
 from skin_host.config.settings import Mqtt
 from skin_host.mqtt.publisher import Publisher
 from skin_host.recording.mcap import Recorder
+from skin_host.recording.playback import LONGEST_PAUSE_S
 from tests.support import programs
 from tests.support.broker import Mosquitto, free_port
 from tests.support.subscriber import Subscriber
@@ -282,3 +283,29 @@ def test_the_example_subscriber_ends_quietly_with_ctrl_c(mosquitto: Mosquitto) -
             running.kill()
     assert running.returncode == 0
     assert told == b""
+
+
+def test_a_playback_that_is_killed_leaves_no_node_online(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    """Its contacts stay at the broker, and it is the status that shows that nobody is behind."""
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        for node in ("main", "arm"):
+            recorder.say(f"skin/demo/nodes/{node}/status", 1, b"online")
+        recorder.say("skin/demo/left_hand/contact", 2, b"ON")
+        recorder.say("skin/demo/left_hand/contact", int(0.9 * LONGEST_PAUSE_S * 1e9), b"OFF")
+    listening = Subscriber(mosquitto.host, mosquitto.port, "skin/#")
+    program = [sys.executable, "-m", "skin_host", "replay", str(path)]
+    with subprocess.Popen([*program, "--onto", "broker", "--broker", url_of(mosquitto)]) as playing:
+        await_payloads(listening, "demo/left_hand/contact", [b"ON"])
+        playing.kill()
+    for node in ("main", "arm"):
+        await_payloads(listening, f"demo/nodes/{node}/status", [b"online", b"offline"])
+
+
+def await_payloads(subscriber: Subscriber, end: str, wanted: list[bytes]) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while (seen := subscriber.payloads(end)) != wanted:
+        assert time.monotonic() < deadline_s, seen
+        time.sleep(0.02)

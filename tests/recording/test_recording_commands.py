@@ -15,11 +15,16 @@ from mcap.reader import make_reader
 from skin_host.cli import main
 from skin_host.config.settings import Mqtt, load
 from skin_host.layout import build_layout
+from skin_host.mqtt.address import Broker
+from skin_host.mqtt.connection import connect
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
-from skin_host.recording.mcap import read_messages_of
+from skin_host.recording import capture
+from skin_host.recording.capture import capture_broker
+from skin_host.recording.mcap import Recorder, read_messages_of, recorded_topics
 from tests.support.broker import Mosquitto
-from tests.support.waiting import PATIENCE_S
+from tests.support.candump import write_config, write_log
+from tests.support.waiting import PATIENCE_S, until
 from tests.support.world import World
 
 ROOT = Path(__file__).parents[2]
@@ -159,3 +164,69 @@ async def test_a_robot_is_recorded_until_ctrl_c_and_played_again(
         main, ["replay", str(file), "--onto", "broker", "--broker", url, "--robot", "ghost"]
     )
     assert played == 0
+
+
+async def test_messages_that_came_faster_than_they_were_recorded_are_counted(
+    mosquitto: Mosquitto, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(capture, "MAX_INCOMING", 2)
+    broker = Broker(mosquitto.host, mosquitto.port)
+    parts = 200
+    async with connect(broker, identifier="parts") as connection:
+        for n in range(parts):
+            await connection.publish(f"skin/icub/part{n}/contact", b"ON", qos=1, retain=True)
+        with Recorder(tmp_path / "a.mcap") as recorder:
+            stop = asyncio.Event()
+            recording = asyncio.create_task(capture_broker(recorder, broker, "skin", "icub", stop))
+            last = recorded_topics("skin", "icub")[-1]
+            await until(lambda: mosquitto.subscriptions(last))
+            # It follows all that was retained.
+            await connection.publish("skin/icub/last/health", b"{}", qos=1)
+            await until(lambda: "health" in recorder.messages)
+            stop.set()
+            await recording
+    assert recorder.discarded > 0
+    assert recorder.messages["contact"] + recorder.discarded == parts
+    with (tmp_path / "a.mcap").open("rb") as file:
+        (metadata,) = make_reader(file).iter_metadata()
+    assert metadata.metadata["discarded"] == str(recorder.discarded)
+
+
+def test_an_export_of_a_recording_that_is_not_there_is_a_wrong_request(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "a.npz").touch()
+    assert main(["export", str(tmp_path / "gone.mcap"), str(tmp_path / "a.npz")]) == 2
+    assert "gone.mcap: cannot be read: No such file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["replay", "a.log", "--config", "skin.toml", "--output", "a.log"],
+        ["replay", "a.log", "--config", "skin.toml", "--output", "link.log"],
+        ["replay", "a.log", "--config", "skin.toml", "--output", "skin.toml"],
+        ["replay", "a.log", "--config", "skin.toml", "--calibration", "c", "--output", "c"],
+        ["export", "a.log", "c.npz", "--config", "skin.toml", "--calibration", "c.npz"],
+        ["plot", "calibration", "c.png", "c.png", "--config", "skin.toml"],
+        ["dbc", "skin.toml", "--output", "skin.toml"],
+        ["urdf", "skin.toml", "--output", "skin.toml"],
+    ],
+)
+def test_what_a_command_reads_is_not_replaced_by_what_it_writes(
+    arguments: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_config(Path("skin.toml"))
+    write_log(Path("a.log"), 130, lambda _: ())
+    Path("link.log").symlink_to("a.log")
+    for name in ("c", "c.npz", "c.png"):
+        Path(name).write_text("{}")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert main(arguments) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "is read by this command; choose another name" in line
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before

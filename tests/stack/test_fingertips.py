@@ -28,7 +28,7 @@ def whole(events: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
 def test_a_press_and_a_slip_on_a_fingertip_reach_a_subscriber(
     stack: Stack, subscriber: Subscriber
 ) -> None:
-    assert stack.calibrate()["fingertips"] == {"index": True, "thumb": True}
+    assert stack.calibrate()["fingertips"] == {"index": "ok", "thumb": "ok"}
     daemon = stack.start("run", str(stack.config), scene=SCENE)
 
     # The scene repeats itself: a slow daemon may come into the middle of a press, not of the next.

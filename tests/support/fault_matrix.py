@@ -123,7 +123,8 @@ what else was reported by then; `chip_back`: until the code is gone. `within` is
 the code is expected on every firmware and fidelity; a cell that is later, or in which the code
 did not come, is bold. Health is worked out every 0.1 s here. The daemon looks for changes as often,
 and works out periods, temperatures and baselines once a second. [scenes.md](scenes.md) explains
-the faults."""
+the faults. `board_latched` is of force/torque boards: `fingertip_frozen` after 250 samples
+([operations.md](operations.md))."""
 
 REASONS = """\
 ## What is expected

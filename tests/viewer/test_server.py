@@ -7,6 +7,7 @@ import urllib.request
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from pathlib import Path
+from socket import gethostname
 from typing import Any
 
 import msgspec
@@ -168,9 +169,31 @@ async def test_a_page_from_elsewhere_is_refused() -> None:
                     pass
 
 
-async def test_a_name_that_was_made_to_point_at_this_machine_is_refused() -> None:
-    async with Viewer(nowhere(), robot="demo").serving(port=0) as url:
-        assert (await fetch(url, Host="evil.example:8080"))[0] == 403
+@pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
+async def test_a_name_that_was_made_to_point_at_this_machine_is_refused(host: str) -> None:
+    """Its page would be that of the same origin: it could calibrate."""
+    async with Viewer(nowhere(), robot="demo").serving(host, port=0) as url:
+        for name in ("evil.example:8080", "evil.example", "localhost.evil.example:80", "", "["):
+            status, _, text = await fetch(url, Host=name)
+            assert status == 403
+            assert b"--name" in text
+        port = int(url.rstrip("/").rpartition(":")[2])
+        elsewhere = f"http://evil.example:{port}"
+        with pytest.raises(InvalidStatus, match="403"):
+            async with page(f"{elsewhere}/", host="127.0.0.1", port=port):
+                pass
+
+
+async def test_the_page_is_served_under_addresses_and_the_names_of_this_machine() -> None:
+    viewer = Viewer(nowhere(), robot="demo", names=["Skin.Example"])
+    own = gethostname()
+    async with viewer.serving(port=0) as url:
+        for name in ("127.0.0.1", "[::1]", "192.168.7.2", "localhost", "LOCALHOST", own):
+            for port in ("", ":80", ":8080"):
+                assert (await fetch(url, Host=name + port))[0] == 200, name + port
+        assert (await fetch(url, Host=f"{own.partition('.')[0]}.local:8080"))[0] == 200
+        assert (await fetch(url, Host="skin.example"))[0] == 200
+        assert (await fetch(url, Host="other.example"))[0] == 403
 
 
 async def test_a_port_that_is_taken_is_told_in_one_line() -> None:

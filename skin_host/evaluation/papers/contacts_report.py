@@ -4,6 +4,7 @@ Plain rows of numbers, then tables and pictures of them.
 """
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ from skin_host.evaluation.papers.fusion import (
     task_errors,
 )
 from skin_host.evaluation.papers.grasp_loops import DETECTORS, false_alarms_per_hour, slip_trials
+from skin_host.evaluation.steps import show_step
 
 Row = dict[str, Any]
 Report = dict[str, list[Row]]
@@ -156,20 +158,25 @@ def measure(plan: ContactsPlan) -> Report:
         Tables of rows: `localization`, `separation`, `intrinsic`, `bounds`, `tasks`,
         `calibrations` (of the fusion), `slip`, `placements`.
     """
-    return {
-        "localization": _localization(plan.presses),
-        "separation": _separation(plan.presses),
-        "intrinsic": _intrinsic(plan.samples),
-        "bounds": _bounds(),
-        "tasks": _tasks(plan.fingertips, plan.seconds),
-        "calibrations": _calibrations(max(1, plan.fingertips // 2), plan.seconds),
-        "slip": _slip(plan.objects, plan.hours),
-        "placements": [
+    tables: dict[str, Callable[[], list[Row]]] = {
+        "localization": lambda: _localization(plan.presses),
+        "separation": lambda: _separation(plan.presses),
+        "intrinsic": lambda: _intrinsic(plan.samples),
+        "bounds": _bounds,
+        "tasks": lambda: _tasks(plan.fingertips, plan.seconds),
+        "calibrations": lambda: _calibrations(max(1, plan.fingertips // 2), plan.seconds),
+        "slip": lambda: _slip(plan.objects, plan.hours),
+        "placements": lambda: [
             {"places": places, "condition": condition}
             for condition, places in PlanarStructure().placements()
             if condition < 10.0
         ],
     }
+    found: Report = {}
+    for name, table in tables.items():
+        show_step(name)
+        found[name] = table()
+    return found
 
 
 def _localization(presses: int) -> list[Row]:

@@ -149,6 +149,10 @@ class Accusations:
         """Whether something damages what a fingertip's board sends, or did so lately."""
         return self._lately("fingertip_noisy", tip)
 
+    def may_repeat(self, tip: str) -> bool:
+        """Whether a fingertip's board repeats what it sent, or did so lately."""
+        return self._lately("fingertip_frozen", tip)
+
     def may_lose(self, tip: str) -> bool:
         """Whether something loses what a fingertip's board sends, or did so lately."""
         return self._lately("fingertip_loses_frames", tip) or self._lately("bus_drops", tip)

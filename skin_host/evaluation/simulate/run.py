@@ -24,7 +24,7 @@ from skin_host.evaluation.simulate.disk import PowerCut
 from skin_host.evaluation.simulate.promises import Promises
 from skin_host.evaluation.simulate.promises.limits import SAMPLE_S
 from skin_host.evaluation.simulate.trace import Before
-from skin_host.evaluation.simulate.troubles import ACTS, KINDS, WIRING, Trouble, act
+from skin_host.evaluation.simulate.troubles import ACTS, WIRING, Trouble, act, kinds_of
 from skin_host.evaluation.simulate.world import Life, Spot, World
 from skin_host.layout import Layout
 from skin_host.mqtt.commands import MAX_RUNNING
@@ -81,6 +81,7 @@ class RunResult:
             `until_s` if the run was to end there.
         seconds: the same before its last whole seconds, to compare it with a repetition.
         broken: the promise that was broken, or None; `last` are the events before.
+        kinds: of trouble that the robot can have.
         troubles: how many of each kind were injected.
         required, named: kinds that health had to name if they lasted, and those that it named.
         touches, deaths: events of touch, and ends of the daemon.
@@ -95,6 +96,7 @@ class RunResult:
     seconds: list[Before] = field(default_factory=list)
     broken: str | None = None
     last: list[str] = field(default_factory=list)
+    kinds: list[str] = field(default_factory=list)
     troubles: dict[str, int] = field(default_factory=dict)
     required: list[str] = field(default_factory=list)
     named: list[str] = field(default_factory=list)
@@ -176,17 +178,18 @@ def coverage(results: Iterable[RunResult]) -> dict[str, list[str]]:
     """Return what came of the catalogue over some runs, as kinds of trouble.
 
     Returns:
-        injected, never_injected: all kinds.
+        injected, never_injected: all kinds that the robot can have.
         named, never_named: of the injected ones that health had to name. Those that do no harm, or
             were too weak, it need not.
     """
     results = list(results)
+    possible = {kind for result in results for kind in result.kinds}
     injected = {kind for result in results for kind in result.troubles}
     required = {kind for result in results for kind in result.required}
     named = {kind for result in results for kind in result.named}
     return {
         "injected": sorted(injected),
-        "never_injected": sorted(KINDS.keys() - injected),
+        "never_injected": sorted(possible - injected),
         "named": sorted(named),
         "never_named": sorted(required - named),
     }
@@ -209,7 +212,8 @@ class _Run:
         self, world: World, state: Path, seed: int, seconds: float, until_s: float | None
     ) -> None:
         self.world = world
-        self.result = RunResult(seed)
+        self._kinds = kinds_of(world.settings)
+        self.result = RunResult(seed, kinds=sorted(self._kinds))
         self._state = state
         self._seconds = seconds
         self._until_s = until_s
@@ -359,7 +363,7 @@ class _Run:
         chance = self._chance
         if len(self._troubles) >= MOST_TROUBLES:
             return
-        name = chance.choice(list(KINDS))
+        name = chance.choice(list(self._kinds))
         if any(trouble.name == name for trouble in self._troubles):
             return
         if name in WIRING and any(trouble.name in WIRING for trouble in self._troubles):
@@ -373,7 +377,7 @@ class _Run:
         """Begin a trouble; None if another one has unplugged the chip that was drawn."""
         world = self.world
         try:
-            trouble = KINDS[name](world, chance, plain)
+            trouble = self._kinds[name](world, chance, plain)
         except ConfigurationError:
             return None
         world.note(f"trouble: {trouble.about}")
@@ -501,8 +505,8 @@ class _Run:
         world = self.world
         if world.life is None:
             return
-        kinds = list(KINDS)
-        kind = kinds[(self.result.seed + self._drills) % len(kinds)]
+        names = list(self._kinds)
+        kind = names[(self.result.seed + self._drills) % len(names)]
         self._drills += 1
         quiet_s = max(QUIET_NS, STARTED_NS) / 1e9
         await world.clock.sleep(quiet_s)

@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 from emulator import faults
 from emulator.probes.scene import Fault
 from skin_host.bus.port import LinkState
+from skin_host.config.settings import Settings
 from skin_host.evaluation.simulate.cables import Mischief
 from skin_host.evaluation.simulate.disk import FULL, READ_ONLY
 from skin_host.evaluation.simulate.world import Triangle, World
+from skin_host.fingertip.frozen import REPEATS
 from skin_host.health.describe import enough_rest
 from skin_host.health.diagnosis import JITTER_SHARE
 from skin_host.layout import PadKind
@@ -637,6 +639,29 @@ def _disk(name: str, code: int) -> Begin:
     return begin
 
 
+def _board_latched(world: World, chance: random.Random, _: bool) -> Trouble:
+    """The board of a fingertip repeats its last sample, or only the force or torque of it."""
+    name = chance.choice(list(world.settings.fingertips))
+    fault = Fault(name="board_latched", board=name, value=float(chance.randrange(3)))
+    world.move()
+    mend = world.robot.inject(fault)
+
+    def end() -> None:
+        world.move()
+        mend()
+
+    return Trouble(
+        "board_latched",
+        f"board_latched board={name} value={fault.value:g}",
+        end,
+        # A zero of samples of which some were repeated is noisy, or of a load.
+        {"fingertip_frozen", "fingertip_noisy", "fingertip_held", "fingertip_pressed"},
+        frozenset({"fingertip_frozen"}),
+        1e-3 * REPEATS * world.settings.fingertips[name].period_ms + 1.0,
+        frozenset({name}),
+    )
+
+
 def _disk_slow(world: World, chance: random.Random, _: bool) -> Trouble:
     """Each file takes long; everything else goes on meanwhile."""
     world.clock.threads_take_s = round(chance.uniform(0.1, 3.0), 2)
@@ -825,3 +850,10 @@ KINDS: dict[str, Begin] = {
     "disk_read_only": _disk("disk_read_only", READ_ONLY),
     "disk_slow": _disk_slow,
 }
+#: Those of robots with fingertips alone: what other robots draw does not depend on them.
+OF_FINGERTIPS: dict[str, Begin] = {"board_latched": _board_latched}
+
+
+def kinds_of(settings: Settings) -> dict[str, Begin]:
+    """Return the kinds of trouble that a robot can have."""
+    return KINDS | OF_FINGERTIPS if settings.fingertips else KINDS

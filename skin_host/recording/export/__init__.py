@@ -5,6 +5,7 @@ layout are in the metadata of the latter two: of each column its `unit`, of the 
 with each part's places (m), normals and areas (mm2) as JSON.
 """
 
+import csv
 import json
 from collections.abc import Iterator
 from io import BytesIO, StringIO
@@ -79,6 +80,11 @@ def export(
 
         write_foxglove(series, recording, output)
         return [output]
+    taken = "touch" if output.suffix == ".npz" else "touches"
+    if taken in series.parts:
+        raise RequestError(
+            f'{output}: part "{taken}" has the name of the table of touches; wanted .parquet'
+        )
     if output.suffix == ".npz":
         buffer = BytesIO()
         np.savez_compressed(buffer, **dict(_arrays(series)))
@@ -122,8 +128,8 @@ def _table(part: PartSeries) -> str:
 
 def _touch_table(touches: list[Touch]) -> str:
     text = StringIO()
-    heads = [*TOUCH_WORDS, "x_m", "y_m", "z_m", *TOUCH_NUMBERS, "taxels"]
-    text.write(",".join(heads) + "\n")
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow([*TOUCH_WORDS, "x_m", "y_m", "z_m", *TOUCH_NUMBERS, "taxels"])
     for touch in touches:
         words, numbers = (
             [getattr(touch, key) for key in of] for of in (TOUCH_WORDS, TOUCH_NUMBERS)
@@ -134,7 +140,7 @@ def _touch_table(touches: list[Touch]) -> str:
             *numbers,
             " ".join(map(str, touch.taxels)),
         ]
-        text.write(",".join("" if cell is None else str(cell) for cell in cells) + "\n")
+        table.writerow(cells)
     return text.getvalue()
 
 
@@ -224,12 +230,23 @@ def write_lerobot(series: Series, output: Path) -> list[Path]:
 
     Raises:
         SkinError: pyarrow is not installed, or a file cannot be written.
+        RequestError: the times of a part go back, or stand still: there is no such rate.
     """
     pa = required("pyarrow", "data sets of LeRobot", "parquet")
     leader = max(series.parts.values(), key=lambda part: len(part.seq))
     t_s = leader.t_s
     n = len(t_s)
-    fps = round(1 / float(np.median(np.diff(t_s)))) if n > 1 else 1
+    for part in series.parts.values():
+        steps_ns = np.diff(part.t_ns)
+        if (back := np.flatnonzero(steps_ns < 0)).size:
+            raise RequestError(
+                f"{output}: {part.name}: its time goes back by {-steps_ns[back[0]] / 1e9:.0f} s "
+                f"at frame {back[0] + 1}; a data set has rising times"
+            )
+    step_s = float(np.median(np.diff(t_s))) if n > 1 else 1.0
+    if step_s <= 0.0:
+        raise RequestError(f"{output}: {leader.name}: its time stands still; it has no rate")
+    fps = max(1, round(1 / step_s))
     columns: dict[str, Any] = {}
     features: dict[str, Any] = {}
     stats: dict[str, Any] = {}

@@ -18,10 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.errors import RequestError, required
-from skin_host.files import whole_file
+from skin_host.files import whole_file, write_atomic, writing
 from skin_host.mqtt.info import PartInfo
 from skin_host.processing.events import Touch
 from skin_host.recording.export.series import HealthLine, Series
+from skin_host.recording.mcap import read_records
 
 ROOT = "robot"
 #: Distance of two parts that lie side by side.
@@ -151,7 +152,12 @@ class RecordedScene:
 
     def __init__(self, series: Series) -> None:
         self._series = series
-        missing = [name for name in series.parts if name not in series.shapes]
+        missing = [
+            name
+            for name, part in series.parts.items()
+            if name not in series.shapes
+            or len(series.shapes[name].pads) != part.pressure_kpa.shape[1]
+        ]
         if missing:
             raise RequestError(
                 f"the recording has no positions of the taxels of {', '.join(missing)}; name "
@@ -217,7 +223,6 @@ def write_foxglove(series: Series, recording: Path | None, output: Path) -> None
     """
     required("mcap_protobuf", "scenes for Foxglove", "foxglove")
     required("foxglove_schemas_protobuf", "scenes for Foxglove", "foxglove")
-    from mcap.reader import make_reader
     from mcap.writer import Writer
 
     scene = RecordedScene(series)
@@ -225,17 +230,16 @@ def write_foxglove(series: Series, recording: Path | None, output: Path) -> None
         writer: Any = Writer(file)
         writer.start(profile="", library="skin-host")
         if recording is not None and recording.suffix == ".mcap":
-            with recording.open("rb") as own:
-                _copy(make_reader(own), writer)
+            _copy(recording, writer)
         _Foxglove(writer).write(scene)
         writer.finish()
 
 
-def _copy(reader: Any, writer: Any) -> None:
-    """Every message of a file as it is."""
+def _copy(recording: Path, writer: Any) -> None:
+    """Write every message of a file as it is."""
     schemas: dict[int, int] = {}
     channels: dict[int, int] = {}
-    for schema, channel, message in reader.iter_messages():
+    for schema, channel, message in read_records(recording):
         if channel.id not in channels:
             if schema is not None and schema.id not in schemas:
                 schemas[schema.id] = writer.register_schema(
@@ -394,14 +398,14 @@ def write_rerun(series: Series, output: Path) -> None:
     """
     rr = required("rerun", "recordings for Rerun", "rerun")
     scene = RecordedScene(series)
-    with whole_file(output) as growing:
-        stream = rr.RecordingStream("skin-host")
-        stream.save(growing)
-        shown = RerunStream(stream, scene.scene)
-        for item in scene.items():
-            shown.show(item)
-        stream.flush()
-        stream.disconnect()
+    stream = rr.RecordingStream("skin-host")
+    # Its own writer of files never ends on a full disk.
+    encoded = stream.binary_stream()
+    shown = RerunStream(stream, scene.scene)
+    for item in scene.items():
+        shown.show(item)
+    with writing(output):
+        write_atomic(output, encoded.read() or b"")
 
 
 class RerunStream:

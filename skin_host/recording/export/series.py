@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from skin_host.config.settings import Settings, skin_hash
 from skin_host.errors import LogError
+from skin_host.health import HealthWatch
 from skin_host.layout import Layout
 from skin_host.mqtt.frames import decode_frame
 from skin_host.mqtt.info import PartInfo, decode_info, node_info
@@ -19,8 +20,8 @@ from skin_host.processing.calibration import Calibration
 from skin_host.processing.core import Engine
 from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
-from skin_host.recording.mcap import read_messages_of
-from skin_host.recording.replay import steps
+from skin_host.recording.mcap import read_messages_of, robot_at
+from skin_host.recording.replay import replay
 
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -69,7 +70,7 @@ class Series:
         parts: by name.
         touches: events in their order.
         shapes: positions of the taxels, if the recording has them.
-        health: changes in their order; a recording of CAN frames has none.
+        health: changes in their order; of a recording of CAN frames, that at its end.
     """
 
     parts: dict[str, PartSeries]
@@ -109,17 +110,25 @@ def read_messages(recording: Path) -> Series:
     """Read an MCAP recording of messages.
 
     Raises:
-        LogError: it cannot be read, or holds no frames.
+        LogError: it cannot be read, holds no frames, or those of several robots.
     """
+    robots: set[str] = set()
     parts: dict[str, _Growing] = {}
     touches: list[Touch] = []
     shapes: dict[str, PartInfo] = {}
     health: list[HealthLine] = []
     latest: dict[str, HealthLine] = {}
     for said in read_messages_of(recording):
-        name, kind = said.topic.split("/")[-2:]
+        words = said.topic.split("/")
+        name, kind = words[-2:]
         try:
             if kind == "frame":
+                robots.add("/".join(words[: robot_at(words) + 1]))
+                if len(robots) > 1:
+                    raise LogError(
+                        f"{recording}: holds frames of several robots: "
+                        f"{', '.join(sorted(robots))}; split it, e.g. with `mcap filter`"
+                    )
                 frame = decode_frame(name, said.payload)
                 growing = parts.setdefault(name, _Growing())
                 if growing.kpa and len(growing.kpa[0]) != len(frame.valid):
@@ -161,11 +170,14 @@ def read_frames(log: Path, settings: Settings, layout: Layout, calibration: Cali
     parts = {part.name: _Growing() for part in layout.parts}
     touches: list[Touch] = []
     counts = dict.fromkeys(parts, 0)
-    for step in steps(log, engine):
-        parts[step.frame.part].add(step.frame)
-        for event in step.events:
-            counts[event.part] += 1
-            touches.append(event.published(counts[event.part]))
+    watch = HealthWatch(engine)
+    for output in replay(log, engine):
+        watch.note(output)
+        for step in output.steps:
+            parts[step.frame.part].add(step.frame)
+            for event in step.events:
+                counts[event.part] += 1
+                touches.append(event.published(counts[event.part]))
     shapes = {
         name: part
         for node in {part.node for part in layout.parts}
@@ -176,4 +188,9 @@ def read_frames(log: Path, settings: Settings, layout: Layout, calibration: Cali
     series = {name: part.series(name) for name, part in parts.items() if part.seq}
     if not series:
         raise LogError(f"{log}: holds no sweep of this skin")
-    return Series(series, touches, shapes)
+    health = [
+        health_line(part.name, parts[part.name].t_ns[-1], watch.replayed(index))
+        for index, part in enumerate(layout.parts)
+        if part.name in series
+    ]
+    return Series(series, touches, shapes, sorted(health, key=lambda line: line.t_ns))

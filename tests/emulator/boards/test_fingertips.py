@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 
 from emulator.faults import parse
-from emulator.probes.scene import Probe, Scene
+from emulator.probes.held_objects import HeldObjects
+from emulator.probes.scene import Fault, Probe, Scene
 from emulator.robot import Robot
 from skin_host.bus.strain import start_frames
 from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import changed, load
 from skin_host.errors import ConfigurationError
 from skin_host.fingertip.events import Slip
+from skin_host.fingertip.health import FingertipHealth
 from skin_host.layout import build_layout
 from skin_host.processing.core import Engine
 from skin_host.processing.events import Touch
@@ -26,14 +28,17 @@ PATH = CONFIG / "fingertips.toml"
 class World:
     """The robot of the shipped configuration and an engine that has been calibrated."""
 
-    def __init__(self, *probes: dict[str, Any]) -> None:
+    def __init__(self, *probes: dict[str, Any], noise: bool = True) -> None:
         # So fast that less than two seconds, before anything presses, are enough to calibrate.
         settings = load(PATH)
         hand = msgspec.structs.replace(settings.boards["hand"], period_ms=20)
         self.settings = changed(settings, {"boards.hand": hand})
         layout = build_layout(self.settings, CONFIG)
         scene = Scene(
-            probe=[msgspec.convert(probe, Probe) for probe in probes], spread=False, quiet=True
+            probe=[msgspec.convert(probe, Probe) for probe in probes],
+            spread=False,
+            quiet=True,
+            noise=noise,
         )
         self.robot = Robot(self.settings, layout, scene)
         self.robot.bring_up()
@@ -161,6 +166,109 @@ def test_a_silent_board_is_known_and_its_touch_ends() -> None:
     mend()
     world.run(0.2)
     assert state.alive and state.tip.touched
+
+
+def test_boards_without_noise_are_not_taken_for_frozen() -> None:
+    world = World({"part": "index", "force_n": [[4.5, 0], [4.6, 2], [6.0, 2]]}, noise=False)
+    assert world.engine.fingertips is not None
+    world.run(2.0)
+    for state in world.engine.fingertips.tips.values():
+        assert state.frozen.trusted and state.tip.zeroed
+        assert state.tip.feels and not state.tip.touched
+    world.run(1.0)
+    (begin,) = [one for one in world.touches("index") if one.event == "begin"]
+    assert world.touches("index")[-1].force_n == pytest.approx(2.0, rel=0.1)
+    assert begin.t_ns == pytest.approx(4_513_000_000, abs=6_000_000)
+
+
+def test_a_board_that_was_silent_sends_nothing_of_that_time_when_it_is_back() -> None:
+    world = World()
+    mends = [world.robot.inject(parse("board_silent board=index")) for _ in range(2)]
+    world.robot.step(3.0)
+    mends[0]()
+    assert 0x31A not in world.robot.step(0.3)["can0"].id
+    mends[1]()
+    batch = world.robot.step(0.3)["can0"]
+    assert np.count_nonzero(batch.id == 0x31A) == pytest.approx(100, abs=2)
+    assert batch.t_ns[0] > world.robot.t_ns - 300_000_000
+
+
+def test_the_object_of_a_board_that_was_silent_for_long_is_not_moved_through_all_that_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    moved_s: list[float] = []
+    advance = HeldObjects.advance
+
+    def note(one: HeldObjects, load_n: Any, normal_n: Any, dt_s: float) -> Any:
+        moved_s.append(dt_s)
+        return advance(one, load_n, normal_n, dt_s)
+
+    monkeypatch.setattr(HeldObjects, "advance", note)
+    held = {"part": "index", "force_n": [[0, 2], [90, 2]], "tangential_n": [[0, 0.5], [90, 0.5]]}
+    world = World(held)
+    mend = world.robot.inject(parse("board_silent board=index"))
+    world.robot.step(30.0)
+    mend()
+    world.robot.step(0.1)
+    assert max(moved_s) == 1.0
+    assert sorted(moved_s)[-2] == pytest.approx(0.003)
+
+
+@pytest.mark.parametrize(
+    ("value", "latched"),
+    [(None, [0x31A, 0x31B]), (0, [0x31A, 0x31B]), (1, [0x31A]), (2, [0x31B])],
+)
+def test_a_latched_board_repeats_its_last_frames_whatever_presses(
+    value: float | None, latched: list[int]
+) -> None:
+    world = World({"part": "index", "force_n": [[2.0, 0], [2.1, 2], [60, 2]]})
+
+    def sent(can_id: int, seconds: float = 0.5) -> set[bytes]:
+        batch = world.robot.step(seconds)["can0"]
+        return {batch.data[row].tobytes() for row in np.flatnonzero(batch.id == can_id)}
+
+    mend = world.robot.inject(Fault(name="board_latched", board="index", value=value))
+    for can_id in (0x31A, 0x31B, 0x32A, 0x32B):
+        assert (len(sent(can_id)) == 1) == (can_id in latched), hex(can_id)
+    branch = Robot.restore(world.robot.save(), world.settings, world.robot.layout)
+    assert (branch.step(0.1)["can0"].data == world.robot.step(0.1)["can0"].data).all()
+    mend()
+    assert all(len(sent(can_id)) > 10 for can_id in (0x31A, 0x31B))
+
+
+def test_health_names_a_latched_board_and_its_touch_ends() -> None:
+    world = World({"part": "index", "force_n": [[2.2, 0], [2.3, 2], [60, 2]]})
+    world.run(1.0)
+    mend = world.robot.inject(parse("board_latched board=index"))
+    world.run(1.0)
+    assert world.engine.fingertips is not None
+    health = FingertipHealth(world.engine.fingertips)
+    records = health.records(world.robot.t_ns)
+    assert [one["code"] for one in records["index"]["faults"]] == ["fingertip_frozen"]
+    assert records["thumb"]["faults"] == []
+    assert world.touches("index")[-1].reason == "lost"
+    mend()
+    world.run(0.2)
+    assert health.records(world.robot.t_ns)["index"]["faults"] == []
+    assert world.touches("index")[-1].event != "end"
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("board_latched board=hand", 'board: no fingertip "hand"; there are: index, thumb'),
+        ("board_latched", "board: missing"),
+        ("board_latched board=index value=3", "value: 3; wanted 0 to 2"),
+        ("board_silent board=foot", 'board: no board "foot"; there are: hand, index, thumb'),
+        ("board_reset board=index", 'board: no board "index"; there are: hand'),
+    ],
+)
+def test_a_fault_names_a_board_that_can_have_it(line: str, said: str) -> None:
+    settings = load(PATH)
+    robot = Robot(settings, build_layout(settings, CONFIG))
+    with pytest.raises(ConfigurationError) as caught:
+        robot.inject(parse(line))
+    assert str(caught.value).startswith(said)
 
 
 @pytest.mark.parametrize(

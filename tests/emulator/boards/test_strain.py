@@ -84,6 +84,12 @@ def test_too_much_load_is_clipped_and_flagged():
     assert frames.value[1, 2] == -0x8000
 
 
+def test_a_full_scale_beyond_what_an_answer_holds_is_answered_as_the_largest() -> None:
+    scale = (1e6, 70_000.0, 65_535.0, 40.0, 0.4, 1e-6)
+    _, reported = started(full_scale=scale)
+    assert reported.tolist() == [65_535, 65_535, 65_535, 40, 0, 0]
+
+
 def test_a_board_says_who_it_is() -> None:
     board = StrainBoard(3, lambda t_ns: LOAD, np.random.default_rng(1))
     for asked in (command_frame(Discover(), 15), command_frame(Discover(), 3)):

@@ -117,7 +117,22 @@ def test_a_wrong_course_is_refused_in_one_line(tmp_path: Path, text: str, wrong:
     ("scene", "wrong"),
     [
         (Scene(air=[Air(part="left_hand")]), "air[0]: wanted one of file and pressure_kpa"),
-        (Scene(air=[Air(part="foot", pressure_kpa=[(0, 1)])]), 'air[0].part: no part "foot"'),
+        (
+            Scene(air=[Air(part="foot", pressure_kpa=[(0, 1)])]),
+            'air[0].part: no part "foot"; there are: left_hand, left_forearm',
+        ),
+        (
+            Scene(air=[Air(part="left_hand", pressure_kpa=[(at_s, 1)]) for at_s in (0, 5)]),
+            'air[1].part: "left_hand" has air already; wanted one',
+        ),
+        (
+            Scene(air=[Air(part="left_hand", pressure_kpa=[(0, 1e6)])]),
+            "air[0].pressure_kpa: 1e+06; wanted up to 10000 kPa",
+        ),
+        (
+            Scene(air=[Air(part="left_hand", file="/nowhere/course.csv")]),
+            "air[0].file: /nowhere/course.csv: cannot be read: No such file or directory",
+        ),
         (Scene(air=[Air(part="left_hand", pressure_kpa=[(0, -1)])]), "air cannot pull"),
         (
             Scene(

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from emulator.probes.scene import Place, Probe, Scene, Script, check, load, tangents
+from skin_host.cli import main
 from skin_host.errors import ConfigurationError
 
 SCENES = Path(__file__).parents[3] / "config" / "scenes"
@@ -37,6 +38,20 @@ def test_the_scenes_that_come_with_the_project_are_right(path: Path) -> None:
             r"probe\[0\].at: has both",
         ),
         ("[temperature]\nkeyframes_c = []", "temperature.keyframes_c: is empty"),
+        *(
+            (
+                f"[[probe]]\npart = 'a'\nforce_n = [[0, 1]]\n{key} = {text}",
+                rf"probe\[0\].{key}.*: seen",
+            )
+            for key, text in (
+                ("diameter_mm", "1e-200"),
+                ("diameter_mm", "1e8"),
+                ("size_mm", "[1e-200, 3]"),
+                ("friction", "1e-9"),
+                ("friction", "1e8"),
+                ("compliance_mm_per_n", "1e8"),
+            )
+        ),
         (
             "[[probe]]\npart = 'a'\nforce_n = [[0, nan]]",
             r"force_n\[0\]\[1\]: seen nan, wanted a finite",
@@ -53,6 +68,28 @@ def test_a_wrong_scene_is_refused_with_its_file_and_key(
         load(path)
     assert str(error.value).startswith(f"{path}: ")
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "[[probe]]\npart = 'left_hand'\nforce_n = [[0, 1]]\nat = { taxel = 999 }",
+            "probe[0].at.taxel",
+        ),
+        ("[[air]]\npart = 'foot'\npressure_kpa = [[0, 1]]", "air[0].part"),
+        ("[[fault]]\nname = 'wrong_address'\nboard = 'hand'\ntriangle = 3", "fault[0].value"),
+    ],
+)
+def test_what_the_robot_does_not_have_is_refused_with_the_scenes_file(
+    tmp_path: Path, text: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "scene.toml"
+    path.write_text(text)
+    demo = SCENES.parent / "demo.toml"
+    assert main(["emulate", str(demo), "--scene", str(path), "--duration", "0.1"]) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith(f"skin emulate: {path}: {said}: ")
 
 
 def test_a_missing_scene_is_refused(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import random
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,11 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from emulator.probes.scene import Scene
 from skin_host.bus.strain import Wrench
 from skin_host.cli.common import load_skin
 from skin_host.demo import configuration
+from skin_host.evaluation.simulate.promises import Promises
 from skin_host.evaluation.simulate.run import RunResult, simulate, simulate_all
+from skin_host.evaluation.simulate.troubles import act, kinds_of
+from skin_host.evaluation.simulate.world import Life, World
 from skin_host.fingertip.events import FingertipEvent
+from skin_host.fingertip.frozen import Frozen
 from skin_host.fingertip.slip import Floats, Seen, SlipWatch
 from skin_host.fingertip.tip import Tip
 
@@ -72,7 +78,7 @@ def test_a_fingertip_that_does_not_feel_what_presses_it_breaks_a_promise(
         return step(tip, replace(wrench, force_n=offset[:3], torque_nm=offset[3:]))
 
     monkeypatch.setattr(Tip, "step", feel_nothing)
-    result = run(2, configuration("fingertips.toml"), until_s=11.0)
+    result = run(3, configuration("fingertips.toml"), until_s=11.0)
     assert result.broken is not None
     assert "not touched while it is pressed" in result.broken
     # What the end of the run does is not shown.
@@ -85,12 +91,12 @@ def test_a_fingertip_that_does_not_feel_what_slips_breaks_a_promise(
     step = SlipWatch.step
 
     def feel_no_slip(
-        watch: SlipWatch, load: Floats, normal: Floats | None, *, settled: bool
+        watch: SlipWatch, load: Floats, normal: Floats | None, t_ns: int, *, settled: bool
     ) -> Seen:
-        return step(watch, load, normal, settled=False)
+        return step(watch, load, normal, t_ns, settled=False)
 
     monkeypatch.setattr(SlipWatch, "step", feel_no_slip)
-    result = run(2, configuration("fingertips.toml"), until_s=11.0)
+    result = run(3, configuration("fingertips.toml"), until_s=11.0)
     assert result.broken == "index: does not slip, and what presses it slides"
 
 
@@ -98,9 +104,49 @@ def test_a_fingertip_that_slips_without_a_pull_breaks_a_promise(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(SlipWatch, "step", lambda *_, settled: Seen(1.0, cause="rate"))
-    result = run(2, configuration("fingertips.toml"), until_s=11.0)
+    result = run(3, configuration("fingertips.toml"), until_s=11.0)
     assert result.broken is not None
     assert "slips, and nothing pulls" in result.broken
+
+
+@pytest.mark.parametrize("is_found", [True, False])
+def test_a_fingertip_whose_board_latches_must_be_named(
+    is_found: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
+    if not is_found:
+        monkeypatch.setattr(Frozen, "repeated", [])
+    config = configuration("fingertips.toml")
+    world = World(*load_skin(config), config, 1, Scene(quiet=True))
+
+    async def live() -> str | None:
+        promises = Promises(world)
+        life = world.life = Life(world)
+        life.start(promises.watch)
+        promises.begin(act("start"))
+        await world.clock.sleep(16.0)
+        promises.begin(kinds_of(world.settings)["board_latched"](world, random.Random(1), True))
+        for _ in range(90):
+            await world.clock.sleep(0.05)
+            promises.sample()
+        life.kill()
+        named = "board_latched" in promises.accusations.named
+        assert named == is_found
+        return promises.broken
+
+    with world.clock.runner() as runner:
+        broken = runner.run(live())
+    assert (broken is None) == is_found
+    assert is_found or "health lacks fingertip_frozen" in str(broken)
+
+
+def test_what_robots_without_fingertips_draw_does_not_depend_on_troubles_of_fingertips() -> None:
+    def kinds(config: Path) -> list[str]:
+        return list(kinds_of(load_skin(config)[0]))
+
+    fingertips = kinds(configuration("fingertips.toml"))
+    assert kinds(DEMO) == kinds(SMALL) == fingertips[:-1]
+    assert fingertips[-1] == "board_latched"
 
 
 def test_the_same_seed_gives_the_same_events_in_another_process(tmp_path: Path) -> None:

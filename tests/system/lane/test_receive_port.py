@@ -117,6 +117,19 @@ def test_the_kernel_leaves_other_classes_out_if_asked(vcan, sender):
     port.close()
 
 
+def test_frames_of_can_fd_are_no_frames_of_boards_even_if_they_are_asked_for(vcan):
+    subprocess.run(["ip", "link", "set", vcan.name, "down"], check=True)
+    subprocess.run(["ip", "link", "set", vcan.name, "mtu", "72"], check=True)
+    vcan.up()
+    port = open_port("left", Bus(channel=vcan.name, options={"fd": True}), Receive())
+    with raw_socket(vcan) as sender:
+        sender.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
+        sender.send(struct.pack("=IB3x64s", 0x4E0, 8, bytes(64)))
+        sender.send(can_frame(0x4E1))
+        assert read_frames(port, 1).id.tolist() == [0x4E1]
+    port.close()
+
+
 def test_a_forced_overflow_is_counted_to_the_frame(sender, opened):
     port = opened(SMALL)
     for _ in range(5000):

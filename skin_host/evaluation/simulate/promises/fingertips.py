@@ -62,7 +62,9 @@ class FingertipCheck:
                 self._slipped.discard(name)
             if tips.slipped_mm(name) < SLID_MM:
                 self._held_ns[name] = now_ns
-            if calibrating and now_ns - self._loaded_ns[name] < NS:
+            # What is repeated may be of a load that has gone.
+            repeats = self._accusations.may_repeat(name)
+            if calibrating and (repeats or now_ns - self._loaded_ns[name] < NS):
                 self._accusations.loaded.add(name)
 
     def slips(self, name: str) -> str | None:
