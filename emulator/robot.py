@@ -47,9 +47,10 @@ POLL_NS = 2_000_000
 #: Boards do not stall with a computer: a process that was held up catches up. One that was stopped
 #: for longer than this first leaves out whole periods of its boards.
 LONGEST_CATCH_UP_NS = 5_000_000_000
-#: After a longer pause the host has found boards silent, on a bus that does not show it a pause.
+#: After a longer pause, in the host's time, it has found boards silent, on a bus that does not show
+#: it a pause.
 STALL_NS = 150_000_000
-#: Pauses are reported this often.
+#: Pauses are reported this often, in the host's time.
 REPORT_NS = 10_000_000_000
 #: Before time is left out, sweeps in progress get so long to end; a full bus is never idle.
 LONGEST_SWEEP_NS = 100_000_000
@@ -307,7 +308,8 @@ class Robot:
         links = {name: BoardLink(name, bus) for name, bus in buses.items()}
         # The clock also counts the time before this and what is left out.
         ahead_ns = clock.now_ns() - self.t_ns
-        looked_ns, reported_ns = clock.now_ns(), -REPORT_NS
+        looked_ns = clock.now_ns()
+        reported_ns: int | None = None
         while True:
             commands = [
                 (name, can_id, data)
@@ -315,14 +317,17 @@ class Robot:
                 for can_id, data in link.received()
             ]
             now_ns = clock.now_ns()
-            if now_ns - looked_ns > STALL_NS and now_ns - reported_ns > REPORT_NS:
+            late_ns = _host_between_ns(clock, looked_ns + POLL_NS, now_ns)
+            if late_ns > STALL_NS and (
+                reported_ns is None or _host_between_ns(clock, reported_ns, now_ns) > REPORT_NS
+            ):
                 reported_ns = now_ns
                 for name in [name for name, link in links.items() if not link.shows_pauses]:
                     log.warning(
                         "bus %s: this computer held the emulator up for %.0f ms; a host took the "
                         "boards for silent, and what followed for late",
                         name,
-                        (now_ns - looked_ns) / 1e6,
+                        _host_between_ns(clock, looked_ns, now_ns) / 1e6,
                     )
             looked_ns = now_ns
             if now_ns - ahead_ns - self.t_ns > LONGEST_CATCH_UP_NS:
@@ -549,3 +554,9 @@ class _StackSizes:
             if board.address == address:
                 return board.stack_size
         return None
+
+
+def _host_between_ns(clock: EmulatedTime, begin_ns: int, end_ns: int) -> int:
+    """Return the host's time between two emulated times: a host measures silence in its own."""
+    begin, end = clock.host_ns(np.array([begin_ns, end_ns])).tolist()
+    return int(end - begin)

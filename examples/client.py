@@ -1,18 +1,21 @@
-"""Touches of one part with the typed client. `python examples/client.py [URL]`."""
+"""Touches with the typed client. `python examples/client.py [URL]`."""
 
 import asyncio
 import sys
 
-from skin_host.client import SkinClient
-from skin_host.errors import SkinError
+from skin_host.client import SkinClient, SkinError
 
 
 async def main(url: str) -> None:
-    """Print every touch that begins, and how many events were missed before it."""
+    """Print every touch that begins, and what is not known of those that end."""
     async with SkinClient(url) as skin:
         async for touch in skin.touches():
+            if touch.missed:
+                print(touch.part, touch.missed, "events were lost")
             if touch.event == "begin":
-                print(touch.part, touch.centroid_m, f"{touch.force_n:.2f} N", touch.missed)
+                print(touch.part, touch.centroid_m, f"{touch.force_n:.2f} N")
+            elif touch.event == "end" and touch.reason != "released":
+                print(touch.part, "may still be touched:", touch.reason)
 
 
 try:

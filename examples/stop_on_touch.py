@@ -2,8 +2,7 @@
 
 import sys
 
-from skin_host.client import Contact, SkinCallbacks
-from skin_host.errors import SkinError
+from skin_host.client import Contact, SkinCallbacks, SkinError
 
 
 def on_contact(contact: Contact) -> None:

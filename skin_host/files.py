@@ -419,14 +419,11 @@ def _opened(end: Path | int) -> IO[bytes]:
 
 
 def _growing(path: Path) -> Path:
-    """Make an empty file that takes the name `path` when it is complete; return its name.
+    """Return the name of a file that takes the name `path` when it is complete.
 
-    No other program has it: of two that write the same file, the last one's is whole. And nobody
-    who may write to the folder, as everybody to /tmp, can have put a link there.
+    No other program has it: of two that write the same file, the last one's is whole.
     """
-    name = path.with_name(f".{path.stem}.growing-{secrets.token_hex(4)}{path.suffix}")
-    os.close(os.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
-    return name
+    return path.with_name(f".{path.stem}.growing-{secrets.token_hex(4)}{path.suffix}")
 
 
 def refuse_removed(path: Path) -> None:
@@ -469,7 +466,7 @@ class Draft:
         path: where to write; its suffix is that of `wanted`.
 
     Raises:
-        OSError: `wanted` is a folder, or no file can be made beside it.
+        OSError: `wanted` is a folder, or there can be none that it lies in.
     """
 
     def __init__(self, wanted: Path) -> None:
@@ -483,9 +480,18 @@ class Draft:
             else:
                 import tempfile  # which imports every way of compression
 
-                descriptor, name = tempfile.mkstemp(suffix=wanted.suffix)
-                os.close(descriptor)
-                self.path = Path(name)
+                self.path = _growing(Path(tempfile.gettempdir()) / wanted.name)
+
+    def begin(self) -> None:
+        """Make it, empty. A signal that ends the program may come right after.
+
+        Raises:
+            OSError: no file can be made there.
+        """
+        mode = 0o600 if self._file is None else 0o666
+        with _naming(self._wanted):
+            # Nobody who may write to the folder, as everybody to /tmp, can have put a link there.
+            os.close(os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode))
 
     def finish(self) -> None:
         """Let it replace the wanted file, or write it into what is there.
@@ -534,6 +540,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     with writing(path):
         draft = Draft(path)
         try:
+            draft.begin()
             yield draft.path
             draft.finish()
         finally:

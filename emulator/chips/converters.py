@@ -70,7 +70,7 @@ def fidelities(layout: Layout, fidelity: str | Mapping[str, str]) -> dict[int, s
 
 def slot_of(board: BoardLayout, triangle: int) -> int:
     """Return the slot of a triangle's chip on its board: ergoCub hands have a separate map."""
-    return ERGO_HAND_SLOTS[triangle] if board.settings.skin_type == 3 else triangle
+    return ERGO_HAND_SLOTS[triangle] if board.settings.effective_skin_type == 3 else triangle
 
 
 class Converters:

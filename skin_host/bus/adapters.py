@@ -28,7 +28,7 @@ from skin_host.bus.port import (
     Port,
     one_line,
 )
-from skin_host.bus.wire import FrameBatch
+from skin_host.bus.wire import MAX_EXTENDED_ID, FrameBatch
 from skin_host.clock import SYSTEM, Clock, Executor
 from skin_host.config.settings import Bus
 from skin_host.errors import BusError, ConfigurationError
@@ -73,12 +73,23 @@ def nanoseconds(seconds: float) -> int:
 
 
 def identifier(message: can.Message) -> int:
-    """Return a message's identifier with SocketCAN's flags."""
+    """Return a message's identifier with SocketCAN's flags.
+
+    An error frame has no format, whatever the adapter's library makes of that, and may have the
+    flag in its number already.
+
+    Raises:
+        ValueError: it is no identifier.
+    """
+    number = message.arbitration_id
+    if message.is_error_frame:
+        return number & MAX_EXTENDED_ID | ERROR_FLAG
+    if not 0 <= number <= MAX_EXTENDED_ID:
+        raise ValueError(f"an identifier of {hex(number)[:40]}")
     return (
-        message.arbitration_id
+        number
         | bool(message.is_extended_id) * EXTENDED_FLAG
         | bool(message.is_remote_frame) * REMOTE_FLAG
-        | bool(message.is_error_frame) * ERROR_FLAG
     )
 
 
@@ -313,6 +324,9 @@ def open_bus(name: str, settings: Bus) -> can.BusABC:
         known = ", ".join(sorted(can.VALID_INTERFACES))
         raise ConfigurationError(f"{where}: python-can has no such interface; it has {known}")
     try:
+        if settings.interface == MULTICAST:
+            # Without, `recv(0)` returns None for a frame of CAN FD, even if others wait.
+            options["fd"] = True
         if settings.interface == SOCKETCAND and {"host", "port"} <= options.keys():
             _await_greeting(settings.options)
         bus = can.Bus(

@@ -23,6 +23,7 @@ from skin_host.bus.wire import (
     HEAD_BYTES,
     HEADER_A,
     HEADER_B,
+    MAIS_TYPES,
     MAX_STANDARD_ID,
     NS_PER_S,
     TAXELS,
@@ -456,12 +457,21 @@ class Assembler:
                 return True
             else:
                 self._count_stranger(identifier)
-        elif dlc == 8 and message_class in _CLASSES.get(header, ()):
+        elif (
+            dlc == 8
+            and message_class in _CLASSES.get(header, ())
+            and not self._may_be_mais(identifier)
+        ):
             self._count_stranger(identifier)
         else:
-            # Other sensors use the legacy class too, with fewer bytes.
+            # Other sensors use the legacy class too, most with fewer bytes.
             counters.other += 1
         return False
+
+    def _may_be_mais(self, identifier: int) -> bool:
+        """Whether a frame may be of joints: no skin board is configured at its address."""
+        legacy = identifier >> 8 == MessageClass.ANALOG_STREAM and identifier & 0xF in MAIS_TYPES
+        return legacy and identifier >> 4 & 0xF not in self._states
 
     def _count_stranger(self, identifier: int) -> None:
         address = identifier >> 4 & 0xF

@@ -79,6 +79,23 @@ class BoardRecord:
         return self.board_type == BoardType.SKIN
 
     @property
+    def may_be_mtb3(self) -> bool:
+        """Whether it has not answered that it is none: a wrong model in the configuration would
+        silence it.
+        """
+        return self.board_type in {None, BoardType.SKIN}
+
+    @property
+    def is_wrong_model(self) -> bool:
+        """Whether it has answered that it is an MTB3, and is not configured as one, or the reverse:
+        the two compute different values.
+        """
+        return self.board_type in SKIN_BOARD_TYPES and not self._is_of_model(self.board_type)
+
+    def _is_of_model(self, board_type: int) -> bool:
+        return (board_type == BoardType.SKIN) == (self.layout.settings.model == "mtb3")
+
+    @property
     def was_reset(self) -> bool:
         """Whether it has started since its last set-up began: that is lost, or parts of it."""
         return self.booted_at_ns is not None and self.booted_at_ns > self.configured_from_ns
@@ -99,10 +116,12 @@ class BoardRecord:
         return self.in_bootloader or self.is_wrong_type
 
     def believes(self, answer: Discovered | DiscoveredBootloader) -> bool:
-        """Return whether an answer to a query counts. One that it cannot send skin values counts
-        when the next query is answered alike: one damaged byte makes such an answer.
+        """Return whether an answer to a query counts. One that it cannot send skin values, or is
+        of another model than configured, counts when the next query is answered alike: damaged
+        bytes make such an answer.
         """
-        if isinstance(answer, Discovered) and answer.board_type in SKIN_BOARD_TYPES:
+        kind = answer.board_type if isinstance(answer, Discovered) else None
+        if kind in SKIN_BOARD_TYPES and (kind == self.board_type or self._is_of_model(kind)):
             self.claim = None
             return True
         before, self.claim = self.claim, (answer, self.asked)
@@ -120,7 +139,7 @@ class BoardRecord:
     @property
     def gap_s(self) -> float:
         """Return the necessary pause between commands to it."""
-        if self.is_mtb3:
+        if self.may_be_mtb3:
             return MTB3_GAP_PERIODS * self.layout.settings.period_ms * 1e-3
         return GAP_S
 

@@ -47,7 +47,7 @@ from skin_host.bus.ledger import WRONG_PERIOD, BoardLedger
 from skin_host.bus.opening import open_port
 from skin_host.bus.wire import BROADCAST_ADDRESS, find_skin_frames
 from skin_host.clock import SYSTEM, Clock
-from skin_host.config.settings import Bus, Receive
+from skin_host.config.settings import Bus, Receive, format_triangles
 from skin_host.errors import BusError
 from skin_host.layout import BoardLayout, TriangleLayout
 from skin_host.tasks import cancel
@@ -246,8 +246,9 @@ class Boards:
         await self._clock.sleep(max(gap_s, NEW_OFFSET_S))
         record.configured_from_ns = began_ns
         # It answers before its first sweep. Nothing else shows that it was reset before its last
-        # commands came: it would send by its own settings. An MTB3 does not report its uptime.
-        questions: list[Message] = [] if record.is_mtb3 else [GetTimeOfLife()]
+        # commands came: it would send by its own settings. An MTB3 does not report its uptime, and
+        # would stop sending.
+        questions: list[Message] = [] if record.may_be_mtb3 else [GetTimeOfLife()]
         await self._port.send(self._asked(record, [SetTxMode(TxMode.START), *questions]))
         record.configurations += 1
         record.configured_ns = self._ledger.now_ns
@@ -523,6 +524,9 @@ class Boards:
             if record.is_wrong_type:
                 record.claimed_ns = self._ledger.now_ns
                 self._warn(record, f"is of type {answer.board_type}, which is no skin board")
+            elif record.is_wrong_model:
+                model = record.layout.settings.model
+                self._warn(record, f"is of type {answer.board_type}, and configured as {model}")
         elif isinstance(answer, DiscoveredBootloader):
             record.board_type = answer.board_type
             record.in_bootloader = True
@@ -562,7 +566,8 @@ async def scan(bus: Bus) -> list[FoundBoard]:
     """
     port = open_port("scan", bus, Receive())
     found: dict[int, FoundBoard] = {}
-    triangles: dict[int, set[int]] = {}
+    #: Of each board, which halves of which triangles came: a lone one may be no frame of skin.
+    halves: dict[int, set[tuple[int, int]]] = {}
     try:
         # Listen before asking: an MTB3 that streams stops sending when it is asked.
         for asked in (False, True):
@@ -572,10 +577,10 @@ async def scan(bus: Bus) -> list[FoundBoard]:
                 await asyncio.sleep(SCAN_S / 10)
                 batch = port.read()
                 skin = find_skin_frames(batch)
-                for board, triangle in zip(
-                    skin.board.tolist(), skin.triangle.tolist(), strict=True
+                for board, triangle, half in zip(
+                    skin.board.tolist(), skin.triangle.tolist(), skin.half.tolist(), strict=True
                 ):
-                    triangles.setdefault(board, set()).add(triangle)
+                    halves.setdefault(board, set()).add((triangle, half))
                 for row in range(len(batch)):
                     payload = batch.data[row, : int(batch.dlc[row])].tobytes()
                     parsed = parse_answer(int(batch.id[row]), payload)
@@ -596,9 +601,11 @@ async def scan(bus: Bus) -> list[FoundBoard]:
                         )
     finally:
         port.close()
-    for address, seen in triangles.items():
-        record = found.setdefault(address, FoundBoard(address, "unknown", None, False, []))
-        record.triangles = sorted(seen)
+    for address, seen in halves.items():
+        triangles = sorted(triangle for triangle, half in seen if half and (triangle, 0) in seen)
+        if triangles:
+            record = found.setdefault(address, FoundBoard(address, "unknown", None, False, []))
+            record.triangles = triangles
     return [found[address] for address in sorted(found)]
 
 
@@ -611,7 +618,7 @@ def scan_table(found: list[FoundBoard], channel: str) -> str:
     lines = ["address  type      firmware  streaming triangles"]
     for one in found:
         firmware = "bootloader" if one.in_bootloader else one.firmware or "-"
-        streaming = ", ".join(map(str, one.triangles)) or "-"
+        streaming = format_triangles(one.triangles) or "-"
         lines.append(f"{one.address:>7}  {one.board_type:<8}  {firmware:<8}  {streaming}")
     return "\n".join(lines)
 

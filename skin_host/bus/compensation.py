@@ -26,7 +26,10 @@ FIRST_HAND_TRIANGLE = 5
 
 
 def thermal_gains(skin_type: int, triangle: int) -> tuple[tuple[int, ...], int]:
-    """Return the gains x128 of a triangle's taxels, and the taxel that measures the temperature."""
+    """Return the gains x128 of a triangle's taxels, and the taxel that measures the temperature.
+
+    `skin_type` is the one that the board's firmware acts by, `Board.effective_skin_type`.
+    """
     if skin_type == 0:
         return GAIN, THERMAL_TAXEL
     if skin_type == 8 or (skin_type == 3 and triangle >= FIRST_HAND_TRIANGLE):

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, BinaryIO, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.bus.wire import MAX_EXTENDED_ID, FrameBatch, RecordBatch
+from skin_host.bus.wire import FrameBatch, RecordBatch
 from skin_host.errors import LogError
 
 if TYPE_CHECKING:
@@ -412,8 +412,6 @@ def _frame(message: "can.Message") -> tuple[str, Frame] | None:
     t_ns = nanoseconds(message.timestamp)
     if len(data) > 8:
         raise ValueError(f"a frame of {len(data)} bytes; wanted at most 8")
-    if not 0 <= message.arbitration_id <= MAX_EXTENDED_ID:
-        raise ValueError(f"an identifier of {hex(message.arbitration_id)[:40]}")
     if not 0 <= t_ns < 2**63:
         raise ValueError(f"a time of {message.timestamp:g} s")
     return channel, (identifier(message), data, t_ns)

@@ -253,9 +253,7 @@ class Port(ABC):
 
     def _note_errors(self, batch: FrameBatch) -> None:
         """Count a batch's error frames and derive the link's state from them."""
-        # In an extended identifier this bit belongs to the number.
-        kind = batch.id & np.uint32(EXTENDED_FLAG | ERROR_FLAG)
-        for row in np.flatnonzero(kind == ERROR_FLAG).tolist():
+        for row in np.flatnonzero(batch.id & np.uint32(ERROR_FLAG)).tolist():
             self.counters.error_frames += 1
             error, detail = int(batch.id[row]), int(batch.data[row, 1])
             if error & _ERROR_CONTROLLER:

@@ -18,10 +18,10 @@ Floats = NDArray[np.float64]
 
 ZERO_WORD = 0x8000
 CHANNELS = 6
-#: The sensor has timed out when nothing was received for this long.
-SILENT_NS = 100_000_000
-
-
+#: A board has timed out when nothing was received for this long, as the robots' own host has it,
+#: and for so many of its periods: one lost sample is no silence.
+LEAST_SILENT_NS = 100_000_000
+SILENT_NS_PER_MS = 2_500_000
 #: Time in which the two frames of a sample must arrive, per ms of period.
 PAIR_NS_PER_MS = 750_000
 
@@ -65,6 +65,11 @@ class FullScale(Analog):
     value: int
 
 
+def silent_ns(period_ms: int) -> int:
+    """Return after how long without a frame a board that sends every `period_ms` has timed out."""
+    return max(LEAST_SILENT_NS, SILENT_NS_PER_MS * period_ms)
+
+
 def scale_queries(board: int) -> list[tuple[int, bytes]]:
     """Return the frames that query all full scales of a board, twice: one answer may be damaged."""
     once = [command_frame(GetFullScale(channel), board) for channel in range(CHANNELS)]
@@ -97,7 +102,7 @@ class StrainFrames:
         board, type: intp[m], see `StrainType`.
         value: int32[m, 3], words minus 0x8000.
         saturated: bool[m].
-        wrong_length: frames of such an identifier with neither 6 nor 7 bytes.
+        wrong_length: intp[k], boards of the frames of such identifiers with neither 6 nor 7 bytes.
     """
 
     row: NDArray[np.intp]
@@ -105,7 +110,7 @@ class StrainFrames:
     type: NDArray[np.intp]
     value: NDArray[np.int32]
     saturated: NDArray[np.bool_]
-    wrong_length: int
+    wrong_length: NDArray[np.intp]
 
 
 def parse_strain(batch: FrameBatch) -> StrainFrames:
@@ -127,7 +132,7 @@ def parse_strain(batch: FrameBatch) -> StrainFrames:
         type=kind[row].astype(np.intp),
         value=words - ZERO_WORD,
         saturated=(batch.dlc[row] == 7) & (data[:, 6] != 0),
-        wrong_length=int(np.count_nonzero(mine & ~fits)),
+        wrong_length=(batch.id[mine & ~fits] >> 4 & 0xF).astype(np.intp),
     )
 
 
@@ -180,7 +185,7 @@ class WrenchAssembler:
 
     def take(self, frames: StrainFrames, t_ns_of: NDArray[np.int64]) -> list[Wrench]:
         """Take a batch's frames, and its times [n]; return the samples that they complete."""
-        self.counters.wrong_length += frames.wrong_length
+        self.counters.wrong_length += int(np.count_nonzero(frames.wrong_length == self.board))
         mine = (frames.board == self.board) & (frames.type >= LOADS)
         samples = []
         for i in np.flatnonzero(mine).tolist():

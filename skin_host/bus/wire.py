@@ -252,14 +252,18 @@ class SkinFrames:
 #: stream. A special firmware sends B frames with class 6.
 _HALVES_OF_CLASS = np.array([0, 0, 0, 3, 3, 0, 2, 0], np.uint8)
 _SMALLEST_DLC = np.array([8, 6], np.uint8)
+#: Types of class 3 with which a MAIS sends the positions of a hand's joints, eight bytes of which
+#: the first may have any value. Source: iCubCanProto_analogSensorMessages.h (HES0TO6, HES7TO14).
+MAIS_TYPES = frozenset({0xC, 0xD})
 
 
 def find_skin_frames(batch: FrameBatch) -> SkinFrames:
     """Return the frames of a batch that carry a triangle's values.
 
-    Class 4, and the legacy class 3 in its two-frame form. An analog stream of class 3
-    (force/torque: DLC 6 or 7; temperature: DLC 5) never has DLC 8, so it is not mistaken
-    for skin. A B frame of old firmware may lack its status bytes (DLC 6 or 7, class 4).
+    Class 4, and the legacy class 3 in its two-frame form. Other streams of class 3 have fewer
+    bytes (force/torque: DLC 6 or 7; temperature: DLC 5), but for `MAIS_TYPES`: a frame of these may
+    be of joints, and a triangle shows by sending both A and B. A B frame of old firmware may lack
+    its status bytes (DLC 6 or 7, class 4).
     """
     n = len(batch)
     message_class = (batch.id >> 8).astype(np.intp)

@@ -15,7 +15,7 @@ import re
 import select
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from skin_host import __version__, emulator_path
 from skin_host.cli import (
@@ -23,6 +23,7 @@ from skin_host.cli import (
     completion,
     files,
     operate,
+    options,
     recordings,
     stderr,
     watch,
@@ -30,6 +31,9 @@ from skin_host.cli import (
 )
 from skin_host.daemon import service
 from skin_host.errors import SkinError, nearest, visible
+
+if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
 
 #: Of more choices only the probable one is named.
 MANY = 8
@@ -55,21 +59,27 @@ class _Parser(argparse.ArgumentParser):
         print(f"{self.prog}: {visible(message)} (see `{self.prog} --help`)", file=sys.stderr)
         raise SystemExit(2)
 
+    def _print_message(self, message: str, file: "SupportsWrite[str] | None" = None) -> None:
+        """Let it be known that help cannot be written, which argparse ignores."""
+        print(message or "", end="", file=file or sys.stderr)
+
     def read(self, words: Sequence[str]) -> argparse.Namespace:
         """Parse a command line; what a command does not know is that command's mistake."""
         if words[:1] == ["help"]:
             words = [*words[1:], "--help"]
         arguments, unknown = self.parse_known_args(words)
         if unknown:
-            command = self._commands().choices[arguments.command]
+            command = self.command(arguments.command)
             command.error(f"unrecognized arguments: {' '.join(unknown)}")
         return arguments
 
-    def _commands(self) -> "argparse._SubParsersAction[_Parser]":
+    def command(self, name: str) -> "_Parser":
+        """Return the parser of one command."""
         (commands,) = (
             action for action in self._actions if isinstance(action, argparse._SubParsersAction)
         )
-        return commands
+        parser: _Parser = commands.choices[name]
+        return parser
 
 
 def _complain(line: str) -> None:
@@ -82,7 +92,7 @@ def _make_printable() -> None:
     """What is printed where nobody can read it goes nowhere, and never ends a command.
 
     A stream that was closed (`>&-`) gets its number again, before a file or socket takes it. A
-    character that the locale's encoding has not becomes a question mark.
+    character that the locale's encoding has not is spelt with others: see `stderr.SPELT`.
     """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         stream = getattr(sys, name)
@@ -90,7 +100,7 @@ def _make_printable() -> None:
             setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115
         elif mode == "w" and isinstance(stream, io.TextIOWrapper):
             with contextlib.suppress(OSError):  # a stream that changed under our feet
-                stream.reconfigure(errors="replace")
+                stream.reconfigure(errors=stderr.SPELT)
     stderr.replace()
 
 
@@ -102,6 +112,14 @@ def _reader_left() -> bool:
     except (OSError, ValueError):  # it is no file
         return False
     return bool(poll.poll(0))
+
+
+def _lose_output() -> None:
+    """Keep Python from reporting at exit that standard output cannot be written."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def build_parser() -> _Parser:
@@ -131,18 +149,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     emulator_path.provide()
     parser = build_parser()
     completion.complete_if_asked(parser)
-    arguments = parser.read(sys.argv[1:] if argv is None else list(argv))
-    name = f"skin {arguments.command}"
+    name = "skin"
     try:
+        try:
+            arguments = parser.read(sys.argv[1:] if argv is None else list(argv))
+        finally:
+            sys.stdout.flush()  # help
+        name = f"skin {arguments.command}"
+        options.check(parser.command(arguments.command), arguments)
         status: int = arguments.run(arguments)
         sys.stdout.flush()
     except SkinError as error:
         _complain(f"{name}: {error}")
         return error.exit_status
     except OSError as error:
-        if isinstance(error, BrokenPipeError) and _reader_left():
-            # It has read enough (`| head`). Keep Python from reporting that at exit.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        read_enough = isinstance(error, BrokenPipeError) and _reader_left()  # such as `| head`
+        _lose_output()
+        if read_enough:
             return 0
         where = f"{error.filename}: " if error.filename else ""
         _complain(f"{name}: {where}{error.strerror or error}")

@@ -18,10 +18,12 @@ from skin_host.cli.common import (
     load_skin,
     positive,
     print_json,
+    refuse_input,
     set_up_logging,
     warn,
     warn_of_virtual,
 )
+from skin_host.cli.options import add_rules
 from skin_host.config.relaxation import FITTED
 from skin_host.errors import RequestError, visible
 
@@ -66,6 +68,20 @@ def add_commands(commands: Commands) -> None:
         "--strict", action="store_true", help="exit status 1 if the skin was touched meanwhile"
     )
     _add_fits(calibrate)
+    add_rules(
+        calibrate,
+        needs={
+            "--load": ["--pressure", "--relaxation"],
+            "--levels": ["--pressure"],
+            "--weight-kpa": ["--relaxation"],
+            "--model": ["--relaxation"],
+        },
+        idle_with={
+            "--weight-kpa": ["--load"],
+            "--node": ["--relaxation"],
+            "--strict": ["--relaxation", "--pressure"],
+        },
+    )
     add_log_level(calibrate)
     calibrate.set_defaults(run=_calibrate)
 
@@ -122,6 +138,8 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     from skin_host.processing.calibration.outcome import outcome
 
     set_up_logging(arguments.verbose)
+    logs = arguments.relaxation, arguments.pressure
+    refuse_input(arguments.output, arguments.config, *logs, arguments.load)
     if arguments.relaxation is not None or arguments.pressure is not None:
         return _relaxation(arguments) if arguments.relaxation is not None else _pressure(arguments)
     settings, layout = load_skin(arguments.config)
@@ -134,7 +152,8 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     )
     if served is not None:
         raise RequestError(
-            f"a daemon publishes {served} at broker {settings.mqtt.host}: calibrating beside it "
+            f"a daemon publishes {served} at broker {settings.mqtt.host}:{settings.mqtt.port}: "
+            "calibrating beside it "
             "would zero its boards; ask it with `skin command calibrate`, or stop it"
         )
     progress = Progress("calibrating, keep the skin untouched")
@@ -209,8 +228,6 @@ def _relaxation(arguments: argparse.Namespace) -> int:
 
     settings, layout = load_skin(arguments.config)
     load = None if arguments.load is None else read_table(arguments.load)
-    if load is not None and arguments.weight_kpa is not None:
-        raise RequestError("--load and --weight-kpa exclude each other")
     model = arguments.model or settings.processing.relaxation.model
     if model == "none":
         raise RequestError('the configured model is "none"; choose one to fit with --model')

@@ -32,6 +32,7 @@ class _Help(argparse.ArgumentDefaultsHelpFormatter):
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
         has_one = action.default is not None and action.default is not False
+        has_one = has_one and action.default != []
         return super()._get_help_string(action) if has_one else action.help
 
 

@@ -16,7 +16,8 @@ from skin_host.cli.common import (
     refuse_input,
     warn,
 )
-from skin_host.cli.recordings import add_calibration, add_onto, play
+from skin_host.cli.options import add_rules
+from skin_host.cli.recordings import PROCESSED, add_calibration, add_onto, play
 from skin_host.errors import RequestError, SkinError
 
 
@@ -36,6 +37,7 @@ def add_commands(commands: Commands) -> None:
         metavar="FILE",
         help="check only whether the daemon that wrote FILE could take it without a restart",
     )
+    add_rules(check, idle_with={"--json": ["--running"]})
     check.set_defaults(run=_check)
 
     replay = add_command(
@@ -63,6 +65,21 @@ def add_commands(commands: Commands) -> None:
     )
     add_calibration(replay)
     add_onto(replay)
+    add_rules(
+        replay,
+        needs={
+            "--onto can": ["--config"],
+            "--speed": ["--onto"],
+            "--broker": ["--onto broker"],
+            "--robot": ["--onto broker"],
+            **PROCESSED,
+        },
+        idle_with={
+            "--output": ["--onto"],
+            "--scheduler": ["--onto"],
+            **{option: ["--onto can"] for option in PROCESSED},
+        },
+    )
     replay.set_defaults(run=_replay)
 
     importing = add_command(
@@ -81,6 +98,7 @@ def add_commands(commands: Commands) -> None:
     importing.add_argument("--output", required=True, type=Path, help="configuration to write")
     importing.add_argument("--config", type=Path, help="configuration to add to")
     importing.add_argument("--part", help="the part that a positions file describes")
+    add_rules(importing, needs={"--part": ["positions"]})
     importing.set_defaults(run=_import)
 
 
@@ -182,6 +200,8 @@ def _import(arguments: argparse.Namespace) -> int:
     from skin_host.importing import import_files
     from skin_host.importing.report import Findings
 
+    # The configuration to add to may be the one to write.
+    refuse_input(arguments.output, *arguments.files)
     findings = Findings()
     try:
         written = import_files(

@@ -1,15 +1,16 @@
 """Commands that work on the real skin: run, scan, command."""
 
 import argparse
+import contextlib
 import gc
 import json
 import logging
 import math
 import re
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_origin, get_type_hints
 
 import msgspec
 
@@ -29,11 +30,20 @@ from skin_host.cli.common import (
     warn,
     warn_of_virtual,
 )
+from skin_host.cli.options import add_rules
 from skin_host.daemon import service
-from skin_host.errors import OtherSkinError, RequestError, SkinError, visible
+from skin_host.errors import (
+    BrokerError,
+    OtherSkinError,
+    RequestError,
+    SkinError,
+    nearest,
+    visible,
+)
 from skin_host.files import write_document
 
 if TYPE_CHECKING:
+    from skin_host.client import SkinClient
     from skin_host.config.settings import Settings
     from skin_host.daemon.daemon import Daemon
 
@@ -44,6 +54,10 @@ log = logging.getLogger(__name__)
 RUNNING = "configuration.json"
 #: An answer to a command is waited for so long.
 PATIENCE_S = 25.0
+#: What nodes retain at the broker, their names among it, comes within this time.
+NAMED_S = 2.0
+#: Of more names only the first are listed.
+MOST_NAMED = 20
 
 
 def add_commands(commands: Commands) -> None:
@@ -100,6 +114,21 @@ def add_commands(commands: Commands) -> None:
     command.add_argument("--json", action="store_true", help="one JSON document")
     command.add_argument(
         "--strict", action="store_true", help="calibrate: exit status 1 if the skin was touched"
+    )
+    add_rules(
+        command,
+        needs={
+            "disable": ["--part"],
+            "enable": ["--part"],
+            "--part": ["calibrate", "disable", "enable"],
+            "--board": ["calibrate", "configure"],
+            "--seconds": ["calibrate", "raw", "record"],
+            "--file": ["record"],
+            "--set": ["thresholds"],
+            "--reset": ["thresholds"],
+            "--strict": ["calibrate"],
+        },
+        idle_with={"--board": ["--part"]},
     )
     command.set_defaults(run=_command)
 
@@ -273,12 +302,11 @@ def _scan(arguments: argparse.Namespace) -> int:
 def _command(arguments: argparse.Namespace) -> int:
     import asyncio
 
-    from skin_host.cli.watch import status_table
+    from skin_host.cli import watch
     from skin_host.client import SkinClient
+    from skin_host.mqtt.commands import LEFT_OUT
     from skin_host.mqtt.messages import check_health
 
-    if arguments.strict and arguments.name != "calibrate":
-        raise RequestError(f"--strict belongs to calibrate; {arguments.name} has no such option")
     request: dict[str, Any] = {
         key: getattr(arguments, key)
         for key in ("part", "board", "seconds", "file")
@@ -286,28 +314,38 @@ def _command(arguments: argparse.Namespace) -> int:
     }
     changes = dict(_pair(text) for text in arguments.set)
     if changes:
+        _check_thresholds(changes)
         request["set"] = changes
     if arguments.reset:
         request["reset"] = True
 
     async def work() -> dict[str, Any]:
-        async with SkinClient(arguments.broker, robot=arguments.robot) as skin:
+        patience = watch.PATIENCE_S
+        async with SkinClient(arguments.broker, robot=arguments.robot, patience_s=patience) as skin:
+            await _check_names(skin, arguments)
             return await skin.command(
                 arguments.name, node=arguments.node, timeout_s=patience_s(arguments), **request
             )
 
     answer = asyncio.run(work())
+    left_out = answer.get(LEFT_OUT)
+    if not isinstance(left_out, list):  # a part may have this name
+        left_out = []
+    shown = {key: value for key, value in answer.items() if not (left_out and key == LEFT_OUT)}
     status = 0
     if arguments.name == "calibrate":
-        status = _show_calibration(answer, arguments)
+        status = _show_calibration(shown, answer, left_out, arguments)
     elif arguments.json:
         print_json(answer)
     elif arguments.name == "status":
-        for record in answer.values():
+        for record in shown.values():
             check_health(record)
-        print(status_table(answer))
+        print(watch.status_table(shown))
     else:
-        print("\n".join(_lines(answer)))
+        print("\n".join(_lines(shown)))
+    if left_out:
+        names = ", ".join(map(str, left_out))
+        warn(f"done, but the answer came without {names}: more than the broker takes in one packet")
     if answer.get("kept") is False:
         warn(
             "done, but it could not be written and is lost when the daemon restarts; `skin status` "
@@ -315,6 +353,69 @@ def _command(arguments: argparse.Namespace) -> int:
         )
         return 1
     return status
+
+
+def _check_thresholds(changes: dict[str, float]) -> None:
+    """Refuse changes that no daemon takes.
+
+    Raises:
+        RequestError: there is no such threshold, or not of this value.
+    """
+    from skin_host.config.explain import explain
+    from skin_host.daemon.state import Thresholds
+
+    try:
+        msgspec.convert(changes, Thresholds)
+    except msgspec.ValidationError as error:
+        raise RequestError(f"--set: {explain(changes, error, Thresholds, {})}") from None
+
+
+async def _check_names(skin: "SkinClient", arguments: argparse.Namespace) -> None:
+    """Refuse names that the robot's nodes do not have, as far as they have described themselves.
+
+    Raises:
+        BrokerError: no node is known.
+        RequestError: there is no such node, part or board; the message names those that there are.
+    """
+    import asyncio
+
+    node, where = arguments.node, f'robot "{skin.robot}"'
+    if node is not None:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(NAMED_S):
+                while node not in skin.nodes:  # noqa: ASYNC110
+                    await asyncio.sleep(0.02)
+        if not skin.nodes:
+            raise BrokerError(
+                f"broker {skin.where}: no node of {where} is known; is `skin run` running?"
+            )
+        _check_name("node", node, skin.nodes, where)
+        where = f'node "{node}"'
+    if arguments.part is None and arguments.board is None:
+        return
+    with contextlib.suppress(BrokerError):  # then the node itself refuses them
+        nodes = await skin.info(NAMED_S)
+        parts = {
+            name: part
+            for key, info in nodes.items()
+            if node in (None, key)
+            for name, part in info.parts.items()
+        }
+        boards = {triangle.board for part in parts.values() for triangle in part.triangles}
+        if parts:
+            _check_name("part", arguments.part, parts, where)
+            _check_name("board", arguments.board, boards, where)
+
+
+def _check_name(kind: str, name: str | None, known: Iterable[str], where: str) -> None:
+    names = sorted(known)
+    if name is None or name in names:
+        return
+    near = nearest(name, names)
+    there = ", ".join(visible(one, 64) for one in names[:MOST_NAMED]) or "none"
+    more = ", ..." if len(names) > MOST_NAMED else ""
+    meant = f"; meant {visible(near, 64)}?" if near else ""
+    raise RequestError(f'no {kind} "{name}" of {where}; there are: {there}{more}{meant}')
 
 
 def patience_s(arguments: argparse.Namespace) -> float:
@@ -326,19 +427,37 @@ def patience_s(arguments: argparse.Namespace) -> float:
     return 2 * PATIENCE_S + 4 * (arguments.seconds or 60.0)
 
 
-def _show_calibration(answer: dict[str, Any], arguments: argparse.Namespace) -> int:
-    """Print what a calibration found, as `skin calibrate` does; return the exit status."""
+def _show_calibration(
+    known: dict[str, Any],
+    document: dict[str, Any],
+    left_out: list[Any],
+    arguments: argparse.Namespace,
+) -> int:
+    """Print what a calibration found, as `skin calibrate` does; return the exit status.
+
+    Args:
+        known: what came of the answer.
+        document: the whole answer, for `--json`.
+        left_out: the keys that did not come.
+        arguments: `json` and `strict`.
+    """
     from skin_host.cli.calibrate import show
     from skin_host.processing.calibration.outcome import Outcome
 
+    absent = {
+        key: (get_origin(kind) or kind)()
+        for key, kind in get_type_hints(Outcome).items()
+        if key in left_out
+    }
     try:
-        found = msgspec.convert(answer, Outcome)
+        found = msgspec.convert(absent | known, Outcome)
     except msgspec.ValidationError as error:
         raise SkinError(
             f"calibrated, but the answer is not understood: {error}; is the daemon of another "
             "version?"
         ) from None
-    return show(found, answer, "is in use", arguments)
+    unsure = arguments.strict and not absent.keys().isdisjoint({"touched", "fingertips"})
+    return max(show(found, document, "is in use", arguments), int(unsure))
 
 
 def _lines(answer: dict[str, Any]) -> Iterator[str]:

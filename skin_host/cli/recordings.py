@@ -22,6 +22,7 @@ from skin_host.cli.common import (
     run,
     warn,
 )
+from skin_host.cli.options import add_rules
 from skin_host.errors import RequestError
 
 if TYPE_CHECKING:
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
     from skin_host.recording.export import Series
 
 LOCAL = "mqtt://localhost"
+#: Messages are as they were published; only CAN frames are processed, and calibrated before.
+PROCESSED = {"--calibration": ["--config"], "--calibrate-seconds": ["--config"]}
 
 
 def add_commands(commands: Commands) -> None:
@@ -52,6 +55,7 @@ def add_commands(commands: Commands) -> None:
     record.add_argument("--config", type=Path, help="record the CAN frames of its buses")
     record.add_argument("--seconds", type=positive, metavar="S", help="end after so long")
     record.add_argument("--json", action="store_true", help="one JSON document at the end")
+    add_rules(record, needs={"--robot": ["--broker", "no --config"]})
     record.set_defaults(run=_record)
 
     export = add_command(
@@ -68,6 +72,7 @@ def add_commands(commands: Commands) -> None:
         help="file .npz, .parquet, .mcap or .rrd; or a folder",
     )
     export.add_argument("--lerobot", action="store_true", help="the folder is a LeRobot data set")
+    add_rules(export, needs=PROCESSED)
     export.set_defaults(run=_export)
 
     plot = add_command(
@@ -80,8 +85,24 @@ def add_commands(commands: Commands) -> None:
     _add_recording(plot, "recording, or calibration")
     plot.add_argument("output", metavar="OUTPUT", type=Path, help="file .png, .svg or .pdf")
     plot.add_argument("--part", help="which part, if there are several")
-    plot.add_argument("--taxels", type=_numbers, metavar="N,N", help="of the part; the strongest")
-    plot.add_argument("--at", type=finite, metavar="S", help="instant of the map; the strongest")
+    plot.add_argument(
+        "--taxels",
+        type=_numbers,
+        metavar="N,N",
+        help="pressure: these taxels of the part; without it those of the highest peaks",
+    )
+    plot.add_argument(
+        "--at",
+        type=finite,
+        metavar="S",
+        help="map: so long after the part's first frame; without it when the sum of the pressures "
+        "of its taxels was highest",
+    )
+    add_rules(
+        plot,
+        needs={"--taxels": ["pressure"], "--at": ["map"], **PROCESSED},
+        idle_with={option: ["calibration"] for option in ["--part", *PROCESSED]},
+    )
     plot.set_defaults(run=_plot)
 
     dbc = add_command(
@@ -95,6 +116,7 @@ def add_commands(commands: Commands) -> None:
     )
     dbc.add_argument("--bus", help="which bus of CONFIG")
     dbc.add_argument("--output", type=Path, help="file to write; else standard output")
+    add_rules(dbc, needs={"--bus": ["CONFIG"]})
     dbc.set_defaults(run=_dbc)
 
     urdf = add_command(
@@ -113,10 +135,12 @@ def add_onto(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--onto", choices=("can", "broker"), help="play it on CONFIG's buses, or to a broker"
     )
-    parser.add_argument("--speed", type=positive, default=1.0, help="2 is twice as fast")
+    parser.add_argument(
+        "--speed", type=positive, default=1.0, help="for --onto: 2 is twice as fast"
+    )
     parser.add_argument("--broker", default=LOCAL, metavar="URL", help="for --onto broker")
     parser.add_argument(
-        "--robot", help="play it under this name, not the recorded or configured one"
+        "--robot", help="for --onto broker: play it under this name, not the recorded or configured"
     )
 
 
@@ -131,8 +155,6 @@ def play(arguments: argparse.Namespace) -> int:
     from skin_host.recording import MCAP_SUFFIX
 
     if arguments.onto == "can":
-        if arguments.config is None:
-            raise RequestError("--onto can needs --config, which gives the buses")
         return asyncio.run(_play_on_buses(arguments))
     if arguments.config is None and arguments.log.suffix != MCAP_SUFFIX:
         raise RequestError(f"{arguments.log}: CAN frames need --config to be processed")

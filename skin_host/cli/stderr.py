@@ -7,6 +7,7 @@ counted and lost.
 """
 
 import atexit
+import codecs
 import contextlib
 import io
 import logging
@@ -14,12 +15,16 @@ import os
 import select
 import sys
 import threading
+import unicodedata
 from collections import deque
 from dataclasses import dataclass
 from typing import Any
 
 from skin_host.daemon import service
 
+#: How streams encode (`errors=`) a character that their encoding has not: with the characters that
+#: stand for it, such as 2 for a raised one, or a question mark.
+SPELT = "skin-spelt"
 #: So much waits for the reader: some thousand lines.
 LIMIT_BYTES = 1 << 20
 #: The end of the process waits so long for the reader.
@@ -139,6 +144,16 @@ def _note(lost: int) -> bytes:
     return (text + "\n").encode()
 
 
+def _spell(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    spelt = unicodedata.normalize("NFKC", error.object[error.start : error.end])
+    return spelt.encode(error.encoding, "replace").decode(error.encoding), error.end
+
+
+codecs.register_error(SPELT, _spell)
+
+
 def replace() -> None:
     """Make `sys.stderr` a stream over `StandardError`, unless it is another program's."""
     own = sys.__stderr__
@@ -146,7 +161,7 @@ def replace() -> None:
         return
     raw = StandardError(own.fileno())
     sys.stderr = io.TextIOWrapper(
-        io.BufferedWriter(raw), encoding=own.encoding, errors="replace", line_buffering=True
+        io.BufferedWriter(raw), encoding=own.encoding, errors=SPELT, line_buffering=True
     )
     atexit.register(raw.finish)
 

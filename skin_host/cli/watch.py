@@ -21,6 +21,7 @@ from skin_host.cli.common import (
     visible_json,
     warn,
 )
+from skin_host.cli.options import add_rules
 from skin_host.errors import visible
 
 if TYPE_CHECKING:
@@ -88,6 +89,8 @@ def add_commands(commands: Commands) -> None:
         metavar="FOLDER",
         help="for what is recorded from the page (recordings)",
     )
+    others = ["--foxglove", "--rerun"]
+    add_rules(view, idle_with={"--name": others, "--read-only": others, "--recordings": others})
     add_log_level(view)
     view.set_defaults(run=_view)
 

@@ -28,6 +28,7 @@ from skin_host.cli.common import (
     warn_of_virtual,
     whole,
 )
+from skin_host.cli.options import add_rules
 from skin_host.daemon import service
 from skin_host.errors import ConfigurationError, RequestError, visible
 
@@ -83,7 +84,7 @@ def add_commands(commands: Commands) -> None:
     emulate.add_argument("--speed", type=positive, default=1.0, help="times real time")
     emulate.add_argument("--interface", help="replaces that of every bus in CONFIG")
     emulate.add_argument("--channel", help="replaces that of the only bus in CONFIG")
-    emulate.add_argument("--board", metavar="NAME", help="only this board; see the next two")
+    emulate.add_argument("--board", metavar="NAME", help="the board of --i2c or --i2c-dev")
     emulate.add_argument(
         "--i2c",
         metavar="DEVICES",
@@ -94,6 +95,20 @@ def add_commands(commands: Commands) -> None:
         type=whole(0, 255),
         metavar="N",
         help="show the I2C lines of --board as /dev/i2c-N, N+1, ... (CUSE, root)",
+    )
+    real = ["--i2c"]
+    add_rules(
+        emulate,
+        needs={"--board": ["--i2c", "--i2c-dev"], "--i2c": ["--board"], "--i2c-dev": ["--board"]},
+        idle_with={
+            "--scene": real,
+            "--mujoco": real,
+            "--fidelity": real,
+            "--seed": real,
+            "--state": [*real, "--mujoco"],
+            "--speed": real,
+            "--i2c-dev": real,
+        },
     )
     add_log_level(emulate)
     emulate.set_defaults(run=_emulate)
@@ -127,6 +142,7 @@ def _add_measurements(commands: Commands) -> None:
     bench.add_argument("--robots", type=count, metavar="N", help="of bench fleet; 1000 otherwise")
     bench.add_argument("--full", action="store_true", help="bench fleet: 7 messages/s a robot")
     bench.add_argument("--json", action="store_true", help="one JSON document")
+    add_rules(bench, needs={"--robots": ["fleet"], "--full": ["fleet"]})
     bench.set_defaults(run=_bench)
 
     report = add_command(
@@ -148,6 +164,7 @@ def _add_measurements(commands: Commands) -> None:
     report.add_argument("--quick", action="store_true", help="within a minute")
     report.add_argument("--output", type=Path, metavar="DIR", help="folder for page and plots")
     report.add_argument("--json", action="store_true", help="one JSON document")
+    add_rules(report, idle_with={"--recordings": ["--contacts", "--rig"]})
     report.set_defaults(run=_report)
 
     simulate = add_command(
@@ -183,6 +200,7 @@ def _add_measurements(commands: Commands) -> None:
         help="end the run at this simulated time, with the daemon's log on stderr",
     )
     simulate.add_argument("--json", action="store_true", help="one JSON document")
+    add_rules(simulate, idle_with={"--until": ["--seeds"]})
     simulate.set_defaults(run=_simulate)
 
 
@@ -214,11 +232,6 @@ def _emulate(arguments: argparse.Namespace) -> int:
     if arguments.board is not None and arguments.board not in settings.boards:
         known = ", ".join(settings.boards)
         raise RequestError(f'--board: no board "{arguments.board}"; there are: {known}')
-    if (arguments.i2c or arguments.i2c_dev is not None) and arguments.board is None:
-        raise RequestError("--i2c and --i2c-dev need --board NAME")
-    if arguments.mujoco is not None and (arguments.i2c or arguments.state is not None):
-        option = "--i2c" if arguments.i2c else "--state"
-        raise RequestError(f"--mujoco and {option}: wanted one of them")
     for name, bus in settings.buses.items():
         chosen = {
             "interface": arguments.interface or bus.interface,
@@ -279,6 +292,9 @@ def _on_emulated_chips(
         fidelity = dict.fromkeys(settings.boards, arguments.fidelity) | {arguments.board: "chip"}
     if arguments.state is not None and arguments.state.exists():
         robot = Robot.read(arguments.state, settings, layout)
+        log.info(
+            "%s: continues with the scene, seed and fidelity with which it began", arguments.state
+        )
     else:
         try:
             robot = Robot(
@@ -392,12 +408,8 @@ def _bench(arguments: argparse.Namespace) -> int:
     module = import_module(f"skin_host.evaluation.bench_{arguments.name}")
     more: dict[str, int] = {}
     if arguments.robots is not None:
-        if arguments.name != "fleet":
-            raise RequestError("--robots is of bench fleet")
         more["robots"] = arguments.robots
     if arguments.full:
-        if arguments.name != "fleet":
-            raise RequestError("--full is of bench fleet")
         more["full"] = True
     document = module.run(quick=arguments.quick, **more)
     if arguments.json:
@@ -410,8 +422,6 @@ def _bench(arguments: argparse.Namespace) -> int:
 def _report(arguments: argparse.Namespace) -> int:
     from skin_host.evaluation.steps import show_step
 
-    if arguments.recordings is not None and (arguments.contacts or arguments.rig):
-        raise RequestError("--recordings goes with --real, or with the whole report")
     kinds = {"papers.contacts_report": arguments.contacts, "rig_report": arguments.rig}
     kinds |= {"real": arguments.real, "report": True}
     name = next(name for name, chosen in kinds.items() if chosen)
@@ -438,8 +448,6 @@ def _simulate(arguments: argparse.Namespace) -> int:
     from skin_host.evaluation.simulate import outcome
     from skin_host.evaluation.simulate.run import simulate, simulate_all
 
-    if arguments.until is not None and arguments.seeds != 1:
-        raise RequestError("--until goes with one seed")
     config: Path = arguments.config or configuration("demo.toml")
     settings, layout = load_skin(config)
     if arguments.until is not None:

@@ -5,7 +5,8 @@
             print(touch.event, touch.id, touch.peak_kpa, "kPa")
 
 The client reconnects by itself. The field `missed` of the next touch or frame reports what was
-lost meanwhile. `SkinCallbacks` is the same without asyncio.
+lost meanwhile. `SkinCallbacks` is the same without asyncio. All that they raise on purpose is a
+`SkinError`: a `BrokerError`, a `RequestError` for what was asked wrongly, or a `CommandError`.
 """
 
 from skin_host.client.callbacks import SkinCallbacks
@@ -13,6 +14,7 @@ from skin_host.client.heard import Health
 from skin_host.client.presence import Contact
 from skin_host.client.session import CommandError, Node, SkinClient
 from skin_host.client.streams import Stream
+from skin_host.errors import BrokerError, RequestError, SkinError
 from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.info import NodeInfo, PartInfo
@@ -21,6 +23,7 @@ from skin_host.processing.events import Touch
 
 __all__ = [
     "Broker",
+    "BrokerError",
     "CommandError",
     "Contact",
     "Frame",
@@ -29,8 +32,10 @@ __all__ = [
     "NodeInfo",
     "Over",
     "PartInfo",
+    "RequestError",
     "SkinCallbacks",
     "SkinClient",
+    "SkinError",
     "Slip",
     "Stream",
     "Touch",

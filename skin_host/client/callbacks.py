@@ -36,6 +36,8 @@ class SkinCallbacks:
     that waits: `ready`, `info`, `command` and `on_...` raise a RequestError there.
 
     Raises (on entering): see `SkinClient`.
+    Raises (in use):
+        RequestError: outside of the `with` block nothing is received.
     Raises (on leaving):
         RequestError: the robot has no part of the name that an `on_...` was given. That is logged
             when it is known.
@@ -71,23 +73,23 @@ class SkinCallbacks:
 
     def on_touch(self, call: Callable[[Touch], object], part: str | None = None) -> None:
         """Call with each touch event of a part, or of all."""
-        self._on(lambda: self._skin.touches(part), call)
+        self._on(lambda skin: skin.touches(part), call)
 
     def on_slip(self, call: Callable[[Slip], object], part: str | None = None) -> None:
         """Call when a fingertip, or any, begins or ends to slip."""
-        self._on(lambda: self._skin.slips(part), call)
+        self._on(lambda skin: skin.slips(part), call)
 
     def on_over(self, call: Callable[[Over], object], part: str | None = None) -> None:
         """Call when a fingertip, or any, begins or ends to press too hard."""
-        self._on(lambda: self._skin.overs(part), call)
+        self._on(lambda skin: skin.overs(part), call)
 
     def on_frame(self, call: Callable[[Frame], object], part: str | None = None) -> None:
         """Call with each frame of a part, or of all."""
-        self._on(lambda: self._skin.frames(part), call)
+        self._on(lambda skin: skin.frames(part), call)
 
     def on_contact(self, call: Callable[[Contact], object], part: str | None = None) -> None:
         """Call when a part's contact state changes; first with the present state."""
-        self._on(lambda: self._skin.contacts(part), call)
+        self._on(lambda skin: skin.contacts(part), call)
 
     def on_unknown(self, call: Callable[[Contact], object], part: str | None = None) -> None:
         """Call when a part's contact state becomes unknown; see `Contact.why`."""
@@ -96,35 +98,38 @@ class SkinCallbacks:
             if not contact.known:
                 call(contact)
 
-        self._on(lambda: self._skin.contacts(part), call_unknown)
+        self._on(lambda skin: skin.contacts(part), call_unknown)
 
     def present(self, part: str | None = None) -> list[Touch]:
         if threading.current_thread() is self._thread:
             return self._skin.present(part)
 
-        async def found() -> list[Touch]:
-            return self._skin.present(part)
+        async def found(skin: SkinClient) -> list[Touch]:
+            return skin.present(part)
 
-        return self._wait_for(found())
+        return self._wait_for(found)
 
     def on_health(self, call: Callable[[Health], object], part: str | None = None) -> None:
         """Call with each record of a part's health, or of all parts' health."""
-        self._on(lambda: self._skin.health(part), call)
+        self._on(lambda skin: skin.health(part), call)
 
     def ready(self) -> None:
         """Wait until what follows reaches the functions: the broker knows what they ask for."""
-        self._wait_for(self._skin.ready())
+        self._wait_for(SkinClient.ready)
 
     def info(self, timeout_s: float = 5.0) -> dict[str, NodeInfo]:
-        return self._wait_for(self._skin.info(timeout_s))
+        return self._wait_for(lambda skin: skin.info(timeout_s))
 
     def command(
         self, name: str, *, node: str | None = None, timeout_s: float = 10.0, **arguments: Any
     ) -> dict[str, Any]:
-        asked = self._skin.command(name, node=node, timeout_s=timeout_s, **arguments)
-        return self._wait_for(asked)
+        return self._wait_for(
+            lambda skin: skin.command(name, node=node, timeout_s=timeout_s, **arguments)
+        )
 
     def __enter__(self) -> Self:
+        if self._thread.ident is not None:
+            raise RequestError("these callbacks were entered before: make other ones")
         self._thread.start()
         self._skin, self._loop = self._ready.result()
         return self
@@ -145,12 +150,14 @@ class SkinCallbacks:
                 raise
             self._ready.set_exception(error)
 
-    def _on(self, open_stream: Callable[[], Stream[T]], call: Callable[[T], object]) -> None:
-        async def begin() -> None:
+    def _on(
+        self, open_stream: Callable[[SkinClient], Stream[T]], call: Callable[[T], object]
+    ) -> None:
+        async def begin(skin: SkinClient) -> None:
             # The stream is opened here, in its own thread, before `on_...` returns.
-            self._calls.add(asyncio.create_task(self._call_with_each(open_stream(), call)))
+            self._calls.add(asyncio.create_task(self._call_with_each(open_stream(skin), call)))
 
-        self._wait_for(begin())
+        self._wait_for(begin)
 
     async def _call_with_each(self, stream: Stream[T], call: Callable[[T], object]) -> None:
         while True:
@@ -168,8 +175,13 @@ class SkinCallbacks:
             except BaseException:  # SystemExit would end the thread, and what the others receive
                 _log.exception("a callback failed")
 
-    def _wait_for(self, work: Coroutine[Any, Any, T]) -> T:
+    def _wait_for(self, work: Callable[[SkinClient], Coroutine[Any, Any, T]]) -> T:
         if threading.current_thread() is self._thread:
-            work.close()
             raise RequestError("a callback cannot wait for messages; ask in another thread")
-        return asyncio.run_coroutine_threadsafe(work, self._loop).result()
+        if not self._thread.is_alive():
+            raise RequestError(
+                "these callbacks were not entered: use them in their `with` block"
+                if self._thread.ident is None
+                else "these callbacks have ended: nothing is received any more"
+            )
+        return asyncio.run_coroutine_threadsafe(work(self._skin), self._loop).result()

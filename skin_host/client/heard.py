@@ -1,18 +1,10 @@
 """Received messages of a part as objects: decodes the payloads of its topics."""
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 from skin_host.client.presence import Contact
 from skin_host.fingertip.events import Over, Slip
-from skin_host.mqtt.messages import (
-    Frame,
-    decode_contact,
-    decode_health,
-    decode_over,
-    decode_slip,
-    decode_touch,
-)
+from skin_host.mqtt.messages import EVENT_DECODERS, Frame, decode_contact, decode_health
 from skin_host.mqtt.order import Stamp
 from skin_host.mqtt.payload import MessageError
 from skin_host.mqtt.topics import ONLINE, PartTopic
@@ -58,13 +50,6 @@ def is_online(payload: bytes, stamp: Stamp | None, *, is_only_broker: bool) -> b
     return None if not payload or (is_will and not is_only_broker) else False
 
 
-_EVENTS: dict[str, Callable[[bytes], Touch | Slip | Over]] = {
-    "touch": decode_touch,
-    "slip": decode_slip,
-    "over": decode_over,
-}
-
-
 def read(
     kind: PartTopic, part: str, payload: bytes
 ) -> Touch | Slip | Over | Frame | Contact | Health | None:
@@ -73,8 +58,8 @@ def read(
     Raises:
         MessageError: the payload does not fit the topic.
     """
-    if kind in _EVENTS:
-        event = _EVENTS[kind](payload)
+    if kind in EVENT_DECODERS:
+        event = EVENT_DECODERS[kind](payload)
         if event.part != part:
             raise MessageError(f'a {kind} of "{event.part}" among those of "{part}"')
         return event

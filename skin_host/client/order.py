@@ -1,6 +1,6 @@
 """Passes on each message once and in order, though several brokers send it. Pure: takes times.
 
-By the numbers of `publish.order`. Messages without them, from a publisher that speaks MQTT 3.1.1,
+By the numbers of `mqtt.order`. Messages without them, from a publisher that speaks MQTT 3.1.1,
 are passed on as they arrive.
 """
 
@@ -8,9 +8,11 @@ from dataclasses import dataclass, field
 
 from msgspec.structs import replace
 
+from skin_host.client.presence import too_many
 from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.messages import Frame
 from skin_host.mqtt.order import Stamp
+from skin_host.mqtt.payload import MessageError
 from skin_host.processing.events import Touch
 
 Event = Touch | Slip | Over
@@ -19,6 +21,9 @@ Event = Touch | Slip | Over
 MAX_HELD = 1000
 #: Of earlier runs of a part, or what looked like one, so many are known.
 MAX_CHAINS = 8
+#: Of each kind of retained topics. With 256 parts in 256 nodes there are at most 512 infos: each
+#: piece after the first of a node has a part.
+MAX_TOPICS = 1000
 #: Greater numbers are given up if only smaller ones came for this long: what comes late from an
 #: earlier run or over another broker comes sooner.
 VANISHED_S = 30.0
@@ -112,7 +117,7 @@ class EventOrder:
             return []
         known.older_s = None
         known.held[count] = event, now_s + self._hold_s
-        if len(known.held) > MAX_HELD:
+        if too_many([waiting for waiting, _ in known.held.values()], MAX_HELD):
             now_s += self._hold_s
         return left + _released(known, now_s)
 
@@ -149,10 +154,11 @@ class Newest:
     """
 
     def __init__(self) -> None:
-        self._stamps: dict[tuple[str, str], Stamp] = {}
-        #: Since when only older messages came of a topic, as long as none with a greater stamp came
-        #: of its part.
-        self._older_s: dict[tuple[str, str], float] = {}
+        #: By kind and name.
+        self._stamps: dict[str, dict[str, Stamp]] = {}
+        #: By name and kind: since when only older messages came of a topic, as long as none with a
+        #: greater stamp came of its part.
+        self._older_s: dict[str, dict[str, float]] = {}
 
     def take(
         self, kind: str, name: str, stamp: Stamp | None, live_s: float | None = None
@@ -167,25 +173,35 @@ class Newest:
             stamp: of the message.
             live_s: when it came, if it was sent then. None: it was stored, or stays as it is until
                 a greater one comes, however long that lasts.
+
+        Raises:
+            MessageError: there are too many topics of this kind.
         """
-        key = kind, name
-        known = self._stamps.get(key)
+        stamps = self._stamps.setdefault(kind, {})
+        known = stamps.get(name)
         if stamp is None:
             return known is None
-        for other in [one for one in self._older_s if one[1] == name]:
-            if stamp >= self._stamps[other]:
-                del self._older_s[other]
+        older_s = self._older_s.get(name, {})
+        for other in list(older_s):
+            if stamp >= self._stamps[other][name]:
+                del older_s[other]
+        if known is None and len(stamps) >= MAX_TOPICS:
+            raise MessageError(f"more than {MAX_TOPICS} topics of this kind of one robot")
         if known is not None and stamp <= known:
             if stamp == known:
                 return None
-            if live_s is None or not _have_vanished(self._older_s.setdefault(key, live_s), live_s):
+            if live_s is None:
                 return False
-            del self._older_s[key]
-        self._stamps[key] = stamp
+            older_s = self._older_s.setdefault(name, {})
+            if not _have_vanished(older_s.setdefault(kind, live_s), live_s):
+                return False
+            del older_s[kind]
+        stamps[name] = stamp
         return True
 
     def forget(self, kind: str, name: str | None = None) -> None:
         """Forget all topics of a kind, or one."""
-        for key in [key for key in self._stamps if key[0] == kind and name in (None, key[1])]:
-            del self._stamps[key]
-            self._older_s.pop(key, None)
+        stamps = self._stamps.get(kind, {})
+        for one in list(stamps) if name is None else [name]:
+            stamps.pop(one, None)
+            self._older_s.get(one, {}).pop(kind, None)

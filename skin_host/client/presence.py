@@ -46,13 +46,16 @@ MAX_TOUCHED = 200_000
 DISTANCE_S = 120.0
 
 
-def too_many(touches: Collection[Touch], most: int) -> bool:
-    """Return whether the oldest of some touches is to be forgotten: there are more than `most`, or
-    several of more taxels together than any robot's.
+def taxels_of(item: object) -> int:
+    """Return how many taxels an item names: a touch may name very many, others none."""
+    return len(item.taxels) if isinstance(item, Touch) else 0
+
+
+def too_many(items: Collection[object], most: int) -> bool:
+    """Return whether the oldest of some items of a part is to go: there are more than `most`, or
+    several touches of more taxels together than any robot's.
     """
-    return len(touches) > most or (
-        len(touches) > 1 and sum(len(touch.taxels) for touch in touches) > MAX_TOUCHED
-    )
+    return len(items) > most or (len(items) > 1 and sum(map(taxels_of, items)) > MAX_TOUCHED)
 
 
 class Lateness:

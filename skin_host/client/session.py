@@ -5,7 +5,6 @@ import contextlib
 import itertools
 import logging
 import math
-import re
 import secrets
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -17,7 +16,7 @@ from skin_host.client.heard import Health, is_online, read
 from skin_host.client.links import RETAINED_S, ROBOT_S, BrokerLink, only_robot
 from skin_host.client.order import EventOrder, Newest
 from skin_host.client.presence import Contact, Presence
-from skin_host.client.streams import Stream
+from skin_host.client.streams import Stream, refuse_other_loop
 from skin_host.errors import BrokerError, RequestError, SkinError, visible
 from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.address import Broker
@@ -33,7 +32,7 @@ from skin_host.mqtt.info import NodeInfo, decode_info, join_pieces
 from skin_host.mqtt.messages import Frame
 from skin_host.mqtt.order import parts_of, run_of, stamp_of
 from skin_host.mqtt.payload import JSON_TYPE, MessageError
-from skin_host.mqtt.topics import PartTopic, Topics
+from skin_host.mqtt.topics import NAME, PartTopic, Topics, wrong_part
 from skin_host.processing.events import Touch
 from skin_host.tasks import cancel
 
@@ -53,8 +52,6 @@ MOST_NAMED = 20
 WATCH_S = 0.25
 #: Further topics that a stream needs: a contact state is valid only while its part lives.
 _NEEDED: dict[PartTopic, tuple[PartTopic, ...]] = {"contact": ("contact", "health", "touch")}
-
-_WORD = re.compile(r"[a-z0-9_-]{1,64}")
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
@@ -102,10 +99,17 @@ class SkinClient:
         last_error: why one was lost, or not found.
         unreadable: messages whose payload did not fit their topic.
 
+    Raises (on making it):
+        RequestError: the URL is wrong, a time is negative or no number, or several brokers are
+            named without the robot.
+
     Raises (on entering):
         BrokerError: no broker, or one that refuses us.
-        RequestError: the URL is wrong, a time is negative or no number, or it is not clear which
-            robot is meant.
+        RequestError: it is not clear which robot is meant, or the client was entered before.
+
+    Raises (in use):
+        RequestError: no part can have such a name, or the event loop is not the one in which the
+            client was entered.
 
     Raises (on reading a stream, once):
         RequestError: the robot has no part of this name, and had none since the stream was opened.
@@ -153,6 +157,8 @@ class SkinClient:
         #: When a node named its parts last.
         self._named_s = -math.inf
         self._news = asyncio.Event()
+        #: In which the client was entered.
+        self._loop: asyncio.AbstractEventLoop | None = None
         self._stopping = False
         self._tasks: list[asyncio.Task[None]] = []
         # Nodes of a cluster share clients' names, so each link has its own.
@@ -214,6 +220,7 @@ class SkinClient:
         Raises:
             RequestError: the robot has no such part.
         """
+        self._check_use(part)
         missing = self._missing(part, _now_s())
         if missing is not None:
             raise RequestError(missing)
@@ -276,7 +283,7 @@ class SkinClient:
                 answer in time.
             RequestError: it is not clear which node is meant, or a name or a number cannot be sent.
         """
-        if not _WORD.fullmatch(name) or not (node is None or _WORD.fullmatch(node)):
+        if not NAME.fullmatch(name) or not (node is None or NAME.fullmatch(node)):
             raise RequestError(
                 "a command and a node have names of up to 64 of the characters a-z 0-9 _ -"
             )
@@ -327,6 +334,11 @@ class SkinClient:
             raise CommandError(f'node "{node}" of robot "{self.robot}" {why}')
 
     async def __aenter__(self) -> Self:
+        if self._loop is not None:
+            raise RequestError("this client was entered before: make another one")
+        self._loop = asyncio.get_running_loop()
+        for stream in self._streams:
+            stream.loop = self._loop
         self._tasks = [
             asyncio.create_task(link.run(), name=f"skin client {link.broker}")
             for link in self._links
@@ -379,6 +391,7 @@ class SkinClient:
         return ", ".join(str(link.broker) for link in self._links)
 
     async def __aexit__(self, *_: object) -> None:
+        refuse_other_loop(self._loop)
         await self._stop()
 
     async def _stop(self) -> None:
@@ -392,8 +405,9 @@ class SkinClient:
         """Wait until `condition` holds, and return its result.
 
         Raises:
-            RequestError: the client has ended.
+            RequestError: the client has ended, or was entered in another event loop.
         """
+        refuse_other_loop(self._loop)
         while not (found := condition()):
             if self._stopping:
                 raise RequestError("the client has ended: what it is asked for cannot come")
@@ -401,8 +415,17 @@ class SkinClient:
             await self._news.wait()
         return found
 
+    def _check_use(self, part: str | None) -> None:
+        refuse_other_loop(self._loop)
+        # A subscription that cannot be made would end the connection, again and again.
+        wrong = None if part is None else wrong_part(part)
+        if wrong is not None:
+            raise RequestError(wrong)
+
     def _stream(self, part: str | None, *kinds: PartTopic) -> Stream[Any]:
+        self._check_use(part)
         stream: Stream[Any] = Stream(part, *kinds)
+        stream.loop = self._loop
         self._streams.add(stream)
         if "health" in kinds:
             for name, health in self._latest.items():
@@ -532,7 +555,7 @@ class SkinClient:
         }
         for kind, part in asked:
             if part is None or (kind, None) not in asked:
-                yield topics.part(kind, part or "+")
+                yield topics.part(kind, "+" if part is None else part)
 
     def take(self, link: BrokerLink, message: Message) -> None:
         assert self._topics is not None

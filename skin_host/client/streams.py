@@ -7,6 +7,7 @@ from typing import Any, Generic, TypeVar, cast
 
 from msgspec.structs import replace
 
+from skin_host.client.presence import taxels_of
 from skin_host.errors import RequestError
 from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.messages import Frame
@@ -31,16 +32,43 @@ DUPLICATE_SPAN = 64
 T = TypeVar("T")
 
 
+def refuse_other_loop(loop: asyncio.AbstractEventLoop | None) -> None:
+    """Refuse what is done in another event loop, which nothing that is received would wake.
+
+    Args:
+        loop: in which the client was entered; None: it was not.
+
+    Raises:
+        RequestError: another one runs, or none.
+    """
+    if loop is None:
+        return
+    try:
+        running: asyncio.AbstractEventLoop | None = asyncio.get_running_loop()
+    except RuntimeError:
+        running = None
+    if running is not loop:
+        raise RequestError(
+            "this client was entered in another event loop: use it there, or use SkinCallbacks, "
+            "which any thread may call"
+        )
+
+
 class Stream(AsyncIterator[T], Generic[T]):
     """Items of some kinds from the request on; made by `SkinClient`, ends with it.
 
     Raises (on reading, once):
         RequestError: the robot has no part of this name, see `SkinClient`.
+
+    Raises (on reading):
+        RequestError: this is not the event loop in which the client was entered.
     """
 
     def __init__(self, part: str | None, *kinds: PartTopic) -> None:
         self.part = part
         self.kinds = kinds
+        #: In which the client was entered.
+        self.loop: asyncio.AbstractEventLoop | None = None
         #: Whether it is known that there is such a part, or was reported that there is none.
         self.is_judged = part is None
         self._failure: str | None = None
@@ -57,14 +85,14 @@ class Stream(AsyncIterator[T], Generic[T]):
         if len(self._items) == self._items.maxlen:
             self._drop()
         self._items.append(item)
-        self._taxels += _taxels_of(item)
+        self._taxels += taxels_of(item)
         while self._taxels > HELD_TAXELS and len(self._items) > 1:
             self._drop()
         self._wake.set()
 
     def _drop(self) -> T:
         item = self._items.popleft()
-        self._taxels -= _taxels_of(item)
+        self._taxels -= taxels_of(item)
         return item
 
     def close(self) -> None:
@@ -78,6 +106,8 @@ class Stream(AsyncIterator[T], Generic[T]):
         self._wake.set()
 
     async def __anext__(self) -> T:
+        if not self._closed:  # what is left may be read anywhere
+            refuse_other_loop(self.loop)
         while True:
             while not self._items:
                 if self._failure is not None:
@@ -110,7 +140,3 @@ class Stream(AsyncIterator[T], Generic[T]):
         self._last[kind] = number, item.t_ns
         # A smaller number at a later time means that the node was restarted.
         return lost or max(0, number - last - 1)
-
-
-def _taxels_of(item: object) -> int:
-    return len(item.taxels) if isinstance(item, Touch) else 0

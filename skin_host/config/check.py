@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from skin_host.bus.compensation import THERMAL_TAXEL, thermal_gains
 from skin_host.config.settings import Settings, format_triangles, skin_hash
 from skin_host.errors import nearest, visible
 from skin_host.layout import TAXELS_PER_TRIANGLE, BoardLayout, Layout, PadKind, TriangleLayout
@@ -25,9 +26,6 @@ WRENCH_BITS = (2 * 95, 2 * 115)
 WARN_LOAD = 0.8
 #: Twelve stages at decimation 256 take the chip this long (AD7147; MTB3's timer constants).
 CONVERSION_MS = 36.86
-#: Boards of these types use pad 6 as a temperature pad (type 3: only from triangle 5 on).
-THERMOMETER_PAD = 6
-COMPENSATED_TYPES = {0: 0, 3: 5, 8: 0}
 #: Taxels of a part that are closer than this are at the same place.
 SAME_PLACE_M = 1e-4
 #: Foam outside this range usually means a wrong unit.
@@ -186,18 +184,20 @@ def _board_warnings(layout: Layout) -> list[str]:
                 f"{where}: feeds parts of the nodes {', '.join(sorted(nodes))}; one daemon "
                 "should set a board up: give these parts one node"
             )
-        first = COMPENSATED_TYPES.get(board.settings.skin_type)
-        if first is None:
-            continue
-        wrong = [
-            triangle.number
-            for triangle in mine
-            if triangle.number >= first
-            and layout.pad_kind[triangle.first + THERMOMETER_PAD] != PadKind.THERMAL
-        ]
+        skin_type = board.settings.effective_skin_type
+        if skin_type != board.settings.skin_type:
+            warnings.append(
+                f"{where}.skin_type: {board.settings.skin_type} is unknown to an MTB3, which then "
+                "compensates no temperature; wanted 0, 1 or 2"
+            )
+        wrong = []
+        for triangle in mine:
+            gains, thermometer = thermal_gains(skin_type, triangle.number)
+            if any(gains) and layout.pad_kind[triangle.first + thermometer] != PadKind.THERMAL:
+                wrong.append(triangle.number)
         if wrong:
             warnings.append(
-                f"{where}.skin_type: {board.settings.skin_type} takes pad {THERMOMETER_PAD} as a "
+                f"{where}.skin_type: {skin_type} takes pad {THERMAL_TAXEL} as a "
                 f"thermometer, but that of triangles {format_triangles(wrong)} feels pressure; "
                 "wanted 1 or 2"
             )

@@ -45,7 +45,6 @@ Address = Annotated[
 
 #: Sizes: of pads, foams, probes, fingertips.
 Millimetres = Annotated[float, Meta(ge=0.001, le=10_000)]
-SquareMillimetres = Annotated[float, Meta(ge=0.001, le=1_000_000)]
 #: Coordinates.
 PlaceMm = Annotated[float, Meta(ge=-1_000_000, le=1_000_000)]
 Seconds = Annotated[float, Meta(ge=0.001, le=1e9)]

@@ -35,7 +35,6 @@ from skin_host.config.fields import (
     PositiveCoefficient,
     Printable,
     Seconds,
-    SquareMillimetres,
     Units,
 )
 from skin_host.config.fingertips import Fingertip as Fingertip  # noqa: PLC0414 (for others too)
@@ -67,6 +66,11 @@ class Bus(_Table, frozen=True):
     skin_only: bool = False
 
 
+#: Skin types that an MTB3 knows, and the one without temperature compensation.
+MTB3_SKIN_TYPES = frozenset({0, 1, 2})
+UNCOMPENSATED = 2
+
+
 class Board(_Table, frozen=True):
     """One MTB. Sources: reference of the wire, commands 4D (SET_BRD_CFG)."""
 
@@ -75,11 +79,20 @@ class Board(_Table, frozen=True):
     #: Selects the board's known problems to work around on bring-up, and the emulated firmware.
     model: Literal["mtb3", "mtb4", "mtb4c"] = "mtb4"
     period_ms: Annotated[int, Meta(ge=10, le=209)] = 50
-    #: 0 with temperature compensation, 1 palm and fingertips, 2 without, 3 ergoHand, 8 V2. With 7,
-    #: a test mode, boards send the low byte of a word, which is no measure of pressure.
+    #: 0 with temperature compensation, 1 palm and fingertips, 2 without, 3 ergoHand, 8 V2; an MTB3
+    #: acts by 3 and 8 as by 2. With 7, a test mode, boards send the low byte of a word, which is no
+    #: measure of pressure.
     skin_type: Literal[0, 1, 2, 3, 8] = 0
     #: At an end of the scale untouched pads would be cut off.
     no_load: Annotated[int, Meta(ge=1, le=254)] = 240
+
+    @property
+    def effective_skin_type(self) -> int:
+        """The skin type that its firmware acts by: an MTB3 compensates nothing with those that it
+        does not know (FillCanMessages8bit of mtb3/main_V3.c).
+        """
+        known = self.model != "mtb3" or self.skin_type in MTB3_SKIN_TYPES
+        return self.skin_type if known else UNCOMPENSATED
 
 
 class PlaceSettings(_Table, frozen=True):
@@ -119,7 +132,6 @@ class KindSettings(_Table, frozen=True):
     pads_mm: list[tuple[PlaceMm, PlaceMm]]
     pitch_mm: Annotated[float, Meta(ge=0.001, le=1000)]
     radius_mm: Millimetres
-    area_mm2: SquareMillimetres
     outline_mm: list[tuple[PlaceMm, PlaceMm]]
     thermal: list[int] = []
 

@@ -275,8 +275,9 @@ class Daemon:
     def enable(self, part: int) -> None:
         """Publish everything of a part again."""
         self.engine.disabled.discard(part)
-        # A board may have been zeroed meanwhile while something pressed the part.
-        self._doubt_contacts(self.engine.zeros.may_be_touched(), [part])
+        # What pressed the part meanwhile may be in a board's new zero, or under a pad that failed.
+        zeros = self.engine.zeros
+        self._doubt_contacts(zeros.may_be_touched() | zeros.at_risk(touched=True), [part])
 
     def set_thresholds(self, thresholds: Thresholds) -> None:
         """Apply these changes to the configured touch thresholds; baselines are kept.

@@ -1,7 +1,8 @@
 """Health as Prometheus text, on localhost: `service.metrics_port`.
 
-Off unless configured. Listens on 127.0.0.1 alone; one request a connection, bounded in size
-and time. Names follow Prometheus' conventions: base units, `_total` for counters.
+Off unless configured. Listens on 127.0.0.1 alone; answers requests whose `Host` is an address or
+localhost; one request a connection, bounded in size and time. Names follow Prometheus' conventions:
+base units, `_total` for counters.
 """
 
 import asyncio
@@ -9,7 +10,9 @@ import contextlib
 import logging
 import os
 from collections.abc import Callable, Iterator, Mapping
+from ipaddress import ip_address
 from typing import Any
+from urllib.parse import urlsplit
 
 from skin_host.clock import SYSTEM, Clock
 from skin_host.fingertip.health import FingertipRecord
@@ -162,9 +165,27 @@ async def serve(port: int, records: Callable[[], Records], clock: Clock = SYSTEM
         await server.serve_forever()
 
 
+def _is_ours(header: bytes) -> bool:
+    """Whether a header is not a `Host` with a name that somebody can make point here."""
+    key, _, value = header.decode("latin-1").partition(":")
+    if key.strip().lower() != "host":
+        return True
+    try:
+        name = urlsplit(f"//{value.strip()}").hostname or ""
+        if name != "localhost":
+            ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
 def _response(request: bytes, records: Callable[[], Records]) -> bytes:
-    method, _, rest = request.partition(b" ")
+    line, *headers = request.split(b"\r\n")
+    method, _, rest = line.partition(b" ")
     path = rest.partition(b" ")[0]
+    if not all(_is_ours(header) for header in headers):
+        # A browser asks for a page from elsewhere, whose name was made to point at this machine.
+        return b"HTTP/1.0 403 Forbidden\r\n\r\nask for localhost or 127.0.0.1\n"
     if method != b"GET":
         return b"HTTP/1.0 405 Method Not Allowed\r\nAllow: GET\r\n\r\n"
     if path != b"/metrics":

@@ -353,6 +353,35 @@ def _sections(report: Report) -> list[Section]:
             [tables.localization(report)],
         ),
         Section(
+            "Force",
+            [
+                (
+                    "`force_n` of the contacts over the load on the emulator's probe: a flat round "
+                    "probe at 40 kPa on 2 mm of foam, half a second after it was set down, 0.4 "
+                    "units of noise, default parameters; drawn foam that the relaxation was not "
+                    "fitted to. A press that comes to no contact counts as 0. `triangle`: the "
+                    "probe's middle is anywhere on a triangle that has neighbours on all sides; "
+                    "`seam`: it is on the line between two triangles; `inside the edge`: the "
+                    "probe touches the edge of the skin from inside; `half over the edge`: its "
+                    "middle is on that edge."
+                ),
+                (
+                    "A pad stands for the part of its triangle's outline that is nearest to it. "
+                    "These parts add up to the skin, so the mean over all places is right for "
+                    "probes of any size. A single press of a probe below some 15 mm, which covers "
+                    "only a few pads, reads more on a pad and less between pads, one of 4 mm "
+                    "from nothing to twice its force. Lines such as a seam or an edge lie "
+                    "in the same way to all pads, so there the mean of a size is not right: a "
+                    "probe of 10 mm reads up to a fifth too much or too little. One that "
+                    "hangs over the edge of the skin presses where no pad is, and only the load on "
+                    "the skin can be reported. The few percent too much that wide probes have "
+                    "in common are the error of the pressures. Fingertips and palms were not "
+                    "measured."
+                ),
+            ],
+            [tables.force(report)],
+        ),
+        Section(
             "Parameters found",
             ["Result of each fit to the calibration hold, and what it could not distinguish."],
             [tables.fits(report)],

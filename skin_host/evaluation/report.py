@@ -16,7 +16,7 @@ import numpy as np
 
 from emulator.probes.viscoelastic import TruthKind
 from skin_host.config.relaxation import MODELS
-from skin_host.evaluation import accuracy, page, real, speed, tables, touching
+from skin_host.evaluation import accuracy, force_trials, page, real, speed, tables, touching
 from skin_host.evaluation.accuracy import DEFAULT, HistoryPlan, Variant
 from skin_host.evaluation.document import as_text
 from skin_host.evaluation.goals import goal
@@ -79,6 +79,7 @@ def run(quick: bool, output: Path | None, recordings: Path | None = None) -> Rep
         "holds": found["long holds"],
         "hard_cases": [row for rows in found["hard cases"] for row in rows],
         "localization": found["localisation"][0],
+        "force": [row for rows in found["force"] for row in rows],
     }
     show_step("speed of models")
     report["speed"], seconds_of["speed"] = _timed(speed.models, (0.02 if quick else 0.15,))
@@ -133,6 +134,9 @@ def jobs_of(quick: bool) -> list[Job]:
     jobs += [("drift", touching.drift_lags, (1.0 if quick else 10.0, rule)) for rule in RULES]
     jobs.append(("delays", touching.detection_delays, ()))
     jobs.append(("localisation", localization, (50 if quick else 400,)))
+    jobs += [
+        ("force", force_trials.force, (kind, 20 if quick else 200)) for kind in force_trials.KINDS
+    ]
     jobs.append(("unwatched", speed.cost_of_glancing, (30.0 if quick else 300.0,)))
     return jobs
 

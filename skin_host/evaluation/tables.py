@@ -417,6 +417,25 @@ def localization(report: Report) -> Table:
     )
 
 
+def force(report: Report) -> Table:
+    """Reported over true force against the size of the probe and its place."""
+    return _by_columns(
+        report["force"],
+        {
+            "kind": ("kind", ""),
+            "place": ("where", ""),
+            "probe mm": ("probe_mm", "g"),
+            "true N": ("true_n", ".2f"),
+            "median": ("median_ratio", ".2f"),
+            "mean": ("mean_ratio", ".2f"),
+            "5 %": ("p5_ratio", ".2f"),
+            "95 %": ("p95_ratio", ".2f"),
+            "no contact": ("unseen_share", ".0%"),
+            "centroid, RMS mm": ("centroid_rms_mm", ".2f"),
+        },
+    )
+
+
 def fits(report: Report) -> Table:
     """The parameters that the fits found."""
 

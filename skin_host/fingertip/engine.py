@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from skin_host.bus.strain import (
     CHANNELS,
     LOADS,
-    SILENT_NS,
     ZERO_WORD,
     StrainType,
     Wrench,
@@ -28,7 +27,6 @@ from skin_host.fingertip.frozen import Frozen
 from skin_host.fingertip.tip import Tip
 from skin_host.layout import Layout
 from skin_host.processing.calibration import Zero
-from skin_host.processing.contacts import LOST_NS
 from skin_host.processing.events import Touch
 from skin_host.processing.masks import Mask
 
@@ -178,19 +176,18 @@ class FingertipEngine:
         for row in np.flatnonzero(batch.id >> 8 == _COMMAND).tolist():
             self._note_answer(here, int(batch.id[row]), batch.data[row, : batch.dlc[row]].tobytes())
         frames = parse_strain(batch)
-        if not len(frames.row) and not frames.wrong_length:
+        if not len(frames.row) and not len(frames.wrong_length):
             return felt
         for address, state in here.items():
             mine = np.flatnonzero((frames.board == address) & (frames.type >= LOADS))
-            if not len(mine):
-                continue
-            state.frames += len(mine)
-            if now_ns - state.received_ns >= LOST_NS:
-                state.agreement.forget()
-                state.frozen.doubt()
-            state.last_ns = int(batch.t_ns[frames.row[mine[-1]]])
-            state.received_ns = now_ns
-            state.came = state.alive = True
+            if len(mine):
+                state.frames += len(mine)
+                if now_ns - state.received_ns >= state.tip.lost_ns:
+                    state.agreement.forget()
+                    state.frozen.doubt()
+                state.last_ns = int(batch.t_ns[frames.row[mine[-1]]])
+                state.received_ns = now_ns
+                state.came = state.alive = True
             if state.assembler is not None:
                 for wrench in state.assembler.take(frames, batch.t_ns):
                     felt.samples.append((state.number, wrench.t_ns))
@@ -217,7 +214,7 @@ class FingertipEngine:
                 # Until now: what waited in a pause of this computer is read at once.
                 state.came, state.received_ns = False, now_ns
             quiet_ns = now_ns - state.received_ns
-            if state.alive and quiet_ns > SILENT_NS:
+            if state.alive and quiet_ns > state.tip.silent_ns:
                 state.alive = False
                 state.silenced += 1
             events += state.tip.expire(t_ns, quiet_ns)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from skin_host.bus.board import GAP_S
 from skin_host.bus.boards import RETRY_S, Sender
 from skin_host.bus.commands import SetTxMode, command_frame
-from skin_host.bus.strain import SILENT_NS, StrainMode, scale_queries, start_frames
+from skin_host.bus.strain import StrainMode, scale_queries, start_frames
 from skin_host.errors import BusError
 from skin_host.fingertip.engine import FingertipEngine, TipState
 from skin_host.fingertip.events import FingertipEvent
@@ -75,7 +75,8 @@ class StrainBoards:
                 board.frames, board.heard_ns = board.state.frames, now_ns
                 if board.state.assembler is not None:
                     board.retries = 0
-            well = now_ns - board.heard_ns <= SILENT_NS and board.state.assembler is not None
+            sends = now_ns - board.heard_ns <= board.state.tip.silent_ns
+            well = sends and board.state.assembler is not None
             due = board.started and now_ns >= board.retry_at_ns
             board.state.awaited &= not (due or board.frames)
             if due and self._busy is None and not (well and not board.state.scale_differs):

@@ -14,7 +14,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from skin_host.bus.strain import SILENT_NS, Wrench
+from skin_host.bus.strain import Wrench, silent_ns
 from skin_host.config.fingertips import Fingertip
 from skin_host.fingertip.events import Cause, FingertipEvent, Over, Slip
 from skin_host.fingertip.grasp import FingerFlags, Flags, GraspThresholds
@@ -131,6 +131,8 @@ class Tip:
         reach_n: the greatest force that is measured in every direction, beside the load of the
             zero; infinite while the full scales of the board are not known.
         samples: how many have been taken in since the zero was known.
+        silent_ns: a pause longer than this is one of its board, not of single samples.
+        lost_ns: a contact ends after a pause of this length.
     """
 
     def __init__(
@@ -139,6 +141,8 @@ class Tip:
         self.samples = 0
         self.threshold_n = settings.threshold_n
         self.reach_n = math.inf
+        self.silent_ns = silent_ns(settings.period_ms)
+        self.lost_ns = max(LOST_NS, self.silent_ns)
         self._name = name
         self._settings = settings
         self._surface = settings.surface
@@ -238,7 +242,7 @@ class Tip:
         """Take in a sample; return its events."""
         if self._zero is None:
             return []
-        if not 0 <= wrench.t_ns - self._last_ns <= SILENT_NS and self.samples:
+        if not 0 <= wrench.t_ns - self._last_ns <= self.silent_ns and self.samples:
             # A sample after a pause, or after the clock was set back, does not continue the samples
             # before it.
             self._restart()
@@ -276,7 +280,7 @@ class Tip:
 
     def expire(self, t_ns: int, quiet_ns: int) -> list[FingertipEvent]:
         """End a contact whose samples have stopped for too long: now, and for how long."""
-        return [] if quiet_ns < LOST_NS else self.lose(t_ns)
+        return [] if quiet_ns < self.lost_ns else self.lose(t_ns)
 
     def lose(self, t_ns: int) -> list[FingertipEvent]:
         """End a contact, because samples have stopped or do not show it any more."""

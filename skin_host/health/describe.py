@@ -150,6 +150,7 @@ class Describer:
             return watch.valid
         layout = self._layout.parts[part]
         valid = watch.valid.copy()
+        usable = self._usable(part)
         for index in layout.boards:
             taxels, row = self._layout.boards[index].taxel_index, ledger.row[index]
             fitted = (taxels >= layout.start) & (taxels < layout.stop)
@@ -157,9 +158,22 @@ class Describer:
             # A chip that does not answer is not late.
             if watch.late is not None and not ledger.flagged[row]:
                 valid[mine] |= watch.late[mine]
+            veto = self._engine.intake.veto.get(row)
             for pads in cleared:
-                valid[mine] |= self._of_board(pads, row)[fitted]
+                here = self._of_board(pads, row)
+                here = here if veto is None else here & ~veto
+                valid[mine] |= here[fitted] & usable[mine]
         return valid
+
+    def _usable(self, part: int) -> Mask:
+        """Return the taxels of a part, bool[m], that can be valid at all."""
+        layout = self._layout.parts[part]
+        mine = slice(layout.start, layout.stop)
+        usable: Mask = self._layout.pad_kind[mine] == PadKind.PRESSURE
+        calibration, pipeline = self._engine.calibration, self._engine.pipeline
+        if calibration is not None:
+            usable = usable & calibration.usable[mine]
+        return usable if pipeline is None else usable & ~pipeline.unreached[mine]
 
     def _state(self, part: int, pressure: NDArray[np.bool_], valid: Mask | None) -> str:
         watch = self._watch.parts[part]
@@ -244,12 +258,24 @@ class Describer:
         if row in ledger.twice:
             # What pressed one of the two boards as it was zeroed cannot be known.
             return None
-        # Single pads are listed with the taxels; only a whole triangle counts here. Pads that were
-        # pressed while their board was zeroed are reported as `board_in_doubt`.
-        far = ledger.far[row, number] & ~self._engine.zeros.in_doubt(board)[number]
+        # Single pads are listed with the taxels; only a whole triangle counts here.
+        far = self._far(board, sweep.raw)[number]
         many = np.count_nonzero(far) >= FAR_PADS
         other = lifted(sweep.raw[number], far)
         return "out of range" if many or other else None
+
+    def _far(self, board: int, raw: NDArray[np.uint8]) -> Mask:
+        """Return pads bool[16, 12] of a board's last sweep that are far out of range, but for those
+        that what pressed as it took its zero explains, which is reported as `board_in_doubt`: they
+        read far below zero pressure, not above.
+
+        Args:
+            board: of the layout.
+            raw: uint8[16, 12], of that sweep.
+        """
+        far: Mask = self._engine.ledger.far[self._engine.ledger.row[board]]
+        found: Mask = far & ~(self._engine.zeros.in_doubt(board) & (raw == 255))
+        return found
 
     def _taxel_faults(self, part: int, pressure: NDArray[np.bool_]) -> dict[str, list[int]]:
         layout = self._layout.parts[part]
@@ -267,10 +293,10 @@ class Describer:
                 "stuck": self._of_board(liveness.stuck, row),
                 "noisy": self._of_board(liveness.noisy, row),
             }
-            if ledger.flagged[row] and row not in ledger.twice:
+            sweep = ledger.last[row]
+            if sweep is not None and ledger.flagged[row] and row not in ledger.twice:
                 answered = (ledger.error[row] == 0)[:, None]
-                far = ledger.far[row] & ~self._engine.zeros.in_doubt(index)
-                masks["out_of_range"] = far & answered
+                masks["out_of_range"] = self._far(index, sweep.raw) & answered
             for kind, mask in masks.items():
                 found[kind][taxels[mine & mask] - layout.start] = True
         pipeline, calibration = self._engine.pipeline, self._engine.calibration
@@ -391,7 +417,7 @@ class Describer:
             "name": board.name,
             "bus": board.settings.bus,
             "address": board.settings.address,
-            "skin_type": board.settings.skin_type,
+            "skin_type": board.settings.effective_skin_type,
             "alive": sweep is not None and not ledger.is_silent(row) and not self._is_new(index),
             "sweeps": int(ledger.sweeps[row]),
             "fitted": list(board.triangles),
@@ -411,6 +437,7 @@ class Describer:
                 "wrong_type": known.is_wrong_type,
                 "firmware": known.firmware,
                 "in_bootloader": known.in_bootloader,
+                "wrong_model": board.settings.model if known.is_wrong_model else "",
                 "awaited": manager.awaits(board.settings.address)
                 or self._engine.zeros.paused(index),
                 "configurations": known.configurations,

@@ -223,6 +223,13 @@ def _board(board: BoardHealth) -> Iterator[FoundFault]:
         yield fault(
             "board_wrong_type", f" reports type {board['board_type']}, which is no skin board"
         )
+    if model := board.get("wrong_model"):
+        kind = "no MTB3" if model == "mtb3" else "an MTB3"
+        yield fault(
+            "board_wrong_model",
+            f" reports type {board['board_type']}, {kind}, but boards.{name}.model is {model}; "
+            "correct that: the two compute different values",
+        )
     events = board.get("lately", {})
     for event, (code, sentence) in _BOARD_EVENTS.items():
         if events.get(event):

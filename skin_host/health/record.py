@@ -69,7 +69,7 @@ class BoardHealth(TypedDict):
     the time to send, or it paused and may have zeroed itself; `lately` has the counters among
     `resets`, `lost_set_ups`, `tx_overflows` and `rezeros` that rose within the last minute;
     `twice`: two boards send at its address; `held_up`: it may be regular, but its frames waited
-    for those of more urgent boards.
+    for those of more urgent boards; `wrong_model` is the configured one if it reports another.
     """
 
     name: str
@@ -88,6 +88,7 @@ class BoardHealth(TypedDict):
     in_doubt: int
     board_type: NotRequired[int | None]
     wrong_type: NotRequired[bool]
+    wrong_model: NotRequired[str]
     firmware: NotRequired[tuple[int, int, int] | None]
     in_bootloader: NotRequired[bool]
     awaited: NotRequired[bool]

@@ -32,11 +32,14 @@ from skin_host.layout.geometry import (
     fitted_outline,
     lay,
     read_positions,
+    shares_mm2,
     tile,
 )
 from skin_host.processing.pressure import BENDS, SLOPES_KPA, PressureCurve
 
 TAXELS_PER_TRIANGLE = 12
+#: A pad that stands for less skin than this counts for no force.
+SMALLEST_SHARE_MM2 = 0.001
 
 
 class PadKind(IntEnum):
@@ -93,7 +96,9 @@ class Layout:
 
     Attributes:
         position_m, normal: float64[n, 3].
-        area_mm2, radius_mm: float64[n]; the skin a pad answers for, and the pad's radius.
+        area_mm2: float64[n], the skin that a pad stands for, see `geometry.shares_mm2`: force is
+            the sum of pressure times this. 0 for thermal pads.
+        radius_mm: float64[n], of the pad itself.
         pad_kind: uint8[n], see `PadKind`.
         unit_ff: float64[n], capacitance of one unit of the transmitted byte.
         sensitivity: float64[n], capacitance of the pad over that of the pad that equation (1)
@@ -303,6 +308,8 @@ def _patch_columns(
             f"{where}.places: {len(patch.places)} places for {n_units} units of "
             f'"{patch.kind}" ({per_unit} triangle(s) each)'
         )
+    share_mm2 = shares_mm2(kind)
+    _check_shares(patch.kind, kind, share_mm2)
     pads, outline = np.array(kind.pads_mm), np.array(kind.outline_mm)
     n = TAXELS_PER_TRIANGLE * n_triangles
     if patch.positions is not None:
@@ -329,7 +336,7 @@ def _patch_columns(
         position_m=position_m,
         normal=normal,
         pad_kind=np.tile(pad_kind, n_units),
-        area_mm2=np.full(n, kind.area_mm2),
+        area_mm2=np.tile(share_mm2, n_units),
         radius_mm=np.full(n, kind.radius_mm),
         pitch_mm=np.full(n, kind.pitch_mm),
         unit_ff=np.empty(n),
@@ -351,6 +358,16 @@ def _check_kind(name: str, kind: KindSettings) -> None:
         )
     if any(not 0 <= pad < n for pad in kind.thermal):
         raise ConfigurationError(f"kinds.{name}.thermal: {kind.thermal}; pads are 0 to {n - 1}")
+
+
+def _check_shares(name: str, kind: KindSettings, share_mm2: Floats) -> None:
+    """Refuse a kind with pads whose pressure would count for no force."""
+    for pad, share in enumerate(share_mm2):
+        if share < SMALLEST_SHARE_MM2 and pad not in kind.thermal:
+            raise ConfigurationError(
+                f"kinds.{name}.outline_mm: {share:.3g} mm2 of it are nearest to pad {pad}; wanted "
+                f"{SMALLEST_SHARE_MM2:g} at least: corners around all pads, one after the other"
+            )
 
 
 def _check_curve(where: str, taxels: _Columns, pressure: Pressure) -> None:

@@ -1,6 +1,8 @@
 """Positions of a unit's pads: tiled, placed manually, or read from a file."""
 
+import math
 import warnings
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -85,6 +87,72 @@ def _rotation_from_z(normal: tuple[float, ...]) -> Floats:
     u, v = x / side, y / side
     k = 1 - z
     return np.array([[1 - k * u * u, -k * u * v, x], [-k * u * v, 1 - k * v * v, y], [-x, -y, z]])
+
+
+def shares_mm2(kind: KindSettings) -> Floats:
+    """The part of a unit's outline that is nearest to each of its pads, float64[pads] in mm2.
+
+    That is the skin whose pressure the pad stands for: force is the sum of pressure times share.
+    The shares add up to the outline, so a press that may be anywhere is neither over- nor
+    underrated, whatever the pads' own size; the nearest pad is the best guess between them.
+    Skin over a pad that measures temperature belongs to the pressure pads around it; its own
+    share is 0, and so is that of a pad to which nothing in the outline is nearest. Pads at the
+    same place have equal shares.
+    """
+    pressing = [pad for number, pad in enumerate(kind.pads_mm) if number not in kind.thermal]
+    of_place = _cells_mm2(tuple(pressing), tuple(kind.outline_mm))
+    return np.array(
+        [
+            0.0 if number in kind.thermal else of_place[pad] / pressing.count(pad)
+            for number, pad in enumerate(kind.pads_mm)
+        ]
+    )
+
+
+Point = tuple[float, float]
+
+
+@lru_cache  # the patches of a robot are of few kinds
+def _cells_mm2(places: tuple[Point, ...], outline: tuple[Point, ...]) -> dict[Point, float]:
+    """Area of each place's Voronoi cell inside an outline, which need not be convex."""
+    sense = math.copysign(1.0, _signed_area(outline))
+    cells = {}
+    for place in set(places):
+        x, y = place
+        cell = list(outline)
+        for other in sorted(set(places) - {place}, key=lambda other: math.dist(place, other)):
+            across = other[0] - x, other[1] - y
+            # Places further away than twice the furthest corner cut nothing off any more.
+            if not cell or math.hypot(*across) > 2 * max(math.dist(place, one) for one in cell):
+                break
+            cell = _cut(cell, ((x + other[0]) / 2, (y + other[1]) / 2), across)
+        cells[place] = max(sense * _signed_area(cell), 0.0)
+    return cells
+
+
+def _cut(polygon: list[Point], edge: Point, outwards: Point) -> list[Point]:
+    """The polygon without what lies beyond a straight edge (Sutherland and Hodgman).
+
+    Of one that is not convex the pieces hang together by strips without area.
+    """
+    beyond = [(x - edge[0]) * outwards[0] + (y - edge[1]) * outwards[1] for x, y in polygon]
+    left = []
+    for number, (end, end_beyond) in enumerate(zip(polygon, beyond, strict=True)):
+        begin, begin_beyond = polygon[number - 1], beyond[number - 1]
+        if (begin_beyond > 0.0) != (end_beyond > 0.0):
+            along = begin_beyond / (begin_beyond - end_beyond)
+            left.append(
+                (begin[0] + along * (end[0] - begin[0]), begin[1] + along * (end[1] - begin[1]))
+            )
+        if end_beyond <= 0.0:
+            left.append(end)
+    return left
+
+
+def _signed_area(polygon: Sequence[Point]) -> float:
+    """Area of a polygon, negative if its corners run clockwise."""
+    corners = zip(polygon, [*polygon[1:], *polygon[:1]], strict=True)
+    return sum(x * next_y - next_x * y for (x, y), (next_x, next_y) in corners) / 2
 
 
 class PlaneFit(NamedTuple):

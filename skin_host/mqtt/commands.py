@@ -15,19 +15,24 @@ from typing import Annotated, Any
 
 import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
+from msgspec.structs import replace
 
-from skin_host.errors import SkinError
-from skin_host.mqtt.payload import MessageError, decode, one_line
+from skin_host.errors import SkinError, visible
+from skin_host.mqtt.payload import MessageError, decode
 from skin_host.tasks import cancel
 from skin_host.untrusted import from_json
 
 RESULT_SCHEMA = "skin.result/1"
 MAX_REQUEST_BYTES = 64 * 1024
-#: At most this many commands run at a time.
+#: At most this many commands run at a time, and one more of each name of which none does: a disk
+#: that does not answer holds up the commands that write, and nobody could ask for the status.
 MAX_RUNNING = 8
 #: This many requests are taken at once, and this many a second in the long run.
 BURST = 20
 PER_SECOND = 10.0
+
+#: Of what others wrote, so many characters are logged.
+LOGGED = 200
 
 #: Answers a command: takes its name and its request, a JSON object as bytes. The return value
 #: becomes `result`; a `SkinError` becomes `error`.
@@ -35,6 +40,8 @@ Handler = Callable[[str, bytes], Awaitable[Mapping[str, Any]]]
 #: Sends the payload of an answer.
 Answer = Callable[[bytes], None]
 
+#: Key of a result from which others were left out, because the broker takes no larger packets.
+LEFT_OUT = "left_out"
 #: Why a daemon that ends refuses what it is asked for.
 ENDING = "the daemon is ending"
 
@@ -91,7 +98,8 @@ class CommandHandler:
 
     def __init__(self, handler: Handler) -> None:
         self._handler = handler
-        self._running: set[asyncio.Task[None]] = set()
+        #: With the names of the commands.
+        self._running: dict[asyncio.Task[None], str] = {}
         self._tokens = float(BURST)
         self._filled_s: float | None = None
         self._flooded = False
@@ -120,13 +128,13 @@ class CommandHandler:
                 refusal = f"the request is not a JSON object as it should be: {error}"
         if refusal is not None:
             self.refused += 1
-            _log.info("command %s refused: %s", _printable(name), one_line(refusal))
+            _log.info("command %s refused: %s", visible(name, 32), visible(refusal, LOGGED))
             answer(_failure(name, identity, refusal))
             return
         self.taken += 1
         task = asyncio.get_running_loop().create_task(self._run(name, payload, identity, answer))
-        self._running.add(task)
-        task.add_done_callback(self._running.discard)
+        self._running[task] = name
+        task.add_done_callback(self._running.pop)
 
     def ignore_retained(self, topic: str) -> None:
         """Count a request that was published as retained: it may be from any time."""
@@ -134,7 +142,7 @@ class CommandHandler:
             self._met_retained = True
             _log.warning(
                 "a retained request on %s is ignored; clear it with: mosquitto_pub -r -n -t %s",
-                *[one_line(topic)] * 2,
+                *[visible(topic, LOGGED)] * 2,
             )
         self.refused += 1
 
@@ -151,7 +159,7 @@ class CommandHandler:
             reply = Result(RESULT_SCHEMA, name, ok=True, id=identity, result=result)
             encoded = msgspec.json.encode(reply)
         except SkinError as error:
-            _log.info("command %s refused: %s", name, one_line(str(error)))
+            _log.info("command %s refused: %s", name, visible(str(error), LOGGED))
             answer(_failure(name, identity, str(error)))
         except asyncio.CancelledError:
             answer(_failure(name, identity, f"{ENDING}; this may not have been done"))
@@ -171,8 +179,10 @@ class CommandHandler:
             return "a command's name has up to 32 of a-z, 0-9, _ and -"
         if len(payload) > MAX_REQUEST_BYTES:
             return f"the request has {len(payload)} bytes; wanted at most {MAX_REQUEST_BYTES}"
-        if len(self._running) >= MAX_RUNNING:
-            return f"{MAX_RUNNING} commands are running already; try again later"
+        if len(self._running) >= MAX_RUNNING and name in self._running.values():
+            return (
+                f"{MAX_RUNNING} commands are running already, and one of this name; try again later"
+            )
         return None
 
     def _token(self) -> bool:
@@ -188,16 +198,27 @@ class CommandHandler:
         return True
 
 
-def answer_too_large(answer: bytes) -> bytes:
-    """Return the replacement for an answer that is too large for the broker."""
-    result = from_json(answer, Result)
-    return _failure(result.command, result.id, "the answer is larger than the broker takes")
+def shortened(answer: bytes) -> bytes | None:
+    """Return a shorter answer in place of one that the broker does not take; None: there is none.
+
+    Of a result the largest key is left out, and `LEFT_OUT` names it: the command was carried out.
+    """
+    reply = from_json(answer, Result)
+    known = {} if reply.result is UNSET else reply.result
+    left = {key: value for key, value in known.items() if key != LEFT_OUT}
+    if not reply.ok:
+        why = "the reason is longer than the broker takes"
+        shorter = _failure(reply.command, reply.id, why)
+    elif left:
+        largest = max(left, key=lambda key: len(msgspec.json.encode(left[key])))
+        del left[largest]
+        result = left | {LEFT_OUT: [*known.get(LEFT_OUT, ()), largest]}
+        shorter = msgspec.json.encode(replace(reply, result=result))
+    else:
+        return None
+    return shorter if len(shorter) < len(answer) else None
 
 
 def _failure(name: str, identity: str | int | UnsetType, why: str) -> bytes:
     command = name if _NAME.fullmatch(name) else "?"
     return msgspec.json.encode(Result(RESULT_SCHEMA, command, ok=False, id=identity, error=why))
-
-
-def _printable(name: str) -> str:
-    return name[:32] if name.isprintable() else "?"

@@ -17,7 +17,7 @@ from itertools import islice
 from typing import Literal, NamedTuple
 
 from skin_host.clock import SYSTEM, Clock
-from skin_host.mqtt.commands import answer_too_large
+from skin_host.mqtt.commands import shortened
 from skin_host.mqtt.connection import (
     TIMEOUT_S,
     Connection,
@@ -221,16 +221,16 @@ class Courier:
         return False
 
     def _drop_large_event(self, number: int) -> None:
-        """Drop an event that is too large; the answer to a command becomes a short refusal, if that
-        is shorter.
+        """Drop an event that is too large; the answer to a command is shortened as long as it can
+        be.
         """
         event = self._outbox.events[number]
         if event.is_touch:
             self._outbox.give_up_event(number)
             return
-        refusal = answer_too_large(event.payload)
-        if len(refusal) < len(event.payload):
-            self._outbox.events[number] = event._replace(payload=refusal)
+        shorter = shortened(event.payload)
+        if shorter is not None:
+            self._outbox.events[number] = event._replace(payload=shorter)
         else:
             self._outbox.give_up_event(number)
             self.too_large.pop(event.topic, None)  # whoever asks may name another one each time

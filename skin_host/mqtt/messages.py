@@ -4,6 +4,7 @@
 programs that only want touches never load numpy.
 """
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import msgspec
@@ -100,6 +101,14 @@ def decode_slip(payload: bytes) -> Slip:
 def decode_over(payload: bytes) -> Over:
     """Read the payload of `<part>/over`; see `decode_touch`."""
     return decode_event(_over_decoder, payload, "over")
+
+
+#: By topic of a part: reads its events.
+EVENT_DECODERS: dict[str, Callable[[bytes], FingertipEvent]] = {
+    "touch": decode_touch,
+    "slip": decode_slip,
+    "over": decode_over,
+}
 
 
 def encode_contact(state: ContactState) -> bytes:

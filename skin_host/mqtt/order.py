@@ -16,7 +16,6 @@ The status has another one, `parts`: of which parts the node publishes. The next
 finds it at the broker, and with it what an earlier configuration left there.
 """
 
-import re
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from itertools import accumulate
@@ -26,6 +25,7 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
 from skin_host.mqtt.connection import Will
+from skin_host.mqtt.topics import NAME
 
 STAMP = "stamp"
 RUN = "run"
@@ -37,7 +37,6 @@ _MAX_DIGITS = 19
 #: A run that comes after a later one than this would have a longer number.
 _LAST_RUN = 10**_MAX_DIGITS - 10**9
 _ONLINE, _LAST_WILL = 0, 1
-_NAME = re.compile(r"[a-z0-9_-]{1,64}")
 
 
 class Stamp(NamedTuple):
@@ -164,7 +163,7 @@ def stamp_of(properties: Any) -> Stamp | None:
 
 def parts_of(properties: Any) -> set[str]:
     """Return the parts of which a node published, by its status."""
-    return set(filter(_NAME.fullmatch, _user_property(properties, PARTS).split(",")))
+    return set(filter(NAME.fullmatch, _user_property(properties, PARTS).split(",")))
 
 
 def _user_property(properties: Any, name: str) -> str:

@@ -29,12 +29,6 @@ class MessageError(SkinError):
     """A payload does not fit its topic."""
 
 
-def one_line(text: str, most: int = 200) -> str:
-    """Make outside text safe for a line of the log: escaped, and cut to `most`."""
-    cut = text if len(text) <= most else text[:most] + "..."
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in cut)
-
-
 def check_size(payload: bytes, what: str, max_bytes: int = MAX_BYTES) -> None:
     """Refuse a payload of the topic `what` that is longer than any valid one.
 

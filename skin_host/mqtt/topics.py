@@ -20,6 +20,10 @@ _PIECE = re.compile(r"[1-9][0-9]{0,4}")
 #: Of what all topics begin with.
 MAX_BASE_BYTES = 256
 MAX_BASE_LEVELS = 32
+#: Of the name of a part, in characters.
+MAX_PART = 64
+#: Names of parts and nodes, as a configuration gives them.
+NAME = re.compile(rf"[a-z0-9_-]{{1,{MAX_PART}}}")
 
 ONLINE = b"online"
 OFFLINE = b"offline"
@@ -45,6 +49,16 @@ def wrong_base(text: str) -> str | None:
             f"{MAX_BASE_LEVELS}: brokers do not take longer topics"
         )
     return wrong_topic(text)
+
+
+def wrong_part(text: str) -> str | None:
+    """Return why no part can have this name: it cannot be one level of a topic; None if it can."""
+    if 0 < len(text) <= MAX_PART and wrong_topic(text) is None and "/" not in text:
+        return None
+    return (
+        f'"{visible(text, 80)}": wanted the name of a part, up to {MAX_PART} characters without '
+        "+, #, / and control characters"
+    )
 
 
 class Subject(NamedTuple):

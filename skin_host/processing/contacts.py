@@ -311,7 +311,7 @@ class ContactTracker:
             return []
         order, starts = found.order, found.starts
         pressure = felt.pressure_kpa.take(order).astype(np.float64)
-        weight = pressure * found.pad_mm2
+        weight = pressure * found.share_mm2
         total = np.add.reduceat(weight, starts)
         moments = np.add.reduceat(weight[:, None] * found.position_m, starts).tolist()
         peaks = np.maximum.reduceat(pressure, starts).tolist()
@@ -537,7 +537,8 @@ class _Grouping(NamedTuple):
         taxels: the same, in order.
         order, starts: intp, all taxels contact by contact, and the index of the first of each.
         spans: which of `order` are of each contact.
-        pad_mm2, position_m: of the taxels in this order: area, and position [.., 3].
+        share_mm2, position_m: of the taxels in this order: skin that they stand for, and
+            position [.., 3].
         area_mm2: of each contact.
     """
 
@@ -547,7 +548,7 @@ class _Grouping(NamedTuple):
     order: NDArray[np.intp]
     starts: NDArray[np.intp]
     spans: list[slice]
-    pad_mm2: Floats
+    share_mm2: Floats
     position_m: Floats
     area_mm2: list[float]
 
@@ -566,9 +567,9 @@ class _Grouping(NamedTuple):
         begins = [0, *ends[:-1]] if ends else []
         starts = np.array(begins, np.intp)
         spans = list(map(slice, begins, ends))
-        pads = area_mm2[order]
-        areas = np.add.reduceat(pads, starts).tolist() if ends else []
-        return cls(names, groups, taxels, order, starts, spans, pads, position_m[order], areas)
+        share_mm2 = area_mm2[order]
+        areas = np.add.reduceat(share_mm2, starts).tolist() if ends else []
+        return cls(names, groups, taxels, order, starts, spans, share_mm2, position_m[order], areas)
 
 
 def _worth_reporting(

@@ -112,6 +112,13 @@ class Curves:
         usable: Mask = self.verdict <= CurveVerdict.UNKNOWN
         return usable
 
+    def is_same(self, other: "Curves") -> bool:
+        """Return whether these are the same curves of the same foam, as read again from a file."""
+        its = other.arrays()
+        return self.memory == other.memory and all(
+            np.array_equal(mine, its[name], equal_nan=True) for name, mine in self.arrays().items()
+        )
+
     def arrays(self) -> dict[str, NDArray[np.float64] | NDArray[np.uint8]]:
         """Return the arrays over taxels, by name."""
         names = ("kpa", "beyond_units", "noise_units", "error_kpa", "verdict")

@@ -255,7 +255,11 @@ class BaselineTracker:
         self._touches.fade(math.exp(-gap_s / SETTLE_S))
 
     def forget(self, taxels: Mask) -> None:
-        """Start again with some taxels, bool[n]: their baselines are new."""
+        """Start again with some taxels, bool[n]: their baselines are new, and drift counts from
+        them.
+        """
+        np.copyto(self.calibrated, self.baseline, where=taxels)
+        self._configure(self._usable, self._settings)
         touched_s = self._touches.touched_s
         for memory in (self._fallen_s, self._former_s, self._taken_s, self._loaded_s, touched_s):
             memory[taxels] = 0.0
@@ -264,8 +268,10 @@ class BaselineTracker:
 
     def renew(self, usable: Mask, zeroed: Mask, settings: Drift) -> None:
         """Continue with other settings, and from new baselines of the taxels `zeroed`, bool[n]."""
-        np.copyto(self.calibrated, self.baseline, where=zeroed)
         self._configure(usable, settings)
+        if settings.rule == "none":
+            # Nothing moves that a touch could hold, and nothing would end what is known of touches.
+            self._touches = _Touches(len(zeroed))
         self.forget(zeroed)
 
     def _configure(self, usable: Mask, settings: Drift) -> None:

@@ -1,5 +1,8 @@
 """Detects pads that jump to and fro: a broken contact, not a pressure."""
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,16 +15,23 @@ Floats = NDArray[np.float32]
 #: of its noise, and below this pressure.
 STEP_DEVIATIONS = 6.0
 STEP_UNITS = 8.0
-#: A few samples with such steps both up and down count 1; each few without them subtract this. At
-#: the limit a pad is erratic: no hand presses and releases that often.
-RELIEF = 0.25
+#: A hand presses at most this often, and half of that time it releases. A pad that rises, falls and
+#: rises in less time, or falls, rises and falls, or rises sooner after it began to fall, is not
+#: pressed so: its contact is broken. A pad may have moved at any time since the sample before.
+FASTEST_HZ = 5.0
+#: Each look that finds such a pad counts 1, and time takes away this much; at the limit the pad is
+#: erratic.
+RELIEF_PER_S = 0.25
 LIMIT = 2.0
 #: A pad stays erratic for this long after its last jumps.
 CALM_S = 60.0
 
 
 class Erratic:
-    """Finds which of m pads jump up and down by more than their noise under pressure.
+    """Finds which of m pads jump up and down by more than their noise, faster than a hand.
+
+    Pads that are read less than three times as often as a hand presses look alike, jumping or
+    tapped: none of them is found.
 
     Args:
         step_kpa: [m], smallest step that cannot be noise; inf where it is not known.
@@ -37,27 +47,46 @@ class Erratic:
         self._step = step_kpa.astype(np.float32)
         self._score = np.zeros(m, np.float32)
         self._left_s = np.zeros(m)
+        self._now_s = 0.0
+        #: The last sample, if what is looked at next follows it.
+        self._before: Floats | None = None
+        #: Whether each pad last rose; and for each way, down and up, since when at the earliest it
+        #: moves so, and the same of the last time before it moved the other way.
+        self._rose: Mask = np.zeros(m, np.bool_)
+        self._began_s = np.full((2, m), -np.inf)
+        self._earlier_s = np.full((2, m), -np.inf)
         self.pads: Mask = np.zeros(m, np.bool_)
         self.any = False
         self.suspects = False
 
-    def look(self, rows: Floats) -> None:
-        """Check some successive samples [k, m] in kPa."""
-        if len(rows) < 3:
-            return
-        if self.suspects:
-            np.subtract(self._score, np.float32(RELIEF), out=self._score)
-            np.maximum(self._score, np.float32(0.0), out=self._score)
+    def look(self, rows: Floats, steps_s: Sequence[float]) -> None:
+        """Check some successive samples.
+
+        Args:
+            rows: [k, m], in kPa.
+            steps_s: k times from sample to sample, the first from the sample before `rows`.
+        """
+        before, self._before = self._before, rows[-1].copy()
+        times_s = np.cumsum([self._now_s, *steps_s]).tolist()
+        elapsed_s, self._now_s = times_s[-1] - self._now_s, times_s[-1]
         # Few pads move that far at all; only those are looked at step by step.
-        spread = rows.max(axis=0)
-        np.subtract(spread, rows.min(axis=0), out=spread)
+        spread, lowest = rows.max(axis=0), rows.min(axis=0)
+        if before is not None:
+            np.maximum(spread, before, out=spread)
+            np.minimum(lowest, before, out=lowest)
+        np.subtract(spread, lowest, out=spread)
         moving = np.flatnonzero(spread > self._step)
+        if self.suspects:
+            relief = np.float32(RELIEF_PER_S * elapsed_s)
+            np.subtract(self._score, relief, out=self._score)
+            np.maximum(self._score, np.float32(0.0), out=self._score)
         if len(moving):
-            changes = np.diff(rows[:, moving], axis=0)
+            first = rows[0] if before is None else before
+            changes = np.diff(rows[:, moving], axis=0, prepend=first[np.newaxis, moving])
             step = self._step[moving]
-            both = moving[(changes.max(axis=0) > step) & (changes.min(axis=0) < -step)]
-            self._score[both] += np.float32(1.0 + RELIEF)
-            beyond = both[self._score[both] > LIMIT]
+            found = self._jumped(moving, changes < -step, changes > step, times_s)
+            self._score[found] += np.float32(1.0)
+            beyond = found[self._score[found] >= LIMIT]
             if len(beyond):
                 self._score[beyond] = LIMIT
                 self._left_s[beyond] = CALM_S
@@ -67,10 +96,47 @@ class Erratic:
             return
         self.suspects = bool(self._score.any())
 
+    def wait(self, elapsed_s: float) -> None:
+        """Let time pass in which no pad need be looked at."""
+        self._now_s += elapsed_s
+        self._before = None
+
+    def _jumped(
+        self,
+        moving: NDArray[np.intp],
+        falls: Mask,
+        rises: Mask,
+        times_s: list[float],
+    ) -> NDArray[np.intp]:
+        """Return which of the moving pads moved to and fro too fast.
+
+        Args:
+            moving: which pads [p].
+            falls, rises: bool[k, p], which of them moved so from sample to sample.
+            times_s: k + 1, of these samples.
+        """
+        found: Mask = np.zeros(len(moving), np.bool_)
+        shortest_s = 1.0 / FASTEST_HZ
+        rising = self._rose[moving]
+        began_s, earlier_s = self._began_s[:, moving], self._earlier_s[:, moving]
+        for fell, rose, (since_s, now_s) in zip(falls, rises, pairwise(times_s), strict=True):
+            for way, begins in ((0, fell & rising), (1, rose & ~rising)):
+                found |= begins & (earlier_s[way] > now_s - shortest_s)
+                np.copyto(earlier_s[1 - way], began_s[1 - way], where=begins)
+                began_s[way, begins] = since_s
+            found |= rose & ~rising & (began_s[0] > now_s - shortest_s / 2.0)
+            rising = (rising | rose) & ~fell
+        self._rose[moving] = rising
+        self._began_s[:, moving], self._earlier_s[:, moving] = began_s, earlier_s
+        return moving[found]
+
     def reset(self, taxels: Mask) -> None:
         """Forget the jumps of taxels [m], which have a new zero."""
         self._score[taxels] = 0.0
         self._left_s[taxels] = 0.0
+        self._rose[taxels] = False
+        self._before = None
+        self._began_s[:, taxels] = self._earlier_s[:, taxels] = -np.inf
         self.pass_time(0.0)
 
     def pass_time(self, dt_s: float) -> None:

@@ -475,7 +475,7 @@ def _encodings(layout: Layout, boards: list[int]) -> list[Encoding]:
     shifts = {(triangle.board, triangle.number): triangle.shift for triangle in layout.triangles}
     return [
         Encoding(
-            thermal_gains(settings.skin_type, number)[0],
+            thermal_gains(settings.effective_skin_type, number)[0],
             shifts.get((board, number), 0),
             settings.no_load,
             settings.model == "mtb3",

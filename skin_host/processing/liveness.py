@@ -62,8 +62,10 @@ RATE_MEMORY_S = 10.0
 #: A calibration counts as this much observation.
 CALIBRATED_S = 5.0
 RATE_SAMPLES = 20
-#: After this many changes a triangle that was frozen, or had an error, is valid again.
+#: After this many changes a triangle that was frozen, or had an error, is valid again; and one of
+#: which nothing is known, because the daemon has just begun. A set-up may change a dead one once.
 PROBATION_CHANGES = 3
+FIRST_CHANGES = 2
 #: Assumed noise of the pads (units) before the calibration.
 USUAL_NOISE_UNITS = 0.5
 #: A byte jumps when it goes up and down by more than this many units, and more than this multiple
@@ -88,6 +90,9 @@ SPIKE_SIGMAS = 8.0
 #: A spike that has not been counted when so many sweeps could not be compared, in a silence or one
 #: here and one there, is over: what is counted is what happens now.
 SPIKE_SWEEPS = 25
+#: Bytes on both sides of a gap of so many sweeps are of one zero, and show whether a chip lives. In
+#: a longer one the board may have restarted.
+FEW_MISSED = 5
 
 
 def change_rate(noise_units: Floats) -> Floats:
@@ -108,7 +113,8 @@ class Liveness:
         k: triangles, those of one board after those of another, equally many of each.
         noise_units: float64[k, 12], calibrated noise, NaN of pads that were received too rarely,
             or None without a calibration. No noise of any pad in a triangle means that it was
-            constant during the calibration, or absent: it is not valid before it changes.
+            constant during the calibration, or absent: it is not valid before it changes often
+            enough. Another is not before its second change.
         period_s: how often each board sends, [boards] or the same for all.
         repeats: finds which pads send something new; without it, those whose byte changes.
         boards: how many boards.
@@ -117,7 +123,7 @@ class Liveness:
     Attributes:
         frozen: bool[k], triangles that repeat their bytes for longer than chance explains.
         unproven: bool[k], triangles that had an error, or were frozen, and have not changed
-            enough since.
+            enough since; at first all.
         silenced: bool[k], those of them whose last reason was an error.
         noisy: bool[k, 12], pads that jump up and down much more than when calibrated.
         doubted: bool[k, 12], pads that are not valid, or None if all are. Of a noisy temperature
@@ -163,7 +169,7 @@ class Liveness:
         self._rows = None if all_of(fitted) else np.flatnonzero(fitted)
         self._rate: Floats = np.minimum(change_rate(noise_units), MOST_RATE)
         self._triangle_rate: Floats = 1.0 - np.prod(1.0 - self._rate, axis=1)
-        constant = ~np.any(noise_units > 0.0, axis=1) & fitted
+        self._constant = constant = ~np.any(noise_units > 0.0, axis=1) & fitted
         # Without a calibration, or if a pad was absent from it or its triangle constant, it is not
         # known how much noise is too much.
         known = ~constant[:, None] & measured & calibrated
@@ -185,6 +191,9 @@ class Liveness:
         self._spiked = np.zeros(shape, np.bool_)
         #: How many sweeps of each triangle could not be compared since its last spike.
         self._uncompared = np.zeros(k, np.int64)
+        #: Triangles whose next step is one over a short gap, and whether there are any.
+        self._over_gap = np.zeros(k, np.bool_)
+        self._any_over_gap = False
         self._felt: TouchedPads | None = None
         self._surprise = np.zeros(k)
         self._any_surprise = False
@@ -205,10 +214,10 @@ class Liveness:
         self._was_far = np.zeros(shape, np.bool_)
         self._knows_far = False
         self._both_far = np.zeros(shape, np.bool_)
-        self._to_show = np.where(constant, PROBATION_CHANGES, 0)
+        self._to_show = np.where(constant, PROBATION_CHANGES, FIRST_CHANGES) * fitted
         self.frozen: Mask = np.zeros(k, np.bool_)
-        self.unproven: Mask = constant.copy()
-        self._any_to_show = any_of(constant)
+        self.unproven: Mask = self._to_show > 0
+        self._any_to_show = any_of(self.unproven)
         self.silenced: Mask = np.zeros(k, np.bool_)
         self.noisy: Mask = np.zeros(shape, np.bool_)
         self._any_noisy = False
@@ -320,6 +329,12 @@ class Liveness:
         else:
             np.copyto(self._present, present, where=np.repeat(came, len(present) // len(came)))
             self._all_present = self._present.tobytes() == self._fitted
+        if self._any_over_gap:
+            if came is None:
+                self._over_gap.fill(False)
+            else:
+                self._over_gap[np.repeat(came, len(present) // len(came))] = False
+            self._any_over_gap = any_of(self._over_gap)
         samples, changes = compared.view(np.int8), changed.view(np.int8)
         if felt is not None:
             samples, changes = samples * felt.calm, changes * felt.calm_pads
@@ -334,7 +349,8 @@ class Liveness:
 
     def note_gap(self, board: int, missed: int = 0) -> None:
         """Sweeps of a board (its row) were lost, so many if that is known: the next step does not
-        follow the last one, and what is received next is not compared with what was before them.
+        follow the last one, and after many, what is received next is not compared with what was
+        before them.
         """
         self.catch_up()
         self._settle_step()
@@ -343,20 +359,23 @@ class Liveness:
         mine = slice(triangles * board, triangles * (board + 1))
         self._step[mine] = 0
         self._uncompared[mine] += missed
-        if missed:
+        if missed > FEW_MISSED:
             self._present[mine] = False
             self._all_present = False
+        elif missed:
+            self._over_gap[mine] = self._any_over_gap = True
 
     def keep(self, before: "Liveness", boards: Mask) -> None:
         """Take over the state of a predecessor for the same skin, for some boards (bool[boards]).
 
-        Of the other boards, which were calibrated, triangles that had to show that they live still
-        have to: a calibration goes on with what was known of those that did not.
+        Of the other boards, which were calibrated, triangles and pads that had to show that they
+        live still have to: a calibration goes on with what was known of those that did not.
         """
         self._settle()
         before._settle()
         self.spikes = before.spikes
         rows = np.repeat(boards, len(self.frozen) // len(boards))
+        constant = self._constant & ~rows
         for mine, its in ((self, before), (self._pads, before._pads)):
             for name, array in vars(mine).items():
                 if not isinstance(array, np.ndarray) or name in {"spikes", "doubted", "lifeless"}:
@@ -367,15 +386,17 @@ class Liveness:
         self._repeats.keep(before._repeats, rows)
         self._any_jumping = any_of(self._jumping > 0.0)
         self._any_noisy = any_of(self.noisy)
-        self._to_show = np.maximum(self._to_show, before._to_show)
+        # Those that live have shown it to the predecessor.
+        self._to_show = np.maximum(np.where(constant, PROBATION_CHANGES, 0), before._to_show)
         self.unproven = self._to_show > 0
         self.frozen = self.frozen | before.frozen
         self.silenced = self.silenced | before.silenced
         self._any_to_show = any_of(self.unproven)
         self._any_surprise = True
+        self._any_over_gap = any_of(self._over_gap)
         self._all_present = self._present.tobytes() == self._fitted
         self._until_learning = 0
-        self._pads.any_stuck = any_of(self._pads.stuck)
+        self._pads.keep_stuck(before._pads)
         self._doubt()
 
     def _settle(self) -> None:
@@ -475,6 +496,8 @@ class Liveness:
         step = np.subtract(raw, self._raw, dtype=np.int16)
         if not whole:
             step *= changed
+        if self._any_over_gap:
+            step[self._over_gap] = 0
         jump = far & (np.abs(self._step) > self._jump_units) & ((step ^ self._step) < 0)
         if not self._any_jumping and not any_of(jump):
             np.copyto(self._step, step, where=compared[:, None])

@@ -48,14 +48,26 @@ class OwnCurves:
         #: Which were touched since the last fold.
         self._felt: Mask = np.zeros(m, np.bool_)
         self._touching = False
-        self._folded_s = 0.0
+        #: Of the samples since the last fold, the time since the one before each.
+        self._steps_s: list[float] = []
+
+    def use(self, smoothing_s: float) -> None:
+        """Smooth over this time from now on."""
+        for smoother in (self._smoother, self._felt_smoother):
+            smoother.use(smoothing_s)
 
     def step(self, momentary: Floats, dt_s: float, touched: Mask, relaxation_kpa: Floats) -> Floats:
         """Return the pressures [m] to report; update the relaxation [m] of touched taxels.
 
         The result is not written to again.
+
+        Args:
+            momentary: [m], in kPa.
+            dt_s: time since the last call.
+            touched: bool[m].
+            relaxation_kpa: [m].
         """
-        self._folded_s += dt_s
+        self._steps_s.append(dt_s)
         if touched is not self._touched:
             self._touched = touched
             self._felt |= touched
@@ -101,20 +113,23 @@ class OwnCurves:
 
     def fold(self, rows: Floats, sums: Floats, relaxation_kpa: Floats) -> None:
         """Take the corrected pressures [k, m] of the last sweeps, and their sums [m]."""
+        folded_s = sum(self._steps_s)
         if self._touching or self.erratic.suspects:
-            self.erratic.look(rows)
+            self.erratic.look(rows, self._steps_s)
+        else:
+            self.erratic.wait(folded_s)
+        self._steps_s.clear()
         momentary = sums / np.float32(len(rows))
         if self._touching:
             # A mean over a press and its release is neither.
             np.copyto(momentary, rows[-1], where=self._felt)
         momentary += relaxation_kpa
-        self._smoother.step(momentary, self._folded_s)
+        self._smoother.step(momentary, folded_s)
         if self._touching:
             self._smoother.take_back(self._which, self._felt_smoother)
             self._touching = self._apart > 0
             if self._touched is not None:
                 np.copyto(self._felt, self._touched)
-        self._folded_s = 0.0
         self._report(relaxation_kpa)
 
     def end_window(self, elapsed_s: float, relaxation_kpa: Floats) -> None:
@@ -162,11 +177,10 @@ class OwnCurves:
         return drifted if drifted is not None and len(drifted) else None
 
     def reset(self, taxels: Mask) -> None:
-        """Forget the readings of taxels [m]."""
+        """Forget the readings of taxels [m], but not that they jumped: see `Erratic.reset`."""
         self._take_back()
         self._smoother.reset(taxels)
         self._reported = np.where(taxels, self._zeros, self._reported)
-        self.erratic.reset(taxels)
         if self._memory is not None:
             self._memory.reset(taxels)
         self._set_apart(self._which, self._apart)

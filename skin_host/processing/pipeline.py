@@ -180,7 +180,7 @@ class Pipeline:
         """Continue from new baselines, because a board was zeroed.
 
         Earlier samples of the taxels refer to the old zero, so they are forgotten: the taxels are
-        untouched until their next sample.
+        relaxed, and untouched until their next sample.
 
         Args:
             taxels: int32[k], which ones.
@@ -310,7 +310,11 @@ class _PartPipeline:
         self._part_kpa = np.empty(m, np.float32)
         self._sum_kpa = np.zeros(m, np.float32)
         self._samples = 0
+        #: Skipped sweeps of the window that no sample stands for.
         self._skipped = 0
+        #: Those since the last sample, and how long they took.
+        self._unseen = 0
+        self._unseen_s = 0.0
         self._since_window_s = 0.0
         self._noted = self._nowhere
         #: How many sweeps of the window lacked each taxel.
@@ -322,21 +326,21 @@ class _PartPipeline:
         rules = rules.part(self._mine)
         zeroed = zeroed[self._mine]
         other_model = rules.settings.relaxation != before.settings.relaxation
-        other_foam = rules.curves is not before.curves
+        if rules.curves is None or before.curves is None:
+            other_foam = rules.curves is not before.curves
+        else:
+            other_foam = not rules.curves.is_same(before.curves)
         if other_foam or (other_model and rules.curves is None):
+            self._fold()
             self._set_model(rules)
+        elif self._own is not None:
+            self._own.use(rules.settings.pressure.smoothing_s)
         self._detector.configure(rules.levels, rules.settings.touch.votes_of_3)
         self.drift.renew(rules.usable, zeroed, rules.settings.drift)
         if any_of(zeroed):
-            for model in (self._relaxation, self._own):
-                if model is not None:
-                    model.reset(zeroed)
-            self._relaxation_kpa[zeroed] = 0.0
-            self._residuals.reset(zeroed)
-            self._rows[:, zeroed] = 0.0
-            self._sum_kpa[zeroed] = 0.0
-            self._was_touched[zeroed] = False
-            self._noted = self._nowhere
+            if self._own is not None:
+                self._own.erratic.reset(zeroed)
+            self._forget(zeroed)
         self._adopt(rules)
         self._begin_anew(zeroed)
 
@@ -416,13 +420,14 @@ class _PartPipeline:
         quiet = touched is self._nowhere and not self._residuals.any and not self._every_sample
         if quiet and not pressures and not self._due(dt_s):
             self._since_window_s += dt_s
-            self._skipped += 1
+            self._unseen_s += dt_s
+            self._unseen += 1
             return self._frame(t_ns, raw, valid, self._zeros, self._nowhere, self._nowhere, False)
         self._since_glance_s = 0.0
         cut_off = 255 in self._last_raw.tobytes()
         beyond = self._beyond(cut_off) if cut_off or not (idle and quiet) else self._nowhere
-        corrected, pressure = self._pressures(beyond, touched, dt_s)
-        self._gather(touched, dt_s)
+        corrected, pressure = self._pressures(beyond, touched, self._unseen_s + dt_s)
+        self._gather(corrected, touched, dt_s, quiet)
         if not quiet:
             repeated = None if idle else self._detector.repeated
             touched = self._residuals.step(touched, corrected, repeated, self._detector.lost)
@@ -442,8 +447,21 @@ class _PartPipeline:
         anew = taxels[self._mine]
         if any_of(anew):
             self.drift.forget(anew)
+            self._forget(anew)
             self._renew_limits()
             self._begin_anew(anew)
+
+    def _forget(self, taxels: Mask) -> None:
+        """Take taxels [m] for relaxed: what the foam keeps of a press is in their new zero."""
+        for model in (self._relaxation, self._own):
+            if model is not None:
+                model.reset(taxels)
+        self._relaxation_kpa[taxels] = 0.0
+        self._residuals.reset(taxels)
+        self._rows[:, taxels] = 0.0
+        self._sum_kpa[taxels] = 0.0
+        self._was_touched[taxels] = False
+        self._noted = self._nowhere
 
     def _begin_anew(self, taxels: Mask) -> None:
         self._last_raw = np.where(taxels, self._untouched_raw(), self._last_raw)
@@ -602,8 +620,19 @@ class _PartPipeline:
         activations: Floats = self._offset[taxels] - self._last_raw[taxels]
         return activations
 
-    def _gather(self, touched: Mask, dt_s: float) -> None:
-        """Add the sample to the window's means; at its end update the slow state."""
+    def _gather(self, corrected: Floats, touched: Mask, dt_s: float, quiet: bool) -> None:
+        """Add the sample to the window's means; at its end update the slow state.
+
+        A quiet sample also stands for the sweeps that were skipped before it. What was skipped
+        before a touch was none, and counts as relaxed.
+        """
+        if self._unseen:
+            if quiet:
+                self._sum_kpa += corrected * np.float32(self._unseen)
+                self._samples += self._unseen
+            else:
+                self._skipped += self._unseen
+            self._unseen, self._unseen_s = 0, 0.0
         self._laid += 1
         if self._laid == ROWS:
             self._fold()
@@ -618,6 +647,8 @@ class _PartPipeline:
     def _end_window(self) -> None:
         """Update the slow state from the means of the window."""
         self._fold()
+        self._skipped += self._unseen
+        self._unseen, self._unseen_s = 0, 0.0
         mean_kpa = np.divide(self._sum_kpa, self._samples, dtype=np.float64)
         if self._own is not None:
             self._own.end_window(self._since_window_s, self._relaxation_kpa)
@@ -631,7 +662,7 @@ class _PartPipeline:
         if self._has_thermal:
             np.subtract(self._offset, self._last_raw, out=units, where=self._thermal)
         if self._relaxation is not None and not self._every_sample:
-            # Within the window the relaxation was constant, and skipped sweeps were untouched.
+            # Within the window the relaxation was constant, and skipped sweeps were relaxed.
             momentary = self._part_kpa
             np.multiply(self._sum_kpa, 1.0 / (self._samples + self._skipped), out=momentary)
             np.add(momentary, self._relaxation_kpa, out=momentary)

@@ -32,10 +32,14 @@ class StepFilter:
     def __init__(self, limit_kpa: ArrayLike, time_s: float, dtype: DTypeLike = np.float64) -> None:
         self._limit: Array = np.asarray(limit_kpa).astype(dtype)
         self._minus_limit: Array = -self._limit
-        self._time_s = time_s
         self.smooth: Array = np.zeros_like(self._limit)
+        self.use(time_s)
+
+    def use(self, time_s: float) -> None:
+        """Filter with this time from now on; what is smoothed so far is kept."""
+        self._time_s = time_s
         self._dt_s = -1.0
-        self._kept = self._limit.dtype.type(0.0)
+        self._kept: Any = self._limit.dtype.type(0.0)
 
     def step(self, kpa: Array, dt_s: float) -> Array:
         """Return the smoothed pressure [n]; the array is valid until the next step.

@@ -417,6 +417,14 @@ class StuckPads:
         self.stuck = self._to_show > 0
         self.any_stuck = any_of(self.stuck)
 
+    def keep_stuck(self, before: "StuckPads") -> None:
+        """Go on to watch the pads that a predecessor found stuck: they send what they sent."""
+        np.maximum(self._to_show, before._to_show, out=self._to_show)
+        self._last, self._earlier = before._last, before._earlier
+        self._went, self._went_far = before._went, before._went_far
+        self.stuck = self._to_show > 0
+        self.any_stuck = any_of(self.stuck)
+
     @property
     def steps_without_decision(self) -> int:
         """Return in how many more steps no pad can become stuck, and no rate is learnt."""

@@ -48,6 +48,8 @@ LEAST_UNITS = 0.1
 #: 3 % at first, 2 % after a second and 1 % after five.
 RESIDUAL_SHARE = 0.03
 RESIDUAL_S = 5.0
+#: Below this nothing is left of a press; denormal numbers would cost many times the time.
+NEGLIGIBLE_KPA = 1e-20
 #: Where the model of the foam is not fitted, more remains, for longer: what is felt when a firm
 #: press falls, up to this share of it, and the time in which that falls to 1/e. On the emulated
 #: foam, 10 s of 70 kPa leave up to 5 % for 15 s.
@@ -467,9 +469,13 @@ class Residuals:
 
     def fade(self, dt_s: float) -> None:
         """Let the residuals of earlier presses fade for this time."""
-        self._pressed *= math.exp(-dt_s / RESIDUAL_S)
-        self._hardest *= math.exp(-dt_s / LEFT_S)
-        self._left *= math.exp(-dt_s / LEFT_S)
+        for residual_kpa, fall_s in (
+            (self._pressed, RESIDUAL_S),
+            (self._hardest, LEFT_S),
+            (self._left, LEFT_S),
+        ):
+            np.multiply(residual_kpa, math.exp(-dt_s / fall_s), out=residual_kpa)
+            residual_kpa[np.abs(residual_kpa) < NEGLIGIBLE_KPA] = 0.0
 
     def reset(self, taxels: Mask) -> None:
         """Forget the presses on some taxels [n]."""

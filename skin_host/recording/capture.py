@@ -116,6 +116,7 @@ class CanLog:
         self._path = path
         with writing(path):
             self._draft = Draft(path)
+            self._draft.begin()
             kind = _Candump if path.suffix == CANDUMP_SUFFIX else _PythonCan
             self._file = kind(self._draft.path)
 
@@ -302,6 +303,7 @@ async def _listen(recorder: Recorder, broker: Broker, topics: list[str]) -> None
     retry = Retry()
     identifier = f"skin-record-{secrets.token_hex(4)}"
     while True:
+        since_s: float | None = None
         try:
             async with connect(
                 broker,
@@ -309,6 +311,7 @@ async def _listen(recorder: Recorder, broker: Broker, topics: list[str]) -> None
                 max_incoming=MAX_INCOMING,
                 max_packet=MAX_PACKET_BYTES,
             ) as connection:
+                since_s = time.monotonic()
                 try:
                     for topic in topics:
                         await connection.subscribe(topic, qos=0 if topic.endswith("/frame") else 1)
@@ -322,7 +325,7 @@ async def _listen(recorder: Recorder, broker: Broker, topics: list[str]) -> None
         except* Exception as group:
             recorder.gaps += 1
             _log.warning("broker %s: %s; trying again", broker, explain(first_error(group)))
-        await asyncio.sleep(retry.delay_s())
+        await asyncio.sleep(retry.delay_s(0.0 if since_s is None else time.monotonic() - since_s))
 
 
 def candump_lines(channel: str, batch: FrameBatch) -> bytes:

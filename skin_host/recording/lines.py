@@ -17,6 +17,7 @@ from skin_host.fingertip.events import FingertipEvent
 from skin_host.mqtt.messages import encode_event, health_keys
 from skin_host.processing.core import Output
 from skin_host.processing.events import KPA_DECIMALS
+from skin_host.processing.masks import any_of
 from skin_host.processing.pipeline import PressureFrame
 
 #: So many frames are written at once. Of more, the work arrays would leave the processor's cache.
@@ -43,7 +44,10 @@ _DECIMALS = _table(
 
 
 def frame_lines(frames: Sequence[PressureFrame]) -> list[bytes]:
-    """Write frames as lines: arrays of all taxels, kPa with three decimals."""
+    """Write frames as lines: arrays of all taxels, kPa with three decimals.
+
+    The key `beyond_range` is there only when a taxel is, as in what is published.
+    """
     ends = np.cumsum([len(frame.raw) for frame in frames]).tolist()
     begins = [0, *ends[:-1]]
     raw = _BYTES.take(np.concatenate([frame.raw for frame in frames])).tobytes()
@@ -57,7 +61,7 @@ def frame_lines(frames: Sequence[PressureFrame]) -> list[bytes]:
         ]
     return [
         b'{"type":"frame","part":%b,"seq":%d,"t_ns":%d,"raw":[%b],"pressure_kpa":[%b],'
-        b'"touched":%b,"valid":%b}\n'
+        b'"touched":%b,"valid":%b%b}\n'
         % (
             _name(frame.part),
             frame.seq,
@@ -66,6 +70,9 @@ def frame_lines(frames: Sequence[PressureFrame]) -> list[bytes]:
             pressures,
             _flags(frame.touched.tobytes()),
             _flags(frame.valid.tobytes()),
+            b',"beyond_range":' + _flags(frame.beyond_range.tobytes())
+            if any_of(frame.beyond_range)
+            else b"",
         )
         for frame, begin, end, pressures in zip(frames, begins, ends, kpas, strict=True)
     ]

@@ -24,7 +24,7 @@ from skin_host.fingertip.events import Over, Slip
 from skin_host.health.record import Record
 from skin_host.mqtt.frames import FRAME_SCHEMA, JsonFrame, decode_frame, encode_frame
 from skin_host.mqtt.info import INFO_SCHEMA, NodeInfo
-from skin_host.mqtt.messages import HEALTH_SCHEMA, Frame, decode_over, decode_slip, decode_touch
+from skin_host.mqtt.messages import EVENT_DECODERS, HEALTH_SCHEMA, Frame, decode_contact
 from skin_host.mqtt.topics import PartTopic, Topics, wrong_topic
 from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
@@ -113,6 +113,7 @@ class Recorder:
         self._path = path
         with writing(path):
             self._draft = Draft(path)
+            self._draft.begin()
             self._file: IO[bytes] = self._draft.path.open("wb")
         self._writer = mcap_writer.Writer(self._file)
         self._writer.start(profile="", library="skin-host")
@@ -374,12 +375,11 @@ def _checked(topic: str, kind: str, payload: bytes, t_ns: int) -> tuple[bytes, i
         if payload[:1] >= b"\xa0":
             payload = _as_json(frame)
         return payload, frame.t_ns
-    if kind == "touch":
-        return payload, decode_touch(payload).t_ns
-    if kind in ("slip", "over"):
-        found = decode_slip(payload) if kind == "slip" else decode_over(payload)
-        return payload, found.t_ns
+    if kind in EVENT_DECODERS:
+        return payload, EVENT_DECODERS[kind](payload).t_ns
     if kind in ("contact", "status"):
+        if kind == "contact" and payload:
+            decode_contact(payload)
         return msgspec.json.encode(_Text(payload.decode())), t_ns
     from_json(payload, dict[str, Any])
     return payload, t_ns

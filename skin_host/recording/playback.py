@@ -22,7 +22,6 @@ from skin_host.errors import BrokerError, BusError, LogError, RequestError
 from skin_host.fingertip.service import FingertipPublisher
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import Connection, MqttError, connect, explain
-from skin_host.mqtt.contact import PartContact
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.order import last_will
 from skin_host.mqtt.publisher import Publisher
@@ -30,12 +29,15 @@ from skin_host.mqtt.topics import OFFLINE
 from skin_host.processing.core import Engine, Output
 from skin_host.recording.capture import message_at
 from skin_host.recording.mcap import read_messages_of, robot_at
-from skin_host.recording.replay import read_buses
+from skin_host.recording.replay import contacts_of, read_buses
 
 LONGEST_PAUSE_S = 600.0
 RETAINED = ("status", "info", "contact", "health")
 #: The node as which frames of CAN are played under another robot's name, with all of its parts.
 NODE = "main"
+#: Each node that is played has a connection of its own, because a connection has one last will:
+#: that of a playback which is killed leaves no node online. No robot has as many.
+MAX_NODES = 64
 #: How long to wait for a broker.
 PATIENCE_S = 5.0
 #: How long the broker may take for the last messages.
@@ -131,8 +133,8 @@ async def play_messages(
     `robot` is a name in place of the recorded one, so that a live robot is not disturbed.
 
     Raises:
-        LogError: the recording cannot be read, holds no messages, or is of several robots that
-            would get one name.
+        LogError: the recording cannot be read, holds no messages, is of several robots that
+            would get one name, or of more than `MAX_NODES` nodes.
         RequestError: the robot is live at this broker.
         BrokerError: the broker cannot be reached, is lost, or does not take a message.
     """
@@ -164,6 +166,11 @@ async def play_messages(
                     free.add(whose)
                 kind = topic.rpartition("/")[2]
                 if kind == "status" and topic not in nodes:
+                    if len(nodes) == MAX_NODES:
+                        raise LogError(
+                            f"{recording}: holds the status of more than {MAX_NODES} nodes; split "
+                            "it, e.g. with `mcap filter`"
+                        )
                     nodes[topic] = await stack.enter_async_context(_node(broker, topic))
                 await nodes.get(topic, common).publish(
                     topic, said.payload, qos=0 if kind == "frame" else 1, retain=kind in RETAINED
@@ -260,7 +267,7 @@ async def play_processed(
         )
 
         fingertips = FingertipPublisher(engine.fingertips, publisher)
-        contacts = {part: PartContact(engine.layout, part) for part in engine.parts}
+        contacts = contacts_of(engine)
 
         def publish(output: Output) -> int:
             fingertips.deliver(output.grasps)

@@ -71,7 +71,7 @@ def plot_pressure(series: Series, output: Path, part: str, taxels: list[int] | N
 
 
 def plot_map(series: Series, output: Path, part: str, at_s: float | None = None) -> None:
-    """Draw the part from above at an instant, or when its pressure was highest.
+    """Draw the part from above at an instant, or when the sum of its pressures was highest.
 
     Raises:
         RequestError: no such part or instant, or the recording has no positions of its taxels.
@@ -85,7 +85,11 @@ def plot_map(series: Series, output: Path, part: str, at_s: float | None = None)
     row = int(felt.sum(axis=1).argmax())
     if at_s is not None:
         if not one.t_s[0] <= at_s <= one.t_s[-1]:
-            raise RequestError(f"{part}: no frame at {at_s:g} s; its last is at {one.t_s[-1]:g} s")
+            first_s, last_s = one.t_s[0], one.t_s[-1]
+            raise RequestError(
+                f"{part}: no frame at {at_s:g} s; its last is at {last_s:.2f} s, "
+                f"its first at {first_s:.2f} s"
+            )
         row = int(np.abs(one.t_s - at_s).argmin())
     kpa = one.pressure_kpa[row]
     thermal = np.array([pad == "thermal" for pad in shape.pads])

@@ -24,6 +24,7 @@ from skin_host.files import whole_file
 from skin_host.health import HealthWatch
 from skin_host.health.diagnosis import named_by_part
 from skin_host.layout import Layout, load_skin
+from skin_host.mqtt.contact import PartContact
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration, Verdict, by_part
 from skin_host.processing.calibration.calibrator import NOISE_SAMPLES
@@ -156,6 +157,21 @@ def doubts(calibration: Calibration, layout: Layout) -> list[str]:
             "valid"
         )
     return found
+
+
+def contacts_of(engine: Engine) -> dict[int, PartContact]:
+    """Return the contact states of the parts of a calibrated engine, by index, as a daemon starts.
+
+    They wait only for taxels that can be valid.
+    """
+    layout = engine.layout
+    contacts = {part: PartContact(layout, part) for part in engine.parts}
+    usable = engine.usable()
+    if usable is not None:
+        for index, contact in contacts.items():
+            part = layout.parts[index]
+            contact.use(usable[part.start : part.stop])
+    return contacts
 
 
 def replay(log: Path, engine: Engine) -> Iterator[Output]:

@@ -416,7 +416,10 @@ BATTERY = wire.MessageClass.BATTERY_STREAM
         (identifier(LEGACY, 1, 9), 8, wire.HEADER_A, "unknown_triangle"),
         (identifier(LEGACY, 9), 8, wire.HEADER_B, "unknown_board"),
         (identifier(BATTERY, 9), 8, wire.HEADER_B, "unknown_board"),
+        (identifier(LEGACY, 1, 12), 8, wire.HEADER_A, "unknown_triangle"),
         # Other sensors share these classes.
+        (identifier(LEGACY, 9, 12), 8, wire.HEADER_A, "other"),
+        (identifier(LEGACY, 9, 13), 8, wire.HEADER_B, "other"),
         (identifier(LEGACY, 1), 7, wire.HEADER_A, "other"),
         (identifier(LEGACY, 1), 6, wire.HEADER_B, "other"),
         (identifier(LEGACY, 1), 8, 0x80, "other"),

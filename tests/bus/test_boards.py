@@ -2,7 +2,9 @@
 
 import asyncio
 from collections.abc import Iterable
+from typing import Any
 
+import msgspec
 import pytest
 
 from skin_host.bus.answers import Discovered, DiscoveredBootloader, answer_frame
@@ -16,10 +18,11 @@ from skin_host.bus.commands import (
 )
 from skin_host.bus.wire import FrameBatch, MessageClass, identifier
 from skin_host.clock import SteppedClock
-from skin_host.config.settings import load
+from skin_host.config.settings import changed, load
 from skin_host.health import HealthWatch, Record
 from skin_host.layout import build_layout
 from skin_host.processing.core import Engine
+from tests.support.board import BoardOnBench
 from tests.support.stack import ROOT
 from tests.support.stepped import stepped
 
@@ -39,8 +42,10 @@ class Nowhere:
 class Heard:
     """The boards of the demo's bus, what they say, and what is told of it."""
 
-    def __init__(self) -> None:
+    def __init__(self, **hand: Any) -> None:
         settings = load(CONFIG)
+        table = msgspec.structs.replace(settings.boards["hand"], **hand)
+        settings = changed(settings, {"boards.hand": table})
         layout = build_layout(settings, CONFIG.parent)
         self.engine = Engine(settings, layout, [0, 1])
         boards = [(i, layout.boards[i]) for i in self.engine.boards]
@@ -69,7 +74,7 @@ class Heard:
         self.now_ns += S // 10
         self.health.tick(self.now_ns, {}, {"can0": self.boards})
 
-    def supervised(self, port: "Kept | Slow", clock: SteppedClock) -> None:
+    def supervised(self, port: "Kept | Slow | Wired", clock: SteppedClock) -> None:
         """From now on boards are queried over a port of their own."""
         layout, ledger = self.engine.layout, self.engine.ledger
         boards = [(i, layout.boards[i]) for i in self.engine.boards]
@@ -377,3 +382,84 @@ async def test_a_board_has_its_time_to_answer_from_when_the_query_is_sent(
         await heard.pass_time(clock)
     assert port.set_up
     await heard.boards.stop()
+
+
+class Wired:
+    """The hand as an MTB3, on a bus with the host; its answers may get lost.
+
+    Args:
+        heard: takes what it sends.
+        clock: of the test.
+        mute: its answers do not arrive, its values do.
+    """
+
+    def __init__(self, heard: Heard, clock: SteppedClock, *, mute: bool) -> None:
+        self.heard, self._clock, self._mute = heard, clock, mute
+        (hand,) = (one for one in heard.engine.layout.boards if one.name == "hand")
+        self._bench = BoardOnBench("mtb3", HAND, slots=hand.triangles)
+        heard.supervised(self, clock)
+
+    async def send(self, frames: Iterable[tuple[int, bytes]], gap_s: float = 0.002) -> None:
+        for can_id, data in frames:
+            self._take(self._bench.board.handle(can_id, data, self._bench.t_ns))
+            await self._clock.sleep(gap_s)
+
+    async def run(self, seconds: float) -> int:
+        """Let time pass; return how many frames of values came in the last second."""
+        came: list[int] = []
+        for step in range(round(seconds / 0.02)):
+            await self._clock.sleep(0.02)
+            self.heard.now_ns += S // 50
+            came.append(self._take(self._bench.run(0.02)))
+            self.heard.engine.ledger.look(self.heard.now_ns)
+            self.heard.boards.supervise()
+            if step % 5 == 0:
+                self.heard.health.tick(self.heard.now_ns, {}, {"can0": self.heard.boards})
+        return sum(came[-50:])
+
+    def _take(self, frames: list[tuple[int, bytes]]) -> int:
+        values = [one for one in frames if one[0] >> 8 == MessageClass.SKIN_STREAM]
+        arrived = [(*one, self.heard.now_ns) for one in (values if self._mute else frames)]
+        output = self.heard.engine.feed("can0", FrameBatch.of(arrived))
+        self.heard.boards.note_answers(output.answers)
+        return len(values)
+
+
+@stepped
+@pytest.mark.parametrize("period_ms", [20, 50, 60, 209])
+async def test_a_mute_board_is_started_whatever_it_is(clock: SteppedClock, period_ms: int) -> None:
+    """An MTB3 that is taken for another board stopped when it was asked for its uptime."""
+    heard = Heard(period_ms=period_ms, model="mtb4")
+    wired = Wired(heard, clock, mute=True)
+    beginning = asyncio.create_task(heard.boards.bring_up())
+    frames = await wired.run(20.0)
+    await beginning
+    assert frames == pytest.approx(2 * 9 * 1000 / period_ms, rel=0.05, abs=18)
+    await heard.boards.stop()
+
+
+@stepped
+@pytest.mark.parametrize("model", ["mtb3", "mtb4"])
+async def test_a_board_of_another_model_than_configured_is_named_and_sends(
+    clock: SteppedClock, model: str
+) -> None:
+    heard = Heard(model=model)
+    wired = Wired(heard, clock, mute=False)
+    beginning = asyncio.create_task(heard.boards.bring_up())
+    assert await wired.run(10.0) == pytest.approx(360, abs=18)
+    await beginning
+    found = [one for one in heard.record()["sentences"] if "boards.hand.model" in one]
+    assert bool(found) == (model == "mtb4")
+    assert (("board_wrong_model", "hand") in heard.told()) == (model == "mtb4")
+    await heard.boards.stop()
+
+
+def test_one_damaged_answer_makes_no_board_one_of_another_model(heard: Heard) -> None:
+    heard.answer(Discovered(BoardType.SKIN, 2, 17, 0), HAND)
+    heard.boards.records[HAND].asked += 1
+    heard.answer(Discovered(BoardType.MTB4, 1, 25, 0), HAND)
+    assert ("board_wrong_model", "hand") not in heard.told()
+    heard.answer_again(Discovered(BoardType.SKIN, 2, 17, 0), HAND)
+    assert ("board_wrong_model", "hand") in heard.told()
+    heard.answer(Discovered(BoardType.MTB4, 1, 25, 0), HAND)
+    assert ("board_wrong_model", "hand") not in heard.told()

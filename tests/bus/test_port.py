@@ -179,14 +179,19 @@ def test_frames_without_stamps_have_the_time_at_which_they_are_read(ends):
     assert (port.read().t_ns >= before_ns).all()
 
 
-def test_the_error_bit_of_an_extended_identifier_is_no_error(ends):
+def test_a_frame_with_the_error_bit_is_an_error_whatever_else_it_is(ends):
+    """The kernel's own filters (net/can/af_can.c) ask for this bit first, and no identifier has
+    it."""
     ours, theirs = ends
     port = port_on(ours)
-    theirs.socket.send(can_frame(0x80000000 | 0x20000040, bytes(8)))
+    theirs.socket.send(can_frame(0x80000000 | 0x1FFFFFFF, bytes(8)))
     theirs.socket.send(can_frame(0x40000000 | 0x123, b""))
     assert len(port.read()) == 2
     assert port.counters.error_frames == 0
-    assert port.state is LinkState.UP
+    theirs.socket.send(can_frame(0x80000000 | 0x20000040, bytes(8)))
+    assert len(port.read()) == 1
+    assert port.counters.error_frames == 1
+    assert port.state is LinkState.BUS_OFF
 
 
 def test_one_line_is_logged_for_a_change_not_for_a_frame(ends, caplog):

@@ -54,6 +54,22 @@ def test_flags_are_those_of_socketcan(virtual):
     assert port.state is LinkState.BUS_OFF
 
 
+def test_error_frames_are_counted_by_whatever_name_the_library_has_them(virtual):
+    """`can.Message` is extended by default, and not every adapter's library changes that."""
+    port, other = virtual
+    other.send(can.Message(arbitration_id=0x004, data=[0, 0x20], is_error_frame=True))
+    assert port.read().id.tolist() == [0x20000004]
+    assert port.counters.error_frames == 1
+    assert port.state is LinkState.ERROR_PASSIVE
+
+
+def test_an_identifier_of_more_than_29_bits_is_damaged(virtual):
+    port, other = virtual
+    other.send(message(0x20000040, bytes(8), is_extended_id=True, check=False))
+    assert len(port.read()) == 0
+    assert (port.counters.damaged, port.counters.error_frames) == (1, 0)
+
+
 def test_fd_frames_are_left_out(virtual):
     port, other = virtual
     other.send(message(0x123, bytes(64), is_fd=True))
@@ -185,3 +201,23 @@ def test_buses_by_multicast_do_not_hear_each_other():
         assert received is not None
         assert received.arbitration_id == 0x410
         assert far.recv(0) is None
+
+
+def test_fd_frames_over_multicast_hold_up_no_others():
+    """With this option python-can's `recv(0)` returns None for them, even if others wait."""
+    pytest.importorskip("msgpack")
+    group = Bus(interface="udp_multicast", channel="239.74.163.203", options={"fd": False})
+    near = open_bus("b", group)
+    port = open_port("left", group, Receive())
+    with can.Bus(interface="udp_multicast", channel=group.channel) as other:
+        try:
+            for _ in range(5):
+                other.send(message(0x123, bytes(64), is_fd=True))
+            other.send(message(0x410))
+        except can.CanError:
+            pytest.skip("this machine has no network for multicast")
+        arrived = iter(lambda: near.recv(PATIENCE_S), None)
+        assert any(one.arbitration_id == 0x410 for one in arrived)
+        assert port.read().id.tolist() == [0x410]
+    near.shutdown()
+    port.close()

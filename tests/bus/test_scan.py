@@ -34,6 +34,8 @@ async def boards(bus: can.BusABC, clock: SteppedClock) -> None:
             if (heard.arbitration_id, bytes(heard.data)) == asked:
                 sent += [answer_frame(answer, address) for address, answer in ANSWERS]
         sent.append((0x7FF, b"not of a skin"[:8]))
+        # Joints that a MAIS measures: the first of them rests at what begins a frame of skin.
+        sent += [(0x36C, b"\x40" + bytes(7)), (0x36D, b"\xc0" + bytes(7))]
         for identifier, payload in sent:
             bus.send(can.Message(arbitration_id=identifier, data=payload, is_extended_id=False))
         await clock.sleep(0.02)
@@ -65,7 +67,7 @@ async def test_boards_are_listed_by_address_with_what_they_run_and_send(
     ]
     rows = scan_table(found, "can0").splitlines()
     assert [row.split() for row in rows[1:]] == [
-        ["5", "unknown", "-", "0,", "3"],
+        ["5", "unknown", "-", "0,3"],
         ["9", "skin", "bootloader", "-"],
         ["10", "type", "77", "6.7.8", "-"],
         ["14", "mtb4", "1.2.3", "-"],

@@ -53,6 +53,40 @@ async def answered(broker: Mosquitto, answer: Mapping[str, Any], *words: str) ->
         return await asyncio.to_thread(main, command)
 
 
+async def test_what_a_broker_had_no_room_for_is_named(
+    mosquitto: Mosquitto, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The answer came without it, though the command was carried out."""
+    record = {"state": "ok", "rate_hz": 20.0, "taxels": 12, "valid_taxels": 12}
+    assert await answered(mosquitto, {"palm": record, "left_out": ["hand"]}, "status") == 0
+    shown = capsys.readouterr()
+    assert [line.split()[0] for line in shown.out.splitlines()] == ["part", "palm"]
+    (warning,) = shown.err.splitlines()
+    assert "without hand: more than the broker takes" in warning
+    known = {key: value for key, value in CALIBRATED.items() if key != "triangles"}
+    without = known | {"left_out": ["triangles"]}
+    assert await answered(mosquitto, without, "calibrate") == 0
+    shown = capsys.readouterr()
+    assert shown.out.strip() == "calibration abc is in use"
+    touched, warning = shown.err.splitlines()
+    assert "taxel 3 of palm" in touched
+    assert "without triangles: more than the broker takes" in warning
+    assert await answered(mosquitto, without, "calibrate", "--json") == 0
+    assert json.loads(capsys.readouterr().out) == without
+
+
+@pytest.mark.parametrize("missing", ["touched", "fingertips"])
+async def test_where_it_is_not_known_what_was_touched_a_strict_calibration_fails(
+    mosquitto: Mosquitto, missing: str
+) -> None:
+    known = CALIBRATED | {"touched": {}}
+    assert await answered(mosquitto, known, "calibrate", "--strict") == 0
+    del known[missing]
+    without = known | {"left_out": [missing]}
+    assert await answered(mosquitto, without, "calibrate", "--strict") == 1
+    assert await answered(mosquitto, without, "calibrate") == 0
+
+
 async def test_values_are_in_words(
     mosquitto: Mosquitto, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -192,11 +226,6 @@ def test_a_threshold_that_is_no_number_is_refused(
     """JSON has no such number: the daemon took it for "unchanged"."""
     assert main(["command", "thresholds", "--set", f"margin_units={number}"]) == 2
     assert f"--set margin_units={number}: wanted KEY=NUMBER" in capsys.readouterr().err
-
-
-def test_strict_belongs_to_calibrate(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["command", "status", "--strict"]) == 2
-    assert "--strict belongs to calibrate" in capsys.readouterr().err
 
 
 async def test_a_calibration_as_a_document_is_the_answer(

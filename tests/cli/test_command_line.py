@@ -239,7 +239,9 @@ def test_every_command_has_help_with_an_example(capsys):
     commands = re.findall(r"^    ([a-z]+)", help_of(capsys), flags=re.MULTILINE)
     assert {"run", "calibrate", "check", "replay", "emulate", "demo", "scan"} <= set(commands)
     for command in commands:
-        assert f"Example: skin {command}" in help_of(capsys, command)
+        text = help_of(capsys, command)
+        assert f"Example: skin {command}" in text
+        assert not re.search(r"default:\s+(None|False|\[\])", text)
 
 
 def test_a_reader_that_leaves_early_is_no_error():
@@ -266,12 +268,28 @@ def test_a_complaint_that_nobody_can_read_changes_no_status(words, status, stder
     assert ended.returncode == status, ended.stderr
 
 
-def test_results_that_cannot_be_written_are_a_failure():
-    line = f"{sys.executable} -m skin_host check {DEMO} >/dev/full"
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("words", [f"check {DEMO}", "--help", "check --help", "--version"])
+def test_results_that_cannot_be_written_are_a_failure(words, unbuffered):
+    line = f"{sys.executable} -m skin_host {words} >/dev/full"
     ended = subprocess.run(
-        ["bash", "-c", line], check=False, cwd=ROOT, capture_output=True, text=True
+        ["bash", "-c", line],
+        check=False,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONUNBUFFERED": unbuffered},
     )
     refused(ended, 1, "No space left")
+
+
+def test_a_terminal_without_a_character_shows_what_it_stands_for():
+    result = skin("check", str(DEMO), PYTHONIOENCODING="ascii")
+    assert result.returncode == 0
+    assert " cm2\n" in result.stdout
+    assert result.stdout.isascii()
+    result = skin("check", "n\u00b2\u20ac.toml", PYTHONIOENCODING="ascii")
+    refused(result, 2, "n2?.toml")
 
 
 def test_a_connection_that_ended_is_not_taken_for_a_reader_that_read_enough(monkeypatch):

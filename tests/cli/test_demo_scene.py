@@ -52,6 +52,20 @@ def test_every_press_is_one_contact() -> None:
         assert all(0.0 < late < 0.4 for late in late_s), (part, begun[part])
 
 
+def test_the_scene_of_the_tutorial_leaves_time_to_calibrate_by_hand() -> None:
+    """A daemon that waits for its boards has calibrated them 20 s after they began to send."""
+    presses = load_scene(CONFIG / "scenes" / "tutorial.toml").probe
+    courses = [probe.force_n or probe.pressure_kpa for probe in presses]
+    spans = sorted(
+        (probe.start_s, probe.start_s + course[-1][0])
+        for probe, course in zip(presses, courses, strict=True)
+    )
+    assert spans[0][0] >= 30.0
+    (repeat_s,) = {probe.repeat_s for probe in presses}
+    assert spans[0][0] + repeat_s - max(end_s for _, end_s in spans) >= 20.0
+    assert {probe.part for probe in presses} == set(PRESSES)
+
+
 def test_no_press_is_missed_or_late_on_pads_as_noisy_as_real_ones() -> None:
     begun = begun_in(replace(load_scene(CONFIG / "scenes" / "demo.toml"), quiet=False))
     for part, at_s in PRESSES.items():

@@ -51,15 +51,10 @@ async def test_a_running_daemon_answers_and_refuses_in_one_line(
     assert await skin("command", "thresholds", "--set", "margin_units=3", "--broker", url) == 0
     assert "  margin_units: 3\n" in capsys.readouterr().out
     words = ["command", "thresholds", "--set", "margin_unit=3"]
-    assert await skin(*words, "--broker", url) == 1
-    assert "set: unknown key `margin_unit`; meant `margin_units`?" in capsys.readouterr().err
+    assert await skin(*words, "--broker", url) == 2
+    assert "--set: unknown key `margin_unit`; meant `margin_units`?" in capsys.readouterr().err
     assert await skin("command", "thresholds", "--reset", "--json", "--broker", url) == 0
     assert json.loads(capsys.readouterr().out)
-    assert await skin("command", "disable", "--part", "tail", "--broker", url) == 1
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert said.err.count("\n") == 1
-    assert "tail" in said.err
 
 
 async def test_every_command_can_be_given_to_a_running_daemon(
@@ -84,8 +79,47 @@ async def test_every_command_can_be_given_to_a_running_daemon(
     ended = await command("stop_recording")
     assert ended["lost"] == 0
     assert ended["frames"] > 100
-    assert await skin("command", "calibrate", "--board", "foot", "--broker", url) == 1
-    assert "foot" in capsys.readouterr().err
+
+
+async def test_where_no_daemon_runs_a_node_is_not_called_a_wrong_name(
+    mosquitto: Mosquitto, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["command", "status", "--robot", "demo", "--node", "main"]
+    assert await skin(*words, "--broker", f"mqtt://{mosquitto.host}:{mosquitto.port}") == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith('no node of robot "demo" is known; is `skin run` running?')
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["calibrate", "--node", "mian"], 'no node "mian" of robot "demo"; there are: main'),
+        (
+            ["disable", "--part", "tail"],
+            'no part "tail" of robot "demo"; there are: left_forearm, left_hand',
+        ),
+        (
+            ["disable", "--part", "left_hnad", "--node", "main"],
+            'no part "left_hnad" of node "main"; there are: left_forearm, left_hand',
+        ),
+        (
+            ["calibrate", "--board", "foot"],
+            'no board "foot" of robot "demo"; there are: forearm_inner, forearm_outer, hand',
+        ),
+        (["thresholds", "--set", "votes_of_3=4"], "--set: votes_of_3: "),
+        (["thresholds", "--set", "margin_units=-1"], "--set: margin_units: "),
+    ],
+)
+async def test_a_name_or_number_that_cannot_be_is_a_wrong_request(
+    live: Live, url: str, capsys: pytest.CaptureFixture[str], words: list[str], line: str
+) -> None:
+    taken = live.daemon.publisher.counters.commands_taken
+    assert await skin("command", *words, "--broker", url) == 2
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err.startswith(f"skin command: {line}")
+    assert shown.err.count("\n") == 1
+    assert live.daemon.publisher.counters.commands_taken == taken
 
 
 async def test_what_a_daemon_answers_is_printed_for_people(

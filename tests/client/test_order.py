@@ -5,8 +5,9 @@ import random
 import pytest
 from msgspec.structs import replace
 
-from skin_host.client.order import MAX_HELD, EventOrder, Newest
+from skin_host.client.order import MAX_HELD, MAX_TOPICS, EventOrder, Newest
 from skin_host.mqtt.order import Numbers, Stamp
+from skin_host.mqtt.payload import MessageError
 from skin_host.processing.events import Touch
 from tests.client.test_presence import seen
 
@@ -68,6 +69,18 @@ def test_what_waits_is_bounded() -> None:
     assert counts(passed) == [*range(3, 3 + MAX_HELD + 1)]
 
 
+def test_large_touches_that_wait_do_not_fill_the_memory() -> None:
+    order = EventOrder(hold_s=1e9)
+    order.take(event(1), 7, 0.0)
+    large = list(range(100_000))
+    passed = [
+        one for n in range(3, 9) for one in order.take(replace(event(n), taxels=large), 7, 0.0)
+    ]
+    # Those that wait have together as many taxels as are kept of a part.
+    assert counts(passed) == [3, 4, 5, 6, 7, 8]
+    assert counts(order.take(event(10), 7, 0.0)) == []
+
+
 def test_the_newest_state_wins_over_what_comes_late() -> None:
     newest = Newest()
     assert newest.take("contact", "palm", Stamp(5, 3))
@@ -77,6 +90,20 @@ def test_the_newest_state_wins_over_what_comes_late() -> None:
     assert newest.take("contact", "arm", None)
     newest.forget("contact")
     assert newest.take("contact", "palm", Stamp(4, 9))
+
+
+def test_topics_without_end_are_passed_over_and_the_known_ones_go_on() -> None:
+    """Whoever may publish could number the pieces of a node's info for ever."""
+    newest = Newest()
+    for piece in range(MAX_TOPICS):
+        assert newest.take("info", f"main/{piece}", Stamp(5, 3))
+    for piece in range(MAX_TOPICS, MAX_TOPICS + 10):
+        with pytest.raises(MessageError, match=f"more than {MAX_TOPICS} topics of this kind"):
+            newest.take("info", f"main/{piece}", Stamp(5, 3))
+    assert newest.take("info", "main/1", Stamp(5, 4))
+    assert newest.take("contact", "palm", Stamp(5, 4))
+    newest.forget("info", "main/7")
+    assert newest.take("info", f"main/{MAX_TOPICS}", Stamp(5, 3))
 
 
 def test_numbers_rise_while_the_clock_is_set_back() -> None:

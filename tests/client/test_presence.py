@@ -498,7 +498,7 @@ async def test_what_anybody_names_steers_no_terminal_and_is_cut(mosquitto: Mosqu
         await skin.ready()
         skin._presence.take_node("main", online=True)
         skin._presence.take_info("main", presence_names)
-        stream = skin.touches("a\x07b")
+        stream = skin.touches("absent")
         skin._check_parts(asyncio.get_running_loop().time() + NAMED_S + 1.0)
         with pytest.raises(RequestError) as raised:
             await anext(stream)

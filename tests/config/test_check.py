@@ -70,6 +70,15 @@ def test_a_thermometer_that_feels_pressure_is_warned_of() -> None:
     assert "triangles 0-15 feels pressure" in warning
 
 
+@pytest.mark.parametrize("skin_type", [3, 8])
+def test_a_skin_type_that_an_mtb3_does_not_know_is_warned_of(skin_type: int) -> None:
+    (warning,) = full_boards(1, model="mtb3", skin_type=skin_type)["warnings"]
+    assert warning == (
+        f"boards.mtb1.skin_type: {skin_type} is unknown to an MTB3, which then compensates no "
+        "temperature; wanted 0, 1 or 2"
+    )
+
+
 def test_an_unused_bus_and_a_board_of_two_daemons_are_warned_of() -> None:
     description = described(
         {"mtb": {"bus": "can0", "address": 1, "skin_type": 2}},

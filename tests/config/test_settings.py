@@ -46,8 +46,7 @@ pads_mm = [[0, 0], [5, 0], [9, 0], [15, 0], [20, 0], [25, 0],
     [0, 5], [5, 5], [9, 5], [15, 5], [20, 5], [25, 5]]
 pitch_mm = 5
 radius_mm = 2
-area_mm2 = 18
-outline_mm = [[0, 0], [20, 0], [0, 20]]
+outline_mm = [[-3, -3], [28, -3], [28, 8], [-3, 8]]
 """
 PATCH = "parts.left_hand.patches[1]"
 TIP = 'fingertips.tip]\nbus = "can0"\naddress = 3\nshape = '
@@ -302,7 +301,6 @@ def written(folder: Path, key: str, value: object) -> Path:
         ("kinds.row.radius_mm", 1e-100),
         ("kinds.row.radius_mm", 1e-5),
         ("kinds.row.pitch_mm", 1e8),
-        ("kinds.row.area_mm2", 1e-320),
         ("parts.left_hand.foam_mm", 1e-308),
         ("processing.calibration.seconds", 1e8),
         ("processing.pressure.pad_radius_mm", 1e-200),

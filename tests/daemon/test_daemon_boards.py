@@ -255,8 +255,9 @@ async def test_while_the_daemon_is_behind_no_board_is_set_up(
             rows = zip(batch.id, batch.dlc, batch.data, batch.t_ns, strict=True)
             waiting.extend((int(i), bytes(data[:n]), int(t_ns)) for i, n, data, t_ns in rows)
             # There is always more to come: if nothing is old enough, a frame of somebody else's.
+            oldest_ns = waiting[0][2] if waiting else clock.now_ns()
             old = len(waiting) > FRAMES_BEHIND
-            return FrameBatch.of([waiting.pop(0) if old else (0x100, b"", clock.now_ns())])
+            return FrameBatch.of([waiting.pop(0) if old else (0x100, b"", oldest_ns)])
 
         port.read, port.capacity = read_too_late, 1  # type: ignore[method-assign]
         bus = can.Bus(interface=can_bus_settings.interface, channel=can_bus_settings.channel)

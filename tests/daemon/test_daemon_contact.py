@@ -3,12 +3,16 @@
 from collections.abc import AsyncIterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from emulator.probes.scene import Fault, Place, Probe, Scene
+from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus
+from skin_host.mqtt.messages import ContactState
 from tests.support.broker import Mosquitto
 from tests.support.live import Live, living
+from tests.support.stepped import stepped
 from tests.support.subscriber import Subscriber
 
 
@@ -48,6 +52,48 @@ async def test_a_board_that_dies_during_a_touch_never_looks_untouched(
         assert subscriber.payloads("left_forearm/contact")[-1] == b"OFF"
     subscriber.catch_up()
     assert b"OFF" not in subscriber.payloads("left_hand/contact")[3:]
+
+
+@stepped
+async def test_a_part_that_is_enabled_again_may_be_touched_where_it_failed_meanwhile(
+    clock: SteppedClock, tmp_path: Path
+) -> None:
+    """A pad was pressed while nothing of its part was published, and nobody saw it released."""
+    press = Probe(
+        part="left_hand",
+        at=Place(triangle=4),
+        diameter_mm=10,
+        pressure_kpa=[(0, 0), (0.1, 60), (8, 60), (8.1, 0), (1000, 0)],
+        start_s=8.0,
+    )
+    bus, scene = Bus(interface="virtual", channel="enabled"), Scene(quiet=True, probe=[press])
+    async with living(bus, tmp_path, scene=scene, clock=clock) as live:
+        daemon = live.daemon
+        await live.until_well(but=frozenset({"board_rezeroed"}))
+        said: list[str] = []
+
+        def note(part: str, state: ContactState) -> None:
+            if part == "left_hand":
+                said.append(state)
+
+        daemon.publisher.put_contact = note  # type: ignore[method-assign]
+        daemon.disable(0)
+        zeros, board = daemon.engine.zeros, daemon.layout.boards[0]
+        await live.wait(lambda: bool(zeros.at_risk(touched=True).any()))
+        await clock.sleep(1.0)
+        taxel = int(np.flatnonzero(zeros.at_risk(touched=True))[0])
+        triangle, pad = np.argwhere(board.taxel_index == taxel)[0].tolist()
+        mend = live.robot.inject(
+            Fault(name="noisy_taxel", board="hand", triangle=triangle, taxel=pad, value=20)
+        )
+        await clock.sleep(9.0)
+        said.clear()
+        daemon.enable(0)
+        await clock.sleep(2.0)
+        assert set(said) == {"UNKNOWN"}
+        mend()
+        await clock.sleep(5.0)
+        assert said[-1] == "OFF"
 
 
 async def test_after_a_restart_a_silent_board_is_unknown_whatever_the_broker_kept(

@@ -1,4 +1,5 @@
 import asyncio
+import re
 from pathlib import Path
 
 import can
@@ -7,7 +8,7 @@ import pytest
 from smbus2 import i2c_msg
 
 from emulator.chips import signal
-from emulator.clock import SteppedTime
+from emulator.clock import RealClock, SteppedTime
 from emulator.probes import scene as scenes
 from emulator.probes.scene import Fault, Place, Probe, Scene
 from emulator.robot import Robot
@@ -22,6 +23,7 @@ from skin_host.bus.commands import (
 )
 from skin_host.bus.pair import PairBus, pair
 from skin_host.bus.wire import FrameBatch, find_skin_frames
+from skin_host.clock import SteppedClock
 from skin_host.config import settings as configurations
 from skin_host.config.settings import Settings, changed
 from skin_host.errors import ConfigurationError, LogError
@@ -291,6 +293,31 @@ async def test_a_pause_that_a_host_takes_for_silence_is_reported(
             await clock.advance(passed_s)
         life.cancel()
     assert not caplog.messages
+
+
+@pytest.mark.parametrize("speed", [0.01, 0.1, 1.0, 10.0])
+def test_a_pause_is_measured_in_the_time_of_the_host(
+    speed: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    robot, host = Robot(*load()), SteppedClock()
+
+    async def live() -> None:
+        with can.Bus(interface="virtual", channel="test-pause-of-host") as plain:
+            life = asyncio.create_task(robot.run({"can0": plain}, RealClock(speed, host)))
+            await host.sleep(1.0)  # of slow emulated time it looks rarely, and is not late
+            assert not caplog.messages
+            for pause_s in (0.05, 0.4, 0.4, 0.0):  # no more than one in 10 s is reported
+                await host.sleep(0.1)
+                host.advance(pause_s)
+            life.cancel()
+
+    with host.runner() as runner:
+        runner.run(live())
+    (said,) = caplog.messages
+    found = re.search(r"held the emulator up for (\d+) ms", said)
+    assert found is not None
+    # The robot looked for the last time up to one interval of its own before.
+    assert 400 <= int(found[1]) <= 400 + 2.5 / speed
 
 
 @pytest.mark.parametrize("stalled_s", [0.3, 1.2, 7.33, 3600.01])

@@ -9,6 +9,7 @@ import pytest
 from skin_host.evaluation import (
     accuracy,
     bench_processing,
+    force_trials,
     page,
     report,
     speed,
@@ -52,6 +53,7 @@ def small():
         ],
         "hard_cases": touching.negative(2.0),
         "localization": report.localization(20),
+        "force": force_trials.force("triangle", 4, (4.0, 10.0)),
         "real_skin": {"absent": "nowhere", "real": [], "published": [], "grasps": None},
         "seconds": 1.0,
     }

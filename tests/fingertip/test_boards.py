@@ -184,6 +184,48 @@ async def test_a_board_that_falls_silent_is_told_of_and_set_up_again() -> None:
     assert bench.record()["silences"] == 1
 
 
+@pytest.mark.parametrize("period_ms", [100, 150, 255])
+async def test_a_board_has_timed_out_when_it_is_late_by_its_own_period(period_ms: int) -> None:
+    bench = Bench(period_ms=period_ms, filter_hz=1.0, full_scale=(50.0, 50.0, 50.0, 1.0, 1.0, 1.0))
+    await bench.boards.bring_up()
+    await bench.run(1.0)
+    seen = set()
+    for _ in range(30):
+        await bench.run(0.1)
+        seen.update(bench.codes())
+    assert seen == {"not_calibrated"}
+    assert bench.record()["silences"] == 0
+    mend = bench.robot.inject(parse("board_silent board=index"))
+    await bench.run(3.0 * period_ms / 1000)
+    assert bench.codes()[0] == "silent"
+    mend()
+    await bench.run(2.0)
+    assert bench.codes() == ["not_calibrated"]
+    assert bench.record()["silences"] == 1
+
+
+async def test_a_touch_outlasts_a_lost_sample_of_a_slow_board() -> None:
+    bench = Bench(
+        {"part": "index", "force_n": [[8.0, 0], [8.1, 3], [99.0, 3]]},
+        period_ms=255,
+        filter_hz=1.0,
+        full_scale=(50.0, 50.0, 50.0, 1.0, 1.0, 1.0),
+    )
+    await bench.boards.bring_up()
+    await bench.run(1.0)
+    bench.engine.begin_calibration(4.0)
+    await bench.run(4.1)
+    bench.engine.use(bench.engine.end_calibration("2026-01-01T00:00:00+00:00"))
+    await bench.run(6.0)
+    assert bench.contact() == "ON"
+    mend = bench.robot.inject(parse("board_silent board=index"))
+    await bench.run(0.26)
+    mend()
+    await bench.run(2.0)
+    assert [event.event for event in bench.felt if event.event == "end"] == []
+    assert bench.record()["silences"] == 0
+
+
 async def test_full_scales_that_somebody_else_reported_are_told_until_the_board_is_asked() -> None:
     bench = Bench(full_scale=(50.0, 50.0, 50.0, 1.0, 1.0, 1.0))
     await bench.boards.bring_up()
@@ -231,6 +273,17 @@ async def test_lost_frames_are_told_until_none_is_lost() -> None:
     assert bench.codes() == ["loses_frames"]
     await bench.run(6.0)
     assert bench.codes() == []
+
+
+async def test_frames_of_a_wrong_length_count_for_the_board_that_sent_them() -> None:
+    bench = Bench()
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    skin = (0x388, bytes.fromhex("40F0F0F0F0F0F0F0"))  # the legacy stream of a skin board
+    for can_id, data in ((FORCE_OF_INDEX, bytes(5)), skin, (FORCE_OF_INDEX, bytes(8))):
+        bench.engine.feed("can0", FrameBatch.of([(can_id, data, bench.now_ns)]))
+    assert bench.record()["wrong_length"] == 2
+    assert bench.record("thumb")["wrong_length"] == 0
 
 
 async def test_load_beyond_the_range_is_told_and_has_no_place() -> None:

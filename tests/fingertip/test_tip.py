@@ -27,6 +27,7 @@ class Bench:
         table: dict[str, Any] = {"shape": "sphere", "radius_mm": RADIUS_MM, "period_ms": 10}
         table |= settings
         self.tip = Tip("index", Fingertip(bus="can0", address=3, **table), 50.0, 50 * MS)
+        self.period_ns = table["period_ms"] * MS
         self.tip.use(Zero(OFFSET, NOISE))
         self.rng = np.random.default_rng(1)
         self.t_ns = 0
@@ -34,7 +35,7 @@ class Bench:
     def sample(
         self, point_mm: Any, force_n: Any, more: Any = 0.0, *, saturated: bool = False
     ) -> list[FingertipEvent]:
-        self.t_ns += 10 * MS
+        self.t_ns += self.period_ns
         torque_nm = 1e-3 * np.cross(point_mm, force_n)
         sent = np.concatenate([force_n, torque_nm]) + more + OFFSET
         sent = sent + NOISE * self.rng.normal(size=6)
@@ -249,6 +250,19 @@ def test_a_pull_that_changes_faster_than_a_slip_is_one_whatever_is_lost(losses: 
     found = slipping(8.0, LOSSES[losses])
     assert found[0].event == "begin" and found[0].cause == "rate"
     assert found[0].shear_rate_n_s == pytest.approx(7.0, abs=1.3)
+
+
+@pytest.mark.parametrize("period_ms", [10, 100, 150, 255])
+def test_samples_of_a_slow_board_continue_those_before_them(period_ms: int) -> None:
+    """A rate is that of a line through several samples."""
+    bench = Bench(period_ms=period_ms, filter_hz=1.0, slip_n_s=0.2)
+    bench.hold(20, POINT, -5.0 * DIRECTION)
+    along = np.array([0.8, -0.6, 0.0])
+    events = []
+    for pull_n in np.linspace(0.0, 1.0, round(2000 / period_ms)):
+        events += bench.sample(POINT, -5.0 * DIRECTION + pull_n * along)
+    found = slips(events)
+    assert [(one.event, one.cause) for one in found] == [("begin", "rate")]
 
 
 def test_samples_that_are_held_up_and_arrive_together_are_no_slip() -> None:

@@ -133,6 +133,7 @@ ELSEWHERE = {
     "board_absent": "tests/daemon/test_daemon_boards.py",
     "board_in_bootloader": "tests/bus/test_boards.py",
     "board_twice": "tests/health/test_honest.py",
+    "board_wrong_model": "tests/bus/test_boards.py",
     "board_wrong_type": "tests/bus/test_boards.py",
     "bus_stranger": "tests/bus/test_boards.py",
     "host_stalls": "tests/health/test_honest.py",

@@ -221,3 +221,20 @@ def test_what_pressed_as_a_board_took_its_zero_is_no_fault_of_its_triangle() -> 
     assert ("board_in_doubt", "hand") in bench.told
     assert not {where for code, where in bench.first_told if "out_of_range" in code}
     assert not bench.valid["left_hand"][48:60].all()
+
+
+def test_what_pressed_as_a_board_took_its_zero_hides_no_fault_of_the_chip() -> None:
+    """Such pads read far below zero pressure; a chip that fails reads far above."""
+    press = press_on_hand(9.0)
+    bench = FaultBench(3.0, Scene(quiet=True, probe=[press]), settle_s=5.0)
+    bench.run(10.0 - bench.t_s)
+    bench.inject("chip_gone", board="hand", triangle=0, value=0)  # after which it takes a zero
+    bench.run(5.0)
+    mend = bench.inject("clock_stretched", board="hand", triangle=4)
+    bench.run(1.0)
+    assert ("board_in_doubt", "hand") in bench.told
+    assert ("triangle_out_of_range", "hand/4") in bench.told
+    mend()
+    bench.run(1.0)
+    assert ("board_in_doubt", "hand") in bench.told
+    assert not {where for code, where in bench.told if "out_of_range" in code}

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skin_host.config.settings import PlaceSettings, Settings, changed
+from skin_host.config.settings import KindSettings, PlaceSettings, Settings, changed
 from skin_host.errors import ConfigurationError
 from skin_host.layout import Layout, PadKind, build_layout, builtin_kinds
-from skin_host.layout.geometry import NEIGHBOUR_PITCHES, fitted_outline, lay, tile
+from skin_host.layout.geometry import NEIGHBOUR_PITCHES, fitted_outline, lay, shares_mm2, tile
 
 HERE = Path()
 angles_deg = st.floats(-360, 360)
@@ -255,9 +255,76 @@ KIND = {
     "pads_mm": [[5.0 * i, 0.0] for i in range(12)],
     "pitch_mm": 5,
     "radius_mm": 2,
-    "area_mm2": 25,
     "outline_mm": [[0, 0], [60, 0], [0, 5]],
 }
+
+
+def outline_mm2(kind: KindSettings) -> float:
+    x, y = np.array(kind.outline_mm).T
+    return 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
+
+
+@pytest.mark.parametrize("name", builtin_kinds())
+def test_the_pads_of_a_unit_stand_for_all_of_its_outline(name: str) -> None:
+    """Pressure between the pads counts, and none counts twice."""
+    kind = builtin_kinds()[name]
+    triangles = len(kind.pads_mm) // 12
+    layout = build_layout(skin({"triangles": f"0-{triangles - 1}", "kind": name}), HERE)
+    assert layout.area_mm2.sum() == pytest.approx(outline_mm2(kind))
+    thermal = layout.pad_kind == PadKind.THERMAL
+    assert (layout.area_mm2[thermal] == 0.0).all()
+    assert (layout.area_mm2[~thermal] > 5.0).all()
+
+
+def test_an_equal_pad_of_the_triangle_of_twelve_stands_for_a_twelfth_of_it() -> None:
+    layout = build_layout(skin({"triangles": "0"}), HERE)
+    assert layout.area_mm2 == pytest.approx(np.full(12, np.sqrt(3) / 4 * 30**2 / 12), rel=1e-3)
+
+
+def test_the_skin_of_a_pad_is_that_of_its_kind_wherever_its_places_are_read_from(
+    tmp_path: Path,
+) -> None:
+    write_rows(tmp_path / "arm.txt", np.random.default_rng(5).uniform(0.1, 0.2, (12, 6)))
+    laid, read = (
+        build_layout(skin({"triangles": "0", "kind": "triangle_10pad", **more}), tmp_path)
+        for more in ({}, {"positions": "arm.txt"})
+    )
+    assert np.array_equal(laid.area_mm2, read.area_mm2)
+
+
+@given(
+    st.lists(st.tuples(st.integers(-40, 40), st.integers(-30, 30)), min_size=12, max_size=12),
+    st.sets(st.integers(0, 11), max_size=11),
+    st.booleans(),
+)
+def test_a_pad_stands_for_the_skin_that_is_nearest_to_it(
+    places: list[tuple[int, int]], thermal: set[int], clockwise: bool
+) -> None:
+    """Also where the outline has a notch; pads at one place have equal shares."""
+    outline = [(-50, -40), (50, -40), (50, 40), (0, 5), (-50, 40)]
+    kind = msgspec.convert(
+        KIND
+        | {
+            "pads_mm": places,
+            "thermal": sorted(thermal),
+            "outline_mm": outline[::-1] if clockwise else outline,
+        },
+        KindSettings,
+    )
+    found = shares_mm2(kind)
+    step = 1.0
+    x, y = np.meshgrid(np.arange(-49.5, 50, step), np.arange(-39.5, 40, step))
+    within = y < 5 + 35 / 50 * np.abs(x)
+    points = np.column_stack([x[within], y[within]])
+    pressing = np.array([number for number in range(12) if number not in thermal])
+    apart = np.linalg.norm(points[:, None] - np.array(places)[pressing], axis=2)
+    nearest = apart <= apart.min(axis=1, keepdims=True) + 1e-9
+    share = nearest / nearest.sum(axis=1, keepdims=True)
+    wanted = np.zeros(12)
+    wanted[pressing] = share.sum(axis=0) * step**2
+    # The grid's squares are cut where the cells' borders run, some 200 mm of them.
+    assert found == pytest.approx(wanted, abs=60.0)
+    assert found.sum() == pytest.approx(outline_mm2(kind))
 
 
 def test_a_kind_of_the_users_own_is_laid_out() -> None:
@@ -268,6 +335,9 @@ def test_a_kind_of_the_users_own_is_laid_out() -> None:
     assert neighbours(layout, 5) == {4, 6}
 
 
+WANTED_OUTLINE = "wanted 0.001 at least: corners around all pads, one after the other"
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -275,6 +345,14 @@ def test_a_kind_of_the_users_own_is_laid_out() -> None:
         ({"pads_mm": []}, "kinds.row.pads_mm: 0 pads; wanted a multiple of 12"),
         ({"outline_mm": [[0, 0], [1, 1]]}, "kinds.row.outline_mm: 2 corners; wanted 3 or more"),
         ({"thermal": [12]}, "kinds.row.thermal: [12]; pads are 0 to 11"),
+        (
+            {"outline_mm": [[0, -3], [40, -3], [40, 3], [0, 3]]},
+            f"kinds.row.outline_mm: 0 mm2 of it are nearest to pad 9; {WANTED_OUTLINE}",
+        ),
+        (
+            {"outline_mm": [[0, 0], [60, 0], [30, 0]]},
+            f"kinds.row.outline_mm: 0 mm2 of it are nearest to pad 0; {WANTED_OUTLINE}",
+        ),
     ],
 )
 def test_a_bad_kind_is_named(change: dict[str, object], said: str) -> None:

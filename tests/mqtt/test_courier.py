@@ -568,17 +568,46 @@ async def test_touches_on_their_way_with_an_answer_are_suspected_without_it(
     assert waiting == [[], [1], [2], [3], [4, 5]]
 
 
+async def answered(clock: SteppedClock, **keys: Any) -> list[dict[str, Any]]:
+    """Answers to a command that reach a subscriber of a broker of small packets."""
+    sender, link = Sender(clock), Link(packet_limit=1000, is_prompt=True)
+    answer = json.encode(Result(RESULT_SCHEMA, "scan", id="a", **keys))
+    sender.outbox.put_event(Event("reply", answer, None, is_touch=False))
+    async with sender.over(link):
+        found = [json.decode(one.payload) for one in link.sent if one.topic == "reply"]
+    counters = sender.outbox.counters
+    assert counters.rejected == counters.answers_dropped == (not found)
+    return found
+
+
 @stepped
-async def test_an_answer_larger_than_the_broker_takes_becomes_a_refusal(
+async def test_an_answer_larger_than_the_broker_takes_is_shortened_and_says_so(
     clock: SteppedClock,
 ) -> None:
-    sender, link = Sender(clock), Link(packet_limit=1000, is_prompt=True)
-    result = Result(RESULT_SCHEMA, "scan", ok=True, id="a", result={"text": "x" * 2000})
-    sender.outbox.put_event(Event("reply", json.encode(result), None, is_touch=False))
-    async with sender.over(link):
-        (answer,) = (one for one in link.sent if one.topic == "reply")
-        assert json.decode(answer.payload)["error"] == "the answer is larger than the broker takes"
-    assert sender.outbox.counters.rejected == 0
+    """What was asked for is done: a refusal would let the asker do it again."""
+    result = {"id": "b", "text": "x" * 2000, "kept": True, "list": [1] * 600, "few": [1, 2]}
+    assert await answered(clock, ok=True, result=result) == [
+        {
+            "schema": RESULT_SCHEMA,
+            "command": "scan",
+            "id": "a",
+            "ok": True,
+            "result": {"id": "b", "kept": True, "few": [1, 2], "left_out": ["text", "list"]},
+        }
+    ]
+
+
+@stepped
+async def test_the_reason_of_a_refusal_is_shortened_too(clock: SteppedClock) -> None:
+    (answer,) = await answered(clock, ok=False, error="x" * 2000)
+    assert not answer["ok"]
+    assert answer["error"] == "the reason is longer than the broker takes"
+
+
+@stepped
+async def test_an_answer_that_cannot_be_short_enough_is_dropped(clock: SteppedClock) -> None:
+    result = {f"{number:03}": number for number in range(500)}
+    assert await answered(clock, ok=True, result=result) == []
 
 
 @stepped

@@ -78,7 +78,8 @@ def test_an_event_tells_place_area_pressure_and_force():
     taxels = sorted(HERE)
     area = LAYOUT.area_mm2[taxels].sum()
     assert event.taxels == taxels
-    assert event.centroid_m == pytest.approx(LAYOUT.position_m[taxels].mean(axis=0).tolist())
+    centroid_m = LAYOUT.area_mm2[taxels] @ LAYOUT.position_m[taxels] / area
+    assert event.centroid_m == pytest.approx(centroid_m.tolist())
     assert event.normal == pytest.approx([0.0, 0.0, 1.0])
     assert event.area_mm2 == pytest.approx(area)
     assert (event.peak_kpa, event.mean_kpa) == (50.0, pytest.approx(50.0))
@@ -415,7 +416,7 @@ def test_where_hardly_anything_is_left_to_feel_the_normal_stays():
     skin = Skin(replace(LAYOUT, normal=tilted))
     (begin,) = skin.show({0, 1})
     (moved,) = skin.show({0, 1}, kpa=0.3, unlike={0: 1.5})
-    assert moved.normal == begin.normal == pytest.approx([0.5**0.5, 0.5**0.5, 0.0])
+    assert moved.normal == begin.normal == pytest.approx([0.5**0.5, 0.5**0.5, 0.0], abs=1e-3)
 
 
 def test_stopping_ends_every_contact():
@@ -572,12 +573,13 @@ def test_what_feels_no_pressure_yet_is_a_contact_without_a_place():
 
 
 def test_the_normal_of_a_contact_is_the_mean_of_its_taxels_of_length_one():
+    alike = replace(LAYOUT, area_mm2=np.full(N, 20.0))
     tilted = LAYOUT.normal.copy()
     tilted[0], tilted[1] = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
-    (event,) = Skin(replace(LAYOUT, normal=tilted)).show({0, 1})
+    (event,) = Skin(replace(alike, normal=tilted)).show({0, 1})
     assert event.normal == pytest.approx([0.5**0.5, 0.5**0.5, 0.0])
     tilted[1] = (-1.0, 0.0, 0.0)
-    (event,) = Skin(replace(LAYOUT, normal=tilted)).show({0, 1})
+    (event,) = Skin(replace(alike, normal=tilted)).show({0, 1})
     assert event.normal is None
 
 

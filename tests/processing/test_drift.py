@@ -495,6 +495,24 @@ def test_the_time_in_touch_is_reported_from_its_limit_on_and_fades_after_it():
     assert not track.frozen.any()
 
 
+def test_without_tracking_no_touch_of_before_is_reported_for_ever():
+    track = tracker(frozen_report_s=30.0)
+    touched = np.arange(N) < 6
+    for _ in range(40):
+        follow(track, 0.0, touched, 25.0)
+    assert track.frozen[:6].all()
+    track.renew(np.ones(N, bool), NOBODY, Drift(rule="none", frozen_report_s=30.0))
+    for _ in range(60):
+        follow(track, 0.0)
+    assert not track.frozen.any()
+    track.renew(np.ones(N, bool), NOBODY, Drift(frozen_report_s=30.0))
+    for _ in range(29):
+        follow(track, 0.0, touched, 25.0)
+        assert not track.frozen.any()
+    follow(track, 0.0, touched, 25.0)
+    assert track.frozen[:6].all()
+
+
 def test_a_taxel_that_fell_alone_is_left_for_five_seconds_and_then_followed_at_once():
     track = tracker()
     baselines = []

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from skin_host.processing.curves import KNOTS_UNITS, TableCurve
-from skin_host.processing.erratic import LIMIT, RELIEF, Erratic, step_kpa
+from skin_host.processing.erratic import LIMIT, RELIEF_PER_S, Erratic, step_kpa
 from skin_host.processing.pressure import PressureCurve
 
 STEP_KPA = 5.0
+PERIOD_S = 0.02
 
 
 def samples(*kpa: float) -> np.ndarray:
@@ -18,41 +19,93 @@ def samples(*kpa: float) -> np.ndarray:
     return rows
 
 
+def look(found: Erratic, *kpa: float, period_s: float = PERIOD_S) -> None:
+    found.look(samples(*kpa), [period_s] * len(kpa))
+
+
 def jumping(looks: int) -> Erratic:
     found = Erratic(np.array([STEP_KPA, STEP_KPA, np.inf]))
     for _ in range(looks):
-        found.look(samples(0, 9, 0, 9))
+        look(found, 0, 9, 0, 9)
+    return found
+
+
+def tapping(presses_per_s: float, contact_s: float, hz: float, seconds: float) -> Erratic:
+    """A pad that is tapped, read so often, and looked at as the pipeline does."""
+    found = jumping(0)
+    t_s = np.arange(round(seconds * hz)) / hz
+    phase_s = t_s % (1.0 / presses_per_s)
+    kpa = np.where(phase_s < contact_s, 20.0 * np.sin(np.pi * phase_s / contact_s), 0.0)
+    for begin in range(0, len(kpa) - 7, 8):
+        look(found, *kpa[begin : begin + 8], period_s=1.0 / hz)
     return found
 
 
 def test_a_pad_that_jumps_again_and_again_is_erratic_and_the_others_are_not():
     assert not jumping(1).any
-    found = jumping(2)
+    found = jumping(3)
     assert found.any
     assert found.pads.tolist() == [False, True, False]
+
+
+@pytest.mark.parametrize("hz", [10.0, 15.0, 20.0, 25.0, 49.0, 100.0])
+@pytest.mark.parametrize("presses_per_s", [1.0, 2.0, 3.0, 4.9])
+def test_tapping_is_no_broken_contact_at_any_rate_of_sweeps(hz: float, presses_per_s: float):
+    contact_s = min(0.1, 0.6 / presses_per_s)
+    assert not tapping(presses_per_s, contact_s, hz, 60.0).any
+
+
+@pytest.mark.parametrize("hz", [20.0, 49.0, 100.0])
+def test_a_broken_contact_is_found_at_any_rate_of_sweeps(hz: float):
+    found = jumping(0)
+    rng = np.random.default_rng(3)
+    # The contact opens and closes with each conversion of the chip.
+    t_s = np.arange(round(10.0 * hz)) / hz
+    levels = np.where(rng.random(round(10.0 / 0.037) + 1) < 0.5, 0.0, 9.0)
+    kpa = levels[(t_s / 0.037).astype(np.int64)]
+    for begin in range(0, len(kpa) - 7, 8):
+        look(found, *kpa[begin : begin + 8], period_s=1.0 / hz)
+    assert found.pads.tolist() == [False, True, False]
+
+
+def test_a_press_that_is_lost_for_some_samples_again_and_again_is_a_broken_contact():
+    found = jumping(0)
+    for _ in range(8):
+        look(found, 9, 9, 0, 0, 9, 9, 9, 9)
+        look(found, *[9] * 8)
+    assert found.pads.tolist() == [False, True, False]
+
+
+def test_jumps_that_are_read_less_than_three_times_as_often_as_a_hand_presses_may_be_presses():
+    found = jumping(0)
+    for _ in range(20):
+        look(found, 0, 9, 0, 9, 0, 9, 0, 9, period_s=0.07)
+    assert not found.suspects
 
 
 def test_a_press_and_a_release_that_lie_far_apart_are_no_jumps():
     found = jumping(0)
     for _ in range(20):
-        found.look(samples(0, 9, 9, 9))  # up
-        found.look(samples(9, 9, 0, 0))  # and down in a later look
-    assert not found.any
+        look(found, 0, 0, 0, 9, 9, 9, 9, 9)  # up
+        look(found, 9, 9, 0, 0, 0, 0, 0, 0)  # and down in a later look
+    assert not found.suspects
+
+
+def test_jumps_count_across_looks_and_not_across_a_pause():
+    for pause_s in (0.0, 0.2):
+        found = jumping(0)
+        look(found, 0, 9, 9, 0)
+        found.wait(pause_s)
+        look(found, 0, 9, 9)
+        assert found.suspects == (pause_s == 0.0)
 
 
 def test_rare_jumps_are_forgotten():
     found = jumping(0)
     for _ in range(20):
-        found.look(samples(0, 9, 0))
-        for _ in range(round(1.0 / RELIEF)):
-            found.look(samples(0, 0, 0))
-    assert not found.any
-
-
-def test_too_few_samples_show_no_jump():
-    found = jumping(0)
-    for _ in range(20):
-        found.look(samples(0, 9))
+        look(found, 0, 9, 0, 9)
+        for _ in range(round(1.0 / (RELIEF_PER_S * 0.5))):
+            look(found, *[9] * 25)
     assert not found.any
 
 
@@ -70,10 +123,11 @@ def test_a_new_zero_begins_without_old_jumps(jumps: int):
     found = jumping(jumps)
     found.reset(np.array([False, True, False]))
     assert not found.any
-    found.look(samples(0, 9, 0))
+    look(found, 0, 9, 0)
+    assert not found.suspects
+    look(found, 0, 9, 0, 9)
+    assert found.suspects
     assert not found.any
-    found.look(samples(0, 9, 0))
-    assert found.any
 
 
 def test_a_new_zero_of_one_pad_changes_nothing_of_another():
@@ -85,28 +139,10 @@ def test_a_new_zero_of_one_pad_changes_nothing_of_another():
 
 def test_a_pad_that_jumped_for_long_is_a_suspect_no_longer_than_at_its_limit():
     found = jumping(100)
-    for _ in range(round(LIMIT / RELIEF)):
+    for _ in range(round(LIMIT / RELIEF_PER_S)):
         assert found.suspects
-        found.look(samples(0, 0, 0))
+        look(found, *[9] * 8, period_s=0.125)
     assert not found.suspects
-
-
-def test_a_pad_is_a_suspect_from_its_first_jumps_until_they_are_forgotten():
-    assert not jumping(0).suspects
-    found = jumping(1)
-    for _ in range(round((1.0 + RELIEF) / RELIEF)):
-        assert found.suspects
-        found.look(samples(0, 0, 0))
-    assert not found.suspects
-
-
-def test_too_few_samples_relieve_no_suspect():
-    found = jumping(0)
-    for _ in range(2):
-        found.look(samples(0, 9, 0))
-        for _ in range(round((1.0 + RELIEF) / RELIEF)):
-            found.look(samples(0, 0))
-    assert found.any
 
 
 def test_noise_of_six_deviations_or_eight_units_is_no_jump():

@@ -49,9 +49,12 @@ class Joined:
 
 
 def intake():
-    """Of the forearm, both of whose boards have been heard of."""
+    """Of the forearm, both of whose boards have been received, and live."""
     parts = Joined()
-    parts.feed([sweep(OUTER, 1), sweep(INNER, 2), sweep(OUTER, 3)])
+    for t_ns in (1, 3):
+        parts.feed([sweep(OUTER, t_ns), sweep(INNER, t_ns + 1)])
+        parts.feed([sweep(OUTER, t_ns + 2, fill=239), sweep(INNER, t_ns + 3, fill=239)])
+    parts.feed([sweep(OUTER, 7)])
     parts.engine.intake.flush()
     return parts
 
@@ -98,7 +101,9 @@ def test_boards_of_a_part_with_different_periods_are_valid_in_every_sample(
         newest = one.raw[0, 0] if one.board == OUTER else newest
         came = parts.feed([one])
         assert len(came) == (one.board == INNER)
-        assert all(sample.present.all() and sample.raw[0] == newest for sample in came)
+        assert all(sample.raw[0] == newest for sample in came)
+        # A board lives from its third sweep on.
+        assert all(sample.present.all() for sample in came if len(samples) > 2)
         samples += came + parts.expire(one.t_ns)
     assert len(samples) == 2000 // slow_ms
 

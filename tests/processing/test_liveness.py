@@ -272,14 +272,17 @@ def test_a_press_before_a_gap_and_its_end_after_it_are_no_spike(gap: bool) -> No
     assert liveness.spikes.sum() == (0 if gap else 1)
 
 
-def test_a_press_that_began_in_a_gap_and_ends_after_its_first_sweep_is_no_spike() -> None:
+@pytest.mark.parametrize("missed", [1, 5, 6, 100])
+def test_a_press_that_began_in_a_gap_and_ends_after_its_first_sweep_is_no_spike(
+    missed: int,
+) -> None:
     rng = np.random.default_rng(3)
     centre = np.full((K, 12), 240.3)
     liveness = calibrated(rng, 0.4, centre)
     pressed = noisy_bytes(rng, 0.4, centre)
     pressed[1, 4] -= 40
     liveness.step(noisy_bytes(rng, 0.4, centre), HERE, NO)
-    liveness.note_gap(0, 100)
+    liveness.note_gap(0, missed)
     liveness.step(pressed, HERE, NO)
     rest(liveness, 30)
     assert not liveness.spikes.any()
@@ -424,6 +427,50 @@ def test_a_byte_that_was_off_before_a_long_silence_is_not_counted_after_it(
     assert liveness.spikes.sum() == spikes
 
 
+@pytest.mark.parametrize("missed", [1, 5])
+def test_a_board_that_sends_more_seldom_than_it_was_set_up_to_is_judged_as_any_other(
+    missed: int,
+) -> None:
+    """Each of its sweeps follows a gap. A live chip is valid; a dead one, or stuck pad, is not."""
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+    liveness = Liveness(K, np.full((K, 12), 0.8), PERIOD_S)
+    for _ in range(400):
+        liveness.note_gap(0, missed)
+        raw = noisy_bytes(rng, 0.8, centre)
+        raw[1], raw[2, 4] = 240, 240
+        liveness.step(raw, HERE, NO)
+    assert liveness.unproven.tolist() == [False, True, False, False]
+    assert liveness.frozen.tolist() == [False, True, False, False]
+    assert np.argwhere(liveness.stuck).tolist() == [[2, 4]]
+    assert not liveness.noisy.any()
+
+
+def test_presses_of_a_board_that_sends_seldom_are_neither_noise_nor_spikes() -> None:
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+    liveness = calibrated(rng, 0.4, centre)
+    for number in range(400):
+        liveness.note_gap(0, 1)
+        raw = noisy_bytes(rng, 0.4, centre)
+        raw[1, 4] -= 40 * (number % 2)
+        liveness.step(raw, HERE, NO)
+        assert not liveness.noisy.any()
+    assert not liveness.spikes.any()
+
+
+def test_another_byte_after_a_long_silence_shows_no_life() -> None:
+    """The board may have restarted meanwhile, and has another zero."""
+    liveness = Liveness(K, np.full((K, 12), 0.8), PERIOD_S)
+    for number in range(4):
+        liveness.note_gap(0, 6)
+        rest(liveness, 1)
+        raw = np.full((K, 12), 230 + number, np.uint8)
+        liveness.note_gap(0, 6)
+        liveness.step(raw, HERE, NO)
+    assert liveness.unproven.all()
+
+
 @pytest.mark.parametrize(("lost_of_7", "spikes"), [(0, 1), (1, 1), (5, 0)])
 def test_a_byte_that_was_off_is_not_counted_long_after_it_where_most_sweeps_are_lost(
     lost_of_7: int, spikes: int
@@ -439,18 +486,70 @@ def test_a_byte_that_was_off_is_not_counted_long_after_it_where_most_sweeps_are_
     assert liveness.spikes.sum() == spikes
 
 
-def test_triangles_are_valid_until_a_calibration_finds_them_constant() -> None:
+@pytest.mark.parametrize("noise_units", [None, np.full((K, 12), 0.8)])
+def test_a_triangle_of_which_nothing_is_known_is_valid_from_its_second_change_on(
+    noise_units: np.ndarray | None,
+) -> None:
+    liveness = Liveness(K, noise_units, PERIOD_S)
+    raw = np.full((K, 12), 240, np.uint8)
+    for _ in range(5):
+        assert liveness.unproven.all()
+        assert liveness.doubted is not None
+        assert liveness.doubted.all()
+        liveness.step(raw, HERE, NO)
+    assert not liveness.frozen.any()
+    # One change may be that of a set-up.
+    for changes in (1, 2):
+        raw[1, 4] -= 1
+        liveness.step(raw, HERE, NO)
+        assert liveness.unproven.tolist() == [True, changes < 2, True, True]
+
+
+def test_a_calibration_takes_no_triangle_for_unknown_that_has_changed() -> None:
+    before = Liveness(K, None, PERIOD_S)
+    raw = np.full((K, 12), 240, np.uint8)
+    for _ in range(3):
+        raw[:3, 4] -= 1
+        before.step(raw, HERE, NO)
+    noise = np.full((K, 12), 0.8)
+    noise[2] = 0.0
+    after = Liveness(K, noise, PERIOD_S)
+    after.keep(before, np.zeros(1, np.bool_))
+    assert after.unproven.tolist() == [False, False, True, True]
+
+
+def test_a_pad_that_is_stuck_at_a_calibration_is_so_until_it_has_moved_three_times() -> None:
+    """The boards' zeros are what they were, and so are the bytes that show its life."""
     rng = np.random.default_rng(3)
-    assert Liveness(K, None, PERIOD_S).doubted is None
+    centre, noise = np.full((K, 12), 240.3), np.full((K, 12), 0.8)
+    before = Liveness(K, noise, PERIOD_S)
+    for _ in range(400):
+        raw = noisy_bytes(rng, 0.8, centre)
+        raw[1, 4] = 240
+        before.step(raw, HERE, NO)
+    assert np.argwhere(before.stuck).tolist() == [[1, 4]]
+    after = Liveness(K, noise, PERIOD_S)
+    after.keep(before, np.zeros(1, np.bool_))
+    for byte in (240, 240, 241, 241, 241, 240, 240, 241):
+        assert np.argwhere(after.stuck).tolist() == [[1, 4]]
+        assert after.lifeless is not None
+        assert np.array_equal(after.lifeless, after.stuck)
+        raw = noisy_bytes(rng, 0.8, centre)
+        raw[1, 4] = byte
+        after.step(raw, HERE, NO)
+    assert after.lifeless is None
+
+
+def test_a_triangle_that_a_calibration_finds_constant_is_valid_after_three_changes() -> None:
+    rng = np.random.default_rng(3)
     noise = np.full((K, 12), 0.8)
     noise[2] = 0.0
     liveness = Liveness(K, noise, PERIOD_S)
+    liveness.step(noisy_bytes(rng, 0.8, np.full((K, 12), 240.3)), HERE, NO)
     for changes in range(4):
-        assert liveness.unproven.tolist() == [False, False, changes < 3, False]
+        others = changes < 2
+        assert liveness.unproven.tolist() == [others, others, changes < 3, others]
         liveness.step(noisy_bytes(rng, 0.8, np.full((K, 12), 240.3)), HERE, NO)
-        if not changes:
-            # The first sweep is compared with nothing.
-            liveness.step(noisy_bytes(rng, 0.8, np.full((K, 12), 240.3)), HERE, NO)
 
 
 def test_a_press_right_after_a_release_is_no_damaged_byte() -> None:

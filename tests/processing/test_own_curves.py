@@ -1,5 +1,6 @@
 """What a part with fitted curves makes of bytes at the ends of the scale, jumps and slow rises."""
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -79,6 +80,77 @@ def test_a_pad_that_jumps_to_and_fro_under_pressure_is_not_valid_until_it_is_cal
     frames = hold(rig, 20.0, 50 * 65)
     assert not frames[50 * 55].valid[3]
     assert frames[-1].valid.all()
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.1])
+@pytest.mark.parametrize("pressures", [False, True])
+@pytest.mark.parametrize(
+    ("hz", "presses_per_s", "share"),
+    [(20.0, 2.0, 0.3), (50.0, 4.9, 0.5), (100.0, 4.0, 0.25), (100.0, 4.9, 0.25)],
+)
+def test_pads_that_a_hand_taps_stay_valid(
+    hz: float, presses_per_s: float, share: float, pressures: bool, loss: float
+):
+    """Also where sweeps are lost, or computed more seldom while nothing touches the pad."""
+    rig = Rig(1, 0.3, seed=5, hz=hz)
+    use_own_curves(rig, 0.4)
+    rng = np.random.default_rng(1)
+    for sweep in range(round(10.0 * hz)):
+        phase = sweep / hz * presses_per_s % 1.0 / share
+        raw = rig.read(np.where(PRESSED, 40.0 * np.sin(np.pi * min(phase, 1.0)), 0.0))
+        rig.t_ns += round(1e9 / hz)
+        if rng.random() >= loss:
+            frame = rig.pipeline.step(0, raw, np.ones(rig.n, bool), rig.t_ns, pressures)
+            assert frame.valid.all()
+
+
+def test_a_calibration_elsewhere_leaves_memory_and_doubts_of_other_pads():
+    """Each calibration reads the fitted curves again from their file."""
+    rig = own()
+    hold(rig, 40.0, 50)
+    jumping = np.arange(192) == 3
+    for sweep in range(60):
+        rig.step(np.where(PRESSED, 20.0, 0.0) + np.where(jumping, 20.0 * (sweep % 2), 0.0))
+    relaxation_kpa = rig.pipeline.relaxation_kpa[4:12].copy()
+    assert relaxation_kpa.min() > 1.0
+    elsewhere = np.arange(192) >= 180
+    again = use_own_curves(rig, 0.4, zeroed=elsewhere)
+    assert rig.pipeline.relaxation_kpa[4:12].tolist() == relaxation_kpa.tolist()
+    (frame,) = hold(rig, 20.0, 1)
+    assert np.flatnonzero(~frame.valid).tolist() == [3]
+    rig.pipeline.renew(rig.settings.processing, again, jumping)
+    assert hold(rig, 20.0, 1)[-1].valid.all()
+    use_own_curves(rig, 0.5)  # fitted again: another foam
+    assert not rig.pipeline.relaxation_kpa.any()
+
+
+def test_a_board_that_was_zeroed_leaves_a_broken_contact_in_doubt():
+    rig = own()
+    jumping = np.arange(192) == 3
+    for sweep in range(60):
+        rig.step(np.where(PRESSED, 20.0, 0.0) + np.where(jumping, 30.0 * (sweep % 2), 0.0))
+    rig.pipeline.set_zero(np.arange(12, dtype=np.int32), rig.true_baseline[:12])
+    (frame,) = hold(rig, 0.0, 1)
+    assert np.flatnonzero(~frame.valid).tolist() == [3]
+
+
+def test_another_time_of_smoothing_takes_effect_with_the_next_samples():
+    """And nothing else changes: neither what the foam remembers nor what is smoothed so far."""
+    rig = Rig(1, 1.0, seed=5, hz=50.0)
+    calibration = use_own_curves(rig, 1.0)
+    hold(rig, 40.0, 50)
+    for smoothing_s, least, most in ((0.5, 0.0, 1.0), (0.0, 1.5, 5.0)):
+        changed = msgspec.structs.replace(
+            rig.settings.processing,
+            pressure=msgspec.structs.replace(
+                rig.settings.processing.pressure, smoothing_s=smoothing_s
+            ),
+        )
+        memory_kpa = rig.pipeline.relaxation_kpa.copy()
+        rig.pipeline.renew(changed, calibration, np.zeros(rig.n, bool))
+        assert rig.pipeline.relaxation_kpa.tolist() == memory_kpa.tolist()
+        pressures = [frame.pressure_kpa[:12] for frame in hold(rig, 20.0, 100)][50:]
+        assert least < np.std(np.diff(pressures, axis=0)) < most
 
 
 def test_a_load_that_grows_slowly_is_pressure_and_not_drift():
@@ -258,10 +330,11 @@ def test_what_is_reset_begins_anew_and_the_others_go_on():
     kpa[[7, 9]] = 3.0
     for press in (40.0, 40.0, 40.0, 20.0):
         kpa[touched] = press
-        for _ in range(4 * ROWS):
-            before = own.step(kpa, DT_S, touched, relaxation)
-            sums = ROWS * (kpa - relaxation)
-        own.fold(np.tile(kpa - relaxation, (ROWS, 1)), sums, relaxation)
+        for _ in range(4):
+            for _ in range(ROWS):
+                before = own.step(kpa, DT_S, touched, relaxation)
+                sums = ROWS * (kpa - relaxation)
+            own.fold(np.tile(kpa - relaxation, (ROWS, 1)), sums, relaxation)
     assert relaxation[:3].min() > 1.0
     assert before[[7, 9]] == pytest.approx(3.0, abs=0.1)
     reset = np.isin(np.arange(N), [1, 2, 7])

@@ -674,6 +674,58 @@ def test_zeros_move_alike_whether_pressures_are_subscribed_or_not(units):
     assert unwatched == pytest.approx(watched, abs=0.05)
 
 
+@pytest.mark.parametrize("shift_units", [20.0, -12.0])
+def test_drift_is_limited_from_the_zero_that_a_board_has(shift_units: float):
+    """Held near the zero before, all of a board would read pressed, or nothing."""
+    rig = Rig(1, 0.3, seed=5, hz=25.0, processing={"drift": {"limit_units": 5.0}})
+    press(rig, 0.0, 50)
+    rig._resting -= np.float32(shift_units)
+    rig.pipeline.set_zero(np.arange(rig.n, dtype=np.int32), rig.true_baseline)
+    assert not any(frame.touched.any() for frame in press(rig, 0.0, 125))
+    assert rig.pipeline.baseline == pytest.approx(rig.true_baseline, abs=0.5)
+    assert not rig.pipeline.at_limit(0).any()
+    rig.pipeline.renew(rig.settings.processing, rig.calibration, np.zeros(rig.n, bool))
+    assert rig.pipeline.baseline == pytest.approx(rig.true_baseline, abs=0.5)
+    frames = press(rig, 20.0, 5)
+    assert np.array_equal(np.flatnonzero(frames[-1].touched), range(6))
+
+
+def test_a_tap_after_a_board_was_zeroed_is_felt_in_full_though_its_foam_had_been_pressed():
+    """What the foam keeps of the press is in the new zero, and must not be taken off twice."""
+    rig = Rig(1, 0.3, seed=5, hz=50.0)
+    curve = PressureCurve(rig.layout.unit_ff / rig.layout.sensitivity)
+    pressed = np.arange(rig.n) < 12
+    press(rig, 40.0, 50 * 60, where=pressed)
+    for _ in range(50 * 8):
+        rig.step(curve.units(rig.pipeline.relaxation_kpa))
+    left_units = curve.units(rig.pipeline.relaxation_kpa)
+    assert left_units[:12].min() > 1.5
+    zeroed = pressed & (np.arange(rig.n) % 12 < 6)
+    rig.pipeline.set_zero(
+        np.flatnonzero(zeroed).astype(np.int32), (rig.true_baseline + left_units)[zeroed]
+    )
+    assert not rig.pipeline.relaxation_kpa[zeroed].any()
+    assert rig.pipeline.relaxation_kpa[6:12].min() > 4.0
+    tapped = curve.units(np.where(pressed, 12.0, 0.0)) + left_units
+    frames = [rig.step(tapped) for _ in range(20)]
+    assert frames[-1].touched[:12].all()
+    felt_kpa = np.mean([frame.pressure_kpa[:6] for frame in frames])
+    assert felt_kpa == pytest.approx(12.0, abs=1.5)
+
+
+def test_relaxation_fades_after_a_release_alike_whether_pressures_are_subscribed_or_not():
+    rigs = [Rig(1, 0.0, hz=50.0) for _ in range(2)]
+    for sweep in range(50 * 30):
+        for rig, pressures in zip(rigs, (True, False), strict=True):
+            rig.t_ns += 20_000_000
+            units = 30.0 if sweep < 50 * 20 else 0.0
+            raw = rig.read(np.where(np.arange(rig.n) < 6, units, 0.0))
+            rig.pipeline.step(0, raw, np.ones(rig.n, bool), rig.t_ns, pressures)
+        watched, unwatched = (rig.pipeline.relaxation_kpa for rig in rigs)
+        assert unwatched == pytest.approx(watched, abs=0.1)
+    assert watched[:6].min() > 0.5
+
+
 def test_without_a_subscriber_an_untouched_part_is_computed_five_times_a_second():
     rig = Rig(1, 0.0, hz=50.0)
     present = np.ones(rig.n, bool)

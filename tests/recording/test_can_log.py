@@ -1,5 +1,6 @@
 """Recordings of CAN frames in every format: times, kinds and channels are kept, or it is stated."""
 
+import json
 import os
 import resource
 from collections.abc import Iterator
@@ -180,8 +181,8 @@ def test_what_a_full_disk_took_of_a_file_is_named(
         if suffix == ".mcap":
             with Recorder(path) as recorder:
                 for n in range(100_000):
-                    data = os.urandom(4).hex()
-                    recorder.say(f"{TOPIC}/contact", n, data.encode())
+                    record = {"state": os.urandom(4).hex()}
+                    recorder.say(f"{TOPIC}/health", n, json.dumps(record).encode())
             return
         with CanLog(path) as log:
             for n in range(10_000):

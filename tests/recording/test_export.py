@@ -71,13 +71,18 @@ def test_tables_have_a_row_a_frame_and_empty_cells_where_nothing_is_known(
     series: Series, tmp_path: Path
 ) -> None:
     written = export(series, tmp_path / "tables")
-    assert [path.name for path in written] == ["left_hand.csv", "touches.csv"]
+    assert [path.name for path in written] == [
+        *("left_hand.csv", "touches.csv", "slips.csv", "overs.csv", "contacts.csv", "health.csv"),
+    ]
     with written[0].open() as file:
         rows = list(csv.reader(file))
     assert rows[0][:3] == ["seq", "t_ns", "taxel_0_kpa"]
     assert len(rows) == 261
-    assert rows[1][2 + 60 :] == [""] * 48
+    assert rows[1][2 + 60 : -2] == [""] * 48
     part = series.parts["left_hand"]
+    assert part.raw is not None
+    assert rows[0][-2:] == ["beyond_range", "raw"]
+    assert bytes.fromhex(rows[200][-1]) == part.raw[199].tobytes()
     assert float(rows[200][2]) == pytest.approx(part.pressure_kpa[199, 0], abs=0.005)
     with written[1].open() as file:
         touches = list(csv.DictReader(file))
@@ -166,6 +171,8 @@ def test_what_is_not_there_is_not_drawn(series: Series, tmp_path: Path) -> None:
         plots.plot_map(series, tmp_path / "a.png", "foot")
     with pytest.raises(RequestError, match="no frame at 1000 s; its last is at"):
         plots.plot_map(series, tmp_path / "a.png", "left_hand", at_s=1000.0)
+    with pytest.raises(RequestError, match=r"no frame at -3 s; .*, its first at 0.00 s"):
+        plots.plot_map(series, tmp_path / "a.png", "left_hand", at_s=-3.0)
     with pytest.raises(RequestError, match="taxels 0 to 107; seen 108"):
         plots.plot_pressure(series, tmp_path / "a.png", "left_hand", [108])
     with pytest.raises(RequestError, match=r"ends in one of \.png"):

@@ -9,13 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from skin_host.cli import main
 from skin_host.errors import RequestError, SkinError, required
-from skin_host.mqtt.info import PartInfo, TriangleInfo
+from skin_host.mqtt.info import FingertipInfo, PartInfo, TriangleInfo
 from skin_host.processing.events import Touch
 from skin_host.recording.export import HealthLine, PartSeries, Series, export
 from skin_host.recording.export.scene import ARROW_M_PER_N, POINT, RecordedScene
+from tests.recording.test_export_tables import BEGIN, LOAD, LOST, OVER, SLIP
 from tests.support.rerun import chunks
 
 N, TAXELS = 5, 12
@@ -97,6 +99,8 @@ def test_foxglove_reads_points_contacts_transforms_and_log(series: Series, tmp_p
     assert fields == {name: POINT.fields[name][1] for name in POINT.names}
     assert (points["valid"] == 0).nonzero()[0].tolist() == [3]
     assert points["kpa"][4] == 28.0
+    last = np.frombuffer(seen["/arm/points"][4][2].data, POINT)
+    assert last["beyond_range"].nonzero()[0].tolist() == [8, 9, 10]
     assert points["x"][4] == pytest.approx(0.016)
     begin, moved, ended = (decoded for _, _, decoded in seen["/arm/contacts"])
     (arrow,) = moved.entities[0].arrows
@@ -109,6 +113,47 @@ def test_foxglove_reads_points_contacts_transforms_and_log(series: Series, tmp_p
     places = {one.child_frame_id: one.translation.x for one in tf.transforms}
     assert places["hand"] - places["arm"] > 0.044  # side by side
     assert seen["/health"][0][2].message.endswith("taxel 3: stuck")
+
+
+def test_fingertips_have_arrows_and_what_no_arrow_shows_is_a_line(tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+    from mcap_protobuf.decoder import DecoderFactory
+
+    index, palm = replace(BEGIN, t_ns=START_NS + 1), replace(LOST, part="arm", t_ns=START_NS + 2)
+    free, skinned = (FingertipInfo(3, "sphere", [7.0], of, None, 0.3, 8.0) for of in (None, "arm"))
+    series = Series(
+        {"arm": part("arm")},
+        [index, replace(BEGIN, part="thumb"), replace(BEGIN, part="not described"), palm],
+        {"arm": shape()},
+        slips=[SLIP, replace(SLIP, event="end")],
+        overs=[OVER, replace(OVER, event="end")],
+        fingertips={"index": free, "thumb": skinned},
+    )
+    scene = RecordedScene(series).scene
+    assert scene.origins_m["thumb"] == scene.origins_m["arm"]
+    assert scene.origins_m["index"][0] - scene.origins_m["arm"][0] > 0.044
+    export(series, tmp_path / "shown.mcap")
+    with (tmp_path / "shown.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        seen = [(topic.topic, found) for _, topic, _, found in reader.iter_decoded_messages()]
+    lines = [found.message for topic, found in seen if topic == "/events"]
+    assert lines == [
+        "arm: contact 9 ended without a release (lost): it may still last",
+        "index: contact 4 begins to slip (fall): 2.00 N, 1.10 N along the surface",
+        "index: contact 4 slips no longer",
+        "index: contact 4 presses too hard: 10.40 N",
+        "index: contact 4 presses too hard no longer",
+    ]
+    (contact,) = (found for topic, found in seen if topic == "/index/contacts")
+    # It has the whole force, that along the surface too.
+    (words,) = contact.entities[0].texts
+    assert words.text == f"#4 {np.linalg.norm(LOAD.force_n):.2f} N"
+    assert "/thumb/contacts" in dict(seen)
+    assert "/not described/contacts" not in dict(seen)
+    export(series, tmp_path / "shown.rrd")
+    from rerun.chunk import RrdReader
+
+    assert "TextLog:text" in chunks(RrdReader(tmp_path / "shown.rrd"))["/events"]
 
 
 def test_an_arrow_turns_to_where_a_force_points() -> None:
@@ -150,7 +195,7 @@ def test_pandas_and_polars_read_parquet_with_units_and_layout(
     import polars as pl
     from pyarrow import parquet
 
-    frames, touches = export(series, tmp_path / "grasp.parquet")
+    frames, touches, *_ = export(series, tmp_path / "grasp.parquet")
     table = pd.read_parquet(frames, filters=[("part", "==", "arm")])
     kpa = np.stack(table["pressure_kpa"])
     np.testing.assert_array_equal(kpa, series.parts["arm"].pressure_kpa)
@@ -182,6 +227,8 @@ def test_a_data_set_for_learning_has_an_array_a_step(series: Series, tmp_path: P
     hand_valid = np.array(table["observation.skin.hand.valid"].to_pylist())
     assert not hand_valid[0].any()
     assert hand_valid[1].all()
+    beyond = np.array(table["observation.skin.arm.beyond_range"].to_pylist())
+    np.testing.assert_array_equal(beyond, series.parts["arm"].beyond_range)
     np.testing.assert_allclose(table["timestamp"].to_pylist(), 0.05 * np.arange(N), atol=1e-6)
 
 

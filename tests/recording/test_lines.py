@@ -1,5 +1,6 @@
 """A line of a replay is what would have been published, and its type."""
 
+from dataclasses import replace
 from io import BytesIO
 
 import numpy as np
@@ -22,6 +23,13 @@ def test_a_line_of_a_frame_holds_every_taxel() -> None:
         b'{"type":"frame","part":"palm","seq":7,"t_ns":1763700000123456789,"raw":[0,1],'
         b'"pressure_kpa":[0.123,0.0],"touched":[false,false],"valid":[true,false]}\n'
     )
+
+
+def test_a_line_names_the_taxels_beyond_range_where_there_are_any() -> None:
+    frame = make_frame([0.5, 90.0])
+    (line,) = frame_lines([replace(frame, beyond_range=np.array([False, True]))])
+    assert json.decode(line)["beyond_range"] == [False, True]
+    assert line.endswith(b'"valid":[true,true],"beyond_range":[false,true]}\n')
 
 
 def _plainly(frame: PressureFrame) -> bytes:

@@ -7,7 +7,8 @@ import signal
 import sys
 import warnings
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.recording.export import live
+from skin_host.recording.export.scene import Arrows, EventLine, Points
 from tests.support.broker import Mosquitto, free_port
 from tests.support.rerun import chunks
 from tests.support.said import touch_event
@@ -112,6 +114,61 @@ async def test_foxglove_s_client_receives_points_contacts_and_transforms(
     assert len(entity.arrows) == 1
     names = {one.child_frame_id for one in seen["/tf"].transforms}
     assert names == {"left_hand", "left_forearm"}
+
+
+@asynccontextmanager
+async def following(broker: Mosquitto) -> AsyncIterator[list[Any]]:
+    """What a viewer of the robot is given to show."""
+    items: list[Any] = []
+    stop = asyncio.Event()
+    ready = asyncio.Event()
+
+    @asynccontextmanager
+    async def serving() -> AsyncIterator[tuple[str, live.Show]]:
+        yield "a viewer", lambda _: items.append
+
+    where = f"mqtt://{broker.host}:{broker.port}"
+    running = asyncio.create_task(live.run(where, "demo", stop, serving(), lambda _: ready.set()))
+    async with asyncio.timeout(PATIENCE_S):
+        await ready.wait()
+        yield items
+        stop.set()
+        await running
+
+
+async def test_a_part_of_a_robot_that_is_gone_does_not_look_as_it_was(
+    mosquitto: Mosquitto,
+) -> None:
+    layout = build_layout(load(CONFIG), CONFIG.parent)
+    n = layout.part("left_hand").n_taxels
+    all_valid, none = np.ones(n, np.bool_), np.zeros(n, np.bool_)
+    raw, kpa = np.zeros(n, np.uint8), np.zeros(n, np.float32)
+    frame = PressureFrame("left_hand", 1, 10**18, raw, kpa, none, all_valid, none)
+
+    def last(kind: type) -> Any:
+        return next((item for item in reversed(items) if isinstance(item, kind)), None)
+
+    settings = Mqtt(host=mosquitto.host, port=mosquitto.port)
+    async with AsyncExitStack() as stack:
+        robot = await stack.enter_async_context(Publisher(settings, "demo", "main"))
+        robot.put_info(node_info(layout, "main", version="1", configuration="x"))
+        async with following(mosquitto) as items:
+            while last(Points) is None or last(Arrows) is None or not last(Arrows).arrows:
+                robot.put_contact("left_hand", "ON")
+                robot.put_frame(replace(frame, t_ns=frame.t_ns + len(items)))
+                robot.put_touch(TOUCH)
+                await asyncio.sleep(0.05)
+            assert last(Points).points["valid"].all()
+            # The end of the contact is lost on the way.
+            robot.put_contact("left_hand", "OFF")
+            await until(lambda: not last(Arrows).arrows)
+            before_ns = last(Points).t_ns
+            robot.put_touch(TOUCH.ended(4, 10**18 + 6, "lost"))
+            await until(lambda: last(EventLine))
+            assert last(EventLine).text.endswith("it may still last")
+            await stack.aclose()
+            await until(lambda: not last(Points).points["valid"].any())
+            assert last(Points).t_ns > before_ns
 
 
 def listening() -> set[str]:

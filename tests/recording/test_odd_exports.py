@@ -15,6 +15,7 @@ from skin_host.mqtt.frames import encode_frame
 from skin_host.mqtt.info import encode_info, node_info
 from skin_host.mqtt.messages import encode_event
 from skin_host.processing.pipeline import PressureFrame
+from skin_host.recording.export.columns import TABLES
 from skin_host.recording.mcap import Recorder
 from tests.support.said import touch_event
 
@@ -59,7 +60,7 @@ def test_two_robots_in_one_recording_are_not_one(
     for command in (["export", str(path), str(tmp_path / "a.npz")],):
         assert main(command) == 2
         (line,) = capsys.readouterr().err.splitlines()
-        assert f"{path}: holds frames of several robots: skin/demo, skin/icub" in line
+        assert f"{path}: holds messages of several robots: skin/demo, skin/icub" in line
 
 
 @pytest.mark.parametrize(
@@ -120,7 +121,7 @@ def test_hostile_names_of_parts_end_in_a_file_or_in_a_line(
         return
     if output == "tables":
         tables = {one.name: one for one in (where / output).iterdir()}
-        assert len(tables) == 2
+        assert len(tables) == 1 + len(TABLES)
         with tables["touches.csv"].open(newline="") as file:
             head, row = csv.reader(file)
         assert row[head.index("part")] == part

@@ -3,7 +3,6 @@
 import asyncio
 import dataclasses
 import json
-import signal
 import subprocess
 import sys
 import time
@@ -16,7 +15,7 @@ from skin_host.cli import main
 from skin_host.config.settings import Mqtt
 from skin_host.mqtt.publisher import Publisher
 from skin_host.recording.mcap import Recorder
-from skin_host.recording.playback import LONGEST_PAUSE_S
+from skin_host.recording.playback import LONGEST_PAUSE_S, MAX_NODES
 from tests.support import programs
 from tests.support.broker import Mosquitto, free_port
 from tests.support.subscriber import Subscriber
@@ -258,33 +257,6 @@ def test_every_touch_of_a_recording_that_ends_while_touched_is_ended(
     assert listening.payloads("left_hand/contact")[-1] == b"UNKNOWN"
 
 
-def test_the_example_subscriber_explains_a_wrong_port() -> None:
-    program = [sys.executable, str(ROOT / "examples" / "subscriber.py")]
-    for port in ("many", "70000"):
-        ended = subprocess.run([*program, port], capture_output=True, text=True, check=False)
-        assert ended.returncode == 1
-        assert ended.stderr.count("\n") == 1
-        assert port in ended.stderr
-
-
-def test_the_example_subscriber_ends_quietly_with_ctrl_c(mosquitto: Mosquitto) -> None:
-    # What runs in the background ignores this signal, and so would all that it starts.
-    program = ["env", "--default-signal=INT", sys.executable]
-    program += [str(ROOT / "examples" / "subscriber.py"), str(mosquitto.port)]
-    with subprocess.Popen(program, stderr=subprocess.PIPE) as running:
-        try:
-            deadline_s = time.monotonic() + PATIENCE_S
-            while not mosquitto.subscriptions("skin/+/+/touch"):
-                assert time.monotonic() < deadline_s
-                time.sleep(0.02)
-            running.send_signal(signal.SIGINT)
-            _, told = running.communicate(timeout=PATIENCE_S)
-        finally:
-            running.kill()
-    assert running.returncode == 0
-    assert told == b""
-
-
 def test_a_playback_that_is_killed_leaves_no_node_online(
     mosquitto: Mosquitto, tmp_path: Path
 ) -> None:
@@ -309,3 +281,20 @@ def await_payloads(subscriber: Subscriber, end: str, wanted: list[bytes]) -> Non
     while (seen := subscriber.payloads(end)) != wanted:
         assert time.monotonic() < deadline_s, seen
         time.sleep(0.02)
+
+
+def test_a_recording_of_more_nodes_than_a_robot_has_is_refused(
+    mosquitto: Mosquitto, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each one that is played has a connection of its own."""
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        for number in range(MAX_NODES + 1):
+            recorder.say(f"skin/demo/nodes/node{number}/status", 1, b"online")
+    listening = Subscriber(mosquitto.host, mosquitto.port, "skin/#")
+    assert main(["replay", str(path), "--onto", "broker", "--broker", url_of(mosquitto)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{path}: holds the status of more than {MAX_NODES} nodes" in line
+    listening.catch_up()
+    assert listening.payloads(f"node{MAX_NODES - 1}/status")[-1] == b"offline"
+    assert listening.payloads(f"node{MAX_NODES}/status") == []

@@ -16,7 +16,7 @@ from skin_host.cli import main
 from skin_host.config.settings import Mqtt, load
 from skin_host.layout import build_layout
 from skin_host.mqtt.address import Broker
-from skin_host.mqtt.connection import connect
+from skin_host.mqtt.connection import FIRST_RETRY_S, GOOD_S, Retry, connect
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
 from skin_host.recording import capture
@@ -53,6 +53,10 @@ def test_a_recording_is_exported_and_drawn(
         "a.npz",
         "left_hand.csv",
         "touches.csv",
+        "slips.csv",
+        "overs.csv",
+        "contacts.csv",
+        "health.csv",
         "map.png",
     ]
     with np.load(tmp_path / "a.npz") as arrays:
@@ -190,6 +194,35 @@ async def test_messages_that_came_faster_than_they_were_recorded_are_counted(
     with (tmp_path / "a.mcap").open("rb") as file:
         (metadata,) = make_reader(file).iter_metadata()
     assert metadata.metadata["discarded"] == str(recorder.discarded)
+
+
+async def test_a_recording_comes_back_soon_after_a_connection_that_was_good(
+    mosquitto: Mosquitto, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many were lost before it: what is published meanwhile is not recorded."""
+    waits_s: list[float] = []
+
+    class Noted(Retry):
+        def delay_s(self, lasted_s: float = 0.0) -> float:
+            # As if each connection had lasted for long.
+            wait_s = super().delay_s(GOOD_S * (lasted_s > 0.0))
+            waits_s.extend([wait_s] * (lasted_s > 0.0))
+            return 0.0
+
+    monkeypatch.setattr(capture, "Retry", Noted)
+    broker = Broker(mosquitto.host, mosquitto.port)
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        stop = asyncio.Event()
+        recording = asyncio.create_task(capture_broker(recorder, broker, "skin", "icub", stop))
+        last = recorded_topics("skin", "icub")[-1]
+        for number in range(5):
+            await until(lambda n=number: mosquitto.subscriptions(last) > n)  # type: ignore[misc]
+            mosquitto.restart()
+            await until(lambda n=number: recorder.gaps > n)  # type: ignore[misc]
+        stop.set()
+        await recording
+    assert len(waits_s) == 5
+    assert max(waits_s) <= FIRST_RETRY_S
 
 
 def test_an_export_of_a_recording_that_is_not_there_is_a_wrong_request(

@@ -16,9 +16,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from skin_host.client import Contact, Frame, Health, PartInfo, Touch
 from skin_host.mqtt.info import TriangleInfo
+from skin_host.processing.events import Load
 from tests.support.cdr import typestore
 
 ROS2 = Path(__file__).parents[2] / "ros2"
@@ -130,6 +132,19 @@ def test_contacts_and_their_wrench(store: Any, made: Any, again: Callable[[Any],
     wrench = again(made.wrench("arm", [TOUCH], T_NS)).wrench
     assert wrench.force.z == -2.0  # into the skin
     assert wrench.torque.y == pytest.approx(0.2)
+
+
+def test_the_wrench_on_a_fingertip_is_what_its_board_measures(
+    made: Any, again: Callable[[Any], Any]
+) -> None:
+    """With the force along the surface, and of several contacts that have no one place."""
+    load = Load("several_contacts", (0.5, 0.0, -2.0), (0.01, 0.0, 0.002), None, ["touch"])
+    several = replace(TOUCH, centroid_m=None, normal=None, load=load)
+    wrench = again(made.wrench("index", [several], T_NS)).wrench
+    assert (wrench.force.x, wrench.force.z) == (0.5, -2.0)
+    assert (wrench.torque.x, wrench.torque.z) == (0.01, 0.002)
+    saturated = replace(several, load=replace(load, verdict="saturated"))
+    assert again(made.wrench("index", [saturated], T_NS)).wrench.force.z == 0.0
 
 
 def test_health_is_diagnostics(made: Any, again: Callable[[Any], Any]) -> None:

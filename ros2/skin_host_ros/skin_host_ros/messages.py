@@ -95,10 +95,18 @@ class Messages:
         )
 
     def wrench(self, part: str, touches: Sequence[Touch], t_ns: int) -> Any:
-        """geometry_msgs/WrenchStamped: what all located contacts do to the part, in its frame."""
+        """geometry_msgs/WrenchStamped: what all contacts do to the part, in its frame.
+
+        Of a fingertip on a force/torque board this is measured; of skin it is known of contacts
+        with a place.
+        """
         force, torque = np.zeros(3), np.zeros(3)
         for touch in touches:
-            if touch.centroid_m is not None and touch.normal is not None:
+            if touch.load is not None:
+                if touch.load.verdict != "saturated":
+                    force += touch.load.force_n
+                    torque += touch.load.torque_nm
+            elif touch.centroid_m is not None and touch.normal is not None:
                 one = -touch.force_n * np.array(touch.normal)
                 force += one
                 torque += np.cross(touch.centroid_m, one)

@@ -21,8 +21,7 @@ from sensor_msgs.msg import PointCloud2
 from skin_host_msgs.msg import ContactArray, TaxelArray, TaxelLayout
 from skin_host_msgs.srv import Calibrate
 
-from skin_host.client import CommandError, Contact, Frame, Health, PartInfo, SkinCallbacks, Touch
-from skin_host.errors import SkinError
+from skin_host.client import Contact, Frame, Health, PartInfo, SkinCallbacks, SkinError, Touch
 from skin_host_ros.messages import Messages
 
 KEPT = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -119,7 +118,7 @@ class SkinNode(Node):
             result = self.skin.command(
                 "calibrate", node=request.node or None, timeout_s=60.0 + request.seconds, **wanted
             )
-        except (CommandError, SkinError) as error:
+        except SkinError as error:
             response.success, response.message = False, str(error)
         else:
             response.success, response.message = True, json.dumps(result.get("verdicts", result))

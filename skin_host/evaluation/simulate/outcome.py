@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import Any
 
 from skin_host.evaluation.simulate.promises.chance import too_many
+from skin_host.evaluation.simulate.promises.limits import MEASUREMENTS_A_FALSE_TOUCH
 from skin_host.evaluation.simulate.run import RunResult, coverage
-from skin_host.processing.touch import ODDS
 
 
 def line(result: RunResult) -> str:
@@ -57,7 +57,7 @@ def summary(results: list[RunResult]) -> str:
     touches, measurements = _touched_by_chance(results)
     noise = f"noise alone made {touches} touches in {measurements:.2g} measurements of valid pads"
     if too_many(touches, measurements):
-        noise += f": the touch decision allows one in {ODDS:.0e}"
+        noise += f": promised is one in {MEASUREMENTS_A_FALSE_TOUCH:.0e} at most"
     return f"{kept} of {len(results)} seeds kept every promise\n{covered}\n{noise}"
 
 

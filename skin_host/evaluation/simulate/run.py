@@ -24,7 +24,14 @@ from skin_host.evaluation.simulate.disk import PowerCut
 from skin_host.evaluation.simulate.promises import Promises
 from skin_host.evaluation.simulate.promises.limits import SAMPLE_S
 from skin_host.evaluation.simulate.trace import Before
-from skin_host.evaluation.simulate.troubles import ACTS, WIRING, Trouble, act, kinds_of
+from skin_host.evaluation.simulate.troubles import (
+    ACTS,
+    LASTING,
+    WIRING,
+    Trouble,
+    act,
+    kinds_of,
+)
 from skin_host.evaluation.simulate.world import Life, Spot, World
 from skin_host.layout import Layout
 from skin_host.mqtt.commands import MAX_RUNNING
@@ -47,6 +54,9 @@ SHORT_S, LONG_S = (0.2, 5.0), (7.0, 11.0)
 LONG_SHARE = 0.3
 #: Share of the presses of a fingertip in which an object is held that slips.
 SLIP_SHARE = 0.4
+#: One round in so many ends with light loss for minutes. Meanwhile the temperature moves by up to
+#: ten degrees in ten minutes, as of a robot that was switched on, up and down in turn.
+ENDURING_ROUNDS, LEAST_C_PER_S, MOST_C_PER_S = 5, 0.1 / 60, 1.0 / 60
 #: The temperature moves by at most so much in this time.
 WANDER_S, MOST_WANDER_C = 600.0, 1.0
 #: Presses of rehearsals.
@@ -213,7 +223,7 @@ class _Run:
     ) -> None:
         self.world = world
         self._kinds = kinds_of(world.settings)
-        self.result = RunResult(seed, kinds=sorted(self._kinds))
+        self.result = RunResult(seed, kinds=sorted(self._kinds | LASTING))
         self._state = state
         self._seconds = seconds
         self._until_s = until_s
@@ -222,6 +232,9 @@ class _Run:
         self._injected: Counter[str] = Counter()
         self._requests = 0
         self._drills = 0
+        self._rounds = 0
+        #: Draws how light loss is, and where it is pressed meanwhile.
+        self._enduring = random.Random(f"{seed} light loss")
         #: Draws what is rehearsed: storms stay as they are when rehearsals change.
         self._staging = random.Random(f"{seed} rehearsals")
         self._rehearsals = 0
@@ -283,6 +296,7 @@ class _Run:
             await self._calm()
             await self._drill()
             await self._rehearse()
+            await self._endure()
         await self._end_in_a_press()
 
     # ------------------------------------------------------------------ the daemon's lives
@@ -377,7 +391,7 @@ class _Run:
         """Begin a trouble; None if another one has unplugged the chip that was drawn."""
         world = self.world
         try:
-            trouble = self._kinds[name](world, chance, plain)
+            trouble = (self._kinds | LASTING)[name](world, chance, plain)
         except ConfigurationError:
             return None
         world.note(f"trouble: {trouble.about}")
@@ -464,6 +478,8 @@ class _Run:
         self._requests += 1
         if name in ACTS:
             self._promises.begin(act(name))
+        if name == "thresholds":
+            self._promises.note_thresholds(payload)
         topics = world.life.daemon.publisher.topics if world.life is not None else None
         if topics is None:
             return self._requests
@@ -588,6 +604,34 @@ class _Run:
         await clock.sleep(self._staging.uniform(0.1, 2.0))
         self._start()
         await clock.sleep(5.0)
+
+    # ------------------------------------------------------------------ light loss
+
+    async def _endure(self) -> None:
+        """Single frames are lost for minutes, as real robots lose them all the time, while the skin
+        warms up or cools down and is pressed now and then.
+        """
+        self._rounds += 1
+        if self.world.life is None or (self.result.seed + self._rounds) % ENDURING_ROUNDS:
+            return
+        world, chance = self.world, self._enduring
+        trouble = self._inject("light_loss", chance)
+        assert trouble is not None
+        c_per_s = chance.uniform(LEAST_C_PER_S, MOST_C_PER_S) * (-1) ** self._rounds
+        seconds = chance.uniform(*trouble.lasts_s)
+        async with asyncio.TaskGroup() as group:
+            lasting = group.create_task(self._last(trouble, seconds))
+            left_s = seconds
+            while not lasting.done():
+                world.warm(c_per_s)
+                spot = chance.choice(world.spots)
+                if not spot.pressed and chance.random() < 1.0 / PRESS_S:
+                    pressed_s = min(chance.uniform(*SHORT_S), max(left_s, SHORT_S[0]))
+                    group.create_task(spot.press(pressed_s, chance.uniform(20.0, 80.0)))
+                await world.clock.sleep(1.0)
+                left_s -= 1.0
+        if world.life is not None:
+            self._promises.account(world.life)
 
     async def _end_in_a_press(self) -> None:
         """The daemon is asked to end while something touches; every touch ends before it does."""

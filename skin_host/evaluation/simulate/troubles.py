@@ -97,6 +97,8 @@ SURE_NOISE_UNITS, SURE_NOISE, MOST_NOISE_UNITS = 5.0, 8.0, 20.0
 SURE_DAMAGED = 36
 #: Of many more it is named within this.
 DAMAGED_S = 8.0
+#: A bus that loses this share of its frames surely shows it.
+SURE_LOSS = 0.02
 #: Evidence of a touch is gone after 2.6 s in the mean, of a pad with noise of six units.
 RECOVERS_S = 5.0
 #: A temperature pad that reads bytes of another chip moves the rests of its triangle. They go back
@@ -476,6 +478,30 @@ def _frames(
     return begin
 
 
+def _light_loss(world: World, chance: random.Random, _: bool) -> Trouble:
+    """Every bus loses single frames, as those of real robots do all the time, for minutes."""
+    world.move()
+    shares = {name: round(chance.uniform(0.01, 0.05), 4) for name in world.cables}
+    for name, share in shares.items():
+        world.cables[name].mischief.lost = share
+
+    def end() -> None:
+        world.move()
+        for cable in world.cables.values():
+            cable.mischief.lost = 0.0
+
+    return Trouble(
+        "light_loss",
+        " ".join(["light_loss", *(f"{name}={share}" for name, share in shares.items())]),
+        end,
+        # The temperature moves meanwhile.
+        _BUS | {"part_temperature"},
+        frozenset({"bus_loses_frames"} if max(shares.values()) >= SURE_LOSS else ()),
+        8.0,
+        lasts_s=(60.0, 150.0),
+    )
+
+
 def _address_twice(world: World, chance: random.Random, _: bool) -> Trouble:
     """A second board of the same address sends the same bus full of its own sweeps."""
     board = chance.choice(world.layout.boards)
@@ -828,7 +854,7 @@ KINDS: dict[str, Begin] = {
         spoils=True,
         recovers_s=60.0,
     ),
-    "frames_lost": _frames("lost", _BUS, 0.5, must="bus_loses_frames", sure=0.02),
+    "frames_lost": _frames("lost", _BUS, 0.5, must="bus_loses_frames", sure=SURE_LOSS),
     "frames_late": _frames("late", _BUS, 0.2),
     "frames_doubled": _frames("doubled", _BUS, 0.2),
     "frames_swapped": _frames("swapped", _BUS, 0.5),
@@ -850,6 +876,8 @@ KINDS: dict[str, Begin] = {
     "disk_read_only": _disk("disk_read_only", READ_ONLY),
     "disk_slow": _disk_slow,
 }
+#: What lasts for longer than a storm has a time of its own, so storms and drills draw none of it.
+LASTING: dict[str, Begin] = {"light_loss": _light_loss}
 #: Those of robots with fingertips alone: what other robots draw does not depend on them.
 OF_FINGERTIPS: dict[str, Begin] = {"board_latched": _board_latched}
 

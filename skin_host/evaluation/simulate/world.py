@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from emulator.boards.mtb4 import POWER_CONTROL
-from emulator.probes.scene import Place, Probe, Scene
+from emulator.probes.scene import Fault, Place, Probe, Scene
 from emulator.robot import NS, LiveProbe, Robot
 from skin_host.bus.port import Port
 from skin_host.clock import SYSTEM, Clock, SteppedClock
@@ -145,7 +145,8 @@ class World:
             for name, tip in settings.fingertips.items()
             if tip.array is None
         ]
-        #: Looks at the skin just before a place is pressed: pauses may be shorter than samples.
+        #: Looks at the skin just before it is pressed otherwise: presses and pauses may be shorter
+        #: than the time between samples.
         self.before_press: Callable[[], object] = lambda: None
         self.power_failed = asyncio.Event()
         self._disk_refuses: int | None = None
@@ -167,6 +168,11 @@ class World:
         for name, batch in self.robot.step(seconds).items():
             self.cables[name].sleep_through(batch)
         self.clock.suspend(seconds)
+
+    def warm(self, by_c: float) -> None:
+        """The skin is so much warmer from now on (degrees C)."""
+        self.move()
+        self.robot.inject(Fault(name="temperature_step", value=by_c))
 
     def taxels(self, place: Triangle) -> NDArray[np.intp]:
         """Return the taxels [m] of a triangle."""
@@ -260,16 +266,16 @@ class Target:
             kpa = self._chance.uniform(20.0, 80.0)
         world.note(f"press {self._about} {kpa:.0f} kPa for {seconds:.1f} s")
         self.pressed = True
-        world.move()
-        world.before_press()
         try:
             for share in (0.25, 0.5, 0.75, 1.0):
                 world.move()
+                world.before_press()
                 self._probe.press(share * kpa * self._area_mm2 * 1e-3)
                 await world.clock.sleep(0.03)
             await world.clock.sleep(seconds)
         finally:
             world.move()
+            world.before_press()
             self._probe.lift()
             world.note(f"lift {self._about}")
             self.pressed = False

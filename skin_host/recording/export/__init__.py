@@ -12,14 +12,12 @@ from io import BytesIO, StringIO
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from skin_host.errors import RequestError, required
 from skin_host.files import write_atomic, writing
-from skin_host.processing.events import Touch
+from skin_host.recording.export.columns import TABLES, Column, Table
 from skin_host.recording.export.series import (
-    TOUCH_NUMBERS,
     HealthLine,
     PartSeries,
     Series,
@@ -34,8 +32,6 @@ SUFFIXES = ("", ".npz", ".parquet", ".mcap", ".rrd")
 LEROBOT_VERSION = "v2.1"
 CHUNK = 1000
 TASK = "tactile recording"
-UNITS = {"area_mm2": "mm2", "peak_kpa": "kPa", "mean_kpa": "kPa", "force_n": "N", "sigma_m": "m"}
-TOUCH_WORDS = ("t_ns", "part", "event", "id")
 
 
 def export(
@@ -52,8 +48,9 @@ def export(
         lerobot: write the folder as a data set of LeRobot instead of tables.
 
     In an npz file the arrays of a part are `<part>.seq`, `.t_ns`, `.pressure_kpa` (NaN where
-    not valid), `.beyond_range`, `.raw` and `.position_m`; touches are columns `touch.*`. In a
-    folder there is `<part>.csv`, a row a frame, and `touches.csv`.
+    not valid), `.beyond_range`, `.raw` and `.position_m`; the columns of `TABLES` are `touch.*`,
+    `slip.*`, ... In a folder there is `<part>.csv`, a row a frame, and a file for each of these
+    tables, `touches.csv`, `slips.csv`, ..., also without rows: one of an earlier export would stay.
 
     Raises:
         RequestError: the suffix is another one.
@@ -80,17 +77,19 @@ def export(
 
         write_foxglove(series, recording, output)
         return [output]
-    taken = "touch" if output.suffix == ".npz" else "touches"
-    if taken in series.parts:
-        raise RequestError(
-            f'{output}: part "{taken}" has the name of the table of touches; wanted .parquet'
-        )
+    for table in TABLES:
+        taken = table.singular if output.suffix == ".npz" else table.name
+        if taken in series.parts:
+            raise RequestError(
+                f'{output}: part "{taken}" has the name of the table of {table.name}; wanted '
+                ".parquet"
+            )
     if output.suffix == ".npz":
         buffer = BytesIO()
         np.savez_compressed(buffer, **dict(_arrays(series)))
         return [_written(output, buffer.getvalue())]
-    tables = {name: _table(part) for name, part in series.parts.items()}
-    tables["touches"] = _touch_table(series.touches)
+    tables = {name: _frame_table(part) for name, part in series.parts.items()}
+    tables |= {table.name: _text_table(table, getattr(series, table.name)) for table in TABLES}
     return [_written(output / f"{name}.csv", text.encode()) for name, text in tables.items()]
 
 
@@ -104,48 +103,46 @@ def _arrays(series: Series) -> Iterator[tuple[str, Any]]:
             yield f"{name}.raw", part.raw
         if name in series.shapes:
             yield f"{name}.position_m", np.array(series.shapes[name].position_m)
-    for key in (*TOUCH_WORDS, *TOUCH_NUMBERS):
-        kind = np.float64 if key in TOUCH_NUMBERS else None
-        yield f"touch.{key}", np.array([getattr(touch, key) for touch in series.touches], kind)
-    nowhere = (np.nan,) * 3
-    yield (
-        "touch.centroid_m",
-        np.array([touch.centroid_m or nowhere for touch in series.touches]).reshape(-1, 3),
-    )
+    for table in TABLES:
+        rows = getattr(series, table.name)
+        for column in table.columns:
+            for key, array in column.arrays(rows).items():
+                yield f"{table.singular}.{key}", array
 
 
-def _table(part: PartSeries) -> str:
-    """A row a frame: seq, time, then kPa of each taxel, empty where not valid."""
+def _frame_table(part: PartSeries) -> str:
+    """A row a frame: seq, time, kPa of each taxel, empty where not valid, then the numbers of the
+    taxels beyond range, and the boards' own bytes in hexadecimal where they were recorded.
+    """
     text = StringIO()
     heads = [f"taxel_{i}_kpa" for i in range(part.pressure_kpa.shape[1])]
-    text.write(",".join(["seq", "t_ns", *heads]) + "\n")
-    rows = zip(part.seq.tolist(), part.t_ns.tolist(), part.pressure_kpa, strict=True)
-    for seq, t_ns, kpa in rows:
+    text.write(",".join(["seq", "t_ns", *heads, "beyond_range", "raw"]) + "\n")
+    raw = [""] * len(part.seq) if part.raw is None else [row.tobytes().hex() for row in part.raw]
+    rows = zip(
+        *(part.seq.tolist(), part.t_ns.tolist(), part.pressure_kpa, part.beyond_range, raw),
+        strict=True,
+    )
+    for seq, t_ns, kpa, beyond, sent in rows:
         cells = ["" if value != value else f"{value:.2f}" for value in kpa.tolist()]  # noqa: PLR0124  # NaN
+        cells += [" ".join(map(str, np.flatnonzero(beyond).tolist())), sent]
         text.write(f"{seq},{t_ns},{','.join(cells)}\n")
     return text.getvalue()
 
 
-def _touch_table(touches: list[Touch]) -> str:
+def _text_table(table: Table, rows: list[Any]) -> str:
     text = StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow([*TOUCH_WORDS, "x_m", "y_m", "z_m", *TOUCH_NUMBERS, "taxels"])
-    for touch in touches:
-        words, numbers = (
-            [getattr(touch, key) for key in of] for of in (TOUCH_WORDS, TOUCH_NUMBERS)
-        )
-        cells = [
-            *words,
-            *(touch.centroid_m or (None,) * 3),
-            *numbers,
-            " ".join(map(str, touch.taxels)),
-        ]
-        table.writerow(cells)
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([head for column in table.columns for head in column.heads])
+    for row in rows:
+        writer.writerow([cell for column in table.columns for cell in column.cells(row)])
     return text.getvalue()
 
 
 def write_parquet(series: Series, output: Path) -> list[Path]:
     """Write `NAME.parquet`, a row a frame of a part, and `NAME.touches.parquet`, a row an event.
+
+    The other `TABLES` have a file each, too: `NAME.slips.parquet`, ... In all of them `t` is the
+    time.
 
     Columns of frames: part, seq, t (UTC, ns), pressure_kpa (a list, null where not valid),
     beyond_range, raw (null where it was not recorded).
@@ -167,10 +164,13 @@ def write_parquet(series: Series, output: Path) -> list[Path]:
         metadata=layout,
     )
     parts = [_frames(pa, part, schema) for part in series.parts.values()]
-    touches = output.with_suffix(".touches.parquet")
-    _write(output, pa.concat_tables(parts))
-    _write(touches, _touches(pa, series, layout))
-    return [output, touches]
+    tables = {output: pa.concat_tables(parts)} | {
+        output.with_suffix(f".{table.name}.parquet"): _arrow_table(pa, table, series, layout)
+        for table in TABLES
+    }
+    for path, table in tables.items():
+        _write(path, table)
+    return list(tables)
 
 
 def _frames(pa: Any, part: PartSeries, schema: Any) -> Any:
@@ -192,18 +192,29 @@ def _frames(pa: Any, part: PartSeries, schema: Any) -> Any:
     return pa.table(columns, schema=schema)
 
 
-def _touches(pa: Any, series: Series, layout: dict[str, str]) -> Any:
-    fields = [
-        pa.field("t", pa.timestamp("ns", "UTC")),
-        pa.field("part", pa.string()),
-        pa.field("event", pa.string()),
-        pa.field("id", pa.int64()),
-        pa.field("centroid_m", pa.list_(pa.float64()), metadata={"unit": "m"}),
-        *(pa.field(key, pa.float64(), metadata={"unit": UNITS[key]}) for key in TOUCH_NUMBERS),
-        pa.field("taxels", pa.list_(pa.int32())),
-    ]
-    rows = [{"t": touch.t_ns} | msgspec.to_builtins(touch) for touch in series.touches]
-    return pa.Table.from_pylist(rows, schema=pa.schema(fields, metadata=layout))
+def _arrow_table(pa: Any, table: Table, series: Series, layout: dict[str, str]) -> Any:
+    kinds = {
+        "integer": pa.int64(),
+        "number": pa.float64(),
+        "text": pa.string(),
+        "vector": pa.list_(pa.float64()),
+        "numbers": pa.list_(pa.int32()),
+        "texts": pa.list_(pa.string()),
+    }
+
+    def field(column: Column) -> Any:
+        if column.name == "t_ns":
+            return pa.field("t", pa.timestamp("ns", "UTC"))
+        unit = None if column.unit is None else {"unit": column.unit}
+        return pa.field(column.name, kinds[column.kind], metadata=unit)
+
+    schema = pa.schema([field(column) for column in table.columns], metadata=layout)
+    rows = getattr(series, table.name)
+    columns = [[column.of(row) for row in rows] for column in table.columns]
+    return pa.table(
+        [pa.array(values, one.type) for values, one in zip(columns, schema, strict=True)],
+        schema=schema,
+    )
 
 
 def _layout(series: Series) -> dict[str, Any]:
@@ -226,7 +237,8 @@ def write_lerobot(series: Series, output: Path) -> list[Path]:
     """Write a recording as one episode of a LeRobot data set, for learning.
 
     Frames come at the rate of the part that has most of them; the others' last values are held.
-    `observation.skin.<part>` is float32[m] in kPa, 0 where `...<part>.valid` is false.
+    `observation.skin.<part>` is float32[m] in kPa, 0 where `...<part>.valid` is false; where
+    `...<part>.beyond_range` is true it is an estimate.
 
     Raises:
         SkinError: pyarrow is not installed, or a file cannot be written.
@@ -255,7 +267,12 @@ def write_lerobot(series: Series, output: Path) -> list[Path]:
         kpa = part.pressure_kpa[rows]
         valid = np.isfinite(kpa) & (part.t_ns[0] <= leader.t_ns)[:, np.newaxis]
         kpa = np.where(valid, kpa, np.float32(0.0))
-        for key, values, kind in (("", kpa, "float32"), (".valid", valid, "bool")):
+        beyond_range = part.beyond_range[rows] & valid
+        for key, values, kind in (
+            ("", kpa, "float32"),
+            (".valid", valid, "bool"),
+            (".beyond_range", beyond_range, "bool"),
+        ):
             column = f"observation.skin.{name}{key}"
             flat = pa.array(values.ravel())
             columns[column] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1])

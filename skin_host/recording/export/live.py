@@ -21,10 +21,12 @@ from skin_host.clock import SYSTEM, Clock
 from skin_host.errors import SkinError, required
 from skin_host.mqtt.broker import free_port
 from skin_host.mqtt.info import PartInfo
+from skin_host.processing.events import Touch
 from skin_host.recording.export.scene import (
     Item,
     RerunStream,
     SkinScene,
+    event_line,
     foxglove_message,
     transforms,
 )
@@ -63,7 +65,10 @@ async def run(
         nodes = await skin.info()
         shapes = {name: part for node in nodes.values() for name, part in node.parts.items()}
         async with serving as (url, begin):
-            scene = SkinScene(shapes)
+            fingertips = {
+                name: tip for node in nodes.values() for name, tip in node.fingertips.items()
+            }
+            scene = SkinScene(shapes, fingertips=fingertips)
             show = begin(scene)
             show_url(url)
             await until(stop, _follow(skin, shapes, scene, show, clock))
@@ -78,16 +83,31 @@ async def _follow(
 ) -> None:
     """Show what comes, until cancelled."""
 
+    last_ns: dict[str, int] = {}
+
     async def frames() -> None:
         async for frame in skin.frames():
             if frame.part in shapes and len(frame.valid) == len(shapes[frame.part].pads):
+                last_ns[frame.part] = frame.t_ns
                 kpa = np.where(frame.valid, frame.pressure_kpa, np.nan)
-                show(scene.points(frame.part, frame.t_ns, kpa))
+                show(scene.points(frame.part, frame.t_ns, kpa, frame.beyond_range))
 
-    async def touches() -> None:
-        async for touch in skin.touches():
-            if touch.part in shapes:
-                show(scene.arrows(touch.part, touch.t_ns, [touch]))
+    async def events() -> None:
+        async for event in skin.events():
+            if isinstance(event, Touch) and event.part in scene.origins_m:
+                show(scene.arrows(event.part, event.t_ns, [event]))
+            line = event_line(event)
+            if line is not None:
+                show(line)
+
+    async def contacts() -> None:
+        """What is not received any more must not go on looking as it was last."""
+        async for contact in skin.contacts():
+            t_ns = max(clock.now_ns(), last_ns.get(contact.part, 0) + 1)
+            if contact.state == "OFF" and contact.part in scene.origins_m:
+                show(scene.untouched(contact.part, t_ns))
+            elif contact.why not in (None, "not_felt") and contact.part in shapes:
+                show(scene.unknown(contact.part, t_ns))
 
     async def health() -> None:
         latest: dict[str, str] = {}
@@ -98,7 +118,7 @@ async def _follow(
                 show(line)
 
     async with asyncio.TaskGroup() as group:
-        for follow in (frames, touches, health):
+        for follow in (frames, events, contacts, health):
             group.create_task(follow())
 
 

@@ -1,14 +1,15 @@
 """Recordings as three-dimensional scenes, for common robotics tools.
 
 An `.mcap` file for Foxglove holds, besides the recording's own messages, a point cloud of each
-part, its contacts as arrows, the parts' transforms and health, in Foxglove's own Protobuf schemas:
+part, its contacts as arrows, the parts' transforms, health and further events, in Foxglove's own
+Protobuf schemas:
 no custom panel is needed. An `.rrd` file holds the same for Rerun.
 
 A configuration does not contain where on the body a part is: the parts lie side by side, each in
 its frame.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from heapq import merge
 from itertools import groupby
 from pathlib import Path
@@ -19,7 +20,8 @@ from numpy.typing import NDArray
 
 from skin_host.errors import RequestError, required
 from skin_host.files import whole_file, write_atomic, writing
-from skin_host.mqtt.info import PartInfo
+from skin_host.fingertip.events import FingertipEvent, Over, Slip
+from skin_host.mqtt.info import FingertipInfo, PartInfo
 from skin_host.processing.events import Touch
 from skin_host.recording.export.series import HealthLine, Series
 from skin_host.recording.mcap import read_records
@@ -46,10 +48,14 @@ ARROW_RGBA = (255, 110, 80, 255)
 #: The scale ends at this pressure or above.
 LEAST_TOP_KPA = 20.0
 
-#: x, y, z (m), pressure (kPa, 0 where not valid), valid (0 or 1), colour.
+#: A fingertip without a size, a plane, gets this much room to either side.
+PLANE_M = 0.01
+COLOUR = ("red", "green", "blue", "alpha")
+#: x, y, z (m), pressure (kPa, 0 where not valid), valid and beyond the calibrated range (0 or 1),
+#: colour.
 POINT = np.dtype(
-    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("kpa", "<f4"), ("valid", "u1")]
-    + [(name, "u1") for name in ("red", "green", "blue", "alpha")]
+    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("kpa", "<f4")]
+    + [(name, "u1") for name in ("valid", "beyond_range", *COLOUR)]
 )
 
 Floats = NDArray[np.floating[Any]]
@@ -79,7 +85,15 @@ class Arrows(NamedTuple):
     arrows: list[Arrow]
 
 
-Item = Points | Arrows | HealthLine
+class EventLine(NamedTuple):
+    """What no arrow shows: a slip, too hard a press, a contact that ended without a release."""
+
+    part: str
+    t_ns: int
+    text: str
+
+
+Item = Points | Arrows | HealthLine | EventLine
 
 
 class SkinScene:
@@ -88,16 +102,21 @@ class SkinScene:
     The colour scale ends at `top_kpa`; higher pressures raise it.
 
     Attributes:
-        origins_m: where the frame of each part lies in the robot's.
+        origins_m: where the frame of each part and fingertip lies in the robot's.
         radius_m: of each part's taxels.
     """
 
-    def __init__(self, shapes: dict[str, PartInfo], top_kpa: float = LEAST_TOP_KPA) -> None:
+    def __init__(
+        self,
+        shapes: dict[str, PartInfo],
+        top_kpa: float = LEAST_TOP_KPA,
+        fingertips: Mapping[str, FingertipInfo] | None = None,
+    ) -> None:
         self._top_kpa = top_kpa
         self._feels: dict[str, NDArray[np.bool_]] = {}
         self._points: dict[str, NDArray[np.void]] = {}
-        self._arrows: dict[str, dict[int, Arrow]] = {}
-        self.origins_m = _side_by_side(shapes)
+        self.origins_m = _side_by_side(shapes, fingertips or {})
+        self._arrows: dict[str, dict[int, Arrow]] = {name: {} for name in self.origins_m}
         self.radius_m = {
             name: float(np.mean(shape.radius_mm)) * 1e-3 for name, shape in shapes.items()
         }
@@ -107,17 +126,28 @@ class SkinScene:
             places_m = np.array(shape.position_m, np.float64)[feels]
             for axis, key in enumerate("xyz"):
                 points[key] = places_m[:, axis]
-            self._feels[name], self._points[name], self._arrows[name] = feels, points, {}
+            self._feels[name], self._points[name] = feels, points
 
-    def points(self, part: str, t_ns: int, all_kpa: Floats) -> Points:
-        """A frame: pressures of all taxels [m], NaN where not valid."""
-        points, kpa = self._points[part].copy(), all_kpa[self._feels[part]]
+    def points(
+        self, part: str, t_ns: int, all_kpa: Floats, beyond_range: NDArray[np.bool_]
+    ) -> Points:
+        """A frame: pressures of all taxels [m], NaN where not valid, and which are beyond the
+        calibrated range [m].
+        """
+        feels = self._feels[part]
+        points, kpa = self._points[part].copy(), all_kpa[feels]
         self._top_kpa = max(self._top_kpa, float(np.nanmax(kpa, initial=0.0)))
         points["valid"] = np.isfinite(kpa)
         points["kpa"] = np.nan_to_num(kpa)
-        for key, values in zip(POINT.names[5:], self._colours(kpa).T, strict=True):  # type: ignore[index]
+        points["beyond_range"] = beyond_range[feels]
+        for key, values in zip(COLOUR, self._colours(kpa).T, strict=True):
             points[key] = values
         return Points(part, t_ns, points)
+
+    def unknown(self, part: str, t_ns: int) -> Points:
+        """A part of which nothing is known any more: no taxel is valid."""
+        m = len(self._feels[part])
+        return self.points(part, t_ns, np.full(m, np.nan), np.zeros(m, np.bool_))
 
     def _colours(self, kpa: Floats) -> NDArray[np.uint8]:
         """Red, green, blue, alpha uint8[n, 4]."""
@@ -138,6 +168,11 @@ class SkinScene:
             if arrow is not None:
                 there[touch.id] = arrow
         return Arrows(part, t_ns, list(there.values()))
+
+    def untouched(self, part: str, t_ns: int) -> Arrows:
+        """Nothing touches a part, whatever has been received of its contacts."""
+        self._arrows[part].clear()
+        return Arrows(part, t_ns, [])
 
 
 class RecordedScene:
@@ -168,7 +203,7 @@ class RecordedScene:
             default=0.0,
         )
         shapes = {name: series.shapes[name] for name in series.parts}
-        self.scene = SkinScene(shapes, max(LEAST_TOP_KPA, peak_kpa))
+        self.scene = SkinScene(shapes, max(LEAST_TOP_KPA, peak_kpa), series.fingertips)
 
     @property
     def start_ns(self) -> int:
@@ -178,14 +213,18 @@ class RecordedScene:
     def items(self) -> Iterator[Item]:
         """Everything, in the order of time."""
         courses: list[Iterator[Item]] = [self._points(name) for name in self._series.parts]
-        courses += [self._arrows(name) for name in self._series.parts]
-        courses.append(iter(self._series.health))
+        courses += [self._arrows(name) for name in self.scene.origins_m]
+        series = self._series
+        for events in (series.touches, series.slips, series.overs):
+            courses.append(filter(None, map(event_line, events)))
+        courses.append(iter(series.health))
         yield from merge(*courses, key=lambda item: item.t_ns)
 
     def _points(self, name: str) -> Iterator[Item]:
         part = self._series.parts[name]
-        for t_ns, kpa in zip(part.t_ns.tolist(), part.pressure_kpa, strict=True):
-            yield self.scene.points(name, t_ns, kpa)
+        rows = zip(part.t_ns.tolist(), part.pressure_kpa, part.beyond_range, strict=True)
+        for t_ns, kpa, beyond_range in rows:
+            yield self.scene.points(name, t_ns, kpa, beyond_range)
 
     def _arrows(self, name: str) -> Iterator[Item]:
         mine = (touch for touch in self._series.touches if touch.part == name)
@@ -196,19 +235,55 @@ class RecordedScene:
 def _arrow(touch: Touch) -> Arrow | None:
     if touch.event == "end" or touch.centroid_m is None:
         return None
+    if touch.load is not None:
+        return Arrow(touch.id, touch.centroid_m, touch.load.force_n)
     x, y, z = touch.normal or (0.0, 0.0, 1.0)
     force_n = (-x * touch.force_n, -y * touch.force_n, -z * touch.force_n)
     return Arrow(touch.id, touch.centroid_m, force_n)
 
 
-def _side_by_side(shapes: dict[str, PartInfo]) -> dict[str, tuple[float, float, float]]:
-    origins: dict[str, tuple[float, float, float]] = {}
-    x_m = 0.0
+def event_line(event: FingertipEvent) -> EventLine | None:
+    """Return an event as a line; None for one that arrows show."""
+    who = f"{event.part}: contact {event.id}"
+    match event:
+        case Touch(event="end", reason="lost" | "stopped"):
+            text = f"{who} ended without a release ({event.reason}): it may still last"
+        case Touch():
+            return None
+        case Slip(event="begin"):
+            text = (
+                f"{who} begins to slip ({event.cause}): {event.force_n:.2f} N, "
+                f"{event.shear_n:.2f} N along the surface"
+            )
+        case Slip():
+            text = f"{who} slips no longer"
+        case Over(event="begin"):
+            text = f"{who} presses too hard: {event.force_n:.2f} N"
+        case Over():
+            text = f"{who} presses too hard no longer"
+    return EventLine(event.part, event.t_ns, text)
+
+
+def _side_by_side(
+    shapes: Mapping[str, PartInfo], fingertips: Mapping[str, FingertipInfo]
+) -> dict[str, tuple[float, float, float]]:
+    """Return where the frame of each part lies; skin on a fingertip has the fingertip's frame."""
+    extents_m: dict[str, tuple[float, float]] = {}
     for name, shape in shapes.items():
-        places_m = np.array(shape.position_m, np.float64)
-        low_m, high_m = places_m[:, 0].min(), places_m[:, 0].max()
-        origins[name] = (float(x_m - low_m), 0.0, 0.0)
-        x_m += float(high_m - low_m) + GAP_M
+        x_m = np.array(shape.position_m, np.float64)[:, 0]
+        extents_m[name] = float(x_m.min()), float(x_m.max())
+    for name, tip in fingertips.items():
+        if tip.array not in shapes and name not in shapes:
+            half_m = max(tip.size_mm, default=PLANE_M * 1e3) * 1e-3
+            extents_m[name] = -half_m, half_m
+    origins: dict[str, tuple[float, float, float]] = {}
+    next_m = 0.0
+    for name, (low_m, high_m) in extents_m.items():
+        origins[name] = (next_m - low_m, 0.0, 0.0)
+        next_m += high_m - low_m + GAP_M
+    for name, tip in fingertips.items():
+        if name not in origins and tip.array is not None:
+            origins[name] = origins[tip.array]
     return origins
 
 
@@ -295,8 +370,10 @@ def foxglove_message(item: Item) -> tuple[str, int, Any]:
             return f"/{part}/points", t_ns, _cloud(item)
         case Arrows(part, t_ns, _):
             return f"/{part}/contacts", t_ns, _update(item)
-        case _:
-            return "/health", item.t_ns, _log(item)
+        case EventLine(_, t_ns, _):
+            return "/events", t_ns, _log(item, is_warning=True)
+        case HealthLine(_, t_ns, state, _):
+            return "/health", t_ns, _log(item, is_warning=state != "ok")
 
 
 def transforms(scene: SkinScene, t_ns: int) -> Any:
@@ -380,10 +457,10 @@ def turned_from_x(direction: Floats) -> tuple[float, float, float, float]:
     return ix, iy, iz, w
 
 
-def _log(item: HealthLine) -> Any:
+def _log(item: HealthLine | EventLine, *, is_warning: bool) -> Any:
     from foxglove_schemas_protobuf.Log_pb2 import Log
 
-    level = Log.INFO if item.state == "ok" else Log.WARNING
+    level = Log.WARNING if is_warning else Log.INFO
     message = Log(level=level, name=item.part, message=item.text)
     message.timestamp.FromNanoseconds(item.t_ns)
     return message
@@ -426,7 +503,7 @@ class RerunStream:
         match item:
             case Points(part, _, points):
                 places_m = np.stack([points[axis] for axis in "xyz"], axis=1)
-                colours = np.stack([points[key] for key in POINT.names[5:]], axis=1)  # type: ignore[index]
+                colours = np.stack([points[key] for key in COLOUR], axis=1)
                 radius_m = self._scene.radius_m[part]
                 cloud = rr.Points3D(places_m, colors=colours, radii=radius_m)
                 stream.log(f"{where}/taxels", cloud)
@@ -446,3 +523,5 @@ class RerunStream:
             case HealthLine():
                 level = "INFO" if item.state == "ok" else "WARN"
                 stream.log("health", rr.TextLog(item.text, level=level))
+            case EventLine():
+                stream.log("events", rr.TextLog(item.text, level="WARN"))

@@ -1,5 +1,6 @@
 """What was recorded, as arrays over time: read from messages, or computed from CAN frames."""
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,22 +11,29 @@ from numpy.typing import NDArray
 
 from skin_host.config.settings import Settings, skin_hash
 from skin_host.errors import LogError
+from skin_host.fingertip.events import FingertipEvent, Over, Slip
+from skin_host.fingertip.health import FingertipHealth
 from skin_host.health import HealthWatch
 from skin_host.layout import Layout
 from skin_host.mqtt.frames import decode_frame
-from skin_host.mqtt.info import PartInfo, decode_info, node_info
-from skin_host.mqtt.messages import Frame, decode_health, decode_touch
+from skin_host.mqtt.info import FingertipInfo, PartInfo, decode_info, node_info
+from skin_host.mqtt.messages import (
+    EVENT_DECODERS,
+    ContactState,
+    Frame,
+    decode_contact,
+    decode_health,
+)
 from skin_host.mqtt.payload import MessageError
 from skin_host.processing.calibration import Calibration
 from skin_host.processing.core import Engine
 from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.recording.mcap import read_messages_of, robot_at
-from skin_host.recording.replay import replay
+from skin_host.recording.replay import contacts_of, replay
 
 Floats = NDArray[np.float32]
 Mask = NDArray[np.bool_]
-TOUCH_NUMBERS = ("area_mm2", "peak_kpa", "mean_kpa", "force_n", "sigma_m")
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,21 +70,45 @@ class HealthLine(NamedTuple):
     text: str
 
 
+class ContactLine(NamedTuple):
+    """Contact state of a part, from this time on."""
+
+    part: str
+    t_ns: int
+    state: ContactState
+
+
 @dataclass(frozen=True, slots=True)
 class Series:
     """A whole recording.
 
     Attributes:
         parts: by name.
-        touches: events in their order.
+        touches: events in their order, of fingertips too.
         shapes: positions of the taxels, if the recording has them.
         health: changes in their order; of a recording of CAN frames, that at its end.
+        slips, overs: of fingertips, in their order.
+        contacts: changes in their order; of a recording of CAN frames, those of parts with skin.
+        fingertips: those on force/torque boards, as far as the recording describes them.
     """
 
     parts: dict[str, PartSeries]
     touches: list[Touch]
     shapes: dict[str, PartInfo]
     health: list[HealthLine] = field(default_factory=list)
+    slips: list[Slip] = field(default_factory=list)
+    overs: list[Over] = field(default_factory=list)
+    contacts: list[ContactLine] = field(default_factory=list)
+    fingertips: dict[str, FingertipInfo] = field(default_factory=dict)
+
+    def take(self, event: FingertipEvent) -> None:
+        """Add an event."""
+        if isinstance(event, Touch):
+            self.touches.append(event)
+        elif isinstance(event, Slip):
+            self.slips.append(event)
+        else:
+            self.overs.append(event)
 
 
 @dataclass(slots=True)
@@ -114,21 +146,20 @@ def read_messages(recording: Path) -> Series:
     """
     robots: set[str] = set()
     parts: dict[str, _Growing] = {}
-    touches: list[Touch] = []
-    shapes: dict[str, PartInfo] = {}
-    health: list[HealthLine] = []
-    latest: dict[str, HealthLine] = {}
+    found = Series({}, [], {})
+    health: dict[str, HealthLine] = {}
+    contacts: dict[str, ContactLine] = {}
     for said in read_messages_of(recording):
         words = said.topic.split("/")
         name, kind = words[-2:]
+        robots.add("/".join(words[: robot_at(words) + 1]))
+        if len(robots) > 1:
+            raise LogError(
+                f"{recording}: holds messages of several robots: "
+                f"{', '.join(sorted(robots))}; split it, e.g. with `mcap filter`"
+            )
         try:
             if kind == "frame":
-                robots.add("/".join(words[: robot_at(words) + 1]))
-                if len(robots) > 1:
-                    raise LogError(
-                        f"{recording}: holds frames of several robots: "
-                        f"{', '.join(sorted(robots))}; split it, e.g. with `mcap filter`"
-                    )
                 frame = decode_frame(name, said.payload)
                 growing = parts.setdefault(name, _Growing())
                 if growing.kpa and len(growing.kpa[0]) != len(frame.valid):
@@ -137,22 +168,28 @@ def read_messages(recording: Path) -> Series:
                         f"{len(frame.valid)} taxels; export the recordings of one skin"
                     )
                 growing.add(frame)
-            elif kind == "touch":
-                touches.append(decode_touch(said.payload))
-            elif kind == "health":
+            elif kind in EVENT_DECODERS:
+                found.take(EVENT_DECODERS[kind](said.payload))
+            elif kind == "contact" and said.payload:
+                state = ContactLine(name, said.t_ns, decode_contact(said.payload))
+                if name not in contacts or contacts[name].state != state.state:
+                    contacts[name] = state
+                    found.contacts.append(state)
+            elif kind == "health" and said.payload:
                 line = health_line(name, said.t_ns, decode_health(said.payload))
-                before = latest.get(name)
-                if before is None or (before.state, before.text) != (line.state, line.text):
-                    latest[name] = line
-                    health.append(line)
-            elif kind == "info":
-                shapes |= decode_info(said.payload).parts
+                if name not in health or health[name]._replace(t_ns=said.t_ns) != line:
+                    health[name] = line
+                    found.health.append(line)
+            elif kind == "info" and said.payload:
+                info = decode_info(said.payload)
+                found.shapes.update(info.parts)
+                found.fingertips.update(info.fingertips)
         except MessageError as error:
             raise LogError(f"{recording}: {said.topic}: {error}") from None
     if not parts:
         raise LogError(f"{recording}: holds no frames of pressure")
-    found = {name: part.series(name) for name, part in parts.items()}
-    return Series(found, touches, shapes, health)
+    found.parts.update((name, part.series(name)) for name, part in parts.items())
+    return found
 
 
 def health_line(part: str, t_ns: int, record: Mapping[str, Any]) -> HealthLine:
@@ -168,29 +205,44 @@ def read_frames(log: Path, settings: Settings, layout: Layout, calibration: Cali
     """
     engine = Engine(settings, layout, list(range(len(layout.parts))), calibration)
     parts = {part.name: _Growing() for part in layout.parts}
-    touches: list[Touch] = []
-    counts = dict.fromkeys(parts, 0)
+    found = Series({}, [], {})
+    counts: Counter[tuple[str, type]] = Counter()
+    contacts = contacts_of(engine)
+    states: dict[int, ContactState] = {}
     watch = HealthWatch(engine)
     for output in replay(log, engine):
         watch.note(output)
         for step in output.steps:
-            parts[step.frame.part].add(step.frame)
-            for event in step.events:
-                counts[event.part] += 1
-                touches.append(event.published(counts[event.part]))
-    shapes = {
-        name: part
-        for node in {part.node for part in layout.parts}
-        for name, part in node_info(
-            layout, node, version="", configuration=skin_hash(settings)
-        ).parts.items()
-    }
-    series = {name: part.series(name) for name, part in parts.items() if part.seq}
-    if not series:
+            frame = step.frame
+            parts[frame.part].add(frame)
+            state = contacts[step.part].step(frame, step.events)
+            if states.get(step.part) != state:
+                states[step.part] = state
+                found.contacts.append(ContactLine(frame.part, frame.t_ns, state))
+        for event in output.events:
+            counts[event.part, type(event)] += 1
+            found.take(event.published(counts[event.part, type(event)]))
+    for node in {part.node for part in layout.parts}:
+        info = node_info(
+            layout,
+            node,
+            version="",
+            configuration=skin_hash(settings),
+            fingertips=settings.fingertips,
+        )
+        found.shapes.update(info.parts)
+        found.fingertips.update(info.fingertips)
+    found.parts.update((name, part.series(name)) for name, part in parts.items() if part.seq)
+    if not found.parts:
         raise LogError(f"{log}: holds no sweep of this skin")
-    health = [
+    found.health.extend(
         health_line(part.name, parts[part.name].t_ns[-1], watch.replayed(index))
         for index, part in enumerate(layout.parts)
-        if part.name in series
-    ]
-    return Series(series, touches, shapes, sorted(health, key=lambda line: line.t_ns))
+        if part.name in found.parts
+    )
+    if engine.fingertips is not None:
+        last_ns = max(part.t_ns[-1] for part in parts.values() if part.t_ns)
+        records = FingertipHealth(engine.fingertips).records(None)
+        found.health.extend(health_line(name, last_ns, record) for name, record in records.items())
+    found.health.sort(key=lambda line: line.t_ns)
+    return found

@@ -2,6 +2,8 @@
 icub-firmware: theSkin is embot_app_application_theSkin.cpp, PSK is
 embot_prot_can_skin_periodic.cpp; MTB3 is in test_mtb3.py."""
 
+from typing import Literal
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,6 +12,7 @@ from hypothesis.extra import numpy as arrays
 
 from emulator.boards.arithmetic import transmit_16, transmit_32
 from emulator.boards.mtb import make_board
+from emulator.chips.converters import slot_of
 from skin_host.bus import commands
 from skin_host.bus.answers import (
     AdditionalInfo,
@@ -34,7 +37,10 @@ from skin_host.bus.commands import (
     TactileSetup,
     TxMode,
 )
-from skin_host.bus.compensation import GAIN, GAIN_V2
+from skin_host.bus.compensation import GAIN, GAIN_V2, thermal_gains
+from skin_host.bus.wire import TRIANGLES
+from skin_host.config.settings import Board
+from skin_host.layout import BoardLayout
 from tests.support.board import RESTING_FF, BoardOnBench
 
 START = SetTxMode(TxMode.START)
@@ -153,6 +159,23 @@ def test_the_thermal_pad_takes_temperature_out_of_the_others(
     expected = [min(255, 240 - (-one >> 2)) for one in drift]
     expected[6] = 240 - (400 >> 2)
     assert values == expected
+
+
+@pytest.mark.parametrize("model", ["mtb3", "mtb4", "mtb4c"])
+@pytest.mark.parametrize("skin_type", [0, 1, 2, 3, 8])
+def test_the_host_knows_what_each_firmware_makes_of_a_skin_type(
+    model: Literal["mtb3", "mtb4", "mtb4c"], skin_type: Literal[0, 1, 2, 3, 8]
+) -> None:
+    """main: an MTB3 has gains for type 0 alone, and no map of an ergoCub hand."""
+    bench = BoardOnBench(model)
+    bench.run(0.15)
+    bench.say(SetBoardConfig(skin_type, 50, 240))
+    settings = Board(bus="can0", address=1, model=model, skin_type=skin_type)
+    layout = BoardLayout("mtb", settings, (), 0, np.zeros((TRIANGLES, 12), np.int32), ())
+    for triangle in range(TRIANGLES):
+        gains, _ = thermal_gains(settings.effective_skin_type, triangle)
+        assert bench.board.thermal(triangle)[0] == gains
+        assert bench.board.slot(triangle) == slot_of(layout, triangle)
 
 
 def test_palms_have_no_temperature_gains() -> None:

@@ -197,6 +197,61 @@ MUTANTS = [
         'if recent["halves"] >= FEW_HALVES:',
         'if recent["frames_hz"] > 0 and recent["halves"] >= 0:',
     ),
+    Mutant(
+        "forces are in mN",
+        "processing/contacts.py",
+        "force_n=totals[number] * 1e-3,",
+        "force_n=totals[number] * 1.0,",
+    ),
+    Mutant(
+        "a contact is far away from its pads",
+        "processing/contacts.py",
+        "centroid = x / whole, y / whole, z / whole",
+        "centroid = 9.0, 9.0, 9.0",
+    ),
+    Mutant(
+        "normals point into the skin",
+        "processing/contacts.py",
+        "direction = weight @ self._normal[taxels]",
+        "direction = -weight @ self._normal[taxels]",
+    ),
+    Mutant(
+        "contacts have no area",
+        "processing/contacts.py",
+        "                area_mm2=area_mm2,\n",
+        "                area_mm2=0.001,\n",
+    ),
+    Mutant(
+        "the mean pressure is a sum in Pa",
+        "processing/contacts.py",
+        "mean_kpa=totals[number] / area_mm2,",
+        "mean_kpa=totals[number] * 1e3,",
+    ),
+    Mutant(
+        "all pressures are a fifth",
+        "processing/pipeline.py",
+        "return self._frame(t_ns, raw, valid, pressure, touched, beyond, True)",
+        "return self._frame(t_ns, raw, valid, 0.2 * pressure, touched, beyond, True)",
+    ),
+    Mutant(
+        "touches need ten units more",
+        "processing/touch.py",
+        "margin = settings.margin_units - HALF_UNIT",
+        "margin = 10.0 + settings.margin_units - HALF_UNIT",
+    ),
+    Mutant(
+        "noise alone touches a pad once in 10^4 measurements",
+        "processing/touch.py",
+        "ODDS = 1e9\n",
+        "ODDS = 1e4\n",
+        DEMO,
+    ),
+    Mutant(
+        "pads are taken for eight times as noisy",
+        "processing/touch.py",
+        "    margin = settings.margin_units",
+        "    spread = 8.0 * spread\n    margin = settings.margin_units",
+    ),
 ]
 
 

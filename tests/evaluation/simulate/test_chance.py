@@ -1,9 +1,9 @@
-"""Noise alone may touch a pad as rarely as the touch decision allows."""
+"""Noise alone may touch a pad as rarely as is promised."""
 
 import pytest
 
 from skin_host.evaluation.simulate.promises.chance import Chance, too_many
-from skin_host.processing.touch import ODDS
+from skin_host.evaluation.simulate.promises.limits import MEASUREMENTS_A_FALSE_TOUCH
 
 S = 1_000_000_000
 #: Measurements of the demo's robot in an hour.
@@ -20,15 +20,15 @@ HOUR = 396 * 20 * 3600
         (60, 2000 * HOUR, False),
     ],
 )
-def test_touches_by_noise_are_as_rare_as_the_decision_allows(
+def test_touches_by_noise_are_as_rare_as_promised(
     touches: int, measurements: int, wrong: bool
 ) -> None:
     assert too_many(touches, measurements) == wrong
 
 
 def test_more_touches_than_measurements_allow_are_too_many() -> None:
-    assert too_many(3 * 100, int(100 * ODDS))
-    assert not too_many(100, int(100 * ODDS))
+    assert too_many(3 * 100, int(100 * MEASUREMENTS_A_FALSE_TOUCH))
+    assert not too_many(100, int(100 * MEASUREMENTS_A_FALSE_TOUCH))
 
 
 def test_one_touch_is_counted_once_and_a_second_one_is_not_explained() -> None:

@@ -223,7 +223,7 @@ def test_taxels_that_are_stepped_apart_and_taken_back_are_as_if_they_had_not_bee
 EQUATION_1_KPA = PressureCurve(2.88).kpa(KNOTS_UNITS[:, np.newaxis])[:, 0]
 
 
-def use_own_curves(rig, noise_units, verdict=CurveVerdict.GOOD, kpa=EQUATION_1_KPA):
+def use_own_curves(rig, noise_units, verdict=CurveVerdict.GOOD, kpa=EQUATION_1_KPA, zeroed=None):
     """Give all pads equation (1) or another own curve, and a foam with plays; return these."""
     n = rig.n
     curves = Curves(
@@ -237,7 +237,8 @@ def use_own_curves(rig, noise_units, verdict=CurveVerdict.GOOD, kpa=EQUATION_1_K
         memory=Memory((5.0, 20.0), (0.2, 0.1)),
     )
     calibration = replace(rig.calibration, curves=curves)
-    rig.pipeline.renew(rig.settings.processing, calibration, np.zeros(n, np.bool_))
+    zeroed = np.zeros(n, np.bool_) if zeroed is None else zeroed
+    rig.pipeline.renew(rig.settings.processing, calibration, zeroed)
     return calibration
 
 

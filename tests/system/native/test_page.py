@@ -250,6 +250,9 @@ async def test_stopped_data_are_called_stale_and_everything_comes_back(
         robot.kill()  # robot and daemon are gone, without a word
         await seen.until(STALE)
         assert "stale" in (await seen.run('document.getElementById("banner").textContent')).lower()
+        _, top, _, height = await seen.box("#banner")
+        _, map_top, _, _ = await seen.box("#map")
+        assert top + height <= map_top  # the names of the parts stay readable
         assert await seen.run(CONTACTS) == []
         start(robot)
         await seen.until(f"{LIVE} && !({STALE})")

@@ -1,5 +1,6 @@
 """The service files: systemd finds nothing wrong with them, and little that is exposed."""
 
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -13,6 +14,7 @@ from tests.support.certificates import authority, certificate
 ROOT = Path(__file__).parents[3]
 UNIT = ROOT / "systemd" / "skin-host@.service"
 MOST_EXPOSED = 13
+MOST_EXPOSED_WITH_AN_ADAPTER = 15
 
 
 def analyze(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":
@@ -43,6 +45,30 @@ def test_the_unit_exposes_little(installed_unit: Path) -> None:
         "security", "--offline=true", "--no-pager", f"--threshold={MOST_EXPOSED}", installed_unit
     )
     assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.parametrize(
+    ("drop_in", "devices"),
+    [
+        ("skin-host-serial.conf", ["char-ttyACM", "char-ttyUSB"]),
+        ("skin-host-usb.conf", ["char-usb_device"]),
+    ],
+)
+def test_an_adapter_that_is_no_network_interface_is_reached_by_a_drop_in_that_exposes_little_more(
+    installed_unit: Path, drop_in: str, devices: list[str]
+) -> None:
+    folder = installed_unit.with_name(f"{installed_unit.name}.d")
+    folder.mkdir()
+    shutil.copy(ROOT / "systemd" / drop_in, folder)
+    done = analyze("verify", "--man=no", installed_unit)
+    assert (done.returncode, done.stderr) == (0, "")
+    threshold = f"--threshold={MOST_EXPOSED_WITH_AN_ADAPTER}"
+    done = analyze("security", "--offline=true", "--no-pager", threshold, installed_unit)
+    assert done.returncode == 0, done.stdout
+    (allowed,) = [line for line in done.stdout.splitlines() if "DeviceAllow=" in line]
+    # A real-time clock may be read: that comes with the protection of the computer's clock.
+    reached = set(re.findall(r"char-\w+:rw", allowed))
+    assert reached == {f"{device}:rw" for device in devices}
 
 
 def test_can_is_allowed_and_secrets_are_no_arguments() -> None:

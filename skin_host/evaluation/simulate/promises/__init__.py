@@ -4,7 +4,9 @@ The daemon's outputs are looked at where they leave the core (every frame, touch
 health record) and where subscribers get them from the broker. The first promise that is broken
 ends the run.
 
+- `truth`: what presses the skin, and what may be read of it
 - `skin`: frames and touches report what presses the skin
+- `contacts`: so do the numbers of touch events: force, place, area, pressures
 - `fingertips`: so do those on force/torque boards
 - `received`: what is valid was received lately, in one sweep
 - `subscribers`: what the broker keeps and subscribers get is what the daemon put
@@ -16,9 +18,9 @@ ends the run.
 import asyncio
 import gc
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from skin_host.daemon.daemon import Daemon
@@ -27,6 +29,7 @@ from skin_host.evaluation.simulate.promises.accounts import Accounts
 from skin_host.evaluation.simulate.promises.excuses import Excuses
 from skin_host.evaluation.simulate.promises.fingertips import FingertipCheck
 from skin_host.evaluation.simulate.promises.limits import (
+    FELT_NS,
     MORE_OBJECTS,
     MOST_TASKS,
     NS,
@@ -37,6 +40,7 @@ from skin_host.evaluation.simulate.promises.limits import (
 from skin_host.evaluation.simulate.promises.received import Received
 from skin_host.evaluation.simulate.promises.skin import SkinCheck
 from skin_host.evaluation.simulate.promises.subscribers import Subscribers
+from skin_host.evaluation.simulate.promises.truth import Truth
 from skin_host.evaluation.simulate.promises.zeros import ZeroCheck
 from skin_host.evaluation.simulate.troubles import Trouble, damaged_set_up
 from skin_host.evaluation.simulate.world import Life, Triangle, World
@@ -66,9 +70,10 @@ class Promises:
         self.accusations = Accusations(world)
         self.excuses = Excuses(world)
         self.subscribers = Subscribers(world)
-        self._skin = SkinCheck(world, self.excuses)
+        self._truth = Truth(world)
+        self._skin = SkinCheck(world, self.excuses, self._truth)
         self.chance = self._skin.chance
-        self._zeros = ZeroCheck(world, self.excuses)
+        self._zeros = ZeroCheck(world, self.excuses, self._truth)
         self._fingertips = FingertipCheck(world, self.accusations)
         self._received = Received(world)
         self._accounts = Accounts(world)
@@ -92,7 +97,7 @@ class Promises:
             self.stopped.set()
 
     def _note_pause(self) -> None:
-        self._skin.note_pause()
+        self._truth.note()
         self._fingertips.note_pause()
 
     def _hold(self, wrong: str | None) -> None:
@@ -113,6 +118,11 @@ class Promises:
         """A trouble ends."""
         self.accusations.end(trouble)
         self.excuses.end(trouble)
+
+    def note_thresholds(self, payload: str) -> None:
+        """An operator asks for other thresholds."""
+        asked = msgspec.json.decode(payload).get("set", {})
+        self._truth.note_margin(asked.get("margin_units", 0.0))
 
     def calibrated_at_rest(self) -> None:
         """A calibration of the whole untouched skin was taken."""
@@ -183,6 +193,7 @@ class Promises:
 
     def _touch(self, event: FingertipEvent) -> None:
         self._accounts.note_event()
+        self._truth.note()
         if isinstance(event, Touch):
             self.touches += 1
             self._hold(self._skin.touch(event))
@@ -192,6 +203,7 @@ class Promises:
             self._hold(self._fingertips.slips(event.part))
 
     def _frame(self, frame: PressureFrame) -> None:
+        self._truth.note()
         valid = frame.valid.tobytes()
         wrong = (
             self._skin.frame(frame, valid)
@@ -230,8 +242,9 @@ class Promises:
         world, excuses = self._world, self.excuses
         now_ns = self._now_ns()
         world.move()
-        true_kpa = world.robot.skin.true_pressure_kpa().copy()
-        self._skin.note_truth(true_kpa)
+        self._truth.note()
+        true_kpa = self._truth.kpa
+        self._skin.note_recovered()
         self._note_set_ups()
         life = world.life
         alone = life is None or life.began_ns >= self._sampled_ns
@@ -242,16 +255,15 @@ class Promises:
             if life.daemon.engine.calibrating:
                 excuses.note_calibrating(true_kpa)
             self._skin.note_valid(true_kpa)
-            decides = partial(self._skin.decides_kpa, life)
-            self._zeros.note_observed(life, true_kpa, self._skin.valid_ns, self._felt_ns, decides)
+            self._zeros.note_observed(life, true_kpa, self._skin.valid_ns, self._felt_ns)
             self._felt_ns = self._received.last_ns()
             calibration = life.daemon.engine.calibration
             if calibration is not None:
                 self.subscribers.note_calibration(calibration.id, calibration.time)
         self._fingertips.note_loads(life)
-        if life is None or life.dead or not self._skin.sampled:
+        if life is None or life.dead or not self._truth.sampled:
             return
-        self._hold(self._skin.wrong(life))
+        self._hold(self._skin.wrong())
         if not life.stop.is_set():  # a daemon that ends reads no more, and stops the boards
             self._hold(self._fingertips.wrong(life))
             self._hold(self._unreceived(now_ns))
@@ -268,7 +280,7 @@ class Promises:
         if not life.stop.is_set():  # Then `offline` is the last of all.
             self._hold(self.subscribers.not_kept())
         self._hold(self.subscribers.blank_off())
-        if not self._skin.sampled:
+        if not self._truth.sampled:
             return
         pads = self._world.layout.pad_kind == PadKind.PRESSURE
         pads &= ~self.excuses.exempt & ~self.excuses.spoiled()
@@ -276,7 +288,7 @@ class Promises:
         if usable is not None:
             # A part whose other pads are valid has a contact, and health names those without one.
             pads &= usable
-        self._hold(self.subscribers.pressed_off(self._skin.pressed() & pads))
+        self._hold(self.subscribers.pressed_off(self._truth.firm(FELT_NS) & pads))
 
     def _note_set_ups(self) -> None:
         """Note which chips do not measure what they should: their board is to be switched off and

@@ -1,17 +1,21 @@
-"""Touches by noise alone: a pad is touched once in `touch.ODDS` measurements, and no more often."""
+"""Touches by noise alone: as rare as promised, whatever the daemon decides by."""
 
 import math
 
-from skin_host.evaluation.simulate.promises.limits import CAUSE_NS, UNLIKELY
-from skin_host.processing.touch import ODDS
+from skin_host.evaluation.simulate.promises.limits import (
+    CAUSE_NS,
+    MEASUREMENTS_A_FALSE_TOUCH,
+    UNLIKELY,
+)
 
 
 def too_many(touches: int, measurements: int) -> bool:
     """Return whether noise touches so often with a probability below `UNLIKELY`.
 
-    The number is taken for a Poisson variable with mean `measurements` / `ODDS`.
+    The number is taken for a Poisson variable with mean `measurements` /
+    `MEASUREMENTS_A_FALSE_TOUCH`.
     """
-    mean = max(measurements, 1) / ODDS
+    mean = max(measurements, 1) / MEASUREMENTS_A_FALSE_TOUCH
     fewer = sum(
         math.exp(number * math.log(mean) - mean - math.lgamma(number + 1))
         for number in range(touches)

@@ -1,6 +1,5 @@
 """What is reported of the skin, compared with what presses it."""
 
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -8,28 +7,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.evaluation.simulate.promises.chance import Chance
+from skin_host.evaluation.simulate.promises.contacts import ContactCheck, Known
 from skin_host.evaluation.simulate.promises.excuses import Excuses
 from skin_host.evaluation.simulate.promises.limits import (
     AGAIN_NS,
     CAUSE_NS,
     DEAF_SAMPLES,
-    FELT_KPA,
-    FELT_SAMPLES,
-    KEPT,
+    FELT_NS,
     LASTS_NS,
     LASTS_PAUSE_NS,
     LONG_AGO_NS,
+    LOOKED_BACK_NS,
     NS,
-    PAUSE_NS,
-    PRESSED_KPA,
     RELAXED_NS,
-    SAMPLES,
-    SIGMAS,
     TOUCHING_KPA,
-    UNTOUCHED_KPA,
     Mask,
 )
-from skin_host.evaluation.simulate.world import Life, World
+from skin_host.evaluation.simulate.promises.truth import Floats, Truth
+from skin_host.evaluation.simulate.world import World
 from skin_host.layout import PadKind
 from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
@@ -41,10 +36,12 @@ class _Open:
 
     Attributes:
         taxels: [k] those of the part that it touches, as reported last.
+        known: of its place, for parts with skin.
         unsaid_ns: time of frames that felt it since then.
     """
 
     taxels: NDArray[np.intp]
+    known: Known | None = None
     unsaid_ns: int = 0
 
 
@@ -54,6 +51,7 @@ class SkinCheck:
     Args:
         world: to watch.
         excuses: which taxels are not judged, and when each was pressed.
+        truth: what presses.
 
     Attributes:
         chance: touches by noise alone.
@@ -61,8 +59,9 @@ class SkinCheck:
         valid_ns: when each taxel was last valid [n].
     """
 
-    def __init__(self, world: World, excuses: Excuses) -> None:
-        self._world, self._excuses = world, excuses
+    def __init__(self, world: World, excuses: Excuses, truth: Truth) -> None:
+        self._world, self._excuses, self._truth = world, excuses, truth
+        self._contacts = ContactCheck(world, truth)
         self.chance = Chance()
         layout = world.layout
         n = layout.n_taxels
@@ -83,12 +82,6 @@ class SkinCheck:
         self._unheard_ns = np.full(n, LONG_AGO_NS, np.int64)
         self._blind_ns = np.full(n, LONG_AGO_NS, np.int64)
         self._lost = np.zeros(n, np.bool_)
-        #: When each taxel was last seen not to be pressed between two samples.
-        self._paused_ns = np.full(n, LONG_AGO_NS, np.int64)
-        #: The hardest press of each taxel since it last had time to recover (kPa).
-        self._hardest_kpa = np.zeros(n)
-        #: What presses each taxel (kPa) at the last samples.
-        self._truth: deque[NDArray[np.float64]] = deque(maxlen=SAMPLES)
 
     def begin(self) -> None:
         """A life of the daemon begins."""
@@ -116,11 +109,21 @@ class SkinCheck:
             return f"{part}: touch {event.id} has a {event.event} without a begin"
         if event.event == "end":
             now.pop(event.id, None)
-        else:
-            now[event.id] = _Open(np.asarray(event.taxels, np.intp))
-            if not event.taxels and part in self._parts:
-                return f"{part}: touch {event.id} has no taxel"
-        return None
+            return None
+        taxels = np.asarray(event.taxels, np.intp)
+        before = now.get(event.id)
+        now[event.id] = _Open(taxels)
+        if part not in self._parts:
+            return None
+        if not event.taxels:
+            return f"{part}: touch {event.id} has no taxel"
+        known = None if before is None else before.known
+        ever = taxels if known is None else np.union1d(known.taxels, taxels)
+        now[event.id].known = Known(ever, event.centroid_m)
+        fit = self._judged() & self._truth.reads
+        if abs(self._world.clock.now_ns() - event.t_ns) > NS // 2:
+            fit[:] = False  # it waited to be read, or the time of day was set
+        return self._contacts.wrong(event, self._parts[part], known, ever, fit)
 
     def endless(self) -> str | None:
         """Return a part with touches that have no end; the daemon has ended."""
@@ -252,17 +255,9 @@ class SkinCheck:
 
     # ------------------------------------------------------------------ samples of the truth
 
-    def note_pause(self) -> None:
-        """Something is about to be pressed; what was lifted just before has not been sampled."""
-        rests = self._world.robot.skin.true_pressure_kpa() <= PRESSED_KPA
-        self._paused_ns[rests] = self._now_ns()
-
-    def note_truth(self, true_kpa: NDArray[np.float64]) -> None:
-        """Take a sample of what presses each taxel [n]."""
-        self._truth.append(true_kpa)
-        recovered = self._now_ns() - self._excuses.touched_ns > RELAXED_NS
-        self._hardest_kpa[recovered] = 0.0
-        np.maximum(self._hardest_kpa, true_kpa, out=self._hardest_kpa)
+    def note_recovered(self) -> None:
+        """Note whose foam has recovered."""
+        self._truth.recover(self._now_ns() - self._excuses.touched_ns > RELAXED_NS)
 
     def note_valid(self, true_kpa: NDArray[np.float64]) -> None:
         """Note which taxels [n] are valid, and which are pressed and are not."""
@@ -272,26 +267,13 @@ class SkinCheck:
             self.valid_ns[part.start : part.stop][frame.valid] = now_ns
         self._unheard_ns[(true_kpa > TOUCHING_KPA) & (self.valid_ns < now_ns)] = now_ns
 
-    @property
-    def sampled(self) -> bool:
-        """Enough samples were taken to look back on."""
-        return len(self._truth) == SAMPLES
-
-    def pressed(self) -> Mask:
-        """Return which taxels [n] have been pressed for some samples."""
-        lately = np.array(list(self._truth)[-FELT_SAMPLES:])
-        pressed: Mask = lately.min(axis=0) > PRESSED_KPA
-        return pressed
-
-    def wrong(self, life: Life) -> str | None:
+    def wrong(self) -> str | None:
         """Return a part whose last frame is wrong by the samples of the truth, or None."""
-        spoiled = self._excuses.spoiled()
-        longer = np.array(list(self._truth))
-        least, most = longer[-4:].min(axis=0), longer.max(axis=0)
-        pressed = self.pressed()
+        judged = self._judged()
+        bounds_kpa = self._truth.bounds_kpa(LOOKED_BACK_NS)
+        firm = self._truth.firm(FELT_NS)
         rested = self._now_ns() - self._excuses.touched_ns > RELAXED_NS
         rested[self.chance.lately(self._now_ns())] = False
-        judged = self._pads & ~self._excuses.exempt & ~spoiled
         wall_ns = self._world.clock.now_ns()
         for name, frame in self._frames.items():
             part = self._parts[name]
@@ -299,80 +281,46 @@ class SkinCheck:
             if abs(wall_ns - frame.t_ns) > NS // 2:
                 continue
             fit = frame.valid & judged[mine]
-            wrong = self._wrong_touched(life, frame, mine, fit, pressed, rested)
+            wrong = self._wrong_touched(frame, mine, fit, firm[mine], rested[mine])
             if wrong is None and frame.computed:
-                wrong = self._wrong_pressure(life, frame, mine, fit, least, most)
+                wrong = self._wrong_pressure(frame, mine, fit & self._truth.reads[mine], bounds_kpa)
             if wrong is not None:
                 return f"{name}: {wrong}"
         return None
 
+    def _judged(self) -> Mask:
+        """Return the pads bool[n] whose values have no excuse."""
+        judged: Mask = self._pads & ~self._excuses.exempt & ~self._excuses.spoiled()
+        return judged
+
     def _wrong_touched(
-        self, life: Life, frame: PressureFrame, mine: slice, fit: Mask, pressed: Mask, rested: Mask
+        self, frame: PressureFrame, mine: slice, fit: Mask, firm: Mask, rested: Mask
     ) -> str | None:
-        lasts = fit & frame.touched & rested[mine]
+        lasts = fit & frame.touched & rested
         if lasts.any():
             return f"taxels {np.flatnonzero(lasts).tolist()} are still touched, and nothing presses"
-        deaf = fit & pressed[mine] & ~frame.touched
-        if deaf.any():
-            deaf &= self.decides_kpa(life, frame.part) < PRESSED_KPA
+        deaf = fit & firm & ~frame.touched
         self._deaf[mine] = np.where(deaf, self._deaf[mine] + 1, 0)
         if self._deaf[mine].max() <= DEAF_SAMPLES:
             return None
         taxel = int(self._deaf[mine].argmax())
-        true_kpa = self._truth[-1][mine][taxel]
+        true_kpa = self._truth.kpa[mine][taxel]
         return f"taxel {taxel} is valid and not touched while it is pressed with {true_kpa:.1f} kPa"
 
     def _wrong_pressure(
-        self,
-        life: Life,
-        frame: PressureFrame,
-        mine: slice,
-        fit: Mask,
-        least: NDArray[np.float64],
-        most: NDArray[np.float64],
+        self, frame: PressureFrame, mine: slice, fit: Mask, bounds_kpa: tuple[Floats, Floats]
     ) -> str | None:
-        missed = fit & (least[mine] > PRESSED_KPA) & (frame.pressure_kpa < FELT_KPA)
-        missed &= self._now_ns() - self._paused_ns[mine] > PAUSE_NS
-        if missed.any():
-            taxel = int(np.flatnonzero(missed)[0])
-            return (
-                f"taxel {taxel} is valid and reads {frame.pressure_kpa[taxel]:.1f} kPa while it is "
-                f"pressed with {self._truth[-1][mine][taxel]:.1f} kPa"
-            )
-        kept_kpa = KEPT * self._hardest_kpa[mine]
-        untouched_kpa = np.maximum(UNTOUCHED_KPA, kept_kpa)
-        false = fit & (most[mine] < 0.01) & (frame.pressure_kpa > untouched_kpa)
-        if false.any():
-            # What foam kept has noise too.
-            false &= frame.pressure_kpa > kept_kpa + self._noise_kpa(life, frame.part)
-        if not false.any():
+        least, most = bounds_kpa[0][mine], bounds_kpa[1][mine]
+        kpa = frame.pressure_kpa
+        wrong = fit & ((kpa < least) | (kpa > most))
+        if not wrong.any():
             return None
-        taxel = int(np.flatnonzero(false)[0])
+        taxel = int(np.flatnonzero(wrong)[0])
         return (
-            f"taxel {taxel} is valid and reads {frame.pressure_kpa[taxel]:.1f} kPa while nothing "
-            "presses it"
+            f"taxel {taxel} is valid and reads {kpa[taxel]:.1f} kPa while it is pressed with "
+            f"{self._truth.kpa[mine][taxel]:.1f} kPa, which gives {least[taxel]:.1f} to "
+            f"{most[taxel]:.1f} kPa"
         )
-
-    def _noise_kpa(self, life: Life, name: str) -> NDArray[np.float64]:
-        """Return how far noise alone may move each taxel [m] of a part."""
-        engine, part = life.daemon.engine, self._parts[name]
-        if engine.calibration is None or engine.pipeline is None:
-            return np.zeros(part.n_taxels)
-        units = SIGMAS * engine.calibration.spread[part.start : part.stop]
-        index = list(self._parts).index(name)
-        found: NDArray[np.float64] = engine.pipeline._parts[index]._curve.kpa(units)
-        return found
-
-    def decides_kpa(self, life: Life, name: str) -> NDArray[np.float64]:
-        """Return what pressure each taxel [m] of a part detects within a second."""
-        pipeline = life.daemon.engine.pipeline
-        if pipeline is None:
-            return np.full(self._parts[name].n_taxels, np.inf)
-        rules = pipeline._parts[list(self._parts).index(name)]._rules
-        found: NDArray[np.float64] = rules.curve.kpa(
-            np.where(rules.usable, rules.levels.decides, 0.0)
-        )
-        return found
 
     def _now_ns(self) -> int:
         return self._world.clock.monotonic_ns()

@@ -1,7 +1,5 @@
 """What presses a pad when its board is zeroed: if nobody felt it begin, it is in the zero."""
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +12,7 @@ from skin_host.evaluation.simulate.promises.limits import (
     TOUCHING_KPA,
     UNHEARD_PERIODS,
 )
+from skin_host.evaluation.simulate.promises.truth import Truth
 from skin_host.evaluation.simulate.world import Life, World
 from skin_host.processing.rezero import Rezero
 
@@ -24,10 +23,12 @@ class ZeroCheck:
     Args:
         world: to watch.
         excuses: where taxels are exempt whose zero nobody can know.
+        truth: what pressure each taxel detects in time: noisy ones only a firm press.
     """
 
-    def __init__(self, world: World, excuses: Excuses) -> None:
+    def __init__(self, world: World, excuses: Excuses, truth: Truth) -> None:
         self._world, self._excuses = world, excuses
+        self._truth = truth
         n = world.layout.n_taxels
         #: When each taxel began to be pressed, or firmly so, when its board was last received, and
         #: since when what presses it may be in its zero.
@@ -80,7 +81,6 @@ class ZeroCheck:
         true_kpa: NDArray[np.float64],
         valid_ns: NDArray[np.int64],
         felt_ns: NDArray[np.int64],
-        decides_kpa: Callable[[str], NDArray[np.float64]],
     ) -> None:
         """What a board did not feel before it took a zero is in that zero: nobody can know.
 
@@ -89,7 +89,6 @@ class ZeroCheck:
             true_kpa: what presses each taxel [n].
             valid_ns: when each was last valid [n].
             felt_ns: when each was last received, as known at the sample before [n].
-            decides_kpa: by name of a part, what pressure each of its taxels [m] detects in time.
         """
         now_ns, wall_ns = self._world.clock.monotonic_ns(), self._world.clock.now_ns()
         spoiled = self._excuses.spoiled()
@@ -127,9 +126,5 @@ class ZeroCheck:
             if rezero.begun:
                 unfelt &= self._pressed_ns[taxels] <= self._observed[board][1]
             if finds.any():
-                unfelt |= pressed[taxels] & (true_kpa < self._decides_kpa(decides_kpa))[taxels]
+                unfelt |= pressed[taxels] & (true_kpa < self._truth.decides_kpa)[taxels]
             self._excuses.exempt[taxels] |= finds & (unfelt | spoiled[taxels])
-
-    def _decides_kpa(self, of_part: Callable[[str], NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return what pressure each taxel [n] detects in time: noisy ones only a firm press."""
-        return np.concatenate([of_part(part.name) for part in self._world.layout.parts])
