@@ -311,7 +311,8 @@ def test_a_frame_costs_less_than_half_of_what_it_costs_through_python_can(vcan):
     usual, ours = (measure(wire, path, 8000, 5.0) for path in ("notifier_async", "batch"))
     logging.info("notifier_async %s; batch %s", usual, ours)
     # The lane's kernel counts CPU time by its ticks of 10 ms. What wakes up just after a tick and
-    # sleeps before the next may be counted with none: that it ran is shown by its frames.
+    # sleeps before the next may be counted with none: that it ran is shown by its frames. How many
+    # are sent depends on the computer.
     assert ours["lost"] == 0
-    assert ours["received_per_s"] > 7000
+    assert 2 * ours["received_per_s"] > usual["received_per_s"]
     assert 2 * ours["ns_per_frame"] < usual["ns_per_frame"]
