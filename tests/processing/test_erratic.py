@@ -68,6 +68,15 @@ def test_a_broken_contact_is_found_at_any_rate_of_sweeps(hz: float):
     assert found.pads.tolist() == [False, True, False]
 
 
+def test_seven_short_presses_a_second_are_a_broken_contact() -> None:
+    """Each release is as long as those of a hand; presses do not follow each other so fast."""
+    found = jumping(0)
+    kpa = [9, 9, 0, 0, 0, 0, 0] * 16
+    for begin in range(0, len(kpa), 8):
+        look(found, *kpa[begin : begin + 8])
+    assert found.pads.tolist() == [False, True, False]
+
+
 def test_a_press_that_is_lost_for_some_samples_again_and_again_is_a_broken_contact():
     found = jumping(0)
     for _ in range(8):
