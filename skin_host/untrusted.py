@@ -1,5 +1,6 @@
-"""JSON that anybody may have written: a message of a broker, a wish of a page, a file."""
+"""What anybody may have written: JSON of a broker, a page or a file, and the host of a request."""
 
+from collections.abc import Collection
 from functools import lru_cache
 from typing import Any, TypeVar
 
@@ -35,3 +36,20 @@ def decoded(decoder: "msgspec.json.Decoder[T]", data: bytes | str) -> T:
 @lru_cache
 def _decoder(kind: Any) -> "msgspec.json.Decoder[Any]":
     return msgspec.json.Decoder(kind)
+
+
+def names_us(host: str, names: Collection[str]) -> bool:
+    """Return whether a header `Host` has an address, which nobody can make point elsewhere, or one
+    of these names.
+    """
+    # Only those that serve pages need them, and every command reads files.
+    import ipaddress
+    from urllib.parse import urlsplit
+
+    try:
+        name = urlsplit(f"//{host}").hostname or ""
+        if name not in names:
+            ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True

@@ -10,14 +10,13 @@ import contextlib
 import logging
 import os
 from collections.abc import Callable, Iterator, Mapping
-from ipaddress import ip_address
 from typing import Any
-from urllib.parse import urlsplit
 
 from skin_host.clock import SYSTEM, Clock
 from skin_host.fingertip.health import FingertipRecord
 from skin_host.health import Record
 from skin_host.tasks import in_tasks
+from skin_host.untrusted import names_us
 
 log = logging.getLogger(__name__)
 
@@ -168,15 +167,7 @@ async def serve(port: int, records: Callable[[], Records], clock: Clock = SYSTEM
 def _is_ours(header: bytes) -> bool:
     """Whether a header is not a `Host` with a name that somebody can make point here."""
     key, _, value = header.decode("latin-1").partition(":")
-    if key.strip().lower() != "host":
-        return True
-    try:
-        name = urlsplit(f"//{value.strip()}").hostname or ""
-        if name != "localhost":
-            ip_address(name)
-    except ValueError:
-        return False
-    return True
+    return key.strip().lower() != "host" or names_us(value.strip(), {"localhost"})
 
 
 def _response(request: bytes, records: Callable[[], Records]) -> bytes:

@@ -150,7 +150,9 @@ class Describer:
             return watch.valid
         layout = self._layout.parts[part]
         valid = watch.valid.copy()
-        usable = self._usable(part)
+        usable = self._layout.pad_kind == PadKind.PRESSURE
+        can_be = self._engine.usable()
+        usable = usable if can_be is None else usable & can_be
         for index in layout.boards:
             taxels, row = self._layout.boards[index].taxel_index, ledger.row[index]
             fitted = (taxels >= layout.start) & (taxels < layout.stop)
@@ -162,18 +164,8 @@ class Describer:
             for pads in cleared:
                 here = self._of_board(pads, row)
                 here = here if veto is None else here & ~veto
-                valid[mine] |= here[fitted] & usable[mine]
+                valid[mine] |= here[fitted] & usable[taxels[fitted]]
         return valid
-
-    def _usable(self, part: int) -> Mask:
-        """Return the taxels of a part, bool[m], that can be valid at all."""
-        layout = self._layout.parts[part]
-        mine = slice(layout.start, layout.stop)
-        usable: Mask = self._layout.pad_kind[mine] == PadKind.PRESSURE
-        calibration, pipeline = self._engine.calibration, self._engine.pipeline
-        if calibration is not None:
-            usable = usable & calibration.usable[mine]
-        return usable if pipeline is None else usable & ~pipeline.unreached[mine]
 
     def _state(self, part: int, pressure: NDArray[np.bool_], valid: Mask | None) -> str:
         watch = self._watch.parts[part]

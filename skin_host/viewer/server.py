@@ -6,7 +6,6 @@ listens on this machine only, and it takes requests from its own page only.
 
 import asyncio
 import contextlib
-import ipaddress
 import logging
 import os
 import socket
@@ -16,7 +15,6 @@ from http import HTTPStatus
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
-from urllib.parse import urlsplit
 
 import msgspec
 from msgspec import Meta, Struct
@@ -32,7 +30,7 @@ from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import first_error
 from skin_host.recording.capture import MAX_AGO_S, PageRecording
 from skin_host.tasks import cancel
-from skin_host.untrusted import from_json
+from skin_host.untrusted import from_json, names_us
 from skin_host.viewer.picture import Cursor, Picture
 
 #: Pages get new messages this often; screens show no more.
@@ -196,7 +194,7 @@ class Viewer:
             origin = request.headers.get("Origin")
         except MultipleValuesError:
             return _response(HTTPStatus.BAD_REQUEST, "text/plain", b"two hosts or origins\n")
-        if not self._is_ours(host):
+        if not names_us(host, self._names):
             # A page from elsewhere, whose name was made to point at this machine.
             text = b"not served under this name; `skin view --name NAME` allows one\n"
             return _response(HTTPStatus.FORBIDDEN, "text/plain", text)
@@ -211,16 +209,6 @@ class Viewer:
         if file is None:
             return _response(HTTPStatus.NOT_FOUND, "text/plain", b"no such page\n")
         return _response(HTTPStatus.OK, *file)
-
-    def _is_ours(self, host: str) -> bool:
-        """Whether a header `Host` has an address, which nobody can make point elsewhere, or a name
-        of ours.
-        """
-        try:
-            name = urlsplit(f"//{host}").hostname or ""
-        except ValueError:
-            return False
-        return name in self._names or _is_address(name)
 
     async def _talk(self, page: ServerConnection) -> None:
         """Send one page its new messages until it closes, and take its requests."""
@@ -351,14 +339,6 @@ def _own_names() -> set[str]:
     name = socket.gethostname().lower()
     short = name.partition(".")[0]
     return {name, short, f"{short}.local"}
-
-
-def _is_address(name: str) -> bool:
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
 
 
 def _close_with(page: ServerConnection, telling: "asyncio.Task[None]") -> None:
