@@ -17,12 +17,14 @@ from skin_host.bus.ledger import BoardLedger
 from skin_host.bus.wire import TRIANGLES, StatusError
 from skin_host.layout import Layout
 from skin_host.processing.calibration import Calibration
-from skin_host.processing.intake import Intake, below_zero
+from skin_host.processing.drift import SETTLE_S
+from skin_host.processing.intake import Intake, below_zero, lifted
 from skin_host.processing.liveness import PADS
 from skin_host.processing.masks import Mask, any_of
 from skin_host.processing.pipeline import Pipeline, PressureFrame
 from skin_host.processing.rezero import (
     BELOW_SWEEPS,
+    END,
     JUMPS_NS,
     STEADY_UNITS,
     Rezero,
@@ -36,6 +38,11 @@ from skin_host.processing.silent_zero import SilentZero
 GLIMPSED = 3
 #: ... or has become it less than this ago: a touch may not be decided yet.
 DECIDED_NS = 500_000_000
+#: One reading inside the scale counts as so many at its end: a pad whose noise reaches inside in a
+#: tenth of its readings rests within 1.3 standard deviations of the end.
+INSIDE_WEIGHT = 9
+#: The byte at the end of the scale, to be found among those of a sweep.
+END_BYTE = bytes((END,))
 
 
 @dataclass(slots=True)
@@ -98,7 +105,10 @@ class BoardZeros:
         #: In how many sweeps in a row that came pads int64[16, 12] of a board have read far below
         #: zero, where any do.
         self._below: dict[int, NDArray[np.int64]] = {}
-        #: When a board's pad last came back from there by itself.
+        #: Of how many sweeps more pads int64[16, 12] of a board have sent the end of the scale than
+        #: readings inside, these by `INSIDE_WEIGHT`, where any have.
+        self._at_end: dict[int, NDArray[np.int64]] = {}
+        #: When a board's pad last came back from far below zero by itself.
         self._jumped_ns: dict[int, int] = {}
         self._touched = np.zeros(layout.n_taxels, np.bool_)
         #: Whether each taxel was touched when it was last valid. A board that restarts in a touch
@@ -117,7 +127,7 @@ class BoardZeros:
         self._silent_zeros = before._silent_zeros
         self._glimpses = before._glimpses
         self._unanswered = before._unanswered
-        self._below = before._below
+        self._below, self._at_end = before._below, before._at_end
         self._jumped_ns = before._jumped_ns
         self._touched = before._touched
         self._last_touched = before._last_touched
@@ -133,6 +143,7 @@ class BoardZeros:
             self.rezeros.pop(board, None)
             self._silent_zeros.pop(board, None)
             self._glimpses.pop(board, None)
+            self._at_end.pop(board, None)
         self.release(boards)
         zeroed = self._layout.taxels_of(boards)
         self._last_touched[zeroed] = self._touched[zeroed]
@@ -156,6 +167,8 @@ class BoardZeros:
             return
         if ledger.flagged[row] or self._below:
             self._note_below_zero(sweep, row)
+        if END_BYTE in sweep.raw.tobytes() or sweep.board in self._at_end:
+            self._note_at_end(sweep, row)
         if self.rezeros:
             rezero = self.rezeros.get(sweep.board)
             if rezero is not None:
@@ -247,6 +260,7 @@ class BoardZeros:
             touched = np.zeros_like(fitted)
             self._last_touched[taxels[fitted]] = False
         self._glimpses.pop(board, None)
+        self._at_end.pop(board, None)
         if before is not None:
             touched |= before.unknown.reshape(TRIANGLES, PADS)
         own = self._layout.boards[board].settings
@@ -512,14 +526,44 @@ class BoardZeros:
         if not any_of(lasted > 0):
             return
         self._below[sweep.board] = lasted
-        sure = lasted >= BELOW_SWEEPS
-        if any_of(sure):
-            if sweep.board not in self.rezeros:
-                self.rezeros[sweep.board] = Rezero.over(np.full(sure.size, no_load), sweep.t_ns)
-            doubted = self.rezeros[sweep.board].doubted
-            if any_of(sure.ravel() & ~doubted):
-                doubted |= sure.ravel()
-                self.changes += 1
+        self._doubt_pads(sweep, lasted >= BELOW_SWEEPS)
+
+    def _note_at_end(self, sweep: Sweep, row: int) -> None:
+        """Detect pads that rest at the end of the scale, or beyond it.
+
+        Their zero was taken under a press that has lifted, but not by so much that their board
+        marks them as far out of range, or has drifted that far. Nobody knows where they rest, so
+        that a press is felt late and measured too low. Beside a touch skin bulges, and may read so
+        for as long as the touch lasts.
+        """
+        if self._calibration is None:
+            return
+        far = self._ledger.far[row]
+        here = (self._ledger.error[row] == 0) & self._ledger.present[row] & ~lifted(sweep.raw, far)
+        taxels = self._of(sweep.board)
+        pads = here[:, None] & ~far & (taxels >= 0) & self._calibration.usable[taxels]
+        at_end = pads & (sweep.raw == END)
+        lasted = self._at_end.pop(sweep.board, np.zeros(at_end.shape, np.int64))
+        if row not in self._intake.touched:
+            lasted += at_end
+        lasted -= INSIDE_WEIGHT * (pads & ~at_end)
+        np.maximum(lasted, 0, out=lasted)
+        if lasted.any():
+            self._at_end[sweep.board] = lasted
+            period_s = self._layout.boards[sweep.board].settings.period_ms * 1e-3
+            self._doubt_pads(sweep, lasted * period_s >= SETTLE_S)
+
+    def _doubt_pads(self, sweep: Sweep, pads: Mask) -> None:
+        """The zero of some pads, bool[16, 12], of the board of a sweep is not known."""
+        if not any_of(pads):
+            return
+        if sweep.board not in self.rezeros:
+            no_load = float(self._layout.boards[sweep.board].settings.no_load)
+            self.rezeros[sweep.board] = Rezero.over(np.full(pads.size, no_load), sweep.t_ns)
+        doubted = self.rezeros[sweep.board].doubted
+        if any_of(pads.ravel() & ~doubted):
+            doubted |= pads.ravel()
+            self.changes += 1
 
     def _find_zero(self, sweep: Sweep, row: int, rezero: Rezero) -> None:
         if self._pipeline is None or self._calibration is None:

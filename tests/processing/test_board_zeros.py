@@ -45,12 +45,18 @@ class Hand:
         self.first_lost = False
         #: Whether the first frame of the last triangle that comes is lost.
         self.halved = False
+        #: Whether the status words mark bytes of 255 as far below zero.
+        self.marks_far = True
         #: Takes the outputs.
         self.deliver: Callable[[Output], None] = lambda output: None
         if rest_seed is not None:
             self.rests_elsewhere(rest_seed)
+        self.calibrate()
+
+    def calibrate(self, **pads: int) -> None:
+        """Calibrate, while the board sends what `send` does."""
         self.engine.begin_calibration(2.0)
-        self.send(50)
+        self.send(50, **pads)
         self.engine.use(self.engine.end_calibration("2026-01-01T00:00:00+00:00"))
 
     def send(self, sweeps: int, **pads: int) -> None:
@@ -69,7 +75,7 @@ class Hand:
         status[-1] = self.error
         for name, value in pads.items():
             values[0, int(name[1:])] = value
-            if value == FAR_BELOW:
+            if value == FAR_BELOW and self.marks_far:
                 status[0] |= 0x10 << int(name[1:])
         ids, data = encode_sweep(
             self._board.settings.address, triangles, values.astype(np.uint8), status
@@ -132,6 +138,66 @@ def test_whether_a_pad_stays_below_zero_shows_in_the_sweeps_that_came(
     hand.first_lost = False
     hand.send(1)
     assert hand.in_doubt == doubted
+
+
+def test_a_pad_that_rests_at_the_end_of_its_scale_was_pressed_when_its_board_was_zeroed(
+    hand: Hand,
+) -> None:
+    """Its board marks it only at twice the range; up to there nothing shows where it rests."""
+    hand.marks_far = False
+    frames: list[PressureFrame] = []
+    hand.deliver = lambda output: frames.extend(output.frames)
+    hand.send(95, p3=255)
+    assert hand.in_doubt == []
+    hand.send(10, p3=255)
+    assert hand.in_doubt == [3]
+    hand.send(100)
+    assert hand.in_doubt == [3]
+    assert np.flatnonzero(~frames[-1].valid[:12]).tolist() == [3]
+
+
+def test_a_pad_whose_readings_are_mostly_cut_off_rests_at_the_end_of_its_scale(hand: Hand) -> None:
+    hand.marks_far = False
+    for _ in range(30):
+        hand.send(19, p3=255)
+        hand.send(1, p3=254)
+    assert hand.in_doubt == [3]
+
+
+def test_a_pad_whose_readings_are_cut_off_at_times_rests_inside_its_scale(hand: Hand) -> None:
+    hand.marks_far = False
+    for _ in range(60):
+        hand.send(8, p3=255)
+        hand.send(2, p3=254)
+    assert hand.in_doubt == []
+
+
+def test_skin_that_bulges_beside_a_touch_is_not_taken_for_a_lifted_press(hand: Hand) -> None:
+    """It reads less for as long as the touch lasts."""
+    hand.marks_far = False
+    for sweep in range(300):
+        hand.send(1, p3=255, p4=NO_LOAD - 60 - sweep % 3)
+    assert hand.in_doubt == []
+    hand.send(60)
+    assert hand.in_doubt == []
+
+
+def test_a_pad_that_was_refused_is_not_in_doubt_at_the_end_of_its_scale(hand: Hand) -> None:
+    hand.marks_far = False
+    hand.calibrate(p3=255)
+    hand.send(200, p3=255)
+    assert hand.in_doubt == []
+
+
+def test_a_calibration_ends_the_doubt_in_a_pad_that_rested_at_the_end_of_its_scale(
+    hand: Hand,
+) -> None:
+    hand.marks_far = False
+    hand.send(150, p3=255)
+    assert hand.in_doubt == [3]
+    hand.calibrate()
+    hand.send(2)
+    assert hand.in_doubt == []
 
 
 def test_a_pad_in_doubt_that_is_pressed_again_and_again_does_not_jump(hand: Hand) -> None:

@@ -192,6 +192,35 @@ def test_what_pressed_as_the_daemon_started_is_in_doubt_when_it_lifts_and_no_bro
         runner.run(live())
 
 
+@pytest.mark.parametrize("kpa", [30.0, 40.0])
+def test_a_pad_at_the_end_of_its_scale_after_a_press_that_nobody_felt_begin_is_not_valid(
+    world: World, kpa: float
+) -> None:
+    """Boards mark a pad only at twice their range; the others seem to be untouched for ever."""
+
+    async def live() -> None:
+        life = start(world)
+        await world.clock.sleep(8.0)
+        await world.end()
+        spot = world.spots[0]
+        pressing = asyncio.create_task(spot.press(6.0, kpa))
+        await world.clock.sleep(0.5)
+        life = start(world)
+        await pressing
+        await world.clock.sleep(1.5)
+        at_end = set(life.daemon.records()[spot.part]["beyond_range"])
+        assert at_end
+        await world.clock.sleep(6.0)
+        record = life.daemon.records()[spot.part]
+        assert record["beyond_range"] == []
+        assert at_end <= set(record["invalid"])
+        assert "board_in_doubt" in {fault["code"] for fault in record["faults"]}
+        life.kill()
+
+    with world.clock.runner() as runner:
+        runner.run(live())
+
+
 def test_a_press_that_begins_while_a_zero_is_observed_is_felt_when_it_comes_again(
     world: World,
 ) -> None:
