@@ -303,6 +303,7 @@ def _live(
     """Be the robot, in its own process, until the parent ends."""
     from emulator.probes.mujoco_model import MujocoModel
     from emulator.robot import Robot
+    from skin_host.bus.opening import open_bus
 
     try:
         model = None if mujoco is None else MujocoModel(mujoco, layout)
@@ -310,7 +311,7 @@ def _live(
         buses: dict[str, can.BusABC] = {name: PairBus(end) for name, end in ends.items()}
         for name, bus in settings.buses.items():
             if name not in buses:
-                buses[name] = can.Bus(interface=bus.interface, channel=bus.channel)
+                buses[name] = open_bus(name, bus)
     except SkinError as error:
         told.send(error)
         return
@@ -331,8 +332,8 @@ def _live(
         print(f"skin demo: {error}", file=sys.stderr)
         sys.exit(1)
     finally:
-        for open_bus in buses.values():
-            open_bus.shutdown()
+        for opened in buses.values():
+            opened.shutdown()
 
 
 async def _heard(touches: "Counter[str]", sent: int) -> None:

@@ -329,14 +329,18 @@ def open_bus(name: str, settings: Bus) -> can.BusABC:
             options["fd"] = True
         if settings.interface == SOCKETCAND and {"host", "port"} <= options.keys():
             _await_greeting(settings.options)
-        bus = can.Bus(
-            interface=settings.interface,
-            channel=settings.channel,
-            ignore_config=True,
-            **options,  # type: ignore[arg-type]
-        )
         if settings.interface == MULTICAST:
+            from skin_host.bus.multicast import MulticastBus
+
+            bus: can.BusABC = MulticastBus(settings.channel, **options)  # type: ignore[arg-type]
             _leave_other_groups(bus, settings.channel)
+        else:
+            bus = can.Bus(
+                interface=settings.interface,
+                channel=settings.channel,
+                ignore_config=True,
+                **options,  # type: ignore[arg-type]
+            )
     except Exception as error:
         # Each adapter's library has its own errors; the user gets one kind.
         why = one_line(error)

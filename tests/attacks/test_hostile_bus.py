@@ -59,6 +59,7 @@ ATTACKS = {
     "list as a flag": [frame(is_extended_id=[0] * 100), frame(is_remote_frame=[0])] * TIMES,
     "too long": [frame(data=bytes(60_000), dlc=60_000)] * 20,
     "another length": [frame(dlc=3), frame(data=[1] * 8), frame(data="12345678")] * TIMES,
+    "a number as data": [frame(data=n) for n in (200_000_000, 2**31, 2**63, -1)] * 20,
     "remote frames": [frame(is_remote_frame=True, data=b"", dlc=n) for n in range(9)] * TIMES,
     "CAN FD": [frame(is_fd=True, data=bytes(64), dlc=64)] * TIMES,
     "reserved addresses": RESERVED * 20,

@@ -1,7 +1,9 @@
 """Interfaces that are not SocketCAN: the same batches, by way of python-can's virtual bus."""
 
+import contextlib
 import itertools
 import time
+import tracemalloc
 
 import can
 import pytest
@@ -201,6 +203,62 @@ def test_buses_by_multicast_do_not_hear_each_other():
         assert received is not None
         assert received.arbitration_id == 0x410
         assert far.recv(0) is None
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"data": 200_000_000},
+        {"data": 2**63},
+        {"data": -1},
+        {"data": "12345678"},
+        {"data": [1] * 8},
+        {"data": bytes(65), "dlc": 65},
+        {"dlc": 2**40},
+        {"dlc": -1},
+        {"dlc": 4.0},
+        {"arbitration_id": 2**63},
+        {"arbitration_id": "x"},
+        {"is_extended_id": [0] * 100},
+        {"channel": None, "data": None},
+    ],
+)
+def test_a_datagram_that_is_no_frame_costs_its_own_size_alone(changes: dict[str, object]) -> None:
+    """A number as data makes as many bytes in python-can: one datagram filled the memory."""
+    msgpack = pytest.importorskip("msgpack")
+    group = Bus(interface="udp_multicast", channel="239.74.163.204")
+    frame: dict[str, object] = {
+        "timestamp": 0.0,
+        "arbitration_id": 0x410,
+        "is_extended_id": False,
+        "is_remote_frame": False,
+        "is_error_frame": False,
+        "channel": None,
+        "dlc": 8,
+        "data": bytes(8),
+        "is_fd": False,
+        "bitrate_switch": False,
+        "error_state_indicator": False,
+    }
+    port = open_port("left", group, Receive())
+    near = open_bus("b", group)
+    with can.Bus(interface="udp_multicast", channel=group.channel) as other:
+        try:
+            other._multicast.send(msgpack.packb(frame | changes))
+            other.send(message(0x411, b"\x01"))
+        except can.CanError:
+            pytest.skip("this machine has no network for multicast")
+        tracemalloc.start()
+        with contextlib.suppress(can.CanError):
+            near.recv(PATIENCE_S)
+        assert near.recv(PATIENCE_S).arbitration_id == 0x411
+        assert port.read().id.tolist() == [0x411]
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    assert peak < 5_000_000
+    assert port.counters.damaged == 1
+    near.shutdown()
+    port.close()
 
 
 def test_fd_frames_over_multicast_hold_up_no_others():
