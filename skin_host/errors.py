@@ -7,7 +7,8 @@
     |  |  |- OtherSkinError   the latter
     |  |- NewerFileError      a file that a newer version has written
     |  |- LogError            a recording that cannot be read
-    |- BusyFileError          a file that another program is writing at this moment
+    |- StateError             right, but not now: nothing was done (exit status 1)
+    |  |- BusyFileError       a file that another program is writing at this moment
     |- BusError               the CAN interface: absent, down, refused
     |- BrokerError            the MQTT broker: refused us, or sent an invalid answer
 
@@ -49,7 +50,11 @@ class NewerFileError(RequestError):
     """A file of the state directory that a newer version has written. It is not changed."""
 
 
-class BusyFileError(SkinError):
+class StateError(SkinError):
+    """The request is right, but not at this moment; nothing was done."""
+
+
+class BusyFileError(StateError):
     """Another program is writing a file at this moment. systemd starts a service again."""
 
 

@@ -185,6 +185,7 @@ def show(
     Returns:
         The exit status.
     """
+    from skin_host.daemon.calibrate import touched_meanwhile
     from skin_host.health.diagnosis import named_by_part
 
     if arguments.json:
@@ -193,16 +194,14 @@ def show(
         print(_table(found))
         print(f"calibration {visible(found['id'])} {where}")
     if found["unchanged"]:
-        warn(f"{named_by_part(found['unchanged'])}: received too rarely; they go on as before")
+        is_one = sum(map(len, found["unchanged"].values())) == 1
+        go_on = "it goes on" if is_one else "they go on"
+        warn(f"{named_by_part(found['unchanged'])}: received too rarely; {go_on} as before")
     if found["damaged"]:
         warn(f"{named_by_part(found['damaged'])}: calibrated without the bytes that were damaged")
-    tips = [name for name, verdict in found["fingertips"].items() if verdict == "touched"]
-    touched = "; ".join([named_by_part(found["touched"])] * bool(found["touched"]) + tips)
-    if touched:
-        warn(
-            f"the skin was touched while it was calibrated: {touched}; take away "
-            "what touches it and repeat: these read too little until then"
-        )
+    touched = touched_meanwhile(found, "repeat")
+    if touched is not None:
+        warn(touched)
     return 1 if touched and arguments.strict else 0
 
 

@@ -6,6 +6,7 @@ import json
 import logging
 import math
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -196,18 +197,24 @@ class Progress:
     def __init__(self, what: str) -> None:
         self._what = what
         self._shown = sys.stderr.isatty()
+        #: Of the longest line so far, in characters.
+        self._width = 0
 
     def update(self, share: float, note: str = "") -> None:
-        """Show that `share` (0 to 1) is done."""
+        """Show that `share` (0 to 1) is done. Anybody may have written names in `note`."""
         if self._shown:
             done = int(30 * min(1.0, max(0.0, share)))
             bar = "#" * done + "." * (30 - done)
-            print(f"\r{self._what} [{bar}] {share:4.0%} {note}", end="", file=sys.stderr)
+            # A line that the terminal has to fold cannot be replaced.
+            columns = max(1, shutil.get_terminal_size().columns - 1)
+            line = visible(f"{self._what} [{bar}] {share:4.0%} {note}")[:columns]
+            self._width = max(self._width, len(line))
+            print(f"\r{line:<{self._width}}", end="", file=sys.stderr)
 
     def close(self) -> None:
         """Remove the line."""
         if self._shown:
-            print("\r" + " " * 79 + "\r", end="", file=sys.stderr)
+            print("\r" + " " * self._width + "\r", end="", file=sys.stderr)
 
 
 def leaving() -> tuple[signal.Signals, ...]:

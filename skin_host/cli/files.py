@@ -18,7 +18,7 @@ from skin_host.cli.common import (
 )
 from skin_host.cli.options import add_rules
 from skin_host.cli.recordings import PROCESSED, add_calibration, add_onto, play
-from skin_host.errors import RequestError, SkinError
+from skin_host.errors import RequestError, SkinError, visible
 
 
 def add_commands(commands: Commands) -> None:
@@ -144,9 +144,11 @@ def _replay(arguments: argparse.Namespace) -> int:
     refuse_input(output, log, arguments.config, arguments.calibration)
     calibrated = arguments.calibration, arguments.calibrate_seconds
     task = Task(log, arguments.config, output, *calibrated)
-    with ended_in_good_order():
-        process(task, told, lambda doubt: warn(f"{log}: {doubt}"))
-    progress.close()
+    try:
+        with ended_in_good_order():
+            process(task, told, lambda doubt: warn(f"{log}: {doubt}"))
+    finally:
+        progress.close()
     return 0
 
 
@@ -176,7 +178,7 @@ def _replay_all(arguments: argparse.Namespace) -> int:
         raise RequestError(f"{twice}: two LOGs of that name; process them one folder at a time")
     load_skin(arguments.config)
     try:
-        folder.mkdir(exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RequestError(f"--output {folder}: {error.strerror}") from None
     progress = Progress("replay")
@@ -185,7 +187,7 @@ def _replay_all(arguments: argparse.Namespace) -> int:
         for number, (task, result) in enumerate(process_all(tasks, arguments.scheduler), 1):
             if isinstance(result, SkinError):
                 progress.close()
-                print(f"skin replay: {result}", file=sys.stderr)
+                print(f"skin replay: {visible(str(result))}", file=sys.stderr)
                 worst = max(worst, result.exit_status)
             elif result:
                 progress.close()

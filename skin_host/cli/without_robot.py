@@ -341,7 +341,12 @@ def take_commands(
         begun: a line whose end has not come.
         model: of the scene.
     """
-    data = os.read(sys.stdin.fileno(), LONGEST_COMMAND)
+    try:
+        data = os.read(sys.stdin.fileno(), LONGEST_COMMAND)
+    except BlockingIOError:  # another reader of it was faster
+        return
+    except OSError:  # such as that of a terminal, for an orphan in the background
+        data = b""
     if not data:
         import asyncio
 

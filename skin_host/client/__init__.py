@@ -6,13 +6,14 @@
 
 The client reconnects by itself. The field `missed` of the next touch or frame reports what was
 lost meanwhile. `SkinCallbacks` is the same without asyncio. All that they raise on purpose is a
-`SkinError`: a `BrokerError`, a `RequestError` for what was asked wrongly, or a `CommandError`.
+`SkinError`: a `BrokerError`, a `RequestError` for what was asked wrongly, or a `CommandError`. A
+`WrongCommandError`, for a request that a node found wrong, is of both these kinds.
 """
 
 from skin_host.client.callbacks import SkinCallbacks
 from skin_host.client.heard import Health
 from skin_host.client.presence import Contact
-from skin_host.client.session import CommandError, Node, SkinClient
+from skin_host.client.session import CommandError, Node, SkinClient, WrongCommandError
 from skin_host.client.streams import Stream
 from skin_host.errors import BrokerError, RequestError, SkinError
 from skin_host.fingertip.events import Over, Slip
@@ -39,4 +40,5 @@ __all__ = [
     "Slip",
     "Stream",
     "Touch",
+    "WrongCommandError",
 ]

@@ -58,7 +58,20 @@ _log = logging.getLogger(__name__)
 
 
 class CommandError(SkinError):
-    """A node refused a command, failed, or did not answer; the message gives the reason."""
+    """A node refused a command, failed, or did not answer; the message gives the reason.
+
+    Attributes:
+        cause: the node's: `request`, `state` or `failure`, see `mqtt.commands.Cause`; None if it
+            did not answer, or named none as an earlier version does.
+    """
+
+    def __init__(self, message: str, cause: str | None = None) -> None:
+        super().__init__(message)
+        self.cause = cause
+
+
+class WrongCommandError(CommandError, RequestError):
+    """A node found a request wrong: a name, a key or a value of it (cause `request`)."""
 
 
 @dataclass
@@ -281,6 +294,8 @@ class SkinClient:
         Raises:
             CommandError: the node is offline, takes no commands, refused, failed, or did not
                 answer in time.
+            WrongCommandError: the node found the request wrong. It is a `CommandError` and a
+                `RequestError`.
             RequestError: it is not clear which node is meant, or a name or a number cannot be sent.
         """
         if not NAME.fullmatch(name) or not (node is None or NAME.fullmatch(node)):
@@ -312,7 +327,9 @@ class SkinClient:
         finally:
             del self._asked[number]
         if not result.ok:
-            raise CommandError(result.error or "refused without a reason")
+            cause = result.cause or None
+            kind = WrongCommandError if cause == "request" else CommandError
+            raise kind(result.error or "refused without a reason", cause)
         return result.result or {}
 
     def _answer(self, node: str, number: str) -> Result | None:

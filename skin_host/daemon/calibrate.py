@@ -12,9 +12,11 @@ from skin_host.daemon.link import Link
 from skin_host.daemon.state import can_be_read, kept_path
 from skin_host.errors import CalibrationError, OtherSkinError, SkinError
 from skin_host.files import set_aside
+from skin_host.health.diagnosis import named_by_part
 from skin_host.layout import Layout
 from skin_host.processing.calibration import Calibration
 from skin_host.processing.calibration.file import load_calibration
+from skin_host.processing.calibration.outcome import Outcome
 from skin_host.processing.core import Engine
 from skin_host.tasks import cancel
 
@@ -109,6 +111,20 @@ async def collect(
         )
     # Of a large skin this takes a second, in which the boards' frames must be read.
     return await clock.in_thread(compute)
+
+
+def touched_meanwhile(found: Outcome, repeat: str) -> str | None:
+    """Return in words what touched the skin during a calibration, and how to mend it, `repeat`;
+    None: nothing touched it.
+    """
+    tips = [name for name, verdict in found["fingertips"].items() if verdict == "touched"]
+    touched = "; ".join([named_by_part(found["touched"])] * bool(found["touched"]) + tips)
+    if not touched:
+        return None
+    return (
+        f"the skin was touched while it was calibrated: {touched}; take away what touches it and "
+        f"{repeat}: these read too little until then"
+    )
 
 
 def calibration_path(settings: Settings, node: str) -> Path:

@@ -17,12 +17,13 @@ from skin_host.clock import Clock
 from skin_host.config.explain import explain
 from skin_host.config.settings import Settings
 from skin_host.daemon import service
+from skin_host.daemon.calibrate import touched_meanwhile
 from skin_host.daemon.state import NodeState, Thresholds
-from skin_host.errors import BusError, RequestError, SkinError
+from skin_host.errors import BusError, RequestError, SkinError, StateError
 from skin_host.layout import Layout
 from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.calibration import Calibration
-from skin_host.processing.calibration.outcome import outcome
+from skin_host.processing.calibration.outcome import Outcome, outcome
 from skin_host.processing.core import Engine
 from skin_host.recording.capture import FrameRecorder
 from skin_host.untrusted import from_json
@@ -124,7 +125,9 @@ class Control:
         """Carry out a request and return its result.
 
         Raises:
-            SkinError: it was refused, or failed; one line gives the reason.
+            RequestError: it is wrong; one line gives the reason, as with the others.
+            StateError: it came at a wrong moment; nothing was done.
+            SkinError: it failed.
         """
         command = self._commands.get(name)
         if command is None:
@@ -134,6 +137,20 @@ class Control:
                 "an empty request is refused: it is also what clears a retained one; wanted {}"
             )
         return await command(payload or b"{}")
+
+    async def calibrate(self, seconds: float, boards: list[int] | None = None) -> Outcome:
+        """Let the daemon calibrate, see there; return what was found, and log what touched it."""
+        daemon = self._daemon
+        engine, layout = daemon.engine, daemon.layout
+        parts, tips, before = engine.parts, engine.fingertips, engine.calibration
+        found = await daemon.calibrate(seconds, boards)
+        zeroed = () if tips is None or boards is not None else tuple(tips.tips)
+        # A large skin takes a while, in which the boards' frames must be read.
+        known = await daemon.clock.in_thread(outcome, found, layout, parts, boards, zeroed, before)
+        touched = touched_meanwhile(known, "repeat with `skin command calibrate`")
+        if touched is not None:
+            log.warning("%s", touched)
+        return known
 
     async def close(self) -> None:
         """End a recording in progress."""
@@ -153,12 +170,7 @@ class Control:
         elif request.part is not None:
             boards = list(layout.parts[self._part(request.part)].boards)
         seconds = request.seconds or daemon.settings.processing.calibration.seconds
-        engine = daemon.engine
-        parts, tips, before = engine.parts, engine.fingertips, engine.calibration
-        found = await daemon.calibrate(seconds, boards)
-        zeroed = () if tips is None or boards is not None else tuple(tips.tips)
-        # A large skin takes a while, in which the boards' frames must be read.
-        answer = await daemon.clock.in_thread(outcome, found, layout, parts, boards, zeroed, before)
+        answer = await self.calibrate(seconds, boards)
         return {**answer, "kept": "calibration" not in daemon.unkept}
 
     async def _status(self, payload: bytes) -> Answer:
@@ -209,7 +221,7 @@ class Control:
     async def _reload(self, payload: bytes) -> Answer:
         _decode(payload, _Request)
         if self._daemon.is_reloading:  # commands that wait would leave no room for others
-            raise RequestError(
+            raise StateError(
                 "the configuration is being read again already; ask again when that has ended"
             )
         await self._daemon.reload()
@@ -231,7 +243,7 @@ class Control:
         path = folder / "recordings" / name
         async with self._starting:
             if self.recorder is not None and self.recorder.ended is None:
-                raise RequestError(f"{self.recorder.path.name} is being recorded already; stop it")
+                raise StateError(f"{self.recorder.path.name} is being recorded already; stop it")
             self.recorder = await clock.in_thread(
                 FrameRecorder, path, request.seconds, request.max_bytes, clock
             )
@@ -242,7 +254,7 @@ class Control:
         _decode(payload, _Request)
         recorder = self.recorder
         if recorder is None:
-            raise RequestError("nothing is being recorded")
+            raise StateError("nothing is being recorded")
         recorder.finish()
         await recorder.finished()
         return {

@@ -21,7 +21,7 @@ from skin_host.daemon.calibrate import collect
 from skin_host.daemon.control import Control
 from skin_host.daemon.link import Link, OpenPort
 from skin_host.daemon.state import NodeState, Thresholds, Zeros, kept_path, load_kept
-from skin_host.errors import ConfigurationError, RequestError, SkinError
+from skin_host.errors import ConfigurationError, RequestError, SkinError, StateError
 from skin_host.files import write_document
 from skin_host.fingertip.health import FingertipRecord
 from skin_host.fingertip.service import FingertipPublisher
@@ -229,11 +229,12 @@ class Daemon:
             boards: indices of those whose taxels are calibrated; all by default.
 
         Raises:
-            SkinError: another one is being taken, no data came, or the file is not to be replaced:
-                another program is writing it, or a newer version has.
+            StateError: another one is being taken, or another program is writing the file.
+            NewerFileError: a newer version has written it.
+            SkinError: no data came.
         """
         if self._calibration_lock.locked():
-            raise SkinError("a calibration is being taken already; wait for it to end")
+            raise StateError("a calibration is being taken already; wait for it to end")
         async with self._calibration_lock:
             # Gains and curves are the file's: another program may have fitted them meanwhile.
             path = self._path("calibration")
@@ -302,10 +303,10 @@ class Daemon:
 
         Raises:
             BusError: a bus does not take frames.
-            RequestError: the daemon is ending: it would not stop them again.
+            StateError: the daemon is ending: it would not stop them again.
         """
         if self._is_ending:
-            raise RequestError(ENDING)
+            raise StateError(ENDING)
         chosen = self.engine.boards if boards is None else boards
         await self.link.set_up(chosen)
         return [self.layout.boards[board].name for board in chosen]
@@ -422,7 +423,7 @@ class Daemon:
             await self.link.bring_up()
         while calibrate or self.engine.calibration is None:
             try:
-                await self.calibrate(self.settings.processing.calibration.seconds)
+                await self.control.calibrate(self.settings.processing.calibration.seconds)
                 break
             except SkinError as error:
                 log.warning("%s", error)

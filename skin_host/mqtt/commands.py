@@ -3,7 +3,7 @@
 A request is a JSON object of at most `MAX_REQUEST_BYTES` (an empty payload counts as `{}`). Its
 key `id`, if it has one, comes back in the answer. The answer is a JSON object:
 `{"schema":"skin.result/1","command":..,"id":..,"ok":true,"result":{..}}`, or with
-`"ok":false` and `"error"`, one line with the reason.
+`"ok":false`, `"error"`, one line with the reason, and `"cause"`, one of `Cause`.
 """
 
 import asyncio
@@ -11,13 +11,13 @@ import json
 import logging
 import re
 from collections.abc import Awaitable, Callable, Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 from msgspec.structs import replace
 
-from skin_host.errors import SkinError, visible
+from skin_host.errors import RequestError, SkinError, StateError, visible
 from skin_host.mqtt.payload import MessageError, decode
 from skin_host.tasks import cancel
 from skin_host.untrusted import from_json
@@ -34,8 +34,11 @@ PER_SECOND = 10.0
 #: Of what others wrote, so many characters are logged.
 LOGGED = 200
 
+#: Why a command was not carried out: the request is wrong, and is refused until it is mended; it is
+#: right, but came at a wrong moment, and nothing was done; or it failed, and a part may be done.
+Cause = Literal["request", "state", "failure"]
 #: Answers a command: takes its name and its request, a JSON object as bytes. The return value
-#: becomes `result`; a `SkinError` becomes `error`.
+#: becomes `result`; a `SkinError` becomes `error` and `cause`.
 Handler = Callable[[str, bytes], Awaitable[Mapping[str, Any]]]
 #: Sends the payload of an answer.
 Answer = Callable[[bytes], None]
@@ -50,7 +53,10 @@ _NAME = re.compile(r"[a-z0-9_-]{1,32}")
 
 
 class Result(Struct, omit_defaults=True):
-    """The answer to a request."""
+    """The answer to a request.
+
+    `cause` is a `Cause`, or what a later version has more; an earlier one sends none.
+    """
 
     schema: Annotated[str, Meta(max_length=32)]
     command: Annotated[str, Meta(max_length=64)]
@@ -58,6 +64,7 @@ class Result(Struct, omit_defaults=True):
     id: str | int | UnsetType = UNSET
     result: dict[str, Any] | UnsetType = UNSET
     error: str | UnsetType = UNSET
+    cause: Annotated[str, Meta(max_length=32)] | UnsetType = UNSET
 
 
 class _Identified(Struct):
@@ -119,17 +126,14 @@ class CommandHandler:
             self._flooded = True
             self.refused += 1
             return
-        refusal = self._refusal(name, payload)
         identity: str | int | UnsetType = UNSET
-        if refusal is None:
-            try:
-                identity = from_json(payload or b"{}", _Identified).id
-            except msgspec.DecodeError as error:
-                refusal = f"the request is not a JSON object as it should be: {error}"
-        if refusal is not None:
+        try:
+            identity = _identity(name, payload)
+            self._check_moment(name)
+        except SkinError as error:
             self.refused += 1
-            _log.info("command %s refused: %s", visible(name, 32), visible(refusal, LOGGED))
-            answer(_failure(name, identity, refusal))
+            _log.info("command %s refused: %s", visible(name, 32), visible(str(error), LOGGED))
+            answer(_failure(name, identity, error))
             return
         self.taken += 1
         task = asyncio.get_running_loop().create_task(self._run(name, payload, identity, answer))
@@ -160,30 +164,27 @@ class CommandHandler:
             encoded = msgspec.json.encode(reply)
         except SkinError as error:
             _log.info("command %s refused: %s", name, visible(str(error), LOGGED))
-            answer(_failure(name, identity, str(error)))
+            answer(_failure(name, identity, error))
         except asyncio.CancelledError:
-            answer(_failure(name, identity, f"{ENDING}; this may not have been done"))
+            ended = SkinError(f"{ENDING}; this may not have been done")
+            answer(_failure(name, identity, ended))
             raise
         except Exception as error:
             # An error in one command must neither stop the service nor remain without an answer.
             _log.exception("command %s failed", name)
-            answer(_failure(name, identity, f"failed: {type(error).__name__}; see the log"))
+            failed = SkinError(f"failed: {type(error).__name__}; see the log")
+            answer(_failure(name, identity, failed))
         else:
             _log.info("command %s done", name)
             answer(encoded)
 
-    def _refusal(self, name: str, payload: bytes) -> str | None:
+    def _check_moment(self, name: str) -> None:
         if self._ending:
-            return ENDING
-        if not _NAME.fullmatch(name):
-            return "a command's name has up to 32 of a-z, 0-9, _ and -"
-        if len(payload) > MAX_REQUEST_BYTES:
-            return f"the request has {len(payload)} bytes; wanted at most {MAX_REQUEST_BYTES}"
+            raise StateError(ENDING)
         if len(self._running) >= MAX_RUNNING and name in self._running.values():
-            return (
+            raise StateError(
                 f"{MAX_RUNNING} commands are running already, and one of this name; try again later"
             )
-        return None
 
     def _token(self) -> bool:
         now_s = asyncio.get_running_loop().time()
@@ -207,8 +208,9 @@ def shortened(answer: bytes) -> bytes | None:
     known = {} if reply.result is UNSET else reply.result
     left = {key: value for key, value in known.items() if key != LEFT_OUT}
     if not reply.ok:
-        why = "the reason is longer than the broker takes"
-        shorter = _failure(reply.command, reply.id, why)
+        shorter = msgspec.json.encode(
+            replace(reply, error="the reason is longer than the broker takes")
+        )
     elif left:
         largest = max(left, key=lambda key: len(msgspec.json.encode(left[key])))
         del left[largest]
@@ -219,6 +221,39 @@ def shortened(answer: bytes) -> bytes | None:
     return shorter if len(shorter) < len(answer) else None
 
 
-def _failure(name: str, identity: str | int | UnsetType, why: str) -> bytes:
+def _identity(name: str, payload: bytes) -> str | int | UnsetType:
+    """Return the `id` of a request.
+
+    Raises:
+        RequestError: it is none that any command takes.
+    """
+    if not _NAME.fullmatch(name):
+        raise RequestError("a command's name has up to 32 of a-z, 0-9, _ and -")
+    if len(payload) > MAX_REQUEST_BYTES:
+        raise RequestError(
+            f"the request has {len(payload)} bytes; wanted at most {MAX_REQUEST_BYTES}"
+        )
+    try:
+        return from_json(payload or b"{}", _Identified).id
+    except msgspec.DecodeError as error:
+        raise RequestError(f"the request is not a JSON object as it should be: {error}") from None
+
+
+def _failure(name: str, identity: str | int | UnsetType, error: SkinError) -> bytes:
     command = name if _NAME.fullmatch(name) else "?"
-    return msgspec.json.encode(Result(RESULT_SCHEMA, command, ok=False, id=identity, error=why))
+    return msgspec.json.encode(
+        Result(
+            RESULT_SCHEMA,
+            command,
+            ok=False,
+            id=identity,
+            error=str(error),
+            cause=_cause(error),
+        )
+    )
+
+
+def _cause(error: SkinError) -> Cause:
+    if isinstance(error, RequestError):
+        return "request"
+    return "state" if isinstance(error, StateError) else "failure"

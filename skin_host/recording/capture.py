@@ -31,7 +31,7 @@ from skin_host.bus.port import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Port
 from skin_host.bus.wire import FrameBatch
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Settings
-from skin_host.errors import RequestError, SkinError
+from skin_host.errors import RequestError, SkinError, StateError
 from skin_host.files import Draft, refuse_removed, writing
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import Retry, connect, explain, first_error
@@ -347,7 +347,7 @@ def candump_lines(channel: str, batch: FrameBatch) -> bytes:
 
 def _check_room(folder: Path, names: str) -> None:
     if sum(1 for _ in folder.glob(names)) >= MAX_RECORDINGS:
-        raise RequestError(f"{folder}: holds {MAX_RECORDINGS} recordings already; move some away")
+        raise StateError(f"{folder}: holds {MAX_RECORDINGS} recordings already; move some away")
 
 
 class FrameRecorder:
@@ -360,8 +360,9 @@ class FrameRecorder:
         ended: why it has ended, None while it continues.
 
     Raises:
-        RequestError: the name is not that of a candump log, or the folder is full.
-        SkinError: the file exists, or cannot be made.
+        RequestError: the name is not that of a candump log, or the file exists.
+        StateError: the folder is full.
+        SkinError: the file cannot be made.
     """
 
     def __init__(self, path: Path, seconds: float, max_bytes: int, clock: Clock = SYSTEM) -> None:
@@ -380,7 +381,11 @@ class FrameRecorder:
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             _check_room(path.parent, "*")
-            self._log = _Lines(path.open("xb", buffering=0))
+            try:
+                file = path.open("xb", buffering=0)
+            except FileExistsError:
+                raise RequestError(f"{path}: is there already; wanted another name") from None
+            self._log = _Lines(file)
         self._append = self._log.append
         self._thread = clock.thread(self._write, "recorder")
 
@@ -502,7 +507,8 @@ class PageRecording:
         """Begin a recording.
 
         Raises:
-            RequestError: one is in progress, or the folder is full.
+            RequestError: one is in progress.
+            StateError: the folder is full.
             SkinError: mcap is not installed, or the file cannot be made.
         """
         if self._recorder is not None:

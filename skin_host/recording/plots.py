@@ -1,5 +1,6 @@
 """Pictures of recordings and calibrations: `skin plot` (PNG, SVG or PDF by the suffix)."""
 
+import os
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -202,9 +203,15 @@ def _draw_curves(axes: Any, curves: Curves, mine: slice, feels: NDArray[np.bool_
 
 
 def _part(series: Series, part: str) -> PartSeries:
-    if part not in series.parts:
-        raise RequestError(f'no part "{part}"; there are: {", ".join(series.parts)}')
-    return series.parts[part]
+    there = ", ".join(series.parts)
+    if part in series.parts:
+        return series.parts[part]
+    if part in series.fingertips:
+        raise RequestError(
+            f"{part}: a fingertip on a force/torque board has no taxels to draw; wanted a part of "
+            f"skin: {there}; its touches and slips: `skin export`"
+        )
+    raise RequestError(f'no part "{part}"; there are: {there}')
 
 
 def _contacts(series: Series, part: PartSeries) -> list[tuple[float, float]]:
@@ -241,6 +248,7 @@ def _pyplot() -> Any:
     Raises:
         SkinError: it is not installed.
     """
+    os.environ["MPLBACKEND"] = "agg"  # one that it does not know ends its import
     mpl = required("matplotlib", "pictures", "plots")
     mpl.use("Agg")
     mpl.rcParams["text.parse_math"] = False  # a recording's names may look like formulas

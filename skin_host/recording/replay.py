@@ -8,7 +8,7 @@ files; a cluster's workers must find them under the same absolute paths.
 
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -140,9 +140,14 @@ def doubts(calibration: Calibration, layout: Layout) -> list[str]:
     """Return what is in doubt of the zeros with which a recording is processed, a sentence each."""
     found = []
     if touched := by_part(calibration.verdict == Verdict.TOUCHED, layout):
+        state = (
+            "was touched while its zero was taken, and reads"
+            if _is_one(touched)
+            else "were touched while their zero was taken, and read"
+        )
         found.append(
-            f"{named_by_part(touched)} were touched while their zero was taken, and read too "
-            "little; wanted some seconds of untouched skin, or a calibration file that has them"
+            f"{named_by_part(touched)} {state} too little; wanted some seconds of untouched skin, "
+            "or a calibration file that has them"
         )
     refused = ~calibration.usable
     if without := by_part(refused, layout):
@@ -152,11 +157,17 @@ def doubts(calibration: Calibration, layout: Layout) -> list[str]:
             else "no usable curve"
             for number in np.unique(calibration.verdict[refused])
         }
+        have, are = ("has", "is") if _is_one(without) else ("have", "are")
         found.append(
-            f"{named_by_part(without)} have no zero ({', '.join(sorted(reasons))}) and are not "
+            f"{named_by_part(without)} {have} no zero ({', '.join(sorted(reasons))}) and {are} not "
             "valid"
         )
     return found
+
+
+def _is_one(taxels: Mapping[str, Sequence[int]]) -> bool:
+    """Whether a single taxel is named, by part."""
+    return sum(map(len, taxels.values())) == 1
 
 
 def contacts_of(engine: Engine) -> dict[int, PartContact]:

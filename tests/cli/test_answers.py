@@ -124,7 +124,7 @@ async def test_a_calibration_names_pads_and_fingertips_that_were_touched(
         "calibration abc is in use",
     ]
     unchanged, damaged, touched = shown.err.splitlines()
-    assert unchanged == "warning: taxel 7 of palm: received too rarely; they go on as before"
+    assert unchanged == "warning: taxel 7 of palm: received too rarely; it goes on as before"
     assert damaged == "warning: taxel 8 of palm: calibrated without the bytes that were damaged"
     assert "while it was calibrated: taxel 3 of palm; index; take away" in touched
 

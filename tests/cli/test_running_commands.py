@@ -122,6 +122,26 @@ async def test_a_name_or_number_that_cannot_be_is_a_wrong_request(
     assert live.daemon.publisher.counters.commands_taken == taken
 
 
+@pytest.mark.parametrize(
+    ("words", "status", "line"),
+    [
+        (["calibrate", "--seconds", "1e6"], 2, "the request: seconds: "),
+        (["record", "--file", "../x"], 2, 'file: "../x": wanted a plain name'),
+        (["record", "--file", "x.blf"], 2, 'x.blf: wanted a name that ends in ".log"'),
+        (["thresholds", "--set", "margin_units=255"], 2, "margin_units = 255, "),
+        (["stop_recording"], 1, "nothing is being recorded"),
+    ],
+)
+async def test_what_the_daemon_finds_wrong_ends_as_what_the_command_line_finds_wrong(
+    url: str, capsys: pytest.CaptureFixture[str], words: list[str], status: int, line: str
+) -> None:
+    assert await skin("command", *words, "--broker", url) == status
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err.startswith(f"skin command: {line}")
+    assert shown.err.count("\n") == 1
+
+
 async def test_what_a_daemon_answers_is_printed_for_people(
     url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

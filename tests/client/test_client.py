@@ -20,7 +20,7 @@ from paho.mqtt.properties import Properties
 
 from skin_host.client import CommandError, Contact, SkinCallbacks, SkinClient
 from skin_host.config.settings import Mqtt, load
-from skin_host.errors import BrokerError, RequestError
+from skin_host.errors import BrokerError, RequestError, SkinError, StateError
 from skin_host.layout import build_layout
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
@@ -48,7 +48,11 @@ def touch(number: int, part: str = "palm", event: Any = "move") -> Touch:
 
 async def answer(name: str, payload: bytes) -> Mapping[str, Any]:
     if name == "refuse":
-        raise RequestError("not now")
+        raise RequestError("no such thing")
+    if name == "later":
+        raise StateError("not now")
+    if name == "fail":
+        raise SkinError("no board sent a sweep")
     if name == "sleep":
         await asyncio.sleep(60)
     arguments = json.decode(payload)
@@ -252,12 +256,36 @@ async def test_a_command_returns_its_result(mosquitto: Mosquitto, protocol: Any)
 
 async def test_a_command_that_fails_says_why(mosquitto: Mosquitto) -> None:
     async with publishing(mosquitto), hearing(mosquitto) as skin:
-        with pytest.raises(CommandError, match="not now"):
-            await skin.command("refuse")
+        with pytest.raises(CommandError, match="no board sent a sweep"):
+            await skin.command("fail")
         with pytest.raises(CommandError, match='no answer to "sleep" from node "main"'):
             await skin.command("sleep", node="main", timeout_s=0.2)
         with pytest.raises(CommandError, match='node "other"'):
             await skin.command("calibrate", node="other", timeout_s=0.2)
+
+
+@pytest.mark.parametrize(
+    ("name", "cause", "status"),
+    [("refuse", "request", 2), ("later", "state", 1), ("fail", "failure", 1)],
+)
+async def test_a_refused_command_shows_whose_the_mistake_is(
+    mosquitto: Mosquitto, name: str, cause: str, status: int
+) -> None:
+    """A wrong request can be caught as any other wrong request of the client."""
+    async with publishing(mosquitto), hearing(mosquitto) as skin:
+        with pytest.raises(CommandError) as refused:
+            await skin.command(name, node="main", timeout_s=PATIENCE_S)
+    assert refused.value.cause == cause
+    assert refused.value.exit_status == status
+    assert isinstance(refused.value, RequestError) == (cause == "request")
+
+
+async def test_a_command_without_an_answer_has_no_cause_of_the_node(mosquitto: Mosquitto) -> None:
+    async with publishing(mosquitto), hearing(mosquitto) as skin:
+        with pytest.raises(CommandError) as refused:
+            await skin.command("sleep", node="main", timeout_s=0.2)
+    assert refused.value.cause is None
+    assert refused.value.exit_status == 1
 
 
 async def test_a_request_has_the_clients_own_number(mosquitto: Mosquitto) -> None:

@@ -15,6 +15,7 @@ from skin_host.client import (
     SkinCallbacks,
     SkinClient,
     SkinError,
+    WrongCommandError,
 )
 from tests.client.test_client import hearing, publishing, take, touch
 from tests.support.broker import Mosquitto
@@ -129,7 +130,7 @@ def test_callbacks_are_used_while_they_are_entered(mosquitto: Mosquitto) -> None
 
 
 def test_all_that_the_client_raises_can_be_caught_by_what_it_exports() -> None:
-    for error in (BrokerError, RequestError, CommandError):
+    for error in (BrokerError, RequestError, CommandError, WrongCommandError):
         assert issubclass(error, SkinError)
         assert error.__name__ in skin_host.client.__all__
     with pytest.raises(SkinError):

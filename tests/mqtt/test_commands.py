@@ -4,9 +4,135 @@ import asyncio
 from collections.abc import Mapping
 from typing import Any
 
+import msgspec
+import pytest
+from msgspec import UNSET
+
 from skin_host.clock import SteppedClock
-from skin_host.mqtt.commands import MAX_RUNNING, CommandHandler, Result, decode_result
+from skin_host.errors import (
+    BusError,
+    BusyFileError,
+    ConfigurationError,
+    RequestError,
+    SkinError,
+    StateError,
+)
+from skin_host.mqtt.commands import (
+    MAX_REQUEST_BYTES,
+    MAX_RUNNING,
+    RESULT_SCHEMA,
+    CommandHandler,
+    Result,
+    decode_result,
+)
+from skin_host.mqtt.payload import MessageError
 from tests.support.stepped import stepped
+
+
+async def refused(
+    error: BaseException | None, name: str = "scan", payload: bytes = b"{}"
+) -> Result:
+    """The answer to a request that fails so."""
+    received: list[Result] = []
+
+    async def handle(name: str, payload: bytes) -> Mapping[str, Any]:
+        assert error is not None, "the handler is not to be asked"
+        raise error
+
+    handler = CommandHandler(handle)
+    handler.take(name, payload, lambda answer: received.append(decode_result(answer)))
+    await asyncio.wait([asyncio.create_task(asyncio.sleep(0)), *handler._running])
+    (answer,) = received
+    assert not answer.ok
+    return answer
+
+
+@pytest.mark.parametrize(
+    ("error", "cause"),
+    [
+        (RequestError("seconds: seen 1e6"), "request"),
+        (ConfigurationError("demo.toml: wrong"), "request"),
+        (StateError("something else is being done"), "state"),
+        (BusyFileError("calibration.json: another program is writing it"), "state"),
+        (BusError("can0 is down"), "failure"),
+        (SkinError("no board sent a sweep"), "failure"),
+        (ZeroDivisionError("secret detail"), "failure"),
+    ],
+)
+async def test_an_answer_distinguishes_a_wrong_request_a_wrong_moment_and_a_failure(
+    error: Exception, cause: str
+) -> None:
+    assert (await refused(error)).cause == cause
+
+
+@pytest.mark.parametrize(
+    ("name", "payload"),
+    [
+        ("Scan it", b"{}"),
+        ("scan", b"{"),
+        ("scan", b"[]"),
+        ("scan", b'{"id":1.5}'),
+        ("scan", b" " * (MAX_REQUEST_BYTES + 1)),
+    ],
+)
+async def test_what_is_no_request_is_a_wrong_one(name: str, payload: bytes) -> None:
+    assert (await refused(None, name, payload)).cause == "request"
+
+
+@stepped
+async def test_what_an_ending_handler_refuses_or_ends_was_no_wrong_request(
+    clock: SteppedClock,
+) -> None:
+    received: list[Result] = []
+
+    async def handle(name: str, payload: bytes) -> Mapping[str, Any]:
+        await asyncio.Event().wait()
+        raise AssertionError
+
+    def ask() -> None:
+        handler.take("scan", b"{}", lambda answer: received.append(decode_result(answer)))
+
+    handler = CommandHandler(handle)
+    ask()
+    await clock.sleep(1.0)
+    await handler.end()
+    ask()
+    # What ran may have been done in part; what came later was not begun.
+    assert [answer.cause for answer in received] == ["failure", "state"]
+
+
+@stepped
+async def test_who_asks_at_a_wrong_moment_recognises_the_answer(clock: SteppedClock) -> None:
+    """Without its `id` the client waited for an answer until it gave up."""
+    received: list[Result] = []
+
+    async def handle(name: str, payload: bytes) -> Mapping[str, Any]:
+        await asyncio.Event().wait()
+        raise AssertionError
+
+    def ask(identity: str) -> None:
+        payload = msgspec.json.encode({"id": identity})
+        handler.take("scan", payload, lambda answer: received.append(decode_result(answer)))
+
+    handler = CommandHandler(handle)
+    for number in range(MAX_RUNNING):
+        ask(f"running {number}")
+    ask("one too many")
+    assert [(answer.id, answer.cause) for answer in received] == [("one too many", "state")]
+    await clock.sleep(1.0)
+    await handler.end()
+    ask("late")
+    assert (received[-1].id, received[-1].cause) == ("late", "state")
+
+
+def test_an_answer_without_a_cause_or_with_a_later_one_is_read() -> None:
+    """Of a daemon of another version."""
+    answer = {"schema": RESULT_SCHEMA, "command": "scan", "ok": False, "error": "no"}
+    assert decode_result(msgspec.json.encode(answer)).cause is UNSET
+    assert decode_result(msgspec.json.encode({**answer, "cause": "later"})).cause == "later"
+    for wrong in (1, None, [], "x" * 33):
+        with pytest.raises(MessageError, match="cause"):
+            decode_result(msgspec.json.encode({**answer, "cause": wrong}))
 
 
 @stepped
@@ -41,6 +167,7 @@ async def test_commands_that_a_disk_holds_up_leave_room_for_every_other_command(
         ("enable", False),
         ("status", True),
     ]
+    assert received[1].cause == "state"
     assert received[1].error == (
         f"{MAX_RUNNING} commands are running already, and one of this name; try again later"
     )

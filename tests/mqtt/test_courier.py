@@ -599,8 +599,8 @@ async def test_an_answer_larger_than_the_broker_takes_is_shortened_and_says_so(
 
 @stepped
 async def test_the_reason_of_a_refusal_is_shortened_too(clock: SteppedClock) -> None:
-    (answer,) = await answered(clock, ok=False, error="x" * 2000)
-    assert not answer["ok"]
+    (answer,) = await answered(clock, ok=False, error="x" * 2000, cause="request")
+    assert (answer["ok"], answer["cause"]) == (False, "request")
     assert answer["error"] == "the reason is longer than the broker takes"
 
 

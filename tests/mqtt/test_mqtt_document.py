@@ -2,13 +2,14 @@
 
 import re
 from pathlib import Path
+from typing import get_args
 
 import msgspec
 import numpy as np
 
 from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt import frames, messages
-from skin_host.mqtt.commands import decode_result
+from skin_host.mqtt.commands import Cause, decode_result
 from skin_host.mqtt.info import FingertipInfo, NodeInfo, PartInfo, TriangleInfo
 from skin_host.mqtt.outbox import PublisherCounters
 from skin_host.processing.events import Load, Touch
@@ -46,6 +47,12 @@ def test_slips_and_excess_of_the_document_have_exactly_their_keys() -> None:
 
 def test_the_result_of_the_document_is_a_result() -> None:
     assert decode_result(EXAMPLES["skin.result/1"]).ok
+
+
+def test_the_document_names_every_cause_of_a_refusal() -> None:
+    (commands,) = re.findall(r"\n## Commands\n(.*?)\n## ", DOCUMENT, re.DOTALL)
+    named = re.findall(r"^\| `(\w+)` \|", commands, re.MULTILINE)
+    assert named == ["cause", *get_args(Cause)]
 
 
 def test_the_document_names_every_key() -> None:

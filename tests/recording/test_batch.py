@@ -1,6 +1,7 @@
 """Many recordings are processed side by side, each to the same bytes as alone."""
 
 import logging
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -66,6 +67,37 @@ def test_recordings_side_by_side_come_to_the_same_bytes_as_alone(
     command = ["replay", *map(str, logs), "--config", str(config)]
     assert main([*command, "--output", str(tmp_path / "out")]) == 0
     assert written(tmp_path / "out") == alone
+
+
+def test_folders_above_the_output_are_made_as_those_of_a_file(
+    logs: list[Path], config: Path, alone: dict[str, bytes], tmp_path: Path
+) -> None:
+    command = ["replay", *map(str, logs), "--config", str(config)]
+    assert main([*command, "--output", str(tmp_path / "new" / "out")]) == 0
+    assert written(tmp_path / "new" / "out") == alone
+    command = ["replay", str(logs[0]), "--config", str(config)]
+    assert main([*command, "--output", str(tmp_path / "newer" / "out" / "a.jsonl")]) == 0
+    assert (tmp_path / "newer" / "out" / "a.jsonl").read_bytes() == alone["a.jsonl"]
+
+
+def test_no_name_of_a_recording_steers_the_terminal(
+    logs: list[Path],
+    config: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    evil = "\x1b]0;title\x07\x1b[2J\r"
+    named = [log.rename(log.with_name(f"{evil}{log.name}")) for log in logs[:2]]
+    with named[1].open("a") as damaged:
+        damaged.write("(17")
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    command = ["replay", *map(str, named), "--config", str(config)]
+    assert main([*command, "--output", str(tmp_path / "out")]) == 2
+    shown = capsys.readouterr().err
+    assert "title" in shown
+    assert "\x1b]" not in shown
+    assert "\x1b[2J" not in shown
 
 
 def test_a_damaged_recording_is_told_and_stops_no_other(

@@ -4,16 +4,19 @@ reported of the recording.
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from skin_host.cli import main
 from skin_host.layout import load_skin
+from skin_host.processing.calibration import Verdict
 from skin_host.processing.calibration.file import save_calibration
 from skin_host.recording.export import read_frames
-from skin_host.recording.replay import calibrate_from_log
+from skin_host.recording.replay import calibrate_from_log, doubts
 from tests.support.candump import write_config, write_log
 
 #: One taxel of a triangle and two of another.
@@ -71,6 +74,27 @@ def test_pads_without_enough_readings_are_named_and_not_valid(
     frames = [json.loads(line) for line in output.read_text().splitlines()][:-1]
     assert frames
     assert not any(any(frame["valid"]) for frame in frames)
+
+
+def test_what_is_stated_of_one_pad_is_stated_of_one(config: Path, tmp_path: Path) -> None:
+    settings, layout = load_skin(config)
+    log = write_log(tmp_path / "a.log", 140, lambda period: PADS[:1] if 30 < period < 60 else ())
+    touched = calibrate_from_log(log, settings, layout, 5.0)
+    (line,) = doubts(touched, layout)
+    assert line.startswith(
+        "taxel 5 of arm was touched while its zero was taken, and reads too little; wanted"
+    )
+    for verdicts, line in (
+        (
+            {5: Verdict.STUCK, 7: Verdict.TOO_FEW},
+            "taxels 5, 7 of arm have no zero (stuck, too few) and are not valid",
+        ),
+        ({5: Verdict.STUCK}, "taxel 5 of arm has no zero (stuck) and is not valid"),
+    ):
+        verdict = np.zeros_like(touched.verdict)
+        for taxel, found in verdicts.items():
+            verdict[taxel] = found
+        assert doubts(replace(touched, verdict=verdict), layout) == [line]
 
 
 def test_untouched_skin_gives_no_warning(

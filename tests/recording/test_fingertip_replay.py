@@ -58,3 +58,17 @@ def test_a_replay_tells_what_the_fingertips_felt_and_tells_it_again(
     assert set(health) == {"thumb_skin", "index", "thumb"}
     assert health["index"]["state"] == "ok"
     assert "age_ms" not in health["index"]
+
+
+def test_a_fingertip_has_no_taxels_to_draw_and_its_picture_is_refused_with_what_there_is(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output, config = tmp_path / "a.png", str(CONFIG / "fingertips.toml")
+    command = ["plot", "pressure", str(recording), str(output), "--config", config]
+    assert main([*command, "--part", "index"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == (
+        "skin plot: index: a fingertip on a force/torque board has no taxels to draw; wanted a "
+        "part of skin: thumb_skin; its touches and slips: `skin export`"
+    )
+    assert not output.exists()

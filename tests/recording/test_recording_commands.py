@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -38,6 +39,20 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("grasp") / "grasp.log"
     path.write_text("".join(GRASP.read_text().splitlines(keepends=True)[:2600]))
     return path
+
+
+def test_a_picture_needs_no_window_that_the_environment_names(tmp_path: Path) -> None:
+    """A name that matplotlib does not know was a traceback."""
+    log, config = write_log(tmp_path / "a.log", 140, lambda period: ()), tmp_path / "skin.toml"
+    words = ["plot", "pressure", str(log), str(tmp_path / "a.png")]
+    done = subprocess.run(
+        [sys.executable, "-m", "skin_host", *words, "--config", str(write_config(config))],
+        env={**os.environ, "MPLBACKEND": "of_another_program"},
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 @needs_grasp

@@ -1,4 +1,5 @@
 // Wiring: the WebSocket, the tools, the keys, and when to draw.
+import { calibrated } from "./calibrated.js";
 import { DASHES, paper, ramp, shareOf, theme } from "./colours.js";
 import { SkinMap } from "./map.js";
 import { put, showContacts, showHealth, showParts } from "./panels.js";
@@ -18,8 +19,7 @@ const map = new SkinMap($("map"), store);
 let socket = null;
 let link = "connecting";
 let dirty = true;
-let busy = false;
-/** The part whose calibration is going on, null for the whole skin. */
+/** The calibration that is going on: of which part (null: the whole skin), how many nodes were asked, and their answers. */
 let calibrating = null;
 let endedSaid = "";
 let notice = null;
@@ -44,6 +44,8 @@ function connect() {
   socket.onclose = () => {
     link = "lost";
     dirty = true;
+    if (calibrating) say("The page lost its server: health shows whether the skin was calibrated.", 15000, "warn");
+    calibrating = null;
     setTimeout(connect, 1000);
   };
 }
@@ -73,13 +75,16 @@ function take(data) {
   else if (message.type === "answer") answered(message);
 }
 
+/** Send a wish; whether there is a connection for it. */
 function send(wish) {
-  if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify(wish));
+  if (socket?.readyState !== WebSocket.OPEN) return false;
+  socket.send(JSON.stringify(wish));
+  return true;
 }
 
 function answered(message) {
   if (message.do === "raw" && message.ok) return;
-  if (!message.do || message.do === "calibrate") busy = false;
+  if (message.do === "calibrate") return takeCalibration(message);
   if (!message.ok) {
     say(message.error, 8000);
     if (map.raw && message.do === "raw") setRaw(false);
@@ -89,18 +94,21 @@ function answered(message) {
   if (message.do === "mark") return say(`Mark ${message.result.marks}`, 2000, "ok");
   if (message.do === "stop") {
     const { file, messages, marks, gaps } = message.result;
-    const lost = gaps ? `, the broker was lost ${gaps} times` : "";
+    const lost = gaps ? `, the broker was lost ${gaps === 1 ? "once" : `${gaps} times`}` : "";
     return say(`Recorded ${messages} messages, ${marks} of them marks${lost}: ${file}`, 10000, gaps ? "warn" : "ok");
   }
-  // The verdicts are of all parts; those of another calibration are not news.
-  const verdicts = Object.entries(message.result.verdicts ?? {}).filter(([part]) => !calibrating || part === calibrating);
-  const counts = verdicts.map(([part, found]) => `${part}: ${Object.entries(found).map(([verdict, n]) => `${n} ${verdict.replaceAll("_", " ")}`).join(", ")}`);
-  const touched = verdicts.filter(([, found]) => found.touched);
-  if (touched.length) {
-    const which = touched.map(([part, found]) => `${found.touched} taxels of ${part}`).join(", ");
-    return say(`Touched while it was calibrated: ${which}. Take away what touches the skin and calibrate again.`, 15000, "warn");
-  }
-  say(`Calibrated. ${counts.length > 3 ? `${counts.length} parts` : counts.join("; ")}`, 6000, "ok");
+}
+
+/** Show what the nodes found when all have answered, an error at once. */
+function takeCalibration(answer) {
+  if (!calibrating) return;
+  const { part, asked, answers } = calibrating;
+  answers.push(answer);
+  const isWhole = answers.length >= asked;
+  if (isWhole) calibrating = null;
+  if (!isWhole && answer.ok) return;
+  const { text, level, ms } = calibrated(answers, part);
+  say(text, ms, level);
 }
 
 function say(text, ms, level = "alarm") {
@@ -149,16 +157,16 @@ async function asked(dialog) {
 
 /** What a calibration from here is of: the part that is shown, or the whole skin. */
 async function calibrate() {
-  if (busy || !mayCommand()) return;
+  if (calibrating || !mayCommand()) return;
   const part = store.part(map.shown) && !store.part(map.shown).fingertip ? map.shown : null;
   put($("confirm-title"), `Calibrate ${part ?? "the whole skin"}?`);
   put($("confirm-words"), `Leave ${part ?? "the whole skin"} untouched until it is done. The new calibration replaces the old one.`);
   const nodes = nodesShown();
   if (!await asked($("confirm"))) return;
-  busy = true;
-  calibrating = part;
+  const sent = nodes.filter((node) => send(part ? { do: "calibrate", node, part } : { do: "calibrate", node })).length;
+  if (!sent) return say("Nothing was calibrated: the page has no connection to its server.", 8000);
+  calibrating = { part, asked: sent, answers: [] };
   say(`Calibrating: leave ${part ?? "the skin"} untouched.`, 120000, "ok");
-  for (const node of nodes) send(part ? { do: "calibrate", node, part } : { do: "calibrate", node });
 }
 
 function record() {
@@ -467,7 +475,7 @@ function frame(nowMs) {
     }
     showRecording();
     $("calibrate").hidden = !store.status.commands;
-    $("calibrate").disabled = busy || !mayCommand();
+    $("calibrate").disabled = calibrating !== null || !mayCommand();
     $("show-raw").disabled = !map.raw && !mayCommand();
     document.body.dataset.draws = String(Number(document.body.dataset.draws ?? 0) + 1);
   }

@@ -276,7 +276,7 @@ async def test_the_skin_can_be_calibrated_from_the_page(robot: Stack, tmp_path: 
         title = await seen.run('document.getElementById("confirm-title").textContent')
         assert title == "Calibrate left_hand?"
         await seen.run('document.querySelector("#confirm button.do").click()')
-        done = "/^Calibrated. left_hand: [^;]*$|^Touched .* [0-9]+ taxels of left_hand[.]/"
+        done = "/^Calibrated. left_hand: [^;]*$|^Touched .* [0-9]+ taxels? of left_hand[.]/"
         await seen.until(f'{done}.test(document.getElementById("banner").textContent)')
         # And the whole skin.
         await seen.press("0")
