@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.processing.conversions import CONVERSION_S
 from skin_host.processing.curves import Curve
 from skin_host.processing.masks import Mask
 
@@ -17,7 +18,9 @@ STEP_DEVIATIONS = 6.0
 STEP_UNITS = 8.0
 #: A hand presses at most this often, and half of that time it releases. A pad that rises, falls and
 #: rises in less time, or falls, rises and falls, or rises sooner after it began to fall, is not
-#: pressed so: its contact is broken. A pad may have moved at any time since the sample before.
+#: pressed so: its contact is broken. A pad may have moved at any time since the measurement before:
+#: that is the sample before, or the conversion before where each is sent several times. Where some
+#: are left out, the sample before may show one that is nearly a conversion old.
 FASTEST_HZ = 5.0
 #: Each look that finds such a pad counts 1, and time takes away this much; at the limit the pad is
 #: erratic.
@@ -120,10 +123,12 @@ class Erratic:
         rising = self._rose[moving]
         began_s, earlier_s = self._began_s[:, moving], self._earlier_s[:, moving]
         for fell, rose, (since_s, now_s) in zip(falls, rises, pairwise(times_s), strict=True):
+            leaves_out = now_s - since_s >= CONVERSION_S
+            measured_s = (since_s if leaves_out else now_s) - CONVERSION_S
             for way, begins in ((0, fell & rising), (1, rose & ~rising)):
                 found |= begins & (earlier_s[way] > now_s - shortest_s)
                 np.copyto(earlier_s[1 - way], began_s[1 - way], where=begins)
-                began_s[way, begins] = since_s
+                began_s[way, begins] = measured_s
             found |= rose & ~rising & (began_s[0] > now_s - shortest_s / 2.0)
             rising = (rising | rose) & ~fell
         self._rose[moving] = rising

@@ -430,7 +430,12 @@ class _PartPipeline:
         self._gather(corrected, touched, dt_s, quiet)
         if not quiet:
             repeated = None if idle else self._detector.repeated
-            touched = self._residuals.step(touched, corrected, repeated, self._detector.lost)
+            residuals = self._residuals
+            if beyond is not self._nowhere:
+                residuals.press_beyond(beyond & touched, self._last_raw == 0, dt_s)
+            touched = residuals.step(
+                touched, corrected, repeated, self._detector.lost, self._relaxation_kpa
+            )
         if valid is not self._always_valid:
             pressure = np.where(valid, pressure, self._zeros)
             touched = touched if touched is self._nowhere else touched & valid

@@ -55,6 +55,17 @@ NEGLIGIBLE_KPA = 1e-20
 #: foam, 10 s of 70 kPa leave up to 5 % for 15 s.
 LARGEST_SHARE = 0.06
 LEFT_S = 30.0
+#: Beyond the calibrated range a pressure is an estimate, and so is the relaxation derived from it:
+#: it may lack this share of itself, and more where the byte was cut off, because no byte shows how
+#: hard the press was. On the emulated foam that ends the touch of 220 kPa held for ten minutes, and
+#: of 250 kPa, a tenth beyond the end of the scale, held for one. More may remain of a harder or a
+#: longer press; it is a touch then, because a contact that was eased reads the same.
+BEYOND_SHARE = 0.25
+CUT_OFF_SHARE = 0.5
+#: Foam recovers half as fast as it relaxes. What is left of a press that was beyond the calibrated
+#: range for a time falls to 1/e in this multiple of it more, and in at most so many seconds.
+RECOVERS_IN = 2.0
+LONGEST_LEFT_S = 1200.0
 #: A residual of less than this share of the threshold causes no touch.
 LEAST_RESIDUAL = 0.05
 #: Weight of a new sample in the mean that is compared with the residual.
@@ -314,7 +325,8 @@ class Residuals:
     enough to keep a touch. The baselines still follow the decision before: what is left may be
     drift, and then it lasts. While that decision holds on to a residual it is no new evidence, nor
     is it when it has lost it and finds it again: a taxel is touched again when its mean rises
-    further than noise carries it.
+    further than noise carries it. Beyond the calibrated range the model of the foam may lack some
+    of the relaxation, so a harder press ends at a higher residual, which remains for longer.
 
     Attributes:
         any: whether any is reported.
@@ -330,6 +342,11 @@ class Residuals:
         #: What the last firm press of each taxel left when it fell or ended, fading.
         self._left = np.zeros(n, np.float32)
         self._felt = np.zeros(n, np.float32)
+        #: The time in which that falls to 1/e, and by which share of itself the relaxation may be
+        #: too small, both because of presses beyond the calibrated range; and that in kPa.
+        self._left_s = np.full(n, LEFT_S, np.float32)
+        self._lacking_share = np.zeros(n, np.float32)
+        self._lacking = np.zeros(n, np.float32)
         #: For how many measurements it has fallen, and their sum.
         self._fallen = np.zeros(n, np.int64)
         self._fallen_sum = np.zeros(n, np.float32)
@@ -368,6 +385,7 @@ class Residuals:
         signal: Array,
         repeated: Mask | None = None,
         lost: Mask | None = None,
+        relaxation: Array | None = None,
     ) -> Mask:
         """Take one decision [n] and the signal [n] that it was based on, in kPa.
 
@@ -378,13 +396,30 @@ class Residuals:
             signal: float[n].
             repeated: bool[n], which of them only repeat a measurement.
             lost: see `TouchDetector`.
+            relaxation: float[n], what was subtracted for the signal, in kPa; by default nothing.
         """
+        if relaxation is not None:
+            np.multiply(self._lacking_share, relaxation, out=self._lacking, casting="same_kind")
+            np.fmax(self._lacking, 0.0, out=self._lacking)
         if self._undecided or touched is not self._seen or lost is not self._lost:
             self._lost = lost
             self._begin_and_end(touched, signal, lost)
         if self.any:
             self._end_fallen(signal, repeated)
         return self._reported
+
+    def press_beyond(self, taxels: Mask, cut_off: Mask, dt_s: float) -> None:
+        """Some taxels, bool[n], are pressed beyond their calibrated range.
+
+        Args:
+            taxels: which ones.
+            cut_off: bool[n], taxels at the end of the scale.
+            dt_s: for how long.
+        """
+        share = np.where(cut_off, np.float32(CUT_OFF_SHARE), np.float32(BEYOND_SHARE))
+        np.fmax(self._lacking_share, share, out=self._lacking_share, where=taxels)
+        np.add(self._left_s, np.float32(RECOVERS_IN * dt_s), out=self._left_s, where=taxels)
+        np.minimum(self._left_s, np.float32(LONGEST_LEFT_S), out=self._left_s)
 
     def _begin_and_end(self, touched: Mask, signal: Array, lost: Mask | None) -> None:
         # A sample is noisy: a taxel's signal is its fading mean since it was touched.
@@ -406,7 +441,7 @@ class Residuals:
         """
         if len(ended):
             felt, on = self._felt[ended], self._on[ended]
-            most = LARGEST_SHARE * self._hardest[ended]
+            most = LARGEST_SHARE * self._hardest[ended] + self._lacking[ended]
             fallen = felt < on + most
             left = np.clip(felt + self._rise[ended], self._left[ended], most)
             self._left[ended] = np.where(fallen, left, self._left[ended])
@@ -422,7 +457,9 @@ class Residuals:
         pressed = np.fmax(self._pressed[which], now)
         self._pressed[which] = pressed
         self._hardest[which] = np.fmax(self._hardest[which], now)
-        bar = self._on[which] + RESIDUAL_SHARE * pressed
+        # What earlier presses have left is left after this one, too.
+        left = np.fmax(RESIDUAL_SHARE * pressed + self._lacking[which], self._left[which])
+        bar = self._on[which] + left
         fallen = (now < bar) & (felt >= bar + self._firmer[which])
         if not self._any_fallen and not any_of(fallen):
             mean = felt + MEAN_SHARE * (now - felt)
@@ -451,7 +488,8 @@ class Residuals:
             left = self._fallen_sum[ended] / self._fallen[ended]
             self._felt[ended] = left
             self._held[ended] = True
-            self._left[ended] = np.clip(left, 0.0, LARGEST_SHARE * self._pressed[ended])
+            most = LARGEST_SHARE * self._pressed[ended] + self._lacking[ended]
+            self._left[ended] = np.clip(left, 0.0, np.fmax(most, self._left[ended]))
             reported = self._reported.copy()
             reported[ended] = False
             self._report(reported)
@@ -469,19 +507,26 @@ class Residuals:
 
     def fade(self, dt_s: float) -> None:
         """Let the residuals of earlier presses fade for this time."""
-        for residual_kpa, fall_s in (
-            (self._pressed, RESIDUAL_S),
-            (self._hardest, LEFT_S),
-            (self._left, LEFT_S),
+        kept = np.exp(np.float32(-dt_s) / self._left_s)
+        self._left_s -= LEFT_S
+        for residual, share in (
+            (self._pressed, math.exp(-dt_s / RESIDUAL_S)),
+            (self._hardest, kept),
+            (self._left, kept),
+            (self._lacking_share, kept),
+            (self._left_s, kept),
         ):
-            np.multiply(residual_kpa, math.exp(-dt_s / fall_s), out=residual_kpa)
-            residual_kpa[np.abs(residual_kpa) < NEGLIGIBLE_KPA] = 0.0
+            np.multiply(residual, share, out=residual)
+            residual[np.abs(residual) < NEGLIGIBLE_KPA] = 0.0
+        self._left_s += LEFT_S
 
     def reset(self, taxels: Mask) -> None:
         """Forget the presses on some taxels [n]."""
         self._pressed[taxels] = 0.0
         self._hardest[taxels] = 0.0
         self._left[taxels] = 0.0
+        self._left_s[taxels] = LEFT_S
+        self._lacking_share[taxels] = 0.0
         self._held[taxels] = False
         self._report(self._reported & ~taxels)
         self._undecided = True

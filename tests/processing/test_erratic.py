@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from skin_host.processing.conversions import CONVERSION_S
 from skin_host.processing.curves import KNOTS_UNITS, TableCurve
 from skin_host.processing.erratic import LIMIT, RELIEF_PER_S, Erratic, step_kpa
 from skin_host.processing.pressure import PressureCurve
@@ -30,11 +31,14 @@ def jumping(looks: int) -> Erratic:
     return found
 
 
-def tapping(presses_per_s: float, contact_s: float, hz: float, seconds: float) -> Erratic:
-    """A pad that is tapped, read so often, and looked at as the pipeline does."""
+def tapping(
+    presses_per_s: float, contact_s: float, hz: float, seconds: float, convert_s: float = 1e-9
+) -> Erratic:
+    """A pad that is tapped, converted and read so often, and looked at as the pipeline does."""
     found = jumping(0)
     t_s = np.arange(round(seconds * hz)) / hz
-    phase_s = t_s % (1.0 / presses_per_s)
+    converted_s = np.floor(t_s / convert_s) * convert_s
+    phase_s = converted_s % (1.0 / presses_per_s)
     kpa = np.where(phase_s < contact_s, 20.0 * np.sin(np.pi * phase_s / contact_s), 0.0)
     for begin in range(0, len(kpa) - 7, 8):
         look(found, *kpa[begin : begin + 8], period_s=1.0 / hz)
@@ -53,6 +57,23 @@ def test_a_pad_that_jumps_again_and_again_is_erratic_and_the_others_are_not():
 def test_tapping_is_no_broken_contact_at_any_rate_of_sweeps(hz: float, presses_per_s: float):
     contact_s = min(0.1, 0.6 / presses_per_s)
     assert not tapping(presses_per_s, contact_s, hz, 60.0).any
+
+
+@pytest.mark.parametrize("hz", [20.0, 25.0, 49.0, 100.0])
+@pytest.mark.parametrize("presses_per_s", [3.0, 4.0, 4.5, 4.7, 4.9])
+@pytest.mark.parametrize("contact_s", [0.06, 0.1])
+def test_tapping_is_no_broken_contact_where_a_chip_converts_more_seldom_than_it_is_read(
+    hz: float, presses_per_s: float, contact_s: float
+):
+    """A press shows up to a conversion after it began: two may seem closer than they are."""
+    assert not tapping(presses_per_s, contact_s, hz, 60.0, CONVERSION_S).any
+
+
+@pytest.mark.parametrize("hz", [30.0, 49.0, 100.0])
+def test_where_no_conversion_is_left_out_presses_that_no_hand_repeats_are_a_broken_contact(
+    hz: float,
+):
+    assert tapping(6.5, 0.05, hz, 60.0, CONVERSION_S).any
 
 
 @pytest.mark.parametrize("hz", [20.0, 49.0, 100.0])

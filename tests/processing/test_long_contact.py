@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from skin_host.evaluation.histories import record
 from skin_host.evaluation.rig import Rig
 from skin_host.layout import PadKind
-from tests.support.long_hold import ALL, FEW, hold
+from tests.support.long_hold import ALL, CURVE, FEW, hold
 
 TEN_MINUTES_S, TWO_HOURS_S, EIGHT_HOURS_S = 600.0, 7200.0, 28800.0
 
@@ -34,6 +35,58 @@ def test_a_hold_of_hours_is_neither_absorbed_nor_left_behind(pressed, drift, sec
     assert held.during.all()
     assert held.after.sum() <= 3.0
     assert not held.after[-60:].any()
+
+
+@pytest.mark.parametrize("truth", ["A", "S", "H"])
+@pytest.mark.parametrize(("kpa", "seconds"), [(180.0, 60.0), (220.0, 10.0), (250.0, 60.0)])
+def test_a_press_beyond_the_calibrated_range_leaves_no_touch(truth, kpa, seconds):
+    """At 250 kPa the byte is cut off at 0."""
+    hz = 10.0
+    held = hold(truth, seconds, hz=hz, pressed=FEW, kpa=kpa)
+    assert held.during.all()
+    assert not held.after[round(hz) :].any()
+
+
+@pytest.mark.parametrize("truth", ["A", "S", "H"])
+def test_presses_to_the_end_of_the_scale_again_and_again_are_as_many_touches(truth):
+    hz, presses = 10.0, 8
+    played = record(truth, [(0.0, 20.0), *[(250.0, 2.0), (0.0, 2.0)] * presses, (0.0, 60.0)], hz)
+    rig = Rig(1, 0.3, seed=21, hz=hz)
+    here = np.arange(rig.n) < FEW
+    frames = [rig.step(np.where(here, units, 0.0)) for units in CURVE.units(played.momentary_kpa)]
+    assert min(frame.raw.min() for frame in frames) == 0
+    touched = np.array([frame.touched[here] for frame in frames])
+    begins = np.count_nonzero(touched[1:] & ~touched[:-1], axis=0)
+    assert begins.tolist() == [presses] * FEW
+    assert not touched[-round(59 * hz) :].any()
+
+
+@pytest.mark.parametrize("truth", ["A", "S", "H"])
+@pytest.mark.parametrize(("kpa", "seconds"), [(220.0, 2.0), (250.0, 60.0), (300.0, 2.0)])
+def test_a_press_beyond_the_calibrated_range_that_is_eased_to_a_firm_one_stays_a_touch(
+    truth, kpa, seconds
+):
+    hz = 10.0
+    played = record(truth, [(0.0, 20.0), (kpa, seconds), (70.0, 60.0)], hz)
+    rig = Rig(1, 0.3, seed=21, hz=hz)
+    here = np.arange(rig.n) < FEW
+    frames = [rig.step(np.where(here, units, 0.0)) for units in CURVE.units(played.momentary_kpa)]
+    assert all(frame.touched[here].all() for frame in frames[round(20.5 * hz) :])
+
+
+@pytest.mark.parametrize("truth", ["A", "S", "H"])
+def test_a_tap_on_what_a_press_to_the_end_of_the_scale_has_left_is_a_touch(truth):
+    hz = 10.0
+    holds = [(0.0, 20.0), (250.0, 60.0), (0.0, 5.0), (60.0, 2.0), (0.0, 20.0)]
+    played = record(truth, holds, hz)
+    rig = Rig(1, 0.3, seed=21, hz=hz)
+    here = np.arange(rig.n) < FEW
+    frames = [rig.step(np.where(here, units, 0.0)) for units in CURVE.units(played.momentary_kpa)]
+    touched = np.array([frame.touched[here].all() for frame in frames])
+    began, ended = round(85.5 * hz), round(87.0 * hz)
+    assert touched[began : ended - 2].all()
+    assert not touched[round(82.0 * hz) : round(85.0 * hz) - 2].any()
+    assert not touched[ended + round(hz) :].any()
 
 
 def ghost_s(kind):

@@ -292,6 +292,57 @@ def test_a_press_that_has_fallen_to_what_it_leaves_has_ended():
     )
 
 
+def after_a_press_beyond(seconds, felt, *, cut_off=False, relaxation=20.0, later=(), wait_s=0.0):
+    """What is reported at the end of a press of 100 kPa, beyond the calibrated range for so long,
+    that falls to what is felt then; and whether what is felt later is.
+    """
+    residuals, touched = residuals_of(), np.array([True])
+    kept = np.array([relaxation])
+    residuals.press_beyond(touched, np.array([cut_off]), seconds)
+    for value in [100.0] * 5 + [felt] * 4:
+        reported = residuals.step(touched, np.array([value]), relaxation=kept)
+    residuals.fade(wait_s)
+    # The decision is another one, so that it is looked at again.
+    for value in later:
+        reported = residuals.step(touched.copy(), np.array([value]), relaxation=kept)
+    return bool(reported[0])
+
+
+@pytest.mark.parametrize(("cut_off", "most"), [(False, 2.0 + 3.0 + 5.0), (True, 2.0 + 3.0 + 10.0)])
+def test_a_press_beyond_the_calibrated_range_may_leave_a_share_of_the_relaxation_more(
+    cut_off, most
+):
+    assert not after_a_press_beyond(1.0, most - 0.1, cut_off=cut_off)
+    assert after_a_press_beyond(1.0, most + 0.1, cut_off=cut_off)
+    # A model that takes nothing off, or adds, lacks nothing.
+    for relaxation in (0.0, -20.0):
+        assert after_a_press_beyond(1.0, 5.1, cut_off=cut_off, relaxation=relaxation)
+        assert not after_a_press_beyond(1.0, 4.9, cut_off=cut_off, relaxation=relaxation)
+
+
+def test_what_a_press_beyond_the_calibrated_range_left_stays_for_as_long_as_its_foam_recovers():
+    """8 kPa are a touch again when they are 2 and what noise adds, 1.9, above what has remained of
+    them, which falls to 1/e in 30 s and twice the time beyond the range. No press is remembered
+    for ever.
+    """
+    for seconds, falls_in_s in ((0.04, 30.08), (60.0, 150.0), (1e6, 1200.0)):
+        for multiple, wanted in ((0.62, False), (0.72, True)):
+            wait_s = multiple * falls_in_s
+            assert after_a_press_beyond(seconds, 8.0, later=[8.0] * 60, wait_s=wait_s) == wanted
+
+
+def test_a_tap_on_what_a_press_has_left_ends_where_it_began():
+    """The tap alone would leave 0.6 kPa; 6 of the harder press are left before and after it."""
+    residuals, on, off = residuals_of(), np.array([True]), np.array([False])
+    for value in [200.0] * 5 + [6.0] * 4:
+        residuals.step(on, np.array([value]))
+    residuals.step(off, np.array([0.0]))
+    residuals.fade(3.0)
+    again, tap = on.copy(), [20.0] * 5 + [6.0] * 4
+    reported = [bool(residuals.step(again, np.array([value]))[0]) for value in tap]
+    assert reported == flags(1, 1, 1, 1, 1, 1, 0, 0, 0)
+
+
 def test_taps_stay_apart_though_the_foam_has_not_come_back_between_them():
     taps = ([60] * 5 + [3] * 8) * 3
     reported = reported_over(taps, residuals_of())
@@ -389,12 +440,18 @@ def test_a_reset_forgets_the_press_of_its_taxel() -> None:
     residuals = Residuals(2)
     residuals.configure(np.full(2, 2.0), np.full(2, 6.0), np.array([2, 2]))
     both, none = np.ones(2, bool), np.zeros(2, bool)
-    residuals.step(both, np.full(2, 100.0))
+    residuals.press_beyond(both, both, 60.0)
+    kept = np.full(2, 20.0)
+    residuals.step(both, np.full(2, 100.0), relaxation=kept)
     assert residuals.any
     residuals.reset(np.array([True, False]))
     assert residuals.step(none, np.zeros(2)).tolist() == [False, False]
     assert not residuals.any
     assert residuals.step(both.copy(), np.full(2, 4.0)).tolist() == [True, False]
+    # Pressed again within the range, the first lacks nothing.
+    for signal in (100.0, 100.0, 9.0, 9.0, 9.0):
+        reported = residuals.step(both, np.full(2, signal), relaxation=kept)
+    assert reported.tolist() == [True, False]
 
 
 def test_what_is_felt_under_a_residual_is_the_mean_since_it_was_touched() -> None:

@@ -31,18 +31,24 @@ class LongHold:
 
 
 @cache
-def history(truth: TruthKind, seconds: float, hz: float) -> PlayedHistory:
-    return record(truth, [(0.0, BEFORE_S), (HOLD_KPA, seconds), (0.0, AFTER_S)], hz)
+def history(truth: TruthKind, seconds: float, hz: float, kpa: float) -> PlayedHistory:
+    return record(truth, [(0.0, BEFORE_S), (kpa, seconds), (0.0, AFTER_S)], hz)
 
 
 def hold(
-    truth: TruthKind, seconds: float, *, hz: float, pressed: int, drift: float = 0.0
+    truth: TruthKind,
+    seconds: float,
+    *,
+    hz: float,
+    pressed: int,
+    drift: float = 0.0,
+    kpa: float = HOLD_KPA,
 ) -> LongHold:
     """Press so many pads for so long, while everything drifts by so many units a second.
 
     Nothing else may be touched.
     """
-    played = history(truth, seconds, hz)
+    played = history(truth, seconds, hz, kpa)
     rig = Rig(1, 0.3, seed=21, hz=hz)
     here = np.arange(rig.n) < pressed
     start, end = round(BEFORE_S * hz), round((BEFORE_S + seconds) * hz)
