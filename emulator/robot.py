@@ -187,7 +187,7 @@ class Robot:
             if self._tips_due_ns <= self.t_ns:
                 for bus, batch in self.fingertips.step(self.t_ns):
                     self.wires[bus].put(batch)
-                self._look_ahead()
+                self._look_ahead_at_tips()
             if self.t_ns >= end_ns:
                 break
         return {name: wire.until(self.t_ns) for name, wire in wires.items()}
@@ -196,6 +196,9 @@ class Robot:
         """Find out when the next board is due; after anything that may have changed it."""
         self._due_ns = [self._due_of(number) for number in range(len(self._boards))]
         self._boards_due_ns = min(self._due_ns, default=NEVER_NS)
+        self._look_ahead_at_tips()
+
+    def _look_ahead_at_tips(self) -> None:
         self._tips_due_ns = self.fingertips.due_ns
 
     def _due_of(self, number: int) -> int:

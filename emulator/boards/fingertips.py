@@ -9,8 +9,12 @@ as a real one and streams force and torque of the load that is laid on it. It ma
 host and board share no encoder.
 """
 
+import struct
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from functools import partial
+from operator import itemgetter
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -39,6 +43,8 @@ Floats = NDArray[np.float64]
 Frame = tuple[int, bytes]
 
 NEVER_NS = 1 << 62
+_NOTHING = np.zeros(6)
+_NOTHING.flags.writeable = False
 #: N and N m of the channels of a board that the configuration leaves open.
 FULL_SCALE = (50.0, 50.0, 50.0, 1.0, 1.0, 1.0)
 #: Unloaded boards read up to this share of their full scale.
@@ -52,6 +58,9 @@ STEP_S = 1e-3
 #: lost.
 MOST_UNSEEN_S = 1.0
 NS_PER_MS = 1_000_000
+#: Loads that boards measured are known for so long at least.
+LATELY_NS = 1_000_000_000
+_WORDS = struct.Struct("<3H")
 _SET_MODE, _SET_PERIOD, _GET_FULL_SCALE = 0x07, 0x08, 0x18
 _STOP = 1
 #: Lowest bit of the types of frames with force, and with torque.
@@ -108,6 +117,12 @@ class StrainBoard:
         self._sent: dict[int, bytes] = {}
         self._mixing = np.eye(6) + 0.1 * rng.normal(size=(6, 6))
 
+    @property
+    def off(self) -> Floats:
+        """Standard deviation of the noise of each channel and one unit, float64[6] (N, N m)."""
+        off: Floats = self._full_scale * (self._noise_share + 1 / 0x8000)
+        return off
+
     def handle(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
         """Take a frame from the bus; give what the board sends back."""
         asked = [
@@ -145,19 +160,15 @@ class StrainBoard:
         share = share + self._noise(t_ns)
         frames = []
         for force_type, torque_type, calibrated in _STREAMS[self._mode]:
-            counts = np.round((share if calibrated else self._mixing @ share) * 0x8000) + 0x8000
-            over = (counts < 0) | (counts > 0xFFFF)
-            words = np.clip(counts, 0, 0xFFFF).astype(int)
-            pair = [
-                (force_type, words[:3], over[:3]),
-                (torque_type, words[3:], over[3:]),
-            ]
-            for delay, (kind, three, flags) in enumerate(
-                reversed(pair) if self._torque_first else pair
-            ):
-                data = b"".join(int(word).to_bytes(2, "little") for word in three)
-                if flags.any():
-                    data += bytes([sum(1 << i for i in np.flatnonzero(flags).tolist())])
+            values = share if calibrated else self._mixing @ share
+            # Plain numbers: numpy takes several times as long for six.
+            counts = (np.round(values * 0x8000) + 0x8000).tolist()
+            pair = [(force_type, counts[:3]), (torque_type, counts[3:])]
+            for delay, (kind, three) in enumerate(reversed(pair) if self._torque_first else pair):
+                data = _WORDS.pack(*(min(max(int(count), 0), 0xFFFF) for count in three))
+                flags = sum(1 << i for i, count in enumerate(three) if not 0 <= count <= 0xFFFF)
+                if flags:
+                    data += bytes([flags])
                 if kind & 1 in self.latched:
                     data = self._sent.get(kind, data)
                 self._sent[kind] = data
@@ -178,6 +189,33 @@ class StrainBoard:
         return self._noise_share * self._rng.normal(size=6)
 
 
+class Pressed(NamedTuple):
+    """What one probe does to a fingertip: in the fingertip's frame, float64[3] each.
+
+    Attributes:
+        normal_n: force (N) into the surface.
+        point_mm, normal: where it presses, and the outward normal there.
+    """
+
+    normal_n: float
+    point_mm: Floats
+    normal: Floats
+
+
+class Loaded(NamedTuple):
+    """The load of a fingertip when its board measured it.
+
+    Attributes:
+        t_ns: time of the sample.
+        wrench: force (N) and torque (N m) on the fingertip about its origin, float64[6].
+        presses: of the probes that press it.
+    """
+
+    t_ns: int
+    wrench: Floats
+    presses: list[Pressed]
+
+
 class Fingertips:
     """The force/torque boards of a robot and what lies on them.
 
@@ -189,6 +227,7 @@ class Fingertips:
     Attributes:
         boards: by name of the fingertip.
         hung: names of those whose boards neither receive nor send.
+        lately: by name, the loads that its board measured in the last `LATELY_NS`, and some before.
 
     Raises:
         ConfigurationError: a probe cannot be on its fingertip; the message names the key.
@@ -203,6 +242,7 @@ class Fingertips:
     ) -> None:
         self.boards: dict[str, StrainBoard] = {}
         self.hung: set[str] = set()
+        self.lately: dict[str, list[Loaded]] = {}
         self._tips = settings.fingertips
         self._skin_force_n = skin_force_n
         self._presses: dict[str, list[_Press]] = {}
@@ -218,9 +258,11 @@ class Fingertips:
                     raise ConfigurationError(f"probe[{i}].{error}") from None
             rng = np.random.default_rng([scene.seed, 6, number])
             scale = np.array(tip.full_scale or FULL_SCALE)
+            lately: list[Loaded] = []
+            self.lately[name] = lately
             self.boards[name] = StrainBoard(
                 tip.address,
-                _Load(tip, presses, OFFSET_SHARE * rng.uniform(-1, 1, 6) * scale),
+                _Load(tip, presses, OFFSET_SHARE * rng.uniform(-1, 1, 6) * scale, lately),
                 rng,
                 full_scale=tuple(scale),
                 noise_share=5e-5 if scene.noise else 0.0,
@@ -279,6 +321,16 @@ class Fingertips:
             if self._tips[name].bus == bus and name not in self.hung
             for answer in board.handle(can_id, data, t_ns)
         ]
+
+    def off(self, name: str) -> tuple[float, float]:
+        """How far off a sample of the load of one is without its offset: force (N), torque (N m).
+
+        One standard deviation of noise and one unit of the words, of the largest channels.
+        """
+        off = self.boards[name].off
+        force_n, torque_nm = float(off[:3].max()), float(off[3:].max())
+        arm_m = 1e-3 * float(np.linalg.norm(self._tips[name].sensor_mm))
+        return force_n, torque_nm + arm_m * force_n
 
     def _force_on_skin(self, number: int) -> float:
         return self._skin_force_n().get(number, 0.0)
@@ -355,6 +407,8 @@ class _Press:
         self._pull = np.cos(turn) * self._along[0] + np.sin(turn) * self._along[1]
         self._object: HeldObjects | None = None
         self._last_ns = 0
+        #: What it does since the last `wrench`; None if it does not press.
+        self.pressed: Pressed | None = None
 
     @property
     def slipped_mm(self) -> float:
@@ -369,8 +423,8 @@ class _Press:
             phase_s %= probe.repeat_s
         normal_n = _value(probe.drive, phase_s) if self._force_n is None else self._force_n()
         if normal_n == 0.0:
-            self._object = None
-            return np.zeros(6)
+            self._object = self.pressed = None
+            return _NOTHING
         force = -normal_n * self._normal
         pull_n: float | None = None
         if self._pull_n is not None:
@@ -384,6 +438,7 @@ class _Press:
             times, x_mm, y_mm = np.array(probe.slide_mm).T
             offset = np.array([np.interp(phase_s, times, x_mm), np.interp(phase_s, times, y_mm)])
         point_mm = self._point_mm + offset @ self._along
+        self.pressed = Pressed(normal_n, point_mm, self._normal)
         x, y, z = (1e-3 * point_mm).tolist()
         fx, fy, fz = force.tolist()
         return np.array([fx, fy, fz, y * fz - z * fy, z * fx - x * fz, x * fy - y * fx])
@@ -406,9 +461,16 @@ class _Press:
 class _Load:
     """What a board measures: force (N) and torque (N m) of its channels, with its offset."""
 
-    def __init__(self, tip: Fingertip, presses: Sequence[_Press], offset: Floats) -> None:
+    def __init__(
+        self,
+        tip: Fingertip,
+        presses: Sequence[_Press],
+        offset: Floats,
+        lately: list[Loaded],
+    ) -> None:
         self._presses = presses
         self._offset = offset
+        self._lately = lately
         x, y, z = (1e-3 * np.array(tip.sensor_mm)).tolist()
         about_sensor = np.eye(6)
         about_sensor[3:, :3] -= [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
@@ -417,9 +479,19 @@ class _Load:
         )
 
     def __call__(self, t_ns: int) -> Floats:
-        load = np.zeros(6)
+        load = _NOTHING
+        pressed: list[Pressed] = []
         for press in self._presses:
-            load += press.wrench(t_ns)
+            wrench = press.wrench(t_ns)
+            if press.pressed is not None:
+                load = load + wrench
+                pressed.append(press.pressed)
+        lately = self._lately
+        lately.append(Loaded(t_ns, load, pressed))
+        if lately[0].t_ns < t_ns - 2 * LATELY_NS:
+            del lately[: bisect_left(lately, t_ns - LATELY_NS, key=itemgetter(0))]
+        if not pressed:
+            return self._offset
         measured: Floats = self._to_board @ load + self._offset
         return measured
 

@@ -5,13 +5,15 @@ the frames of the parts. Their forces press the emulated foam, each on a disc ar
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from emulator.probes.coverage import FACING, LEAST_SHARE
+from emulator.probes.coverage import FACING, LEAST_SHARE, points_of_pads_mm
 from emulator.probes.foam import Footprint
+from emulator.probes.overlap import POINTS, Neighbours
 from emulator.probes.pads import lens_area_mm2
 from skin_host.layout import Layout
 
@@ -95,6 +97,7 @@ class ContactPads:
     """
 
     def __init__(self, layout: Layout) -> None:
+        self._layout = layout
         self._position_mm = layout.position_m * 1e3
         self._normal = layout.normal
         self._radius_mm = np.asarray(layout.radius_mm, np.float64)
@@ -131,6 +134,7 @@ class ContactPads:
         hit = (along_mm < radius_mm + pad_mm) & (covered > LEAST_SHARE)
         contact, area_mm2 = contact[hit], area_mm2[hit]
         borne_mm2 = np.bincount(contact, area_mm2, len(contacts))
+        neighbours = Neighbours(taxel[hit], contact, contacts.normal, contacts.radius_mm)
         footprint = Footprint(
             taxel[hit],
             (np.cumsum(on_skin) - 1)[contact],
@@ -139,8 +143,19 @@ class ContactPads:
             area_mm2 / borne_mm2[contact],
             np.pi * contacts.radius_mm[on_skin] ** 2,
             np.ones(np.count_nonzero(on_skin)),
+            partial(self._inside, contacts, taxel[hit], contact),
+            neighbours.meeting(contacts.place_mm)[on_skin],
         )
         return on_skin, footprint
+
+    def _inside(self, contacts: Contacts, taxel: Ints, contact: Ints, rows: Ints) -> Mask:
+        """Which points of their pads some rows cover."""
+        taxel, contact = taxel[rows], contact[rows]
+        apart_mm = points_of_pads_mm(self._layout, taxel) - contacts.place_mm[contact, None]
+        height_mm = np.einsum("kpx,kx->kp", apart_mm, contacts.normal[contact])
+        along_mm2 = np.square(apart_mm).sum(axis=2) - np.square(height_mm)
+        inside: Mask = along_mm2 <= contacts.radius_mm[contact, None] ** 2
+        return inside
 
     def _around(self, part: int, size: int, *cell: int) -> Ints:
         """The pads of a part that a contact in a cell may cover, or lie beside."""
@@ -170,4 +185,14 @@ def joined(first: Footprint, second: Footprint) -> Footprint:
         np.concatenate([first.weight, second.weight]),
         np.concatenate([first.area_mm2, second.area_mm2]),
         np.concatenate([first.edge, second.edge]),
+        partial(_inside_either, first, second),
     )
+
+
+def _inside_either(first: Footprint, second: Footprint, rows: Ints) -> Mask:
+    inside = np.zeros((len(rows), len(POINTS)), np.bool_)
+    is_first = rows < len(first.taxel)
+    for one, own, begin in ((first, is_first, 0), (second, ~is_first, len(first.taxel))):
+        if one.points_inside is not None:
+            inside[own] = one.points_inside(rows[own] - begin)
+    return inside

@@ -6,18 +6,22 @@ covered are found together, and in each of them it only remains to look up how m
 probe at this distance covers.
 """
 
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from emulator.probes.foam import Footprint
+from emulator.probes.overlap import POINTS, Neighbours
 from emulator.probes.pads import (
+    UNDER_MM,
     ZONES,
     Disc,
     Pads,
     Rectangle,
     Shape,
+    is_between,
     lens_area_mm2,
     rectangle_area_mm2,
 )
@@ -40,6 +44,16 @@ LEAST_SHARE = 1e-6
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+
+def points_of_pads_mm(layout: Layout, taxels: Ints) -> Floats:
+    """The points of some pads [k] in the frame of their part, float64[k, p, 3] (mm)."""
+    along = tangents(layout.normal[taxels].T)
+    radius_mm = np.asarray(layout.radius_mm, np.float64)[taxels]
+    points_mm: Floats = radius_mm[:, None, None] * np.einsum("pa,axk->kpx", POINTS, along)
+    points_mm += 1e3 * layout.position_m[taxels, None]
+    return points_mm
 
 
 class Coverage:
@@ -61,6 +75,11 @@ class Coverage:
         #: Of each probe: the pads that face it, and where they are along its axes, [2, k].
         self._facing: list[Ints] = []
         self._facing_mm: list[Floats] = []
+        #: And its place (mm) and axes [2, 3] in the frame of its part.
+        self._frames: list[tuple[Floats, Floats]] = []
+        #: Of the present probes: which are near each other, their places and axes.
+        self._neighbours: Neighbours | None = None
+        self._middle_mm, self._axes = np.zeros((0, 3)), np.zeros((0, 2, 3))
         self._numbers: Ints = np.zeros(0, np.intp)
         self._gathered = False
         #: Of the pads that the probes `_numbers` face: x and y, pad, probe and reach.
@@ -95,7 +114,9 @@ class Coverage:
         facing = (self._layout.normal[of_part] @ normal > FACING) & (np.abs(height_mm) < REACH_MM)
         taxels = np.flatnonzero(facing) + part.start
         self._facing.append(taxels)
-        self._facing_mm.append(tangents(normal) @ (self._position_mm[taxels] - point_m * 1e3).T)
+        along = tangents(normal)
+        self._facing_mm.append(along @ (self._position_mm[taxels] - point_m * 1e3).T)
+        self._frames.append((point_m * 1e3, along))
         if probe.size_mm is None:
             self._shapes.append(Disc(0.0, 0.0, probe.diameter_mm))
         else:
@@ -118,7 +139,9 @@ class Coverage:
             area_mm2[rectangle] = self._rectangle_mm2(rows[rectangle], along_mm)
         covered = area_mm2 / self._pad_mm2[rows]
         hit = covered > LEAST_SHARE
-        return self._footprints(rows[hit], covered[None, hit])[0]
+        [found] = self._footprints(rows[hit], covered[None, hit])
+        self._know_points(found, offset_mm, self._meeting(offset_mm))
+        return found
 
     def footprints(
         self, numbers: Ints, offset_mm: Floats, step_mm: Floats, steps: int
@@ -150,7 +173,17 @@ class Coverage:
                 flat = np.flatnonzero(self._is_rectangle[self._contact[rows[on]]])
                 covered[:, flat] = by_rectangle[start:stop, on[flat]]
             found += self._footprints(rows[on], covered)
+        meets = self._meeting(offset_mm, (steps - 1) * step_mm)
+        for step, footprint in enumerate(found):
+            self._know_points(footprint, offset_mm + step * step_mm, meets)
         return found
+
+    def _meeting(self, offset_mm: Floats, way_mm: Floats | None = None) -> Mask:
+        """Which probes may overlap another one, there or on a way on which they slide straight."""
+        assert self._neighbours is not None
+        place_mm = self._middle_mm + np.einsum("ca,cax->cx", offset_mm, self._axes)
+        slid_mm = None if way_mm is None else np.einsum("ca,cax->cx", way_mm, self._axes)
+        return self._neighbours.meeting(place_mm, slid_mm)
 
     def _footprints(self, rows: Ints, covered: Floats) -> list[Footprint]:
         """Of some steps in which the same pads `rows` are covered, by so much [k, rows]."""
@@ -174,6 +207,45 @@ class Coverage:
             Footprint(taxel, contact, of_pad, ones, share, size, no_edge)
             for of_pad, share in zip(covered, weight, strict=True)
         ]
+
+    def _know_points(
+        self,
+        footprint: Footprint,
+        offset_mm: Floats,
+        meets: Mask | None = None,
+        zone_mm: Floats | None = None,
+    ) -> None:
+        """Let a footprint find which points of its pads are covered by the present probes.
+
+        Args:
+            footprint: of them.
+            offset_mm: [c, 2], how far they have slid.
+            meets: of the footprint.
+            zone_mm: [m, 2], in which zone around its probe each row is; under it if not given.
+        """
+        footprint.meets = meets
+        footprint.points_inside = partial(
+            self._inside, footprint.taxel, footprint.contact, self._numbers, offset_mm, zone_mm
+        )
+
+    def _inside(
+        self,
+        taxel: Ints,
+        contact: Ints,
+        numbers: Ints,
+        offset_mm: Floats,
+        zone_mm: Floats | None,
+        rows: Ints,
+    ) -> Mask:
+        contact = contact[rows]
+        points_mm = points_of_pads_mm(self._layout, taxel[rows])
+        outside_mm = np.empty(points_mm.shape[:2])
+        for one in np.unique(contact).tolist():
+            number, own = numbers[one], contact == one
+            point_mm, along = self._frames[number]
+            places_mm = (points_mm[own] - point_mm) @ along.T - offset_mm[one]
+            outside_mm[own] = self._shapes[number].outside_mm(places_mm)
+        return is_between(outside_mm, np.array([UNDER_MM]) if zone_mm is None else zone_mm[rows])
 
     def _on_the_way(
         self, offset_mm: Floats, step_mm: Floats, steps: int
@@ -260,6 +332,8 @@ class Coverage:
         self._pad_mm2 = np.pi * self._pad_radius_mm**2
         self._reach_mm = self._shape_reach_mm[self._contact] + self._pad_radius_mm
         self._rows, self._course = np.full(1, -1, np.intp), np.zeros((0, 0))
+        normal = np.cross(self._axes[:, 0], self._axes[:, 1])
+        self._neighbours = Neighbours(self._taxel, self._contact, normal, self._shape_reach_mm)
 
     def _set_contacts(self, numbers: Ints) -> None:
         """Gather the pads that these probes face, and what their shapes are."""
@@ -273,6 +347,9 @@ class Coverage:
         self._all_reach_mm = self._shape_reach_mm[self._all_contact]
         self._all_reach_mm += self._radius_mm[self._all_taxel] + ZONES[-1] * self._membrane_mm
         self._of_probes = np.zeros((0, 0, 0))
+        frames = [self._frames[number] for number in numbers]
+        self._middle_mm = np.array([middle_mm for middle_mm, _ in frames]).reshape(-1, 3)
+        self._axes = np.array([along for _, along in frames]).reshape(-1, 2, 3)
         self._numbers, self._gathered = numbers.copy(), True
         self._contact_mm2 = np.array([shape.area_mm2 for shape in shapes])
         self._no_edge = np.ones(len(shapes))
@@ -288,6 +365,7 @@ class Coverage:
     def _with_membrane(self, offset_mm: Floats) -> Footprint:
         """What a drawn-down surface adds is found contact by contact."""
         singles = []
+        zones_mm = [np.zeros((0, 2))]
         starts = np.searchsorted(self._contact, np.arange(len(self._numbers) + 1)).tolist()
         for number, offset, near in zip(
             self._numbers.tolist(), offset_mm, map(slice, starts, starts[1:]), strict=False
@@ -299,17 +377,25 @@ class Coverage:
                 self._thickness_mm[taxel],
                 membrane_mm=self._membrane_mm,
             )
-            one = pads.footprint([self._shapes[number]])
+            one, zone_mm = pads.zoned_footprint([self._shapes[number]])
+            zones_mm.append(zone_mm)
             singles.append((taxel[one.taxel], one))
         rows = [len(taxel) for taxel, _ in singles]
-        return Footprint(
+        covered, share, weight, area_mm2, edge = (
+            np.concatenate([np.zeros(0), *(getattr(one, name) for _, one in singles)])
+            for name in ("covered", "share", "weight", "area_mm2", "edge")
+        )
+        found = Footprint(
             np.concatenate([np.zeros(0, np.intp), *(taxel for taxel, _ in singles)]),
             np.repeat(np.arange(len(singles)), rows),
-            *(
-                np.concatenate([np.zeros(0), *(getattr(one, name) for _, one in singles)])
-                for name in ("covered", "share", "weight", "area_mm2", "edge")
-            ),
+            covered,
+            share,
+            weight,
+            area_mm2,
+            edge,
         )
+        self._know_points(found, offset_mm, zone_mm=np.concatenate(zones_mm))
+        return found
 
 
 #: Numbers of a course: three of the squared distance by step; at which distance the pad is

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from emulator.probes.overlap import Overlap, PointsInside, shared_rows
 from emulator.probes.viscoelastic import FoamTruth
 
 E0_KPA = 91.7
@@ -136,6 +137,9 @@ class Footprint:
             1 for a contact with any pad under it; 0 in the zone around.
         area_mm2: float64[c], the contact's whole area.
         edge: float64[c], force on the contact over force on its area alone; 1 without membrane.
+        points_inside: which points of their pads rows cover, to find where contacts overlap; None
+            if no two of them cover the same pad.
+        meets: bool[c], which contacts may overlap another one; None if that is not known.
     """
 
     taxel: Ints
@@ -145,6 +149,8 @@ class Footprint:
     weight: Floats
     area_mm2: Floats
     edge: Floats
+    points_inside: PointsInside | None = None
+    meets: Mask | None = None
 
     @classmethod
     def empty(cls) -> "Footprint":
@@ -186,7 +192,11 @@ class Drive:
 
 @dataclass(frozen=True, slots=True)
 class Felt:
-    """Strained foam after a step: arrays [k], the footprint's rows first, then residuals."""
+    """Strained foam after a step: arrays [k], the footprint's rows first, then residuals.
+
+    `covered` is the fraction of the pad that is strained so; where contacts overlap, it is the
+    deepest one's alone.
+    """
 
     taxel: Ints
     strain: Floats
@@ -201,7 +211,7 @@ class FoamLayer:
         truth: viscoelastic truth, n taxels.
 
     Attributes:
-        pressure_kpa: float64[n], true pressure on the covered part of each pad.
+        pressure_kpa: float64[n], true pressure on the part of each pad that is pressed deepest.
         force_n, depth_mm: float64[c], of each contact in the last step.
         is_still: the last step changed nothing: nothing pressed, and no foam was due that recovers.
     """
@@ -226,6 +236,10 @@ class FoamLayer:
         self._mean_thickness_mm = float(foam.thickness_mm.mean()) if len(foam) else 1.0
         self._footprint = Footprint.empty()
         self._drive = Drive.by_force([])
+        #: Of the footprint's rows in the last step: the pressure, and the fraction of the pad under
+        #: it; and where contacts overlap.
+        self._row_kpa = self._row_covered = np.zeros(0)
+        self._overlap: Overlap | None = None
         self._a = self._b = self._unit = np.zeros(0)
         self._is_moved = False
         self.is_still = False
@@ -266,22 +280,37 @@ class FoamLayer:
             pressure = self.truth.step(deepest[self._touched], dt_s, self._touched)
             self.pressure_kpa[self._touched] = np.maximum(pressure, 0.0)
             pressure = self.pressure_kpa[rows.taxel]
+            # Each contact on a pad strains it differently, and presses by so much less than the
+            # deepest one: the pad's foam has one memory. Zones around a contact are none.
+            less_kpa = np.where(rows.share == 1, deepest[rows.taxel] - elastic, 0.0)
+            pressure = np.maximum(pressure - less_kpa, 0.0)
         else:
             pressure = np.maximum(self.truth.step(elastic, dt_s, rows.taxel), 0.0)
             self.pressure_kpa[rows.taxel] = pressure
+        self._row_kpa = pressure
+        covered = rows.covered if self._overlap is None else self._overlap.covered(strain)
+        self._row_covered = covered
         borne = rows.weight * (np.where(loose, 0.0, pressure) if is_loose else pressure)
         mean_kpa = np.bincount(rows.contact, borne, len(rows.area_mm2))
         if len(self._between):
             mean_kpa[~self._bears] = self._between.elastic_kpa(self._strain[~self._bears])
         self.force_n = mean_kpa * self._bears_n_per_kpa
         if not len(self._recovering):
-            return Felt(rows.taxel, strain, rows.covered)
+            return Felt(rows.taxel, strain, covered)
         left_strain, left_covered = self._left
         return Felt(
             self._felt_taxel,
             np.concatenate([strain, left_strain]),
-            np.concatenate([rows.covered, left_covered]),
+            np.concatenate([covered, left_covered]),
         )
+
+    def mean_kpa(self) -> Floats:
+        """True pressure of each pad, float64[n]: mean over its whole area (kPa)."""
+        rows = self._footprint
+        # What a contact only draws down is not pressed.
+        bears = np.where(rows.weight > 0, self._row_kpa * self._row_covered, 0.0)
+        mean = np.bincount(rows.taxel, bears, len(self.foam))
+        return mean.astype(np.float64, copy=False)
 
     def _press(self, drive: Drive, imprint: Floats) -> Floats:
         """The strain under each contact, [c]: a x + b p(x) = d by Newton's method.
@@ -335,6 +364,8 @@ class FoamLayer:
             self._set_thickness(footprint)
         else:
             changed = False
+        if footprint is not before:
+            self._overlap = self._overlapping(footprint)
         if footprint.area_mm2 is not before.area_mm2:
             self._meet(len(footprint.area_mm2))
         if (
@@ -353,7 +384,7 @@ class FoamLayer:
         self._touched = np.flatnonzero(is_touched)
         if len(left):
             self._covered[left] = 0.0
-            np.add.at(self._covered, before.taxel, before.covered)
+            np.add.at(self._covered, before.taxel, self._row_covered)
         is_met = is_touched[self._recovering]
         if is_met.any():
             met = self._recovering[is_met]
@@ -378,6 +409,19 @@ class FoamLayer:
         self._between = Foam.uniform(int(np.count_nonzero(~self._bears)))
         self._bears_n_per_kpa = rows.area_mm2 * rows.edge * 1e-3
         self._set_thickness(rows)
+
+    def _overlapping(self, rows: Footprint) -> Overlap | None:
+        """Where contacts of a footprint overlap on a pad, or None if they do not."""
+        meets = rows.meets
+        if not self._repeats or rows.points_inside is None or not (meets is None or meets.any()):
+            return None
+        shared = shared_rows(rows.taxel, rows.contact, len(self.foam))
+        if meets is not None:
+            shared = shared[meets[rows.contact[shared]]]
+        if not len(shared):
+            return None
+        overlap = Overlap(rows.taxel, rows.covered, shared, rows.points_inside)
+        return overlap if overlap.is_any else None
 
     def _set_thickness(self, rows: Footprint) -> None:
         """Of the foam under each contact; whether it is the same all over each of them."""

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from emulator.chips.noise import SENT_UNIT_FF
 from emulator.probes.foam import Felt, Footprint
+from emulator.probes.overlap import POINTS
 
 C0_FF = 100.0
 C0_RADIUS_MM = 2.1
@@ -25,6 +26,8 @@ RESTING_FF = 7800.0
 RESTING_SD_FF = 700.0
 #: Bounds of the zones of a drawn-down surface, in decay lengths from the contact's edge.
 ZONES = (0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0)
+#: Distances (mm) from a contact that are under it.
+UNDER_MM = -np.inf, 0.0
 #: One unit of the paper's 8-bit value.
 UNIT_FF = 2.88
 
@@ -32,6 +35,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
+Mask = NDArray[np.bool_]
 
 
 class Shape(Protocol):
@@ -196,6 +200,16 @@ def _arccos(cosine: Floats) -> Floats:
     return angle
 
 
+def is_between(outside_mm: Floats, zone_mm: Floats) -> Mask:
+    """Whether points are in zones around a contact, the nearer bound excluded, bool[k, p].
+
+    Args:
+        outside_mm: [k, p], how far points are from it, 0 under it.
+        zone_mm: [k, 2], from where to where the zones are.
+    """
+    return (outside_mm > zone_mm[:, :1]) & (outside_mm <= zone_mm[:, 1:])
+
+
 class Pads:
     """The n pads of a flat piece of skin.
 
@@ -232,8 +246,15 @@ class Pads:
 
     def footprint(self, shapes: Sequence[Shape]) -> Footprint:
         """What the given contacts cover; contact i of the footprint is `shapes[i]`."""
+        return self.zoned_footprint(shapes)[0]
+
+    def zoned_footprint(self, shapes: Sequence[Shape]) -> tuple[Footprint, Floats]:
+        """As `footprint`, and between which distances (mm) from its contact each row [m] is.
+
+        The distances, float64[m, 2], are those of `is_between`.
+        """
         if not shapes:
-            return Footprint.empty()
+            return Footprint.empty(), np.zeros((0, 2))
         rows = [
             (number, *zone) for number, shape in enumerate(shapes) for zone in self._zones(shape)
         ]
@@ -243,10 +264,11 @@ class Pads:
             # K1/K0 of large arguments; good to 2 % for the discs of the rig.
             steep = self.membrane_mm / np.array([shape.edge_radius_mm for shape in shapes])
             edge = 1 + 2 * steep * (1 + steep / 2)
-        sizes = [len(taxel) for _, taxel, _, _ in rows]
-        contact = np.repeat([number for number, _, _, _ in rows], sizes)
+        sizes = [len(taxel) for _, taxel, *_ in rows]
+        contact = np.repeat([number for number, *_ in rows], sizes)
+        zone_mm = np.repeat([zone_mm for *_, zone_mm in rows], sizes, axis=0)
         taxel, covered, share = (
-            np.concatenate(column) for column in list(zip(*rows, strict=True))[1:]
+            np.concatenate(column) for column in list(zip(*rows, strict=True))[1:4]
         )
         covered_mm2 = covered * self.area_mm2[taxel]
         bears_mm2 = np.where(share == 1, covered_mm2, 0.0)
@@ -254,20 +276,33 @@ class Pads:
         beside = np.bincount(contact, bears_mm2, len(shapes)) == 0
         bears_mm2 = np.where(beside[contact], covered_mm2, bears_mm2)
         weight = bears_mm2 / np.bincount(contact, bears_mm2, len(shapes))[contact]
-        return Footprint(taxel, contact, covered, share, weight, area_mm2, edge)
 
-    def _zones(self, shape: Shape) -> Iterator[tuple[Ints, Floats, Floats]]:
-        """Pads, covered fractions and shares of the depth: the contact, then what it draws down."""
+        def points_inside(some: Ints) -> Mask:
+            of = taxel[some]
+            points_mm = self.centre_mm[of, None] + self.radius_mm[of, None, None] * POINTS
+            outside_mm = np.empty(points_mm.shape[:2])
+            for number in np.unique(contact[some]).tolist():
+                own = contact[some] == number
+                outside_mm[own] = shapes[number].outside_mm(points_mm[own])
+            return is_between(outside_mm, zone_mm[some])
+
+        found = Footprint(taxel, contact, covered, share, weight, area_mm2, edge, points_inside)
+        return found, zone_mm
+
+    def _zones(self, shape: Shape) -> Iterator[tuple[Ints, Floats, Floats, tuple[float, float]]]:
+        """The contact, then the zones it draws down: pads, covered fractions, shares of the depth,
+        and between which distances from the contact (mm) they are.
+        """
         reach_mm = self.radius_mm + ZONES[-1] * self.membrane_mm
         near = np.flatnonzero(shape.outside_mm(self.centre_mm) < reach_mm)
         covered = (
             shape.covered_mm2(self.centre_mm[near], self.radius_mm[near]) / self.area_mm2[near]
         )
         hit = covered > 1e-6
-        yield near[hit], covered[hit], np.ones(np.count_nonzero(hit))
+        yield near[hit], covered[hit], np.ones(np.count_nonzero(hit)), UNDER_MM
         if not self.membrane_mm:
             return
-        points = self.centre_mm[near, None] + self.radius_mm[near, None, None] * _PAD_POINTS
+        points = self.centre_mm[near, None] + self.radius_mm[near, None, None] * POINTS
         outside_mm = shape.outside_mm(points)
         # K0(r/l) / K0(a/l) of large arguments.
         radius_mm = shape.edge_radius_mm
@@ -275,11 +310,12 @@ class Pads:
             -outside_mm / self.membrane_mm
         )
         for start, stop in pairwise(ZONES):
-            zone = (outside_mm > start * self.membrane_mm) & (outside_mm <= stop * self.membrane_mm)
+            zone_mm = start * self.membrane_mm, stop * self.membrane_mm
+            zone = (outside_mm > zone_mm[0]) & (outside_mm <= zone_mm[1])
             count = zone.sum(axis=1)
             some = count > 0
             mean = (share * zone).sum(axis=1)[some] / count[some]
-            yield near[some], count[some] / len(_PAD_POINTS), mean
+            yield near[some], count[some] / len(POINTS), mean, zone_mm
 
     def rise_ff(self, felt: Felt, footprint: Footprint, grounded: ArrayLike = False) -> Floats:
         """Capacitance above rest of all pads, float64[n] (fF).
@@ -373,14 +409,3 @@ def draw_dead(n: int, rng: np.random.Generator) -> NDArray[np.bool_]:
     hardly a dead pad elsewhere; a dead chip is a fault of its own.
     """
     return rng.random(n) < 1 / 200
-
-
-def _pad_points(n: int) -> Floats:
-    """Points [n, 2] spread evenly over the unit disc (sunflower)."""
-    i = np.arange(n) + 0.5
-    turn = np.pi * (1 + np.sqrt(5)) * i
-    points: Floats = np.sqrt(i / n)[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
-    return points
-
-
-_PAD_POINTS = _pad_points(400)

@@ -546,6 +546,8 @@ def resolve(place: Place, part: str, layout: Layout) -> tuple[Floats, Floats]:
 def tangents(normal: Floats) -> Floats:
     """Two unit vectors [2, 3] along the skin; x and y of the frame where the skin faces z.
 
+    Of normals [3, k] they are [2, 3, k].
+
     The basis of Duff et al., "Building an Orthonormal Basis, Revisited" (2017), which stays
     exact in every direction.
     """

@@ -251,7 +251,7 @@ class Skin:
 
     def true_pressure_kpa(self) -> Floats:
         """True pressure of each pad, float64[n]: mean over the pad's whole area (kPa)."""
-        return self._foam.pressure_kpa * self._covered() + self._air_kpa
+        return self._foam.mean_kpa() + self._air_kpa
 
     def contact_force_n(self) -> dict[int, float]:
         """Force (N) of each probe that is in contact now, by its number in `probes`."""
@@ -368,9 +368,10 @@ class Skin:
         if len(self._jumping):
             pads = touched[self._jumping]
             # Foam that nothing presses any more is under no pressure, however it was covered.
-            simple = is_alone and not self._membrane_mm
-            covered = felt.covered[self._jumping] if simple else self._covered()[pads]
-            pressure_kpa = self._foam.pressure_kpa[pads] * covered
+            if is_alone and not self._membrane_mm:
+                pressure_kpa = self._foam.pressure_kpa[pads] * felt.covered[self._jumping]
+            else:
+                pressure_kpa = self._foam.mean_kpa()[pads]
             rise_ff[self._jumping] += self._jumps.step_ff(pads, pressure_kpa)
         self.capacitance_ff[touched] = self._untouched_ff + rise_ff
         return touched
@@ -417,12 +418,6 @@ class Skin:
             self._compliance_now = np.append(self._compliance[number], none)
             self._grounded_now = np.append(self._grounded[number], none > 0)
         self._footprint = joined(of_probes, self._pressed)
-
-    def _covered(self) -> Floats:
-        """Which share of each pad bears a contact, float64[n]."""
-        rows = self._footprint
-        bears = np.where(rows.weight > 0, rows.covered, 0.0) if self._membrane_mm else rows.covered
-        return np.bincount(rows.taxel, bears, self._layout.n_taxels).astype(np.float64, copy=False)
 
     def _cover(self, moment: Moment, *, same: bool) -> Footprint:
         """What the probes cover, the `same` as in the last step; as it was foreseen, if it was."""

@@ -90,3 +90,22 @@ def test_frames_of_a_babbling_node_pass_as_if_arbitrated_one_by_one(seed: int) -
         at_once, one_by_one = (list(wire.until(t_ns).frames()) for wire in wires)
         assert at_once == one_by_one
     assert wires[0].lost == wires[1].lost
+
+
+@pytest.mark.parametrize("apart_us", [60, 99, 100, 130])
+def test_frames_that_are_handed_over_together_pass_as_one_by_one(apart_us: int) -> None:
+    """Those of a force/torque board become ready one after the other; 6 bytes take 100 us."""
+    frames = [(0x320 | kind, bytes([kind] * 6), kind * apart_us * 1000) for kind in (10, 11, 12)]
+    together, single = wire_of(), wire_of()
+    together.put(FrameBatch.of(frames))
+    for frame in frames:
+        single.put(FrameBatch.of([frame]))
+        single.until(frame[2])
+    sent, wanted = together.until(10 * MS), single.until(10 * MS)
+    # What has ended meanwhile was given before.
+    n = len(wanted)
+    assert len(sent) == 3 and n > 0
+    assert sent.t_ns[-n:].tolist() == wanted.t_ns.tolist()
+    assert sent.id[-n:].tolist() == wanted.id.tolist()
+    if apart_us >= 100:
+        assert sent.t_ns.tolist() == [t_ns + 100_000 for *_, t_ns in frames]

@@ -157,6 +157,10 @@ class Accusations:
         """Whether something loses what a fingertip's board sends, or did so lately."""
         return self._lately("fingertip_loses_frames", tip) or self._lately("bus_drops", tip)
 
+    def may_wait(self, tip: str) -> bool:
+        """Whether what a fingertip's board sends waits for a bus, or did so lately."""
+        return self._lately("bus_babbling", tip)
+
     def _lately(self, code: str, where: str) -> bool:
         now_ns = self._world.clock.monotonic_ns()
         return any(

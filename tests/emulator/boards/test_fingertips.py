@@ -296,3 +296,29 @@ def test_a_probe_that_cannot_be_on_its_fingertip_is_refused(
     with pytest.raises(ConfigurationError) as caught:
         Robot(settings, build_layout(settings, CONFIG), scene)
     assert str(caught.value).startswith(said)
+
+
+def test_the_loads_that_a_board_measured_lately_are_known_and_older_ones_forgotten() -> None:
+    world = World({"part": "index", "force_n": [[2, 0], [2.1, 2], [9, 2]]})
+    for _ in range(4):
+        world.run(1.0)
+        lately = world.robot.fingertips.lately["index"]
+        now_ns = world.robot.t_ns
+        assert lately[-1].t_ns > now_ns - 5_000_000
+        assert now_ns - 2_010_000_000 < lately[0].t_ns <= now_ns - 1_000_000_000
+    [press] = lately[-1].presses
+    assert press.normal_n == pytest.approx(2.0)
+    assert press.normal.tolist() == [0.0, 0.0, 1.0]
+    assert press.point_mm.tolist() == pytest.approx([0.0, 0.0, 13.0])
+    assert lately[-1].wrench.tolist() == pytest.approx([0.0, 0.0, -2.0, 0.0, 0.0, 0.0])
+    # The thumb, which nothing presses, is known to be free.
+    assert not world.robot.fingertips.lately["thumb"][-1].presses
+
+
+def test_samples_are_off_by_the_noise_and_the_unit_that_a_board_states() -> None:
+    world = World()
+    force_n, torque_nm = world.robot.fingertips.off("index")
+    assert force_n == pytest.approx(50.0 * (5e-5 + 2.0**-15))
+    assert torque_nm == pytest.approx(1.0 * (5e-5 + 2.0**-15) + 0.025 * force_n)
+    still = World(noise=False).robot.fingertips.off("index")
+    assert still[0] == pytest.approx(50.0 * 2.0**-15)

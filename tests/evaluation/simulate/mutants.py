@@ -27,6 +27,7 @@ ROOT = Path(__file__).parents[3]
 SMALL = Path(__file__).with_name("small.toml")
 KASPAR = ROOT / "config" / "kaspar.toml"
 DEMO = ROOT / "config" / "demo.toml"
+FINGERTIPS = ROOT / "config" / "fingertips.toml"
 PACKAGES = ("skin_host", "emulator", "config")
 
 
@@ -251,6 +252,69 @@ MUTANTS = [
         "processing/touch.py",
         "    margin = settings.margin_units",
         "    spread = 8.0 * spread\n    margin = settings.margin_units",
+    ),
+    Mutant(
+        "fingertips press 1.3 times as hard",
+        "fingertip/tip.py",
+        "            force_n=normal_n,\n            sigma_m",
+        "            force_n=1.3 * normal_n,\n            sigma_m",
+        FINGERTIPS,
+    ),
+    Mutant(
+        "forces on fingertips are 1.3 times as large",
+        "fingertip/tip.py",
+        "force_n = rounded(load[:3].tolist(), N_DECIMALS)",
+        "force_n = rounded((1.3 * load[:3]).tolist(), N_DECIMALS)",
+        FINGERTIPS,
+    ),
+    Mutant(
+        "torques on fingertips are 1.3 times as large",
+        "fingertip/tip.py",
+        "torque_nm = rounded((1e-3 * load[3:]).tolist(), NM_DECIMALS)",
+        "torque_nm = rounded((1.3e-3 * load[3:]).tolist(), NM_DECIMALS)",
+        FINGERTIPS,
+    ),
+    Mutant(
+        "shears of fingertips are 1.3 times as large",
+        "fingertip/tip.py",
+        "shear = rounded((load[:3] + normal_n * place.normal).tolist(), N_DECIMALS)",
+        "shear = rounded((1.3 * (load[:3] + normal_n * place.normal)).tolist(), N_DECIMALS)",
+        FINGERTIPS,
+    ),
+    Mutant(
+        "a contact of a fingertip is 1.3 times as far from its origin",
+        "fingertip/tip.py",
+        "centroid_m=None if place is None else _vector(1e-3 * place.point_mm)",
+        "centroid_m=None if place is None else _vector(1.3e-3 * place.point_mm)",
+        FINGERTIPS,
+    ),
+    Mutant(
+        "normals point into fingertips",
+        "fingertip/tip.py",
+        "            normal=None if place is None else _vector(place.normal),",
+        "            normal=None if place is None else _vector(-place.normal),",
+        FINGERTIPS,
+    ),
+    Mutant(
+        "what slips presses 1.3 times as hard",
+        "fingertip/tip.py",
+        "            force_n=force_n,\n            shear_n=shear_n,",
+        "            force_n=1.3 * force_n,\n            shear_n=shear_n,",
+        FINGERTIPS,
+    ),
+    Mutant(
+        "what slips is pulled twice as hard",
+        "fingertip/tip.py",
+        "            shear_n=shear_n,\n            shear_rate_n_s",
+        "            shear_n=2.0 * shear_n,\n            shear_rate_n_s",
+        FINGERTIPS,
+    ),
+    Mutant(
+        "excesses are 1.3 times as large",
+        "fingertip/tip.py",
+        "t_ns=t_ns, part=self._name, force_n=force_n)",
+        "t_ns=t_ns, part=self._name, force_n=1.3 * force_n)",
+        FINGERTIPS,
     ),
 ]
 

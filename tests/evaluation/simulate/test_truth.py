@@ -18,6 +18,8 @@ from skin_host.demo import configuration
 from skin_host.evaluation.simulate.promises.contacts import least_mean
 from skin_host.evaluation.simulate.run import simulate
 from skin_host.evaluation.simulate.troubles import LASTING, kinds_of
+from skin_host.fingertip.events import Over, Slip
+from skin_host.fingertip.tip import Tip
 from skin_host.processing import pipeline, touch
 from skin_host.processing.contacts import ContactTracker
 from skin_host.processing.events import Touch
@@ -25,6 +27,7 @@ from skin_host.processing.pipeline import Pipeline, PressureFrame
 from skin_host.processing.touch import Floats, Levels, levels
 
 DEMO = configuration("demo.toml")
+FINGERTIPS = configuration("fingertips.toml")
 SMALL = Path(__file__).with_name("small.toml")
 Patch = pytest.MonkeyPatch
 
@@ -79,13 +82,80 @@ def of_levels(margin_units: float = 0.0, noise: float = 1.0) -> Callable[[Patch]
     return plant
 
 
+def of_tips(change: Callable[[Touch], dict[str, Any]]) -> Callable[[Patch], None]:
+    """Contacts of force/torque boards that have other numbers than were found."""
+
+    def plant(monkeypatch: Patch) -> None:
+        described = Tip._described
+
+        def off(tip: Tip, *args: Any) -> Touch:
+            event = described(tip, *args)
+            return msgspec.structs.replace(event, **change(event))
+
+        monkeypatch.setattr(Tip, "_described", off)
+
+    return plant
+
+
+def of_slips(force: float = 1.0, shear: float = 1.0) -> Callable[[Patch], None]:
+    """Slips of forces that are shares of what was found."""
+
+    def plant(monkeypatch: Patch) -> None:
+        slip = Tip._slip
+
+        def off(*args: Any) -> Slip:
+            event = slip(*args)
+            forces = {"force_n": force * event.force_n, "shear_n": shear * event.shear_n}
+            return msgspec.structs.replace(event, **forces)
+
+        monkeypatch.setattr(Tip, "_slip", off)
+
+    return plant
+
+
+def of_excess(monkeypatch: Patch) -> None:
+    """Excesses of forces that are greater than was found."""
+    over = Tip._over
+
+    def off(*args: Any) -> Over:
+        event = over(*args)
+        return msgspec.structs.replace(event, force_n=1.3 * event.force_n)
+
+    monkeypatch.setattr(Tip, "_over", off)
+
+
+def of_loads(**shares: float) -> Callable[[Patch], None]:
+    """Loads of fingertips with a force, a torque or a shear that is a share of what was found."""
+
+    def change(event: Touch) -> dict[str, Any]:
+        assert event.load is not None
+        found = {name: getattr(event.load, name) for name in shares}
+        off = {
+            name: tuple(shares[name] * value for value in values)
+            for name, values in found.items()
+            if values is not None
+        }
+        return {"load": msgspec.structs.replace(event.load, **off)}
+
+    return of_tips(change)
+
+
+def further(event: Touch) -> dict[str, Any]:
+    """A contact that is further from the origin than it was found."""
+    if event.centroid_m is None:
+        return {}
+    x, y, z = event.centroid_m
+    return {"centroid_m": (1.3 * x, 1.3 * y, 1.3 * z)}
+
+
 def odds(monkeypatch: Patch) -> None:
     """Noise alone touches a pad once in 10^4 measurements."""
     monkeypatch.setattr(touch, "ODDS", 1e4)
 
 
 def flipped(event: Touch) -> dict[str, Any]:
-    assert event.normal is not None
+    if event.normal is None:
+        return {}
     x, y, z = event.normal
     return {"normal": (-x, -y, -z)}
 
@@ -113,6 +183,24 @@ WRONG: dict[str, tuple[Callable[[Patch], None], Path, int, float, str]] = {
     "a margin": (of_levels(margin_units=10.0), SMALL, 8, 12.0, "is valid and not touched"),
     "noise": (of_levels(noise=8.0), SMALL, 8, 12.0, "is valid and not touched"),
     "odds": (odds, DEMO, 5, 14.0, "and nothing presses there"),
+    "a fingertip's force": (
+        of_tips(lambda event: {"force_n": 1.3 * event.force_n}),
+        *(FINGERTIPS, 1, 12.0, " presses with "),
+    ),
+    "a fingertip's vector of force": (
+        of_loads(force_n=1.3),
+        *(FINGERTIPS, 1, 12.0, " has a force of "),
+    ),
+    "a fingertip's torque": (
+        of_loads(torque_nm=1.3),
+        *(FINGERTIPS, 1, 12.0, " has a torque of "),
+    ),
+    "a fingertip's shear": (of_loads(shear_n=1.3), FINGERTIPS, 1, 12.0, "N off its force"),
+    "a fingertip's place": (of_tips(further), FINGERTIPS, 1, 12.0, "mm from what presses it"),
+    "a fingertip's normal": (of_tips(flipped), FINGERTIPS, 1, 12.0, "N off its force"),
+    "the force in a slip": (of_slips(force=1.3), FINGERTIPS, 3, 10.0, "slip 1 presses with"),
+    "the pull in a slip": (of_slips(shear=2.0), FINGERTIPS, 3, 10.0, "slip 1 is pulled with"),
+    "the force of an excess": (of_excess, FINGERTIPS, 1, 17.0, "over 1 presses with"),
 }
 
 

@@ -7,7 +7,7 @@ ends the run.
 - `truth`: what presses the skin, and what may be read of it
 - `skin`: frames and touches report what presses the skin
 - `contacts`: so do the numbers of touch events: force, place, area, pressures
-- `fingertips`: so do those on force/torque boards
+- `fingertips`: so do those on force/torque boards, and `loads` the numbers of their events
 - `received`: what is valid was received lately, in one sweep
 - `subscribers`: what the broker keeps and subscribers get is what the daemon put
 - `accounts`: every frame and every event is accounted for
@@ -44,7 +44,7 @@ from skin_host.evaluation.simulate.promises.truth import Truth
 from skin_host.evaluation.simulate.promises.zeros import ZeroCheck
 from skin_host.evaluation.simulate.troubles import Trouble, damaged_set_up
 from skin_host.evaluation.simulate.world import Life, Triangle, World
-from skin_host.fingertip.events import FingertipEvent, Slip
+from skin_host.fingertip.events import FingertipEvent
 from skin_host.layout import PadKind
 from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
@@ -197,10 +197,7 @@ class Promises:
         if isinstance(event, Touch):
             self.touches += 1
             self._hold(self._skin.touch(event))
-            if event.event == "begin":
-                self._fingertips.touches(event.part)
-        elif isinstance(event, Slip) and event.event == "begin":
-            self._hold(self._fingertips.slips(event.part))
+        self._hold(self._fingertips.reports(event))
 
     def _frame(self, frame: PressureFrame) -> None:
         self._truth.note()

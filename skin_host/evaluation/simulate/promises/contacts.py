@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from skin_host.evaluation.simulate.promises.limits import (
     FAINT_KPA,
     LEAST_AREA,
+    LOCATED_PADS,
     LOOKED_BACK_NS,
     MOST_AREA,
     MOST_TILT,
@@ -111,7 +112,10 @@ class ContactCheck:
         low: Floats,
         high: Floats,
     ) -> str | None:
-        """Return a centroid that is a pitch away from all places that the pressures explain."""
+        """Return a centroid that is a pitch away from all places that the pressures explain.
+
+        On one pad or two a template's probe explains a reading wherever it covers them.
+        """
         assert event.peak_kpa is not None
         if event.centroid_m is None:
             return None
@@ -122,7 +126,10 @@ class ContactCheck:
             low, high = np.zeros_like(low), np.full_like(high, np.inf)
         of_part = slice(part.start, part.stop)
         taxels = np.asarray(event.taxels, np.intp)
-        if self._world.settings.parts[part.name].localization != "centroid":
+        reach_m, chosen = 0.0, self._world.settings.parts[part.name]
+        if chosen.localization != "centroid":
+            if len(ever) < LOCATED_PADS:
+                reach_m = max(chosen.probe_mm) / 2e3
             taxels, low, high = ever, np.zeros(len(ever)), np.full(len(ever), np.inf)
         place_m = self._world.layout.position_m[of_part][taxels]
         mm2 = self._world.layout.area_mm2[of_part][taxels]
@@ -134,7 +141,7 @@ class ContactCheck:
             least_m, most_m = place_m.min(axis=0), place_m.max(axis=0)
         centroid_m = np.array(event.centroid_m)
         off_m = np.linalg.norm(centroid_m - np.clip(centroid_m, least_m, most_m))
-        if off_m <= pitch_m:
+        if off_m <= pitch_m + reach_m:
             return None
         return (
             f"{part.name}: touch {event.id} is at {event.centroid_m} m, {off_m * 1e3:.1f} mm from "

@@ -1,5 +1,5 @@
-"""A fingertip on a force/torque board whose zero is of no load is touched while it is loaded, and
-slips while its load slides.
+"""A fingertip on a force/torque board whose zero is of no load is touched while it is loaded, slips
+while its load slides, and reports this load.
 """
 
 import numpy as np
@@ -16,7 +16,10 @@ from skin_host.evaluation.simulate.promises.limits import (
     SLID_MM,
     SLID_NS,
 )
+from skin_host.evaluation.simulate.promises.loads import LoadCheck
 from skin_host.evaluation.simulate.world import Life, World
+from skin_host.fingertip.events import FingertipEvent, Slip
+from skin_host.processing.events import Touch
 
 
 class FingertipCheck:
@@ -29,6 +32,7 @@ class FingertipCheck:
 
     def __init__(self, world: World, accusations: Accusations) -> None:
         self._world, self._accusations = world, accusations
+        self._load = LoadCheck(world)
         #: When each was last loaded, and was not loaded firmly.
         self._loaded_ns = dict.fromkeys(world.settings.fingertips, LONG_AGO_NS)
         self._eased_ns = dict.fromkeys(world.settings.fingertips, LONG_AGO_NS)
@@ -67,22 +71,26 @@ class FingertipCheck:
             if calibrating and (repeats or now_ns - self._loaded_ns[name] < NS):
                 self._accusations.loaded.add(name)
 
-    def slips(self, name: str) -> str | None:
-        """Take the begin of a slip; return what is wrong with it, or None."""
-        self._slipped.add(name)
+    def reports(self, event: FingertipEvent) -> str | None:
+        """Take an event; return what is wrong with it, or None."""
+        name = event.part
+        if name not in self._held_ns or event.event == "end":
+            return None
+        slips = isinstance(event, Slip)
+        begins = isinstance(event, Touch) and event.event == "begin"
+        if slips or (begins and self._world.robot.fingertips.slipped_mm(name) > 0.0):
+            self._slipped.add(name)
         if self._unknown(name):
             return None
-        pulled_ns = max(
-            (tip.pulled_ns for tip in self._world.tips if tip.name == name), default=LONG_AGO_NS
-        )
-        if self._world.clock.monotonic_ns() - pulled_ns > PULLED_NS:
+        if slips and self._world.clock.monotonic_ns() - self._pulled_ns(name) > PULLED_NS:
             return f"{name}: slips, and nothing pulls"
-        return None
+        is_old = self._accusations.may_repeat(name) or self._accusations.may_wait(name)
+        return None if is_old else self._load.wrong(event)
 
-    def touches(self, name: str) -> None:
-        """Take the begin of a touch."""
-        if name in self._held_ns and self._world.robot.fingertips.slipped_mm(name) > 0.0:
-            self._slipped.add(name)
+    def _pulled_ns(self, name: str) -> int:
+        """When what is held on one was last pulled."""
+        of_tip = (tip.pulled_ns for tip in self._world.tips if tip.name == name)
+        return max(of_tip, default=LONG_AGO_NS)
 
     def _unknown(self, name: str) -> bool:
         return name in self._accusations.loaded or self._accusations.may_damage(name)

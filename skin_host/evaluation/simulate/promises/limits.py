@@ -47,6 +47,8 @@ LEFT_SHARE = 0.1
 LEAST_AREA, MOST_AREA, MOST_TILT = 0.9, 3.0, np.deg2rad(10.0)
 #: A contact of less (its peak) may stay where it was last felt: its place is noise.
 FAINT_KPA = 2.0
+#: By fewer pads a probe cannot be located in the plane.
+LOCATED_PADS = 3
 #: Numbers of events are rounded.
 PUBLISHED = 1e-3
 #: Pads that press at least so much are pressed firmly.
@@ -77,6 +79,13 @@ LASTS_NS, LASTS_PAUSE_NS = 3 * NS // 2, NS // 4
 RESTING_NS = 8 * NS
 #: A fingertip is loaded from a small force on, and must be felt from a larger one on.
 LOADED_N, FELT_N = 0.05, 1.0
+#: What events report of its load is of samples that were taken no longer ago: half a second for
+#: which they may wait, and the filter. That has two poles: of a change it passes on up to a tenth
+#: more.
+LOADED_BACK_NS, OVERSHOOT = 3 * NS // 4, 0.1
+#: Where a load presses is judged while it changes by no more than this. The line of its force may
+#: meet the surface at a slant, which takes what it is off twice as far at most.
+STEADY_SHARE, SLANTED = 0.1, 2.0
 #: What has slid so far over a fingertip is reported to slip within this time; and what slips was
 #: pulled no longer ago, a stall included.
 SLID_MM, SLID_NS, PULLED_NS = 1.0, NS // 4, 5 * NS

@@ -81,18 +81,15 @@ class Truth:
             return
         self._noted_ns = robot.t_ns
         now_ns = self._world.clock.monotonic_ns()
-        most = self.kpa = robot.skin.true_pressure_kpa()
-        # Where two probes overlap, each is taken to cover the pad: together they press no harder
-        # than the foam is pressed, and are no less than that.
-        least = np.minimum(most, robot.skin._foam.pressure_kpa)
-        np.maximum(self.hardest_kpa, most, out=self.hardest_kpa)
+        kpa = self.kpa = robot.skin.true_pressure_kpa()
+        np.maximum(self.hardest_kpa, kpa, out=self.hardest_kpa)
         if now_ns - self._began_ns >= BIN_NS:
             self._began_ns = now_ns - now_ns % BIN_NS
-            self._bins.append((self._began_ns, least, most.copy()))
+            self._bins.append((self._began_ns, kpa.copy(), kpa.copy()))
         else:
             _, at_least, at_most = self._bins[-1]
-            np.minimum(at_least, least, out=at_least)
-            np.maximum(at_most, most, out=at_most)
+            np.minimum(at_least, kpa, out=at_least)
+            np.maximum(at_most, kpa, out=at_most)
 
     def note_margin(self, units: float) -> None:
         """An operator asks for a margin. It may be in use from now on, also after a restart; that
