@@ -2,11 +2,13 @@
 
 Force and torque of one sample are two frames of class 3, ID 0x300 | board<<4 | type, each
 with three little-endian words around 0x8000. They have no sequence number and are paired by
-arrival. Source: icub-main's CanBusFtSensor.cpp and iCubCanProto_analogSensorMessages.h.
+arrival, in the order in which the board sends them. Source: icub-main's CanBusFtSensor.cpp and
+iCubCanProto_analogSensorMessages.h.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +26,14 @@ LEAST_SILENT_NS = 100_000_000
 SILENT_NS_PER_MS = 2_500_000
 #: Time in which the two frames of a sample must arrive, per ms of period.
 PAIR_NS_PER_MS = 750_000
+#: A board sends its two frames one right after the other: the second is complete after 0.13 ms, or
+#: after twice that behind a frame of another board. What follows within this, and within a sixth of
+#: a period, after a pause of half a period is the second half of a sample.
+NEXT_NS = 300_000
+NEXT_SHARE = 1 / 6
+PAUSE_SHARE = 1 / 2
+#: By so many samples more of the other order than of the known one, the other becomes the known.
+ORDER_SAMPLES = 8
 
 
 class StrainType(IntEnum):
@@ -163,25 +173,59 @@ class StrainCounters:
     wrong_length: int = 0
 
 
-@dataclass(slots=True)
-class WrenchAssembler:
-    """Pairs the force and torque frames of one board, in either order.
+class _Half(NamedTuple):
+    """A frame: its time, type and values; `begins` if it came after a pause."""
 
-    Two frames belong together if they are of different types and arrived within three quarters of a
-    period. A frame whose other half is late is counted and dropped, so that force is never joined
-    with the torque of another sample.
+    t_ns: int
+    kind: int
+    value: NDArray[np.int32]
+    saturated: bool
+    begins: bool
+
+
+class WrenchAssembler:
+    """Pairs the force and torque frames of one board, in its order, whichever that is.
+
+    Either may come first, but always the same one: which one is learned from frames that come one
+    right after the other. Before that only such frames are paired. Two frames belong together if
+    they came in this order, with none between them, within three quarters of a period, and the
+    second cannot be of the sample before. Other frames are counted and dropped, so that force is
+    never joined with the torque of another sample, however late one of them is within its period
+    and whichever are lost. Time stamps may be those of reading, equal for all that waited.
+
+    Nothing distinguishes a board whose second half is always late by a whole period, to within
+    `NEXT_NS`, from one that sends the other half first.
 
     Args:
         board: its address.
         period_ms: between samples.
         full_scale: float64[6], N and N m of a value of 0x8000.
+        counters: to go on with; new ones by default.
     """
 
-    board: int
-    period_ms: int
-    full_scale: Floats
-    counters: StrainCounters = field(default_factory=StrainCounters)
-    _half: tuple[int, int, NDArray[np.int32], bool] | None = None
+    def __init__(
+        self,
+        board: int,
+        period_ms: int,
+        full_scale: Floats,
+        counters: StrainCounters | None = None,
+    ) -> None:
+        self.board = board
+        self.full_scale = full_scale
+        self.counters = StrainCounters() if counters is None else counters
+        period_ns = self._period_ns = 1_000_000 * period_ms
+        self._pair_ns = period_ms * PAIR_NS_PER_MS
+        self._next_ns = min(NEXT_NS, NEXT_SHARE * period_ns)
+        self._pause_ns = PAUSE_SHARE * period_ns
+        self._before: _Half | None = None
+        #: The frame before waits for its other half.
+        self._waits = False
+        #: When the one before that came, if it had waited in vain: its other half may still come.
+        self._owed_ns: int | None = None
+        #: The type that comes first, None until that is known; and by how many samples more that is
+        #: force than torque.
+        self._first: int | None = None
+        self._force_first = 0
 
     def take(self, frames: StrainFrames, t_ns_of: NDArray[np.int64]) -> list[Wrench]:
         """Take a batch's frames, and its times [n]; return the samples that they complete."""
@@ -190,24 +234,46 @@ class WrenchAssembler:
         samples = []
         for i in np.flatnonzero(mine).tolist():
             t_ns = int(t_ns_of[frames.row[i]])
-            sample = self._pair(
-                t_ns, int(frames.type[i]), frames.value[i], bool(frames.saturated[i])
+            begins = self._before is None or abs(t_ns - self._before.t_ns) >= self._pause_ns
+            half = _Half(
+                t_ns, int(frames.type[i]), frames.value[i], bool(frames.saturated[i]), begins
             )
+            sample = self._pair(half)
             if sample is not None:
                 samples.append(sample)
         return samples
 
-    def _pair(
-        self, t_ns: int, kind: int, value: NDArray[np.int32], saturated: bool
-    ) -> Wrench | None:
-        half, self._half = self._half, None
-        if half is None or half[1] == kind or abs(t_ns - half[0]) > self.period_ms * PAIR_NS_PER_MS:
-            self.counters.lone += half is not None
-            self._half = (t_ns, kind, value, saturated)
-            return None
-        force, torque = (half[2], value) if kind == StrainType.TORQUE else (value, half[2])
-        scaled = np.concatenate([force, torque]) * (self.full_scale / ZERO_WORD)
-        saturated = saturated or half[3]
+    def _pair(self, half: _Half) -> Wrench | None:
+        before, self._before = self._before, half
+        waited, self._waits = self._waits, False
+        owed_ns, self._owed_ns = self._owed_ns, None
+        if before is not None and before.kind != half.kind:
+            passed_ns = abs(half.t_ns - before.t_ns)
+            if before.begins and passed_ns <= self._next_ns:
+                self._note_order(before.kind)
+            owed = owed_ns is not None and abs(half.t_ns - owed_ns) < self._period_ns
+            in_order = waited and before.kind == self._first
+            if in_order and passed_ns <= self._pair_ns and not owed:
+                return self._joined(before, half)
+        elif before is not None and waited:
+            self._owed_ns = before.t_ns
+        self.counters.lone += waited
+        self._waits = self._first in (None, half.kind)
+        self.counters.lone += not self._waits
+        return None
+
+    def _note_order(self, first: int) -> None:
+        """A sample came whose first half was of this type."""
+        more = self._force_first + (1 if first == StrainType.FORCE else -1)
+        self._force_first = max(-ORDER_SAMPLES, min(more, ORDER_SAMPLES))
+        if self._first is None or abs(self._force_first) == ORDER_SAMPLES:
+            self._first = first
+
+    def _joined(self, first: _Half, second: _Half) -> Wrench:
+        in_order = first.kind == StrainType.FORCE
+        force, torque = (first, second) if in_order else (second, first)
+        scaled = np.concatenate([force.value, torque.value]) * (self.full_scale / ZERO_WORD)
+        saturated = first.saturated or second.saturated
         self.counters.samples += 1
         self.counters.saturated += saturated
-        return Wrench(t_ns, scaled[:3], scaled[3:], saturated)
+        return Wrench(second.t_ns, scaled[:3], scaled[3:], saturated)

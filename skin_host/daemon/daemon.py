@@ -523,7 +523,8 @@ class Daemon:
         return (
             *self.health.pulse(self.link.ports, self.link.boards),
             (output.connected, output.last_error, output.touches_dropped, output.refused),
-            (tuple(output.withheld), output.name_taken, tuple(self.unkept)),
+            (tuple(output.withheld), tuple(output.unsubscribed)),
+            (output.name_taken, tuple(self.unkept)),
         )
 
     def _under_way(self) -> asyncio.Task[None] | None:

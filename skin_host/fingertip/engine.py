@@ -12,6 +12,7 @@ from skin_host.bus.strain import (
     CHANNELS,
     LOADS,
     ZERO_WORD,
+    StrainFrames,
     StrainType,
     Wrench,
     WrenchAssembler,
@@ -54,15 +55,21 @@ class TipState:
             not answered.
         reported_scale: float64[6], those on which two answers in a row agreed: a damaged one has
             no checksum, and would be a wrong unit of everything.
-        last_ns, received_ns: time of its last frame, and the same by the ledger's clock, which does
-            not jump.
+        last_ns, sampled_ns: time of its last whole sample, and the same by the ledger's clock,
+            which does not jump. A contact is as old as that, whatever else the board sends.
+        received_ns: by that clock, when its last frame was received.
+        half_ns: the same of each type of frame of its samples.
+        wrong_ns: the same of frames of a wrong length.
+        begun_ns: the same of when it began to send what can be sampled.
         touched_since_ns: the same of its touch, if there is one.
         assembler: of its samples; None until the full scales are known.
         agreement: of its samples, which only together are a load.
         frozen: whether they are measured.
         saturated_ns: when its load was last saturated, 0 if never.
-        silenced: how often the board has timed out.
-        came: a frame of it was read since boards were last looked at.
+        silenced: how often the board has timed out: has sent nothing, or no whole sample.
+        alive: it sends.
+        incomplete: it sends, and for too long no whole sample.
+        came, sampled: a frame of it, and a whole sample, was read since boards were last looked at.
         awaited: the board is being set up and has not had the time to send yet.
         zeroing, touching: samples of which a zero is taken, and whether it was touched in each.
     """
@@ -77,26 +84,54 @@ class TipState:
     agreement: Agreement = field(default_factory=Agreement)
     frozen: Frozen = field(default_factory=Frozen)
     last_ns: int = 0
+    sampled_ns: int = 0
     received_ns: int = 0
+    half_ns: dict[int, int] = field(default_factory=dict)
+    wrong_ns: int | None = None
+    begun_ns: int = 0
     touched_since_ns: int | None = None
     frames: int = 0
     saturated_ns: int = 0
     silenced: int = 0
     alive: bool = False
+    incomplete: bool = False
     came: bool = False
+    sampled: bool = False
     awaited: bool = False
     zeroing: list[Floats] = field(default_factory=list)
     touching: list[bool] = field(default_factory=list)
 
     @property
+    def samples(self) -> int:
+        """How many whole samples it has sent."""
+        return 0 if self.assembler is None else self.assembler.counters.samples
+
+    def lately(self, at_ns: int | None) -> bool:
+        """Whether what came at a time, by the ledger's clock, is of what the board sends now."""
+        return at_ns is not None and self.received_ns - at_ns < self.tip.lost_ns
+
+    @property
+    def reports_all(self) -> bool:
+        """Whether the full scales of all channels are known. One below 0.5 is reported as 0."""
+        return bool((self.reported_scale > 0.0).all())
+
+    @property
     def scale_differs(self) -> bool:
-        """Whether the board reported other full scales than the configuration has."""
-        if self.settings.full_scale is None:
+        """Whether the board reported other full scales than are used."""
+        if self.assembler is None:
             return False
         known = self.reported_scale > 0.0
         # A board reports whole numbers.
-        off = np.abs(self.reported_scale - np.array(self.settings.full_scale))
+        off = np.abs(self.reported_scale - self.assembler.full_scale)
         return bool((off[known] > 0.5).any())
+
+    @property
+    def exchanged(self) -> bool:
+        """Whether it is another board than that whose full scales are used: not if they are given.
+
+        What it measures may be a fraction of what presses it, until it has a zero of its own.
+        """
+        return self.settings.full_scale is None and self.scale_differs
 
 
 class FingertipOutput(NamedTuple):
@@ -179,20 +214,35 @@ class FingertipEngine:
         if not len(frames.row) and not len(frames.wrong_length):
             return felt
         for address, state in here.items():
-            mine = np.flatnonzero((frames.board == address) & (frames.type >= LOADS))
-            if len(mine):
-                state.frames += len(mine)
-                if now_ns - state.received_ns >= state.tip.lost_ns:
-                    state.agreement.forget()
-                    state.frozen.doubt()
-                state.last_ns = int(batch.t_ns[frames.row[mine[-1]]])
-                state.received_ns = now_ns
-                state.came = state.alive = True
+            self._note_frames(state, frames, address)
             if state.assembler is not None:
                 for wrench in state.assembler.take(frames, batch.t_ns):
+                    self._note_sample(state, wrench)
                     felt.samples.append((state.number, wrench.t_ns))
                     felt.events.extend(self._step(state, wrench))
         return felt
+
+    def _note_frames(self, state: TipState, frames: StrainFrames, address: int) -> None:
+        """Note what a board sent, whether it can be sampled or not."""
+        types = frames.type[(frames.board == address) & (frames.type >= LOADS)].tolist()
+        wrong = int(np.count_nonzero(frames.wrong_length == address))
+        if not types and not wrong:
+            return
+        if not state.alive:
+            state.begun_ns = self._now_ns
+        state.frames += len(types) + wrong
+        state.half_ns.update(dict.fromkeys(types, self._now_ns))
+        if wrong:
+            state.wrong_ns = self._now_ns
+        state.received_ns = self._now_ns
+        state.came = state.alive = True
+
+    def _note_sample(self, state: TipState, wrench: Wrench) -> None:
+        if self._now_ns - state.sampled_ns >= state.tip.lost_ns:
+            state.agreement.forget()
+            state.frozen.doubt()
+        state.last_ns, state.sampled_ns = wrench.t_ns, self._now_ns
+        state.sampled, state.incomplete = True, False
 
     def note_skin(self, part: int, events: Iterable[Touch], t_ns: int) -> None:
         """Take in the contacts of a processed frame of a part (index in the layout)."""
@@ -201,7 +251,7 @@ class FingertipEngine:
             state.tip.note_skin(events, t_ns)
 
     def expire(self, t_ns: int, now_ns: int) -> list[FingertipEvent]:
-        """Find boards that have timed out.
+        """Find boards that have timed out, or send no whole samples any more.
 
         Args:
             t_ns: now, on the clock of the frames' time stamps, which may be set.
@@ -210,14 +260,19 @@ class FingertipEngine:
         self._now_ns = now_ns
         events: list[FingertipEvent] = []
         for state in self.tips.values():
+            # Until now: what waited in a pause of this computer is read at once.
             if state.came:
-                # Until now: what waited in a pause of this computer is read at once.
                 state.came, state.received_ns = False, now_ns
-            quiet_ns = now_ns - state.received_ns
-            if state.alive and quiet_ns > state.tip.silent_ns:
-                state.alive = False
-                state.silenced += 1
-            events += state.tip.expire(t_ns, quiet_ns)
+            if state.sampled:
+                state.sampled, state.sampled_ns = False, now_ns
+            since_ns = max(state.sampled_ns, state.begun_ns)
+            if state.alive and now_ns - state.received_ns > state.tip.silent_ns:
+                state.silenced += not state.incomplete
+                state.alive = state.incomplete = False
+            elif state.alive and state.assembler is not None and not state.incomplete:
+                state.incomplete = now_ns - since_ns >= state.tip.lost_ns
+                state.silenced += state.incomplete
+            events += state.tip.expire(t_ns, now_ns - state.sampled_ns)
             self._note_touch(state)
         return events
 
@@ -236,9 +291,15 @@ class FingertipEngine:
         return [event for state in self.tips.values() for event in state.tip.end_all(t_ns)]
 
     def begin_zero(self) -> None:
-        """Start to collect samples of the unloaded fingertips."""
+        """Start to collect samples of the unloaded fingertips.
+
+        From now on those whose boards were exchanged are read by the full scales of the new ones.
+        """
         self._zeroing = True
         for state in self.tips.values():
+            if state.exchanged and state.reports_all and not state.tip.lasts:
+                self._assemble(state, state.reported_scale.copy())
+                state.tip.use(None)
             state.zeroing.clear()
             state.touching.clear()
 
@@ -274,7 +335,7 @@ class FingertipEngine:
         events: list[FingertipEvent] = []
         load = state.agreement.take(wrench)
         state.frozen.take(wrench)
-        if not state.frozen.trusted:
+        if not state.frozen.trusted or state.exchanged:
             events = state.tip.lose(wrench.t_ns)
             self._note_touch(state)
         elif load is not None:
@@ -298,14 +359,15 @@ class FingertipEngine:
         if state.answered_scale[answer.channel] == answer.value:
             state.reported_scale[answer.channel] = answer.value
         state.answered_scale[answer.channel] = answer.value
-        if state.assembler is None and (state.reported_scale > 0.0).all():
+        if state.assembler is None and state.reports_all:
             self._assemble(state, state.reported_scale.copy())
 
-    @staticmethod
-    def _assemble(state: TipState, full_scale: Floats) -> None:
+    def _assemble(self, state: TipState, full_scale: Floats) -> None:
         table = state.settings
-        state.assembler = WrenchAssembler(table.address, table.period_ms, full_scale)
+        counters = None if state.assembler is None else state.assembler.counters
+        state.assembler = WrenchAssembler(table.address, table.period_ms, full_scale, counters)
         state.tip.set_range(full_scale)
+        state.begun_ns = self._now_ns
 
 
 def damaged(samples: Floats, step: Floats) -> Mask:

@@ -7,6 +7,7 @@ The record is published as `<fingertip>/health`, with the same schema, `state`, 
 from collections.abc import Iterator
 from typing import NotRequired, TypedDict
 
+from skin_host.bus.strain import StrainCounters, StrainType
 from skin_host.fingertip.engine import FingertipEngine, TipState
 from skin_host.health.diagnosis import FoundFault
 from skin_host.health.record import FaultName
@@ -25,8 +26,8 @@ class FingertipRecord(TypedDict):
     """One fingertip. Counters count from the start of the daemon.
 
     `lone` are frames whose other half did not arrive, `silences` counts how often the board timed
-    out, `full_scale` is N and N m of its channels, `threshold_n` the least force of a contact,
-    which noise may raise.
+    out or stopped to send whole samples, `age_ms` is of the last of these, `full_scale` is N and
+    N m of its channels, `threshold_n` the least force of a contact, which noise may raise.
     """
 
     part: str
@@ -61,9 +62,8 @@ class FingertipHealth:
     def tick(self, now_ns: int) -> None:
         """Read the counters; to be called several times a second."""
         for name, state in self._engine.tips.items():
-            counters = None if state.assembler is None else state.assembler.counters
-            samples, lone = (0, 0) if counters is None else (counters.samples, counters.lone)
-            totals = {"samples": samples, "lone": lone}
+            lone = 0 if state.assembler is None else state.assembler.counters.lone
+            totals = {"samples": state.samples, "lone": lone}
             gained = self._gained[name] = self._windows[name].note(now_ns, totals)
             if gained["lone"] >= max(FEW_LONE, LONE_SHARE * gained["samples"]):
                 self._lossy_ns[name] = now_ns
@@ -74,7 +74,7 @@ class FingertipHealth:
 
     def _record(self, state: TipState, now_ns: int | None) -> FingertipRecord:
         assembler, table = state.assembler, state.settings
-        counters = None if assembler is None else assembler.counters
+        counters = StrainCounters() if assembler is None else assembler.counters
         faults = list(self._faults(state, now_ns))
         gained = self._gained.get(state.name)
         rate_hz = gained["samples"] / gained["seconds"] if gained and gained["seconds"] else 0.0
@@ -84,11 +84,11 @@ class FingertipHealth:
             "state": _state(state, faults),
             "bus": table.bus,
             "address": table.address,
-            "samples": 0 if counters is None else counters.samples,
+            "samples": counters.samples,
             "rate_hz": round(rate_hz, 2),
-            "lone": 0 if counters is None else counters.lone,
-            "saturated": 0 if counters is None else counters.saturated,
-            "wrong_length": 0 if counters is None else counters.wrong_length,
+            "lone": counters.lone,
+            "saturated": counters.saturated,
+            "wrong_length": counters.wrong_length,
             "silences": state.silenced,
             "full_scale": None if assembler is None else assembler.full_scale.tolist(),
             "threshold_n": round(state.tip.threshold_n, 4),
@@ -104,7 +104,7 @@ class FingertipHealth:
 
     def _faults(self, state: TipState, now_ns: int | None) -> Iterator[FoundFault]:
         """Each cause before its consequences: the first fault gives the state."""
-        name, table = state.name, state.settings
+        name, table, assembler = state.name, state.settings, state.assembler
         here = f"the force/torque board of {name} (bus {table.bus}, address {table.address})"
 
         def fault(code: str, sentence: str) -> FoundFault:
@@ -112,29 +112,38 @@ class FingertipHealth:
 
         if not state.frames and not state.awaited:
             yield fault("absent", f"{here} has not sent anything yet; check power and address")
-        elif not state.alive and now_ns is not None:
+        elif state.frames and not state.alive and now_ns is not None:
             yield fault(
                 "silent", f"{here} has stopped sending; it is set up again; check its power"
             )
-        if state.frames and state.assembler is None:
+        elif state.incomplete:
+            yield fault("incomplete", f"{here} {_incomplete(state)}")
+        if state.frames and assembler is None:
             yield fault(
                 "not_configured",
                 f"{here} does not report its full scales; set fingertips.{name}.full_scale",
             )
         if state.scale_differs:
-            reported = ", ".join(f"{value:g}" for value in state.reported_scale)
-            yield fault(
-                "scale",
-                f"{here} reports other full scales ({reported}) than fingertips.{name}.full_scale, "
-                "which is used",
+            assert assembler is not None
+            reported, used = (
+                ", ".join(f"{value:g}" for value in scale)
+                for scale in (state.reported_scale, assembler.full_scale)
             )
-        if state.alive and state.frozen.repeated:
+            if state.exchanged:
+                than = (
+                    f"({used}) before, as another board does: nothing is felt; calibrate it "
+                    "unloaded: skin command calibrate"
+                )
+            else:
+                than = f"fingertips.{name}.full_scale, which is used"
+            yield fault("scale", f"{here} reports other full scales ({reported}) than {than}")
+        if state.alive and not state.incomplete and state.frozen.repeated:
             yield fault(
                 "frozen",
                 f"{here} repeats the same {' and '.join(state.frozen.repeated)} for longer than "
                 "chance allows: its converter has stopped; switch it off and on",
             )
-        if state.assembler is not None and not state.tip.zeroed:
+        if assembler is not None and not state.tip.zeroed:
             yield fault(
                 "not_calibrated",
                 f"{name} has no zero: no contact is reported; calibrate it unloaded: "
@@ -159,7 +168,8 @@ class FingertipHealth:
             return
         if state.saturated_ns and abs(now_ns - state.saturated_ns) < HOLD_NS:
             yield fault("saturated", f"{here} is saturated: the load is beyond its range")
-        if abs(now_ns - self._lossy_ns.get(name, -HOLD_NS)) < HOLD_NS and self._lossy_ns.get(name):
+        lossy_ns = self._lossy_ns.get(name)
+        if lossy_ns is not None and abs(now_ns - lossy_ns) < HOLD_NS and not state.incomplete:
             yield fault(
                 "loses_frames",
                 f"{here}: force comes without torque, or the reverse: frames are lost or late; "
@@ -171,6 +181,23 @@ class FingertipHealth:
                 f"{name} has been touched for so long that its zero is uncertain; calibrate it "
                 "unloaded",
             )
+
+
+def _incomplete(state: TipState) -> str:
+    """Return what a board sends instead of whole samples, and what mends it."""
+    names = {StrainType.FORCE: "force", StrainType.TORQUE: "torque"}
+    came = [name for kind, name in names.items() if state.lately(state.half_ns.get(kind))]
+    wrong = "frames of a wrong length" if state.lately(state.wrong_ns) else ""
+    mend = "it is set up again; switch it off and on"
+    if len(came) == len(names):
+        sends = "force and torque that do not follow each other within a period"
+        mend = "the bus is overloaded or badly terminated"
+    elif came:
+        (missing,) = set(names.values()) - set(came)
+        sends = f"{came[0]} without {missing}" + (f", and {wrong}" if wrong else "")
+    else:
+        sends = f"only {wrong}"
+    return f"sends {sends}: without whole samples nothing is felt; {mend}"
 
 
 def _unreached(state: TipState) -> str:
@@ -189,6 +216,7 @@ def _unreached(state: TipState) -> str:
 
 _STATES = {
     "fingertip_silent": "silent",
+    "fingertip_incomplete": "silent",
     "fingertip_not_configured": "not configured",
     "fingertip_not_calibrated": "not calibrated",
     "fingertip_saturated": "saturated",

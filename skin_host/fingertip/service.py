@@ -25,8 +25,8 @@ log = logging.getLogger(__name__)
 class _Known:
     state: TipState
     started: bool = False
-    frames: int = 0
-    heard_ns: int = 0
+    samples: int = 0
+    sampled_ns: int = 0
     retry_at_ns: int = 0
     retries: int = 0
 
@@ -71,14 +71,13 @@ class StrainBoards:
         """Supervise every board; set-ups run as separate tasks, so this does not wait for them."""
         now_ns = self._clock()
         for board in self._boards:
-            if board.state.frames != board.frames:
-                board.frames, board.heard_ns = board.state.frames, now_ns
-                if board.state.assembler is not None:
-                    board.retries = 0
-            sends = now_ns - board.heard_ns <= board.state.tip.silent_ns
-            well = sends and board.state.assembler is not None
+            if board.state.samples != board.samples:
+                board.samples, board.sampled_ns = board.state.samples, now_ns
+                board.retries = 0
+            # What comes but is no sample, as force without torque, is no more than silence.
+            well = now_ns - board.sampled_ns <= board.state.tip.silent_ns
             due = board.started and now_ns >= board.retry_at_ns
-            board.state.awaited &= not (due or board.frames)
+            board.state.awaited &= not (due or board.state.frames)
             if due and self._busy is None and not (well and not board.state.scale_differs):
                 self._busy = asyncio.create_task(self._mend(board, well=well))
 

@@ -196,6 +196,11 @@ class Tip:
         return self._reported is not None
 
     @property
+    def lasts(self) -> bool:
+        """Whether something has begun and not ended: a slip may outlast its contact a little."""
+        return self.touched or bool(self.flags & (Flags.SLIP | Flags.OVER))
+
+    @property
     def unreached(self) -> bool:
         """Whether there are directions in which no load within the board's range is a touch."""
         return self.threshold_n > self.reach_n
@@ -279,16 +284,16 @@ class Tip:
         return events
 
     def expire(self, t_ns: int, quiet_ns: int) -> list[FingertipEvent]:
-        """End a contact whose samples have stopped for too long: now, and for how long."""
+        """End what has begun, if samples have stopped for too long: now, and for how long."""
         return [] if quiet_ns < self.lost_ns else self.lose(t_ns)
 
     def lose(self, t_ns: int) -> list[FingertipEvent]:
-        """End a contact, because samples have stopped or do not show it any more."""
+        """End what has begun, because samples have stopped or do not show it any more."""
         self._arrives = False
-        return [] if self._reported is None else self.end_all(t_ns, "lost")
+        return self.end_all(t_ns, "lost") if self.lasts else []
 
     def end_all(self, t_ns: int, reason: Reason = "stopped") -> list[FingertipEvent]:
-        """End all contacts, because the fingertip will not send for a while."""
+        """End all that has begun, because the fingertip will not send for a while."""
         events: list[FingertipEvent] = []
         if self.flags & Flags.SLIP:
             number = self._ids[Flags.SLIP]

@@ -438,6 +438,13 @@ def _output(output: dict[str, Any] | None, lost_lately: Collection[str]) -> Iter
             f"the broker does not take what is published at {topics}; check its packet limit and "
             "its access rules",
         )
+    if output.get("unsubscribed"):
+        topics = ", ".join(output["unsubscribed"])
+        yield fault(
+            "broker_withholds",
+            f"the broker does not let this node receive what is sent to {topics}; check its access "
+            "rules (commands come through cmd/+)",
+        )
     if output.get("name_taken"):
         yield fault(
             "node_name_taken",

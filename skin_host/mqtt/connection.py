@@ -340,6 +340,9 @@ class Connection(aiomqtt.Client):
 
         With MQTT 5 messages show whether they were published as retained, also those that come
         while we listen.
+
+        Raises:
+            MqttError: the connection is lost, or there is no answer for `TIMEOUT_S`.
         """
         if not self._takes_wildcards and any(one in topic for one in "+#"):
             return False
@@ -494,6 +497,9 @@ class Connection(aiomqtt.Client):
         closed = reason_code.value == _CLOSED
         self.ended_by_broker = not self._cut and (accused or closed)
         self.without_reason = not self._cut and closed
+        for answer in self._pending_subscribes.values():  # aiomqtt would wait until its timeout
+            if not answer.done():
+                answer.set_exception(aiomqtt.MqttCodeError(reason_code, "closed"))
         if self._connected.cancelled():
             return  # the attempt was given up; aiomqtt would raise
         if not self._connected.done():  # aiomqtt would wait for the answer until its timeout
@@ -694,6 +700,7 @@ def explain(error: BaseException) -> str:
 
 _HINTS = {
     "Unspecified error": "the broker closed the connection",
+    "The client is not currently connected": "the broker closed the connection",
     "Connection refused": "no broker listens there",
     "Operation timed out": "the broker does not answer",
     "Not authorized": "check mqtt.username and its password",

@@ -5,7 +5,9 @@ first, then all frames of that turn in one write. While the socket is full they 
 where a newer frame of a part replaces the one before, which is counted.
 
 Messages that were in flight when the broker ended a connection are sent one at a time over the
-next: if one of them is the reason, it is found, dropped after `trials.TRIES`, counted and named.
+next: if one of them is the reason, it is found after `trials.TRIES`, counted and named. An event is
+dropped then; states and frames of its topic are withheld for a while. Without the status nothing
+is sent: who sees no node online must not see its contacts.
 """
 
 import asyncio
@@ -30,6 +32,7 @@ from skin_host.mqtt.frames import encode_frame
 from skin_host.mqtt.outbox import Outbox
 from skin_host.mqtt.packets import publish_head, publish_packet
 from skin_host.mqtt.topics import Topics
+from skin_host.mqtt.trials import REJECTIONS
 from skin_host.processing.pipeline import PressureFrame
 
 #: Limit of unacknowledged messages. Together less than the 20 that mosquitto and paho allow, so
@@ -51,6 +54,18 @@ class FrameForm(NamedTuple):
     properties: PackedProperties | None
 
 
+class Suspect(NamedTuple):
+    """The only publication that was in flight when the broker ended the connection.
+
+    Attributes:
+        topic: its topic.
+        found: how often in a row this topic has been found to be the reason, see `Trials.strike`.
+    """
+
+    topic: str
+    found: int
+
+
 class _InFlight(NamedTuple):
     """A message on its way: done when it is acknowledged, which must be before `until_s`."""
 
@@ -64,7 +79,7 @@ class Courier:
     Args:
         outbox: the messages to send.
         topics: of the robot.
-        status: the topic of the node's status, which is never dropped.
+        status: the topic of the node's status, which is never withheld.
         form: how frames are written.
         state_properties: of a topic's retained payload.
         after_states: called when all retained messages have been acknowledged.
@@ -150,9 +165,9 @@ class Courier:
         finally:
             self._to = None
 
-    def note_end(self, connection: Connection) -> str | None:
-        """Note the end of the connection; return the topic of a publication that was dropped
-        because of it.
+    def note_end(self, connection: Connection) -> Suspect | None:
+        """Note the end of the connection; return the publication that may be the reason, if one
+        alone was in flight.
         """
         outbox = self._outbox
         outbox.drop_frames()
@@ -161,40 +176,64 @@ class Courier:
         self._events_out.clear()
         answers = sum(not event.is_touch for event in islice(outbox.events, out))
         states = [topic for topic, done in self._states_out.items() if not done.done()]
+        first = outbox.events[0].topic if out else ""
         outbox.drop_answers()
         if not connection.ended_by_broker:
             return None
         events = out - answers
-        if out + len(states) == 1 and not answers and self._works and states != [self._status]:
-            topic = outbox.events[0].topic if events else states[0]
-            payload = outbox.events[0].payload if events else outbox.retained[topic].payload
-            if outbox.trials.strike(topic, payload):
-                if events:
-                    outbox.give_up_event()
-                    self._events_alone = max(0, self._events_alone - 1)
-                else:
-                    outbox.give_up_state(topic)
-                    self._states_alone.pop(topic, None)
-                return topic
         if out + len(states) == 0:
             return self._judge_frames()
         self._events_alone = max(self._events_alone, events)
         self._states_alone |= dict.fromkeys(states)
-        return None
+        if out + len(states) > 1:
+            return None
+        if answers:  # lost in any case, so it need not be found
+            return Suspect(first, 0)
+        # The status is the first of all, so nothing needs to have worked before it.
+        if states == [self._status]:
+            return Suspect(self._status, outbox.trials.strike(self._status))
+        if not self._works:
+            return None
+        return self._judge_event() if events else self._judge_state(states[0])
 
-    def _judge_frames(self) -> str | None:
+    def _judge_event(self) -> Suspect:
+        """Judge the first event, which alone was in flight."""
+        outbox = self._outbox
+        topic = outbox.events[0].topic
+        found = outbox.trials.strike(topic)
+        if found:
+            outbox.give_up_event()
+            self._events_alone -= 1
+        if found >= REJECTIONS:
+            outbox.trials.withhold(topic)
+        return Suspect(topic, found)
+
+    def _judge_state(self, topic: str) -> Suspect:
+        """Judge a state that alone was in flight."""
+        found = self._strike(topic)
+        if found:
+            self._states_alone.pop(topic, None)
+        return Suspect(topic, found)
+
+    def _judge_frames(self) -> Suspect | None:
         """Judge frames, if nothing else was in flight."""
         part, self._frame_tried = self._frame_tried, None
         if part is None:
             self._frames_alone |= self._frames_out
             return None
         topic = self._topics.part("frame", part)
-        if not self._outbox.trials.strike(topic, b""):
-            return None
-        self._outbox.trials.withhold(topic)
-        self._outbox.counters.rejected += 1
-        self._frames_alone.pop(part, None)
-        return topic
+        found = self._strike(topic)
+        if found:
+            self._frames_alone.pop(part, None)
+        return Suspect(topic, found)
+
+    def _strike(self, topic: str) -> int:
+        """A strike for states or frames; their topic is withheld when it is found."""
+        found = self._outbox.trials.strike(topic)
+        if found:
+            self._outbox.trials.withhold(topic)
+            self._outbox.counters.rejected += 1
+        return found
 
     def _fits(
         self,
@@ -242,7 +281,9 @@ class Courier:
             status = {self._status: outbox.retained[self._status]}
             sent = self._send_state(connection, self._status, status[self._status].payload)
             if sent is not None:
+                self._states_out[self._status] = sent
                 await within(TIMEOUT_S, sent)
+                del self._states_out[self._status]
                 outbox.states_sent(status)
                 self._works = True
             self._states_alone.pop(self._status, None)

@@ -47,6 +47,9 @@ class PublisherCounters(Struct):
         rejected: publications that were dropped because the broker ended the connection
             whenever they were sent.
         withheld: topics to which nothing is sent because of that, or of the size of the message.
+        unsubscribed: topics that this node should receive and does not, though it is connected: the
+            broker does not allow the subscription, does not answer it, or ends the connection
+            over it. Without that of commands none is received.
         name_taken: connections are ended as if another client used this node's name.
         answers_dropped: answers to commands that were lost with a connection, or that the broker
             does not take.
@@ -65,6 +68,7 @@ class PublisherCounters(Struct):
     refused: int = 0
     rejected: int = 0
     withheld: list[str] = []
+    unsubscribed: list[str] = []
     name_taken: bool = False
     answers_dropped: int = 0
     commands_taken: int = 0
@@ -129,7 +133,7 @@ class Outbox:
         #: By topic and contact: its last event, if that is a move, and the event's number.
         self._last_moves: dict[tuple[str, int], tuple[Event, int]] = {}
         self._version = 0
-        #: States that the broker did not take, by topic.
+        #: States that are larger than the broker takes, by topic.
         self._given_up: dict[str, State] = {}
         self._frame_ns = int(1e9 / frame_hz) if frame_hz else 0
         self._frame_due_ns: dict[str, int] = {}
@@ -299,7 +303,7 @@ class Outbox:
         self.retained_put.set()
 
     def give_up_state(self, topic: str) -> None:
-        """Drop a retained message that the broker does not take, until it changes."""
+        """Drop a retained message that is larger than the broker takes, until it changes."""
         self.counters.rejected += 1
         self._given_up[topic] = self.retained[topic]
         self.pending.pop(topic, None)

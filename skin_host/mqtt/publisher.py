@@ -37,7 +37,7 @@ from skin_host.mqtt.connection import (
     message_properties,
     within,
 )
-from skin_host.mqtt.courier import Courier, FrameForm
+from skin_host.mqtt.courier import Courier, FrameForm, Suspect
 from skin_host.mqtt.frames import load_cbor2
 from skin_host.mqtt.info import (
     MAX_PIECES,
@@ -60,7 +60,7 @@ from skin_host.mqtt.order import (
 from skin_host.mqtt.outbox import Event, Outbox, PublisherCounters
 from skin_host.mqtt.payload import CBOR_TYPE, JSON_TYPE
 from skin_host.mqtt.topics import OFFLINE, ONLINE, PartTopic, Topics
-from skin_host.mqtt.trials import TRIES
+from skin_host.mqtt.trials import TRIES, Trials
 from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
 
@@ -141,6 +141,14 @@ class Publisher:
         self._drain_s = drain_s
         self._status = self.topics.node("status", node)
         self._commands = self.topics.command(node, "+").removesuffix("/+")
+        self._wanted = [self._status]
+        if self._command_handler is not None:
+            self._wanted.append(self.topics.command(node, "+"))
+        #: Of these, those that the broker has acknowledged, and the one that waits for that.
+        self._subscribed: set[str] = set()
+        self._asked: str | None = None
+        #: Of subscriptions, over which a broker may end the connection as over publications.
+        self._trials = Trials(clock.monotonic_s)
 
         self._outbox = Outbox(settings.event_queue, settings.frame_hz, clock)
         self._outbox.put_state(self._status, ONLINE)
@@ -201,6 +209,7 @@ class Publisher:
             known,
             touches_waiting=self._outbox.touches_waiting(),
             withheld=[*self._outbox.trials.withheld, *self._courier.too_large][:MAX_NAMED],
+            unsubscribed=self._unsubscribed(),
             name_taken=self._clock.monotonic_s() < self._name_taken_until_s,
             refused=known.refused + (connection.refused if connection else 0),
             commands_taken=handler.taken if handler else 0,
@@ -208,6 +217,16 @@ class Publisher:
             + (handler.refused if handler else 0)
             + (connection.discarded if connection else 0),
         )
+
+    @property
+    def frames_waiting(self) -> int:
+        """How many frames have not been written: the newest of each part at most."""
+        return len(self._outbox.frames)
+
+    def _unsubscribed(self) -> list[str]:
+        if not self._outbox.counters.connected:
+            return []
+        return [topic for topic in self._wanted if topic not in self._subscribed]
 
     def put_info(self, info: NodeInfo, elsewhere: Collection[str] = ()) -> None:
         """Publish the description of this node; again whenever it changes.
@@ -345,7 +364,8 @@ class Publisher:
         """How long to leave the name to another daemon that seems to have taken it.
 
         Not every broker gives a reason when it closes the older of two connections of one name.
-        Over a publication it closes no more than `TRIES` + 1 in a row.
+        An end does not count if one thing alone waited for its answer, because that may be the
+        reason; of the others such a reason causes no more than `TRIES` + 1 in a row.
         """
         ended, self._was_ended = self._was_ended, False
         self._closed_in_a_row = self._closed_in_a_row + 1 if ended and up_s < GOOD_S else 0
@@ -371,7 +391,7 @@ class Publisher:
         self._connection = connection
         self._met_status = False
         # Who sees this node online may ask it at once: it listens first.
-        await self._subscribe(connection)
+        later = await self._subscribe(connection)
         self._outbox.counters.connected = True
         self._outbox.counters.connections += 1
         if self._is_brief:
@@ -390,6 +410,7 @@ class Publisher:
                 group.create_task(self._listen(connection)),
                 group.create_task(connection.lost()),
                 group.create_task(self._clear_left(connection)),
+                group.create_task(self._subscribe_later(connection, later)),
             ]
             await self._closing.wait()
             await self._outbox.drained()
@@ -413,16 +434,33 @@ class Publisher:
         counters.connected = False
         if connection is None:
             return
-        self._was_ended = connection.taken_over or connection.without_reason
         counters.refused += connection.refused
         counters.commands_refused += connection.discarded
         self._connection = None
-        topic = self._courier.note_end(connection)
-        if topic is not None:
-            self._closed_in_a_row = 0
-            why = f"the broker ends the connection when this is published: {topic}"
-            counters.last_error = why
-            _log.warning("broker %s: %s; given up", self._broker, why)
+        self._subscribed.clear()
+        suspect = self._courier.note_end(connection)
+        asked, self._asked = self._asked, None
+        if asked is not None and connection.ended_by_broker:
+            suspect = Suspect(asked, self._trials.strike(asked))
+            if suspect.found:
+                self._trials.withhold(asked)
+                self._name_reason(connection, f"we subscribe to: {asked}", "; given up")
+        elif suspect is not None and suspect.found:
+            # The status is not given up: every connection ends over it.
+            is_status = suspect.topic == self._status
+            what, then = f"this is published: {suspect.topic}", "" if is_status else "; given up"
+            self._name_reason(connection, what, then, log=suspect.found == 1 or not is_status)
+        self._was_ended = connection.taken_over or (connection.without_reason and suspect is None)
+
+    def _name_reason(
+        self, connection: Connection, what: str, then: str, *, log: bool = True
+    ) -> None:
+        """Name what the broker ends connections over, with the reason that it gives."""
+        counters = self._outbox.counters
+        given = "" if connection.without_reason else f": {counters.last_error}"
+        counters.last_error = f"the broker ends the connection when {what}{given}"
+        if log:
+            _log.warning("broker %s: %s%s", self._broker, counters.last_error, then)
 
     def _note_refusals(self, connection: Connection) -> None:
         why = f"the broker refuses what we publish: {connection.refusal}"
@@ -446,29 +484,53 @@ class Publisher:
     def _parts_in_will(self) -> Sequence[str]:
         return () if str(self._broker) in self._without_parts else that_fit(self._parts)
 
-    async def _subscribe(self, connection: Connection) -> None:
-        wanted = [self._status]
-        if self._command_handler is not None:
-            wanted.append(self.topics.command(self._node, "+"))
-        for topic in wanted:
+    async def _subscribe(self, connection: Connection) -> list[str]:
+        """Subscribe to what a node listens to; return what is withheld."""
+        withheld = [topic for topic in self._wanted if self._trials.withholds(topic)]
+        for topic in self._wanted:
+            if topic not in withheld and not await self._subscribe_to(topic, connection):
+                break  # this broker answers none
+        return withheld
+
+    async def _subscribe_later(self, connection: Connection, topics: Sequence[str]) -> None:
+        """Subscribe to what was withheld: the broker's rules may have changed."""
+        for topic in topics:
+            left_s = (self._trials.until_s(topic) or 0.0) - self._clock.monotonic_s()
+            await self._clock.sleep(max(left_s, 0.0))
+            await self._subscribe_to(topic, connection)
+
+    async def _subscribe_to(self, topic: str, connection: Connection) -> bool:
+        """Subscribe to a topic; return whether the broker answers, not whether it allows it.
+
+        Raises:
+            MqttError: the connection is lost.
+        """
+        self._asked = topic
+        try:
+            allowed = await connection.listen_to(topic)
+        except MqttError as error:
+            # A broker that is frozen does not answer this either.
+            properties = self._state_properties(self._status, ONLINE)
             try:
-                allowed = await connection.listen_to(topic)
+                done = connection.send(
+                    self._status, ONLINE, qos=1, retain=True, properties=properties
+                )
             except MqttError:
-                # A broker that is frozen does not answer this either.
-                properties = self._state_properties(self._status, ONLINE)
-                await within(
-                    TIMEOUT_S,
-                    connection.send(
-                        self._status, ONLINE, qos=1, retain=True, properties=properties
-                    ),
-                )
-                _log.warning(
-                    "broker %s: no commands are received: it does not acknowledge the subscription",
-                    self._broker,
-                )
-                return
-            if not allowed:
-                _log.warning("broker %s: may not subscribe to %s", self._broker, topic)
+                raise error from None
+            self._asked = None
+            await within(TIMEOUT_S, done)
+            _log.warning(
+                "broker %s: no commands are received: it does not acknowledge the subscription",
+                self._broker,
+            )
+            return False
+        self._asked = None
+        self._trials.arrived(topic)
+        if allowed:
+            self._subscribed.add(topic)
+        else:
+            _log.warning("broker %s: may not subscribe to %s", self._broker, topic)
+        return True
 
     def _note_left(self, parts: set[str]) -> None:
         """Note the parts of which this node published before, by another configuration."""

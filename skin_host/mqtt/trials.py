@@ -1,18 +1,23 @@
-"""Finds publications that make a broker end the connection, and withholds their topics. Pure.
+"""Finds what makes a broker end the connection, and withholds its topics. Pure.
 
-A publication gets a strike when it was the only one in flight as the broker ended the connection.
+A topic gets a strike when a publication to it, or a subscription, was all that waited for an answer
+as the broker ended the connection. Strikes are of topics, not of payloads: a state that is sent
+again may be a newer one each time.
 """
 
 from collections.abc import Callable
 
 from skin_host.clock import SYSTEM
 
-#: A publication is dropped after this many strikes.
+#: A topic is found after this many strikes.
 TRIES = 3
-#: When this many in a row to one topic were dropped, nothing is sent to it ...
+#: When this many events in a row of one topic were dropped, none is sent to it ...
 REJECTIONS = 3
-#: ... for this long.
+#: ... for this long. States, frames and subscriptions are withheld for as long when their topic is
+#: found.
 HOLD_S = 600.0
+#: Each time from then on it is twice as long, up to this: each try costs a connection.
+LONGEST_HOLD_S = 3600.0
 
 
 class Trials:
@@ -24,8 +29,8 @@ class Trials:
 
     def __init__(self, now_s: Callable[[], float] = SYSTEM.monotonic_s) -> None:
         self._now_s = now_s
-        self._strikes: dict[tuple[str, bytes], int] = {}
-        self._rejections: dict[str, int] = {}
+        self._strikes: dict[str, int] = {}
+        self._hold_s: dict[str, float] = {}
         self._until_s: dict[str, float] = {}
 
     @property
@@ -42,32 +47,26 @@ class Trials:
         """Until when this topic is or was withheld, if something has not arrived since."""
         return self._until_s.get(topic)
 
-    def strike(self, topic: str, payload: bytes) -> bool:
-        """The connection ended while only this was in flight; return whether to drop it.
+    def strike(self, topic: str) -> int:
+        """The connection ended while only this waited for an answer.
 
-        Once one of a topic was dropped, the next ones have a single try, until one arrives.
+        Returns:
+            How often the topic has been found: 0 before `TRIES` strikes, and one more with each
+            strike from then on, until something arrives.
         """
-        key = topic, payload
-        strikes = self._strikes.pop(key, 0) + 1
-        if strikes < TRIES and topic not in self._rejections:
-            self._strikes[key] = strikes
-            return False
-        self.reject(topic)
-        return True
-
-    def reject(self, topic: str) -> None:
-        """A publication to this topic was dropped."""
-        self._rejections[topic] = self._rejections.get(topic, 0) + 1
-        if self._rejections[topic] >= REJECTIONS:
-            self.withhold(topic)
+        strikes = self._strikes[topic] = self._strikes.get(topic, 0) + 1
+        return max(0, strikes - TRIES + 1)
 
     def withhold(self, topic: str) -> None:
-        """Send nothing to this topic for `HOLD_S`."""
-        self._until_s[topic] = self._now_s() + HOLD_S
+        """Send nothing to this topic for `HOLD_S`, or longer if nothing arrived after the last
+        time.
+        """
+        hold_s = min(2 * self._hold_s.get(topic, HOLD_S / 2), LONGEST_HOLD_S)
+        self._hold_s[topic] = hold_s
+        self._until_s[topic] = self._now_s() + hold_s
 
     def arrived(self, topic: str) -> None:
-        """A publication to this topic was acknowledged."""
-        if self._strikes or self._rejections:
-            self._rejections.pop(topic, None)
-            self._until_s.pop(topic, None)
-            self._strikes = {key: n for key, n in self._strikes.items() if key[0] != topic}
+        """Something of this topic was acknowledged."""
+        self._strikes.pop(topic, None)
+        self._hold_s.pop(topic, None)
+        self._until_s.pop(topic, None)

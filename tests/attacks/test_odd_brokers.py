@@ -1,10 +1,12 @@
-"""Brokers that follow the letter of MQTT 5 and allow little, or answer only half of what they must.
+"""Brokers that follow the letter of MQTT 5 and allow little, or answer only half of what they must,
+or end the connection over one topic.
 
 Whatever a broker withholds, the node publishes what it may, says in a line what is missing, and
 does not fill the log.
 """
 
 import asyncio
+import itertools
 import logging
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
@@ -13,9 +15,10 @@ from typing import Any
 import pytest
 
 from skin_host.config.settings import Mqtt
-from skin_host.mqtt import connection
+from skin_host.mqtt import connection, trials
 from skin_host.mqtt.commands import Handler
 from skin_host.mqtt.publisher import Publisher
+from skin_host.mqtt.trials import TRIES
 from tests.support.packets import PUBLISH, SUBSCRIBE, packet_with_flags, suback
 from tests.support.waiting import until
 
@@ -28,6 +31,8 @@ class Odd:
     """A broker with these properties of CONNACK, which ends a connection for a reason code.
 
     Attributes:
+        ends_over: publications to this topic, or subscriptions to it, end the connection without
+            a word.
         topics: of all publications.
         in_flight, most: unacknowledged publications, now and at most.
     """
@@ -40,7 +45,9 @@ class Odd:
         wildcards: bool = True,
         judge: Callable[["Odd", int], int] = lambda *_: 0,
         connack_s: float = 0.0,
+        ends_over: tuple[int, str] | None = None,
     ) -> None:
+        self.ends_over = ends_over
         self._properties, self._subscribes, self._judge = properties, subscribes, judge
         self._connack_s = connack_s
         self._wildcards = wildcards
@@ -69,10 +76,14 @@ class Odd:
             if first >> 4 == SUBSCRIBE and b"+" in body and not self._wildcards:
                 writer.write(bytes([DISCONNECT, 1, WILDCARDS_NOT_SUPPORTED]))
                 return
+            if first >> 4 == SUBSCRIBE and self.ends_over == (SUBSCRIBE, body[5:-1].decode()):
+                return
             if first >> 4 == SUBSCRIBE and self._subscribes:
                 writer.write(suback(body))
             elif first >> 4 == PUBLISH and first & QOS_1:
                 end = 2 + int.from_bytes(body[:2], "big")
+                if self.ends_over == (PUBLISH, body[2:end].decode()):
+                    return
                 self.topics.append(body[2:end].decode())
                 self.in_flight += 1
                 self.most = max(self.most, self.in_flight)
@@ -129,6 +140,7 @@ async def test_touches_reach_a_broker_that_never_acknowledges_a_subscription(
     async with publishing(broker) as publisher:
         await until(lambda: len(set(broker.topics)) >= 13)
         assert publisher.counters.connected
+        assert publisher.counters.unsubscribed == ["skin/robot/nodes/main/status"]
     assert broker.connections == 1
     said = [line for line in lines(caplog) if "no commands are received" in line]
     assert len(said) == 1
@@ -139,8 +151,9 @@ async def test_a_broker_without_wildcards_takes_everything_but_commands(
 ) -> None:
     """It ends the connection over a subscription with one (MQTT 5.0, 3.2.2.3.11)."""
     broker = Odd(b"\x28\0", wildcards=False)
-    async with publishing(broker, answer):
+    async with publishing(broker, answer) as publisher:
         await until(lambda: len(set(broker.topics)) >= 13)
+        assert publisher.counters.unsubscribed == ["skin/robot/nodes/main/cmd/+"]
     assert broker.connections == 1
     said = [
         line for line in lines(caplog) if "may not subscribe to skin/robot/nodes/main/cmd/+" in line
@@ -171,3 +184,81 @@ async def test_an_acknowledgement_that_drips_is_given_up_in_a_line(
         await until(lambda: broker.connections >= 3)
     assert len(lines(caplog)) == 1
     assert not [record for record in caplog.records if record.name == "asyncio"]
+
+
+@pytest.fixture
+def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next connection follows at once."""
+    monkeypatch.setattr(connection, "FIRST_RETRY_S", 0.05)
+    monkeypatch.setattr(connection, "LAST_RETRY_S", 0.05)
+
+
+@pytest.mark.usefixtures("hasty")
+async def test_a_state_that_differs_at_every_try_is_found_and_all_else_is_published(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    topic = "skin/robot/palm/health"
+    numbers = itertools.count()
+    broker = Odd(ends_over=(PUBLISH, topic))
+    async with publishing(broker) as publisher:
+
+        def goes_on() -> bool:
+            publisher.put_health("palm", {"number": next(numbers)})
+            return publisher.counters.connected and "skin/robot/after/contact" in broker.topics
+
+        def is_found() -> bool:
+            publisher.put_health("palm", {"number": next(numbers)})
+            return broker.connections > 2 * TRIES or bool(publisher.counters.withheld)
+
+        await until(is_found)
+        publisher.put_contact("after", "ON")
+        await until(goes_on)
+        counters = publisher.counters
+        assert counters.withheld == [topic]
+        assert counters.last_error.endswith(f"when this is published: {topic}")
+        assert not counters.name_taken
+        assert counters.rejected == 1
+    assert broker.connections <= TRIES + 2
+    assert sum(topic in line for line in lines(caplog)) == 1
+
+
+@pytest.mark.usefixtures("hasty")
+async def test_a_broker_that_never_takes_the_status_is_named_for_that_in_a_line(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Nothing is published without it: who sees no node online must not see its contacts."""
+    topic = "skin/robot/nodes/main/status"
+    broker = Odd(ends_over=(PUBLISH, topic))
+    async with publishing(broker, answer) as publisher:
+        await until(lambda: broker.connections >= 3 * TRIES)
+        counters = publisher.counters
+        assert counters.last_error.endswith(f"when this is published: {topic}")
+        assert not counters.name_taken
+        assert counters.withheld == []
+    assert sum(topic in line for line in lines(caplog)) == 1
+    assert len(lines(caplog)) <= 3
+
+
+@pytest.mark.usefixtures("hasty")
+@pytest.mark.parametrize("name", ["status", "cmd/+"])
+async def test_a_broker_that_takes_no_subscription_takes_everything_else_until_it_allows_it(
+    name: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    topic = f"skin/robot/nodes/main/{name}"
+    broker = Odd(ends_over=(SUBSCRIBE, topic))
+    with monkeypatch.context() as patch:
+        patch.setattr(trials, "HOLD_S", 2.0)
+        async with publishing(broker, answer) as publisher:
+            await until(lambda: len(set(broker.topics)) >= 13 or broker.connections > 2 * TRIES)
+            counters = publisher.counters
+            assert broker.connections == TRIES + 1
+            assert counters.unsubscribed == [topic]
+            assert counters.last_error.endswith(f"when we subscribe to: {topic}")
+            assert not counters.name_taken
+            assert sum(topic in line for line in lines(caplog)) == 1
+            # Its rules are asked for again, once, and once more.
+            await until(lambda: broker.connections == TRIES + 2)
+            broker.ends_over = None
+            await until(lambda: publisher.counters.connected)
+            await until(lambda: not publisher.counters.unsubscribed)
+            assert broker.connections == TRIES + 2

@@ -128,6 +128,121 @@ def test_a_lost_half_never_joins_two_samples():
     assert assembler.counters.lone == 2
 
 
+LATE_MS = st.floats(0.1, 9.6)
+
+
+@pytest.mark.parametrize("order", ["ft", "tf"])
+@given(
+    samples=st.lists(st.tuples(LATE_MS, st.booleans(), st.booleans()), min_size=1, max_size=40),
+    gathered=st.booleans(),
+)
+def test_force_is_never_joined_with_the_torque_of_another_sample(order, samples, gathered):
+    """However late a half is within its period, and whichever frames are lost."""
+    frames = []
+    for number, (late_ms, loses_first, loses_second) in enumerate(samples):
+        halves = [(10 * number, order[0]), (10 * number + late_ms, order[1])]
+        frames += [
+            (t_ms, kind, number)
+            for (t_ms, kind), lost in zip(halves, (loses_first, loses_second), strict=True)
+            if not lost
+        ]
+    assembler = WrenchAssembler(13, 10, SCALE)
+    batches = [stream(*frames)] if gathered else [stream(frame) for frame in frames]
+    found = [sample for batch in batches for sample in samples_of(assembler, batch)]
+    for sample in found:
+        assert sample.force_n[0] / SCALE[0] == sample.torque_nm[0] / SCALE[3]
+    assert assembler.counters.samples == len(found)
+    waits = len(frames) - 2 * len(found) - assembler.counters.lone
+    assert waits in (0, 1)
+
+
+@pytest.mark.parametrize("order", ["ft", "tf"])
+def test_a_late_half_ends_its_sample_and_begins_no_other(order):
+    assembler = WrenchAssembler(13, 10, SCALE)
+    late = range(20, 60)
+    frames = [
+        (10 * i + k * (8.0 if i in late else 0.1), kind, i)
+        for i in range(80)
+        for k, kind in enumerate(order)
+    ]
+    samples = samples_of(assembler, stream(*frames))
+    numbers = [round(sample.force_n[0] / SCALE[0] * 0x8000) for sample in samples]
+    assert numbers == [i for i in range(80) if i not in late]
+    assert assembler.counters.lone == 2 * len(late)
+
+
+@pytest.mark.parametrize("order", ["ft", "tf"])
+def test_a_half_may_be_late_by_half_a_period_once_the_order_is_known(order):
+    assembler = WrenchAssembler(13, 10, SCALE)
+    frames = [
+        (10 * i + k * (5.0 if i else 0.1), o, i) for i in range(9) for k, o in enumerate(order)
+    ]
+    assert len(samples_of(assembler, stream(*frames))) == 9
+    assert assembler.counters.lone == 0
+
+
+@pytest.mark.parametrize("lost", ["f", "t"])
+def test_frames_that_were_stamped_when_read_are_paired_in_the_order_of_the_board(lost):
+    """An adapter may stamp all that waited with one time: a lost frame is lost alone."""
+    assembler = WrenchAssembler(13, 10, SCALE)
+    numbers = []
+    #: A torque that comes after two forces may be of either.
+    missing = {"f": [4], "t": [4, 5]}[lost]
+    for read in range(5):
+        frames = [
+            (100 * read, kind, 10 * read + i)
+            for i in range(10)
+            for kind in "ft"
+            if (i, kind) != (4, lost)
+        ]
+        for sample in samples_of(assembler, stream(*frames)):
+            assert sample.force_n[0] / SCALE[0] == sample.torque_nm[0] / SCALE[3]
+            numbers.append(round(sample.force_n[0] / SCALE[0] * 0x8000))
+    assert numbers == [i for i in range(50) if i % 10 not in missing]
+    assert assembler.counters.lone == 5 * (2 * len(missing) - 1)
+
+
+@pytest.mark.parametrize("order", ["ft", "tf"])
+def test_a_half_that_may_be_of_either_of_two_samples_is_of_none(order):
+    """A board that is set up again begins another period: here after 6.5 of 10 ms."""
+    assembler = WrenchAssembler(13, 10, SCALE)
+    first, second = order
+    whole = [(10 * i + 0.1 * k, kind, i) for i in range(3) for k, kind in enumerate(order)]
+    late = [(30, first, 3), (36.5, first, 4), (38.4, second, 3), (46.5, first, 5)]
+    late += [(46.6, second, 5)]
+    samples = samples_of(assembler, stream(*whole, *late))
+    numbers = [round(sample.force_n[0] / SCALE[0] * 0x8000) for sample in samples]
+    assert numbers == [0, 1, 2, 5]
+    assert assembler.counters.lone == 3
+
+
+def test_frames_that_changed_places_are_lost_and_those_after_them_are_not():
+    assembler = WrenchAssembler(13, 10, SCALE)
+    frames = [
+        (10 * i + 0.1 * k, kind, i)
+        for i in range(20)
+        for k, kind in enumerate("tf" if i == 10 else "ft")
+    ]
+    samples = samples_of(assembler, stream(*frames))
+    numbers = [round(sample.force_n[0] / SCALE[0] * 0x8000) for sample in samples]
+    assert numbers == [i for i in range(20) if i != 10]
+    assert assembler.counters.lone == 2
+
+
+def test_the_order_of_another_board_at_the_address_is_learned():
+    assembler = WrenchAssembler(13, 10, SCALE)
+    frames = [
+        (10 * i + 0.1 * k, kind, i)
+        for i in range(100)
+        for k, kind in enumerate("ft" if i < 50 else "tf")
+    ]
+    samples = samples_of(assembler, stream(*frames))
+    numbers = [round(sample.force_n[0] / SCALE[0] * 0x8000) for sample in samples]
+    assert numbers[:50] == list(range(50))
+    assert numbers[50:] == list(range(100 - len(numbers[50:]), 100))
+    assert 30 < len(numbers[50:]) < 50
+
+
 def test_pairs_may_be_split_over_batches_and_other_boards_are_not_mixed_in():
     assembler = WrenchAssembler(13, 10, SCALE)
     assert samples_of(assembler, stream((0, "f", 1))) == []

@@ -106,8 +106,7 @@ class Bench:
 
 async def test_a_board_is_asked_for_its_full_scales_set_up_and_zeroed() -> None:
     bench = Bench()
-    assert "absent" not in bench.codes()
-    assert bench.record()["state"] == "no data"
+    assert (bench.record()["state"], bench.codes()) == ("no data", [])
     await bench.boards.bring_up()
     await bench.run(0.4)
     assert bench.record()["full_scale"] == [50, 50, 50, 1, 1, 1]
@@ -247,6 +246,56 @@ async def test_full_scales_that_are_given_are_used_and_compared() -> None:
     assert bench.codes() == []
     bench.tips.tips["index"].reported_scale[2] = 2000.0
     assert bench.codes() == ["scale"]
+
+
+def exchange(bench: Bench, full_scale: float) -> None:
+    """Put another board in the place of the index finger's, which does not send yet."""
+    board = bench.robot.fingertips.boards["index"]
+    board._full_scale = np.full(6, full_scale)
+    board.next_ns = None
+
+
+async def test_a_board_that_was_exchanged_for_one_of_another_range_does_not_feel() -> None:
+    """By the range of the board before, a press on this one would be a fortieth of itself."""
+    bench = Bench({"part": "index", "force_n": [[4.0, 0], [4.1, 5], [8.0, 5], [8.1, 0]]})
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    await bench.calibrate()
+    mend = bench.robot.inject(parse("board_silent board=index"))
+    await bench.run(0.7)
+    exchange(bench, 2000.0)
+    mend()
+    assert await contacts(bench, 3.0) == {"UNKNOWN"}
+    record = bench.record()
+    assert (record["state"], bench.codes()) == ("degraded", ["scale"])
+    (sentence,) = record["sentences"]
+    assert "(2000, 2000, 2000, 2000, 2000, 2000) than (50, 50, 50, 1, 1, 1)" in sentence
+    assert await contacts(bench, 5.0) == {"UNKNOWN"}
+    samples = bench.record()["samples"]
+    bench.engine.begin_calibration(0.5)
+    assert await contacts(bench, 0.6) == {"UNKNOWN"}
+    bench.engine.use(bench.engine.end_calibration("2026-01-01T00:00:00+00:00"))
+    await bench.run(0.1)
+    assert bench.record()["full_scale"] == [2000.0] * 6
+    assert bench.record()["samples"] > samples
+    assert ("scale" in bench.codes(), bench.contact()) == (False, "OFF")
+
+
+async def test_full_scales_that_somebody_else_reported_are_doubted_until_the_board_is_asked() -> (
+    None
+):
+    bench = Bench()
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    await bench.calibrate()
+    address = bench.tips.tips["index"].settings.address
+    forged = answer_frame(FullScale(0, 7), address)
+    bench.engine.feed("can0", FrameBatch.of([(*forged, bench.robot.t_ns)] * 2))
+    await bench.run(0.02)
+    assert (bench.codes(), bench.contact()) == (["scale"], "UNKNOWN")
+    await bench.run(9.0)
+    assert (bench.codes(), bench.contact()) == ([], "OFF")
+    assert bench.record()["full_scale"] == [50, 50, 50, 1, 1, 1]
 
 
 async def test_a_board_that_does_not_tell_its_full_scales_is_not_configured() -> None:
@@ -687,6 +736,197 @@ async def test_a_board_that_has_stopped_sending_is_not_frozen_too() -> None:
     bench.robot.inject(parse("board_silent board=index"))
     await bench.run(0.4)
     assert bench.codes() == ["silent"]
+
+
+class Halves:
+    """What happens to frames of the index finger's board on their way while it `acts`.
+
+    Args:
+        of: their identifiers.
+        how: they are "lost", "short" of a byte, "late" by 0.8 periods, or "rare": only one in
+            fifty comes.
+    """
+
+    def __init__(self, bench: Bench, of: tuple[int, ...], how: str) -> None:
+        self.acts = False
+        self._step = bench.robot.step
+        self._of, self._how = of, how
+        self._number = 0
+        bench.robot.step = self.step  # type: ignore[method-assign]
+
+    def step(self, seconds: float) -> dict[str, FrameBatch]:
+        batches = self._step(seconds)
+        batch = batches["can0"]
+        mine = np.isin(batch.id, self._of)
+        if not self.acts or not mine.any():
+            return batches
+        rows = np.arange(len(batch))
+        if self._how == "short":
+            batch.dlc[mine] = 5
+        elif self._how == "late":
+            batch.t_ns = batch.t_ns + mine * 2_400_000
+            rows = np.argsort(batch.t_ns, kind="stable")
+        else:
+            lost = mine.copy()
+            if self._how == "rare":
+                numbers = self._number + np.cumsum(mine)
+                lost &= numbers % 50 != 0
+            self._number += int(mine.sum())
+            rows = np.flatnonzero(~lost)
+        batches["can0"] = FrameBatch(
+            batch.id[rows], batch.dlc[rows], batch.data[rows], batch.t_ns[rows]
+        )
+        return batches
+
+
+HALVES = {"force": (FORCE_OF_INDEX,), "torque": (TORQUE_OF_INDEX,)}
+
+
+@pytest.mark.parametrize(
+    ("missing", "how"),
+    [
+        ("force", "lost"),
+        ("torque", "lost"),
+        ("force", "short"),
+        ("torque", "short"),
+        ("torque", "late"),
+    ],
+)
+@pytest.mark.parametrize("pressed_n", [0.0, 2.0])
+async def test_a_board_that_sends_no_whole_samples_does_not_feel(
+    missing: str, how: str, pressed_n: float
+) -> None:
+    """What is left of a sample is no load: the contact before would last for ever."""
+    bench = Bench({"part": "index", "force_n": [[2.5, 0], [2.6, pressed_n], [99.0, pressed_n]]})
+    halves = Halves(bench, HALVES[missing], how)
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    await bench.calibrate()
+    await bench.run(2.0)
+    before = "ON" if pressed_n else "OFF"
+    assert (bench.codes(), bench.contact()) == ([], before)
+    halves.acts = True
+    await bench.run(0.4)
+    assert bench.contact() == before
+    commands = len(bench.sent)
+    await bench.run(0.2)
+    record = bench.record()
+    assert (record["state"], bench.codes()) == ("silent", ["incomplete"])
+    (sentence,) = record["sentences"]
+    (other,) = set(HALVES) - {missing}
+    wanted = {"lost": f"sends {other} without {missing}: ", "late": "do not follow each other"}
+    wanted["short"] = f"sends {other} without {missing}, and frames of a wrong length: "
+    assert wanted[how] in sentence
+    assert record["silences"] == 1
+    assert 500.0 <= (record["age_ms"] or 0.0) <= 620.0
+    assert (bench.contact(), bench.contact("thumb")) == ("UNKNOWN", "OFF")
+    assert not record["touched"]
+    ends = [event for event in bench.felt if isinstance(event, Touch) and event.event == "end"]
+    assert [event.reason for event in ends] == (["lost"] if pressed_n else [])
+    assert await contacts(bench, 2.0) == {"UNKNOWN"}
+    assert len(bench.sent) >= commands + 14  # it is set up again
+    assert bench.codes("thumb") == []
+    halves.acts = False
+    await bench.run(0.1)
+    assert bench.contact() == before
+    await bench.run(6.0)
+    record = bench.record()
+    assert (record["state"], bench.codes(), record["silences"]) == ("ok", [], 1)
+
+
+async def test_a_touch_is_not_reported_after_its_release_by_a_board_that_lost_its_torque() -> None:
+    bench = Bench({"part": "index", "force_n": [[2.0, 0], [2.1, 2], [4.0, 2], [4.1, 0]]})
+    halves = Halves(bench, HALVES["torque"], "lost")
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    await bench.calibrate()
+    await bench.run(2.0)
+    assert bench.contact() == "ON"
+    halves.acts = True
+    await bench.run(0.6)
+    assert await contacts(bench, 2.0) == {"UNKNOWN"}
+    halves.acts = False
+    await bench.run(0.1)
+    assert bench.contact() == "OFF"
+
+
+async def test_single_frames_of_a_board_that_is_silent_are_no_sign_that_nothing_touches() -> None:
+    bench = Bench()
+    halves = Halves(bench, (FORCE_OF_INDEX, TORQUE_OF_INDEX), "rare")
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    await bench.calibrate()
+    halves.acts = True
+    await bench.run(0.6)
+    assert await contacts(bench, 3.0) == {"UNKNOWN"}
+
+
+@pytest.mark.parametrize("missing", list(HALVES))
+async def test_a_board_that_never_sends_whole_samples_is_named_once_it_has_had_its_time(
+    missing: str,
+) -> None:
+    before = Bench()
+    await before.boards.bring_up()
+    await before.calibrate()
+    bench = Bench()
+    halves = Halves(bench, HALVES[missing], "lost")
+    halves.acts = True
+    await bench.boards.bring_up()
+    assert before.engine.calibration is not None
+    bench.tips.use(before.engine.calibration.zeros)
+    await bench.run(0.3)
+    assert "incomplete" not in bench.codes()
+    assert await contacts(bench, 1.0) == {"UNKNOWN"}
+    assert bench.codes()[0] == "incomplete"
+    assert bench.record()["age_ms"] is None
+    assert bench.record()["state"] == "silent"
+
+
+async def test_a_board_that_sends_only_frames_of_a_wrong_length_is_not_called_silent() -> None:
+    bench = Bench()
+    halves = Halves(bench, (FORCE_OF_INDEX, TORQUE_OF_INDEX), "short")
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    await bench.calibrate()
+    halves.acts = True
+    await bench.run(0.7)
+    assert bench.codes() == ["incomplete"]
+    assert "sends only frames of a wrong length: " in bench.record()["sentences"][0]
+    assert bench.contact() == "UNKNOWN"
+    bench.robot.inject(parse("board_silent board=index"))
+    await bench.run(0.3)
+    assert bench.codes() == ["silent"]
+    assert bench.record()["silences"] == 1
+
+
+async def test_no_zero_is_taken_of_a_board_that_sends_no_whole_samples() -> None:
+    bench = Bench()
+    halves = Halves(bench, HALVES["torque"], "lost")
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    halves.acts = True
+    bench.tips.begin_zero()
+    await bench.run(1.0)
+    assert set(bench.tips.end_zero()) == {"thumb"}
+
+
+async def test_a_contact_of_before_a_gap_in_the_samples_must_show_again_that_it_is_measured() -> (
+    None
+):
+    bench = Bench()
+    latch = Latch(bench)
+    halves = Halves(bench, HALVES["force"], "lost")
+    await bench.boards.bring_up()
+    await bench.run(0.4)
+    await bench.calibrate()
+    await bench.run(0.2)
+    halves.acts = True
+    await bench.run(0.8)
+    latch.holds, halves.acts = True, False
+    assert await contacts(bench, 0.7 * REPEATS * 3e-3) == {"UNKNOWN"}
+    latch.holds = False
+    await bench.run(0.1)
+    assert bench.contact() == "OFF"
 
 
 def sample(force: float, torque: float, *, saturated: bool = False) -> Wrench:

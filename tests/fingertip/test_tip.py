@@ -330,6 +330,17 @@ def test_a_board_that_falls_silent_ends_its_touch_and_slip() -> None:
     assert not bench.tip.touched
 
 
+def test_a_board_that_falls_silent_after_a_release_ends_the_slip_before_it() -> None:
+    """A slip is held for a moment, longer than its touch."""
+    bench = Bench(friction=0.2)
+    bench.hold(20, POINT, -2 * DIRECTION + np.array([0.8, -0.6, 0.0]))
+    events = bench.hold(1, NOWHERE, NOWHERE)
+    assert [(type(event), event.event) for event in events] == [(Touch, "end")]
+    ended = bench.tip.expire(bench.t_ns + 600 * MS, 600 * MS)
+    assert [(type(event), event.event) for event in ended] == [(Slip, "end")]
+    assert bench.tip.expire(bench.t_ns + 700 * MS, 700 * MS) == []
+
+
 def test_matrix_and_place_of_the_sensor_lead_to_the_fingertips_frame() -> None:
     turn = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     matrix = np.kron(np.eye(2), np.array(turn))

@@ -84,6 +84,7 @@ OUTPUT = {"connected": True, "touches_dropped": 4}
         (OUTPUT | {"connected": False, "last_error": "refused"}, (), "broker_away", "refused"),
         (OUTPUT, ("touches_dropped",), "touches_dropped", "4 since the start"),
         (OUTPUT | {"withheld": ["a/frame", "b/frame"]}, (), "broker_rejects", "a/frame, b/frame"),
+        (OUTPUT | {"unsubscribed": ["a/cmd/+"]}, (), "broker_withholds", "a/cmd/+"),
         (OUTPUT | {"name_taken": True}, (), "node_name_taken", "--node"),
     ],
 )

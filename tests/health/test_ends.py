@@ -75,13 +75,14 @@ def test_a_chip_that_answers_again_is_not_told_to_be_silent_but_to_need_a_set_up
     assert not bench.valid["left_forearm"][36:48].any()
 
 
-#: What is counted within a minute, or held up to ten minutes, is over then: see `LATELY_NS`.
+#: What is counted within a minute, or held up to an hour, is over then: see `LATELY_NS`.
 _OUTPUT: dict[str, Any] = {
     "connected": True,
     "touches_dropped": 0,
     "refused": 0,
     "last_error": "",
     "withheld": [],
+    "unsubscribed": [],
     "name_taken": False,
 }
 #: What the publisher counts -> what is reported, and what it counts when that is over. Publications
@@ -90,6 +91,7 @@ OUTPUT: list[tuple[dict[str, Any], str, dict[str, Any]]] = [
     ({"connected": False}, "broker_away", {}),
     ({"refused": 1}, "broker_refuses", {"refused": 1}),
     ({"withheld": ["a/frame"]}, "broker_rejects", {}),
+    ({"unsubscribed": ["a/cmd/+"]}, "broker_withholds", {}),
     ({"touches_dropped": 1}, "touches_dropped", {"touches_dropped": 1}),
     ({"name_taken": True}, "node_name_taken", {}),
 ]
@@ -140,6 +142,7 @@ ELSEWHERE = {
     "fingertip_absent": "tests/fingertip/test_boards.py",
     "fingertip_frozen": "tests/fingertip/test_boards.py",
     "fingertip_held": "tests/fingertip/test_boards.py",
+    "fingertip_incomplete": "tests/fingertip/test_boards.py",
     "fingertip_loses_frames": "tests/fingertip/test_boards.py",
     "fingertip_not_configured": "tests/fingertip/test_boards.py",
     "fingertip_pressed": "tests/fingertip/test_boards.py",

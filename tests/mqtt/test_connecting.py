@@ -1,6 +1,7 @@
-"""A connection to a broker that is given up while it is being made."""
+"""A connection to a broker that is given up while it is being made, or ended by the broker."""
 
 import asyncio
+import contextlib
 import socket
 import threading
 from typing import Any
@@ -8,7 +9,8 @@ from typing import Any
 import pytest
 
 from skin_host.mqtt.address import Broker
-from skin_host.mqtt.connection import MqttError, connect
+from skin_host.mqtt.connection import MqttError, connect, explain
+from tests.support.packets import CONNACK, SUBSCRIBE, packet
 from tests.support.waiting import PATIENCE_S, until
 
 
@@ -48,3 +50,30 @@ async def test_a_host_that_no_computer_can_have_is_no_connection() -> None:
     with pytest.raises(MqttError, match="too long"):
         async with connect(broker):
             pass
+
+
+@pytest.mark.parametrize(
+    ("farewell", "reason"),
+    [(b"\xe0\1\x97", "Quota exceeded"), (b"", "the broker closed the connection")],
+)
+async def test_a_subscription_over_which_the_connection_ends_fails_for_the_reason_of_the_end(
+    farewell: bytes, reason: str
+) -> None:
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await packet(reader)
+        writer.write(CONNACK)
+        assert (await packet(reader))[0] == SUBSCRIBE
+        writer.write(farewell)
+        writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    broker = Broker("127.0.0.1", server.sockets[0].getsockname()[1])
+    with contextlib.suppress(MqttError):
+        async with connect(broker) as link:
+            with pytest.raises(MqttError) as subscribing:
+                await link.listen_to("t")
+            with pytest.raises(MqttError) as sending:
+                link.send("t", b"x", qos=1)
+    server.close()
+    assert reason in explain(subscribing.value)
+    assert "the broker closed the connection" in explain(sending.value)

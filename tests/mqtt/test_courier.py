@@ -1,6 +1,7 @@
 """What a courier sends over a connection, in which order, and what it gives up."""
 
 import asyncio
+import itertools
 from collections.abc import AsyncIterator, Iterable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
@@ -25,6 +26,7 @@ from skin_host.mqtt.courier import (
     TOUCH_WINDOW,
     Courier,
     FrameForm,
+    Suspect,
 )
 from skin_host.mqtt.outbox import Event, Outbox
 from skin_host.mqtt.packets import publish_head
@@ -165,13 +167,20 @@ class Sender:
         await self.clock.sleep(seconds)
 
     async def rejected(self, link: Link | None = None) -> str | None:
-        """Let the broker end a connection over what is put meanwhile; return what was dropped."""
+        """Let the broker end a connection over what is put meanwhile; return the topic if it is
+        found.
+        """
         link = link or Link()
         async with self.over(link):
             link.acknowledge(link.waiting(STATUS))
             await self.turn()
         link.ended_by_broker = True
-        return self.courier.note_end(link)  # type: ignore[arg-type]
+        return self.found(link)
+
+    def found(self, link: Link) -> str | None:
+        """The topic over which the broker has ended a connection, if it is found."""
+        suspect = self.courier.note_end(link)  # type: ignore[arg-type]
+        return suspect.topic if suspect and suspect.found else None
 
 
 def is_loss(error: BaseException | None) -> bool:
@@ -415,6 +424,16 @@ async def test_one_touch_that_the_broker_never_takes_is_dropped_after_some_tries
 
 
 @stepped
+async def test_touches_that_were_on_their_way_together_have_no_strike_for_it(
+    clock: SteppedClock,
+) -> None:
+    sender = Sender(clock)
+    sender.put_touches([1, 2])
+    assert [await sender.rejected() for _ in range(1 + TRIES)] == [*[None] * TRIES, TOUCHES]
+    assert len(sender.outbox.events) == 1
+
+
+@stepped
 async def test_of_several_touches_on_their_way_the_rejected_one_is_found_one_at_a_time(
     clock: SteppedClock,
 ) -> None:
@@ -432,7 +451,7 @@ async def test_of_several_touches_on_their_way_the_rejected_one_is_found_one_at_
                 await sender.turn()
             assert [one.number for one in link.waiting(TOUCHES)] == [2]
         link.ended_by_broker = True
-        found = sender.courier.note_end(link)  # type: ignore[arg-type]
+        found = sender.found(link)
     assert found == TOUCHES
     link = Link()
     async with sender.over(link):
@@ -463,25 +482,72 @@ async def test_a_connection_that_never_worked_or_that_we_lost_accuses_no_message
             if not link.ended_by_broker:
                 link.acknowledge(link.waiting(STATUS))
                 await sender.turn()
-        assert sender.courier.note_end(link) is None  # type: ignore[arg-type]
+        assert sender.found(link) is None
     assert len(sender.outbox.events) == 1
     assert sender.outbox.counters.rejected == 0
 
 
 @stepped
-async def test_a_state_that_the_broker_never_takes_is_dropped_until_it_changes(
+async def test_a_state_that_the_broker_never_takes_is_found_though_it_changes_at_every_try(
     clock: SteppedClock,
 ) -> None:
+    """It is tried again as it is then, once, when its topic is no longer withheld."""
+    sender, numbers = Sender(clock), itertools.count()
+
+    async def rejected() -> str | None:
+        sender.outbox.put_state("state", b"%d" % next(numbers))
+        return await sender.rejected()
+
+    # Over the first connection the status was on its way with it.
+    assert [await rejected() for _ in range(1 + TRIES)] == [*[None] * TRIES, "state"]
+    assert sender.outbox.counters.rejected == 1
+    assert sender.outbox.trials.withheld == ["state"]
+    link = Link(is_prompt=True)
+    sender.outbox.repeat_states()
+    async with sender.over(link):
+        sender.outbox.put_state("state", b"withheld")
+        await sender.turn(HOLD_S - 1.0)
+        assert [one.topic for one in link.sent] == [STATUS]
+        sender.outbox.put_state("state", b"newest")
+        link.is_prompt = False
+        await sender.turn(2.0)
+        assert [one.payload for one in link.waiting()] == [b"newest"]
+    link.ended_by_broker = True
+    assert sender.found(link) == "state"
+    assert sender.outbox.trials.withheld == ["state"]
+
+
+@stepped
+async def test_a_state_that_arrives_after_all_was_never_suspected(clock: SteppedClock) -> None:
     sender = Sender(clock)
     sender.outbox.put_state("state", b"1")
-    # Over the first connection the status was on its way with it.
-    found = [await sender.rejected() for _ in range(1 + TRIES)]
-    assert found == [*[None] * TRIES, "state"]
-    assert sender.outbox.counters.rejected == 1
-    sender.outbox.repeat_states()
-    assert list(sender.outbox.pending) == [STATUS]
+    for _ in range(TRIES):
+        assert await sender.rejected() is None
+    async with sender.over(Link(is_prompt=True)):
+        pass
     sender.outbox.put_state("state", b"2")
-    assert "state" in sender.outbox.pending
+    assert [await sender.rejected() for _ in range(1 + TRIES)] == [*[None] * TRIES, "state"]
+
+
+@stepped
+async def test_a_status_that_never_arrives_is_found_and_never_withheld(
+    clock: SteppedClock,
+) -> None:
+    """Of what was on its way with it nothing is accused."""
+    sender = Sender(clock)
+    sender.outbox.put_state("state", b"1")
+    suspects = []
+    for _ in range(2 + TRIES):
+        link = Link(ended_by_broker=True)
+        async with sender.over(link):
+            assert link.waiting(STATUS)
+        suspects.append(sender.courier.note_end(link))  # type: ignore[arg-type]
+    assert suspects == [None, *(Suspect(STATUS, found) for found in (0, 0, 1, 2))]
+    assert sender.outbox.trials.withheld == []
+    assert sender.outbox.counters.rejected == 0
+    link = Link(is_prompt=True)
+    async with sender.over(link):
+        assert [one.topic for one in link.sent] == [STATUS, "state"]
 
 
 @stepped
@@ -497,7 +563,7 @@ async def test_the_status_is_never_dropped(clock: SteppedClock) -> None:
             await sender.turn()
             assert len(link.waiting(STATUS)) == 1
         link.ended_by_broker = True
-        assert sender.courier.note_end(link) is None  # type: ignore[arg-type]
+        assert sender.found(link) is None
     assert sender.outbox.counters.rejected == 0
 
 
@@ -527,7 +593,11 @@ async def test_an_answer_is_lost_with_the_connection_and_no_touch_is_accused_for
     sender = Sender(clock)
     for _ in range(2 * TRIES):
         sender.outbox.put_event(Event("reply", b"{}", None, is_touch=False))
-        assert await sender.rejected() is None
+        link = Link(ended_by_broker=True)
+        async with sender.over(link):
+            link.acknowledge(link.waiting(STATUS))
+            await sender.turn()
+        assert sender.courier.note_end(link) == Suspect("reply", 0)  # type: ignore[arg-type]
     assert sender.outbox.counters.answers_dropped == 2 * TRIES
     assert sender.outbox.counters.rejected == 0
 
@@ -630,7 +700,7 @@ async def test_frames_are_suspected_when_nothing_else_was_on_its_way(clock: Step
             await sender.turn()
             assert [one.topic for one in link.waiting()] == ([topic] if number else [])
         link.ended_by_broker = True
-        found.append(sender.courier.note_end(link))  # type: ignore[arg-type]
+        found.append(sender.found(link))
     assert found == [*[None] * TRIES, topic]
     assert sender.outbox.counters.rejected == 1
     assert sender.outbox.trials.withheld == [topic]
@@ -656,7 +726,7 @@ async def test_a_suspected_frame_that_arrives_clears_its_part(clock: SteppedCloc
                 link.acknowledge(link.waiting())
                 await sender.turn()
         link.ended_by_broker = True
-        assert sender.courier.note_end(link) is None  # type: ignore[arg-type]
+        assert sender.found(link) is None
     assert sender.outbox.counters.rejected == 0
 
 
@@ -864,22 +934,6 @@ async def test_the_newest_of_the_states_put_while_their_topic_is_withheld_goes_w
         await sender.turn(2 * HOLD_S)
         assert len(link.sent) == 3
         assert not carrying.done()
-
-
-@stepped
-async def test_a_state_that_is_refused_again_after_its_topic_was_withheld_has_one_try(
-    clock: SteppedClock,
-) -> None:
-    sender = Sender(clock)
-    for number in range(REJECTIONS):
-        sender.outbox.put_state("contact", b"%d" % number)
-        while "contact" in sender.outbox.pending:
-            await sender.rejected()
-    sender.outbox.put_state("contact", b"ON")
-    clock.advance(HOLD_S)
-    # Over the first connection nothing shows that the broker works.
-    assert [await sender.rejected() for _ in range(2)] == [None, "contact"]
-    assert sender.outbox.trials.withheld == ["contact"]
 
 
 @stepped

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from msgspec import json
 
+from skin_host.mqtt import trials
 from skin_host.mqtt.publisher import Publisher
-from skin_host.mqtt.trials import HOLD_S, REJECTIONS, TRIES, Trials
+from skin_host.mqtt.trials import HOLD_S, LONGEST_HOLD_S, TRIES, Trials
 from skin_host.processing.pipeline import PressureFrame
 from tests.mqtt.test_publisher import frame, listening, settings, touch
 from tests.support.broker import Mosquitto
@@ -63,12 +64,16 @@ async def test_a_state_that_the_broker_does_not_take_is_given_up_and_named(
     assert "skin/robot/palm/health" in given_up[0]
 
 
-async def test_a_state_that_was_given_up_is_sent_when_it_has_changed(mosquitto: Mosquitto) -> None:
+async def test_a_state_that_was_given_up_is_sent_as_it_is_when_its_topic_may_be_tried_again(
+    mosquitto: Mosquitto, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trials, "HOLD_S", 0.5)
     async with listening(mosquitto) as seen, Publisher(narrow(mosquitto), "robot") as publisher:
         publisher.put_health("palm", LARGE)
         await until(lambda: publisher.counters.rejected == 1)
         publisher.put_health("palm", {"rate_hz": 2.0})
         await until(lambda: seen.payloads("palm/health"))
+        await until(lambda: publisher.counters.withheld == [])
 
 
 async def test_of_touches_one_that_is_not_taken_is_counted_and_the_others_arrive_in_order(
@@ -129,25 +134,45 @@ async def test_an_answer_is_dropped_with_the_connection_that_it_ended(
             assert publisher.counters.rejected == 0
 
 
-def test_a_topic_is_withheld_after_some_rejections_in_a_row_and_for_a_while() -> None:
+def test_a_topic_is_found_after_some_strikes_and_by_each_one_from_then_on() -> None:
+    found = Trials()
+    assert [found.strike("a") for _ in range(5)] == [0, 0, 1, 2, 3]
+    assert TRIES == 3
+    assert found.strike("b") == 0
+
+
+def test_a_topic_is_withheld_for_a_while() -> None:
     now_s = [0.0]
-    trials = Trials(lambda: now_s[0])
-    given_up = [trials.strike("a", bytes([n])) for n in (1, 1, 1, 2, 3)]
-    assert given_up == [False, False, True, True, True]
-    assert (TRIES, REJECTIONS) == (3, 3)
-    assert trials.withheld == ["a"]
+    found = Trials(lambda: now_s[0])
+    found.withhold("a")
+    assert found.withheld == ["a"]
     now_s[0] = HOLD_S
-    assert trials.withheld == []
-    assert trials.strike("a", b"4")  # a single try
-    assert trials.withheld == ["a"]
+    assert found.withheld == []
+
+
+def test_a_topic_that_is_never_taken_is_withheld_for_longer_and_longer_until_one_arrives() -> None:
+    """Each try costs a connection."""
+    found = Trials(lambda: 0.0)
+    ends_s = []
+    for arrives in (False, False, False, False, True):
+        found.withhold("a")
+        ends_s.append(found.until_s("a"))
+        if arrives:
+            found.arrived("a")
+    found.withhold("a")
+    assert ends_s == [HOLD_S, 2 * HOLD_S, 4 * HOLD_S, LONGEST_HOLD_S, LONGEST_HOLD_S]
+    assert found.until_s("a") == HOLD_S
 
 
 def test_an_arrival_clears_a_topic() -> None:
-    trials = Trials()
-    for _ in range(TRIES - 1):
-        assert not trials.strike("a", b"1")
-    trials.arrived("a")
-    assert not trials.strike("a", b"1")
+    found = Trials()
+    for _ in range(TRIES):
+        found.strike("a")
+        found.strike("b")
+    found.withhold("a")
+    found.arrived("a")
+    assert found.withheld == []
+    assert (found.strike("a"), found.strike("b")) == (0, 2)
 
 
 async def test_the_limit_that_a_broker_announces_is_kept(
@@ -180,12 +205,15 @@ async def test_the_limit_that_a_broker_announces_is_kept(
     assert sum("skin/robot/palm/health" in r.getMessage() for r in caplog.records) == 1
 
 
+@pytest.mark.parametrize("protocol", ["5", "3.1.1"])
 async def test_two_daemons_of_one_name_give_way_to_each_other_and_say_so(
-    mosquitto: Mosquitto,
+    mosquitto: Mosquitto, protocol: str
 ) -> None:
-    async with Publisher(settings(mosquitto), "robot") as one:
+    """With MQTT 3.1.1 the broker closes the older connection without a reason."""
+    at = settings(mosquitto, protocol=protocol)
+    async with Publisher(at, "robot") as one:
         await until(lambda: one.counters.connected)
-        async with Publisher(settings(mosquitto), "robot") as other:
+        async with Publisher(at, "robot") as other:
             await until(lambda: one.counters.name_taken)
             await until(lambda: other.counters.name_taken)
             before = one.counters.connections + other.counters.connections

@@ -83,7 +83,7 @@ WIRING = {
 #: A force/torque board that is not received, or not asked yet for its full scales.
 _TIPS = {"fingertip_absent", "fingertip_silent", "fingertip_not_configured"}
 _BUS = _TIMING | _SET_UP | _CHIPS | _TIPS
-_BUS |= {"bus_silent", "board_overflows", "fingertip_loses_frames"}
+_BUS |= {"bus_silent", "board_overflows", "fingertip_incomplete", "fingertip_loses_frames"}
 _SWAPPED = _CHIPS | _SET_UP | {"part_temperature"}
 #: Until a calibration at rest.
 FOR_EVER_S = 1e6
@@ -111,6 +111,7 @@ SILENCING = {"chip_gone"}
 #: Nothing but the chip that it names sends what is wrong.
 ALONE = {"no_acknowledge"}
 _BROKER = {"broker_away", "touches_dropped", "broker_refuses", "node_name_taken", "broker_rejects"}
+_BROKER |= {"broker_withholds"}
 
 
 def _nothing() -> None:
