@@ -11,7 +11,7 @@ import select
 import signal
 import stat
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextvars import ContextVar
 from pathlib import Path
 from typing import IO, Protocol, TypeVar
@@ -493,6 +493,15 @@ class Draft:
             # Nobody who may write to the folder, as everybody to /tmp, can have put a link there.
             os.close(os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode))
 
+    def sync(self) -> None:
+        """Force it to the disk, which may be full only then.
+
+        Raises:
+            OSError: the disk is full, ...
+        """
+        with _naming(self._wanted):
+            (_disk.get() or _DISK).sync(self.path)
+
     def finish(self) -> None:
         """Let it replace the wanted file, or write it into what is there.
 
@@ -545,3 +554,51 @@ def whole_file(path: Path) -> Iterator[Path]:
             draft.finish()
         finally:
             draft.remove()
+
+
+def refuse_input(output: Path | None, *inputs: Path | None) -> None:
+    """Protect what a command reads from being replaced by what it writes.
+
+    Raises:
+        RequestError: `output` is one of the inputs; None is none.
+    """
+    for one in inputs:
+        if output is not None and one is not None:
+            with contextlib.suppress(OSError):  # one of them is absent
+                if output.samefile(one):
+                    raise RequestError(f"{output}: is read by this command; choose another name")
+
+
+def write_together(
+    files: Iterable[tuple[Path, bytes]], made_from: Sequence[Path] = ()
+) -> list[Path]:
+    """Write files that belong together: names and contents. None gets its name before all of them
+    are on the disk, so that one that is full leaves what was there.
+
+    Args:
+        files: names and contents.
+        made_from: files that none of them replaces.
+
+    Returns:
+        The names.
+
+    Raises:
+        RequestError: there is a folder of one of these names, or one is of `made_from`.
+        SkinError: one of them cannot be written.
+    """
+    drafts: dict[Path, Draft] = {}
+    try:
+        for path, data in files:
+            refuse_input(path, *made_from)
+            with writing(path):
+                drafts[path] = Draft(path)
+                drafts[path].begin()
+                drafts[path].path.write_bytes(data)
+                drafts[path].sync()
+        for path, draft in drafts.items():
+            with writing(path):
+                draft.finish()
+    finally:
+        for draft in drafts.values():
+            draft.remove()
+    return list(drafts)

@@ -14,7 +14,7 @@ import contextlib
 import io
 import re
 from bisect import bisect_left
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, NamedTuple, cast
@@ -365,17 +365,18 @@ def read_channels(
 def _windows(
     batch: RecordBatch, channel: NDArray[np.uint16], window_ns: int
 ) -> Iterator[tuple[int, int]]:
-    """Where windows begin and end: at the first frame that is too late for one, or too many."""
+    """Where windows begin and end: at the first frame that is too late or too early for one, or too
+    many.
+    """
     times = batch.t_ns.data  # unlike a list, it makes numbers only of those looked at
     n = len(times)
     rising = bool((np.diff(batch.t_ns) >= 0).all())
     begin = 0
     while begin < n:
-        end_ns = times[begin] + window_ns
         if rising:
-            end = bisect_left(times, end_ns, begin + 1)
+            end = bisect_left(times, times[begin] + window_ns, begin + 1)
         else:
-            end = next((row for row in range(begin + 1, n) if times[row] >= end_ns), n)
+            end = _end_of_span(times, begin, window_ns)
         if end - begin > CAPACITY:
             for code in np.flatnonzero(np.bincount(channel[begin:end]) > CAPACITY):
                 of_channel = np.flatnonzero(channel[begin:end] == code)
@@ -383,6 +384,20 @@ def _windows(
                     end = begin + int(of_channel[CAPACITY])
         yield begin, end
         begin = end
+
+
+def _end_of_span(times: Sequence[int], begin: int, window_ns: int) -> int:
+    """The first row after `begin` with which the times, in any order, span the window.
+
+    Also a time that goes back ends a window: after a clock was set back, or one damaged time ahead,
+    a later one comes only when all channels' frames of that while are in the window.
+    """
+    low_ns = high_ns = times[begin]
+    for row in range(begin + 1, len(times)):
+        low_ns, high_ns = min(low_ns, times[row]), max(high_ns, times[row])
+        if high_ns - low_ns >= window_ns:
+            return row
+    return len(times)
 
 
 def _by_channel(
@@ -455,6 +470,7 @@ def _reader(path: Path) -> "can.io.generic.MessageReader":
 
     import can
 
+    from skin_host.bus.asc import DatedAscReader
     from skin_host.bus.blf import BoundedBlfReader
 
     zipped = path.suffix.lower() == ".gz"
@@ -464,7 +480,8 @@ def _reader(path: Path) -> "can.io.generic.MessageReader":
     if not issubclass(kind, can.io.generic.TextIOMessageReader):
         return can.LogReader(path)
     file = gzip.open(path) if zipped else path.open("rb")  # noqa: SIM115  # the reader closes it
-    return kind(_Lines(cast(BinaryIO, file), errors="strict"))
+    lines = _Lines(cast(BinaryIO, file), errors="strict")
+    return DatedAscReader(lines) if kind is can.ASCReader else kind(lines)
 
 
 def _format(suffixes: list[str]) -> str:

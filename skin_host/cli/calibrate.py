@@ -223,10 +223,12 @@ def _relaxation(arguments: argparse.Namespace) -> int:
     from skin_host.files import whole_file
     from skin_host.processing.pressure import PressureCurve
     from skin_host.recording import fitting
-    from skin_host.recording.load_table import read_table
+    from skin_host.recording.load_table import check_course, read_table
 
     settings, layout = load_skin(arguments.config)
     load = None if arguments.load is None else read_table(arguments.load)
+    if load is not None:
+        check_course(load)
     model = arguments.model or settings.processing.relaxation.model
     if model == "none":
         raise RequestError('the configured model is "none"; choose one to fit with --model')
@@ -325,9 +327,9 @@ def _course(arguments: argparse.Namespace) -> int:
 
     settings, layout = load_skin(arguments.config)
     load = read_table(arguments.load)
-    check_course(arguments.load, *load)
+    check_course(load)
     samples = _read_samples(arguments.pressure, settings, layout, arguments.seconds)
-    found, curves = fitting.fit_curves(samples, settings, layout, load, arguments.load)
+    found, curves = fitting.fit_curves(samples, settings, layout, load)
     path = arguments.output or calibration_path(settings, arguments.node)
     _keep(arguments, path, found, layout)
     verdicts = curve_verdicts(curves, layout)

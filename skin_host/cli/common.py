@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from skin_host.cli import stderr
 from skin_host.daemon import service
-from skin_host.errors import RequestError, visible
+from skin_host.errors import visible
+from skin_host.files import refuse_input as refuse_input  # noqa: PLC0414 (for other commands)
 
 if TYPE_CHECKING:
     import asyncio
@@ -176,19 +177,6 @@ def warn(text: str) -> None:
     if sys.stderr.isatty() and not os.environ.get("NO_COLOR"):
         line = f"\033[33m{line}\033[0m"
     print(line, file=sys.stderr)
-
-
-def refuse_input(output: Path | None, *inputs: Path | None) -> None:
-    """Protect what a command reads from being replaced by what it writes.
-
-    Raises:
-        RequestError: `output` is one of the inputs; None is none.
-    """
-    for one in inputs:
-        if output is not None and one is not None:
-            with contextlib.suppress(OSError):  # one of them is absent
-                if output.samefile(one):
-                    raise RequestError(f"{output}: is read by this command; choose another name")
 
 
 class Progress:

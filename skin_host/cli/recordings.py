@@ -152,11 +152,11 @@ def play(arguments: argparse.Namespace) -> int:
     """
     import asyncio
 
-    from skin_host.recording import MCAP_SUFFIX
+    from skin_host.recording import is_mcap
 
     if arguments.onto == "can":
         return asyncio.run(_play_on_buses(arguments))
-    if arguments.config is None and arguments.log.suffix != MCAP_SUFFIX:
+    if arguments.config is None and not is_mcap(arguments.log):
         raise RequestError(f"{arguments.log}: CAN frames need --config to be processed")
     if arguments.config is not None:
         return asyncio.run(_play_processed(arguments))
@@ -205,14 +205,14 @@ def _numbers(text: str) -> list[int]:
 
 
 def _record(arguments: argparse.Namespace) -> int:
-    from skin_host.recording import MCAP_SUFFIX
+    from skin_host.recording import is_mcap
     from skin_host.recording.capture import CanLog
     from skin_host.recording.mcap import Recorder
 
     file: Path = arguments.file
     if file.exists():
         raise RequestError(f"{file}: is there already; remove it or choose another name")
-    if file.suffix == MCAP_SUFFIX:
+    if is_mcap(file):
         with Recorder(file) as recorder:
             told = run(partial(_capture, arguments, recorder, None), arguments.seconds, leaving())
         told |= {"messages": recorder.messages, "unreadable": recorder.unreadable}
@@ -288,11 +288,11 @@ async def _robot(url: str, robot: str | None) -> tuple["Broker", str, str]:
 
 
 def _series(arguments: argparse.Namespace) -> "Series":
-    from skin_host.recording import MCAP_SUFFIX
+    from skin_host.recording import is_mcap
     from skin_host.recording.export import read_frames, read_messages
 
     if arguments.config is None:
-        if arguments.recording.suffix != MCAP_SUFFIX:
+        if not is_mcap(arguments.recording):
             raise RequestError(f"{arguments.recording}: CAN frames need --config to be processed")
         return read_messages(arguments.recording)
     settings, layout = load_skin(arguments.config)
@@ -327,6 +327,7 @@ def _plot(arguments: argparse.Namespace) -> int:
         plots.plot_calibration(found, layout, arguments.output)
     else:
         series = _series(arguments)
+        series.require_frames(f"{arguments.output}: a picture")
         part = arguments.part or next(iter(series.parts))
         if arguments.part is None and len(series.parts) > 1:
             raise RequestError(f"choose one with --part; there are: {', '.join(series.parts)}")

@@ -32,6 +32,8 @@ Printable = Annotated[
         )
     ),
 ]
+#: A file, from the folder of the configuration.
+FileName = Annotated[Printable, Meta(extra={"names": "file"})]
 #: host, host:port or [IPv6]:port
 Address = Annotated[
     str,

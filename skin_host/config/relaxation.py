@@ -11,7 +11,7 @@ from typing import Annotated, Literal, get_args
 import msgspec
 from msgspec import Meta, Struct
 
-from skin_host.config.fields import Printable, Seconds, Share
+from skin_host.config.fields import FileName, Seconds, Share
 from skin_host.errors import ConfigurationError, visible
 from skin_host.files import read_document
 
@@ -46,7 +46,7 @@ class RelaxationSettings(Struct, forbid_unknown_fields=True, kw_only=True, froze
     #: updates states at every sweep.
     update_s: Annotated[float, Meta(ge=0, le=5)] = 1.0
     #: A file written by `skin calibrate --relaxation`; it replaces the numbers above.
-    file: Printable | None = None
+    file: FileName | None = None
 
 
 class RelaxationFile(Struct, kw_only=True):

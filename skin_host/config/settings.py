@@ -28,6 +28,7 @@ from skin_host.config.explain import (
 from skin_host.config.fields import (
     Address,
     Coefficient,
+    FileName,
     Hertz,
     Millimetres,
     Name,
@@ -122,7 +123,7 @@ class Patch(_Table, frozen=True):
     #: One place per triangle. Without them the triangles are tiled side by side.
     places: list[PlaceSettings] = []
     #: Or a file of taxel positions: one row x y z nx ny nz (m) per taxel of the patch.
-    positions: Printable | None = None
+    positions: FileName | None = None
 
 
 class KindSettings(_Table, frozen=True):
@@ -151,9 +152,9 @@ class Part(_Table, frozen=True):
     #: How a contact is located, see `processing.localization`. All but `centroid` also separate
     #: several contacts in one touched patch.
     localization: Literal["centroid", "half_maximum", "peak", "template"] = "centroid"
-    #: For `template`: diameters of touching objects. A single one is more precise if it is the
-    #: right one.
-    probe_mm: Annotated[list[Millimetres], Meta(min_length=1)] = field(
+    #: For `template`: diameters of touching objects, up to three pitches of the part's pads. A
+    #: single one is more precise if it is the right one.
+    probe_mm: Annotated[list[Millimetres], Meta(min_length=1, max_length=16)] = field(
         default_factory=lambda: [6.0, 8.0, 10.0, 12.0]
     )
 
@@ -230,11 +231,11 @@ class Mqtt(_Table, frozen=True):
     base: str = "skin"
     username: Annotated[Printable, Meta(min_length=1, max_length=1000)] | None = None
     #: A file with the password; otherwise systemd's credential `mqtt-password`.
-    password_file: Printable | None = None
+    password_file: FileName | None = None
     tls: bool = False
-    ca_file: Printable | None = None
-    certificate_file: Printable | None = None
-    key_file: Printable | None = None
+    ca_file: FileName | None = None
+    certificate_file: FileName | None = None
+    key_file: FileName | None = None
     keepalive_s: Annotated[int, Meta(ge=5, le=3600)] = 10
     encoding: Literal["json", "cbor"] = "json"
     frame_hz: Annotated[float, Meta(ge=0, le=1_000_000)] = 0.0

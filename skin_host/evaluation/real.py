@@ -30,6 +30,7 @@ from skin_host.processes import Processes
 from skin_host.processing.calibration import Calibration, Verdict, with_pressures_of
 from skin_host.processing.core import Engine
 from skin_host.recording.fitting import Samples, fit_curves
+from skin_host.recording.load_table import LoadTable
 from skin_host.recording.replay import calibrate_from_log, steps
 
 Row = dict[str, Any]
@@ -288,8 +289,8 @@ def fit_pressures(path: Path) -> Calibration:
     )
     n = min(len(recording.t_ns), len(recording.pressure_kpa))
     time_s: Floats = recording.t_ns[:n].astype(np.float64) * 1e-9
-    load = time_s, recording.pressure_kpa[:n]
-    return fit_curves(samples, settings, layout, load, path)[0]
+    load = LoadTable(path, time_s, recording.pressure_kpa[:n])
+    return fit_curves(samples, settings, layout, load)[0]
 
 
 def calibrate(recording: InsoleRecording, settings: Settings, layout: Layout) -> Calibration:

@@ -9,7 +9,7 @@ from typing import Literal
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skin_host.processing.events import N_DECIMALS, Count, Int64, PartName, Touch
+from skin_host.processing.events import N_DECIMALS, Count, Nanoseconds, PartName, Touch
 
 #: What indicated a slip.
 Cause = Literal["rate", "friction", "fall"]
@@ -28,7 +28,7 @@ class Slip(
 
     event: Literal["begin", "end"]
     id: Count
-    t_ns: Int64
+    t_ns: Nanoseconds
     count: Count = 0
     part: PartName
     cause: Cause
@@ -55,7 +55,7 @@ class Over(
 
     event: Literal["begin", "end"]
     id: Count
-    t_ns: Int64
+    t_ns: Nanoseconds
     count: Count = 0
     part: PartName
     force_n: float

@@ -112,7 +112,7 @@ class FingertipHealth:
 
         if not state.frames and not state.awaited:
             yield fault("absent", f"{here} has not sent anything yet; check power and address")
-        elif state.frames and not state.alive and now_ns is not None:
+        elif state.frames and not state.alive:
             yield fault(
                 "silent", f"{here} has stopped sending; it is set up again; check its power"
             )

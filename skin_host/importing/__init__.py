@@ -8,16 +8,19 @@ import json
 import os
 import tempfile
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeVar, cast, get_args, get_type_hints
 
 import msgspec
 from msgspec import Struct
 
 from skin_host.config import settings as configuration
+from skin_host.config.fields import FileName
+from skin_host.config.relaxation import RelaxationFile
 from skin_host.config.settings import Patch, Settings
 from skin_host.errors import ConfigurationError
-from skin_host.files import becomes_file, write_atomic, writing
+from skin_host.files import becomes_file, write_together, writing
 from skin_host.importing.positions import import_positions
 from skin_host.importing.report import Findings
 from skin_host.importing.skingui import import_places
@@ -27,6 +30,10 @@ from skin_host.layout import build_layout
 
 Source = Literal["skinspec", "skingui", "positions", "skinmanager"]
 SOURCES: tuple[Source, ...] = get_args(Source)
+#: What a file of a fitted foam has.
+FITTED_KEYS = tuple(key for key in RelaxationFile.__struct_fields__ if key != "schema")
+
+T = TypeVar("T")
 
 
 def configuration_text(settings: Settings, comment: str = "") -> str:
@@ -46,7 +53,10 @@ def configuration_text(settings: Settings, comment: str = "") -> str:
         for patch in part.patches:
             lines += _patch(name, patch)
     for section in ("calibration", "pressure", "relaxation", "touch", "drift"):
-        lines += _table(f"processing.{section}", getattr(settings.processing, section))
+        table = getattr(settings.processing, section)
+        # A file replaces the numbers.
+        from_file = section == "relaxation" and table.file is not None
+        lines += _table(f"processing.{section}", table, without=FITTED_KEYS if from_file else ())
     for section in ("mqtt", "receive", "service"):
         lines += _table(section, getattr(settings, section))
     return "\n".join(lines) + "\n"
@@ -119,7 +129,8 @@ def import_files(
 
     The positions files of `robot.toml` go to the folder `robot-positions` beside it. `findings`
     receives every remark, also those made before an error. `config` is a configuration to add to;
-    it may be `output` itself. Its comments are lost. `part` is what a positions file describes.
+    it may be `output` itself. Its comments are lost; the files that it names stay where they are.
+    `part` is what a positions file describes.
 
     Returns:
         The files written; nothing is written if anything is wrong. A device or a pipe as `output`
@@ -128,6 +139,7 @@ def import_files(
     Raises:
         ConfigurationError: a file cannot be read, or the result is not a valid configuration, or
             is one with positions files and `output` is no file.
+        RequestError: one of `files` has the name of a file to write.
         SkinError: a file cannot be written.
     """
     folder = output.parent
@@ -136,9 +148,10 @@ def import_files(
     base = None
     if config is not None:
         base = configuration.load(config)
-        # Paths of positions files are relative to the configuration's folder, which may be another
-        # one here.
-        base = _with_positions(base, lambda name: os.path.relpath(config.parent / name, folder))
+        # Names of files are relative to the configuration's folder, which may be another one here.
+        base = _with_files(
+            base, lambda name: _moved(name, config.parent, folder if is_file else None)
+        )
     written: dict[str, bytes] = {}
     if source == "skinspec":
         settings = import_boards(files, base, findings)
@@ -152,49 +165,71 @@ def import_files(
         settings = import_manager(files, base, findings)
     names = ", ".join(file.name for file in files)
     text = configuration_text(settings, f"Imported from {names} by `skin import {source}`.")
-    _check(text, written, output)
+    _check(settings, written, output)
     if written and not is_file:
         raise ConfigurationError(
             f"{output}: positions files go to a folder beside it; wanted a file"
         )
-    for name, data in [*written.items(), (output.name, text.encode())]:
-        with writing(folder / name):
-            write_atomic(folder / name, data)
-    return [folder / name for name in [output.name, *written]] if is_file else []
+    documents = [(output.name, text.encode()), *written.items()]
+    paths = write_together(((folder / name, data) for name, data in documents), files)
+    return paths if is_file else []
 
 
-def _with_positions(settings: Settings, renamed: Callable[[str], str]) -> Settings:
-    """Return the same settings with renamed positions files."""
+def _with_files(table: T, renamed: Callable[[str], str]) -> T:
+    """Return the same settings with every file that they name renamed."""
+    found: Any = table
+    if isinstance(table, Struct):
+        kinds = _kinds(type(table))
+        entries = {key: getattr(table, key) for key in kinds}
+        changed = {
+            key: renamed(value)
+            if kinds[key] == FileName | None and value is not None
+            else _with_files(value, renamed)
+            for key, value in entries.items()
+        }
+        found = msgspec.structs.replace(table, **changed)
+    elif isinstance(table, dict):
+        found = {key: _with_files(value, renamed) for key, value in table.items()}
+    elif isinstance(table, list):
+        found = [_with_files(value, renamed) for value in table]
+    return cast(T, found)
 
-    def changed(patch: Patch) -> Patch:
-        if patch.positions is None:
-            return patch
-        return msgspec.structs.replace(patch, positions=renamed(patch.positions))
 
-    parts = {
-        name: msgspec.structs.replace(part, patches=[changed(patch) for patch in part.patches])
-        for name, part in settings.parts.items()
-    }
-    return msgspec.structs.replace(settings, parts=parts)
+@cache
+def _kinds(table: type[Struct]) -> dict[str, Any]:
+    return get_type_hints(table, include_extras=True)
 
 
-def _check(text: str, written: dict[str, bytes], output: Path) -> None:
-    """Read the new configuration back in a temporary folder before it is written.
+def _moved(name: str, old: Path, new: Path | None) -> str:
+    """Name a file from another folder, or from any (None); what has an absolute name keeps it.
+
+    Links in the names of the folders are followed: what is above a link is not above its end.
+    """
+    if Path(name).is_absolute():
+        return name
+    there = Path(os.path.realpath((old / name).parent), Path(name).name)
+    return str(there) if new is None else os.path.relpath(there, os.path.realpath(new))
+
+
+def _check(settings: Settings, written: dict[str, bytes], output: Path) -> None:
+    """Write a new configuration into a temporary folder and read it back before it is written.
 
     Raises:
         ConfigurationError: it is not a valid configuration.
     """
+
+    def where_it_is(name: str) -> str:
+        return name if name in written else str((output.parent / name).resolve())
+
     with tempfile.TemporaryDirectory() as folder:
         trial = Path(folder) / output.name
-        for name, data in {**written, output.name: text.encode()}.items():
-            write_atomic(trial.parent / name, data)
-
-        def where_it_is(name: str) -> str:
-            return name if name in written else str((output.parent / name).resolve())
-
+        text = configuration_text(_with_files(settings, where_it_is))
+        write_together(
+            (trial.parent / name, data)
+            for name, data in {**written, output.name: text.encode()}.items()
+        )
         try:
-            settings = _with_positions(configuration.load(trial), where_it_is)
-            build_layout(settings, trial.parent)
+            build_layout(configuration.load(trial), trial.parent)
         except ConfigurationError as error:
             what = str(error).removeprefix(f"{trial}: ")
             raise ConfigurationError(

@@ -19,6 +19,7 @@ from skin_host.config.settings import (
     TRIANGLES_PER_BOARD,
     Board,
     KindSettings,
+    Part,
     Patch,
     Pressure,
     Settings,
@@ -40,6 +41,10 @@ from skin_host.processing.pressure import BENDS, SLOPES_KPA, PressureCurve
 TAXELS_PER_TRIANGLE = 12
 #: A pad that stands for less skin than this counts for no force.
 SMALLEST_SHARE_MM2 = 0.001
+#: A probe of more pitches covers so many pads wholly that the strongest reading does not show which
+#: is nearest: the template is then farther off than the centroid (on pads of 5 mm: 0.05 mm with a
+#: probe of 10 mm, 0.7 mm with 15 mm, 2.7 mm with 20 mm; the centroid is 0.1 to 0.2 mm off).
+WIDEST_PITCHES = 3.0
 
 
 class PadKind(IntEnum):
@@ -176,8 +181,8 @@ def build_layout(settings: Settings, folder: Path) -> Layout:
     Relative file names in them start in `folder`, the configuration's own.
 
     Raises:
-        ConfigurationError: an unknown kind, wrong numbers of places, a bad positions file, or
-            taxels that would feel nothing.
+        ConfigurationError: an unknown kind, wrong numbers of places, a bad positions file,
+            taxels that would feel nothing, or probes too large for the pads.
     """
     kinds = builtin_kinds() | settings.kinds
     board_names = list(settings.boards)
@@ -234,6 +239,7 @@ def build_layout(settings: Settings, folder: Path) -> Layout:
                     )
                 )
             taxel += TAXELS_PER_TRIANGLE * len(numbers)
+        _check_probes(part_name, part, columns[first_column:])
         if all((column.pad_kind != PadKind.PRESSURE).all() for column in columns[first_column:]):
             raise ConfigurationError(
                 f"parts.{part_name}: all of its pads are thermal; wanted one at least that "
@@ -281,6 +287,19 @@ class _Columns:
 
 
 _ARRAYS = [one.name for one in fields(_Columns) if one.name != "outlines_m"]
+
+
+def _check_probes(name: str, part: Part, columns: list[_Columns]) -> None:
+    if part.localization != "template":
+        return
+    most_mm = WIDEST_PITCHES * max(float(column.pitch_mm.max()) for column in columns)
+    largest_mm = max(part.probe_mm)
+    if largest_mm > most_mm:
+        raise ConfigurationError(
+            f"parts.{name}.probe_mm: {largest_mm:g} mm; wanted at most {most_mm:g} mm, "
+            f"{WIDEST_PITCHES:g} pitches of its pads: many pads read alike under a larger object, "
+            'which localization = "centroid" locates better'
+        )
 
 
 def _board_layout(

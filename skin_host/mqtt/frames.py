@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from skin_host.errors import SkinError
 from skin_host.mqtt.messages import SCALE_KPA, Frame
 from skin_host.mqtt.payload import MessageError, check_size, decode
-from skin_host.processing.events import MAX_TAXELS, Count, Int64
+from skin_host.processing.events import MAX_TAXELS, Count, Nanoseconds
 from skin_host.processing.masks import Mask, any_of
 
 FRAME_SCHEMA: Final = "skin.frame/1"
@@ -100,7 +100,7 @@ class _FrameFields(Struct, omit_defaults=True):
 
     schema: Annotated[str, Meta(max_length=32)]
     seq: Count
-    t_ns: Int64
+    t_ns: Nanoseconds
     unit: Literal["kPa"]
     scale: Annotated[float, Meta(gt=0, le=1000)]
     values: Any

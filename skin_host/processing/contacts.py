@@ -70,7 +70,7 @@ class ContactTracker:
     With the part's `localization` left at `centroid`, a connected patch of touched taxels is one
     contact at its mean weighted by force. With any other, a patch with several clear maxima is
     several contacts, and each is located from activations. The template's table of a pad is
-    computed when the pad is first the strongest, which takes some 30 ms once.
+    computed when the pad is first the strongest, which takes some 20 ms once (at most a second).
 
     Args:
         layout: the skin.

@@ -9,7 +9,10 @@ from msgspec.structs import replace
 #: No part has more.
 MAX_TAXELS = 100_000
 
-Int64 = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
+#: The last time that numpy and the formats of recordings hold, in the year 2262.
+LATEST_NS = 2**63 - 1
+#: Since 1970.
+Nanoseconds = Annotated[int, Meta(ge=0, le=LATEST_NS)]
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Vector = tuple[float, float, float]
 PartName = Annotated[str, Meta(max_length=64)]
@@ -68,7 +71,7 @@ class Touch(
     event: Literal["begin", "move", "end"]
     id: Count
     seq: Count
-    t_ns: Int64
+    t_ns: Nanoseconds
     count: Count = 0
     part: PartName
     taxels: Annotated[list[Annotated[int, Meta(ge=0, le=MAX_TAXELS)]], Meta(max_length=MAX_TAXELS)]

@@ -42,17 +42,21 @@ SADDLE = 0.6
 #: Assumed sizes of touching objects, for the template, mm. One size is more precise if it is the
 #: right one and worse than the centroid if it is not.
 PROBES_MM = (6.0, 8.0, 10.0, 12.0)
-#: Distance of the candidate places, mm. Between them the pattern is treated as linear.
+#: Least distance of the candidate places, mm. Between them the pattern is treated as linear.
 STEP_MM = 0.3
+#: Most shares of pads that are looked at for one table: places times pads times sizes of probe.
+#: Where there would be more, the places lie farther apart. A part of triangles with four sizes has
+#: half of that. So a table is laid down within some 200 MB and a second, whatever the pads.
+MOST_SHARES = 1_000_000
 #: A place is a candidate if the pad is covered there nearly as much as the most covered one.
 #: Strengths of pads differ, so the strongest reading may not be that of the most covered pad.
 STRONGEST_WITHIN = 0.25
 #: Pads differ in strength by about this share even after calibration.
 GAIN_SPREAD = 0.03
-#: Error of a pattern half a step away from the nearest candidate place, in units per unit.
+#: Error of a pattern half of `STEP_MM` away from the nearest candidate place, in units per unit.
 STEP_SHARE = 0.01
-#: Number of tables kept at a time, about 0.7 MB each with four sizes of probe.
-MOST_TABLES = 128
+#: Tables of a part that are kept at a time. One has about 0.7 MB with four sizes of probe.
+MOST_TABLE_BYTES = 100_000_000
 #: If the places that explain the readings lie closer together than this, the best is refined.
 SHARP_MM = 0.5
 
@@ -64,8 +68,10 @@ class _Table(NamedTuple):
     [places, 4] are 1, x, y, x^2 + y^2 of the places, each times the prior weight of the place (see
     `TemplateLocalizer`); `shape` [places, 3, pads] are the pattern and its slopes along x and y,
     per mm. `frame` [3, 3] holds, in mm, the pad's position and its change per mm along x and y.
+    `step_mm` is the distance of the places.
     """
 
+    step_mm: float
     pads: Indices
     place_mm: Floats
     moments: Floats32
@@ -73,6 +79,11 @@ class _Table(NamedTuple):
     twice_squared: Floats32
     shape: Floats32
     frame: Floats
+
+    @property
+    def size_bytes(self) -> int:
+        """Memory of its arrays."""
+        return sum(array.nbytes for array in self if isinstance(array, np.ndarray))
 
 
 class TemplateLocalizer:
@@ -117,7 +128,9 @@ class TemplateLocalizer:
             )
         ]
         self._centroid = CentroidLocalizer(position_m, noise_units=noise_units)
+        #: Those laid down earlier come first.
         self._tables: dict[int, _Table] = {}
+        self._tables_bytes = 0
 
     def locate(self, taxels: Indices, units: Floats, usable: Mask) -> Location | None:
         mine = taxels[usable[taxels]]
@@ -131,16 +144,16 @@ class TemplateLocalizer:
             return self._centroid.locate(taxels, units, usable)
         table = self._tables.get(strongest)
         if table is None:
-            if len(self._tables) >= MOST_TABLES:
-                self._tables.pop(next(iter(self._tables)))
-            table = self._tables[strongest] = self._lay_down(strongest)
+            table = self._lay_down(strongest)
+            self._keep(strongest, table)
         # Each call of numpy costs as much as its work here, so there are few. All is float32: one
         # float64 among these would copy the tables at each touch.
         trust = usable.take(table.pads)
         reading = np.multiply(units.take(table.pads), trust, dtype=np.float32)
         spread = reading * reading
         spread *= np.float32(GAIN_SPREAD**2)
-        unsure = np.float32(self._noise_units**2 + (STEP_SHARE * peak) ** 2)
+        between = STEP_SHARE * table.step_mm / STEP_MM
+        unsure = np.float32(self._noise_units**2 + (between * peak) ** 2)
         coarse = np.divide(trust, spread + unsure, dtype=np.float32)
         weighted = coarse * reading
         # The strength of the push is unknown: use the best one for each place.
@@ -162,7 +175,7 @@ class TemplateLocalizer:
             fine = np.divide(trust, spread, dtype=np.float32)
             refined = _refine(table, place, reading, fine)
             # A pattern that does not change with the place cannot be refined.
-            if refined is not None and refined[2] < variance_mm2 + STEP_MM**2:
+            if refined is not None and refined[2] < variance_mm2 + table.step_mm**2:
                 x, y, variance_mm2 = refined
         place_mm = np.array((1.0, x, y)) @ table.frame
         return Location(1e-3 * place_mm, 1e-3 * math.sqrt(variance_mm2 * misfit))
@@ -174,17 +187,27 @@ class TemplateLocalizer:
             mask |= 1 << taxel
         return any(mask & self._far[taxel] for taxel in taxels)
 
+    def _keep(self, centre: int, table: _Table) -> None:
+        """Keep the table of a pad, and forget as many of the oldest as leave room for it."""
+        self._tables_bytes += table.size_bytes
+        while self._tables and self._tables_bytes > MOST_TABLE_BYTES:
+            self._tables_bytes -= self._tables.pop(next(iter(self._tables))).size_bytes
+        self._tables[centre] = table
+
     def _lay_down(self, centre: int) -> _Table:
         """Return the patterns of all places at which this pad would have about the highest
         reading.
         """
         radius = self._radius_mm
         reach_mm = self._probes_mm.max() + 2.0 * radius.max()
-        pads, flat_m, basis = tangent_plane(self._position_m, self._normal, centre, 2e-3 * reach_mm)
+        pads, flat_m, basis = tangent_plane(self._position_m, self._normal, centre, 1e-3 * reach_mm)
         flat_mm = 1e3 * flat_m
         half_mm = 0.5 * self._probes_mm.max() + radius[centre]
-        axis = STEP_MM * np.arange(-np.ceil(half_mm / STEP_MM), np.ceil(half_mm / STEP_MM) + 1)
+        places_a_side = math.sqrt(MOST_SHARES / (len(pads) * len(self._probes_mm)))
+        step_mm = max(STEP_MM, 2.0 * half_mm / places_a_side)
+        axis = step_mm * np.arange(-np.ceil(half_mm / step_mm), np.ceil(half_mm / step_mm) + 1)
         grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+        grid = grid[np.hypot(*grid.T) < half_mm]
         # Places much nearer to another pad cannot cover this one most; drop them early.
         away = np.linalg.norm(grid[:, None] - flat_mm[None], axis=2)
         own = int(np.flatnonzero(pads == centre)[0])
@@ -200,11 +223,11 @@ class TemplateLocalizer:
             patterns.append(share[near])
             right, left, up, down = (
                 covered_share(
-                    grid[near] + 0.5 * STEP_MM * np.array(side), flat_mm, radius, probe_mm
+                    grid[near] + 0.5 * step_mm * np.array(side), flat_mm, radius, probe_mm
                 )
                 for side in ((1, 0), (-1, 0), (0, 1), (0, -1))
             )
-            slopes.append(np.stack([right - left, up - down], axis=1) / STEP_MM)
+            slopes.append(np.stack([right - left, up - down], axis=1) / step_mm)
         place_mm = np.concatenate(places)
         pattern = np.concatenate(patterns)
         used = pattern.max(axis=0) > 0.0
@@ -212,6 +235,7 @@ class TemplateLocalizer:
         moments = np.column_stack([np.ones(len(place_mm)), place_mm, (place_mm**2).sum(axis=1)])
         moments *= np.linalg.norm(pattern, axis=1, keepdims=True)
         return _Table(
+            step_mm,
             pads[used],
             place_mm,
             moments.astype(np.float32),
@@ -245,7 +269,7 @@ def _refine(
         return None
     move_x, move_y = (yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant
     strength = (t - tx * move_x - ty * move_y) / tt
-    limit = STEP_MM * strength
+    limit = table.step_mm * strength
     if not (abs(move_x) <= limit and abs(move_y) <= limit):
         return None
     at_x, at_y = table.place_mm[place].tolist()

@@ -17,7 +17,7 @@ import os
 import queue
 import secrets
 import time
-from bisect import bisect_right
+from bisect import bisect_right, insort
 from collections.abc import Awaitable, Callable, Collection
 from io import FileIO
 from pathlib import Path
@@ -25,7 +25,8 @@ from typing import Any, Self, cast
 
 import can
 
-from skin_host.bus.logs import candump_name, name_in
+from skin_host.bus.asc import DatedAscWriter
+from skin_host.bus.logs import WINDOW_NS, candump_name, name_in
 from skin_host.bus.opening import open_port
 from skin_host.bus.port import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Port
 from skin_host.bus.wire import FrameBatch
@@ -104,7 +105,8 @@ class CanLog:
     """
 
     def __init__(self, path: Path, channels: Collection[str] = ()) -> None:
-        if path.suffix not in CAN_SUFFIXES:
+        suffix = path.suffix.lower()
+        if suffix not in CAN_SUFFIXES:
             known = ", ".join([*CAN_SUFFIXES, MCAP_SUFFIX])
             raise RequestError(f'{path}: suffix "{path.suffix}"; wanted one of {known}')
         if len({name_in(path, channel) for channel in channels}) < len(channels):
@@ -117,8 +119,10 @@ class CanLog:
         with writing(path):
             self._draft = Draft(path)
             self._draft.begin()
-            kind = _Candump if path.suffix == CANDUMP_SUFFIX else _PythonCan
-            self._file = kind(self._draft.path)
+            if suffix == CANDUMP_SUFFIX:
+                self._file: _Candump | _PythonCan = _Candump(self._draft.path)
+            else:
+                self._file = _PythonCan(self._draft.path, suffix)
 
     @property
     def left_out(self) -> int:
@@ -180,16 +184,21 @@ class _PythonCan:
     """A growing file of python-can.
 
     Some formats need frames in the order of their times. Buses are read in turn, so the newest
-    frames are held back for these until those of the others have come.
+    frames are held back for these until those of the others have come, or the clock is set back:
+    then those held are before what follows, whatever their times.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, suffix: str) -> None:
         self.left_out = self.moved = 0
-        self._logger = cast(can.io.generic.FileIOMessageWriter[Any], can.Logger(path))
-        self._knows_data_alone = path.suffix == ".trc"
-        self._needs_order = path.suffix in (".asc", ".blf")
+        logger = DatedAscWriter(path) if suffix == ".asc" else can.Logger(path)
+        self._logger = cast(can.io.generic.FileIOMessageWriter[Any], logger)
+        self._knows_data_alone = suffix == ".trc"
+        self._needs_order = suffix in (".asc", ".blf")
+        #: In the order of their times, where the format needs that.
         self._held: list[can.Message] = []
         self._last_s = 0.0
+        #: Time of each channel's last frame.
+        self._last_of_s: dict[str, float] = {}
 
     def put(self, channel: str, batch: FrameBatch) -> int:
         messages = [message_at(batch, row, channel) for row in range(len(batch))]
@@ -197,12 +206,11 @@ class _PythonCan:
             data = [one for one in messages if not (one.is_remote_frame or one.is_error_frame)]
             self.left_out += len(messages) - len(data)
             messages = data
-        self._held += messages
-        n = len(self._held)
-        if self._needs_order and n:
-            self._held.sort(key=_time_of)
-            known = bisect_right(self._held, self._held[-1].timestamp - HELD_S, key=_time_of)
-            n = known if n - known <= MAX_HELD else n
+        if self._needs_order:
+            n = self._hold(channel, messages)
+        else:
+            self._held += messages
+            n = len(messages)
         self._write(n)
         return len(messages)
 
@@ -214,6 +222,21 @@ class _PythonCan:
             # It leaves the file open if the disk is full.
             with contextlib.suppress(OSError):
                 self._logger.file.close()
+
+    def _hold(self, channel: str, messages: list[can.Message]) -> int:
+        """Hold back a channel's messages; return how many of those held need not wait longer."""
+        held = self._held
+        for message in messages:
+            newest_s = held[-1].timestamp if held else 0.0
+            first_s = max(self._last_of_s.get(channel, 0.0), newest_s - HELD_S)
+            if message.timestamp < first_s:  # the clock was set back
+                self._write(len(held))
+            insort(held, message, key=_time_of)
+            self._last_of_s[channel] = message.timestamp
+        if not held:
+            return 0
+        known = bisect_right(held, held[-1].timestamp - HELD_S, key=_time_of)
+        return known if len(held) - known <= MAX_HELD else len(held)
 
     def _write(self, n: int) -> None:
         """Write the first `n` of those that are held back."""
@@ -273,13 +296,13 @@ async def capture_buses(settings: Settings, sink: CanSink, stop: asyncio.Event) 
         for name, bus in settings.buses.items():
             ports.append(open_port(name, bus, settings.receive))
         while not stop.is_set():
-            is_behind = False
-            for port in ports:
-                # Once in turn: a bus on which more comes than is read must not hold up the end.
-                batch = port.read()
-                is_behind |= len(batch) >= port.capacity
-                if len(batch):
-                    sink(port.channel, batch)
+            # Once in turn: a bus on which more comes than is read must not hold up the end.
+            batches = [(port.channel, port.read()) for port in ports]
+            is_behind = any(
+                len(batch) >= port.capacity for port, (_, batch) in zip(ports, batches, strict=True)
+            )
+            for channel, batch in _as_they_came(batches):
+                sink(channel, batch)
             await asyncio.sleep(0.0 if is_behind else POLL_S)
         return sum(port.counters.dropped + port.counters.damaged for port in ports)
     finally:
@@ -287,10 +310,48 @@ async def capture_buses(settings: Settings, sink: CanSink, stop: asyncio.Event) 
             port.close()
 
 
+def _as_they_came(batches: list[tuple[str, FrameBatch]]) -> list[tuple[str, FrameBatch]]:
+    """Batches of buses that were read in one turn, cut into windows of time.
+
+    A turn may be longer than a board's period. Whoever reads the recording gets its frames in this
+    order, and must not meet several sweeps of one bus before those of another.
+    """
+    filled = [(channel, batch) for channel, batch in batches if len(batch)]
+    if len(filled) < 2:
+        return filled
+    pieces: list[tuple[tuple[int, int], str, FrameBatch]] = []
+    for channel, batch in filled:
+        windows = _windows(batch.t_ns.tolist())
+        begin = 0
+        for end in range(1, len(windows) + 1):
+            if end < len(windows) and windows[end] == windows[begin]:
+                continue
+            rows = slice(begin, end)
+            piece = FrameBatch(batch.id[rows], batch.dlc[rows], batch.data[rows], batch.t_ns[rows])
+            piece.dropped = 0 if begin else batch.dropped
+            pieces.append((windows[begin], channel, piece))
+            begin = end
+    pieces.sort(key=lambda piece: piece[0])
+    return [(channel, piece) for _, channel, piece in pieces]
+
+
+def _windows(times_ns: list[int]) -> list[tuple[int, int]]:
+    """In which window each time is, the windows of a clock that was set back after all before."""
+    found = []
+    n_set = window = last_ns = 0
+    for t_ns in times_ns:
+        if t_ns < last_ns - WINDOW_NS:
+            n_set, window = n_set + 1, 0
+        last_ns, window = t_ns, max(window, t_ns // WINDOW_NS)
+        found.append((n_set, window))
+    return found
+
+
 async def capture_broker(
     recorder: Recorder, broker: Broker, base: str, robot: str, stop: asyncio.Event
 ) -> int:
-    """Record a robot's messages until `stop` is set; return how often the broker was lost.
+    """Record a robot's messages until `stop` is set; return how often the broker was lost or not
+    there.
 
     Raises:
         SkinError: the recording cannot be written.
@@ -302,6 +363,7 @@ async def capture_broker(
 async def _listen(recorder: Recorder, broker: Broker, topics: list[str]) -> None:
     retry = Retry()
     identifier = f"skin-record-{secrets.token_hex(4)}"
+    is_out = False
     while True:
         since_s: float | None = None
         try:
@@ -315,6 +377,7 @@ async def _listen(recorder: Recorder, broker: Broker, topics: list[str]) -> None
                 try:
                     for topic in topics:
                         await connection.subscribe(topic, qos=0 if topic.endswith("/frame") else 1)
+                    is_out = False
                     async for message in connection.messages:
                         if isinstance(message.payload, bytes):
                             recorder.say(message.topic.value, time.time_ns(), message.payload)
@@ -323,7 +386,8 @@ async def _listen(recorder: Recorder, broker: Broker, topics: list[str]) -> None
         except* SkinError as group:
             raise first_error(group) from None
         except* Exception as group:
-            recorder.gaps += 1
+            recorder.gaps += not is_out  # however many attempts it takes to listen again
+            is_out = True
             _log.warning("broker %s: %s; trying again", broker, explain(first_error(group)))
         await asyncio.sleep(retry.delay_s(0.0 if since_s is None else time.monotonic() - since_s))
 

@@ -3,6 +3,7 @@
 The recording begins with some seconds of untouched skin, which serve as its calibration.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -32,7 +33,7 @@ from skin_host.processing.fitting.course import (
 from skin_host.processing.fitting.hold import Fit, HoldRecord, fit, merge
 from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.relaxation import make_model, parameters_of
-from skin_host.recording.load_table import check_course, on_clock_of
+from skin_host.recording.load_table import LoadTable, check_course, check_covers, on_clock_of
 from skin_host.recording.replay import calibrate_from_log, steps
 
 Floats = NDArray[np.float64]
@@ -46,6 +47,8 @@ PRESSED_QUANTILE = 0.95
 #: A hold has at least this pressure, for at least this share of its time.
 LEAST_KPA = 10.0
 HELD_SHARE = 0.98
+#: A fit that leaves this share of the hold's level as its error describes another hold.
+FITTED_SHARE = 0.5
 #: Pressure moves if it changes by more than this share of the hold's from one sample to the next.
 MOVING_SHARE = 0.1
 #: A plateau of known pressure lasts at least this long, and is steady to this share of itself.
@@ -153,7 +156,7 @@ def read_samples(
 def hold_record(
     samples: Samples,
     curve: PressureCurve,
-    load: tuple[Floats, Floats] | None,
+    load: LoadTable | None,
     weight_kpa: float | None,
 ) -> HoldRecord:
     """Find the hold and the release in a recording.
@@ -161,12 +164,12 @@ def hold_record(
     Args:
         samples: of the recording.
         curve: of its taxels.
-        load: a load cell's times (s, on the recording's clock or from its start) and
-            pressures (kPa), if there was one.
+        load: a load cell's table, on the recording's clock or from its start, if there was one.
         weight_kpa: the pressure of a dead weight that was laid on and taken off again.
 
     Raises:
-        RequestError: nothing was pressed for long, or more than once, or it was not released.
+        RequestError: nothing was pressed for long, or more than once, or it was not released; or
+            the table is no course of pressure in kPa, or does not cover the hold.
     """
     # Some thousand samples show which taxels take part; only for those the whole is used.
     thin = slice(None, None, max(len(samples.raw) // 4000, 1))
@@ -195,12 +198,12 @@ def hold_record(
     if weight_kpa is not None:
         pressure[start:release] = weight_kpa
     elif load is not None:
-        time_s, load_kpa = load
-        now_s = np.arange(len(momentary)) * samples.dt_s
-        if time_s[0] >= samples.start_s - 1.0:
-            now_s += samples.start_s
-        inside = (now_s >= time_s[0]) & (now_s <= time_s[-1])
-        pressure = np.where(inside, np.interp(now_s, time_s, load_kpa), pressure)
+        check_course(load)
+        load = on_clock_of(load, samples.start_s)
+        now_s = samples.start_s + np.arange(len(momentary)) * samples.dt_s
+        check_covers(load, float(now_s[start]), float(now_s[release]), "hold")
+        inside = (now_s >= load.time_s[0]) & (now_s <= load.time_s[-1])
+        pressure = np.where(inside, np.interp(now_s, load.time_s, load.kpa), pressure)
     # During movement, reading and load cell are not of the same moment.
     moving = np.abs(np.diff(momentary)) > MOVING_SHARE * strongest[chosen].mean()
     pressure[:-1][moving] = np.nan
@@ -220,8 +223,14 @@ def fit_relaxation(record: HoldRecord, models: Sequence[str]) -> list[Fit]:
 
 
 def save_relaxation(path: Path, found: Fit, settings: Settings, record: HoldRecord) -> None:
-    """Write a file for `processing.relaxation.file`, completely or not at all."""
+    """Write a file for `processing.relaxation.file`, completely or not at all.
+
+    Raises:
+        RequestError: the model does not describe the record, so its pressure is probably not
+            that of the hold.
+    """
     chosen = found.parameters
+    _check_fit(found, record)
     document: dict[str, Any] = {
         "schema": RELAXATION_SCHEMA,
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -276,21 +285,20 @@ def fit_curves(
     samples: Samples,
     settings: Settings,
     layout: Layout,
-    load: tuple[Floats, Floats],
-    path: Path,
+    load: LoadTable,
 ) -> tuple[Calibration, Curves]:
     """Fit a curve to every pad, and the foam's memory, from any course of known pressure.
 
-    `load` are times in s, and pressures in kPa on all pads alike, from the table at `path`.
+    `load` is the pressure on all pads alike.
 
     Raises:
         RequestError: the table is no course of pressure, not of this recording, or nothing is
             pressed.
     """
-    time_s, kpa = load
-    check_course(path, time_s, kpa)
+    check_course(load)
+    path, time_s, kpa = load = on_clock_of(load, samples.start_s)
     end_s = samples.start_s + samples.dt_s * len(samples.raw)
-    time_s = on_clock_of(time_s, samples.start_s, end_s, path)
+    check_covers(load, samples.start_s, end_s, "recording")
     pads = samples.received & (layout.pad_kind == PadKind.PRESSURE)
     course = Course(samples.dt_s, samples.raw, samples.zero, pads, np.zeros(len(samples.raw)))
     units, _ = activations(course)
@@ -372,6 +380,23 @@ def _kept_shares(
                     out=total,
                 )
     return [total / (part.stop - part.start) for part, total in zip(parts, sums, strict=True)]
+
+
+def _check_fit(found: Fit, record: HoldRecord) -> None:
+    errors_kpa = found.rms_hold_kpa, found.rms_rest_kpa
+    worst_kpa = max((kpa for kpa in errors_kpa if not math.isnan(kpa)), default=0.0)
+    most_kpa = FITTED_SHARE * record.level_kpa
+    if worst_kpa >= most_kpa:
+        raise RequestError(
+            f"{found.model} fits a hold at {record.level_kpa:.0f} kPa to {worst_kpa:.3g} kPa RMS; "
+            f"wanted less than {most_kpa:.3g}: is the pressure that of this hold, in kPa?"
+        )
+    taken = max(math.fsum(found.parameters.beta), math.fsum(found.parameters.beta_unload))
+    if taken >= 1.0:
+        raise RequestError(
+            f"{found.model} takes {taken:.0%} of a hold's pressure away; wanted less than 100%: is "
+            "the pressure that of this hold, in kPa?"
+        )
 
 
 def _held(values: NDArray[np.uint8], valid: Mask) -> NDArray[np.uint8]:

@@ -1,6 +1,7 @@
 """Tables of known pressure: `time_s,pressure_kpa`, written by a load cell or a pressure sensor."""
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,14 +21,22 @@ LEAST_KPA = 10.0
 #: Samples may be missing for this long, or for this multiple of their usual distance.
 LONGEST_GAP_S = 1.0
 GAP_SAMPLES = 10.0
-#: At least this share of the recording must lie within the table.
+#: At least this share of the recording, or of its hold, must lie within the table.
 COVERED_SHARE = 0.95
 #: A table that begins before this many seconds counts them from its recording's start.
 OWN_CLOCK_S = 1e6
 
 
-def read_table(path: Path) -> tuple[Floats, Floats]:
-    """Read times in s, rising, and pressures in kPa, both finite [t], at least two.
+class LoadTable(NamedTuple):
+    """A course of pressure in time: times [t] in s, rising, and pressures [t] in kPa, of a file."""
+
+    path: Path
+    time_s: Floats
+    kpa: Floats
+
+
+def read_table(path: Path) -> LoadTable:
+    """Read a table of at least two samples, all finite.
 
     A first line without numbers is a heading; lines that start with # are remarks.
 
@@ -60,16 +69,17 @@ def read_table(path: Path) -> tuple[Floats, Floats]:
         rows.append((time_s, kpa))
     if len(rows) < 2:
         raise RequestError(f"{path}: {len(rows)} samples; {WANTED}")
-    table = np.array(rows)
-    return table[:, 0], table[:, 1]
+    time_s, kpa = np.array(rows).T
+    return LoadTable(path, time_s, kpa)
 
 
-def check_course(path: Path, time_s: Floats, kpa: Floats) -> None:
+def check_course(table: LoadTable) -> None:
     """Check that a table holds a course of pressure in kPa without gaps.
 
     Raises:
         RequestError: it spans too little, is in another unit, or has a gap.
     """
+    path, time_s, kpa = table
     low, high = float(kpa.min()), float(kpa.max())
     seen = f"{path}: pressures from {low:g} to {high:g}"
     if high > HIGHEST_KPA:
@@ -88,28 +98,33 @@ def check_course(path: Path, time_s: Floats, kpa: Floats) -> None:
         )
 
 
-def on_clock_of(time_s: Floats, start_s: float, end_s: float, path: Path) -> Floats:
-    """Return a table's times on a recording's clock, but for a lag.
+def on_clock_of(table: LoadTable, start_s: float) -> LoadTable:
+    """Return a table on the clock of a recording that starts at `start_s`, but for a lag.
 
     A table counts from its recording's start, or has the same clock.
+    """
+    of_own = table.time_s[0] < OWN_CLOCK_S <= start_s
+    return table._replace(time_s=table.time_s + start_s) if of_own else table
+
+
+def check_covers(table: LoadTable, start_s: float, end_s: float, whole: str) -> None:
+    """Check that a table covers a time on its clock, which the message calls `whole`.
 
     Raises:
-        RequestError: the table is of another time, or ends long before the recording does.
+        RequestError: the table is of another time, or lacks more than little of it.
     """
-    of_own = time_s[0] < OWN_CLOCK_S <= start_s
-    aligned: Floats = time_s + start_s if of_own else time_s
-    covered = min(end_s, aligned[-1]) - max(start_s, aligned[0])
+    first_s, last_s = float(table.time_s[0]), float(table.time_s[-1])
+    covered = min(end_s, last_s) - max(start_s, first_s)
     if covered <= 0.0:
         raise RequestError(
-            f"{path}: covers {time_s[0]:.0f} to {time_s[-1]:.0f} s, the recording {start_s:.0f} to "
+            f"{table.path}: covers {first_s:.0f} to {last_s:.0f} s, the {whole} {start_s:.0f} to "
             f"{end_s:.0f} s; wanted the pressure of the same time"
         )
     if covered < COVERED_SHARE * (end_s - start_s):
         raise RequestError(
-            f"{path}: covers {covered:.0f} s of the recording's {end_s - start_s:.0f} s; wanted "
-            "the pressure throughout the recording"
+            f"{table.path}: covers {covered:.0f} s of the {whole}'s {end_s - start_s:.0f} s; "
+            f"wanted the pressure throughout the {whole}"
         )
-    return aligned
 
 
 def _is_number(text: str) -> bool:

@@ -24,6 +24,7 @@ from skin_host.mqtt.address import Broker
 from skin_host.mqtt.connection import Connection, MqttError, connect, explain
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.order import last_will
+from skin_host.mqtt.outbox import BACKLOG
 from skin_host.mqtt.publisher import Publisher
 from skin_host.mqtt.topics import OFFLINE
 from skin_host.processing.core import Engine, Output
@@ -42,6 +43,10 @@ MAX_NODES = 64
 PATIENCE_S = 5.0
 #: How long the broker may take for the last messages.
 DRAIN_S = 10.0
+#: So many events may wait for the broker; from about twice as many on, moves are replaced.
+MOST_EVENTS = BACKLOG // 2
+#: How often a broker that is slow is looked after.
+LOOK_S = 0.001
 _NO_DATA = ERROR_FLAG | REMOTE_FLAG
 
 T = TypeVar("T")
@@ -239,17 +244,19 @@ class Played(NamedTuple):
 async def play_processed(
     log: Path, engine: Engine, settings: Settings, broker: Broker, speed: float = 1.0
 ) -> Played:
-    """Process a recording of CAN frames with the pipeline and publish the results.
+    """Process a recording of CAN frames with the pipeline and publish the results as a daemon.
 
     The engine is calibrated already. Of the table `mqtt` of the settings the form of the messages
-    counts, not the broker. Contacts that last at the end of the recording are ended.
+    counts, not the broker. A broker that is slower than the recording delays it, so that no frame
+    is replaced by a newer one. Contacts that last at the end of the recording are ended.
 
     Raises:
         LogError: the recording cannot be read.
         BrokerError: the broker cannot be reached, or has not taken everything.
     """
-    n = missed = 0
-    last_ns = 0
+    n = last_ns = 0
+    of = engine.layout.parts
+    engine.touch_only = {i for i in engine.parts if not settings.parts[of[i].name].frames}
     publisher = _publisher(settings.mqtt, engine.layout.robot, broker)
     async with publisher:
         await _connected(publisher, broker)
@@ -261,6 +268,7 @@ async def play_processed(
                 version=__version__,
                 configuration=skin_hash(settings),
                 encoding=settings.mqtt.encoding,
+                frame_hz=settings.mqtt.frame_hz,
                 commands=False,
                 fingertips=settings.fingertips,
             )
@@ -269,15 +277,19 @@ async def play_processed(
         fingertips = FingertipPublisher(engine.fingertips, publisher)
         contacts = contacts_of(engine)
 
-        def publish(output: Output) -> int:
+        async def publish(output: Output) -> int:
             fingertips.deliver(output.grasps)
+            frames = 0
             for step in output.steps:
-                publisher.put_frame(step.frame)
+                if step.part not in engine.touch_only:
+                    publisher.put_frame(step.frame)
+                    frames += 1
                 for event in step.events:
                     publisher.put_touch(event)
                 state = contacts[step.part].step(step.frame, step.events)
                 publisher.put_contact(step.frame.part, state)
-            return len(output.steps)
+                await _taken(publisher)
+            return frames
 
         def end() -> None:
             for part, contact in contacts.items():
@@ -290,10 +302,8 @@ async def play_processed(
         try:
             async for bus, batch in paced(read_buses(log, settings), _last_ns, speed):
                 last_ns = int(batch.t_ns[-1])
-                new = publish(engine.feed(bus, batch))
-                n += new
-                missed += 0 if publisher.counters.connected else new
-            n += publish(engine.flush())
+                n += await publish(engine.feed(bus, batch))
+            n += await publish(engine.flush())
         finally:
             end()
     counters = publisher.counters
@@ -301,18 +311,33 @@ async def play_processed(
     losses = {
         "touch events lost": counters.touches_dropped,
         "messages refused": counters.refused,
-        "messages over which the broker ends the connection": counters.rejected,
+        "messages that it does not take": counters.rejected,
     }
-    nothing = n and not played.frames_sent
-    if missed or nothing or any(losses.values()) or counters.last_error != trouble:
+    lost = counters.frames_skipped or any(losses.values())
+    if lost or counters.last_error != trouble:
+        withheld = ", ".join(counters.withheld)
+        why = counters.last_error or (
+            f"it does not take {withheld}" if withheld else "it is too slow"
+        )
         told = [f"{count} {what}" for what, count in losses.items() if count]
         raise BrokerError(
-            f"broker {broker}: not everything was taken: "
-            f"{counters.last_error or 'it is too slow'}; sent were {played.frames_sent} of {n} "
-            f"frames and {played.events_sent} touch events"
+            f"broker {broker}: not everything was taken: {why}; sent were {played.frames_sent} of "
+            f"{n} frames and {played.events_sent} touch events"
             + (f"; {', '.join(told)}" if told else "")
         )
     return played
+
+
+async def _taken(publisher: Publisher) -> None:
+    """Wait until there is room for more: a recording's time is its own.
+
+    A broker that is lost is not waited for.
+    """
+    await asyncio.sleep(0.0)  # what was put is written in a turn of the loop
+    while publisher.counters.connected and (  # noqa: ASYNC110
+        publisher.frames_waiting or publisher.counters.touches_waiting > MOST_EVENTS
+    ):
+        await asyncio.sleep(LOOK_S)
 
 
 def _publisher(settings: Mqtt, robot: str, broker: Broker) -> Publisher:

@@ -97,7 +97,8 @@ def plot_map(series: Series, output: Path, part: str, at_s: float | None = None)
     position_mm = np.array(shape.position_m) @ _face_on(np.array(shape.normal)).T * 1e3
     figure, axes = _pyplot().subplots(figsize=(8, 6), layout="compressed")
     for triangle in shape.triangles:
-        outline_mm = np.array(triangle.outline_m) @ _face_on(np.array(shape.normal)).T * 1e3
+        outline_m = np.array(triangle.outline_m).reshape(-1, 3)
+        outline_mm = outline_m @ _face_on(np.array(shape.normal)).T * 1e3
         axes.fill(*outline_mm[:, :2].T, facecolor="none", edgecolor="#b0b0b0", linewidth=0.8)
     valid = np.isfinite(kpa)
     dots = axes.scatter(

@@ -30,7 +30,7 @@ from skin_host.processing.calibration import Calibration, Verdict, by_part
 from skin_host.processing.calibration.calibrator import NOISE_SAMPLES
 from skin_host.processing.calibration.file import load_calibration
 from skin_host.processing.core import Engine, Output, Step
-from skin_host.recording import MCAP_SUFFIX
+from skin_host.recording import is_mcap
 from skin_host.recording.lines import LineWriter, health_line
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def read_buses(
         LogError: see `logs.read_channels`; or several buses, and none of their channels in it.
     """
     merged = len(settings.buses) == 1
-    if log.suffix == MCAP_SUFFIX:
+    if is_mcap(log):
         from skin_host.recording.mcap import read_can
 
         channels = read_can(log)
@@ -196,6 +196,10 @@ def replay(log: Path, engine: Engine) -> Iterator[Output]:
             yield from engine.feed_long(bus, batch)
     else:
         for bus, batch in read_buses(log, engine.settings):
+            if engine.fingertips is not None:
+                # What came before this batch has been fed. Nothing else ends the contact of a
+                # fingertip that is silent.
+                yield engine.expire(int(batch.t_ns[0]))
             yield engine.feed(bus, batch)
     yield engine.flush()
 

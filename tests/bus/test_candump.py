@@ -20,18 +20,20 @@ Read = list[tuple[str, list[tuple[int, bytes, int]]]]
 def line_by_line(path: Path) -> Iterator[tuple[str, list[tuple[int, bytes, int]]]]:
     """The oracle: each message of python-can put where it belongs."""
     windows: dict[str, list[tuple[int, bytes, int]]] = {}
-    end_ns = 0
+    low_ns = high_ns = 0
     with can.LogReader(path) as reader:
         for message in reader:
             if message.is_fd:
                 continue
             channel = "" if message.channel is None else str(message.channel)
             t_ns = nanoseconds(message.timestamp)
-            if windows and (t_ns >= end_ns or len(windows.get(channel, ())) == CAPACITY):
+            is_within = max(high_ns, t_ns) - min(low_ns, t_ns) < WINDOW_NS
+            if windows and (not is_within or len(windows.get(channel, ())) == CAPACITY):
                 yield from windows.items()
                 windows = {}
             if not windows:
-                end_ns = t_ns + WINDOW_NS
+                low_ns = high_ns = t_ns
+            low_ns, high_ns = min(low_ns, t_ns), max(high_ns, t_ns)
             frame = identifier(message), bytes(message.data), t_ns
             windows.setdefault(channel, []).append(frame)
     yield from windows.items()

@@ -3,6 +3,7 @@
 import gc
 import gzip
 from collections.abc import Iterator
+from datetime import datetime
 from pathlib import Path
 
 import can
@@ -53,6 +54,26 @@ def test_batches_span_no_more_than_the_window(tmp_path):
     assert sum(len(batch) for batch in batches) == 100
     assert all(int(batch.t_ns[-1] - batch.t_ns[0]) < 4 * MS for batch in batches)
     assert len(batches) == 25
+
+
+@pytest.mark.parametrize(
+    ("of_clock", "of_row"),
+    [(-3600, range(50, 100)), (-0.05, range(50, 100)), (3600, range(50, 51)), (-3600, [50, 70])],
+    ids=["set back", "set back a little", "one time ahead", "two times back"],
+)
+def test_batches_span_no_more_than_the_window_when_time_goes_back(tmp_path, of_clock, of_row):
+    """A window that waited for a later time would take in one channel's seconds, then the other's,
+    and a sensor whose halves or boards lie on both would have no whole sweep.
+    """
+    lines = [
+        f"({10_000 + row * 0.001 + of_clock * (row in of_row):.6f}) can{row % 2} {0x400 + row:X}#40"
+        for row in range(100)
+    ]
+    path = candump(tmp_path / "a.log", lines)
+    batches = list(read(path, window_ns=4 * MS))
+    assert all(int(np.ptp(batch.t_ns)) < 4 * MS for batch in batches)
+    rows = np.concatenate([batch.id for batch in batches]) - 0x400
+    assert np.abs(rows - np.arange(100)).max() < 4
 
 
 def test_a_flood_within_a_window_is_cut(tmp_path):
@@ -107,7 +128,45 @@ def test_every_format_of_python_can_gives_the_same_frames(tmp_path, suffix):
     assert [identifier for identifier, _ in frames] == [identifier for identifier, *_ in sent]
     assert [data.tobytes() for _, data in frames] == [data for _, data, _ in sent]
     times = np.concatenate([batch.t_ns.copy() for batch in read(path)])
-    assert np.all(np.abs(np.diff(times) - 10 * MS) <= MS)
+    assert np.all(np.abs(times - 1_700_000_000_000 * MS - np.arange(10) * 10 * MS) <= MS)
+
+
+def asc(path: Path, date: str, base: str = "hex  timestamps absolute") -> list[int]:
+    """Times of the frames of an ASC recording, in ms."""
+    path.write_text(
+        f"date {date}\nbase {base}\ninternal events logged\nBegin Triggerblock {date}\n"
+        "   0.000000 Start of measurement\n   0.500000 1  4E0             Rx   d 1 40\n"
+        "   0.501000 1  4E1             Rx   d 1 40\nEnd TriggerBlock\n"
+    )
+    return [int(t_ns) // MS for batch in read(path) for t_ns in batch.t_ns]
+
+
+@pytest.mark.parametrize(
+    "date",
+    [
+        "Tue Nov 14 22:13:20.042 2023",
+        "Die Nov 14 22:13:20.042 2023",
+        "Tue Nov 14 10:13:20.042 pm 2023",
+        "Tue Nov 14 22:13:20.42 2023",  # by python-can
+    ],
+)
+def test_times_of_asc_count_from_its_date(tmp_path, date):
+    """In local time, as every program writes it."""
+    local = datetime(2023, 11, 14, 22, 13, 20, 42_000).timestamp()
+    start_ms = round(local * 1000)
+    assert asc(tmp_path / "a.asc", date) == [start_ms + 500, start_ms + 501]
+
+
+@pytest.mark.parametrize(
+    "date", ["mar. nov. 14 22:13:20.042 2023", "Thu Jan 01 00:00:00 1960", "x"]
+)
+def test_times_of_asc_count_from_the_begin_if_its_date_is_none(tmp_path, date):
+    assert asc(tmp_path / "a.asc", date) == [500, 501]
+
+
+def test_times_of_asc_that_count_from_the_line_before_are_refused(tmp_path):
+    with pytest.raises(LogError, match="wanted `timestamps absolute`"):
+        asc(tmp_path / "a.asc", "Tue Nov 14 22:13:20.042 2023", "hex  timestamps relative")
 
 
 @pytest.mark.skipif(not GRASP.exists(), reason=f"the recording {GRASP.name} is not here")

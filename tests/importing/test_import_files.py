@@ -1,6 +1,8 @@
 """`skin import`: the files of the iCub's world become configurations that can be used."""
 
+import re
 from pathlib import Path
+from typing import Any, get_args, get_type_hints
 
 import msgspec
 import numpy as np
@@ -13,8 +15,9 @@ from emulator.robot import Robot
 from skin_host.cli import main
 from skin_host.config import check
 from skin_host.config.explain import LARGEST
+from skin_host.config.fields import FileName
 from skin_host.config.settings import PlaceSettings, Settings, changed, load, parse_triangles
-from skin_host.errors import ConfigurationError
+from skin_host.errors import ConfigurationError, RequestError
 from skin_host.importing import configuration_text, import_files
 from skin_host.importing.report import Findings
 from skin_host.layout import Layout, build_layout, builtin_kinds
@@ -340,6 +343,21 @@ def test_nothing_is_written_when_something_is_wrong(tmp_path: Path, arm: Path) -
     assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
+def test_a_positions_file_is_not_replaced_by_what_is_made_of_it(
+    tmp_path: Path, forearm: Path
+) -> None:
+    file = tmp_path / "forearm.txt"
+    write_rows(file, forearm_rows())
+    run("positions", file, forearm)
+    made = min((tmp_path / "out-positions").iterdir())
+    file.rename(made)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    output = tmp_path / "out.toml"
+    with pytest.raises(RequestError, match=re.escape(f"{made}: is read by this command")):
+        import_files("positions", [made], output, Findings(), config=forearm, part="forearm")
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
 def test_positions_files_are_found_from_another_folder(tmp_path: Path, forearm: Path) -> None:
     file = tmp_path / "forearm.txt"
     write_rows(file, forearm_rows())
@@ -351,6 +369,99 @@ def test_positions_files_are_found_from_another_folder(tmp_path: Path, forearm: 
     assert built(elsewhere)[1].position_m == pytest.approx(
         built(tmp_path / "out.toml")[1].position_m
     )
+
+
+#: Keys of a configuration whose value is the name of a file.
+FILES = {"positions", "file", "password_file", "ca_file", "certificate_file", "key_file"}
+FOAM = {"beta": [0.125], "tau_s": [3.5], "beta_unload": [0.25], "tau_unload_s": [4.5]}
+
+
+@pytest.fixture
+def secured(tmp_path: Path, arm: Path) -> Path:
+    """The arm with a fitted foam, and a broker that wants a password and certificates."""
+    foam = {"schema": "skin.relaxation/1", "model": "published", **FOAM}
+    (tmp_path / "files").mkdir()
+    (tmp_path / "files" / "foam.json").write_bytes(msgspec.json.encode(foam))
+    (tmp_path / "files" / "password").write_text("secret")
+    arm.write_text(
+        arm.read_text()
+        + '[processing.relaxation]\nfile = "files/foam.json"\nupdate_s = 2.0\n'
+        + '[mqtt]\nusername = "skin"\npassword_file = "files/password"\ntls = true\n'
+        + 'ca_file = "/etc/ssl/ca.pem"\ncertificate_file = "files/c.pem"\nkey_file = "k.pem"\n'
+    )
+    return arm
+
+
+def test_all_files_that_a_configuration_names_are_found_from_another_folder(
+    tmp_path: Path, secured: Path
+) -> None:
+    manager = tmp_path / "skinMan.ini"
+    manager.write_text("addThreshold 3\n")
+    for output in (tmp_path / "near.toml", tmp_path / "deep" / "er" / "robot.toml"):
+        import_files("skinmanager", [manager], output, Findings(), config=secured)
+        old, new = load(secured), load(output)
+        for key in FILES - {"positions", "file"}:
+            there = output.parent / getattr(new.mqtt, key)
+            assert there.resolve() == tmp_path / getattr(old.mqtt, key)
+        assert new.mqtt.ca_file == "/etc/ssl/ca.pem"
+        relaxation = msgspec.structs.replace(new.processing.relaxation, file="files/foam.json")
+        assert relaxation == old.processing.relaxation
+        assert relaxation.beta == FOAM["beta"]
+        # The file has the numbers; a copy of them would stay when it changes.
+        assert "beta" not in output.read_text()
+    assert load(tmp_path / "near.toml").mqtt.password_file == "files/password"
+
+
+def test_a_folder_behind_a_link_still_finds_the_files(tmp_path: Path, secured: Path) -> None:
+    manager = tmp_path / "skinMan.ini"
+    manager.write_text("addThreshold 3\n")
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    (tmp_path / "link").symlink_to(tmp_path / "a" / "b")
+    output = tmp_path / "link" / "robot.toml"
+    import_files("skinmanager", [manager], output, Findings(), config=secured)
+    there = output.parent / (load(output).mqtt.password_file or "")
+    assert there.read_text() == "secret"
+
+
+def test_what_goes_into_a_pipe_names_files_from_any_folder(
+    tmp_path: Path, secured: Path, capfdbinary: pytest.CaptureFixture[bytes]
+) -> None:
+    manager = tmp_path / "skinMan.ini"
+    manager.write_text("addThreshold 3\n")
+    import_files("skinmanager", [manager], Path("/dev/stdout"), Findings(), config=secured)
+    elsewhere = tmp_path / "deep" / "robot.toml"
+    elsewhere.parent.mkdir()
+    elsewhere.write_bytes(capfdbinary.readouterr().out)
+    assert load(elsewhere).mqtt.password_file == str(tmp_path / "files" / "password")
+
+
+def test_a_file_that_is_missing_is_named_where_it_is_wanted(tmp_path: Path, secured: Path) -> None:
+    manager = tmp_path / "skinMan.ini"
+    manager.write_text("addThreshold 3\n")
+    output = tmp_path / "deep" / "robot.toml"
+    (tmp_path / "files" / "foam.json").unlink()
+    missing = re.escape(f"{tmp_path}/files/foam.json: cannot be read")
+    with pytest.raises(ConfigurationError, match=missing):
+        import_files("skinmanager", [manager], output, Findings(), config=secured)
+    assert not output.parent.exists()
+
+
+def test_each_key_that_names_a_file_is_one_that_an_import_moves() -> None:
+    named: set[str] = set()
+    moved: set[str] = set()
+    for table in _tables(Settings):
+        for key, kind in get_type_hints(table, include_extras=True).items():
+            moved |= {key} if kind == FileName | None else set()
+            named |= {key} if key.endswith(("file", "positions")) else set()
+    assert named == moved == FILES
+
+
+def _tables(kind: Any) -> set[type[msgspec.Struct]]:
+    """All tables that a type holds, itself included."""
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        inner = get_type_hints(kind, include_extras=True).values()
+        return {kind}.union(*map(_tables, inner))
+    return set().union(*map(_tables, get_args(kind)))
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "config").glob("*.toml")), ids=lambda p: p.stem)

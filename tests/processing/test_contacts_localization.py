@@ -276,10 +276,24 @@ def test_an_end_tells_where_the_contact_was_and_how_surely(configured):
     assert (end.centroid_m, end.sigma_m) == (begun.centroid_m, begun.sigma_m)
 
 
-@pytest.mark.parametrize("keys", ['localization = "best"', "probe_mm = []", "probe_mm = [0]"])
+@pytest.mark.parametrize(
+    "keys",
+    ['localization = "best"', "probe_mm = []", "probe_mm = [0]", f"probe_mm = {[6.0] * 17}"],
+)
 def test_a_wrong_choice_is_refused(configured, keys: Any):
     with pytest.raises(ConfigurationError, match=r"parts\.palm"):
         configured(keys)
+
+
+def test_a_probe_that_covers_many_pads_wholly_is_refused(configured):
+    with pytest.raises(ConfigurationError) as refused:
+        configured('localization = "template"\nprobe_mm = [10, 400]')
+    assert str(refused.value) == (
+        "parts.palm.probe_mm: 400 mm; wanted at most 15 mm, 3 pitches of its pads: many pads read "
+        'alike under a larger object, which localization = "centroid" locates better'
+    )
+    configured('localization = "template"\nprobe_mm = [15]')
+    configured("probe_mm = [400]")
 
 
 def test_the_plain_mean_is_the_default(configured):

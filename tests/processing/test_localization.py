@@ -1,3 +1,4 @@
+import tracemalloc
 from itertools import chain
 from typing import get_args
 
@@ -7,11 +8,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skin_host.layout import builtin_kinds
-from skin_host.processing.localization import Method, covered_share, make_localizer, separate
+from skin_host.processing.localization import (
+    MOST_TABLE_BYTES,
+    Method,
+    covered_share,
+    make_localizer,
+    separate,
+)
 from skin_host.processing.localization_centroid import tangent_plane
 
 METHODS = get_args(Method)
 RADIUS_MM = 2.1
+#: To lay down one table takes no more than this.
+MOST_BYTES = 120_000_000
 
 
 def patch_of_triangles():
@@ -99,6 +108,15 @@ def errors_mm(method, diameter, count=250, *, full=57.0, probe_mm=None, seed=0):
     return np.array(error), np.array(said)
 
 
+def measured(work):
+    """What some work returns, and the most memory, bytes, that it took at a time."""
+    tracemalloc.start()
+    try:
+        return work(), tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
 def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
@@ -184,6 +202,55 @@ def test_a_part_of_one_taxel_is_located_at_it(method):
     found = localizer.locate(np.array([0]), np.array([20.0]), np.ones(1, bool))
     assert np.linalg.norm(found.position_m - POSITION_M[0]) < 1e-3
     assert np.isfinite(found.sigma_m)
+
+
+def test_a_skin_of_large_pads_is_located_as_well_in_proportion_to_them():
+    scale = 20.0
+    radius = np.full(len(PADS_MM), scale * RADIUS_MM)
+    foam = PressedFoam(np.random.default_rng(4))
+    large = make_localizer("template", scale * POSITION_M, NORMAL, radius, probe_mm=10.0 * scale)
+    off = []
+    for _ in range(60):
+        place = in_the_triangle(foam.rng)
+        units = foam.bytes([(*place, 10.0, 57.0)])
+        found, bytes_used = measured(lambda u=units: large.locate(np.flatnonzero(u > 2.6), u, ALL))
+        assert bytes_used < MOST_BYTES
+        off.append(np.linalg.norm(1e3 * found.position_m[:2] / scale - place))
+    assert rms(off) < 0.3
+
+
+def test_pads_that_lie_close_take_no_more_memory():
+    rng = np.random.default_rng(6)
+    n = 1500
+    pads_mm = rng.uniform(-10.0, 10.0, (n, 2))
+    localizer = make_localizer(
+        "template",
+        1e-3 * np.column_stack([pads_mm, np.zeros(n)]),
+        np.tile([0.0, 0.0, 1.0], (n, 1)),
+        np.full(n, RADIUS_MM),
+        probe_mm=10.0,
+    )
+    units = 57.0 * covered_share(np.zeros((1, 2)), pads_mm, np.full(n, RADIUS_MM), 10.0)[0]
+    touched = np.flatnonzero(units > 2.6)
+    found, bytes_used = measured(lambda: localizer.locate(touched, units, np.ones(n, bool)))
+    assert bytes_used < MOST_BYTES
+    assert np.linalg.norm(found.position_m) < 3e-3
+
+
+def test_tables_of_many_pads_take_no_more_memory_than_is_stated():
+    n = 1500
+    radius = np.full(n, RADIUS_MM)
+    localizer = make_localizer(
+        "template", np.zeros((n, 3)), np.tile([0.0, 0.0, 1.0], (n, 1)), radius, probe_mm=10.0
+    )
+
+    def one_pad_after_the_other():
+        for pad in range(14):
+            units = np.where(np.arange(n) == pad, 57.0, 20.0)
+            localizer.locate(np.arange(n), units, np.ones(n, bool))
+
+    _, bytes_used = measured(one_pad_after_the_other)
+    assert bytes_used < MOST_BYTES + MOST_TABLE_BYTES
 
 
 @pytest.mark.parametrize("method", METHODS)

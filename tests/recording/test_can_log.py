@@ -3,6 +3,7 @@
 import json
 import os
 import resource
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from skin_host.files import Disk, on_disk
 from skin_host.recording.capture import CanLog
 from skin_host.recording.mcap import Recorder, read_messages_of
 from skin_host.recording.replay import read_buses
+from tests.support.candump import write_config, write_log
 
 START_NS = 1_700_000_000 * 10**9
 MS = 1_000_000
@@ -29,7 +31,7 @@ def at(*times_ms: int, identifier: int = 0x4E0) -> FrameBatch:
 
 
 def times_of(path: Path) -> list[tuple[str, int]]:
-    """Channel and ms since the start of each frame, the first frame at 0 where there is no date."""
+    """Channel and ms since the start of each frame."""
     found = [
         (channel, t_ns) for channel, batch in read_channels(path) for t_ns in batch.t_ns.tolist()
     ]
@@ -52,6 +54,57 @@ def test_buses_that_are_read_in_turn_keep_their_times(tmp_path: Path, suffix: st
     assert (log.frames, log.moved) == (6, 0)
 
 
+@pytest.mark.parametrize("suffix", [".LOG", ".BLF", ".ASC", ".TRC", ".CSV", ".MCAP"])
+def test_a_name_in_capitals_is_of_the_same_format(
+    tmp_path: Path, suffix: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Other computers write such names."""
+    config = write_config(tmp_path / "skin.toml")
+    plain = write_log(tmp_path / "a.log", 120, lambda _: ())
+    path = tmp_path / f"B{suffix}"
+    with Recorder(path) if suffix == ".MCAP" else CanLog(path) as log:
+        for channel, batch in read_channels(plain):
+            (log.can if isinstance(log, Recorder) else log.put)(channel, batch)
+    assert main(["replay", str(path), "--config", str(config)]) == 0
+    assert '"type":"frame"' in capsys.readouterr().out
+
+
+def test_messages_of_a_recording_named_in_capitals_need_no_configuration(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, other = tmp_path / "A.MCAP", tmp_path / "B.MCAP"
+    with Recorder(path) as recorder:
+        recorder.say(f"{TOPIC}/contact", START_NS, b"ON")
+    for command in (["replay", str(path), "--onto", "broker"], ["record", str(other)]):
+        assert main([*command, "--broker", "nowhere"]) == 2
+        assert "wanted mqtt://" in capsys.readouterr().err
+    main(["export", str(path), str(tmp_path / "a.npz")])
+    assert "--config" not in capsys.readouterr().err
+
+
+@pytest.fixture(params=["UTC", "Europe/Rome", "America/St_Johns"])
+def zone(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv("TZ", request.param)
+    time.tzset()
+    yield
+    monkeypatch.undo()
+    time.tzset()
+
+
+@pytest.mark.usefixtures("zone")
+@pytest.mark.parametrize("suffix", [".log", ".blf", ".asc", ".trc", ".csv"])
+@pytest.mark.parametrize("start_us", [0, 7_125, 42_000, 42_999, 999_999])
+def test_times_are_exact_to_the_microsecond_in_every_time_zone(
+    tmp_path: Path, suffix: str, start_us: int
+) -> None:
+    path = tmp_path / f"a{suffix}"
+    times_ns = [START_NS + (start_us + us) * 1000 for us in (0, 1, 125, 999, 1000, 3_600_000_007)]
+    with CanLog(path) as log:
+        log.put("can0", FrameBatch.of([(0x4E0, b"ab", t_ns) for t_ns in times_ns]))
+    found = [int(t_ns) for _, batch in read_channels(path) for t_ns in batch.t_ns]
+    assert [t_ns - START_NS for t_ns in found] == [t_ns - START_NS for t_ns in times_ns]
+
+
 @pytest.mark.parametrize("suffix", [".log", ".blf", ".asc", ".trc", ".csv"])
 def test_a_clock_that_is_set_back_is_kept_or_counted(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
@@ -64,8 +117,50 @@ def test_a_clock_that_is_set_back_is_kept_or_counted(tmp_path: Path, suffix: str
         assert ms == [3_600_000, 3_600_010, 3_600_500, 0, 10, 20]
         assert log.moved == 0
     else:
-        assert [t - ms[0] for t in ms] == [0, 10, 10, 10, 10, 500]
+        assert [t - ms[0] for t in ms] == [0, 10, 500, 500, 500, 500]
         assert log.moved == 3
+
+
+@pytest.mark.parametrize("suffix", [".log", ".blf", ".asc", ".trc", ".csv"])
+@pytest.mark.parametrize("step_ms", [3_600_000, 150, 30])
+@pytest.mark.parametrize("is_one_batch", [False, True])
+def test_frames_keep_their_order_when_the_clock_is_set_back(
+    tmp_path: Path, suffix: str, step_ms: int, is_one_batch: bool
+) -> None:
+    """Those that are held back for the other buses, too: they were before the jump."""
+    path = tmp_path / f"a{suffix}"
+    times_ms = [step_ms + t - step_ms * (t >= 500) for t in range(0, 1000, 10)]
+    frames = [(0x400 + n, b"ab", START_NS + t * MS) for n, t in enumerate(times_ms)]
+    with CanLog(path) as log:
+        for n in range(0, 100, 100 if is_one_batch else 5):
+            log.put("can0", FrameBatch.of(frames[n : n + (100 if is_one_batch else 5)]))
+    ids = [int(number) for _, batch in read_channels(path) for number in batch.id]
+    assert ids == list(range(0x400, 0x464))
+    assert (log.moved > 0) == (suffix in (".blf", ".asc"))
+
+
+@pytest.mark.parametrize("suffix", [".blf", ".asc"])
+def test_the_buses_of_a_clock_that_is_set_back_keep_their_orders(
+    tmp_path: Path, suffix: str
+) -> None:
+    """The second bus is read after the jump, and gives frames from before it."""
+    path = tmp_path / f"a{suffix}"
+    hour_ms = 3_600_000
+    with CanLog(path) as log:
+        log.put("can0", at(hour_ms, hour_ms + 10, identifier=0x400))
+        log.put("can1", at(hour_ms + 5, identifier=0x500))
+        log.put("can0", at(0, 10, identifier=0x401))
+        log.put("can1", at(hour_ms + 15, 5, identifier=0x501))
+        log.put("can2", at(7, identifier=0x600))
+        log.put("can0", at(200, identifier=0x402))
+    ids: dict[str, list[int]] = {}
+    for channel, batch in read_channels(path):
+        ids.setdefault(channel, []).extend(batch.id.tolist())
+    assert ids == {
+        "0": [0x400] * 2 + [0x401] * 2 + [0x402],
+        "1": [0x500, 0x501, 0x501],
+        "2": [0x600],
+    }
 
 
 def test_times_that_stand_still_do_not_fill_the_memory(

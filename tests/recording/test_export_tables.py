@@ -9,11 +9,13 @@ import pytest
 from skin_host.cli import main
 from skin_host.errors import LogError
 from skin_host.fingertip.events import Over, Slip
+from skin_host.layout import load_skin
 from skin_host.mqtt.messages import encode_event
 from skin_host.processing.events import Load, Touch
-from skin_host.recording.export import Series, export, read_messages
+from skin_host.recording.export import Series, export, read_frames, read_messages
 from skin_host.recording.export.columns import TABLES
 from skin_host.recording.mcap import Recorder
+from skin_host.recording.replay import calibrate_from_log
 from tests.recording.test_fingertip_replay import CONFIG, recording
 from tests.recording.test_odd_exports import START_NS, TIMES_NS, frame, frames
 
@@ -222,3 +224,22 @@ def test_fingertips_in_a_recording_of_can_frames_are_exported(
     contacts = [one["state"] for one in rows(output / "contacts.csv")]
     assert {"OFF", "ON"} <= set(contacts)
     assert {one["part"] for one in rows(output / "health.csv")} == {"thumb_skin", "index", "thumb"}
+
+
+def test_can_frames_of_fingertips_alone_are_exported(recording: Path, tmp_path: Path) -> None:
+    settings, layout = load_skin(CONFIG / "fingertips.toml")
+    zero = calibrate_from_log(recording, settings, layout, 5.0)
+    log = tmp_path / "tips.log"
+    lines = recording.read_text().splitlines(keepends=True)
+    # So short that the board of the skin is not missed yet.
+    tips = [line for line in lines if int(line.split()[2][:3], 16) >> 8 != 4][:100]
+    log.write_text("".join(tips))
+    series = read_frames(log, settings, layout, zero)
+    assert series.parts == {}
+    assert [one.part for one in series.health] == ["index", "thumb"]
+    assert {one.t_ns // 10**9 for one in series.health} == {int(tips[-1][1:].partition(".")[0])}
+    export(series, tmp_path / "tables")
+    assert len(rows(tmp_path / "tables" / "health.csv")) == 2
+    log.write_text(tips[-1].split()[0] + " can0 7FF#00\n")
+    with pytest.raises(LogError, match="no sweep of this skin, and no sample of its fingertips"):
+        read_frames(log, settings, layout, zero)

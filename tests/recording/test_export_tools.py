@@ -216,20 +216,21 @@ def test_a_data_set_for_learning_has_an_array_a_step(series: Series, tmp_path: P
     path = info["data_path"].format(episode_chunk=0, episode_index=0)
     table = parquet.read_table(tmp_path / "set" / path)
     assert info["fps"] == 20
-    assert info["total_frames"] == table.num_rows == N
+    # From the first frame of the arm to the last one of the hand, which began a step later.
+    assert info["total_frames"] == table.num_rows == N + 1
     assert set(info["features"]) == set(table.column_names)
     arm = np.array(table["observation.skin.arm"].to_pylist())
     valid = np.array(table["observation.skin.arm.valid"].to_pylist())
-    assert arm.shape == (N, TAXELS)
+    assert arm.shape == (N + 1, TAXELS)
     assert arm[2, 3] == 0
     assert not valid[2, 3]
-    # The hand began a step later: until then nothing of it is valid.
+    # Until it begins nothing of the hand is valid.
     hand_valid = np.array(table["observation.skin.hand.valid"].to_pylist())
     assert not hand_valid[0].any()
     assert hand_valid[1].all()
     beyond = np.array(table["observation.skin.arm.beyond_range"].to_pylist())
-    np.testing.assert_array_equal(beyond, series.parts["arm"].beyond_range)
-    np.testing.assert_allclose(table["timestamp"].to_pylist(), 0.05 * np.arange(N), atol=1e-6)
+    np.testing.assert_array_equal(beyond[:N], series.parts["arm"].beyond_range)
+    np.testing.assert_allclose(table["timestamp"].to_pylist(), 0.05 * np.arange(N + 1), atol=1e-6)
 
 
 def test_what_is_missing_is_said(series: Series, tmp_path: Path) -> None:
@@ -256,26 +257,45 @@ def test_an_export_to_a_full_disk_ends_in_a_line_and_leaves_what_was_there(
     series: Series, tmp_path: Path, name: str
 ) -> None:
     """Rerun's own writer neither reported it nor ended."""
-    output = tmp_path / name
+    output = tmp_path / "out" / name
     old = output if output.suffix else output / "touches.csv"
-    old.parent.mkdir(exist_ok=True)
+    old.parent.mkdir(parents=True)
     old.write_text("old")
+    ended = exported_to_a_full_disk(series, output, 100)
+    assert ended.endswith("cannot be written: File too large\n")
+    assert old.read_text() == "old"
+    assert list(tmp_path.rglob(".*")) == []
+
+
+def exported_to_a_full_disk(series: Series, output: Path, most_bytes: int) -> str:
+    """Export where no file can have more bytes; return what was wrong."""
     script = (
         "import resource, sys, pickle\n"
         "from pathlib import Path\n"
         "from skin_host.errors import SkinError\n"
         "from skin_host.recording.export import export\n"
         "series = pickle.loads(Path(sys.argv[1]).read_bytes())\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (100, resource.RLIM_INFINITY))\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]), resource.RLIM_INFINITY))\n"
         "try:\n"
         "    export(series, Path(sys.argv[2]), lerobot=sys.argv[2].endswith('set'))\n"
         "except SkinError as error:\n"
         "    print(error)\n"
     )
-    pickled = tmp_path / "pickled"
+    pickled = output.parent.parent / "pickled"
     pickled.write_bytes(pickle.dumps(series))
-    command = [sys.executable, "-c", script, str(pickled), str(output)]
-    ran = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert ran.stdout.endswith("cannot be written: File too large\n")
-    assert old.read_text() == "old"
-    assert list(tmp_path.rglob(".*")) == []
+    command = [sys.executable, "-c", script, str(pickled), str(output), str(most_bytes)]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
+@pytest.mark.parametrize(("name", "most_bytes"), [("a.parquet", 40_000), ("tables", 10_000)])
+def test_files_that_belong_together_appear_all_or_none(
+    series: Series, tmp_path: Path, name: str, most_bytes: int
+) -> None:
+    """The touches do not fit on the disk; the frames, which come before them, do."""
+    touches = [touch("move", n, float(n % 997)) for n in range(5000)]
+    whole = Series(series.parts, touches, series.shapes)
+    output = tmp_path / "out" / name
+    assert "touches" in exported_to_a_full_disk(whole, output, most_bytes)
+    assert [path for path in (tmp_path / "out").rglob("*") if path.is_file()] == []
+    few = Series(series.parts, touches[:5], series.shapes)
+    assert exported_to_a_full_disk(few, output, most_bytes) == ""

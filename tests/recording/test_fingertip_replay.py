@@ -60,6 +60,33 @@ def test_a_replay_tells_what_the_fingertips_felt_and_tells_it_again(
     assert "age_ms" not in health["index"]
 
 
+def test_a_contact_whose_samples_stop_in_a_recording_ends_as_lost(
+    recording: Path, tmp_path: Path
+) -> None:
+    """As with the daemon; the other boards go on."""
+    lines = recording.read_text().splitlines(keepends=True)
+    output = tmp_path / "out.jsonl"
+    command = ["--config", str(CONFIG / "fingertips.toml"), "--calibrate-seconds", "5"]
+    assert main(["replay", str(recording), *command, "--output", str(output)]) == 0
+    found = [json.loads(line) for line in output.read_text().splitlines()]
+    touches = [one for one in found if one["type"] == "touch" and one["part"] == "index"]
+    cut_ns = touches[0]["t_ns"] + 300_000_000
+
+    def came(line: str) -> bool:
+        seconds, micros = line[1 : line.index(")")].split(".")
+        return int(seconds) * 10**9 + int(micros) * 1000 < cut_ns
+
+    log = tmp_path / "stops.log"
+    log.write_text("".join(line for line in lines if came(line) or " can0 31" not in line))
+    assert main(["replay", str(log), *command, "--output", str(output)]) == 0
+    found = [json.loads(line) for line in output.read_text().splitlines()]
+    touches = [one for one in found if one["type"] == "touch" and one["part"] == "index"]
+    assert (touches[-1]["event"], touches[-1]["reason"]) == ("end", "lost")
+    assert 0 < touches[-1]["t_ns"] - cut_ns < 1_000_000_000
+    (health,) = [one for one in found if one["type"] == "health" and one["part"] == "index"]
+    assert health["state"] == "silent"
+
+
 def test_a_fingertip_has_no_taxels_to_draw_and_its_picture_is_refused_with_what_there_is(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -268,6 +268,94 @@ def test_what_is_no_load_cell_is_refused_with_what_is_wanted(bench, hold, capsys
         assert "wanted rising times in s and pressures in kPa" in said.err
 
 
+def of_another_time(time_s, kpa):
+    return time_s + 1.5e9, kpa
+
+
+def with_a_gap(time_s, kpa):
+    kept = (time_s < 40.0) | (time_s > 55.0)
+    return time_s[kept], kpa[kept]
+
+
+def in_bar(time_s, kpa):
+    return time_s, kpa / 100.0
+
+
+def same_clock(time_s, kpa):
+    return time_s + 1.7e9, kpa
+
+
+def same_clock_and_earlier(time_s, kpa):
+    earlier = np.arange(-5.0, 0.0, 0.2)
+    time_s, kpa = np.concatenate([earlier, time_s]), np.concatenate([0.0 * earlier, kpa])
+    return time_s + 1.7e9, kpa
+
+
+@pytest.mark.parametrize("change", [same_clock, same_clock_and_earlier])
+def test_a_load_cell_is_used_whichever_clock_its_table_has_and_however_early_it_begins(
+    bench, hold, tmp_path, capsys, change
+):
+    log, own = hold
+    table = tmp_path / "cell.csv"
+    np.savetxt(table, np.column_stack(change(*np.loadtxt(own, delimiter=",").T)), "%.3f", ",")
+    fits = []
+    for load_cell in (own, table):
+        status, said = run(
+            capsys, "calibrate", bench, "--relaxation", log, "--load", load_cell, "--json"
+        )
+        assert status == 0
+        fits.append(json.loads(said.out)["fits"])
+    assert [one["rms_hold_kpa"] for one in fits[1]] == pytest.approx(
+        [one["rms_hold_kpa"] for one in fits[0]], abs=0.05
+    )
+
+
+def in_pascal(time_s, kpa):
+    return time_s, 1000.0 * kpa
+
+
+def in_tens_of_pascal(time_s, kpa):
+    return time_s, 100.0 * kpa
+
+
+def fading_away(time_s, kpa):
+    return time_s, kpa * np.exp(-np.maximum(time_s - 12.0, 0.0) / 50.0)
+
+
+def after_the_hold(time_s, kpa):
+    return time_s[1300:], kpa[1300:] + np.linspace(0.0, 12.0, len(kpa) - 1300)
+
+
+def of_half_the_hold(time_s, kpa):
+    return time_s[:600], kpa[:600]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (in_pascal, "are they in Pa?"),
+        (in_bar, "are they in bar"),
+        (in_tens_of_pascal, "kPa RMS; wanted less than 28"),
+        (fading_away, "of a hold's pressure away; wanted less than 100%"),
+        (of_another_time, "pressure of the same time"),
+        (after_the_hold, "pressure of the same time"),
+        (of_half_the_hold, "of the hold's"),
+        (with_a_gap, "a gap of 15"),
+    ],
+)
+def test_a_load_that_is_not_that_of_the_hold_is_one_line_and_nothing_is_kept(
+    bench, hold, tmp_path, capsys, change, message
+):
+    log, own = hold
+    table = tmp_path / "cell.csv"
+    np.savetxt(table, np.column_stack(change(*np.loadtxt(own, delimiter=",").T)), "%.3f", ",")
+    status, said = run(capsys, "calibrate", bench, "--relaxation", log, "--load", table)
+    assert (status, said.out) == (2, "")
+    assert message in said.err
+    assert said.err.count("\n") == 1
+    assert not bench.with_suffix(".relaxation.json").exists()
+
+
 def test_a_sample_taken_while_the_probe_moved_does_not_count(bench, tmp_path, capsys):
     played = record("A", [(0.0, 10.0), (60.0, 240.0), (0.0, 240.0)], HZ)
     units = np.zeros((len(played.momentary_kpa), N))
@@ -351,21 +439,8 @@ def test_people_read_what_a_course_of_pressure_showed(bench, chamber, tmp_path, 
     assert "expected error" in said.out
 
 
-def of_another_time(time_s, kpa):
-    return time_s + 1.5e9, kpa
-
-
-def with_a_gap(time_s, kpa):
-    kept = (time_s < 40.0) | (time_s > 55.0)
-    return time_s[kept], kpa[kept]
-
-
 def falling(time_s, kpa):
     return time_s[::-1], kpa
-
-
-def in_bar(time_s, kpa):
-    return time_s, kpa / 100.0
 
 
 def too_short(time_s, kpa):

@@ -171,6 +171,23 @@ async def test_a_part_of_a_robot_that_is_gone_does_not_look_as_it_was(
             assert last(Points).t_ns > before_ns
 
 
+async def test_a_forged_last_time_of_all_ends_no_view(mosquitto: Mosquitto) -> None:
+    layout = build_layout(load(CONFIG), CONFIG.parent)
+    n = layout.part("left_hand").n_taxels
+    none, kpa = np.zeros(n, np.bool_), np.zeros(n, np.float32)
+    frame = PressureFrame("left_hand", 1, 2**63 - 1, np.zeros(n, np.uint8), kpa, none, ~none, none)
+    settings = Mqtt(host=mosquitto.host, port=mosquitto.port)
+    async with Publisher(settings, "demo", "main") as robot:
+        robot.put_info(node_info(layout, "main", version="1", configuration="x"))
+        async with following(mosquitto) as items:
+            while not any(isinstance(item, Points) for item in items):
+                robot.put_frame(frame)
+                await asyncio.sleep(0.05)
+            robot.put_contact("left_hand", "OFF")
+            await until(lambda: any(isinstance(item, Arrows) for item in items))
+            assert {item.t_ns for item in items if isinstance(item, Points | Arrows)} == {2**63 - 1}
+
+
 def listening() -> set[str]:
     """Addresses on which programs of this machine listen, as the kernel writes them."""
     lines = Path("/proc/net/tcp").read_text().splitlines()[1:]

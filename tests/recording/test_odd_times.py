@@ -1,5 +1,6 @@
 """Recordings whose clock was set, stood still, or had no date."""
 
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -35,6 +36,10 @@ def set_by_a_step(us: int) -> int:
     return us + 3_000_000 if us > SET_US else us
 
 
+def once_ahead(us: int) -> int:
+    return us + HOUR_US if us == SET_US else us
+
+
 CHANGES = [back, forward, stands, undated, set_by_a_step]
 
 
@@ -43,15 +48,20 @@ def config(tmp_path: Path) -> Path:
     return write_config(tmp_path / "skin.toml")
 
 
-def changed(path: Path, change: Callable[[int], int]) -> Path:
-    """A recording of ten seconds, pressed from the sixth to the ninth, by another clock."""
+def stamped(text: str, change: Callable[[int], int]) -> str:
+    """The lines of a recording by another clock."""
 
     def stamp(found: re.Match[str]) -> str:
         us = change(int(found[1]) * 10**6 + int(found[2]))
         return f"({us // 10**6}.{us % 10**6:06d})"
 
+    return STAMP.sub(stamp, text)
+
+
+def changed(path: Path, change: Callable[[int], int]) -> Path:
+    """A recording of ten seconds, pressed from the sixth to the ninth, by another clock."""
     write_log(path, 240, lambda period: range(12) if 120 < period < 180 else ())
-    path.write_text(STAMP.sub(stamp, path.read_text()))
+    path.write_text(stamped(path.read_text(), change))
     return path
 
 
@@ -102,3 +112,57 @@ def test_it_is_replayed_exported_and_drawn(
         command = ["export", str(log), where]
     assert main([*command, "--config", str(config)]) == 0
     assert all(line.startswith("warning: ") for line in capsys.readouterr().err.splitlines())
+
+
+TWO_BUSES = """
+robot = "two"
+[buses.a]
+channel = "can0"
+[buses.b]
+channel = "can1"
+[boards.left]
+bus = "a"
+address = 1
+[boards.right]
+bus = "b"
+address = 1
+[[parts.hand.patches]]
+board = "left"
+triangles = "0-15"
+[[parts.hand.patches]]
+board = "right"
+triangles = "0-15"
+"""
+
+
+def touches_of_two_buses(folder: Path, change: Callable[[int], int]) -> list[tuple[str, int, str]]:
+    """Begins and ends of contacts, with the number of their frame: both boards of a part, each on a
+    bus of its own, are pressed in the tenth second of a clock that changes in the seventh.
+    """
+    folder.mkdir()
+    config, log = folder / "two.toml", folder / "a.log"
+    config.write_text(TWO_BUSES)
+    write_log(log, 240, lambda period: range(12) if 180 < period < 200 else ())
+    left = log.read_text()
+    right = stamped(left.replace("can0", "can1"), lambda us: us + 50)
+    in_order = sorted((left + right).splitlines(keepends=True))
+    log.write_text(stamped("".join(in_order), change))
+    output = folder / "a.jsonl"
+    command = ["replay", str(log), "--config", str(config), "--output", str(output)]
+    assert main([*command, "--calibrate-seconds", "5"]) == 0
+    records = map(json.loads, output.read_text().splitlines())
+    return [
+        (one["event"], one["seq"], one.get("reason", ""))
+        for one in records
+        if one["type"] == "touch" and one["event"] != "move"
+    ]
+
+
+@pytest.mark.parametrize("change", [back, once_ahead])
+def test_a_clock_that_changes_does_not_pull_two_buses_apart(
+    change: Callable[[int], int], tmp_path: Path
+) -> None:
+    expected = touches_of_two_buses(tmp_path / "steady", lambda us: us)
+    assert [event for event, _, _ in expected] == ["begin", "begin", "end", "end"]
+    found = touches_of_two_buses(tmp_path / "changed", change)
+    assert found == expected

@@ -1,6 +1,7 @@
 """What was recorded is played again: on CAN, to a broker, through the pipeline."""
 
 import asyncio
+from collections import Counter
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -139,6 +140,48 @@ async def test_a_bus_on_which_more_comes_than_is_read_does_not_hold_up_the_end(
 
     assert await capture_buses(settings, sink, stop) == 0
     assert n
+
+
+async def test_buses_that_are_read_in_turn_are_recorded_as_their_frames_came(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A turn is longer than the period of fast boards, and much longer when the computer was busy:
+    sweeps of one bus, and then those of the other, make no whole samples of a part on both.
+    """
+    hour = 3_600_000
+    times_ms = {
+        "left": [*range(0, 100, 5), *range(100 - hour, 200 - hour, 5)],
+        "right": [*range(2, 102, 5), *range(102 - hour, 202 - hour, 5)],
+    }
+    settings, stop = load(ROOT / "config" / "demo.toml"), asyncio.Event()
+    buses = {name: Bus(interface="virtual", channel=name) for name in times_ms}
+
+    class Filled(StillPort):
+        def __init__(self, name: str, *others: Any) -> None:
+            super().__init__(name, *others)
+            start_ns = 1_700_000_000 * 10**9
+            frames = [
+                (number, b"", start_ns + ms * 1_000_000)
+                for number, ms in enumerate(times_ms.get(name, ()))
+            ]
+            self.waiting = [FrameBatch.of(frames)]
+            self.waiting[0].dropped = 3
+
+    monkeypatch.setattr("skin_host.recording.capture.open_port", Filled)
+    found: list[tuple[str, int]] = []
+    dropped = Counter[str]()
+
+    def sink(channel: str, batch: FrameBatch) -> None:
+        found.extend((channel, number) for number in batch.id.tolist())
+        dropped[channel] += batch.dropped
+        if len(found) == 80:
+            stop.set()
+
+    await capture_buses(changed(settings, {"buses": buses}), sink, stop)
+    assert dropped == {"left": 3, "right": 3}
+    for channel in times_ms:
+        assert [number for name, number in found if name == channel] == list(range(40))
+    assert all(abs(number - place // 2) <= 1 for place, (_, number) in enumerate(found))
 
 
 def test_errors_of_the_wire_are_recorded_as_such(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from skin_host.bus.logs import read_channels
 from skin_host.cli import main
 from skin_host.config.settings import Mqtt
 from skin_host.mqtt.publisher import Publisher
@@ -148,6 +149,69 @@ def test_the_url_outranks_the_brokers_of_the_configuration(
     listening = Subscriber(mosquitto.host, mosquitto.port, "skin/#")
     assert recorded.replay(url_of(mosquitto)) == 0
     assert robots(listening) == {"demo"}
+
+
+def with_part(recorded: Recorded, folder: Path, part: str, line: str) -> Recorded:
+    """The same recording by a configuration with this line in the table of a part."""
+    config = folder / "part.toml"
+    known = recorded.config.read_text()
+    assert f"[parts.{part}]\n" in known
+    config.write_text(known.replace(f"[parts.{part}]\n", f"[parts.{part}]\n{line}\n"))
+    return Recorded(recorded.log, config)
+
+
+def numbers(subscriber: Subscriber, part: str) -> list[int]:
+    subscriber.catch_up()
+    return [frame["seq"] for frame in subscriber.documents(f"demo/{part}/frame")]
+
+
+def test_all_frames_are_delivered_however_many_are_processed_at_once(
+    written: Recorded, mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    """A daemon's newer frame takes the place of one that waits; a playback can wait."""
+    path = tmp_path / "long.mcap"
+    with Recorder(path) as recorder:
+        for channel, batch in read_channels(written.log, window_ns=10**9):
+            recorder.can(channel, batch)
+    listening = Subscriber(mosquitto.host, mosquitto.port, "skin/#")
+    assert Recorded(path, written.config).replay(url_of(mosquitto)) == 0
+    for part in ("left_hand", "left_forearm"):
+        seen = numbers(listening, part)
+        assert len(seen) > 80
+        assert seen == list(range(seen[0], seen[0] + len(seen)))
+
+
+def test_frames_that_the_broker_does_not_take_are_counted_and_named(
+    written: Recorded, mosquitto: Mosquitto, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = tmp_path / "small"
+    place.mkdir()
+    broker = Mosquitto(mosquitto.program, place, "max_packet_size 700\n")
+    broker.start()
+    try:
+        listening = Subscriber(broker.host, broker.port, "skin/#")
+        status = written.replay(url_of(broker))
+        hand, arm = (numbers(listening, part) for part in ("left_hand", "left_forearm"))
+    finally:
+        broker.kill()
+    assert len(hand) > len(arm) == 0
+    assert status == 1
+    seen = capsys.readouterr()
+    assert seen.out == ""
+    assert "it does not take skin/demo/" in seen.err
+    assert "skin/demo/left_forearm/frame" in seen.err
+    assert f"sent were {len(hand)} of {2 * len(hand)} frames" in seen.err
+
+
+def test_a_part_without_frames_in_the_configuration_is_played_without_them(
+    written: Recorded, mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    listening = Subscriber(mosquitto.host, mosquitto.port, "skin/#")
+    recorded = with_part(written, tmp_path, "left_hand", "frames = false")
+    assert recorded.replay(url_of(mosquitto)) == 0
+    assert numbers(listening, "left_forearm")
+    assert numbers(listening, "left_hand") == []
+    assert listening.payloads("demo/left_hand/touch")
 
 
 def guarded(mosquitto: Mosquitto, folder: Path) -> Mosquitto:

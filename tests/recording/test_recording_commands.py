@@ -233,11 +233,42 @@ async def test_a_recording_comes_back_soon_after_a_connection_that_was_good(
         for number in range(5):
             await until(lambda n=number: mosquitto.subscriptions(last) > n)  # type: ignore[misc]
             mosquitto.restart()
-            await until(lambda n=number: recorder.gaps > n)  # type: ignore[misc]
+            await until(lambda n=number: len(waits_s) > n)  # type: ignore[misc]
         stop.set()
         await recording
     assert len(waits_s) == 5
     assert max(waits_s) <= FIRST_RETRY_S
+
+
+async def test_a_gap_is_counted_once_however_many_attempts_it_takes(
+    mosquitto: Mosquitto, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    attempts = 0
+
+    class Noted(Retry):
+        def delay_s(self, lasted_s: float = 0.0) -> float:
+            nonlocal attempts
+            attempts += 1
+            return 0.001
+
+    monkeypatch.setattr(capture, "Retry", Noted)
+    broker = Broker(mosquitto.host, mosquitto.port)
+    last = recorded_topics("skin", "icub")[-1]
+    with Recorder(tmp_path / "a.mcap") as recorder:
+        stop = asyncio.Event()
+        recording = asyncio.create_task(capture_broker(recorder, broker, "skin", "icub", stop))
+        for number in range(2):
+            async with connect(broker, identifier="part") as connection:
+                await until(lambda n=number: mosquitto.subscriptions(last) > n)  # type: ignore[misc]
+                # It follows what shows that the recorder listens.
+                await connection.publish("skin/icub/palm/contact", b"ON", qos=1)
+                await until(lambda n=number: recorder.messages.get("contact", 0) > n)  # type: ignore[misc]
+            before = attempts
+            mosquitto.kill()
+            await until(lambda n=before: attempts >= n + 5)  # type: ignore[misc]
+            mosquitto.start()
+        stop.set()
+        assert await recording == recorder.gaps == 2
 
 
 def test_an_export_of_a_recording_that_is_not_there_is_a_wrong_request(

@@ -65,11 +65,12 @@ RESTING_RAIL_SHARE = 0.05
 NOISY_SHARE = 0.035
 NOISY_KPA = 4.0
 #: Radii of plays to try, as shares of the highest pressure, and how many at most. One more is used
-#: if it lowers the square error on data that was not fitted by this share. Together their weights
-#: stay below the last number.
+#: if it lowers the square error on data that was not fitted by this share. Each has at least the
+#: least weight, together they stay below the most.
 RADII = (0.015, 0.03, 0.06, 0.12, 0.24)
 MOST_PLAYS = 3
 WORTH_SHARE = 0.1
+LEAST_WEIGHT = 0.01
 MOST_WEIGHT = 0.5
 #: The recording is cut into this many pieces; each fit leaves one of them out.
 FOLDS = 8
@@ -138,7 +139,9 @@ def fit_course(course: Course, smoothing_s: float) -> Curves:
     smooth = _smoothed(units[:, good], noise[good], smoothing_s, course.dt_s)
     thin = slice(None, None, max(round(FIT_STEP_S / course.dt_s), 1))
     weight = _weight(pressure, course.dt_s)[thin]
-    memory = _fit_memory(np.median(smooth, axis=1)[thin], pressure[thin], weight, highest_kpa)
+    # What is smoothed lags behind by up to the filter's limit, as the foam does by its memory.
+    median = np.median(units[:, good], axis=1)
+    memory = _fit_memory(median[thin], pressure[thin], weight, highest_kpa)
     loading = _loading_kpa(pressure, memory)[thin]
     kpa = np.zeros((n, len(KNOTS_UNITS)))
     beyond = np.full(n, np.inf)
@@ -343,11 +346,11 @@ def _fit_memory(units: Floats, pressure: Floats, weight: Floats, highest_kpa: fl
     piece = np.arange(len(units)) * 4 * FOLDS // len(units) % FOLDS
 
     def fitted(shares: list[float], kept: Mask) -> Floats | None:
-        """Return coefficients of hinges and plays; None if a play would have the wrong sign."""
+        """Return coefficients of hinges and plays; None if no foam has such plays."""
         basis = np.hstack([hinges, *(-lags[share][:, np.newaxis] for share in shares)])
         found = np.linalg.lstsq((root * basis)[kept], (root[:, 0] * wanted)[kept], rcond=None)[0]
         plays = found[hinges.shape[1] :]
-        return None if np.any(plays <= 0.0) or np.sum(plays) >= MOST_WEIGHT else found
+        return None if np.any(plays < LEAST_WEIGHT) or np.sum(plays) >= MOST_WEIGHT else found
 
     def held_out(shares: list[float]) -> float:
         basis = np.hstack([hinges, *(-lags[share][:, np.newaxis] for share in shares)])

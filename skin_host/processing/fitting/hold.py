@@ -28,6 +28,8 @@ UNCERTAINTY_KPA = 0.3
 DOUBT_FACTOR = np.log(4.0)
 #: A parameter whose uncertainty in the record is worse than this factor is reported as uncertain.
 UNKNOWN_FACTOR = 2.0
+#: A greater factor is reported as this one.
+MOST_FACTOR = 1000.0
 MAXIMUM_ITERATIONS = 60
 #: How much slower than loading unloading is assumed to be before the fit.
 START_RATIO = 2.0
@@ -252,7 +254,7 @@ def _least_squares(
 
 
 def _uncertain(names: list[str], spread: Floats) -> dict[str, float]:
-    factors = np.exp(spread)
+    factors = np.exp(np.minimum(spread, np.log(MOST_FACTOR)))
     return {
         name: round(float(factor), 2)
         for name, factor in zip(names, factors, strict=True)

@@ -1,8 +1,8 @@
 """Exports recordings: arrays and tables here, for viewers of robotics in `scene` and `live`.
 
-Tables are CSV, Parquet for pandas and polars, and data sets in the form of LeRobot. Units and
-layout are in the metadata of the latter two: of each column its `unit`, of the file the key `skin`
-with each part's places (m), normals and areas (mm2) as JSON.
+Tables are CSV, and Parquet for pandas and polars; `lerobot` has data sets for learning. Units and
+layout are in the metadata of Parquet: of each column its `unit`, of the file the key `skin` with
+each part's places (m), normals and areas (mm2) as JSON.
 """
 
 import csv
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from skin_host.errors import RequestError, required
-from skin_host.files import write_atomic, writing
+from skin_host.files import write_together
 from skin_host.recording.export.columns import TABLES, Column, Table
 from skin_host.recording.export.series import (
     HealthLine,
@@ -28,10 +28,6 @@ from skin_host.recording.export.series import (
 __all__ = ["HealthLine", "PartSeries", "Series", "export", "read_frames", "read_messages"]
 
 SUFFIXES = ("", ".npz", ".parquet", ".mcap", ".rrd")
-#: LeRobot's version of the folder's form.
-LEROBOT_VERSION = "v2.1"
-CHUNK = 1000
-TASK = "tactile recording"
 
 
 def export(
@@ -53,7 +49,8 @@ def export(
     tables, `touches.csv`, `slips.csv`, ..., also without rows: one of an earlier export would stay.
 
     Raises:
-        RequestError: the suffix is another one.
+        RequestError: the suffix is another one, the format has no place for this recording, or a
+            file to write is `recording`.
         SkinError: it cannot be written, or the package for it is not installed.
     """
     if output.suffix not in SUFFIXES:
@@ -64,9 +61,12 @@ def export(
         raise RequestError(
             f"{output}: a data set of LeRobot is a folder; wanted a name without end"
         )
-    if output.suffix == ".parquet" or lerobot:
-        write = write_lerobot if lerobot else write_parquet
-        return write(series, output)
+    if lerobot:
+        from skin_host.recording.export.lerobot import write_lerobot
+
+        return write_lerobot(series, output, _layout(series))
+    if output.suffix == ".parquet":
+        return write_parquet(series, output)
     if output.suffix == ".rrd":
         from skin_host.recording.export.scene import write_rerun
 
@@ -87,10 +87,11 @@ def export(
     if output.suffix == ".npz":
         buffer = BytesIO()
         np.savez_compressed(buffer, **dict(_arrays(series)))
-        return [_written(output, buffer.getvalue())]
+        return write_together([(output, buffer.getvalue())])
     tables = {name: _frame_table(part) for name, part in series.parts.items()}
     tables |= {table.name: _text_table(table, getattr(series, table.name)) for table in TABLES}
-    return [_written(output / f"{name}.csv", text.encode()) for name, text in tables.items()]
+    files = ((output / f"{name}.csv", text.encode()) for name, text in tables.items())
+    return write_together(files, [] if recording is None else [recording])
 
 
 def _arrays(series: Series) -> Iterator[tuple[str, Any]]:
@@ -164,13 +165,11 @@ def write_parquet(series: Series, output: Path) -> list[Path]:
         metadata=layout,
     )
     parts = [_frames(pa, part, schema) for part in series.parts.values()]
-    tables = {output: pa.concat_tables(parts)} | {
+    tables = {output: pa.concat_tables([schema.empty_table(), *parts])} | {
         output.with_suffix(f".{table.name}.parquet"): _arrow_table(pa, table, series, layout)
         for table in TABLES
     }
-    for path, table in tables.items():
-        _write(path, table)
-    return list(tables)
+    return write_together((path, _parquet(table)) for path, table in tables.items())
 
 
 def _frames(pa: Any, part: PartSeries, schema: Any) -> Any:
@@ -233,105 +232,9 @@ def _layout(series: Series) -> dict[str, Any]:
     }
 
 
-def write_lerobot(series: Series, output: Path) -> list[Path]:
-    """Write a recording as one episode of a LeRobot data set, for learning.
-
-    Frames come at the rate of the part that has most of them; the others' last values are held.
-    `observation.skin.<part>` is float32[m] in kPa, 0 where `...<part>.valid` is false; where
-    `...<part>.beyond_range` is true it is an estimate.
-
-    Raises:
-        SkinError: pyarrow is not installed, or a file cannot be written.
-        RequestError: the times of a part go back, or stand still: there is no such rate.
-    """
-    pa = required("pyarrow", "data sets of LeRobot", "parquet")
-    leader = max(series.parts.values(), key=lambda part: len(part.seq))
-    t_s = leader.t_s
-    n = len(t_s)
-    for part in series.parts.values():
-        steps_ns = np.diff(part.t_ns)
-        if (back := np.flatnonzero(steps_ns < 0)).size:
-            raise RequestError(
-                f"{output}: {part.name}: its time goes back by {-steps_ns[back[0]] / 1e9:.0f} s "
-                f"at frame {back[0] + 1}; a data set has rising times"
-            )
-    step_s = float(np.median(np.diff(t_s))) if n > 1 else 1.0
-    if step_s <= 0.0:
-        raise RequestError(f"{output}: {leader.name}: its time stands still; it has no rate")
-    fps = max(1, round(1 / step_s))
-    columns: dict[str, Any] = {}
-    features: dict[str, Any] = {}
-    stats: dict[str, Any] = {}
-    for name, part in series.parts.items():
-        rows = np.clip(np.searchsorted(part.t_ns, leader.t_ns, side="right") - 1, 0, None)
-        kpa = part.pressure_kpa[rows]
-        valid = np.isfinite(kpa) & (part.t_ns[0] <= leader.t_ns)[:, np.newaxis]
-        kpa = np.where(valid, kpa, np.float32(0.0))
-        beyond_range = part.beyond_range[rows] & valid
-        for key, values, kind in (
-            ("", kpa, "float32"),
-            (".valid", valid, "bool"),
-            (".beyond_range", beyond_range, "bool"),
-        ):
-            column = f"observation.skin.{name}{key}"
-            flat = pa.array(values.ravel())
-            columns[column] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
-            taxels = [f"taxel_{i}" for i in range(values.shape[1])]
-            features[column] = {"dtype": kind, "shape": [values.shape[1]], "names": taxels}
-            stats[column] = {
-                "min": values.min(axis=0).astype(float).tolist(),
-                "max": values.max(axis=0).astype(float).tolist(),
-                "mean": values.mean(axis=0).astype(float).tolist(),
-                "std": values.std(axis=0).astype(float).tolist(),
-                "count": [n],
-            }
-    columns |= {
-        "timestamp": pa.array(t_s.astype(np.float32)),
-        "frame_index": pa.array(np.arange(n, dtype=np.int64)),
-        "episode_index": pa.array(np.zeros(n, np.int64)),
-        "index": pa.array(np.arange(n, dtype=np.int64)),
-        "task_index": pa.array(np.zeros(n, np.int64)),
-    }
-    kinds = dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64")
-    for key, kind in ({"timestamp": "float32"} | kinds).items():
-        features[key] = {"dtype": kind, "shape": [1], "names": None}
-    data = output / "data/chunk-000/episode_000000.parquet"
-    info = {
-        "codebase_version": LEROBOT_VERSION,
-        "robot_type": "skin",
-        "total_episodes": 1,
-        "total_frames": n,
-        "total_tasks": 1,
-        "total_videos": 0,
-        "total_chunks": 1,
-        "chunks_size": CHUNK,
-        "fps": fps,
-        "splits": {"train": "0:1"},
-        "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
-        "video_path": None,
-        "features": features,
-        "skin": _layout(series),
-    }
-    _write(data, pa.table(columns))
-    meta = {
-        "info.json": json.dumps(info, indent=2),
-        "tasks.jsonl": json.dumps({"task_index": 0, "task": TASK}) + "\n",
-        "episodes.jsonl": json.dumps({"episode_index": 0, "tasks": [TASK], "length": n}) + "\n",
-        "episodes_stats.jsonl": json.dumps({"episode_index": 0, "stats": stats}) + "\n",
-    }
-    return [data, *(_written(output / "meta" / name, text.encode()) for name, text in meta.items())]
-
-
-def _write(path: Path, table: Any) -> None:
-    import pyarrow as pa
+def _parquet(table: Any) -> bytes:
     from pyarrow import parquet
 
-    buffer = pa.BufferOutputStream()
+    buffer = BytesIO()
     parquet.write_table(table, buffer, compression="zstd")
-    _written(path, buffer.getvalue())
-
-
-def _written(path: Path, data: bytes) -> Path:
-    with writing(path):
-        write_atomic(path, data)
-    return path
+    return buffer.getvalue()

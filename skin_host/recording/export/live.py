@@ -21,7 +21,7 @@ from skin_host.clock import SYSTEM, Clock
 from skin_host.errors import SkinError, required
 from skin_host.mqtt.broker import free_port
 from skin_host.mqtt.info import PartInfo
-from skin_host.processing.events import Touch
+from skin_host.processing.events import LATEST_NS, Touch
 from skin_host.recording.export.scene import (
     Item,
     RerunStream,
@@ -103,7 +103,7 @@ async def _follow(
     async def contacts() -> None:
         """What is not received any more must not go on looking as it was last."""
         async for contact in skin.contacts():
-            t_ns = max(clock.now_ns(), last_ns.get(contact.part, 0) + 1)
+            t_ns = max(clock.now_ns(), min(last_ns.get(contact.part, 0) + 1, LATEST_NS))
             if contact.state == "OFF" and contact.part in scene.origins_m:
                 show(scene.untouched(contact.part, t_ns))
             elif contact.why not in (None, "not_felt") and contact.part in shapes:

@@ -23,6 +23,7 @@ from skin_host.files import whole_file, write_atomic, writing
 from skin_host.fingertip.events import FingertipEvent, Over, Slip
 from skin_host.mqtt.info import FingertipInfo, PartInfo
 from skin_host.processing.events import Touch
+from skin_host.recording import is_mcap
 from skin_host.recording.export.series import HealthLine, Series
 from skin_host.recording.mcap import read_records
 
@@ -118,12 +119,12 @@ class SkinScene:
         self.origins_m = _side_by_side(shapes, fingertips or {})
         self._arrows: dict[str, dict[int, Arrow]] = {name: {} for name in self.origins_m}
         self.radius_m = {
-            name: float(np.mean(shape.radius_mm)) * 1e-3 for name, shape in shapes.items()
+            name: float(np.mean(shape.radius_mm or [0.0])) * 1e-3 for name, shape in shapes.items()
         }
         for name, shape in shapes.items():
             feels = np.array([pad == "pressure" for pad in shape.pads], np.bool_)
             points = np.zeros(int(feels.sum()), POINT)
-            places_m = np.array(shape.position_m, np.float64)[feels]
+            places_m = np.array(shape.position_m, np.float64).reshape(-1, 3)[feels]
             for axis, key in enumerate("xyz"):
                 points[key] = places_m[:, axis]
             self._feels[name], self._points[name] = feels, points
@@ -202,13 +203,15 @@ class RecordedScene:
             (float(np.nanmax(part.pressure_kpa, initial=0.0)) for part in series.parts.values()),
             default=0.0,
         )
-        shapes = {name: series.shapes[name] for name in series.parts}
-        self.scene = SkinScene(shapes, max(LEAST_TOP_KPA, peak_kpa), series.fingertips)
+        self.scene = SkinScene(series.shapes, max(LEAST_TOP_KPA, peak_kpa), series.fingertips)
 
     @property
     def start_ns(self) -> int:
-        """Time of the first frame."""
-        return min(int(part.t_ns[0]) for part in self._series.parts.values())
+        """Time of the first frame; without frames, of the first event."""
+        series = self._series
+        first_ns = [int(part.t_ns[0]) for part in series.parts.values()]
+        others = (series.touches, series.slips, series.overs, series.health)
+        return min(first_ns or [events[0].t_ns for events in others if events], default=0)
 
     def items(self) -> Iterator[Item]:
         """Everything, in the order of time."""
@@ -270,8 +273,9 @@ def _side_by_side(
     """Return where the frame of each part lies; skin on a fingertip has the fingertip's frame."""
     extents_m: dict[str, tuple[float, float]] = {}
     for name, shape in shapes.items():
-        x_m = np.array(shape.position_m, np.float64)[:, 0]
-        extents_m[name] = float(x_m.min()), float(x_m.max())
+        # Anybody may publish a part without taxels.
+        xs_m = [x_m for x_m, _, _ in shape.position_m] or [0.0]
+        extents_m[name] = min(xs_m), max(xs_m)
     for name, tip in fingertips.items():
         if tip.array not in shapes and name not in shapes:
             half_m = max(tip.size_mm, default=PLANE_M * 1e3) * 1e-3
@@ -304,7 +308,7 @@ def write_foxglove(series: Series, recording: Path | None, output: Path) -> None
     with whole_file(output) as growing, growing.open("wb") as file:
         writer: Any = Writer(file)
         writer.start(profile="", library="skin-host")
-        if recording is not None and recording.suffix == ".mcap":
+        if recording is not None and is_mcap(recording):
             _copy(recording, writer)
         _Foxglove(writer).write(scene)
         writer.finish()

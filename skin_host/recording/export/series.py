@@ -1,6 +1,6 @@
 """What was recorded, as arrays over time: read from messages, or computed from CAN frames."""
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.client.streams import DUPLICATE_SPAN
 from skin_host.config.settings import Settings, skin_hash
-from skin_host.errors import LogError
+from skin_host.errors import LogError, RequestError
 from skin_host.fingertip.events import FingertipEvent, Over, Slip
 from skin_host.fingertip.health import FingertipHealth
 from skin_host.health import HealthWatch
@@ -29,6 +30,7 @@ from skin_host.processing.calibration import Calibration
 from skin_host.processing.core import Engine
 from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
+from skin_host.recording.export.columns import TABLES
 from skin_host.recording.mcap import read_messages_of, robot_at
 from skin_host.recording.replay import contacts_of, replay
 
@@ -83,7 +85,7 @@ class Series:
     """A whole recording.
 
     Attributes:
-        parts: by name.
+        parts: by name, those with frames.
         touches: events in their order, of fingertips too.
         shapes: positions of the taxels, if the recording has them.
         health: changes in their order; of a recording of CAN frames, that at its end.
@@ -109,6 +111,42 @@ class Series:
             self.slips.append(event)
         else:
             self.overs.append(event)
+
+    def contents(self) -> str:
+        """Return what it holds besides frames, such as "touches (10), health (2)"."""
+        numbers = {table.name: len(getattr(self, table.name)) for table in TABLES}
+        return ", ".join(f"{name} ({n})" for name, n in numbers.items() if n)
+
+    def require_frames(self, what: str) -> None:
+        """Refuse what is made of frames alone.
+
+        Raises:
+            RequestError: there are none.
+        """
+        if not self.parts:
+            raise RequestError(
+                f"{what}: the recording holds {self.contents() or 'nothing'}; wanted frames of "
+                "pressure (`frames = true` of a part); export it to .npz, .parquet or a folder"
+            )
+
+
+class _Repeats:
+    """Finds events that came before: what was in flight when a connection broke is sent again.
+
+    They have the same count and time. One of an equal count at another time is of another run.
+    """
+
+    def __init__(self) -> None:
+        self._latest: dict[tuple[type, str], deque[tuple[int, int]]] = {}
+
+    def has(self, event: FingertipEvent) -> bool:
+        """Return whether an event is among the last ones of its part and kind, and note it."""
+        latest = self._latest.setdefault((type(event), event.part), deque(maxlen=DUPLICATE_SPAN))
+        which = event.count, event.t_ns
+        if event.count and which in latest:  # a publisher that does not count cannot be checked
+            return True
+        latest.append(which)
+        return False
 
 
 @dataclass(slots=True)
@@ -139,14 +177,15 @@ class _Growing:
 
 
 def read_messages(recording: Path) -> Series:
-    """Read an MCAP recording of messages.
+    """Read an MCAP recording of messages. It may have no frames, see `Series.require_frames`.
 
     Raises:
-        LogError: it cannot be read, holds no frames, or those of several robots.
+        LogError: it cannot be read, holds nothing to export, or messages of several robots.
     """
     robots: set[str] = set()
     parts: dict[str, _Growing] = {}
     found = Series({}, [], {})
+    repeats = _Repeats()
     health: dict[str, HealthLine] = {}
     contacts: dict[str, ContactLine] = {}
     for said in read_messages_of(recording):
@@ -169,7 +208,9 @@ def read_messages(recording: Path) -> Series:
                     )
                 growing.add(frame)
             elif kind in EVENT_DECODERS:
-                found.take(EVENT_DECODERS[kind](said.payload))
+                event = EVENT_DECODERS[kind](said.payload)
+                if not repeats.has(event):
+                    found.take(event)
             elif kind == "contact" and said.payload:
                 state = ContactLine(name, said.t_ns, decode_contact(said.payload))
                 if name not in contacts or contacts[name].state != state.state:
@@ -186,9 +227,11 @@ def read_messages(recording: Path) -> Series:
                 found.fingertips.update(info.fingertips)
         except MessageError as error:
             raise LogError(f"{recording}: {said.topic}: {error}") from None
-    if not parts:
-        raise LogError(f"{recording}: holds no frames of pressure")
     found.parts.update((name, part.series(name)) for name, part in parts.items())
+    if not found.parts and not found.contents():
+        raise LogError(
+            f"{recording}: holds no frames of pressure, events, contact states or health of a robot"
+        )
     return found
 
 
@@ -198,7 +241,8 @@ def health_line(part: str, t_ns: int, record: Mapping[str, Any]) -> HealthLine:
 
 
 def read_frames(log: Path, settings: Settings, layout: Layout, calibration: Calibration) -> Series:
-    """Process a recording of CAN frames with the pipeline, as `skin replay` does.
+    """Process a recording of CAN frames with the pipeline, as `skin replay` does. It may have no
+    frames of pressure, see `Series.require_frames`.
 
     Raises:
         LogError: it cannot be read, or holds nothing of this skin.
@@ -210,8 +254,11 @@ def read_frames(log: Path, settings: Settings, layout: Layout, calibration: Cali
     contacts = contacts_of(engine)
     states: dict[int, ContactState] = {}
     watch = HealthWatch(engine)
+    last_ns: int | None = None
     for output in replay(log, engine):
         watch.note(output)
+        times_ns = [step.frame.t_ns for step in output.steps] + [t_ns for _, t_ns in output.samples]
+        last_ns = max(times_ns, default=last_ns)
         for step in output.steps:
             frame = step.frame
             parts[frame.part].add(frame)
@@ -233,15 +280,14 @@ def read_frames(log: Path, settings: Settings, layout: Layout, calibration: Cali
         found.shapes.update(info.parts)
         found.fingertips.update(info.fingertips)
     found.parts.update((name, part.series(name)) for name, part in parts.items() if part.seq)
-    if not found.parts:
-        raise LogError(f"{log}: holds no sweep of this skin")
+    if last_ns is None:
+        raise LogError(f"{log}: holds no sweep of this skin, and no sample of its fingertips")
     found.health.extend(
         health_line(part.name, parts[part.name].t_ns[-1], watch.replayed(index))
         for index, part in enumerate(layout.parts)
         if part.name in found.parts
     )
     if engine.fingertips is not None:
-        last_ns = max(part.t_ns[-1] for part in parts.values() if part.t_ns)
         records = FingertipHealth(engine.fingertips).records(None)
         found.health.extend(health_line(name, last_ns, record) for name, record in records.items())
     found.health.sort(key=lambda line: line.t_ns)

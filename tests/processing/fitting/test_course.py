@@ -88,6 +88,38 @@ def test_curves_of_another_shape_than_the_papers_and_hysteresis_carry_over(press
     assert np.median(rms) < 10.0
 
 
+def swept(period_s, top_kpa=100.0):
+    """At rest, then up and down at a constant rate [t]."""
+    t = np.arange(0.0, 8.0 * period_s + 60.0, DT_S)
+    return np.where(t < 8.0, 0.0, top_kpa * (1.0 - np.abs((t - 8.0) / period_s % 2.0 - 1.0)))
+
+
+@pytest.mark.parametrize("smoothing_s", [0.0, 0.5, 2.0])
+@pytest.mark.parametrize("period_s", [2.0, 15.0, 60.0])
+@pytest.mark.parametrize("noise", [0.0, 0.4, 1.5])
+def test_pads_without_memory_get_none_however_fast_they_are_swept_and_smoothed(
+    period_s, smoothing_s, noise
+):
+    pressure = swept(period_s)
+    rng = np.random.default_rng(7)
+    units = np.outer(0.8 * pressure, np.linspace(0.8, 1.2, 6))
+    units += rng.normal(0.0, noise, units.shape)
+    assert fit_course(as_course(units, pressure), smoothing_s).memory == Memory()
+
+
+def half_width_kpa(memory):
+    """How far a foam that is being let go reads above its mean course."""
+    return sum(r * w for r, w in zip(memory.radius_kpa, memory.weight, strict=True))
+
+
+@pytest.mark.parametrize("period_s", [30.0, 60.0])
+def test_pads_with_memory_keep_it_however_they_are_smoothed(period_s):
+    pressure, units = under(swept(period_s, 300.0))
+    found = [fit_course(as_course(units, pressure), smoothing_s) for smoothing_s in (0.0, 0.5, 2.0)]
+    assert found[0].memory == found[1].memory == found[2].memory
+    assert half_width_kpa(found[0].memory) == pytest.approx(half_width_kpa(MEMORY), rel=0.2)
+
+
 def test_each_pad_gets_its_verdict(pressed):
     units, pressure = pressed
     units = units.copy()

@@ -1,4 +1,6 @@
+from dataclasses import astuple, replace
 from functools import cache
+from itertools import chain
 
 import numpy as np
 import pytest
@@ -93,6 +95,17 @@ def test_a_short_record_says_that_long_times_are_not_known():
     found = fit("asymmetric", short)
     assert any("constant" in remark for remark in found.remarks)
     assert "beta_6" in found.uncertain
+
+
+@pytest.mark.parametrize("model", FITTED)
+@pytest.mark.parametrize("times", [1000.0, 1e7])
+def test_a_pressure_that_no_parameters_explain_gives_finite_numbers(model, times):
+    known = hold_on("A")
+    record = replace(known, pressure_kpa=times * known.pressure_kpa)
+    found = fit(model, record)
+    assert found.rms_hold_kpa > record.level_kpa
+    numbers = [found.rms_rest_kpa, *found.uncertain.values(), *chain(*astuple(found.parameters))]
+    assert np.all(np.isfinite(numbers))
 
 
 def test_merging_keeps_time_and_means():
