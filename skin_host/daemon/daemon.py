@@ -4,7 +4,7 @@ import asyncio
 import logging
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import msgspec
@@ -122,13 +122,15 @@ class Daemon:
         if calibration is not None:
             if self._zeros.are_of(calibration.id):
                 self._use_baselines()
-                doubted = _taxels(layout, self._zeros)
+                doubted = _taxels(layout, self._zeros.unknown)
             elif self._zeros.calibration and not self._zeros.are_older_than(calibration.time):
-                doubted = _taxels(layout, self._zeros)
+                doubted = _taxels(layout, self._zeros.unknown)
             elif had_zeros and not self._zeros.calibration:
                 # It could not be read: any of them may have been touched when their zero was taken.
                 doubted = layout.pad_kind == PadKind.PRESSURE
             self.engine.zeros.doubt(doubted)
+        # Whatever calibration is in use: it is the chip's fault.
+        self.engine.expect_stuck(_taxels(layout, self._zeros.stuck))
         self.engine.zeros.hold(self.engine.boards)
         self.health = HealthWatch(self.engine)
         self.control = Control(self)
@@ -479,14 +481,16 @@ class Daemon:
         said_s = dict.fromkeys(self.engine.parts, 0.0)
         of_parts: dict[tuple[str, str], str] = {}
         pulse: tuple[object, ...] = ()
-        zeroed = self.engine.zeros.changes
+        zeroed, stuck = self.engine.zeros.changes, self.engine.intake.liveness.stuck.tobytes()
         while True:
             await self.clock.sleep(LOOK_S)
             self.link.supervise()
             engine = self.engine
-            if zeroed != engine.zeros.changes:
+            stuck_before, stuck = stuck, engine.intake.liveness.stuck.tobytes()
+            if zeroed != engine.zeros.changes or stuck != stuck_before:
                 zeroed = engine.zeros.changes
-                # At once: what was pressed then must be doubted after a crash, too.
+                # At once: what was pressed then, and what is stuck, must be doubted after a crash,
+                # too.
                 self._begin_to_keep_zeros()
             now_s = self.clock.monotonic_s()
             link = self.link
@@ -558,6 +562,16 @@ class Daemon:
             for part in map(self.layout.parts.__getitem__, self.engine.parts)
         }
 
+    def _numbers(self, taxels: NDArray[np.bool_]) -> dict[str, list[int]]:
+        """Return the numbers of some taxels, bool[n], by part."""
+        if not taxels.any():
+            return {}
+        parts = [self.layout.parts[part] for part in self.engine.parts]
+        numbers = {
+            part.name: np.flatnonzero(taxels[part.start : part.stop]).tolist() for part in parts
+        }
+        return {name: mine for name, mine in numbers.items() if mine}
+
     async def _keep_zeros(
         self,
         *,
@@ -577,15 +591,10 @@ class Daemon:
         engine, found = self.engine, self.engine.calibration
         if found is None:
             return
-        unknown: dict[str, list[int]] = {}
         at_risk = engine.zeros.at_risk(touched)
         if doubted is not None:
             at_risk |= doubted
-        if at_risk.any():
-            for part in map(self.layout.parts.__getitem__, engine.parts):
-                mine = np.flatnonzero(at_risk[part.start : part.stop]).tolist()
-                if mine:
-                    unknown[part.name] = mine
+        unknown, stuck = self._numbers(at_risk), self._numbers(engine.stuck())
         baselines, n_found = self._zeros.baselines, engine.zeros.found
         calibrated = bool(baselines) and self._zeros.calibration != found.id
         if touched or calibrated or n_found != self._zeros_kept:
@@ -594,12 +603,14 @@ class Daemon:
             calibration=found.id,
             before="" if before is None else before.id,
             unknown=unknown,
+            stuck=stuck,
             baselines=baselines,
             written=self._zeros.written,
         )
         # The end does not leave it to a write that may not have ended.
         is_open = "zeros" in self.unkept or (touched and self._under_way() is not None)
-        is_news = zeros != self._zeros and (unknown or baselines or self._zeros.unknown)
+        is_empty = not (unknown or stuck or baselines or self._zeros.unknown or self._zeros.stuck)
+        is_news = zeros != self._zeros and not is_empty
         if not (is_news or is_open):
             self._zeros_kept = n_found
             return
@@ -711,11 +722,11 @@ class Daemon:
         return kept_path(self.settings, self._node, what)
 
 
-def _taxels(layout: Layout, zeros: Zeros) -> NDArray[np.bool_]:
-    """Return as bool[n] the taxels that are named, as far as this skin has them."""
+def _taxels(layout: Layout, numbers: Mapping[str, list[int]]) -> NDArray[np.bool_]:
+    """Return as bool[n] the taxels that are named by part, as far as this skin has them."""
     found = np.zeros(layout.n_taxels, np.bool_)
     for part in layout.parts:
-        for taxel in zeros.unknown.get(part.name, ()):
+        for taxel in numbers.get(part.name, ()):
             if 0 <= taxel < part.n_taxels:
                 found[part.start + taxel] = True
     return found

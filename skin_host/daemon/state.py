@@ -52,7 +52,7 @@ class NodeState(Struct, forbid_unknown_fields=True):
 
 
 class Zeros(Struct, forbid_unknown_fields=True):
-    """What has become of the zeros since the calibration.
+    """What has become of the zeros since the calibration, and of the pads.
 
     A start sets the boards up, and their set-up takes what touches them into the zero. So taxels
     that were touched when the daemon ended are not valid after it, until they are calibrated. What
@@ -65,6 +65,8 @@ class Zeros(Struct, forbid_unknown_fields=True):
             file has its name, a start finds that one.
         unknown: numbers of taxels by part whose zero is not known, or will not be after the next
             start.
+        stuck: numbers of taxels by part whose pads are stuck. They take as long to be found again
+            as the first time.
         baselines: by part, activation of each untouched taxel in units, as found after the last
             set-up, or as it had drifted by the end. Empty: the calibration's.
         written: when that was so, ISO 8601 in UTC.
@@ -79,6 +81,7 @@ class Zeros(Struct, forbid_unknown_fields=True):
     calibration: str = ""
     before: str = ""
     unknown: dict[Name, list[int]] = {}
+    stuck: dict[Name, list[int]] = {}
     baselines: dict[Name, list[Annotated[float, Meta(ge=-255, le=255)]]] = {}
     written: Annotated[str, Meta(max_length=64)] = ""
 

@@ -237,6 +237,11 @@ class Liveness:
         """Return single pads that repeat their byte in a living triangle, bool[k, 12]."""
         return self._pads.stuck
 
+    def expect_stuck(self, pads: Mask) -> None:
+        """Some single pads, bool[k, 12], were stuck before a restart; nothing was received yet."""
+        self._pads.expect_stuck(pads)
+        self._doubt()
+
     def step(
         self,
         raw: NDArray[np.uint8],

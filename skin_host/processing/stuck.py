@@ -425,6 +425,13 @@ class StuckPads:
         self.stuck = self._to_show > 0
         self.any_stuck = any_of(self.stuck)
 
+    def expect_stuck(self, pads: Mask) -> None:
+        """Some pads, bool[k, 12], were stuck before a restart: they are until they show life."""
+        # The first byte of a pad is compared with none, so that the second looks like a move.
+        self._to_show[pads] = PROBATION_MOVES + 1
+        self.stuck = self._to_show > 0
+        self.any_stuck = any_of(self.stuck)
+
     @property
     def steps_without_decision(self) -> int:
         """Return in how many more steps no pad can become stuck, and no rate is learnt."""

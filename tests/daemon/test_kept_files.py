@@ -245,6 +245,31 @@ def test_zeros_that_are_not_known_are_in_doubt_from_the_start(kept: tuple[Any, A
     assert doubted(Daemon(settings, layout, calibration=calibration)) == []
 
 
+def stuck(daemon: Daemon) -> list[int]:
+    """Numbers of the stuck taxels."""
+    return np.flatnonzero(daemon.engine.stuck()).tolist()
+
+
+@pytest.mark.parametrize("calibration_id", ["", "another"])
+def test_pads_that_were_stuck_are_so_from_the_start(
+    kept: tuple[Any, Any, Path], calibration_id: str
+) -> None:
+    """A chip's fault has nothing to do with which calibration is in use."""
+    settings, layout, path = kept
+    calibration = stored_calibration(settings, layout, "main")
+    assert calibration is not None
+    arm = layout.part("left_forearm")
+    zeros = Zeros(
+        calibration=calibration_id or calibration.id,
+        stuck={"left_forearm": [3, 17, -1, arm.n_taxels], "tail": [1]},
+        written="2000-01-01T00:00:00+00:00",
+    )
+    write_document(path.with_name("demo-main.zeros.json"), zeros)
+    daemon = Daemon(settings, layout, calibration=calibration)
+    assert stuck(daemon) == [arm.start + 3, arm.start + 17]
+    assert doubted(daemon) == []
+
+
 @pytest.mark.parametrize("written", ["9999-12-31T00:00:00+00:00", "", "x", "2000-01-01T00:00:00"])
 def test_a_calibration_that_was_put_back_ends_no_doubt(
     kept: tuple[Any, Any, Path], written: str

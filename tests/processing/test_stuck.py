@@ -132,6 +132,18 @@ def test_a_stuck_pad_is_valid_after_three_moves_however_long_it_rests_between_th
     assert after == [True] * late + [False] * (10 - late)
 
 
+def test_a_pad_that_was_stuck_before_a_restart_is_so_until_it_has_moved_three_times() -> None:
+    """Its first byte is compared with none."""
+    watched, rng = lively()
+    was_stuck = np.zeros(SHAPE, bool)
+    was_stuck[1, 5] = True
+    watched.pads.expect_stuck(was_stuck)
+    assert np.argwhere(watched.pads.stuck).tolist() == [[1, 5]]
+    watched.raw[:] = 0
+    for moves, byte in enumerate([200, 200, 201, 201, 202, 202, 203]):
+        assert hold(watched, rng, byte) == [moves < 6]
+
+
 def test_damaged_bytes_are_no_sign_of_life() -> None:
     watched, rng = lively()
     sweeps_until_stuck(watched, rng, 239)

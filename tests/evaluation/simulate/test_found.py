@@ -221,6 +221,47 @@ def test_a_pad_at_the_end_of_its_scale_after_a_press_that_nobody_felt_begin_is_n
         runner.run(live())
 
 
+def test_a_pad_that_is_stuck_is_never_valid_after_a_crash(world: World) -> None:
+    """It takes as long to be found stuck as before; its daemon knows it."""
+
+    async def live() -> None:
+        life = start(world)
+        await world.clock.sleep(8.0)
+        part = world.layout.part(world.spots[0].part)
+        triangle = next(one for one in world.layout.triangles if one.first == part.start)
+        board = world.layout.boards[triangle.board].name
+        stuck = Fault(name="stuck_taxel", board=board, triangle=triangle.number, taxel=0)
+        mend = world.robot.inject(stuck)
+        invalid: list[int] = []
+        for _ in range(300):
+            await world.clock.sleep(1.0)
+            invalid = life.daemon.records()[part.name]["invalid"]
+            if invalid:
+                break
+        assert invalid == [0]
+        await world.clock.sleep(1.0)
+        life.kill()
+        life = start(world)
+        records = []
+        for _ in range(40):
+            await world.clock.sleep(0.1)
+            records.append(life.daemon.records()[part.name])
+        assert all(0 in record["invalid"] for record in records if record["frames"])
+        assert records[-1]["invalid"] == [0]
+        assert records[-1]["taxel_faults"] == {"stuck": [0]}
+        mend()
+        await world.clock.sleep(20.0)
+        assert life.daemon.records()[part.name]["invalid"] == []
+        life.kill()
+        life = start(world)
+        await world.clock.sleep(6.0)
+        assert life.daemon.records()[part.name]["invalid"] == []
+        life.kill()
+
+    with world.clock.runner() as runner:
+        runner.run(live())
+
+
 def test_a_press_that_begins_while_a_zero_is_observed_is_felt_when_it_comes_again(
     world: World,
 ) -> None:
