@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from skin_host.bus.assembler import Assembler, Sweep
 from skin_host.bus.ledger import BoardLedger
-from skin_host.bus.wire import TAXELS, FrameBatch
+from skin_host.bus.wire import FrameBatch
 from skin_host.config.settings import Settings, TouchSettings, skin_hash
 from skin_host.fingertip.events import FingertipEvent
 from skin_host.layout import Layout
@@ -365,7 +365,7 @@ class Engine:
     def stuck(self) -> Mask:
         """Return the taxels bool[n] whose pads are stuck in a living triangle."""
         found = np.zeros(self.layout.n_taxels, np.bool_)
-        taxels = self._taxels_of_pads()
+        taxels = self.intake.taxels
         found[taxels[self.intake.liveness.stuck & (taxels >= 0)]] = True
         return found
 
@@ -373,13 +373,8 @@ class Engine:
         """These taxels, bool[n], were stuck before a restart: they are not valid before their pads
         have shown that they live. Nothing has been fed yet.
         """
-        of_pads = self._taxels_of_pads()
+        of_pads = self.intake.taxels
         self.intake.liveness.expect_stuck(taxels[of_pads] & (of_pads >= 0))
-
-    def _taxels_of_pads(self) -> NDArray[np.int32]:
-        """Return the taxel of each pad [16 b, 12] of all triangles; -1 where there is none."""
-        boards = [self.layout.boards[board].taxel_index for board in self.boards]
-        return np.array(boards, np.int32).reshape(-1, TAXELS)
 
     def end_part(self, part: int, t_ns: int) -> list[Touch]:
         """End every contact of a part."""

@@ -103,6 +103,8 @@ class Intake:
 
     Attributes:
         liveness: of all triangles, those of one board after those of another.
+        taxels: int32[16 b, 12], the taxel of each pad, in the order of `liveness`; -1 where there
+            is none.
         veto: bool[16, 12] by row of the board: taxels that are invalid for a reason that the
             bytes do not show.
         touched: bool[16, 12] by row of the board: pads that are touched, where any is.
@@ -153,6 +155,8 @@ class Intake:
         self._felt: dict[int, Mask] = {}
         #: What it was at the last judgement with any, and the same over all boards.
         self._felt_before: tuple[dict[int, Mask], Mask] = {}, np.zeros((0, PADS), np.bool_)
+        of_boards = [layout.boards[board].taxel_index for board in boards]
+        self.taxels = np.array(of_boards, np.int32).reshape(-1, PADS)
         self._encodings = _encodings(layout, boards)
         self.liveness = self._new_liveness(None)
         self._states = [self._new_state(part, silent_periods) for part in parts]
@@ -416,8 +420,7 @@ class Intake:
         boards = [self._layout.boards[board] for board in self._boards]
         of_pads: NDArray[np.float64] | None = None
         if noise is not None:
-            taxels = np.array([board.taxel_index for board in boards]).reshape(-1, PADS)
-            of_pads = np.where(taxels >= 0, noise[taxels], 0.0)
+            of_pads = np.where(self.taxels >= 0, noise[self.taxels], 0.0)
         return Liveness(
             len(self._encodings),
             of_pads,

@@ -13,6 +13,7 @@ import msgpack
 import pytest
 
 from skin_host.config.settings import Bus
+from tests.support.datagrams import FRAME
 from tests.support.stack import Stack, wait_for
 from tests.support.subscriber import Subscriber
 from tests.support.watchdog import Watchdog, computed_s, memory_kb
@@ -22,20 +23,6 @@ GROWTH_KB = 20_000
 GAP_S = 1.0
 LOG_BYTES = 5_000
 TIMES = 200
-
-FRAME = {
-    "timestamp": 0.0,
-    "arbitration_id": 0x4E0,
-    "is_extended_id": False,
-    "is_remote_frame": False,
-    "is_error_frame": False,
-    "channel": None,
-    "dlc": 8,
-    "data": bytes(8),
-    "is_fd": False,
-    "bitrate_switch": False,
-    "error_state_indicator": False,
-}
 
 
 def frame(**changes: object) -> bytes:

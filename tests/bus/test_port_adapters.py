@@ -13,6 +13,7 @@ from skin_host.bus.opening import open_bus, open_port
 from skin_host.bus.port import LinkState, Port
 from skin_host.clock import SteppedClock
 from skin_host.config.settings import Bus, Receive
+from tests.support.datagrams import FRAME
 from tests.support.waiting import PATIENCE_S
 
 _numbers = itertools.count()
@@ -227,24 +228,11 @@ def test_a_datagram_that_is_no_frame_costs_its_own_size_alone(changes: dict[str,
     """A number as data makes as many bytes in python-can: one datagram filled the memory."""
     msgpack = pytest.importorskip("msgpack")
     group = Bus(interface="udp_multicast", channel="239.74.163.204")
-    frame: dict[str, object] = {
-        "timestamp": 0.0,
-        "arbitration_id": 0x410,
-        "is_extended_id": False,
-        "is_remote_frame": False,
-        "is_error_frame": False,
-        "channel": None,
-        "dlc": 8,
-        "data": bytes(8),
-        "is_fd": False,
-        "bitrate_switch": False,
-        "error_state_indicator": False,
-    }
     port = open_port("left", group, Receive())
     near = open_bus("b", group)
     with can.Bus(interface="udp_multicast", channel=group.channel) as other:
         try:
-            other._multicast.send(msgpack.packb(frame | changes))
+            other._multicast.send(msgpack.packb(FRAME | changes))
             other.send(message(0x411, b"\x01"))
         except can.CanError:
             pytest.skip("this machine has no network for multicast")
