@@ -18,6 +18,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -71,6 +72,8 @@ _RECORD_ARRAY = np.dtype(
         "itemsize": _RECORD.size,
     }
 )
+#: Slices of time since 1970 have numbers of so many bits, if they last 0.1 ms or longer.
+_SLICE_BITS = 44
 #: Bytes of `struct can_frame` up to the first byte of data, the header.
 HEAD_BYTES = 9
 
@@ -200,6 +203,35 @@ class RecordBatch(FrameBatch):
 
     def records(self) -> Records:
         return Records(self._octets, _RECORD, _HEAD)
+
+
+def in_slices(batches: list[tuple[str, FrameBatch]], slice_ns: int) -> list[tuple[str, FrameBatch]]:
+    """Cut what was read of several buses in one turn into slices of time, the frames of a slice bus
+    by bus.
+
+    After a pause of this computer each bus has several sweeps waiting. Taken bus by bus, the last
+    sweep of one would join the first of another to one frame of a part, and the chips of all boards
+    would be judged once for each bus and period, not once for each period.
+
+    The order of a bus's frames is kept. Where its clock was set back by more than a slice, what
+    follows is in slices of its own, after all those before.
+    """
+    if len(batches) < 2 or all(
+        abs(batch.t_ns[-1] - batch.t_ns[0]) < slice_ns for _, batch in batches if len(batch)
+    ):
+        return [(bus, batch) for bus, batch in batches if len(batch)]
+    slices: list[tuple[int, str, FrameBatch]] = []
+    for bus, batch in batches:
+        number = np.clip(batch.t_ns // slice_ns, 0, (1 << _SLICE_BITS) - 1)
+        number[1:] += np.cumsum(np.diff(batch.t_ns) < -slice_ns) << _SLICE_BITS
+        number = np.maximum.accumulate(number)
+        starts = np.flatnonzero(np.diff(number, prepend=-1)).tolist()
+        rows = RecordBatch(batch.id, batch.dlc, batch.data, batch.t_ns)
+        for begin, end in pairwise([*starts, len(batch)]):
+            piece = rows[begin:end]
+            piece.dropped = 0 if begin else batch.dropped
+            slices.append((int(number[begin]), bus, piece))
+    return [(bus, piece) for _, bus, piece in sorted(slices, key=lambda one: one[0])]
 
 
 def _rising(t_ns: NDArray[np.int64]) -> bool:

@@ -54,6 +54,29 @@ def refuse_other_loop(loop: asyncio.AbstractEventLoop | None) -> None:
         )
 
 
+class Repeats:
+    """Finds events and frames that came before: what was in flight when a connection broke is sent
+    again, and without MQTT 5 each of several brokers sends it.
+
+    They have the same number and time. One of an equal number at another time is of another run.
+    """
+
+    def __init__(self) -> None:
+        self._latest: dict[tuple[type, str], deque[tuple[int, int]]] = {}
+
+    def has(self, item: Touch | Slip | Over | Frame) -> bool:
+        """Return whether an item is among the last ones of its part and kind, and note it."""
+        number = item.seq if isinstance(item, Frame) else item.count
+        if not number and not isinstance(item, Frame):
+            return False  # a publisher that does not count cannot be checked
+        latest = self._latest.setdefault((type(item), item.part), deque(maxlen=DUPLICATE_SPAN))
+        which = number, item.t_ns
+        if which in latest:
+            return True
+        latest.append(which)
+        return False
+
+
 class Stream(AsyncIterator[T], Generic[T]):
     """Items of some kinds from the request on; made by `SkinClient`, ends with it.
 
@@ -78,6 +101,7 @@ class Stream(AsyncIterator[T], Generic[T]):
         self._closed = False
         #: By kind and part; each has separate numbers.
         self._last: dict[tuple[type, str], tuple[int, int]] = {}
+        self._repeats = Repeats()
 
     def put(self, item: T) -> None:
         """Add a received item."""
@@ -118,25 +142,27 @@ class Stream(AsyncIterator[T], Generic[T]):
                 self._wake.clear()
                 await self._wake.wait()
             item: Any = self._drop()
-            if isinstance(item, Touch | Slip | Over):
-                # A publisher that does not count cannot be checked.
-                missed = self._missed(item, item.count) if item.count else 0
-            elif isinstance(item, Frame):
+            if not isinstance(item, Touch | Slip | Over | Frame):
+                return cast(T, item)
+            if self._repeats.has(item):
+                continue
+            if isinstance(item, Frame):
                 missed = self._missed(item, item.seq)
             else:
-                return cast(T, item)
-            if missed is not None:
-                # Other streams hold the same object, and may have missed fewer.
-                return cast(T, replace(item, missed=missed) if missed else item)
+                # A publisher that does not count cannot be checked.
+                missed = self._missed(item, item.count) if item.count else 0
+            # Other streams hold the same object, and may have missed fewer.
+            return cast(T, replace(item, missed=missed) if missed else item)
 
-    def _missed(self, item: Touch | Slip | Over | Frame, number: int) -> int | None:
-        """Return how many numbers are missing before this one; None if it was received before."""
+    def _missed(self, item: Touch | Slip | Over | Frame, number: int) -> int:
+        """Return how many numbers are missing before this one."""
         kind = type(item), item.part
         # What was lost behind greater numbers that were forged, only the order of all events knows.
         lost = item.missed if kind in self._last else 0
         last, last_ns = self._last.get(kind, (number - 1, item.t_ns))
-        if number <= last and item.t_ns <= last_ns and last - number < DUPLICATE_SPAN:
-            return None
+        if item.t_ns < last_ns and 0 < last - number < DUPLICATE_SPAN:
+            # It came late over another broker, or its node was restarted with an earlier clock.
+            return lost
         self._last[kind] = number, item.t_ns
         # A smaller number at a later time means that the node was restarted.
         return lost or max(0, number - last - 1)

@@ -3,9 +3,9 @@
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import AbstractContextManager
-from itertools import chain, pairwise
+from itertools import chain
 from typing import Protocol
 
 import numpy as np
@@ -15,7 +15,7 @@ from skin_host.bus.boards import Boards
 from skin_host.bus.opening import open_port
 from skin_host.bus.port import Port
 from skin_host.bus.wake import LONGEST_NS, WakeUp
-from skin_host.bus.wire import NS_PER_S, FrameBatch, RecordBatch
+from skin_host.bus.wire import NS_PER_S, FrameBatch, in_slices
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Bus, Receive
 from skin_host.errors import BusError, SkinError
@@ -57,29 +57,6 @@ class OpenPort(Protocol):
         self, name: str, bus: Bus, receive: Receive, *, wait: bool = False, clock: Clock = SYSTEM
     ) -> Port:
         """See `bus.opening.open_port`."""
-
-
-def _by_time(
-    batches: list[tuple[str, FrameBatch]], slice_ns: int
-) -> Iterator[tuple[str, FrameBatch]]:
-    """Yield what was read of several buses in slices of time, the frames of a slice bus by bus.
-
-    After a pause of this computer each bus has several sweeps waiting. Taken bus by bus, the last
-    sweep of one would join the first of another to one frame of a part, and the chips of all boards
-    would be judged once for each bus and period, not once for each period.
-    """
-    if all(batch.t_ns[-1] - batch.t_ns[0] < slice_ns for _, batch in batches):
-        yield from batches
-        return
-    slices: list[tuple[int, str, FrameBatch]] = []
-    for bus, batch in batches:
-        # The order of a bus's frames is kept, even where its clock was set back.
-        number = np.maximum.accumulate(batch.t_ns) // slice_ns
-        starts = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), len(batch)]
-        rows = RecordBatch(batch.id, batch.dlc, batch.data, batch.t_ns)
-        slices += [(int(number[begin]), bus, rows[begin:end]) for begin, end in pairwise(starts)]
-    for _, bus, part in sorted(slices, key=lambda one: one[0]):
-        yield bus, part
 
 
 class Link:
@@ -249,10 +226,10 @@ class Link:
             if n >= port.capacity:
                 is_behind = True
                 read_ns = min(read_ns, int(batch.t_ns[-1]))
-            record(bus, batch)
             batches.append((bus, batch))
         self._note_clock()
-        for bus, batch in batches if len(batches) < 2 else _by_time(batches, self._slice_ns):
+        for bus, batch in in_slices(batches, self._slice_ns):
+            record(bus, batch)
             output = self._engine.feed(bus, batch)
             if output.answers:
                 self._note_answers(bus, output.answers)

@@ -63,6 +63,8 @@ class TipState:
         begun_ns: the same of when it began to send what can be sampled.
         touched_since_ns: the same of its touch, if there is one.
         assembler: of its samples; None until the full scales are known.
+        zero_scale: float64[6], full scales of the board that its zero was taken of, if they are
+            known.
         agreement: of its samples, which only together are a load.
         frozen: whether they are measured.
         saturated_ns: when its load was last saturated, 0 if never.
@@ -81,6 +83,7 @@ class TipState:
     answered_scale: Floats = field(default_factory=lambda: np.zeros(CHANNELS))
     reported_scale: Floats = field(default_factory=lambda: np.zeros(CHANNELS))
     assembler: WrenchAssembler | None = None
+    zero_scale: Floats | None = None
     agreement: Agreement = field(default_factory=Agreement)
     frozen: Frozen = field(default_factory=Frozen)
     last_ns: int = 0
@@ -116,22 +119,29 @@ class TipState:
         return bool((self.reported_scale > 0.0).all())
 
     @property
-    def scale_differs(self) -> bool:
-        """Whether the board reported other full scales than are used."""
-        if self.assembler is None:
-            return False
-        known = self.reported_scale > 0.0
-        # A board reports whole numbers.
-        off = np.abs(self.reported_scale - self.assembler.full_scale)
-        return bool((off[known] > 0.5).any())
+    def scale_before(self) -> Floats | None:
+        """Return the full scales that are used, or belong to the zero, if the board reported other
+        ones.
+        """
+        for scale in (
+            None if self.assembler is None else self.assembler.full_scale,
+            self.zero_scale,
+        ):
+            if scale is not None:
+                known = self.reported_scale > 0.0
+                # A board reports whole numbers.
+                if (np.abs(self.reported_scale - scale)[known] > 0.5).any():
+                    return scale
+        return None
 
     @property
     def exchanged(self) -> bool:
-        """Whether it is another board than that whose full scales are used: not if they are given.
+        """Whether it is another board than that whose full scales are used, or whose zero: not if
+        they are given.
 
         What it measures may be a fraction of what presses it, until it has a zero of its own.
         """
-        return self.settings.full_scale is None and self.scale_differs
+        return self.settings.full_scale is None and self.scale_before is not None
 
 
 class FingertipOutput(NamedTuple):
@@ -300,6 +310,7 @@ class FingertipEngine:
             if state.exchanged and state.reports_all and not state.tip.lasts:
                 self._assemble(state, state.reported_scale.copy())
                 state.tip.use(None)
+                state.zero_scale = None
             state.zeroing.clear()
             state.touching.clear()
 
@@ -314,7 +325,12 @@ class FingertipEngine:
                 whole = ~damaged(samples, state.assembler.full_scale / ZERO_WORD)
                 touched = bool(np.array(state.touching)[whole].any())
                 samples = samples[whole]
-                found[name] = Zero(samples.mean(axis=0), samples.std(axis=0, ddof=1), touched)
+                found[name] = Zero(
+                    samples.mean(axis=0),
+                    samples.std(axis=0, ddof=1),
+                    touched,
+                    state.assembler.full_scale.copy(),
+                )
             state.zeroing.clear()
             state.touching.clear()
         return found
@@ -327,7 +343,9 @@ class FingertipEngine:
         events: list[FingertipEvent] = []
         for name, state in self.tips.items():
             events += state.tip.end_all(state.last_ns)
-            state.tip.use(zeros.get(name))
+            zero = zeros.get(name)
+            state.tip.use(zero)
+            state.zero_scale = None if zero is None else zero.full_scale
             self._note_touch(state)
         return events
 

@@ -123,11 +123,10 @@ class FingertipHealth:
                 "not_configured",
                 f"{here} does not report its full scales; set fingertips.{name}.full_scale",
             )
-        if state.scale_differs:
-            assert assembler is not None
+        if (before := state.scale_before) is not None:
             reported, used = (
                 ", ".join(f"{value:g}" for value in scale)
-                for scale in (state.reported_scale, assembler.full_scale)
+                for scale in (state.reported_scale, before)
             )
             if state.exchanged:
                 than = (

@@ -78,7 +78,7 @@ class StrainBoards:
             well = now_ns - board.sampled_ns <= board.state.tip.silent_ns
             due = board.started and now_ns >= board.retry_at_ns
             board.state.awaited &= not (due or board.state.frames)
-            if due and self._busy is None and not (well and not board.state.scale_differs):
+            if due and self._busy is None and not (well and board.state.scale_before is None):
                 self._busy = asyncio.create_task(self._mend(board, well=well))
 
     async def stop(self) -> None:

@@ -29,7 +29,7 @@ from skin_host.bus.asc import DatedAscWriter
 from skin_host.bus.logs import WINDOW_NS, candump_name, name_in
 from skin_host.bus.opening import open_port
 from skin_host.bus.port import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Port
-from skin_host.bus.wire import FrameBatch
+from skin_host.bus.wire import FrameBatch, in_slices
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Settings
 from skin_host.errors import RequestError, SkinError, StateError
@@ -301,50 +301,14 @@ async def capture_buses(settings: Settings, sink: CanSink, stop: asyncio.Event) 
             is_behind = any(
                 len(batch) >= port.capacity for port, (_, batch) in zip(ports, batches, strict=True)
             )
-            for channel, batch in _as_they_came(batches):
+            # Whoever reads the recording gets its frames in this order.
+            for channel, batch in in_slices(batches, WINDOW_NS):
                 sink(channel, batch)
             await asyncio.sleep(0.0 if is_behind else POLL_S)
         return sum(port.counters.dropped + port.counters.damaged for port in ports)
     finally:
         for port in ports:
             port.close()
-
-
-def _as_they_came(batches: list[tuple[str, FrameBatch]]) -> list[tuple[str, FrameBatch]]:
-    """Batches of buses that were read in one turn, cut into windows of time.
-
-    A turn may be longer than a board's period. Whoever reads the recording gets its frames in this
-    order, and must not meet several sweeps of one bus before those of another.
-    """
-    filled = [(channel, batch) for channel, batch in batches if len(batch)]
-    if len(filled) < 2:
-        return filled
-    pieces: list[tuple[tuple[int, int], str, FrameBatch]] = []
-    for channel, batch in filled:
-        windows = _windows(batch.t_ns.tolist())
-        begin = 0
-        for end in range(1, len(windows) + 1):
-            if end < len(windows) and windows[end] == windows[begin]:
-                continue
-            rows = slice(begin, end)
-            piece = FrameBatch(batch.id[rows], batch.dlc[rows], batch.data[rows], batch.t_ns[rows])
-            piece.dropped = 0 if begin else batch.dropped
-            pieces.append((windows[begin], channel, piece))
-            begin = end
-    pieces.sort(key=lambda piece: piece[0])
-    return [(channel, piece) for _, channel, piece in pieces]
-
-
-def _windows(times_ns: list[int]) -> list[tuple[int, int]]:
-    """In which window each time is, the windows of a clock that was set back after all before."""
-    found = []
-    n_set = window = last_ns = 0
-    for t_ns in times_ns:
-        if t_ns < last_ns - WINDOW_NS:
-            n_set, window = n_set + 1, 0
-        last_ns, window = t_ns, max(window, t_ns // WINDOW_NS)
-        found.append((n_set, window))
-    return found
 
 
 async def capture_broker(

@@ -73,6 +73,16 @@ async def test_a_node_that_starts_anew_with_an_earlier_clock_is_heard() -> None:
     assert await heard(stream) == [(4000, 0), (1, 0), (2, 0)]
 
 
+async def test_a_node_that_starts_anew_early_with_an_earlier_clock_is_heard() -> None:
+    """Its events are others than those of the same numbers before."""
+    stream: Stream[Touch] = Stream(None, "touch")
+    before = [touch(count, t_ns=1000 + count) for count in (1, 2, 3)]
+    after = [touch(count, t_ns=10 + count) for count in (1, 2, 3, 4, 6)]
+    for item in before + after[:2] + after:
+        stream.put(item)
+    assert await heard(stream) == [(1, 0), (2, 0), (3, 0), (1, 0), (2, 0), (3, 0), (4, 0), (6, 1)]
+
+
 async def test_what_a_slow_reader_loses_is_told() -> None:
     stream: Stream[Touch] = Stream(None, "touch")
     held = HELD["touch"]
@@ -86,7 +96,7 @@ async def test_what_a_slow_reader_loses_is_told() -> None:
 
 async def test_sweeps_between_two_frames_are_told() -> None:
     stream: Stream[Frame] = Stream(None, "frame")
-    for seq in (7, 8, 12):
+    for seq in (7, 8, 7, 8, 12):  # each of two brokers sends them
         stream.put(frame(seq))
     stream.close()
     assert [(item.seq, item.missed) async for item in stream] == [(7, 0), (8, 0), (12, 3)]

@@ -172,8 +172,13 @@ def test_a_silent_board_is_found_on_a_computer_that_pauses_again_and_again(reade
     assert reader.now_ns - began_ns <= 1000 * MS
 
 
-def test_what_waited_on_several_buses_is_taken_by_its_time_and_not_by_its_bus() -> None:
-    """Otherwise a frame of a part would join sweeps of different times."""
+@pytest.mark.parametrize("set_back_ms", [0, 3_600_000])
+def test_what_waited_on_several_buses_is_taken_by_its_time_and_not_by_its_bus(
+    set_back_ms: int,
+) -> None:
+    """Otherwise a frame of a part would join sweeps of different times, and so would a recording of
+    them. The clock may be set back meanwhile.
+    """
     boards = {"b": Board(bus="can0", address=1), "c": Board(bus="can1", address=1)}
     settings = Settings(
         robot="r",
@@ -187,6 +192,7 @@ def test_what_waited_on_several_buses_is_taken_by_its_time_and_not_by_its_bus() 
     for number, port in enumerate(link.ports.values()):
         assert isinstance(port, StillPort)
         starts = [T0 + number * MS + period * PERIOD for period in range(8)]
+        starts[4:] = [start_ns - set_back_ms * MS for start_ns in starts[4:]]
         frames = [
             (int(ids[i]), data[i].tobytes(), start_ns + 100_000 * i)
             for start_ns in starts
@@ -194,10 +200,15 @@ def test_what_waited_on_several_buses_is_taken_by_its_time_and_not_by_its_bus() 
         ]
         port.waiting.append(FrameBatch.of(frames))
     outputs: list[Output] = []
-    link.turn(T0 + 8 * PERIOD, outputs.append)
-    sweeps = [(sweep.t_ns, sweep.board) for output in outputs for sweep in output.sweeps]
-    assert len(sweeps) == 16
-    assert sweeps == sorted(sweeps)
+    recorded: list[str] = []
+    link.turn(
+        T0 + 8 * PERIOD - set_back_ms * MS,
+        outputs.append,
+        lambda bus, batch: recorded.extend([bus] * len(batch)),
+    )
+    boards_of_sweeps = [sweep.board for output in outputs for sweep in output.sweeps]
+    assert boards_of_sweeps == [0, 1] * 8
+    assert recorded == (["can0"] * len(ALL) + ["can1"] * len(ALL)) * 8
 
 
 def test_on_a_bus_that_never_ends_a_board_that_dies_has_timed_out(reader: Reader) -> None:

@@ -281,6 +281,33 @@ async def test_a_board_that_was_exchanged_for_one_of_another_range_does_not_feel
     assert ("scale" in bench.codes(), bench.contact()) == (False, "OFF")
 
 
+@pytest.mark.parametrize("full_scale", [50.0, 2000.0])
+async def test_a_zero_that_was_kept_is_of_the_board_that_it_was_taken_of(
+    tmp_path: Path, full_scale: float
+) -> None:
+    """A board may be exchanged while no daemon runs."""
+    before, after = Bench(), Bench()
+    await before.boards.bring_up()
+    await before.run(0.4)
+    await before.calibrate()
+    calibration, layout = before.engine.calibration, before.engine.layout
+    assert calibration is not None
+    save_calibration(tmp_path / "kept.json", calibration, layout)
+    board = after.robot.fingertips.boards["index"]
+    board._full_scale = np.where(board._full_scale > 1.0, full_scale, 1.0)
+    after.engine.use(load_calibration(tmp_path / "kept.json", layout, calibration.configuration))
+    await after.boards.bring_up()
+    await after.run(0.6)
+    is_other = full_scale > 50.0
+    assert (after.codes(), after.contact()) == ((["scale"], "UNKNOWN") if is_other else ([], "OFF"))
+    if is_other:
+        (sentence,) = after.record()["sentences"]
+        assert "(2000, 2000, 2000, 1, 1, 1) than (50, 50, 50, 1, 1, 1) before" in sentence
+    await after.calibrate()
+    await after.run(0.1)
+    assert ("scale" in after.codes(), after.contact()) == (False, "OFF")
+
+
 async def test_full_scales_that_somebody_else_reported_are_doubted_until_the_board_is_asked() -> (
     None
 ):

@@ -45,12 +45,16 @@ class Verdict(IntEnum):
 class Zero:
     """Load that an unloaded force/torque board sends: mean and sd, float64[6], N and N m.
 
-    `touched`: something touched the fingertip meanwhile, by the zero before.
+    Attributes:
+        touched: something touched the fingertip meanwhile, by the zero before.
+        full_scale: float64[6], of the board that sent it (N, N m), if it is known. With other ones
+            it is another board, which has another zero.
     """
 
     offset: Floats
     noise: Floats
     touched: bool = False
+    full_scale: Floats | None = None
 
 
 @dataclass(frozen=True)
@@ -170,6 +174,7 @@ def identified(calibration: Calibration) -> Calibration:
     for name, zero in sorted(calibration.zeros.items()):
         digest.update(name.encode() + zero.offset.tobytes() + zero.noise.tobytes())
         digest.update(b"touched" * zero.touched)
+        digest.update(b"" if zero.full_scale is None else zero.full_scale.tobytes())
     if (curves := calibration.curves) is not None:
         for array in curves.arrays().values():
             digest.update(np.ascontiguousarray(array).tobytes())

@@ -57,6 +57,8 @@ class _ZeroFile(msgspec.Struct, forbid_unknown_fields=True, omit_defaults=True):
     offset: list[float]
     noise: list[float]
     touched: bool = False
+    #: Files of older versions do not have it.
+    full_scale: list[float] | None = None
 
 
 class _PartCurves(msgspec.Struct, forbid_unknown_fields=True):
@@ -110,7 +112,12 @@ def save_calibration(path: Path, calibration: Calibration, layout: Layout) -> No
         )
     zeros = {
         # Not rounded, so that it serves for coarse and fine boards.
-        name: _ZeroFile(zero.offset.tolist(), zero.noise.tolist(), zero.touched)
+        name: _ZeroFile(
+            zero.offset.tolist(),
+            zero.noise.tolist(),
+            zero.touched,
+            None if zero.full_scale is None else zero.full_scale.tolist(),
+        )
         for name, zero in calibration.zeros.items()
     }
     content = _File(
@@ -221,7 +228,14 @@ def load_calibration(path: Path, layout: Layout, configuration: str) -> Calibrat
                 f"fingertips.{name}: wanted twice {CHANNELS} finite numbers up to {MOST:g}, "
                 "and no noise below 0"
             )
-        zeros[name] = Zero(offset, noise, zero.touched)
+        scale = None if zero.full_scale is None else np.array(zero.full_scale)
+        if scale is not None and not (
+            scale.shape == (CHANNELS,) and ((scale > 0.0) & (scale <= MOST)).all()
+        ):
+            raise refused(
+                f"fingertips.{name}: wanted {CHANNELS} full scales above 0, up to {MOST:g}"
+            )
+        zeros[name] = Zero(offset, noise, zero.touched, scale)
     curves = None
     if content.curves is not None:
         curves = _curves_of(content.curves, layout, refused)

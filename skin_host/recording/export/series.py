@@ -1,6 +1,6 @@
 """What was recorded, as arrays over time: read from messages, or computed from CAN frames."""
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.client.streams import DUPLICATE_SPAN
+from skin_host.client.streams import Repeats
 from skin_host.config.settings import Settings, skin_hash
 from skin_host.errors import LogError, RequestError
 from skin_host.fingertip.events import FingertipEvent, Over, Slip
@@ -130,25 +130,6 @@ class Series:
             )
 
 
-class _Repeats:
-    """Finds events that came before: what was in flight when a connection broke is sent again.
-
-    They have the same count and time. One of an equal count at another time is of another run.
-    """
-
-    def __init__(self) -> None:
-        self._latest: dict[tuple[type, str], deque[tuple[int, int]]] = {}
-
-    def has(self, event: FingertipEvent) -> bool:
-        """Return whether an event is among the last ones of its part and kind, and note it."""
-        latest = self._latest.setdefault((type(event), event.part), deque(maxlen=DUPLICATE_SPAN))
-        which = event.count, event.t_ns
-        if event.count and which in latest:  # a publisher that does not count cannot be checked
-            return True
-        latest.append(which)
-        return False
-
-
 @dataclass(slots=True)
 class _Growing:
     seq: list[int] = field(default_factory=list)
@@ -185,7 +166,7 @@ def read_messages(recording: Path) -> Series:
     robots: set[str] = set()
     parts: dict[str, _Growing] = {}
     found = Series({}, [], {})
-    repeats = _Repeats()
+    repeats = Repeats()
     health: dict[str, HealthLine] = {}
     contacts: dict[str, ContactLine] = {}
     for said in read_messages_of(recording):

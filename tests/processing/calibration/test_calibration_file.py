@@ -39,6 +39,19 @@ def test_zeros_of_fingertips_are_kept_with_it_and_renewed_with_the_whole_skin(un
     found = load_calibration(path, LAYOUT, "abc")
     assert found.zeros["index"].offset.tolist() == list(range(6))
     assert found.zeros["index"].noise.tolist() == [1e-3] * 6
+    assert found.zeros["index"].full_scale is None
+    of_board = calibration.Zero(np.ones(6), np.ones(6), full_scale=np.arange(1.0, 7.0))
+    save_calibration(path, calibration.with_zeros(untouched, {"index": of_board}), LAYOUT)
+    of_board = load_calibration(path, LAYOUT, "abc").zeros["index"]
+    assert of_board.full_scale is not None
+    assert of_board.full_scale.tolist() == [1, 2, 3, 4, 5, 6]
+    for wrong in ("[1, 2]", "[1, 2, 3, 4, 5, 0]", "[1, 2, 3, 4, 5, 1e99]"):
+        whole = json.loads(path.read_text())
+        whole["fingertips"]["index"]["full_scale"] = json.loads(wrong)
+        (tmp_path / "wrong.json").write_text(json.dumps(whole))
+        with pytest.raises(CalibrationError, match=r"fingertips\.index: wanted 6 full scales"):
+            load_calibration(tmp_path / "wrong.json", LAYOUT, "abc")
+    save_calibration(path, taken, LAYOUT)
     newer = calibration.with_zeros(
         untouched, {"index": calibration.Zero(np.ones(6), np.full(6, 1e-3))}
     )
