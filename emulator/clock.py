@@ -17,6 +17,8 @@ NS = 1_000_000_000
 #: held up between them reads them again, so often at most.
 AT_ONCE_NS = 100_000
 MOST_READS = 20
+#: Times are given to the host as no farther away from its own than this.
+FARTHEST_NS = float(1 << 62)
 
 
 class EmulatedTime(Protocol):
@@ -53,8 +55,10 @@ class RealClock:
         """The host's time of day at some emulated times, as its clock is set now."""
         monotonic_ns, host_ns = self._both_ns()
         now_ns = int((monotonic_ns - self._start_ns) * self._speed)
-        ago_ns = ((now_ns - t_ns) / self._speed).astype(np.int64)
-        return np.asarray(host_ns - ago_ns)
+        # At the slowest speeds a moment of emulated time is longer than int64 can count.
+        most_ns = FARTHEST_NS * self._speed
+        ago_ns = np.clip(now_ns - t_ns, -most_ns, most_ns) / self._speed
+        return np.asarray(host_ns - ago_ns.astype(np.int64))
 
     def _both_ns(self) -> tuple[int, int]:
         """Return monotonic time and the host's time of day at one moment."""

@@ -115,10 +115,12 @@ class Kind:
 
 
 def parse(text: str) -> Fault:
-    """A fault from a line such as `chip_gone board=hand triangle=3`.
+    """A fault that begins now, from a line such as `chip_gone board=hand triangle=3`.
+
+    `until_s` in it is how long it lasts.
 
     Raises:
-        ConfigurationError: not such a line, or an unknown name or key.
+        ConfigurationError: not such a line, an unknown name or key, or a time to begin.
     """
     name, *pairs = text.split() or [""]
     fields: dict[str, object] = {"name": name}
@@ -133,6 +135,10 @@ def parse(text: str) -> Fault:
         raise ConfigurationError(f'"{text}": {explain(fields, error, Fault, {})}') from None
     for where, what in out_of_bounds(msgspec.to_builtins(fault)):
         raise ConfigurationError(f'"{text}": {where}: {what}')
+    if "at_s" in fields:
+        raise ConfigurationError(
+            f"at_s: {fault.at_s:g}; a fault given by a line begins at once; wanted no at_s"
+        )
     check(fault)
     return fault
 
@@ -216,8 +222,7 @@ def _board(robot: FaultyRobot, fault: Fault) -> int:
 def _chip(robot: FaultyRobot, fault: Fault) -> int:
     """The chip that the fault names, as the layout numbers it."""
     number = _board(robot, fault)
-    slot = robot.boards[fault.board or ""].slot(fault.triangle or 0)
-    chip = int(robot.converters.chip_of_slot[number][slot])
+    chip = int(robot.converters.chip_of_slot[number][_slot(robot, fault)])
     if chip < 0:
         raise ConfigurationError(f'triangle: {fault.triangle} is not fitted on "{fault.board}"')
     return chip
@@ -268,7 +273,8 @@ def _shorted_finger(robot: FaultyRobot, fault: Fault) -> Mend:
 
 
 def _slot(robot: FaultyRobot, fault: Fault) -> int:
-    return robot.boards[fault.board or ""].slot(fault.triangle or 0)
+    # By the configuration: what a board's firmware knows of itself comes and goes.
+    return robot.converters.slot(_board(robot, fault), fault.triangle or 0)
 
 
 def _line(robot: FaultyRobot, fault: Fault) -> int:

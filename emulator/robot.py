@@ -307,6 +307,11 @@ class Robot:
             buses: an open python-can bus for each bus of the settings, by name.
             clock: time to live in; the machine's own, if not given.
         """
+        if self.skin.noise is None and self._boards:
+            log.warning(
+                "the scene has noise = false: values of untouched skin never change, so a daemon "
+                "takes the chips for stopped and calibrates none of their pads"
+            )
         clock = clock or RealClock()
         links = {name: BoardLink(name, bus) for name, bus in buses.items()}
         # The clock also counts the time before this and what is left out.
@@ -511,7 +516,7 @@ class LiveProbe:
 
     def press(self, drive: float, x_mm: float = 0.0, y_mm: float = 0.0) -> None:
         """Press from now on with a force (N), or to a depth (mm) if it is driven by depth; on skin
-        also off its place.
+        also off its place. No probe goes deeper than the foam lets it, `foam.MOST_STRAIN`.
         """
         if self._number is None:
             self._drive_n = drive

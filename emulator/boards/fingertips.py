@@ -373,10 +373,12 @@ class Fingertips:
                 raise ConfigurationError(f'part: "{name}" is covered by "{tip.array}"; name that')
             if probe.by_depth:
                 raise ConfigurationError("depth_mm: a fingertip without skin is driven by a force")
-            point, normal = place_on(tip, probe)
-            return _Press(probe, point, normal, force_n, pull_n)
-        point_m, normal = resolve(probe.at, probe.part, layout)
-        return _Press(probe, 1e3 * point_m, normal, force_n, pull_n)
+            point_mm, normal = place_on(tip, probe)
+        else:
+            point_m, normal = resolve(probe.at, probe.part, layout)
+            point_mm = 1e3 * point_m
+        _check_slide(tip, probe, point_mm, normal)
+        return _Press(probe, point_mm, normal, force_n, pull_n)
 
 
 class _Press:
@@ -513,21 +515,55 @@ def place_on(tip: Fingertip, probe: Probe) -> tuple[Floats, Floats]:
     if size == 0.0:
         raise ConfigurationError("at.towards: is no direction")
     ray = np.array(at.towards) / size
+    point = _crossing(tip, origin, ray)
+    if point is None:
+        raise ConfigurationError("at: from there the fingertip is not reached")
     if tip.shape == "plane":
-        return np.array([at.x_mm, at.y_mm, 0.0]), np.array([0.0, 0.0, 1.0])
+        return point, np.array([0.0, 0.0, 1.0])
+    gradient = _weight(tip) * point
+    return point, gradient / np.linalg.norm(gradient)
+
+
+def _weight(tip: Fingertip) -> Floats:
+    """Of the squares of x, y, z (mm), whose weighted sum is 1 on the surface; of no plane."""
     if tip.semi_axes_mm is not None:
-        weight = np.array(tip.semi_axes_mm) ** -2.0
-    else:
-        weight = np.full(3, float(tip.radius_mm or 1.0) ** -2.0)
-        if tip.shape == "cylinder":
-            weight[2] = 0.0
+        return np.array(tip.semi_axes_mm) ** -2.0
+    weight = np.full(3, float(tip.radius_mm or 1.0) ** -2.0)
+    if tip.shape == "cylinder":
+        weight[2] = 0.0
+    return weight
+
+
+def _crossing(tip: Fingertip, origin: Floats, ray: Floats) -> Floats | None:
+    """Where a ray from a place leaves the body of a fingertip (mm); None if it does not.
+
+    On a plane: below the place, whatever the ray.
+    """
+    if tip.shape == "plane":
+        within = np.hypot(origin[0], origin[1]) <= (tip.reach_mm or np.inf)
+        return np.array([origin[0], origin[1], 0.0]) if within else None
+    weight = _weight(tip)
     a, b = float(weight @ ray**2), float(weight @ (origin * ray))
     c = float(weight @ origin**2) - 1.0
     if b * b - a * c < 0.0 or a <= 1e-12 * weight.max():
-        raise ConfigurationError("at: from there the fingertip is not reached")
-    point = origin + (-b + np.sqrt(b * b - a * c)) / a * ray
-    gradient = weight * point
-    return point, gradient / np.linalg.norm(gradient)
+        return None
+    point: Floats = origin + (-b + np.sqrt(b * b - a * c)) / a * ray
+    return point if abs(point[2]) <= (tip.half_length_mm or np.inf) else None
+
+
+def _check_slide(tip: Fingertip, probe: Probe, point_mm: Floats, normal: Floats) -> None:
+    """Check that a probe stays on its fingertip: seen along its normal, bodies are convex.
+
+    Raises:
+        ConfigurationError: it does not.
+    """
+    along = tangents(normal)
+    for _, x_mm, y_mm in probe.slide_mm:
+        if _crossing(tip, point_mm + np.array([x_mm, y_mm]) @ along, normal) is None:
+            raise ConfigurationError(
+                f"slide_mm: {x_mm:g} mm, {y_mm:g} mm; the fingertip is not below that place; "
+                "wanted a slide that stays on it"
+            )
 
 
 def _value(keyframes: Keyframes, t_s: float) -> float:

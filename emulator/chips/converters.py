@@ -208,6 +208,10 @@ class Converters:
             self.synced(chip).brown_out(ram)
         self.signal.brown_out(chip, ram)
 
+    def slot(self, number: int, triangle: int) -> int:
+        """Where the chip of a board's triangle sits, 0 to 19."""
+        return slot_of(self._layout.boards[number], triangle)
+
     def answer_second(self, number: int, slot: int, chip: int | None) -> None:
         """Let another chip answer at a slot of a board as well; None ends that."""
         if chip is None:

@@ -9,6 +9,9 @@ fitted to the paper's eq. (1) below 130 kPa. With the viscoelastic truth of
 `emulator.probes.viscoelastic` a taxel under strain x carries P = sigma(x) - relaxation, and never
 less than zero: where the foam has not yet recovered, the probe does not touch it.
 
+No probe squeezes the foam beyond `MOST_STRAIN`, which bears some 2 MPa (Infinergy 3.5 MPa): what a
+probe presses with above that goes past the foam into the board below it.
+
 Quantities: strain x = depth / thickness; pressures in kPa; "elastic pressure" is sigma(x).
 """
 
@@ -36,7 +39,10 @@ INFINERGY_LOSS = 0.464
 
 DENSE_STRAIN = 0.85
 POLE_STRAIN = 0.95
+MOST_STRAIN = 0.94
 _DENSE_KPA = 2000.0
+#: Of a drive (N or mm) what is above this counts as this.
+_MOST_DRIVE = 1e12
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -117,6 +123,18 @@ class Foam:
             value = value + _DENSE_KPA * over**2 / room
             slope = slope + _DENSE_KPA * over * (2 * room + over) / room**2
         return value, slope
+
+
+def deepest_mm(thickness_mm: float, area_mm2: float, compliance_mm_per_n: float = 0.0) -> float:
+    """How deep a probe can be driven: until the foam below it is at `MOST_STRAIN`.
+
+    Args:
+        thickness_mm: of the foam.
+        area_mm2: of the probe.
+        compliance_mm_per_n: of the spring in series, which takes the rest.
+    """
+    most_kpa = float(Foam.uniform(1).elastic_kpa(np.array([MOST_STRAIN]))[0])
+    return MOST_STRAIN * thickness_mm + compliance_mm_per_n * area_mm2 * most_kpa * 1e-3
 
 
 # Not frozen: sliding probes need one at each step, and a frozen one takes three times as long.
@@ -212,7 +230,7 @@ class FoamLayer:
 
     Attributes:
         pressure_kpa: float64[n], true pressure on the part of each pad that is pressed deepest.
-        force_n, depth_mm: float64[c], of each contact in the last step.
+        force_n, depth_mm: float64[c], of each contact in the last step: what the foam bears.
         is_still: the last step changed nothing: nothing pressed, and no foam was due that recovers.
     """
 
@@ -324,15 +342,19 @@ class FoamLayer:
             len(self._unit),
         )
         law = self._law
-        d = np.maximum(drive.value / self._unit, 0.0)
+        # More than any foam bears: whatever a program asks for stays a number that can be divided.
+        wanted = np.minimum(np.maximum(drive.value, 0.0), _MOST_DRIVE)
+        d = wanted / self._unit
         if len(self._between):
             bare = np.flatnonzero(~self._bears & ~drive.is_depth)
-            pressed = np.maximum(drive.value[bare] / self._bears_n_per_kpa[bare], 0.0)
+            pressed = wanted[bare] / self._bears_n_per_kpa[bare]
             d[bare] = Foam.uniform(len(bare)).strain(pressed)
+            d[bare] = np.minimum(d[bare], MOST_STRAIN)
         # Start value: the contact continues nearly as in the last three steps.
         last, before, earlier = self._strain, *self._strains_before
         strain = 3 * (last - before) + earlier
-        strain = np.minimum(np.maximum(strain, 0.0), 0.5 * (last + POLE_STRAIN))
+        nearest = np.minimum(0.5 * (last + POLE_STRAIN), MOST_STRAIN)
+        strain = np.minimum(np.maximum(strain, 0.0), nearest)
         for _ in range(60):
             value, slope = law.elastic_kpa_and_slope(strain[contact])
             over = value - imprint
@@ -343,7 +365,7 @@ class FoamLayer:
                 mean, rise = self._a * strain + self._b * mean, self._a + self._b * rise
             newton = (mean - d) / np.maximum(rise, 1e-9)
             # Half way to the pole at most, so that no step jumps over it.
-            nearest = 0.5 * (strain + POLE_STRAIN)
+            nearest = np.minimum(0.5 * (strain + POLE_STRAIN), MOST_STRAIN)
             last, strain = strain, np.minimum(np.maximum(strain - newton, 0.0), nearest)
             # Convergence is quadratic: what is left is far below the step just made.
             if np.abs(strain - last).max(initial=0.0) < 1e-5:

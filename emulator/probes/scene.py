@@ -28,6 +28,8 @@ from skin_host.files import read_whole
 from skin_host.layout import TAXELS_PER_TRIANGLE, Layout
 
 Seconds = Annotated[float, Meta(ge=0)]
+#: More than the boards and the foam outlast.
+Celsius = Annotated[float, Meta(ge=-100, le=200)]
 #: Coefficients of static friction.
 Friction = Annotated[float, Meta(ge=0.001, le=1000)]
 #: Time (s) and value, straight lines between; no contact before the first and after the last.
@@ -130,7 +132,7 @@ class Air(_Table):
 class Temperature(_Table):
     """Temperature of the skin: degrees C over time, straight lines between, held outside."""
 
-    keyframes_c: list[tuple[Seconds, float]] = field(default_factory=lambda: [(0.0, 25.0)])
+    keyframes_c: list[tuple[Seconds, Celsius]] = field(default_factory=lambda: [(0.0, 25.0)])
 
 
 class Fault(_Table):
@@ -210,6 +212,8 @@ def check(scene: Scene) -> None:
             _check_times(f"{where}.slide_mm", [t_s for t_s, _, _ in probe.slide_mm])
         if probe.at.triangle is not None and probe.at.taxel is not None:
             raise ConfigurationError(f"{where}.at: has both `triangle` and `taxel`")
+        _check_lasts(f"{where}.{drives[0]}", getattr(probe, drives[0]))
+        _check_lasts(f"{where}.tangential_n", probe.tangential_n)
     for number, air in enumerate(scene.air):
         where = f"air[{number}]"
         if bool(air.file) == bool(air.pressure_kpa):
@@ -224,9 +228,16 @@ def check(scene: Scene) -> None:
             raise ConfigurationError(f'{where}.part: "{air.part}" has air already; wanted one')
         if any(probe.part == air.part for probe in scene.probe):
             raise ConfigurationError(f'{where}.part: "{air.part}" has probes too; wanted one')
+        _check_lasts(f"{where}.pressure_kpa", air.pressure_kpa)
     if not scene.temperature.keyframes_c:
         raise ConfigurationError("temperature.keyframes_c: is empty")
     _check_times("temperature.keyframes_c", [t_s for t_s, _ in scene.temperature.keyframes_c])
+
+
+def _check_lasts(where: str, keyframes: Keyframes | None) -> None:
+    """Check that keyframes do something: one alone is over when it begins."""
+    if keyframes and len(keyframes) < 2:
+        raise ConfigurationError(f"{where}: 1 keyframe, which is over at once; wanted at least two")
 
 
 def _check_times(where: str, times_s: list[float]) -> None:

@@ -15,7 +15,7 @@ from emulator.boards.arithmetic import TAXELS
 from emulator.chips.noise import SENT_UNIT_FF, PadNoise
 from emulator.probes.contacts import ContactPads, Contacts, ContactSource, joined
 from emulator.probes.coverage import Coverage
-from emulator.probes.foam import INFINERGY_LOSS, Drive, Foam, FoamLayer, Footprint
+from emulator.probes.foam import INFINERGY_LOSS, Drive, Foam, FoamLayer, Footprint, deepest_mm
 from emulator.probes.pads import Jumps, Pads, draw_dead, draw_noise_ff, draw_resting_ff
 from emulator.probes.scene import Air, AirCourse, Moment, Probe, Scene, Script, read_air
 from emulator.probes.viscoelastic import FoamTruth
@@ -156,6 +156,7 @@ class Skin:
             probe = probes[number]
             try:
                 self._place_probe(probe)
+                self._check_depth(probe)
             except ConfigurationError as error:
                 raise ConfigurationError(f"probe[{number}].{error}") from None
         self._gather()
@@ -199,6 +200,18 @@ class Skin:
     def _place_probe(self, probe: Probe) -> None:
         self._coverage.add(probe)
         self.probes.append(probe)
+
+    def _check_depth(self, probe: Probe) -> None:
+        """Refuse keyframes that drive a probe deeper than the foam of its part."""
+        if probe.depth_mm is None:
+            return
+        foam_mm = self._layout.part(probe.part).foam_mm
+        most_mm = deepest_mm(foam_mm, probe.area_mm2, probe.compliance_mm_per_n)
+        if (depth_mm := max(depth for _, depth in probe.depth_mm)) > most_mm:
+            raise ConfigurationError(
+                f'depth_mm: {depth_mm:g} mm on "{probe.part}", whose foam is {foam_mm:g} mm; '
+                f"wanted up to {most_mm:.3g} mm"
+            )
 
     def _gather(self) -> None:
         self._by_depth = np.array([probe.by_depth for probe in self.probes], bool)

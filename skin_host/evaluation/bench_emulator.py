@@ -114,14 +114,14 @@ def _scale(boards: int, triangles: int, fidelity: str, touched: int, seconds: fl
     robot = Robot(settings, layout, Scene(probe=probes), fidelity=fidelity)
     robot.bring_up()
     robot.step(1.0)
-    frames = 0
+    sweeps, frames = max(1, round(seconds / SWEEP_S)), 0
 
     def live() -> None:
         nonlocal frames
-        for _ in range(round(seconds / SWEEP_S / REPEATS)):
+        for _ in range(sweeps):
             frames += sum(len(batch) for batch in robot.step(SWEEP_S).values())
 
-    spent_s = sum(_seconds(live, 1) for _ in range(REPEATS))
+    spent_s = _seconds(live, 1)
     return {
         "part": "scale",
         "boards": boards,
@@ -129,9 +129,9 @@ def _scale(boards: int, triangles: int, fidelity: str, touched: int, seconds: fl
         "fidelity": fidelity,
         "touched": len(probes),
         "on_one_board": hand,
-        "simulated_s": round(seconds, 1),
+        "simulated_s": round(sweeps * SWEEP_S, 2),
         "frames": frames,
-        "times_real": round(seconds / spent_s, 1),
+        "times_real": round(sweeps * SWEEP_S / spent_s, 1),
     }
 
 

@@ -36,6 +36,8 @@ THERMAL_PADS = (6, 10)
 LARGE_RMS_M = 2.5e-3
 #: A normal farther than this (cosine) from the plane of its taxels is reported.
 OBLIQUE = 0.5
+#: Normals whose mean is shorter than this share of the longest of them have no common direction.
+CANCELLED = 1e-3
 
 Floats = NDArray[np.float64]
 
@@ -199,6 +201,12 @@ def _locate(
             f'{table.file}: {len(table.rows)} rows are {n_boards} board(s), part "{name}" has '
             f"{len(boards)}: {', '.join(boards)}"
         )
+    if len({settings.boards[board].bus for board in boards}) > 1:
+        findings.assumed(
+            (table.file, 0),
+            f'part "{name}": its boards are on several buses; taken in this order: '
+            f"{', '.join(boards)}",
+        )
     patches: list[Patch] = []
     used: set[int] = set()
     for patch in part.patches:
@@ -271,9 +279,12 @@ def _unit(
     placed = rows[:, :3].any(axis=1)
     measured = placed & _own_places(table, index, rows)
     normal = rows[placed, 3:].mean(axis=0)
-    if not normal.any():
-        findings.odd((table.file, line), f"{label}: no normals; taken: +z")
+    longest = np.linalg.norm(rows[placed, 3:], axis=1).max()
+    if np.linalg.norm(normal) <= CANCELLED * longest:
+        why = "its normals cancel each other" if longest else "no normals"
+        findings.odd((table.file, line), f"{label}: {why}; taken: +z")
         normal = np.array([0.0, 0.0, 1.0])
+        rows[:, 3:] = normal
     normal /= np.linalg.norm(normal)
     pads = np.array(kind.pads_mm)
     fit = fit_unit(pads[measured], rows[measured, :3], normal)

@@ -3,7 +3,9 @@ a file alone.
 """
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Literal
 
@@ -96,6 +98,51 @@ def integer(word: str) -> int | None:
     return -value if match[1] == "-" else value
 
 
+def new_bus(
+    buses: dict[str, Bus], wanted: str, file: Path, findings: Findings
+) -> tuple[str, dict[str, Bus]]:
+    """Add a bus with a name and a channel that no other bus has.
+
+    Returns:
+        Its name, which is `wanted` or begins with it, and all buses.
+    """
+    name = next(one for one in _numbered(wanted) if one not in buses)
+    if name != wanted:
+        findings.odd((file, 0), f'a bus "{wanted}" exists; the new one is "{name}"')
+    taken = {bus.channel for bus in buses.values()}
+    numbers = count(len(buses))
+    channel = next(one for number in numbers if (one := f"can{number}") not in taken)
+    return name, buses | {name: Bus(channel=channel)}
+
+
+def _numbered(name: str) -> Iterator[str]:
+    yield name
+    for number in count(2):
+        yield f"{name}_{number}"
+
+
+def with_boards(boards: dict[str, Board], new: dict[str, Board], file: Path) -> dict[str, Board]:
+    """Add boards.
+
+    Raises:
+        ConfigurationError: one of them has the name of another.
+    """
+    for name in new:
+        if name in boards:
+            raise ConfigurationError(f'{file}: a board of this name exists: "{name}"')
+    return boards | new
+
+
+def check_new_part(parts: dict[str, Part], name: str, file: Path) -> None:
+    """Check that there is no such part yet.
+
+    Raises:
+        ConfigurationError: there is.
+    """
+    if name in parts:
+        raise ConfigurationError(f'{file}: a part of this name exists: "{name}"')
+
+
 def with_part(
     settings: Settings,
     file: Path,
@@ -106,13 +153,17 @@ def with_part(
     """Add a part on a bus of its own, with boards of default set-up.
 
     `boards` are by address their triangles and the kind of these; some have no triangles.
+
+    Raises:
+        ConfigurationError: there is such a part, or such a board.
     """
-    channel = f"can{len(settings.buses)}"
-    names = {address: f"{name}_{address}" for address in boards}
+    check_new_part(settings.parts, name, file)
+    bus, buses = new_bus(settings.buses, name, file, findings)
+    names = {address: f"{bus}_{address}" for address in boards}
     findings.assumed(
         (file, 0),
-        f'a bus "{name}" on channel {channel}; boards {", ".join(names.values())} with default '
-        "set-up; `skin import skinspec` brings the robot's own",
+        f'a bus "{bus}" on channel {buses[bus].channel}; boards {", ".join(names.values())} with '
+        "default set-up; `skin import skinspec` brings the robot's own",
     )
     patches = [
         Patch(board=names[address], triangles=format_triangles(triangles), kind=kind)
@@ -121,8 +172,11 @@ def with_part(
     ]
     return msgspec.structs.replace(
         settings,
-        buses=settings.buses | {name: Bus(channel=channel)},
-        boards=settings.boards
-        | {names[address]: Board(bus=name, address=address) for address in boards},
+        buses=buses,
+        boards=with_boards(
+            settings.boards,
+            {names[address]: Board(bus=bus, address=address) for address in boards},
+            file,
+        ),
         parts=settings.parts | {name: Part(patches=patches)},
     )

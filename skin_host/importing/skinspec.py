@@ -18,9 +18,17 @@ from xml.parsers import expat
 
 import msgspec
 
-from skin_host.config.settings import Board, Bus, Part, Patch, Settings, format_triangles
+from skin_host.config.settings import Board, Part, Patch, Settings, format_triangles
 from skin_host.errors import ConfigurationError
-from skin_host.importing.report import Findings, Place, integer, read_source
+from skin_host.importing.report import (
+    Findings,
+    Place,
+    check_new_part,
+    integer,
+    new_bus,
+    read_source,
+    with_boards,
+)
 
 #: The robot's own hosts ignore special sets beyond these numbers, with only a warning.
 HOSTS_READ_TRIANGLE_SETS = 20
@@ -160,6 +168,16 @@ class BoardSpec:
     triangles: dict[int, tuple[int, int]] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, slots=True)
+class TriangleSet:
+    """Some triangles of a board that are on with a set-up (shift, CDC offset), or off: None."""
+
+    entry: Entry
+    board: BoardSpec
+    triangles: range
+    setup: tuple[int, int] | None
+
+
 @dataclass(slots=True)
 class Device:
     """One device: `patches` are its buses, by number, with their boards."""
@@ -174,7 +192,8 @@ def import_boards(files: list[Path], base: Settings | None, findings: Findings) 
     """Read skinSpec (or device) files; each gives a part, and a bus for each of its patches.
 
     Raises:
-        ConfigurationError: a file cannot be read or describes no board.
+        ConfigurationError: a file cannot be read or describes no board, or a part or a board of it
+            exists already.
     """
     base = base or Settings(robot="", buses={}, boards={}, parts={})
     buses, boards, parts = dict(base.buses), dict(base.boards), dict(base.parts)
@@ -187,25 +206,22 @@ def import_boards(files: list[Path], base: Settings | None, findings: Findings) 
                 f"{file}: no triangle of any board is on in it; import the device file that "
                 "includes it, which names the CAN addresses, or add sets of triangles"
             )
-        if device.name in parts:
-            raise ConfigurationError(f'{file}: a part of this name exists: "{device.name}"')
-        patches = []
-        for number, specs in device.patches.items():
-            bus = device.name if len(device.patches) == 1 else f"{device.name}_{number}"
-            buses[bus] = Bus(channel=f"can{len(buses)}")
+        check_new_part(parts, device.name, file)
+        of_patch: dict[int, list[Patch]] = {}
+        for number, specs in sorted(device.patches.items()):
+            wanted = device.name if len(device.patches) == 1 else f"{device.name}_{number}"
+            bus, buses = new_bus(buses, wanted, file, findings)
             findings.assumed(
                 (file, 0), f'patch {number} is the bus "{bus}" on channel {buses[bus].channel}'
             )
-            for spec in specs:
-                name = f"{bus}_{spec.address}"
-                boards[name] = Board(
-                    bus=bus,
-                    address=spec.address,
-                    period_ms=spec.period_ms,
-                    skin_type=spec.skin_type,  # type: ignore[arg-type]  # read as one of them
-                    no_load=spec.no_load,
-                )
-                patches += _patches(name, spec)
+            named = {f"{bus}_{spec.address}": spec for spec in specs}
+            new = {name: _board(bus, spec) for name, spec in named.items()}
+            boards = with_boards(boards, new, file)
+            of_patch[number] = [
+                patch for name, spec in named.items() for patch in _patches(name, spec)
+            ]
+        # The robot's own vector, and with it tables of positions, has the boards of patch 1 last.
+        patches = [patch for number in sorted(of_patch, reverse=True) for patch in of_patch[number]]
         parts[device.name] = Part(patches=patches)
         kinds = sorted({patch.kind for patch in patches})
         findings.assumed(
@@ -216,6 +232,16 @@ def import_boards(files: list[Path], base: Settings | None, findings: Findings) 
     findings.assumed((files[0], 0), "boards are of the model mtb4")
     return msgspec.structs.replace(
         base, robot=robot or "robot", buses=buses, boards=boards, parts=parts
+    )
+
+
+def _board(bus: str, spec: BoardSpec) -> Board:
+    return Board(
+        bus=bus,
+        address=spec.address,
+        period_ms=spec.period_ms,
+        skin_type=spec.skin_type,  # type: ignore[arg-type]  # read as one of them
+        no_load=spec.no_load,
     )
 
 
@@ -312,22 +338,36 @@ def _boards(document: Document) -> dict[int, list[BoardSpec]]:
     }
     for entry, numbers in _sets(document, "specialCfgBoards", "boardSetCfg", 6):
         _set_up_boards(entry, numbers, boards, findings)
-    for entry, numbers in triangle_sets:
-        _set_up_triangles(entry, numbers, boards, findings)
+    triangles = [
+        found
+        for entry, numbers in triangle_sets
+        if (found := _triangle_set(entry, numbers, boards, findings)) is not None
+    ]
     every = [board for boards_of in boards.values() for board in boards_of]
-    bare = [board for board in every if not board.triangles]
+    bare: list[BoardSpec] = []
+    named: list[BoardSpec] = []
+    for board in every:
+        own = [one for one in triangles if one.board is board]
+        # Sets that only turn on name the triangles that are fitted; one that turns off takes its
+        # triangles from those that are on by default.
+        names_all = bool(own) and all(one.setup is not None for one in own)
+        if not own:
+            bare.append(board)
+        elif names_all:
+            named.append(board)
+        if enabled is not False and not names_all:
+            board.triangles = dict.fromkeys(TRIANGLES, (shift, offset))
+        _set_up_triangles(own, findings)
     if enabled is None and bare:
-        _turn_on(bare, shift, offset)
         findings.assumed((document.path, 0), f"boards {_list(bare)}: all 16 triangles are on")
     elif enabled:
-        _turn_on(bare, shift, offset)
         if bare:
             findings.odd(
                 (document.path, 0),
                 f"boards {_list(bare)} have no set of triangles, and all are on by default; all "
                 "16 are taken: remove those that are not fitted",
             )
-        if named := [board for board in every if board not in bare]:
+        if named:
             findings.odd(
                 (document.path, 0),
                 f"boards {_list(named)}: triangles without a set are on by default too; only "
@@ -337,11 +377,6 @@ def _boards(document: Document) -> dict[int, list[BoardSpec]]:
         patch: [board for board in boards_of if board.triangles]
         for patch, boards_of in boards.items()
     }
-
-
-def _turn_on(boards: list[BoardSpec], shift: int, offset: int) -> None:
-    for board in boards:
-        board.triangles = dict.fromkeys(TRIANGLES, (shift, offset))
 
 
 def _list(boards: list[BoardSpec]) -> str:
@@ -474,9 +509,10 @@ def _set_up_boards(
         board.period_ms, board.skin_type, board.no_load = period_ms, skin_type, no_load
 
 
-def _set_up_triangles(
+def _triangle_set(
     entry: Entry, numbers: list[int], boards: dict[int, list[BoardSpec]], findings: Findings
-) -> None:
+) -> TriangleSet | None:
+    """Check a set of triangles; None, with a finding, if it cannot be meant."""
     patch, address, first, last, enabled, shift, offset = numbers
     board = next((b for b in boards.get(patch, []) if b.address == address), None)
     for column, good, seen in (
@@ -488,17 +524,26 @@ def _set_up_triangles(
     ):
         if not good:
             findings.odd(entry.at, f"{entry.name}: {column} {seen}; not read")
-            return
+            return None
     assert board is not None
-    again = [number for number in range(first, last + 1) if number in board.triangles]
-    if again and enabled == 1:
-        findings.odd(
-            entry.at,
-            f"{entry.name}: triangles {again[0]} to {again[-1]} of board {address} were in an "
-            "earlier set; the later one counts",
-        )
-    for number in range(first, last + 1):
-        if enabled == 1:
-            board.triangles[number] = (shift, offset)
-        else:
-            board.triangles.pop(number, None)
+    setup = (shift, offset) if enabled == 1 else None
+    return TriangleSet(entry, board, range(first, last + 1), setup)
+
+
+def _set_up_triangles(sets: list[TriangleSet], findings: Findings) -> None:
+    """Apply the sets of one board, in their order."""
+    turned_on: set[int] = set()
+    for one in sets:
+        if one.setup is None:
+            turned_on.difference_update(one.triangles)
+            for number in one.triangles:
+                one.board.triangles.pop(number, None)
+            continue
+        if again := [number for number in one.triangles if number in turned_on]:
+            findings.odd(
+                one.entry.at,
+                f"{one.entry.name}: triangles {again[0]} to {again[-1]} of board "
+                f"{one.board.address} were in an earlier set; the later one counts",
+            )
+        turned_on.update(one.triangles)
+        one.board.triangles |= dict.fromkeys(one.triangles, one.setup)

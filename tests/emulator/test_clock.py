@@ -66,3 +66,11 @@ async def test_a_free_clock_jumps_over_every_sleep() -> None:
     clock = SteppedTime(free=True)
     await clock.sleep_until_ns(3600 * NS)
     assert clock.now_ns() == 3600 * NS
+
+
+@pytest.mark.parametrize("speed", [5e-324, 1e-300, 1e-12, 0.5, 1e8])
+def test_times_for_the_host_keep_their_order_at_any_speed(speed: float) -> None:
+    clock = RealClock(speed=speed)
+    host_ns = clock.host_ns(clock.now_ns() + np.array([-5_000_000_000, 0, 5_000_000_000]))
+    assert host_ns[0] <= host_ns[1] <= host_ns[2]
+    assert host_ns.dtype == np.int64

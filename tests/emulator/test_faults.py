@@ -59,6 +59,52 @@ def frames(robot: Robot, seconds: float = 0.3) -> FrameBatch:
 
 
 UNTOUCHED = ([240] * 12, 0)
+#: An ergoCub hand: its firmware has a map of chips, which is in force once the host has set it up.
+ERGO_HAND = """\
+robot = "ergo"
+[buses.can0]
+[boards.hand]
+bus = "can0"
+address = 2
+skin_type = 3
+[[parts.hand.patches]]
+board = "hand"
+triangles = "0-5"
+"""
+
+
+def ergo_hand(folder: Path, scene: Scene) -> Robot:
+    """An ergoCub hand that no host has set up."""
+    config = folder / "ergo.toml"
+    config.write_text(ERGO_HAND)
+    settings = configurations.load(config)
+    return Robot(settings, build_layout(settings, folder), scene)
+
+
+def gone(robot: Robot) -> set[int]:
+    """The triangles of the ergoCub hand that send an error."""
+    sent = frames(robot)
+    return {number for number in range(6) if triangle(sent, 2, number)[1]}
+
+
+@pytest.mark.parametrize("number", range(6))
+def test_a_fault_is_of_the_same_chip_before_and_after_the_board_is_set_up(
+    tmp_path: Path, number: int
+) -> None:
+    fault = Fault(name="chip_gone", board="hand", triangle=number)
+    robot = ergo_hand(tmp_path, Scene(noise=False, fault=[fault]))
+    robot.step(0.01)
+    robot.bring_up()
+    robot.step(0.5)
+    assert gone(robot) == {number}
+    robot.inject(Fault(name="chip_back", board="hand", triangle=number))
+    robot.step(0.5)
+    assert gone(robot) == set()
+    robot.inject(Fault(name="board_reset", board="hand"))
+    robot.inject(fault)
+    robot.bring_up()
+    robot.step(0.5)
+    assert gone(robot) == {number}
 
 
 def test_a_chip_that_is_gone_reads_all_ones_and_comes_back(robot: Robot) -> None:
@@ -459,6 +505,11 @@ def test_a_fault_can_be_given_as_a_line() -> None:
 def test_a_line_that_is_no_fault_is_refused(text: str) -> None:
     with pytest.raises(ConfigurationError):
         parse(text)
+
+
+def test_a_line_with_a_time_is_refused_because_its_fault_begins_at_once() -> None:
+    with pytest.raises(ConfigurationError, match="at_s: 20; a fault given by a line begins at"):
+        parse("chip_gone board=hand triangle=3 at_s=20")
 
 
 def test_a_fault_in_the_middle_of_a_run_can_be_mended_by_its_answer() -> None:

@@ -182,18 +182,68 @@ def test_frames_of_one_bus_follow_each_other_as_the_bitrate_allows() -> None:
 def test_a_place_that_is_not_there_is_named_with_its_key() -> None:
     settings, layout = load()
     for probe, message in (
-        (Probe(part="tail", depth_mm=[(0, 1)]), r"probe\[0\].part: no part \"tail\""),
+        (Probe(part="tail", depth_mm=[(0, 1), (1, 1)]), r"probe\[0\].part: no part \"tail\""),
         (
-            Probe(part="left_hand", at=Place(triangle=9), depth_mm=[(0, 1)]),
+            Probe(part="left_hand", at=Place(triangle=9), depth_mm=[(0, 1), (1, 1)]),
             r"probe\[0\].at.triangle: 9; part \"left_hand\" has triangles 0 to 8",
         ),
         (
-            Probe(part="left_hand", at=Place(taxel=108), depth_mm=[(0, 1)]),
+            Probe(part="left_hand", at=Place(taxel=108), depth_mm=[(0, 1), (1, 1)]),
             r"probe\[0\].at.taxel: 108; part \"left_hand\" has taxels 0 to 107",
         ),
     ):
         with pytest.raises(ConfigurationError, match=message):
             Robot(settings, layout, Scene(probe=[probe]))
+
+
+@pytest.mark.parametrize(
+    ("depth_mm", "compliance", "message"),
+    [
+        (1.88, 0.0, None),
+        (1.89, 0.0, r'probe\[1\].depth_mm: 1.89 mm on "left_hand", whose foam is 2 mm; wanted up'),
+        (1e9, 1000.0, "wanted up to 5.27e"),
+        (2.5, 0.06, None),
+        (9.0, 0.06, "wanted up to 5.04 mm"),
+    ],
+)
+def test_a_probe_that_would_go_deeper_than_the_foam_is_refused(
+    depth_mm: float, compliance: float, message: str | None
+) -> None:
+    probe = Probe(
+        part="left_hand",
+        at=Place(taxel=3),
+        depth_mm=[(0, 0), (1, depth_mm), (2, 0)],
+        compliance_mm_per_n=compliance,
+    )
+    scene = Scene(probe=[press("left_hand", 3, 20.0), probe])
+    if message is None:
+        Robot(*load(), scene)
+        return
+    with pytest.raises(ConfigurationError, match=message):
+        Robot(*load(), scene)
+
+
+def test_skin_recovers_from_a_hand_that_presses_deeper_than_its_foam() -> None:
+    settings, layout = load()
+    robot = Robot(settings, layout, Scene(noise=False))
+    robot.bring_up()
+    taxel = layout.part("left_hand").start + 15
+    untouched = values(robot.step(0.12)["can0"], layout)
+    probe = robot.touch(
+        Probe(part="left_hand", at=Place(taxel=15), diameter_mm=3, depth_mm=[(0, 1)])
+    )
+    for depth_mm in (2.0, 2.1, 10.0, 1e9):
+        probe.press(depth_mm)
+        seen = values(robot.step(0.2)["can0"], layout)
+        assert probe.force_n < 100
+        assert robot.true_pressure_kpa("left_hand").max() < 3000
+        assert seen[taxel] == 0
+        others = np.delete(np.arange(layout.n_taxels), taxel)
+        assert np.abs(seen[others] - untouched[others]).max() <= 1
+    probe.lift()
+    robot.step(120.0)
+    after = values(robot.step(0.2)["can0"], layout)
+    assert np.abs(after - untouched).max() <= 4
 
 
 def test_an_unknown_fidelity_is_refused() -> None:
@@ -293,6 +343,20 @@ async def test_a_pause_that_a_host_takes_for_silence_is_reported(
             await clock.advance(passed_s)
         life.cancel()
     assert not caplog.messages
+
+
+@pytest.mark.parametrize("noise", [True, False])
+async def test_a_robot_without_noise_warns_that_a_daemon_calibrates_none_of_it(
+    noise: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    robot, clock = Robot(*load(), Scene(noise=noise)), SteppedTime()
+    with can.Bus(interface="virtual", channel="test-still") as inside:
+        life = asyncio.create_task(robot.run({"can0": inside}, clock))
+        await clock.advance(0.01)
+        life.cancel()
+    assert [line.partition(":")[0] for line in caplog.messages] == (
+        [] if noise else ["the scene has noise = false"]
+    )
 
 
 @pytest.mark.parametrize("speed", [0.01, 0.1, 1.0, 10.0])

@@ -106,6 +106,104 @@ def test_each_sample_makes_a_configuration_by_itself(
     assert "default set-up" in findings.table()
 
 
+SETS = """\
+<params><group name="patches">
+<param name="skinCanAddrsPatch1"> 1 2 </param><param name="skinCanAddrsPatch2"> 13 </param></group>
+<group name="defaultCfgTriangle"><param name="enabled"> true </param></group></params>
+"""
+
+
+def spec(folder: Path, text: str = SETS, name: str = "left_leg-skinSpec.xml") -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def based(folder: Path, bus: str, channel: str, board: str) -> Path:
+    """Write a configuration of one bus with one board on it."""
+    path = folder / "base.toml"
+    path.write_text(
+        f'robot = "base"\n[buses.{bus}]\nchannel = "{channel}"\n[boards.{board}]\n'
+        f'bus = "{bus}"\naddress = 7\n[[parts.chest.patches]]\nboard = "{board}"\n'
+        'triangles = "0-3"\n'
+    )
+    return path
+
+
+@pytest.mark.parametrize("channel", ["can0", "can1", "can2", "can5"])
+@pytest.mark.parametrize("bus", ["left_leg_1", "left_leg_2", "other"])
+def test_a_new_bus_leaves_those_of_the_base_as_they_are(
+    tmp_path: Path, bus: str, channel: str
+) -> None:
+    base = based(tmp_path, bus, channel, "b1")
+    settings, _, said = run("skinspec", spec(tmp_path), base)
+    assert settings.buses[bus] == load(base).buses[bus]
+    assert settings.boards["b1"] == load(base).boards["b1"]
+    channels = [one.channel for one in settings.buses.values()]
+    assert len(set(channels)) == 3
+    # As in the file: boards 1 and 2 on one new bus, board 13 on another.
+    of_bus: dict[str, list[int]] = {}
+    for board in settings.boards.values():
+        of_bus.setdefault(board.bus, []).append(board.address)
+    assert sorted(of_bus.values()) == [[1, 2], [7], [13]]
+    for name in set(settings.buses) - {bus}:
+        assert f'the bus "{name}" on channel {settings.buses[name].channel}' in said
+    assert ("exists" in said) == (bus != "other")
+
+
+def test_a_board_whose_name_exists_is_refused(tmp_path: Path) -> None:
+    base = based(tmp_path, "other", "can0", "left_leg_1_2")
+    with pytest.raises(ConfigurationError, match='a board of this name exists: "left_leg_1_2"'):
+        run("skinspec", spec(tmp_path), base)
+    assert not (tmp_path / "out.toml").exists()
+
+
+def test_a_second_file_of_a_part_is_refused(tmp_path: Path) -> None:
+    files = []
+    for name in ("one.ini", "two.ini"):
+        (tmp_path / name).write_text(HAND)
+        files.append(tmp_path / name)
+    with pytest.raises(ConfigurationError, match=r'two\.ini: a part of this name exists: "hand"'):
+        import_files("skingui", files, tmp_path / "out.toml", Findings())
+
+
+@pytest.mark.parametrize("opposite", ["0 0 0", "0 0 -1"])
+def test_places_without_a_normal_in_common_get_one_and_a_remark(
+    tmp_path: Path, opposite: str
+) -> None:
+    table = tmp_path / "left_arm.txt"
+    first = "0 0 0" if opposite == "0 0 0" else "0 0 1"
+    pads = np.array(builtin_kinds()["triangle"].pads_mm) * 1e-3
+    rows = [f"{x} {y} 0.05 {(first, opposite)[i % 2]}" for i, (x, y) in enumerate(pads)]
+    table.write_text("\n".join(rows) + "\n")
+    _, layout, said = run("positions", table)
+    assert layout.normal == pytest.approx(np.tile([0.0, 0.0, 1.0], (12, 1)))
+    why = "no normals" if opposite == "0 0 0" else "its normals cancel each other"
+    assert f"{why}; taken: +z" in said
+
+
+def test_places_of_a_limb_on_two_buses_are_in_the_order_of_its_vector(tmp_path: Path) -> None:
+    """The boards of patch 2 come before those of patch 1."""
+    base, _, _ = run("skinspec", spec(tmp_path))
+    assert [base.buses[f"left_leg_{patch}"].channel for patch in (1, 2)] == ["can0", "can1"]
+    table = tmp_path / "left_leg.txt"
+    pads = np.array(builtin_kinds()["triangle_10pad"].pads_mm) * 1e-3
+    row_of = {13: 0, 1: 1, 2: 2}
+    rows = [
+        f"{x + 0.03 * triangle} {y} {-0.1 * number} 0 0 1"
+        for number in (1, 2, 3)
+        for triangle in range(16)
+        for x, y in pads
+    ]
+    table.write_text("\n".join(rows) + "\n")
+    _, layout, said = run("positions", table, tmp_path / "out.toml")
+    for board in layout.boards:
+        first = board.taxel_index[0, 0]
+        wanted_m = -0.1 * (1 + row_of[board.settings.address])
+        assert layout.position_m[first, 2] == pytest.approx(wanted_m)
+    assert "boards are on several buses; taken in this order: left_leg_2_13, left_leg_1_1" in said
+
+
 HAND = """\
 robotPart hand
 cardid 14

@@ -175,6 +175,42 @@ def test_a_set_that_is_off_takes_triangles_away(tmp_path: Path) -> None:
     assert triangles(device.patches[1]) == {13: [0, 1, 5, 6, 7]}
 
 
+@pytest.mark.parametrize(
+    ("rows", "on"),
+    [
+        (["1 5 4 15 0 2 0x2200"], {5: [0, 1, 2, 3], 6: list(range(16))}),
+        (["1 5 4 15 0 2 0x2200", "1 5 1 1 1 3 0x2000"], {5: [0, 1, 2, 3], 6: list(range(16))}),
+        (["1 5 1 1 1 3 0x2000", "1 5 4 15 0 2 0x2200"], {5: [0, 1, 2, 3], 6: list(range(16))}),
+        (["1 5 0 15 0 2 0x2200"], {6: list(range(16))}),
+        (["1 5 0 15 0 2 0x2200", "1 5 2 2 1 2 0x2200"], {5: [2], 6: list(range(16))}),
+    ],
+)
+def test_a_set_that_is_off_takes_triangles_from_those_that_are_on_by_default(
+    tmp_path: Path, rows: list[str], on: dict[int, list[int]]
+) -> None:
+    patches = '<group name="patches"><param name="skinCanAddrsPatch1"> 5 6 </param></group>'
+    defaults = DEFAULTS.replace("> false <", "> true <", 2)
+    device, said = read(tmp_path, HEAD + patches + defaults + sets(*rows) + "</params>")
+    assert triangles(device.patches[1]) == on
+    assert "boards 6 have no set of triangles" in said
+    assert "without a set are on by default" not in said
+    assert "earlier set" not in said
+
+
+def test_triangles_that_are_on_by_default_have_the_default_set_up(tmp_path: Path) -> None:
+    defaults = DEFAULTS.replace("> false <", "> true <", 2)
+    rows = ["1 5 2 15 0 2 0x2200", "1 5 1 1 1 3 0x2000"]
+    device, _ = read(tmp_path, HEAD + defaults + sets(*rows) + "</params>")
+    assert device.patches[1][0].triangles == {0: (2, 0x2200), 1: (3, 0x2000)}
+
+
+def test_a_set_that_is_not_read_turns_nothing_on(tmp_path: Path) -> None:
+    defaults = DEFAULTS.replace("> false <", "> true <", 2)
+    rows = ["1 5 0 3 1 2 0x2200", "1 5 8 20 0 2 0x2200"]
+    device, _ = read(tmp_path, HEAD + defaults + sets(*rows) + "</params>")
+    assert triangles(device.patches[1]) == {5: [0, 1, 2, 3]}
+
+
 def test_a_name_that_is_there_twice_is_named_and_both_sets_are_taken(tmp_path: Path) -> None:
     body = sets("1 13 0 0 1 2 0x2200", "1 13 1 1 1 2 0x2200").replace("Cfg2", "Cfg1")
     device, said = read(tmp_path, HEAD + DEFAULTS + body + "</params>")

@@ -7,12 +7,14 @@ import msgspec
 import numpy as np
 import pytest
 
+from emulator.boards.fingertips import place_on
 from emulator.faults import parse
 from emulator.probes.held_objects import HeldObjects
-from emulator.probes.scene import Fault, Probe, Scene
+from emulator.probes.scene import Fault, Place, Probe, Scene
 from emulator.robot import Robot
 from skin_host.bus.strain import start_frames
 from skin_host.bus.wire import FrameBatch
+from skin_host.config.fingertips import Fingertip
 from skin_host.config.settings import changed, load
 from skin_host.errors import ConfigurationError
 from skin_host.fingertip.events import Slip
@@ -274,18 +276,34 @@ def test_a_fault_names_a_board_that_can_have_it(line: str, said: str) -> None:
 @pytest.mark.parametrize(
     ("probe", "said"),
     [
-        ({"part": "index", "depth_mm": [[0, 1]]}, "probe[0].depth_mm"),
-        ({"part": "thumb", "force_n": [[0, 1]]}, 'probe[0].part: "thumb" is covered'),
-        ({"part": "index", "force_n": [[0, 1]], "at": {"taxel": 1}}, "probe[0].at"),
+        ({"part": "index", "depth_mm": [[0, 1], [1, 1]]}, "probe[0].depth_mm"),
+        ({"part": "thumb", "force_n": [[0, 1], [1, 1]]}, 'probe[0].part: "thumb" is covered'),
+        ({"part": "index", "force_n": [[0, 1], [1, 1]], "at": {"taxel": 1}}, "probe[0].at"),
         (
-            {"part": "index", "force_n": [[0, 1]], "at": {"towards": [0, 0, 0]}},
+            {"part": "index", "force_n": [[0, 1], [1, 1]], "at": {"towards": [0, 0, 0]}},
             "probe[0].at.towards",
         ),
         (
-            {"part": "index", "force_n": [[0, 1]], "at": {"x_mm": 20}},
+            {"part": "index", "force_n": [[0, 1], [1, 1]], "at": {"x_mm": 20}},
             "probe[0].at: from there the fingertip is not reached",
         ),
-        ({"part": "ring", "force_n": [[0, 1]]}, "probe[0].part"),
+        ({"part": "ring", "force_n": [[0, 1], [1, 1]]}, "probe[0].part"),
+        (
+            {"part": "index", "force_n": [[0, 1], [1, 1]], "slide_mm": [[0, 0, 0], [1, 500, 0]]},
+            "probe[0].slide_mm: 500 mm, 0 mm; the fingertip is not below that place",
+        ),
+        (
+            {"part": "index", "force_n": [[0, 1], [1, 1]], "slide_mm": [[0, -9, -10], [1, 0, 0]]},
+            "probe[0].slide_mm: -9 mm, -10 mm; the fingertip is not below that place",
+        ),
+        (
+            {
+                "part": "thumb_skin",
+                "force_n": [[0, 1], [1, 1]],
+                "slide_mm": [[0, 0, 0], [1, 0, 17]],
+            },
+            "probe[0].slide_mm: 0 mm, 17 mm; the fingertip is not below that place",
+        ),
     ],
 )
 def test_a_probe_that_cannot_be_on_its_fingertip_is_refused(
@@ -296,6 +314,39 @@ def test_a_probe_that_cannot_be_on_its_fingertip_is_refused(
     with pytest.raises(ConfigurationError) as caught:
         Robot(settings, build_layout(settings, CONFIG), scene)
     assert str(caught.value).startswith(said)
+
+
+@pytest.mark.parametrize(
+    ("shape", "at", "reached"),
+    [
+        ({"shape": "plane", "reach_mm": 16}, {"x_mm": 9, "y_mm": 13}, True),
+        ({"shape": "plane", "reach_mm": 16}, {"x_mm": 10, "y_mm": 13}, False),
+        ({"shape": "plane"}, {"x_mm": 1000}, True),
+        ({"shape": "cylinder", "radius_mm": 8, "half_length_mm": 10}, {"z_mm": 9}, True),
+        ({"shape": "cylinder", "radius_mm": 8, "half_length_mm": 10}, {"z_mm": 11}, False),
+        ({"shape": "cylinder", "radius_mm": 8}, {"z_mm": 11}, True),
+        ({"shape": "ellipsoid", "semi_axes_mm": (5, 6, 7)}, {"z_mm": 6.9}, True),
+        ({"shape": "ellipsoid", "semi_axes_mm": (5, 6, 7)}, {"z_mm": 7.1}, False),
+    ],
+)
+def test_a_place_beyond_the_end_of_a_fingertip_is_refused(
+    shape: dict[str, Any], at: dict[str, float], reached: bool
+) -> None:
+    tip = msgspec.convert({"address": 1, "bus": "can0", "sensor_mm": [0, 0, 0], **shape}, Fingertip)
+    place = Place(towards=(1.0, 0.0, 0.0), **at)
+    probe = Probe(part="index", force_n=[(0, 1)], at=place)
+    if reached:
+        place_on(tip, probe)
+        return
+    with pytest.raises(ConfigurationError, match="at: from there the fingertip is not reached"):
+        place_on(tip, probe)
+
+
+def test_a_probe_can_slide_to_the_edge_of_its_fingertip() -> None:
+    slide = [(0.0, 0.0, 0.0), (1.0, 12.9, 0.0), (2.0, -9.0, 9.0)]
+    world = World({"part": "index", "force_n": [[0, 2], [9, 2]], "slide_mm": slide})
+    world.run(2.5)
+    assert world.robot.fingertips.lately["index"][-1].presses
 
 
 def test_the_loads_that_a_board_measured_lately_are_known_and_older_ones_forgotten() -> None:

@@ -118,11 +118,11 @@ def test_a_wrong_course_is_refused_in_one_line(tmp_path: Path, text: str, wrong:
     [
         (Scene(air=[Air(part="left_hand")]), "air[0]: wanted one of file and pressure_kpa"),
         (
-            Scene(air=[Air(part="foot", pressure_kpa=[(0, 1)])]),
+            Scene(air=[Air(part="foot", pressure_kpa=[(0, 1), (1, 1)])]),
             'air[0].part: no part "foot"; there are: left_hand, left_forearm',
         ),
         (
-            Scene(air=[Air(part="left_hand", pressure_kpa=[(at_s, 1)]) for at_s in (0, 5)]),
+            Scene(air=[Air(part="left_hand", pressure_kpa=[(at_s, 1), (9, 1)]) for at_s in (0, 5)]),
             'air[1].part: "left_hand" has air already; wanted one',
         ),
         (
@@ -136,8 +136,8 @@ def test_a_wrong_course_is_refused_in_one_line(tmp_path: Path, text: str, wrong:
         (Scene(air=[Air(part="left_hand", pressure_kpa=[(0, -1)])]), "air cannot pull"),
         (
             Scene(
-                air=[Air(part="left_hand", pressure_kpa=[(0, 1)])],
-                probe=[Probe(part="left_hand", depth_mm=[(0, 1)])],
+                air=[Air(part="left_hand", pressure_kpa=[(0, 1), (1, 1)])],
+                probe=[Probe(part="left_hand", depth_mm=[(0, 1), (1, 1)])],
             ),
             'air[0].part: "left_hand" has probes too',
         ),

@@ -5,7 +5,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulator.probes.foam import POLE_STRAIN, Drive, Foam, FoamLayer, Footprint
+from emulator.probes.foam import (
+    MOST_STRAIN,
+    POLE_STRAIN,
+    Drive,
+    Foam,
+    FoamLayer,
+    Footprint,
+    deepest_mm,
+)
 from emulator.probes.pads import Disc, Pads
 from emulator.probes.viscoelastic import TAU_S, FoamTruth
 
@@ -71,6 +79,50 @@ class TestFoamLayer:
         pads, layer = layer_of([[0, 0]])
         layer.step(pads.footprint([Disc(0, 0, 6)]), Drive.by_depth(0.8), 0.01)
         assert layer.depth_mm == pytest.approx([0.8])
+
+    @given(
+        st.lists(
+            st.tuples(st.booleans(), st.floats(0, 1e308), st.sampled_from([0.0, 1e-6, 0.01, 1000])),
+            min_size=3,
+            max_size=3,
+        ),
+        st.floats(0.1, 20.0),
+        st.sampled_from(["S", "A", "L", "H", "F", "M"]),
+        st.booleans(),
+    )
+    def test_whatever_drives_a_probe_the_foam_bears_no_more_than_it_can(
+        self, drives, thickness_mm, kind, is_infinergy
+    ):
+        pads = Pads([[0, 0], [5, 0], [0, 5]])
+        foam = Foam.drawn(3, np.random.default_rng(1), thickness_mm)
+        foam = foam.infinergy() if is_infinergy else foam
+        layer = FoamLayer(foam, FoamTruth(kind, 3))
+        # Two on pads, of which they share one, and one that lies between the pads.
+        footprint = pads.footprint([Disc(0, 0, 4), Disc(4, 0, 6), Disc(50, 0, 0.1)])
+        is_depth, value, compliance = (np.array(column) for column in zip(*drives, strict=True))
+        most_kpa = foam.elastic_kpa(np.full(3, MOST_STRAIN)).max()
+        for dt_s in (0.0, 0.005, 0.005, 0.005, 0.5, 0.5):
+            felt = layer.step(footprint, Drive(value, is_depth, compliance), dt_s)
+            assert (felt.strain <= MOST_STRAIN).all()
+            assert (layer.pressure_kpa <= most_kpa).all()
+            assert (layer.force_n <= most_kpa * footprint.area_mm2 * footprint.edge * 1e-3).all()
+        nobody = Footprint.empty()
+        felt = hold(layer, nobody, Drive.by_force([]), 10.0)
+        assert (layer.pressure_kpa == 0).all()
+        assert (felt.strain < MOST_STRAIN).all()
+
+    @given(st.floats(0, 20), st.floats(0.5, 6), st.sampled_from([0.0, 0.001, 0.06, 10]))
+    def test_a_probe_goes_no_deeper_than_the_deepest_foam_can(
+        self, depth_mm, thickness_mm, compliance
+    ):
+        pads, layer = layer_of([[0, 0]], thickness_mm=thickness_mm)
+        footprint = pads.footprint([Disc(0, 0, 3)])
+        most_mm = deepest_mm(thickness_mm, footprint.area_mm2[0], compliance)
+        layer.step(footprint, Drive.by_depth(min(depth_mm, most_mm), compliance), 0.0)
+        reached_mm = layer.depth_mm[0] + compliance * layer.force_n[0]
+        assert reached_mm == pytest.approx(min(depth_mm, most_mm), abs=1e-3, rel=1e-3)
+        layer.step(footprint, Drive.by_depth(most_mm + 1, compliance), 0.0)
+        assert layer.depth_mm[0] + compliance * layer.force_n[0] < most_mm + 0.01
 
     def test_a_rigid_probe_presses_harder_on_stiffer_foam(self):
         pads = Pads([[-2.5, 0], [2.5, 0]])

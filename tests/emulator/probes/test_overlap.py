@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from emulator.probes.contacts import ContactPads, Contacts, joined
@@ -98,6 +98,8 @@ def test_a_pad_is_never_covered_by_more_than_all_of_it_nor_pressed_harder_than_i
 def test_where_two_probes_overlap_the_deeper_one_presses(
     apart_mm: float, force_n: float, other_n: float
 ) -> None:
+    # Which of two is deeper is known where their depths are farther apart than they are solved for.
+    assume(force_n == other_n or abs(force_n - other_n) > 1e-6)
     # The pad is wide under both: its area that either covers is that of their union.
     deep, shallow = (0, 1) if force_n >= other_n else (1, 0)
     discs = [Disc(0, 0, 2.4), Disc(apart_mm / 2, 0, 2.4)]

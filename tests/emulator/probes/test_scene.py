@@ -38,6 +38,20 @@ def test_the_scenes_that_come_with_the_project_are_right(path: Path) -> None:
             r"probe\[0\].at: has both",
         ),
         ("[temperature]\nkeyframes_c = []", "temperature.keyframes_c: is empty"),
+        ("[temperature]\nkeyframes_c = [[0, -300]]", r"keyframes_c\[0\]\[1\]: seen -300, wanted"),
+        ("[temperature]\nkeyframes_c = [[0, 25], [1, 1e9]]", r"keyframes_c\[1\]\[1\]: seen 1"),
+        (
+            "[[probe]]\npart = 'a'\npressure_kpa = [[0, 60]]",
+            r"probe\[0\].pressure_kpa: 1 keyframe, which is over at once; wanted at least two",
+        ),
+        (
+            "[[probe]]\npart = 'a'\nforce_n = [[0, 1], [1, 1]]\ntangential_n = [[0, 1]]",
+            r"probe\[0\].tangential_n: 1 keyframe, which",
+        ),
+        (
+            "[[air]]\npart = 'a'\npressure_kpa = [[0, 60]]",
+            r"air\[0\].pressure_kpa: 1 keyframe, which",
+        ),
         *(
             (
                 f"[[probe]]\npart = 'a'\nforce_n = [[0, 1]]\n{key} = {text}",
@@ -74,10 +88,10 @@ def test_a_wrong_scene_is_refused_with_its_file_and_key(
     ("text", "said"),
     [
         (
-            "[[probe]]\npart = 'left_hand'\nforce_n = [[0, 1]]\nat = { taxel = 999 }",
+            "[[probe]]\npart = 'left_hand'\nforce_n = [[0, 1], [1, 1]]\nat = { taxel = 999 }",
             "probe[0].at.taxel",
         ),
-        ("[[air]]\npart = 'foot'\npressure_kpa = [[0, 1]]", "air[0].part"),
+        ("[[air]]\npart = 'foot'\npressure_kpa = [[0, 1], [1, 1]]", "air[0].part"),
         ("[[fault]]\nname = 'wrong_address'\nboard = 'hand'\ntriangle = 3", "fault[0].value"),
     ],
 )
