@@ -9,7 +9,7 @@ import sys
 import threading
 from pathlib import Path
 
-from skin_host.client import Contact, SkinCallbacks
+from skin_host.client import Contact, SkinCallbacks, SkinError
 
 ROOT = Path(__file__).parents[1]
 CONFIG = ROOT / "config" / "gripper.toml"
@@ -24,7 +24,10 @@ class Gripper:
     def __init__(self, config: Path) -> None:
         skin = Path(sys.executable).parent / "skin"
         self._emulator = subprocess.Popen(
-            [skin, "emulate", config, "--mujoco", MODEL], stdin=subprocess.PIPE, text=True
+            [skin, "emulate", config, "--mujoco", MODEL],
+            stdin=subprocess.PIPE,
+            text=True,
+            start_new_session=True,  # Ctrl-C is for this program, which then ends that one
         )
 
     def move(self, finger: str, speed_m_s: float) -> None:
@@ -58,6 +61,10 @@ def main(url: str = "mqtt://localhost", config: str = str(CONFIG)) -> None:
                 event.wait()
             print("it holds", flush=True)
             sys.stdin.read()
+    except SkinError as error:  # no broker, or one that refuses us
+        sys.exit(str(error))
+    except KeyboardInterrupt:
+        pass
     finally:
         gripper.close()
 

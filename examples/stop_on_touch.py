@@ -22,5 +22,7 @@ try:
         sys.stdin.read()
 except SkinError as error:  # no broker, or no robot there
     sys.exit(str(error))
+except KeyboardInterrupt:
+    pass
 finally:
     print("stop", "the program ends", flush=True)

@@ -122,8 +122,8 @@ def take(message: mqtt.MQTTMessage, parts: dict[str, Part]) -> None:
         if state not in STATES:
             raise ValueError("state")
         parts[name].state = state
-    # A retained message may be from any time.
-    if not message.retain:
+    # A retained message may be from any time, and anybody may delete one.
+    if message.payload and not message.retain:
         parts[name].take_sign(message.timestamp, sent.get("stamp", ""))
 
 

@@ -27,6 +27,10 @@ log = logging.getLogger(__name__)
 MAX_DOCUMENT_BYTES = 64 * 1024 * 1024
 #: What does not state its size, as a pipe or a device, is read for so long.
 PATIENCE_S = 10.0
+#: A name in a folder has at most so many bytes (NAME_MAX of Linux).
+_MOST_NAME_BYTES = 255
+#: An interim name has at most so many more than the final one.
+_MARK_BYTES = 18
 #: As many links as the system itself follows from one name.
 _MOST_LINKS = 40
 
@@ -245,7 +249,8 @@ class Disk:
         """Write a temporary file beside `path`; return its name."""
         import tempfile  # which imports every way of compression
 
-        descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        name = _cut(path.name, _MOST_NAME_BYTES - _MARK_BYTES)
+        descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{name}.")
         try:
             with os.fdopen(descriptor, "wb") as file:
                 file.write(data)
@@ -423,7 +428,13 @@ def _growing(path: Path) -> Path:
 
     No other program has it: of two that write the same file, the last one's is whole.
     """
-    return path.with_name(f".{path.stem}.growing-{secrets.token_hex(4)}{path.suffix}")
+    stem = _cut(path.stem, _MOST_NAME_BYTES - _MARK_BYTES - len(os.fsencode(path.suffix)))
+    return path.with_name(f".{stem}.growing-{secrets.token_hex(4)}{path.suffix}")
+
+
+def _cut(name: str, most: int) -> str:
+    """Return as much of a name as fits so many bytes, in whole characters."""
+    return os.fsencode(name)[: max(most, 0)].decode(errors="ignore")
 
 
 def refuse_removed(path: Path) -> None:
@@ -461,6 +472,7 @@ class Draft:
 
     Args:
         wanted: the name; missing parent folders are made.
+        new: a file that has this name by then is not replaced.
 
     Attributes:
         path: where to write; its suffix is that of `wanted`.
@@ -469,8 +481,8 @@ class Draft:
         OSError: `wanted` is a folder, or there can be none that it lies in.
     """
 
-    def __init__(self, wanted: Path) -> None:
-        self._wanted = wanted
+    def __init__(self, wanted: Path, *, new: bool = False) -> None:
+        self._wanted, self._new = wanted, new
         with _naming(wanted):
             self._end = _end_of(wanted)
             self._file = _file_at(self._end)
@@ -507,10 +519,14 @@ class Draft:
 
         Raises:
             OSError: the disk is full, the file was removed, ...
+            FileExistsError: a new file was wanted, and there is another by now.
         """
         with _naming(self._wanted):
             if self._file is not None:
                 (_disk.get() or _DISK).sync(self.path)
+                if self._new:
+                    # Of two that end at once one makes the name; not every file system has links.
+                    os.close(os.open(self._file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
                 os.replace(self.path, self._file)
                 return
             import shutil
@@ -531,6 +547,9 @@ class Draft:
         except OSError as error:
             if error.errno is None or not self.path.exists():
                 raise
+            if isinstance(error, FileExistsError):
+                why = f"another file got this name meanwhile; this one is {self.path}"
+                raise OSError(error.errno, why) from None
             raise OSError(error.errno, f"{error.strerror}; a part of it is {self.path}") from None
 
     def remove(self) -> None:

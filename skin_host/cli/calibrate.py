@@ -131,10 +131,9 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     import asyncio
 
     from skin_host.client.serving import served_by_daemon
-    from skin_host.daemon.calibrate import calibration_path, take_calibration
-    from skin_host.files import refuse_newer
+    from skin_host.daemon.calibrate import take_calibration
     from skin_host.layout import parts_of
-    from skin_host.processing.calibration.file import SCHEMA, with_gains_of
+    from skin_host.processing.calibration.file import with_gains_of
     from skin_host.processing.calibration.outcome import outcome
 
     set_up_logging(arguments.verbose)
@@ -145,8 +144,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
     settings, layout = load_skin(arguments.config)
     warn_of_virtual(settings)
     parts = parts_of(layout, arguments.node)
-    path = arguments.output or calibration_path(settings, arguments.node)
-    refuse_newer(path, SCHEMA, "calibration")
+    path = _calibration_path(arguments, settings)
     served = asyncio.run(
         served_by_daemon(settings, arguments.config.parent, {layout.parts[i].name for i in parts})
     )
@@ -205,6 +203,21 @@ def show(
     return 1 if touched and arguments.strict else 0
 
 
+def _calibration_path(arguments: argparse.Namespace, settings: "Settings") -> Path:
+    """Return where a calibration is to be kept.
+
+    Raises:
+        NewerFileError: a newer version has written what is there.
+    """
+    from skin_host.daemon.calibrate import calibration_path
+    from skin_host.files import refuse_newer
+    from skin_host.processing.calibration.file import SCHEMA
+
+    path: Path = arguments.output or calibration_path(settings, arguments.node)
+    refuse_newer(path, SCHEMA, "calibration")
+    return path
+
+
 def _keep(
     arguments: argparse.Namespace, path: Path, found: "Calibration", layout: "Layout"
 ) -> None:
@@ -220,7 +233,8 @@ def _keep(
 
 
 def _relaxation(arguments: argparse.Namespace) -> int:
-    from skin_host.files import whole_file
+    from skin_host.config.relaxation import RELAXATION_SCHEMA
+    from skin_host.files import refuse_newer, whole_file
     from skin_host.processing.pressure import PressureCurve
     from skin_host.recording import fitting
     from skin_host.recording.load_table import check_course, read_table
@@ -232,6 +246,8 @@ def _relaxation(arguments: argparse.Namespace) -> int:
     model = arguments.model or settings.processing.relaxation.model
     if model == "none":
         raise RequestError('the configured model is "none"; choose one to fit with --model')
+    path = arguments.output or arguments.config.with_suffix(".relaxation.json")
+    refuse_newer(path, RELAXATION_SCHEMA, "relaxation")
     samples = _read_samples(arguments.relaxation, settings, layout, arguments.seconds)
     pressure = settings.processing.pressure
     curve = PressureCurve(
@@ -240,7 +256,6 @@ def _relaxation(arguments: argparse.Namespace) -> int:
     record = fitting.hold_record(samples, curve, load, arguments.weight_kpa)
     fits = fitting.fit_relaxation(record, FITTED)
     (chosen,) = [found for found in fits if found.model == model]
-    path = arguments.output or arguments.config.with_suffix(".relaxation.json")
     with whole_file(path) as growing:
         fitting.save_relaxation(growing, chosen, settings, record)
     if arguments.json:
@@ -252,6 +267,7 @@ def _relaxation(arguments: argparse.Namespace) -> int:
                 "rest_s": record.rest_s,
                 "level_kpa": record.level_kpa,
                 "unit_rms_kpa": record.unit_rms_kpa,
+                "lag_s": None if load is None else record.lag_s,
                 "fits": [
                     {
                         "model": found.model,
@@ -266,30 +282,46 @@ def _relaxation(arguments: argparse.Namespace) -> int:
         )
     else:
         print(_describe(fits, model, record))
+        if load is not None:
+            print(f"the table's clock is {record.lag_s:+.2f} s ahead")
         print(f'kept in {path}; to use it: [processing.relaxation] file = "{path.name}"')
     return 0
 
 
 def _pressure(arguments: argparse.Namespace) -> int:
-    from skin_host.daemon.calibrate import calibration_path
-    from skin_host.recording import fitting
+    from skin_host.config.settings import skin_hash
+    from skin_host.processing.calibration.file import find_calibration
 
     if (arguments.load is None) == (not arguments.levels):
         raise RequestError(
             "--pressure needs --load CSV, the pressure throughout the recording, or --levels, the "
             "steady pressures in kPa in their order; one of the two"
         )
-    if arguments.load is not None:
-        return _course(arguments)
     settings, layout = load_skin(arguments.config)
-    samples = _read_samples(arguments.pressure, settings, layout, arguments.seconds)
-    found, fit = fitting.fit_pressures(samples, settings, layout, arguments.levels)
-    path = arguments.output or calibration_path(settings, arguments.node)
+    path = _calibration_path(arguments, settings)
+    before = find_calibration(path, layout, skin_hash(settings))
+    fit = _course if arguments.load is not None else _levels
+    return fit(arguments, settings, layout, path, before)
+
+
+def _levels(
+    arguments: argparse.Namespace,
+    settings: "Settings",
+    layout: "Layout",
+    path: Path,
+    before: "Calibration | None",
+) -> int:
+    from skin_host.recording import fitting
+
+    samples = _read_samples(arguments.pressure, settings, layout, arguments.seconds, before)
+    fitted = fitting.fit_pressures(samples, settings, layout, arguments.levels, before)
+    found, fit = fitted.calibration, fitted.found
     _keep(arguments, path, found, layout)
+    kept = _kept(fitted, samples, layout, arguments.pressure, path, before)
     counts = {
         "fitted": int(fit.fitted.sum()),
         "bent": int(fit.bent.sum()),
-        "not_fitted": int((samples.usable & ~fit.fitted).sum()),
+        "not_fitted": int((samples.usable & fitted.pressed & ~fit.fitted).sum()),
     }
     if arguments.json:
         print_json(
@@ -299,6 +331,8 @@ def _pressure(arguments: argparse.Namespace) -> int:
                 **counts,
                 "rms_before_kpa": fit.rms_before_kpa,
                 "rms_after_kpa": fit.rms_after_kpa,
+                "ratio_to_curve": fitted.ratio,
+                "kept": kept,
             }
         )
         return 0
@@ -307,31 +341,35 @@ def _pressure(arguments: argparse.Namespace) -> int:
         f"{counts['fitted']} taxels fitted, {counts['bent']} of them with their own bend, "
         f"{counts['not_fitted']} could not be"
     )
-    if len(gains):
-        print(
-            f"gains {gains.min():.2f} to {gains.max():.2f}, "
-            f"error {fit.rms_before_kpa:.2f} -> {fit.rms_after_kpa:.2f} kPa RMS"
-        )
+    print(
+        f"gains {gains.min():.2f} to {gains.max():.2f}, "
+        f"error {fit.rms_before_kpa:.2f} -> {fit.rms_after_kpa:.2f} kPa RMS"
+    )
     print(f"calibration {found.id} kept in {path}")
     return 0
 
 
-def _course(arguments: argparse.Namespace) -> int:
+def _course(
+    arguments: argparse.Namespace,
+    settings: "Settings",
+    layout: "Layout",
+    path: Path,
+    before: "Calibration | None",
+) -> int:
     import numpy as np
 
-    from skin_host.daemon.calibrate import calibration_path
     from skin_host.health.diagnosis import named
     from skin_host.processing.curves import CurveVerdict
     from skin_host.recording import fitting
     from skin_host.recording.load_table import check_course, read_table
 
-    settings, layout = load_skin(arguments.config)
     load = read_table(arguments.load)
     check_course(load)
-    samples = _read_samples(arguments.pressure, settings, layout, arguments.seconds)
-    found, curves = fitting.fit_curves(samples, settings, layout, load)
-    path = arguments.output or calibration_path(settings, arguments.node)
+    samples = _read_samples(arguments.pressure, settings, layout, arguments.seconds, before)
+    fitted = fitting.fit_curves(samples, settings, layout, load, before)
+    found, curves = fitted.calibration, fitted.found
     _keep(arguments, path, found, layout)
+    kept = _kept(fitted, samples, layout, arguments.pressure, path, before)
     verdicts = curve_verdicts(curves, layout)
     counts = {
         verdict.name.lower(): sum(len(taxels[verdict.name.lower()]) for taxels in verdicts.values())
@@ -346,6 +384,7 @@ def _course(arguments: argparse.Namespace) -> int:
                 "id": found.id,
                 "lag_s": curves.lag_s,
                 "highest_kpa": curves.highest_kpa,
+                "ratio_to_curve": fitted.ratio,
                 "memory": {
                     "radius_kpa": list(curves.memory.radius_kpa),
                     "weight": list(curves.memory.weight),
@@ -366,6 +405,7 @@ def _course(arguments: argparse.Namespace) -> int:
                     }
                     for part in layout.parts
                 },
+                "kept": kept,
             }
         )
         return 0
@@ -374,6 +414,7 @@ def _course(arguments: argparse.Namespace) -> int:
         for radius, weight in zip(curves.memory.radius_kpa, curves.memory.weight, strict=True)
     )
     print(f"0 to {curves.highest_kpa:.0f} kPa; the table's clock is {curves.lag_s:+.2f} s ahead")
+    print(f"{fitted.ratio:.2g} times the pressures of the configured curve")
     print(f"hysteresis of the foam: {plays or 'none'}")
     print(", ".join(f"{count} {name}" for name, count in counts.items() if count))
     if len(error):
@@ -384,6 +425,39 @@ def _course(arguments: argparse.Namespace) -> int:
                 print(f"{part}: {name}: {named(numbers)}")
     print(f"calibration {found.id} kept in {path}")
     return 0
+
+
+def _kept(
+    fitted: "fitting.Fitted[Any]",
+    samples: "fitting.Samples",
+    layout: "Layout",
+    log: Path,
+    path: Path,
+    before: "Calibration | None",
+) -> dict[str, list[int]]:
+    """Return by part the pressure taxels that keep what was known of them.
+
+    Warns of them, and of pressures that may be in another unit.
+    """
+    from skin_host.health.diagnosis import named_by_part
+    from skin_host.processing.calibration import by_part
+    from skin_host.recording.plausibility import DOUBTFUL_RATIO, describe_ratio
+
+    if fitted.ratio > DOUBTFUL_RATIO:
+        warn(f"{log}: {describe_ratio(fitted.ratio)}")
+
+    if before is None:
+        what = "they have neither gains nor curves of their own"
+    else:
+        what = f"they keep zero, gains and curves of {path}"
+    unpressed = ~fitted.pressed
+    for taxels, why in (
+        (unpressed & samples.received, f"not pressed in {log}"),
+        (unpressed & ~samples.received, f"not in {log}"),
+    ):
+        if found := by_part(taxels, layout):
+            warn(f"{named_by_part(found)}: {why}; {what}")
+    return by_part(unpressed, layout)
 
 
 def curve_verdicts(curves: "Curves", layout: "Layout") -> dict[str, dict[str, list[int]]]:
@@ -407,8 +481,21 @@ def curve_verdicts(curves: "Curves", layout: "Layout") -> dict[str, dict[str, li
 
 
 def _read_samples(
-    log: Path, settings: "Settings", layout: "Layout", seconds: float
+    log: Path,
+    settings: "Settings",
+    layout: "Layout",
+    seconds: float,
+    before: "Calibration | None" = None,
 ) -> "fitting.Samples":
+    """Read a recording, and warn of doubtful zeros in it.
+
+    Taxels that are not in it have another zero if there is a calibration `before`.
+    """
+    from dataclasses import replace
+
+    import numpy as np
+
+    from skin_host.processing.calibration import Verdict
     from skin_host.recording.fitting import read_samples
     from skin_host.recording.replay import doubts
 
@@ -423,7 +510,11 @@ def _read_samples(
         )
     finally:
         progress.close()
-    for doubt in doubts(samples.calibration, layout):
+    zero = samples.calibration
+    if before is not None:
+        verdict = np.where(samples.received, zero.verdict, np.uint8(Verdict.OK))
+        zero = replace(zero, verdict=verdict)
+    for doubt in doubts(zero, layout):
         warn(f"{log}: {doubt}")
     return samples
 

@@ -87,6 +87,13 @@ def finite(text: str) -> float:
     return value
 
 
+def filled(text: str) -> str:
+    """A name that is not empty, for argparse."""
+    if not text:
+        raise argparse.ArgumentTypeError("seen '', wanted a name")
+    return text
+
+
 def whole(least: int, most: int) -> Callable[[str], int]:
     """Return the type, for argparse, of a whole number, with bounds that belong to it."""
 

@@ -214,9 +214,12 @@ def _import(arguments: argparse.Namespace) -> int:
             config=arguments.config,
             part=arguments.part,
         )
-    finally:
-        if findings.items:
-            print(findings.table(), file=sys.stderr)
+    except SkinError as error:
+        # What was filled in is of no interest where nothing is written.
+        wrong = [one for one in findings.items if one.grade == "odd"]
+        raise type(error)("; ".join(map(str, [*wrong[:1], error]))) from None
+    if findings.items:
+        print(findings.table(), file=sys.stderr)
     for path in written:
         print(path)
     return 0

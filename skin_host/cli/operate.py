@@ -22,6 +22,7 @@ from skin_host.cli.common import (
     add_config,
     add_log_level,
     count,
+    filled,
     load_skin,
     positive,
     print_json,
@@ -88,8 +89,8 @@ def add_commands(commands: Commands) -> None:
         "ask who is on a CAN bus",
         "skin scan --interface socketcan --channel can0",
     )
-    scan.add_argument("--interface", default="socketcan", help="python-can interface")
-    scan.add_argument("--channel", default="can0", help="its channel")
+    scan.add_argument("--interface", type=filled, default="socketcan", help="python-can interface")
+    scan.add_argument("--channel", type=filled, default="can0", help="its channel")
     scan.add_argument("--json", action="store_true", help="one JSON document")
     scan.set_defaults(run=_scan)
 
@@ -294,9 +295,11 @@ def _scan(arguments: argparse.Namespace) -> int:
     found = asyncio.run(scan(bus))
     if arguments.json:
         print_json({"boards": [asdict(one) for one in found]})
-    else:
+    if not found:
+        raise SkinError(scan_table(found, arguments.channel))
+    if not arguments.json:
         print(scan_table(found, arguments.channel))
-    return 0 if found else 1
+    return 0
 
 
 def _command(arguments: argparse.Namespace) -> int:

@@ -23,7 +23,7 @@ from skin_host.cli.common import (
     warn,
 )
 from skin_host.cli.options import add_rules
-from skin_host.errors import RequestError
+from skin_host.errors import RequestError, SkinError
 
 if TYPE_CHECKING:
     import asyncio
@@ -225,16 +225,15 @@ def _record(arguments: argparse.Namespace) -> int:
         told |= {"frames": log.frames}
         told |= {"frames_left_out": log.left_out} if log.left_out else {}
         told |= {"times_moved": log.moved} if log.moved else {}
-    if arguments.config is not None and not told.get("frames", told.get("messages", {}).get("can")):
-        print(
-            f"no CAN frame came on the buses of {arguments.config}; is the bus up? "
-            "(An interface `virtual` reaches only its own program.)",
-            file=sys.stderr,
-        )
     if arguments.json:
         print_json({"file": str(file)} | told)
     else:
         print(f"{file}: " + ", ".join(f"{key} {_plain(value)}" for key, value in told.items()))
+    if arguments.config is not None and not told.get("frames", told.get("messages", {}).get("can")):
+        raise SkinError(
+            f"{file}: no CAN frame came on the buses of {arguments.config}; is the bus up? "
+            "(An interface `virtual` reaches only its own program.)"
+        )
     return 0
 
 

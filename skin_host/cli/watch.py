@@ -29,6 +29,11 @@ if TYPE_CHECKING:
 
 #: `skin status` looks for the broker for this long; a reachable one answers at once.
 PATIENCE_S = 1.5
+#: Health comes once a second. A part of which none comes for this long is not received; a computer
+#: that has much to do may send it late.
+LIVE_S = 5.0
+#: Until then it is not known whether a robot lives of which the broker has stored something.
+SETTLED_S = 2.5
 PAGE_PORT = 8080
 
 
@@ -106,6 +111,8 @@ def _listen(arguments: argparse.Namespace) -> int:
         printed = 0
         async with contextlib.AsyncExitStack() as stack:
             skin = SkinClient(arguments.broker, robot=arguments.robot)
+            # Events come only while something touches; health comes always.
+            followed = skin.contacts()
             watching = asyncio.create_task(_report_absence(skin))
             stack.push_async_callback(cancel, watching)
             await stack.enter_async_context(skin)
@@ -122,7 +129,8 @@ def _listen(arguments: argparse.Namespace) -> int:
                     print(event_line(event), flush=True)
                 printed += 1
                 if printed == arguments.count:
-                    return
+                    break
+            del followed
 
     asyncio.run(work())
     return 0
@@ -133,8 +141,8 @@ async def _report_absence(skin: "SkinClient") -> None:
     import asyncio
 
     said = ""
+    await asyncio.sleep(SETTLED_S)
     while True:
-        await asyncio.sleep(1.0)  # what is retained comes soon
         why = _absence(skin)
         if why != said:
             if why:
@@ -142,6 +150,7 @@ async def _report_absence(skin: "SkinClient") -> None:
             else:
                 print("events can come now", file=sys.stderr)
             said = why
+        await asyncio.sleep(1.0)
 
 
 def _absence(skin: "SkinClient") -> str:
@@ -149,14 +158,16 @@ def _absence(skin: "SkinClient") -> str:
         return f"no broker at {skin.where}: {skin.last_error}" if skin.last_error else ""
     if all(node.online is False for node in skin.nodes.values()):
         return f'no node of robot "{skin.robot}" is online: is `skin run` running?'
+    if not any(node.online for node in skin.nodes.values()):
+        return f'nothing comes from robot "{skin.robot}": is `skin run` running?'
     return ""
 
 
 async def health_of_all(broker: str, robot: str | None) -> dict[str, dict[str, Any]]:
     """Return the health record of every part that the robot's nodes list.
 
-    A retained record of a part whose node has gone, or lists it no longer, does not describe its
-    present state.
+    A record that the broker has stored does not describe the present state: the robot may have been
+    switched off since. Nor does that of a part whose node has gone, or lists it no longer.
     """
     import asyncio
 
@@ -167,30 +178,44 @@ async def health_of_all(broker: str, robot: str | None) -> dict[str, dict[str, A
         parts = {
             part: name for name, node in nodes.items() for part in [*node.parts, *node.fingertips]
         }
-        records: dict[str, dict[str, Any]] = {}
+        live: dict[str, dict[str, Any]] = {}
+        stored: dict[str, dict[str, Any]] = {}
+
+        def is_gone(part: str) -> bool:
+            return skin.nodes[parts[part]].online is False
+
+        def is_decided(part: str) -> bool:
+            return part in live or (is_gone(part) and part in stored)
+
         stream = skin.health()
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(5.0):
-                while records.keys() != parts.keys():
+            async with asyncio.timeout(LIVE_S):
+                while not all(map(is_decided, parts)):
                     health = await anext(stream)
                     if health.part in parts:
-                        records[health.part] = dict(health.record)
+                        (stored if health.stored else live)[health.part] = dict(health.record)
+        records: dict[str, dict[str, Any]] = {}
         for part, node in parts.items():
-            if skin.nodes[node].online is False:
-                records[part] = _gone(part, node, records.get(part, {}))
-            elif part not in records:
-                records[part] = {"state": "not received", "part": part}
+            last = stored.get(part, {}) | live.get(part, {})
+            if is_gone(part):
+                why = f"node {node} is offline: is `skin run` running there?"
+                records[part] = _absent(part, "offline", why, last)
+            elif part not in live:
+                why = f"nothing came of it for {LIVE_S:g} s: is `skin run` running at node {node}?"
+                records[part] = _absent(part, "not received", why, last)
+            else:
+                records[part] = live[part]
         return records
 
 
-def _gone(part: str, node: str, last: dict[str, Any]) -> dict[str, Any]:
-    """Return the record of a part without a living node; `last` is its last record."""
+def _absent(part: str, state: str, why: str, last: dict[str, Any]) -> dict[str, Any]:
+    """Return the record of a part that is not received; `last` is its last record."""
     return {
         **{key: last[key] for key in ("kind", "taxels") if key in last},
         "part": part,
-        "state": "offline",
+        "state": state,
         "valid_taxels": 0,
-        "sentences": [f"node {node} is offline: is `skin run` running there?"],
+        "sentences": [why],
     }
 
 

@@ -17,6 +17,7 @@ from skin_host.cli.common import (
     add_config,
     add_log_level,
     count,
+    filled,
     load_skin,
     port_number,
     positive,
@@ -82,8 +83,8 @@ def add_commands(commands: Commands) -> None:
         help="continue from FILE if it exists, with its scene; save the robot to it at the end",
     )
     emulate.add_argument("--speed", type=positive, default=1.0, help="times real time")
-    emulate.add_argument("--interface", help="replaces that of every bus in CONFIG")
-    emulate.add_argument("--channel", help="replaces that of the only bus in CONFIG")
+    emulate.add_argument("--interface", type=filled, help="replaces that of every bus in CONFIG")
+    emulate.add_argument("--channel", type=filled, help="replaces that of the only bus in CONFIG")
     emulate.add_argument("--board", metavar="NAME", help="the board of --i2c or --i2c-dev")
     emulate.add_argument(
         "--i2c",

@@ -12,7 +12,7 @@ from skin_host.client.heard import Health
 from skin_host.client.presence import Contact
 from skin_host.client.session import SkinClient
 from skin_host.client.streams import Stream
-from skin_host.errors import RequestError
+from skin_host.errors import RequestError, SkinError
 from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.address import Broker
 from skin_host.mqtt.info import NodeInfo
@@ -41,6 +41,8 @@ class SkinCallbacks:
     Raises (on leaving):
         RequestError: the robot has no part of the name that an `on_...` was given. That is logged
             when it is known.
+        BrokerError: a broker did not let us subscribe to what an `on_...` needs. That is logged,
+            too.
     """
 
     def __init__(
@@ -65,8 +67,8 @@ class SkinCallbacks:
         self._ready: Future[tuple[SkinClient, asyncio.AbstractEventLoop]] = Future()
         self._end = asyncio.Event()
         self._calls: set[asyncio.Task[None]] = set()
-        #: By stream: that the robot has no part of its name.
-        self._missing: dict[Stream[Any], RequestError] = {}
+        #: By stream: that the robot has no part of its name, or the broker refuses its topic.
+        self._failures: dict[Stream[Any], SkinError] = {}
         self._thread = threading.Thread(
             target=lambda: asyncio.run(self._serve()), name="skin callbacks", daemon=True
         )
@@ -137,8 +139,8 @@ class SkinCallbacks:
     def __exit__(self, kind: type[BaseException] | None = None, *_: object) -> None:
         self._loop.call_soon_threadsafe(self._end.set)
         self._thread.join()
-        if kind is None and self._missing:
-            raise next(iter(self._missing.values()))
+        if kind is None and self._failures:
+            raise next(iter(self._failures.values()))
 
     async def _serve(self) -> None:
         try:
@@ -165,11 +167,12 @@ class SkinCallbacks:
                 item = await anext(stream)
             except StopAsyncIteration:
                 return
-            except RequestError as error:
+            except SkinError as error:
                 _log.error("%s", error)
-                self._missing[stream] = error
+                self._failures.setdefault(stream, error)
                 continue
-            self._missing.pop(stream, None)
+            if isinstance(self._failures.get(stream), RequestError):
+                del self._failures[stream]
             try:
                 call(item)
             except BaseException:  # SystemExit would end the thread, and what the others receive

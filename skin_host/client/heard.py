@@ -17,11 +17,13 @@ if TYPE_CHECKING:
 class Health(NamedTuple):
     """Health of a part; `docs/operations.md` explains the keys of `record`.
 
-    A fingertip on a force/torque board has only some of them, and others.
+    A fingertip on a force/torque board has only some of them, and others. `stored` is true of what
+    the broker, or the client, had before it was asked for: it does not show that the part lives.
     """
 
     part: str
     record: "Record"
+    stored: bool = False
 
     @property
     def state(self) -> str:
@@ -51,9 +53,15 @@ def is_online(payload: bytes, stamp: Stamp | None, *, is_only_broker: bool) -> b
 
 
 def read(
-    kind: PartTopic, part: str, payload: bytes
+    kind: PartTopic, part: str, payload: bytes, *, stored: bool = False
 ) -> Touch | Slip | Over | Frame | Contact | Health | None:
     """Decode a message of a part; None means that a retained message was deleted.
+
+    Args:
+        kind: of topic.
+        part: whose.
+        payload: of the message.
+        stored: the broker had it before it was asked for.
 
     Raises:
         MessageError: the payload does not fit the topic.
@@ -72,4 +80,4 @@ def read(
         return None
     if kind == "contact":
         return Contact(part, decode_contact(payload))
-    return Health(part, cast("Record", decode_health(payload)))
+    return Health(part, cast("Record", decode_health(payload)), stored)

@@ -68,6 +68,8 @@ class BrokerLink:
         last_error: why it was lost, or not made.
         failure: why it will not be made, as far as is known, before it was made once.
         reached: the broker has taken us, whatever came after.
+        refused: wanted topics that the broker does not let us subscribe to; it is asked again with
+            the next connection.
         again: to be set when the wanted topics change.
     """
 
@@ -80,6 +82,7 @@ class BrokerLink:
         self.last_error = ""
         self.failure: SkinError | None = None
         self.reached = False
+        self.refused: set[str] = set()
         self.again = asyncio.Event()
         self._identifier = identifier
         self._hearer = hearer
@@ -92,7 +95,7 @@ class BrokerLink:
         return bool(self.connections or self.last_error)
 
     def has(self, topics: set[str]) -> bool:
-        """Return whether all of these are subscribed."""
+        """Return whether all of these are subscribed, or refused."""
         return self._subscribed >= topics
 
     async def run(self) -> None:
@@ -117,7 +120,7 @@ class BrokerLink:
             finally:
                 self.connection = None
                 self._kept |= self._subscribed
-                self._subscribed = set()
+                self._subscribed, self.refused = set(), set()
                 self._hearer.note(self)
             await asyncio.sleep(retry.delay_s(0.0 if since_s is None else loop.time() - since_s))
 
@@ -148,11 +151,16 @@ class BrokerLink:
             want = set(self._hearer.wanted())
             # Nodes first: what is retained of a part whose node has stopped is out of date.
             for topic in sorted(want - self._subscribed, key=lambda one: "/nodes/" not in one):
-                await connection.subscribe(topic, qos=0 if topic.endswith("/frame") else 1)
+                qos = 0 if topic.endswith("/frame") else 1
+                if not await connection.listen_to(topic, qos, as_published=False):
+                    self.refused.add(topic)
+                    _log.info("broker %s: refuses us the topic %s", self.broker, topic)
             for topic in (self._subscribed | self._kept) - want:
-                await connection.unsubscribe(topic)
+                if topic not in self.refused:
+                    await connection.unsubscribe(topic)
                 self._hearer.unfollow(topic)
             self._subscribed, self._kept = want, set()
+            self.refused &= want
             if self.connection is None:
                 self.connection = connection
                 self.connections += 1
@@ -163,6 +171,13 @@ class BrokerLink:
             await self.again.wait()
 
 
+def refusal(broker: Broker, topic: str) -> BrokerError:
+    """Return that a broker does not let us subscribe to a topic."""
+    return BrokerError(
+        f'broker {broker}: refuses us the topic "{topic}"; its access rules decide who may read it'
+    )
+
+
 async def only_robot(connection: Connection, broker: Broker, base: str) -> str:
     """Find the only robot below the base, by the status of its nodes.
 
@@ -170,12 +185,14 @@ async def only_robot(connection: Connection, broker: Broker, base: str) -> str:
 
     Raises:
         RequestError: there is none, or more than one.
+        BrokerError: it does not let us know which there are.
     """
     prefix = f"{base}/"
     # By topic: of two statuses of a node the later one is true.
     statuses: dict[str, object] = {}
     everybody = f"{prefix}+/nodes/+/status"
-    await connection.subscribe(everybody, qos=1)
+    if not await connection.listen_to(everybody, as_published=False):
+        raise refusal(broker, everybody)
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(FIRST_RETAINED_S) as waiting:
             async for message in connection.messages:

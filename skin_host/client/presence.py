@@ -16,8 +16,8 @@ from skin_host.mqtt.messages import ContactState
 from skin_host.processing.events import Touch
 
 #: Why a contact state is unknown: the node cannot feel all of the part; the node, or only this
-#: part, has not been received for too long; the node has stopped; the broker is lost, or the
-#: connection of the node, which may have another one by now.
+#: part, has not been received for too long, or its state was deleted; the node has stopped; the
+#: broker is lost, or the connection of the node, which may have another one by now.
 Why = Literal["not_felt", "stale", "offline", "disconnected"]
 
 
@@ -82,15 +82,21 @@ class Lateness:
 
 @dataclass(slots=True)
 class _Part:
-    #: None: not yet received over this connection.
-    received: ContactState | None
-    alive_s: float
+    #: None: not yet received over this connection, or deleted.
+    received: ContactState | None = None
+    #: When it lived last; -inf: all that came over this connection, or since its node is online
+    #: again, was stored.
+    alive_s: float = -math.inf
+    #: Since when it is waited for what was not stored.
+    waiting_s: float = -math.inf
     lateness: Lateness = field(default_factory=Lateness)
     #: How late the last message was whose time is known.
     late_s: float = 0.0
-    #: Brokers from which the state came; without any it is out of date.
+    #: Brokers from which the state, or its deletion, came; without any it is out of date.
     over: set[int] = field(default_factory=set)
     reported: Contact | None = None
+    #: Of the node's start from which the touches are, as far as they show it.
+    run: int | None = None
     touches: dict[int, tuple[Touch, float]] = field(default_factory=dict)
 
     def hear(self, now_s: float, sent_s: float | None, stale_s: float) -> None:
@@ -102,7 +108,13 @@ class _Part:
         if sent_s is not None:
             self.late_s = self.lateness.of(sent_s, now_s)
         if now_s - self.alive_s <= stale_s or self.late_s <= stale_s / 2:
+            if self.alive_s == -math.inf and self.received == "OFF":
+                self.touches.clear()
             self.alive_s = max(self.alive_s, now_s - self.late_s)
+
+    def wait(self, now_s: float) -> None:
+        """Take nothing for true before something of it comes that was not stored."""
+        self.alive_s, self.waiting_s = -math.inf, now_s
 
 
 @dataclass(slots=True)
@@ -137,6 +149,7 @@ class Presence:
         broker: int = 0,
         *,
         again: bool = False,
+        stored: bool = False,
         sent_s: float | None = None,
     ) -> None:
         """Take the newest contact state; None: it was deleted.
@@ -147,26 +160,33 @@ class Presence:
             now_s: the time.
             broker: from which it came.
             again: it came from another broker before.
+            stored: the broker had it; it does not show that the part lives.
             sent_s: when it was sent, by the node's clock. None: not known, or it was stored.
         """
-        if state is None:
-            self._parts.pop(part, None)
-            return
-        known = self._parts.setdefault(part, _Part(state, now_s))
+        known = self._parts.setdefault(part, _Part())
         known.received = state
-        known.hear(now_s, sent_s, self._stale_s)
         known.over = known.over | {broker} if again else {broker}
-        if state == "OFF":
-            known.touches.clear()
+        if not stored and state is not None:
+            known.hear(now_s, sent_s, self._stale_s)
+            if state == "OFF":
+                known.touches.clear()
+        elif known.alive_s == -math.inf:
+            known.waiting_s = now_s
 
     def take_sign(self, part: str, now_s: float, sent_s: float | None = None) -> None:
         """Take any other message of a part that was not a retained one."""
         if part in self._parts:
             self._parts[part].hear(now_s, sent_s, self._stale_s)
 
-    def take_touch(self, touch: Touch, now_s: float) -> None:
-        part = self._parts.setdefault(touch.part, _Part(None, now_s))
+    def take_touch(self, touch: Touch, now_s: float, run: int | None = None) -> None:
+        """Take a touch, of a run of the node if that is known; those of the runs before have ended
+        with them.
+        """
+        part = self._parts.setdefault(touch.part, _Part())
         part.hear(now_s, None, self._stale_s)
+        if run is not None and run != part.run:
+            part.touches.clear()
+            part.run = run
         if touch.event == "end":
             part.touches.pop(touch.id, None)
         else:
@@ -178,6 +198,7 @@ class Presence:
         self,
         node: str,
         online: bool | None,
+        now_s: float,
         broker: int = 0,
         *,
         again: bool = False,
@@ -185,14 +206,22 @@ class Presence:
     ) -> None:
         """Take the newest status of a node; None: its connection ended, or the status was deleted.
 
+        One that is online again may have been restarted: its parts are not as they were before.
+
         Args:
             node: whose.
             online: whether it is, see `is_online`.
+            now_s: the time.
             broker: from which it came.
             again: it came from another broker before.
             parts: of which it publishes, as far as the status names them.
         """
-        over = self._nodes[node].over if again and node in self._nodes else set()
+        before = self._nodes.get(node)
+        over = before.over if again and before is not None else set()
+        if online and before is not None and not before.online:
+            for name, part in self._parts.items():
+                if self._node_of.get(name) == node:
+                    part.wait(now_s)
         self._nodes[node] = _Node(online, over | {broker}, frozenset(parts))
 
     def take_info(self, node: str, parts: Iterable[str]) -> None:
@@ -201,19 +230,26 @@ class Presence:
         self._parts_of[node] = list(parts)
         self._node_of = {part: name for name, known in self._parts_of.items() for part in known}
 
+    def take_refusal(self, part: str, broker: int = 0) -> None:
+        """Note that a broker does not let us receive the state of a part any more."""
+        known = self._parts.get(part)
+        if known is not None and known.over == {broker}:
+            known.received = None
+
     def take_loss(self, broker: int = 0) -> None:
         """Note the loss of a broker. Its retained messages come again with the next connection."""
         for part in self._parts.values():
             part.over.discard(broker)
             if not part.over:
-                part.received = None
+                part.received, part.alive_s = None, -math.inf
         for node in self._nodes.values():
             node.over.discard(broker)
             if not node.over:
                 node.online = None
 
-    def forget(self) -> None:
-        self._parts.clear()
+    def forget(self, part: str) -> None:
+        """Forget a part that is not followed any more."""
+        self._parts.pop(part, None)
 
     def online(self, node: str, now_s: float) -> bool | None:
         """Return whether a node is online; None: not known.
@@ -226,7 +262,7 @@ class Presence:
         parts = [
             part
             for name, part in self._parts.items()
-            if part.received is not None and self._node_of.get(name) == node
+            if part.over and self._node_of.get(name) == node
         ]
         stale = all(now_s - part.alive_s > self._stale_s for part in parts)
         return None if parts and stale else True
@@ -248,17 +284,23 @@ class Presence:
         return self._nodes[node].over if node in self._nodes else set()
 
     def contact(self, part: str, now_s: float) -> Contact | None:
-        """Return the present state of a part; None if nothing was received of it."""
+        """Return the present state of a part; None if nothing was received of it, or only what was
+        stored, a moment ago.
+        """
         known = self._parts.get(part)
         if known is None or (known.received is None and known.reported is None):
             return None
         node = self._nodes.get(self._node_of.get(part, ""))
         why: Why | None = None
-        if known.received is None or (node is not None and node.online is None):
+        if not known.over or (node is not None and node.online is None):
             why = "disconnected"
         elif node is not None and not node.online:
             why = "offline"
-        elif now_s - known.alive_s > self._stale_s:
+        elif known.received is None or now_s - known.alive_s > self._stale_s:
+            before = known.reported
+            waits = known.alive_s == -math.inf and now_s - known.waiting_s <= self._stale_s
+            if waits and known.received is not None and (before is None or not before.known):
+                return before
             why = "stale"
         elif known.received == "UNKNOWN":
             why = "not_felt"

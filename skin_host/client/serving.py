@@ -12,14 +12,14 @@ from skin_host.mqtt.address import Broker
 
 #: How long to wait for a broker.
 PATIENCE_S = 1.0
-#: Health comes once a second: the record that the broker keeps, and one within this time after it.
+#: Health comes once a second.
 ALIVE_S = 2.5
 
 log = logging.getLogger(__name__)
 
 
 async def served_by_daemon(settings: Settings, folder: Path, parts: Set[str]) -> str | None:
-    """Return one of these parts whose health comes again and again; None: none, or no broker.
+    """Return one of these parts whose health comes now; None: none, or no broker.
 
     Args:
         settings: of the robot and its broker.
@@ -32,11 +32,9 @@ async def served_by_daemon(settings: Settings, folder: Path, parts: Set[str]) ->
             brokers, robot=settings.robot, base=settings.mqtt.base, patience_s=PATIENCE_S
         )
         async with skin, asyncio.timeout(ALIVE_S):
-            received: set[str] = set()
             async for health in skin.health():
-                if health.part in received:
+                if health.part in parts and not health.stored:
                     return health.part
-                received |= {health.part} & parts
     except TimeoutError:
         pass
     except BrokerError as error:

@@ -13,7 +13,7 @@ from typing import Any, Literal, Self, TypeVar
 from weakref import WeakSet
 
 from skin_host.client.heard import Health, is_online, read
-from skin_host.client.links import RETAINED_S, ROBOT_S, BrokerLink, only_robot
+from skin_host.client.links import RETAINED_S, ROBOT_S, BrokerLink, only_robot, refusal
 from skin_host.client.order import EventOrder, Newest
 from skin_host.client.presence import Contact, Presence
 from skin_host.client.streams import Stream, refuse_other_loop
@@ -50,11 +50,16 @@ NAMED_S = 5.0
 MOST_NAMED = 20
 #: Timeouts are checked this often.
 WATCH_S = 0.25
-#: Further topics that a stream needs: a contact state is valid only while its part lives.
-_NEEDED: dict[PartTopic, tuple[PartTopic, ...]] = {"contact": ("contact", "health", "touch")}
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
+
+
+def needed(kind: PartTopic) -> tuple[PartTopic, ...]:
+    """Return the topics that a stream of a kind needs: a contact state is valid only while its part
+    lives.
+    """
+    return ("contact", "health", "touch") if kind == "contact" else (kind,)
 
 
 class CommandError(SkinError):
@@ -220,8 +225,12 @@ class SkinClient:
     def contacts(self, part: str | None = None) -> Stream[Contact]:
         """Contact states of parts: the present one, and each change.
 
+        The present one comes as soon as anything of the part does that the broker had not stored,
+        which takes up to a second, or as UNKNOWN after `stale_s`.
+
         UNKNOWN is an item of its own: when the node cannot feel all of the part, when the part was
-        not received for `stale_s`, when its node stops or the broker is lost.
+        not received for `stale_s` or its state was deleted, when its node stops or the broker is
+        lost.
         """
         return self._stream(part, "contact")
 
@@ -232,19 +241,26 @@ class SkinClient:
 
         Raises:
             RequestError: the robot has no such part.
+            BrokerError: a broker does not let us subscribe to its touches.
         """
         self._check_use(part)
         missing = self._missing(part, _now_s())
         if missing is not None:
             raise RequestError(missing)
+        self._refuse_unread(self._topics_of("touch", part))
         return self._presence.touches(part, _now_s())
 
     def health(self, part: str | None = None) -> Stream[Health]:
-        """Health of parts: the present one, and each change."""
+        """Health of parts: the last one, see `Health.stored`, and each change."""
         return self._stream(part, "health")
 
     async def ready(self) -> None:
-        """Wait until all subscriptions so far have reached the broker."""
+        """Wait until all subscriptions so far have reached the broker.
+
+        Raises:
+            BrokerError: a broker does not let us subscribe to a topic that a stream needs, or to
+                those of the nodes.
+        """
 
         def is_ready() -> bool:
             want = set(self.wanted())
@@ -252,6 +268,7 @@ class SkinClient:
             return bool(made) and all(link.has(want) for link in made)
 
         await self._until(is_ready)
+        self._refuse_unread(self._node_topics().union(*map(self._required, self._streams)))
 
     async def info(self, timeout_s: float = 5.0) -> dict[str, NodeInfo]:
         """Return the descriptions of the robot's nodes: parts, taxels, places.
@@ -274,6 +291,7 @@ class SkinClient:
                 )
         known = {name: node.info for name, node in self.nodes.items() if node.info is not None}
         if not known:
+            self._refuse_unread(self._node_topics())
             raise BrokerError(
                 f'broker {self.where}: no node of robot "{self.robot}" published its info; '
                 "is `skin run` running?"
@@ -297,6 +315,7 @@ class SkinClient:
             WrongCommandError: the node found the request wrong. It is a `CommandError` and a
                 `RequestError`.
             RequestError: it is not clear which node is meant, or a name or a number cannot be sent.
+            BrokerError: no node is online, or the broker does not let us receive answers.
         """
         if not NAME.fullmatch(name) or not (node is None or NAME.fullmatch(node)):
             raise RequestError(
@@ -313,6 +332,7 @@ class SkinClient:
             async with asyncio.timeout(timeout_s):
                 node = node or await self._only_node()
                 self._refuse_deaf(node)
+                self._refuse_unread({self._replies})
                 await self._ask(node, name, request)
                 result = await self._until(partial(self._answer, node, number))
         except TimeoutError:
@@ -513,9 +533,59 @@ class SkinClient:
         properties = message_properties(self._links[0].broker, JSON_TYPE)
         if properties is not None:
             properties.ResponseTopic = self._topics.reply(node, self._identifier)
-        await connection.publish(
-            self._topics.command(node, name), request, 1, properties=properties
-        )
+        why = await connection.request(self._topics.command(node, name), request, properties)
+        if why:
+            raise CommandError(
+                f"broker {self.where}: does not let us command ({why}); log in as one who may"
+            )
+
+    def _topics_of(self, kind: PartTopic, part: str | None) -> set[str]:
+        """Return the topics by which a kind of message of a part, or of all, may come."""
+        if self._topics is None:
+            return set()
+        return {self._topics.part(kind, name) for name in ("+", part) if name is not None}
+
+    def _required(self, stream: Stream[Any]) -> set[str]:
+        """Return the topics without which a stream receives nothing that is true."""
+        kinds = {one for kind in stream.kinds for one in needed(kind)}
+        if "contact" in stream.kinds:
+            kinds.remove("touch")  # it is of use to `present` alone
+        return set().union(*(self._topics_of(kind, stream.part) for kind in kinds))
+
+    def _node_topics(self) -> set[str]:
+        """Return the topics of what the nodes are, and whether they are online."""
+        topics = self._topics
+        if topics is None:
+            return set()
+        return {topics.node("status", "+"), topics.node("info", "+"), topics.info("+", "+")}
+
+    @property
+    def _replies(self) -> str:
+        """The topic of the answers to our requests."""
+        if self._topics is None:
+            return ""
+        if self._links[0].broker.v5:
+            return self._topics.reply("+", self._identifier)
+        return self._topics.result("+", "+")
+
+    def _refuse_unread(self, topics: set[str]) -> None:
+        """Refuse what needs a topic that a broker does not let us subscribe to.
+
+        Raises:
+            BrokerError: there is one among these.
+        """
+        for link in self._links:
+            for topic in sorted(link.refused & topics):
+                raise refusal(link.broker, topic)
+
+    def _note_refusals(self, link: BrokerLink) -> None:
+        """Let streams raise that a broker refuses what they need."""
+        for stream in self._streams if link.refused else ():
+            for topic in self._required(stream) & link.refused:
+                stream.refuse(topic, refusal(link.broker, topic))
+        for part in self._names[False] if link.refused else ():
+            if link.refused & self._topics_of("contact", part):
+                self._presence.take_refusal(part, link.number)
 
     def _way_to(self, node: str) -> Connection | None:
         """Return the connection to a broker where a node is; a request must not reach it twice."""
@@ -535,22 +605,32 @@ class SkinClient:
             self.last_error = link.last_error
         if link.connection is None:
             self._presence.take_loss(link.number)
-            if not self._stopping:
-                self._report_contacts()
-                self._note_nodes()
+        self._note_refusals(link)
+        if not self._stopping:
+            self._report_contacts()
+            self._note_nodes()
         self._news.set()
 
     def unfollow(self, topic: str) -> None:
-        """Forget the state of a topic that is no longer subscribed."""
+        """Forget the states of parts that are not followed any more, neither by another topic."""
         assert self._topics is not None
         place = self._topics.parse(topic)
-        if place is None:
+        kind = None if place is None else place.kind
+        if kind not in ("contact", "health"):
             return
-        if place.kind == "health":
-            self._latest.clear()
-        elif place.kind == "contact":
-            self._presence.forget()
-        self._newest.forget(place.kind)
+        for part in self._names[False]:
+            if kind in self._kinds_of(part):
+                continue
+            if kind == "health":
+                self._latest.pop(part, None)
+            else:
+                self._presence.forget(part)
+            self._newest.forget(kind, part)
+
+    def _kinds_of(self, part: str) -> set[PartTopic]:
+        """Return the kinds of messages of a part that somebody reads."""
+        here = [stream for stream in self._streams if stream.part in (None, part)]
+        return {one for stream in here for kind in stream.kinds for one in needed(kind)}
 
     def wanted(self) -> Iterator[str]:
         """Yield the topics to subscribe to; none contains another, or messages would come twice."""
@@ -560,15 +640,12 @@ class SkinClient:
         yield topics.node("status", "+")
         yield topics.info("+")
         yield topics.info("+", "+")
-        if self._links[0].broker.v5:
-            yield topics.reply("+", self._identifier)
-        else:
-            yield topics.result("+", "+")
+        yield self._replies
         asked: set[tuple[PartTopic, str | None]] = {
             (kind, stream.part)
             for stream in self._streams
             for asked_kind in stream.kinds
-            for kind in _NEEDED.get(asked_kind, (asked_kind,))
+            for kind in needed(asked_kind)
         }
         for kind, part in asked:
             if part is None or (kind, None) not in asked:
@@ -632,8 +709,9 @@ class SkinClient:
             payload, stamp_of(message.properties), is_only_broker=len(self._links) == 1
         )
         parts = parts_of(message.properties)
-        self._presence.take_node(name, said, link.number, again=newness is None, parts=parts)
-        self._named_s = _now_s()
+        now_s, again = _now_s(), newness is None
+        self._presence.take_node(name, said, now_s, link.number, again=again, parts=parts)
+        self._named_s = now_s
         self.nodes.setdefault(name, Node())
         self._report_contacts()
         self._note_nodes()
@@ -670,17 +748,16 @@ class SkinClient:
     def _take_part(
         self, kind: PartTopic, part: str, payload: bytes, link: BrokerLink, message: Message
     ) -> None:
-        here = [stream for stream in self._streams if stream.part in (None, part)]
-        needed = {one for stream in here for k in stream.kinds for one in _NEEDED.get(k, (k,))}
-        if kind not in needed:
+        if kind not in self._kinds_of(part):
             self._ask_again()  # nobody reads it any more
             return
-        item = read(kind, part, payload)
+        item = read(kind, part, payload, stored=message.retain)
         now_s = _now_s()
         if isinstance(item, Touch | Slip | Over):
             run = run_of(message.properties)
             for event in self._order.take(item, run, now_s):
-                self._pass_on(event)
+                # What had to wait for its turn may be of another run.
+                self._pass_on(event, run if event.t_ns == item.t_ns else None)
         elif isinstance(item, Frame):
             if self._order.take_frame(item, run_of(message.properties), now_s):
                 self._presence.take_sign(part, now_s)
@@ -689,26 +766,30 @@ class SkinClient:
             assert item is None or isinstance(item, Contact)
             newness = self._newness(kind, part, message)
             if newness is not False:
-                state = None if item is None else item.state
-                again = newness is None
                 self._presence.take_state(
-                    part, state, now_s, link.number, again=again, sent_s=_sent_s(message)
+                    part,
+                    None if item is None else item.state,
+                    now_s,
+                    link.number,
+                    again=newness is None,
+                    stored=message.retain,
+                    sent_s=_sent_s(message),
                 )
         elif self._newness(kind, part, message):
-            if not message.retain:
-                self._presence.take_sign(part, now_s, _sent_s(message))
             if item is None:
                 self._latest.pop(part, None)
             else:
                 assert isinstance(item, Health)
-                self._latest[part] = item
+                if not item.stored:
+                    self._presence.take_sign(part, now_s, _sent_s(message))
+                self._latest[part] = item._replace(stored=True)
                 self._put(kind, item)
         self._report_contacts()
 
-    def _pass_on(self, event: Touch | Slip | Over) -> None:
+    def _pass_on(self, event: Touch | Slip | Over, run: int | None = None) -> None:
         kind: PartTopic = "touch"
         if isinstance(event, Touch):
-            self._presence.take_touch(event, _now_s())
+            self._presence.take_touch(event, _now_s(), run)
         else:
             kind = "slip" if isinstance(event, Slip) else "over"
             self._presence.take_sign(event.part, _now_s())

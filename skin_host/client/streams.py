@@ -8,13 +8,14 @@ from typing import Any, Generic, TypeVar, cast
 from msgspec.structs import replace
 
 from skin_host.client.presence import taxels_of
-from skin_host.errors import RequestError
+from skin_host.errors import RequestError, SkinError
 from skin_host.fingertip.events import Over, Slip
 from skin_host.mqtt.messages import Frame
 from skin_host.mqtt.topics import PartTopic
 from skin_host.processing.events import Touch
 
-#: How many items a stream holds for a slow reader; then the oldest is dropped and counted.
+#: How many items a stream holds for a slow reader; then the oldest is dropped. The next event or
+#: frame counts it.
 HELD = {
     "touch": 10_000,
     "slip": 10_000,
@@ -23,6 +24,8 @@ HELD = {
     "contact": 1000,
     "health": 1000,
 }
+#: A state is true until the next one of its part. There are fewer parts than items held.
+STATES = {"contact", "health"}
 #: Of touches no more than have this many taxels together: whoever may publish could send some of
 #: a hundred thousand each.
 HELD_TAXELS = 5_000_000
@@ -54,7 +57,7 @@ def refuse_other_loop(loop: asyncio.AbstractEventLoop | None) -> None:
         )
 
 
-class Repeats:
+class SentTwice:
     """Finds events and frames that came before: what was in flight when a connection broke is sent
     again, and without MQTT 5 each of several brokers sends it.
 
@@ -82,6 +85,7 @@ class Stream(AsyncIterator[T], Generic[T]):
 
     Raises (on reading, once):
         RequestError: the robot has no part of this name, see `SkinClient`.
+        BrokerError: a broker does not let us subscribe to a topic that is needed.
 
     Raises (on reading):
         RequestError: this is not the event loop in which the client was entered.
@@ -95,24 +99,39 @@ class Stream(AsyncIterator[T], Generic[T]):
         #: Whether it is known that there is such a part, or was reported that there is none.
         self.is_judged = part is None
         self._failure: str | None = None
-        self._items: deque[T] = deque(maxlen=max(HELD[kind] for kind in kinds))
+        #: Topics that a broker refused, and the errors that were not raised yet.
+        self._refused: set[str] = set()
+        self._refusals: deque[SkinError] = deque()
+        self._items: deque[T] = deque()
+        self._most = max(HELD[kind] for kind in kinds)
         self._taxels = 0
         self._wake = asyncio.Event()
         self._closed = False
         #: By kind and part; each has separate numbers.
         self._last: dict[tuple[type, str], tuple[int, int]] = {}
-        self._repeats = Repeats()
+        self._repeats = SentTwice()
 
     def put(self, item: T) -> None:
         """Add a received item."""
         self.is_judged, self._failure = True, None
-        if len(self._items) == self._items.maxlen:
-            self._drop()
         self._items.append(item)
         self._taxels += taxels_of(item)
+        if len(self._items) > self._most:
+            self._make_room()
         while self._taxels > HELD_TAXELS and len(self._items) > 1:
             self._drop()
         self._wake.set()
+
+    def _make_room(self) -> None:
+        """Drop the oldest item; of states the oldest that a newer one of its part follows: nothing
+        would show that the newest is missing.
+        """
+        if STATES.isdisjoint(self.kinds):
+            self._drop()
+            return
+        items: list[Any] = list(self._items)
+        newest = {item.part: at for at, item in enumerate(items)}
+        del self._items[next(at for at, item in enumerate(items) if newest[item.part] > at)]
 
     def _drop(self) -> T:
         item = self._items.popleft()
@@ -129,11 +148,20 @@ class Stream(AsyncIterator[T], Generic[T]):
         self.is_judged, self._failure = True, why
         self._wake.set()
 
+    def refuse(self, topic: str, error: SkinError) -> None:
+        """Let the reader get an error, once: messages of this topic cannot come."""
+        if topic not in self._refused:
+            self._refused.add(topic)
+            self._refusals.append(error)
+            self._wake.set()
+
     async def __anext__(self) -> T:
         if not self._closed:  # what is left may be read anywhere
             refuse_other_loop(self.loop)
         while True:
-            while not self._items:
+            while self._refusals or not self._items:
+                if self._refusals:
+                    raise self._refusals.popleft()
                 if self._failure is not None:
                     why, self._failure = self._failure, None
                     raise RequestError(why)

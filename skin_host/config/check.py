@@ -28,6 +28,8 @@ WARN_LOAD = 0.8
 CONVERSION_MS = 36.86
 #: Taxels of a part that are closer than this are at the same place.
 SAME_PLACE_M = 1e-4
+#: Boards of a part whose periods differ by this factor are better in two parts.
+UNLIKE_PERIODS = 2
 #: Foam outside this range usually means a wrong unit.
 USUAL_FOAM_MM = (0.3, 30.0)
 #: Settings that are shown as they are.
@@ -213,6 +215,17 @@ def _part_warnings(layout: Layout) -> list[str]:
             warnings.append(
                 f"parts.{part.name}.foam_mm: {part.foam_mm:g}; foam is {low:g} to {high:g} mm "
                 "thick as a rule, and pressures are scaled by it: is it in mm?"
+            )
+        periods_ms = {
+            layout.boards[board].name: layout.boards[board].settings.period_ms
+            for board in part.boards
+        }
+        fast, slow = (choose(periods_ms, key=periods_ms.__getitem__) for choose in (min, max))
+        if periods_ms[slow] >= UNLIKE_PERIODS * periods_ms[fast]:
+            warnings.append(
+                f"parts.{part.name}: board {fast} sends every {periods_ms[fast]} ms and {slow} "
+                f"every {periods_ms[slow]} ms; a part is sampled as seldom as its slowest board "
+                "sends, and feels no shorter taps: wanted like period_ms, or two parts"
             )
         taxels = slice(part.start, part.stop)
         pressure = layout.pad_kind[taxels] == PadKind.PRESSURE

@@ -42,8 +42,7 @@ class RelaxationSettings(Struct, forbid_unknown_fields=True, kw_only=True, froze
     tau_s: Times | None = None
     beta_unload: Shares | None = None
     tau_unload_s: Times | None = None
-    #: States, and means from which drift is followed, are updated this often, every 0.2 to 5 s; 0
-    #: updates states at every sweep.
+    #: States are updated this often from means, every 0.2 to 5 s; 0 updates them at every sweep.
     update_s: Annotated[float, Meta(ge=0, le=5)] = 1.0
     #: A file written by `skin calibrate --relaxation`; it replaces the numbers above.
     file: FileName | None = None
@@ -105,7 +104,7 @@ def _misfit(table: RelaxationSettings) -> str | None:
     if 0.0 < table.update_s < SHORTEST_UPDATE_S:
         return (
             f"`update_s`: {table.update_s:g}; wanted 0, or {SHORTEST_UPDATE_S:g} to 5 s: means of "
-            "fewer sweeps hardly show drift"
+            "fewer sweeps are mostly noise"
         )
     if (table.beta is None) != (table.tau_s is None):
         return "`beta` and `tau_s` go together"

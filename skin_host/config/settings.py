@@ -58,8 +58,8 @@ class _Table(Struct, forbid_unknown_fields=True, kw_only=True, frozen=True):
 class Bus(_Table, frozen=True):
     """One CAN bus, opened by python-can."""
 
-    interface: Printable = "socketcan"
-    channel: Printable = "can0"
+    interface: Annotated[Printable, Meta(min_length=1)] = "socketcan"
+    channel: Annotated[Printable, Meta(min_length=1)] = "can0"
     bitrate: Annotated[int, Meta(ge=1000, le=10_000_000)] = 1_000_000
     #: Further keyword arguments for `can.Bus`, as python-can's own documentation names them.
     options: dict[Printable, Printable | int | float | bool] = {}

@@ -6,8 +6,12 @@ import logging
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from skin_host.bus.wire import TRIANGLES, StatusError
 from skin_host.clock import SYSTEM, Clock
-from skin_host.config.settings import Settings, skin_hash
+from skin_host.config.settings import Settings, format_triangles, skin_hash
 from skin_host.daemon.link import Link
 from skin_host.daemon.state import can_be_read, kept_path
 from skin_host.errors import CalibrationError, OtherSkinError, SkinError
@@ -26,6 +30,8 @@ log = logging.getLogger(__name__)
 GRACE_S = 5.0
 #: A calibration in which a board is zeroed takes longer, so many times.
 MOST_FALLS = 3
+#: Where no sample is usable, so many boards are named.
+NAMED_BOARDS = 4
 
 
 async def take_calibration(
@@ -40,7 +46,7 @@ async def take_calibration(
 
     Raises:
         BusError: a bus cannot be opened.
-        SkinError: no board sent a sweep.
+        SkinError: no board sent a sweep, or none with a usable sample.
     """
     engine = Engine(settings, layout, parts)
     link = Link(engine, clock=clock)
@@ -90,9 +96,11 @@ async def collect(
         clock: for waiting.
 
     Raises:
-        SkinError: no board sent a sweep.
+        SkinError: no board sent a sweep, or none with a usable sample.
     """
     engine().begin_calibration(seconds)
+    ledger = engine().ledger
+    before_sweeps = ledger.sweeps.copy()
     grown_s = clock.monotonic_s()
     share, falls = 0.0, 0
     while share < 1.0 and clock.monotonic_s() - grown_s < GRACE_S:
@@ -105,12 +113,49 @@ async def collect(
         progress(share)
     compute = engine().collected(clock.today().isoformat(timespec="seconds"))
     if share == 0.0 and not falls:
-        raise SkinError(
-            "no calibration: no board sent a sweep; check with `skin scan` whether the boards are "
-            "powered and answer"
-        )
+        now = engine().ledger
+        came = now.sweeps > (before_sweeps if now is ledger else 0)
+        raise SkinError(f"no calibration: {_why_none(engine(), came)}")
     # Of a large skin this takes a second, in which the boards' frames must be read.
     return await clock.in_thread(compute)
+
+
+def _why_none(engine: Engine, came: NDArray[np.bool_]) -> str:
+    """Return in words why there is no usable sample.
+
+    Args:
+        engine: that has none.
+        came: bool[b], the boards of its ledger that have sent sweeps.
+    """
+    if not came.any():
+        return (
+            "no board sent a sweep; check with `skin scan` whether the boards are powered and "
+            "answer"
+        )
+    found = [_of_board(engine, board, came) for board in engine.boards]
+    more = len(found) - NAMED_BOARDS
+    listed = "; ".join(found[:NAMED_BOARDS]) + (f"; and {more} more boards" if more > 0 else "")
+    return f"no taxel gave a usable sample: {listed}; `skin status` has all that is wrong"
+
+
+def _of_board(engine: Engine, board: int, came: NDArray[np.bool_]) -> str:
+    """Return in words what a board sends from which no sample is usable."""
+    ledger, known = engine.ledger, engine.layout.boards[board]
+    row = ledger.row[board]
+    by_fault: dict[str, list[int]] = {}
+    for number in range(TRIANGLES if came[row] else 0):
+        if known.enabled >> number & 1:
+            error = int(ledger.error[row, number])
+            fault = "with no usable value"
+            if not ledger.present[row, number]:
+                fault = "not received"
+            elif error & StatusError.NOT_CONNECTED:
+                fault = "not connected"
+            elif error & StatusError.NO_ACK:
+                fault = "without an answer on I2C"
+            by_fault.setdefault(fault, []).append(number)
+    faults = [f"triangles {format_triangles(those)} {fault}" for fault, those in by_fault.items()]
+    return f"board {known.name}: {', '.join(faults) or 'no sweep'}"
 
 
 def touched_meanwhile(found: Outcome, repeat: str) -> str | None:

@@ -399,12 +399,12 @@ class Daemon:
         self._use_usable()
 
     def _use_usable(self) -> None:
-        """Let contacts wait only for taxels that can be valid again."""
-        usable = self.engine.usable()
-        if usable is not None:
+        """Let contacts wait only for taxels that can be valid again, until these have decided."""
+        decides = self.engine.measurements()
+        if decides is not None:
             for index, contact in self._contacts.items():
                 part = self.layout.parts[index]
-                contact.use(usable[part.start : part.stop])
+                contact.use(decides[part.start : part.stop])
 
     def _doubt_contacts(self, taxels: NDArray[np.bool_], parts: list[int]) -> None:
         """Something may touch these taxels of some parts, bool[n], whose zero is not known."""

@@ -20,12 +20,10 @@ from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Bus, Receive
 from skin_host.errors import BusError, SkinError
 from skin_host.fingertip.service import StrainBoards
-from skin_host.processing.core import Engine, Output
+from skin_host.processing.core import EXPIRE_NS, Engine, Output
 
 log = logging.getLogger(__name__)
 
-#: Waiting sweeps and samples are checked this often.
-EXPIRE_NS = 20_000_000
 #: Frames that several buses with a common part sent within this time may be taken bus by bus.
 SLICE_NS = 10_000_000
 #: A turn that comes later than planned by this was held up by other work on this computer.

@@ -349,12 +349,15 @@ class _Receiver:
         if kind == "contact" and newness is not False:
             state = decode_contact(heard.payload)
             again = newness is None
-            robot.presence.take_state(PART, state, at_s, number, again=again, sent_s=sent_s)
+            stored = heard.retained
+            robot.presence.take_state(
+                PART, state, at_s, number, again=again, stored=stored, sent_s=sent_s
+            )
         elif kind == "health" and newness and not heard.retained:
             robot.presence.take_sign(PART, at_s, sent_s)
         elif kind == "status" and newness is not False:
             online = is_online(heard.payload, heard.stamp, is_only_broker=False)
-            robot.presence.take_node(NODE, online, number, again=newness is None)
+            robot.presence.take_node(NODE, online, at_s, number, again=newness is None)
         robot.note()
 
     def _pass_on(self, robot: _Received, events: Sequence[Any], now_s: float) -> None:

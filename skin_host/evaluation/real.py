@@ -114,6 +114,7 @@ def run(
     recordings: Path | None = None,
     *,
     with_emulation: bool = False,
+    may_be_absent: bool = False,
 ) -> Row:
     """Measure every recording of a folder.
 
@@ -122,14 +123,15 @@ def run(
         output: folder for real.json, real.html and real.md, or None.
         recordings: the folder; if not given, `RECORDINGS` where it is there.
         with_emulation: whether emulated pads are set beside the recorded ones, which takes minutes.
+        may_be_absent: whether `RECORDINGS` may have none: it lies beside some checkouts only.
 
     Returns:
-        `real`, a row for each recording, none if the folder does not exist; `published`, the
+        `real`, a row for each recording, none if there are none; `published`, the
         figures of others; `grasps`, or None; `emulated`, emulated pads beside those of
         `left_calibration`, if `with_emulation`; `absent`, the folder that does not exist, or None.
 
     Raises:
-        RequestError: the given folder has no recording.
+        RequestError: the folder has no recording.
         LogError: one of them is damaged.
         OSError: `output` cannot be written.
     """
@@ -138,6 +140,8 @@ def run(
     paths = sorted(folder.glob("*.npz"))
     if not paths and recordings is not None:
         raise RequestError(f"{folder}: no recording in it; wanted a folder with .npz files")
+    if not paths and not may_be_absent:
+        raise RequestError(_absent(folder))
     if quick:
         paths = [path for path in paths if path.stem in QUICK] or paths[:1]
     grasp_log = folder.parent / GRASPS
@@ -184,10 +188,14 @@ def run(
 def describe(document: Row) -> str:
     """The rows as text for a terminal."""
     if document["absent"] is not None:
-        return f"{document['absent']}: no recordings of real skin here; --recordings names a folder"
+        return _absent(document["absent"])
     head, rows = tables.real(document)
     lines = [as_text(head, rows), *page.remarks_on_real(document)]
     return "\n".join([*lines, f"in {document['seconds']} s on {document['machine']['processor']}"])
+
+
+def _absent(folder: Path | str) -> str:
+    return f"{folder}: no recordings of real skin here; --recordings names a folder"
 
 
 #: The recording that the emulator's Infinergy is fitted to.
@@ -290,7 +298,7 @@ def fit_pressures(path: Path) -> Calibration:
     n = min(len(recording.t_ns), len(recording.pressure_kpa))
     time_s: Floats = recording.t_ns[:n].astype(np.float64) * 1e-9
     load = LoadTable(path, time_s, recording.pressure_kpa[:n])
-    return fit_curves(samples, settings, layout, load)[0]
+    return fit_curves(samples, settings, layout, load).calibration
 
 
 def calibrate(recording: InsoleRecording, settings: Settings, layout: Layout) -> Calibration:

@@ -59,7 +59,7 @@ def run(quick: bool, output: Path | None, recordings: Path | None = None) -> Rep
         OSError: the folder cannot be written.
     """
     start_s, here = time.perf_counter(), machine()
-    real_skin = real.run(quick, None, recordings, with_emulation=not quick)
+    real_skin = real.run(quick, None, recordings, with_emulation=not quick, may_be_absent=True)
     found, seconds_of = _worked_out(jobs_of(quick))
     report: Report = {
         "schema": SCHEMA,

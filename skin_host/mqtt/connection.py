@@ -178,6 +178,8 @@ class Connection(aiomqtt.Client):
         self._read_packet, self._handle_packet = self._paho._packet_read, self._paho._packet_handle
         self._paho._packet_read, self._paho._packet_handle = self._bounded_read, self._checked
         self._sent: dict[int, asyncio.Future[None]] = {}
+        #: By number: requests whose senders wait for the acknowledgement.
+        self._requests: dict[int, asyncio.Future[str]] = {}
         #: Packets for which `flush` follows.
         self._held: list[bytes] = []
         self.when_clear: Callable[[], None] = lambda: None
@@ -334,12 +336,15 @@ class Connection(aiomqtt.Client):
             raise asyncio.CancelledError
         return result
 
-    async def listen_to(self, topic: str) -> bool:
-        """Subscribe with QoS 1; return whether the broker allows it. One that takes no wildcards is
-        not asked for any, because it would end the connection.
+    async def listen_to(self, topic: str, qos: int = 1, *, as_published: bool = True) -> bool:
+        """Subscribe; return whether the broker allows it. One that takes no wildcards is not asked
+        for any, because it would end the connection.
 
-        With MQTT 5 messages show whether they were published as retained, also those that come
-        while we listen.
+        Args:
+            topic: what to subscribe to.
+            qos: the greatest with which messages come.
+            as_published: with MQTT 5 messages show whether they were published as retained, also
+                those that come while we listen; else only what the broker had stored shows it.
 
         Raises:
             MqttError: the connection is lost, or there is no answer for `TIMEOUT_S`.
@@ -347,13 +352,39 @@ class Connection(aiomqtt.Client):
         if not self._takes_wildcards and any(one in topic for one in "+#"):
             return False
         if self._v5:
-            options = SubscribeOptions(qos=1, retainAsPublished=True)
+            options = SubscribeOptions(qos=qos, retainAsPublished=as_published)
             codes: Any = await self.subscribe(topic, options=options)
         else:
-            codes = await self.subscribe(topic, qos=1)
+            codes = await self.subscribe(topic, qos=qos)
         return not any(
             code.is_failure if isinstance(code, ReasonCode) else code >= 128 for code in codes
         )
+
+    async def request(self, topic: str, payload: bytes, properties: Properties | None) -> str:
+        """Publish with QoS 1 and wait for the acknowledgement.
+
+        Returns:
+            Why the broker refuses it, which MQTT 5 alone shows; "" if it does not.
+
+        Raises:
+            MqttError: the connection is lost, or there is no answer for `TIMEOUT_S`.
+        """
+        self.flush()
+        sent = self._client.publish(topic, payload, 1, False, properties)
+        if sent.rc != MQTT_ERR_SUCCESS:
+            raise aiomqtt.MqttCodeError(sent.rc, "not sent")
+        answer: asyncio.Future[str] = self._loop.create_future()
+        self._requests[sent.mid] = answer
+        try:
+            ends: list[asyncio.Future[Any]] = [answer, self._disconnected]
+            await asyncio.wait(ends, timeout=TIMEOUT_S, return_when=asyncio.FIRST_COMPLETED)
+            if answer.done():
+                return answer.result()
+            if self._disconnected.done():
+                await self.lost()
+            raise MqttError("Operation timed out")
+        finally:
+            del self._requests[sent.mid]
 
     async def lost(self) -> None:
         """Wait until the connection is lost.
@@ -425,6 +456,9 @@ class Connection(aiomqtt.Client):
         if reason_code.is_failure:
             self.refused += 1
             self.refusal = str(reason_code)
+        answer = self._requests.get(mid)
+        if answer is not None and not answer.done():
+            answer.set_result(str(reason_code) if reason_code.is_failure else "")
         done = self._sent.pop(mid, None)
         if done is not None and not done.done():
             done.set_result(None)

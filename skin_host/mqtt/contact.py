@@ -1,5 +1,6 @@
 """Contact state of a part, which fails safe. Pure: takes frames and events, returns the state."""
 
+import math
 from collections.abc import Iterable
 
 import numpy as np
@@ -8,13 +9,13 @@ from numpy.typing import NDArray
 from skin_host.layout import Layout, PadKind
 from skin_host.mqtt.messages import ContactState
 from skin_host.processing.contacts import LOST_NS
+from skin_host.processing.conversions import CONVERSION_S
 from skin_host.processing.events import Touch
 from skin_host.processing.masks import all_of, any_of
 from skin_host.processing.pipeline import PressureFrame
 
-#: A place that was not valid counts as untouched from this many frames on: so many votes, and one
-#: more, decide whether something touches it (`processing.touch`).
-SURE_FRAMES = 4
+#: Without a calibration, a place that was not valid counts as untouched after so many measurements.
+SURE_MEASUREMENTS = 4
 
 
 class PartContact:
@@ -22,8 +23,10 @@ class PartContact:
 
     ON: a taxel is touched. OFF: none is, and every triangle has a valid taxel, and all usable
     taxels that were touched when they were last valid, or whose contact was lost, are valid again,
-    in each case for `SURE_FRAMES`. UNKNOWN: all other cases. A triangle may miss frames for
-    `LOST_NS`, as a contact may; a part without any valid taxel is UNKNOWN at once.
+    in each case for the measurements in which they decide whether something touches them. A frame
+    is one measurement at most, and less where it comes sooner than a conversion. UNKNOWN: all other
+    cases. A triangle may miss frames for `LOST_NS`, as a contact may; a part without any valid
+    taxel is UNKNOWN at once.
 
     Args:
         layout: the skin.
@@ -45,14 +48,17 @@ class PartContact:
         self._starts = np.cumsum([0, *(len(one) for one in pads[:-1])])
         #: When each triangle last felt, `PressureFrame.elapsed_ns`.
         self._felt_ns = np.zeros(len(pads), np.int64)
-        #: Valid frames that are still wanted of the taxels where a contact was lost, and of each
+        #: Measurements in which each taxel, and the slowest of each triangle, decides. A
+        #: temperature pad is never valid, so nothing is waited for there.
+        self._decides = np.zeros(here.n_taxels)
+        self._decides[self._pads] = SURE_MEASUREMENTS
+        self._triangle_decides = np.full(len(pads), float(SURE_MEASUREMENTS))
+        #: Measurements that are still wanted of the taxels where a contact was lost, and of each
         #: triangle.
-        self._lost = np.zeros(here.n_taxels, np.uint8)
-        #: A temperature pad is never valid, so nothing is waited for there.
-        self._can_be_valid = np.zeros(here.n_taxels, np.bool_)
-        self._can_be_valid[self._pads] = True
-        self._usable = self._can_be_valid
-        self._unsure = np.full(len(pads), SURE_FRAMES, np.uint8)
+        self._lost = np.zeros(here.n_taxels)
+        self._unsure = self._triangle_decides.copy()
+        #: `PressureFrame.elapsed_ns` of the last frame.
+        self._elapsed_ns = -math.inf
         #: Whether any of these is wanted.
         self._is_unsure = True
         #: The valid taxels of the last frame, and the triangles that have any.
@@ -65,12 +71,13 @@ class PartContact:
 
     def step(self, frame: PressureFrame, events: Iterable[Touch]) -> ContactState:
         """Take a frame and the events of its contacts; return the state."""
+        passed_ns = frame.elapsed_ns - self._elapsed_ns
+        self._elapsed_ns = frame.elapsed_ns
         for event in events:
             if event.event == "end":
                 self._present.discard(event.id)
                 if event.reason == "lost":
-                    self._lost[event.taxels] = SURE_FRAMES
-                    self._lost[~self._usable] = 0
+                    self._lost[event.taxels] = self._decides[event.taxels]
                     self._is_unsure = True
             else:
                 self._present.add(event.id)
@@ -87,9 +94,13 @@ class PartContact:
             return "ON" if self._present or any_of(frame.touched) else "OFF"
         feels = self._feels
         self._felt_ns[feels] = frame.elapsed_ns
-        self._unsure[frame.elapsed_ns - self._felt_ns >= LOST_NS] = SURE_FRAMES
-        self._unsure -= feels & (self._unsure > 0)
-        self._lost -= frame.valid & (self._lost > 0)
+        unfelt = frame.elapsed_ns - self._felt_ns >= LOST_NS
+        np.copyto(self._unsure, self._triangle_decides, where=unfelt)
+        measurements = min(max(passed_ns * 1e-9 / CONVERSION_S, 0.0), 1.0)
+        self._unsure -= measurements * feels
+        self._lost -= measurements * frame.valid
+        for wanted in (self._unsure, self._lost):
+            np.maximum(wanted, 0.0, out=wanted)
         self._is_unsure = any_of(self._unsure > 0) or any_of(self._lost > 0)
         if any_of(frame.touched):
             return "ON"
@@ -103,17 +114,22 @@ class PartContact:
         """Something may touch these taxels [m], as it did when they were last valid, when an
         earlier daemon ended, or while the part was disabled.
         """
-        self._lost[taxels & self._usable] = SURE_FRAMES
+        np.copyto(self._lost, self._decides, where=taxels)
         self._is_unsure = True
 
-    def use(self, usable: NDArray[np.bool_]) -> None:
-        """A calibration has found which taxels [m] are usable: no other will be valid again."""
-        self._usable = usable & self._can_be_valid
-        self._lost[~self._usable] = 0
+    def use(self, decides: NDArray[np.int64]) -> None:
+        """A calibration has found how many measurements int[m] each taxel takes for a decision; 0:
+        it is not usable, and will not be valid again.
+        """
+        self._decides[self._pads] = found = decides[self._pads]
+        self._triangle_decides = np.maximum(np.maximum.reduceat(found, self._starts), 1.0)
+        # Of what is waited for, all is wanted again.
+        np.copyto(self._lost, self._decides, where=self._lost > 0.0)
+        np.copyto(self._unsure, self._triangle_decides, where=self._unsure > 0.0)
 
     def stop(self, events: Iterable[Touch]) -> ContactState:
         """End the contacts, because no data of the part will come for a while."""
         self._present.difference_update(event.id for event in events)
-        self._unsure[:] = SURE_FRAMES
+        self._unsure[:] = self._triangle_decides
         self._is_unsure = True
         return "UNKNOWN"

@@ -33,6 +33,9 @@ INFO_SCHEMA: Final = "skin.info/1"
 #: As on the page and in `skin status`: anything but `ok` is a problem, with its sentences.
 PROBLEM: Final = "{{ 'OFF' if value_json.state == 'ok' else 'ON' }}"
 WHY: Final = "{{ {'state': value_json.state, 'sentences': value_json.sentences} | tojson }}"
+#: Health comes once a second. A broker that has stored the last one may be all that is left of a
+#: robot: after so many seconds without another it is unavailable.
+EXPIRE_S: Final = 10
 #: A part that cannot feel is not "not touched": its contact is unavailable.
 FEELS: Final = (
     "{{ 'online' if value_json.state in ('ok', 'warning', 'degraded', 'saturated') "
@@ -319,6 +322,7 @@ def discovery(prefix: str, topics: Topics, info: NodeInfo) -> dict[str, bytes]:
             "value_template": PROBLEM,
             "json_attributes_topic": health,
             "json_attributes_template": WHY,
+            "expire_after": EXPIRE_S,
             "availability": [alive],
         }
     common = {

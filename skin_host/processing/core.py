@@ -4,7 +4,7 @@ One engine serves both the daemon and the replay of recordings. It has no clock 
 takes frames and times, and returns frames of pressure and events.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
@@ -30,6 +30,9 @@ from skin_host.processing.pressure import PressureCurve, vertex
 
 if TYPE_CHECKING:
     from skin_host.fingertip.engine import FingertipEngine
+
+#: Waiting sweeps and samples are checked this often, see `Engine.expire`.
+EXPIRE_NS = 20_000_000
 
 
 class Step(NamedTuple):
@@ -199,7 +202,9 @@ class Engine:
         self.calibration = calibration
         boards = self.boards if boards is None else boards
         noise = np.where(calibration.verdict < Verdict.ABSENT, calibration.noise, np.nan)
-        self.intake.use(noise, np.isin(self.boards, boards))
+        curves = calibration.curves
+        pressed = None if curves is None else np.where(curves.own, curves.noise_units, np.nan)
+        self.intake.use(noise, np.isin(self.boards, boards), pressed)
         if self.fingertips is not None and boards == self.boards:
             self._ended += self.fingertips.use(calibration.zeros)
         self.zeros.calibrated(boards)
@@ -303,13 +308,12 @@ class Engine:
         taken = self._take(sweeps) if sweeps else []
         return Output(sweeps, self._process(taken) if taken else [], samples, grasps, answers)
 
-    def feed_long(self, bus: str, batch: FrameBatch) -> Iterator[Output]:
-        """Process a batch that spans many sweeps; yield a result for each, as if it came alone.
+    def take(self, sweep: Sweep) -> Output:
+        """Process a sweep of a long batch that its bus's assembler was fed, as if it came alone.
 
-        For skins without fingertips, whose results would have to be put between them.
+        For skins without fingertips, whose results would have to be put between those of sweeps.
         """
-        for sweep in self.assemblers[bus].feed(batch).sweeps:
-            yield Output([sweep], self._process(self._take([sweep])), [], [], [])
+        return Output([sweep], self._process(self._take([sweep])), [], [], [])
 
     def judge(self) -> None:
         """Do deferred work, if there is any, so that the next sweep does not wait for it."""
@@ -361,6 +365,15 @@ class Engine:
         if self.calibration is None or self._pipeline is None:
             return None
         return self.calibration.usable & ~self.zeros.cut_off() & ~self._pipeline.unreached
+
+    def measurements(self) -> NDArray[np.int64] | None:
+        """Return in how many measurements each taxel int64[n] decides whether it is touched; 0: it
+        cannot be valid, now or later. None without a calibration.
+        """
+        usable = self.usable()
+        if usable is None or self._pipeline is None:
+            return None
+        return np.where(usable, self._pipeline.measurements, 0)
 
     def stuck(self) -> Mask:
         """Return the taxels bool[n] whose pads are stuck in a living triangle."""

@@ -52,6 +52,9 @@ REFERENCES = 4
 ALIKE_SHARE = 0.8
 #: Means of a window that differ by no more are the same: five times their noise on good pads.
 TOLERANCE_UNITS = 0.5
+#: Conversions of a window of a second at 50 ms: the mean of fewer is too noisy for that tolerance.
+#: Whether the part moves alike is decided by means over as many.
+CONVERSIONS = 20.0
 #: Drift that skinManager follows reaches 0.2; air in the insole presses at 0.4 to 1.5.
 QUICK_UNITS_PER_S = 0.4
 #: Drift that a load may hide: 10 degrees in 10 minutes are 0.008.
@@ -153,12 +156,17 @@ class BaselineTracker:
         #: Whether something may press on the whole part without any of its taxels being touched
         #: yet.
         self._loaded = False
+        #: Whether the last window's common change was not followed at once.
+        self._behind = False
         #: Whether any taxel is not idle.
         self._unsettled = False
         self._fallen_s: Array = np.zeros(n)
         self._former: Array = np.zeros(n)
         self._former_s: Array = np.zeros(n)
         self._last: Array = np.zeros(n)
+        #: How far each reading is from what the untouched ones have in common, over as many windows
+        #: as `CONVERSIONS` take.
+        self._apart: Array = np.zeros(n)
         #: For how long each taxel has been free of touch, and its lowest reading since.
         self._free_s: Array = np.full(n, np.inf)
         self._lowest: Array = np.full(n, np.inf)
@@ -183,6 +191,7 @@ class BaselineTracker:
         missing: Mask,
         dt_s: float,
         relaxed_units: Array | float = 0.0,
+        conversions: Array | float = CONVERSIONS,
     ) -> NDArray[np.intp] | None:
         """Move the baselines, in place.
 
@@ -191,14 +200,15 @@ class BaselineTracker:
                 of temperature pads count too.
             touched: taxels [n] that were touched at any time in it.
             missing: taxels [n] that were received too rarely in it for a mean.
-            dt_s: that time.
+            dt_s: that time. Where it is 0, nothing has changed.
             relaxed_units: the relaxation [n] that units was corrected for.
+            conversions: how many independent measurements are in each mean, a number or [n].
 
         Returns:
             Numbers of taxels whose touch was recognised as drift, or None. Their baselines have
             moved up to their readings.
         """
-        if self._settings.rule == "none":
+        if self._settings.rule == "none" or dt_s <= 0.0:
             return None
         touched = touched & self._usable
         hidden = self._usable & (touched | missing)
@@ -211,10 +221,12 @@ class BaselineTracker:
             self._note_drift(forecast)
 
         received = int(np.count_nonzero(self._usable & ~missing))
-        common = self._common(units, free & ~recovering, received, dt_s)
+        shows = free & ~recovering
+        share = _share(conversions)
+        common = self._common(units, shows, received, np.where(shows | missing, share, 1.0), dt_s)
         if self._is_calm(units, common, hidden, dt_s):
             change = self._own(units - common, self._settings.rate_units_per_s * dt_s, dt_s)
-            self._move(change + common, forecast)
+            self._move(change + common, common, forecast)
             return None
         state = self._states(units, touched, hidden, recovering, dt_s)
         held = recovering & ~self._remains(units, hidden, dt_s)
@@ -240,7 +252,7 @@ class BaselineTracker:
         change += self._given_back(units, level, touched, released | ended, dt_s)
         back = still & self._back(level, dt_s)
         change[back] = (self._former - self.baseline)[back]
-        self._move(change, forecast)
+        self._move(change, common, forecast)
         self._unsettled = self._touches.fading or bool(
             np.count_nonzero(self._fallen_s)
             or np.count_nonzero(self._former_s > 0.0)
@@ -263,6 +275,7 @@ class BaselineTracker:
         touched_s = self._touches.touched_s
         for memory in (self._fallen_s, self._former_s, self._taken_s, self._loaded_s, touched_s):
             memory[taxels] = 0.0
+        self._apart[taxels] = 0.0
         if self._thermal is not None:
             self._thermal.forget(taxels)
 
@@ -303,22 +316,26 @@ class BaselineTracker:
         edge = (self.baseline <= self._low) | (self.baseline >= self._high)
         return edge & self._usable
 
-    def _common(self, units: Array, free: Mask, received: int, dt_s: float) -> float:
+    def _common(self, units: Array, free: Mask, received: int, share: Array, dt_s: float) -> float:
         """Return how much of the untouched taxels' common change is followed.
 
         Args:
             units, dt_s: see `step`.
             free: untouched taxels, bool[n].
             received: how many usable taxels were received, touched ones as well.
+            share: of this window [n] in the mean by which each taxel moves alike or does not.
         """
         self._loaded = False
         reading = units[free]
         if len(reading) < REFERENCES:
             return 0.0
         median = _median(reading)
-        self._loaded = median > QUICK_UNITS_PER_S * dt_s
-        alike = np.count_nonzero(np.abs(reading - median) < TOLERANCE_UNITS)
-        if alike >= ALIKE_SHARE * received and not self._loaded:
+        # Where noise has made the last window differ, this one has the drift of both.
+        self._loaded = median > QUICK_UNITS_PER_S * dt_s * (2.0 if self._behind else 1.0)
+        self._apart += share * (units - median - self._apart)
+        alike = np.count_nonzero(np.abs(self._apart[free]) < TOLERANCE_UNITS)
+        self._behind = bool(self._loaded or alike < ALIKE_SHARE * received)
+        if not self._behind:
             return median
         reading = reading[reading > FALLEN_UNITS]
         if len(reading) < REFERENCES:
@@ -336,8 +353,9 @@ class BaselineTracker:
             or np.count_nonzero((units < FALLEN_UNITS) & self._usable)
         )
 
-    def _move(self, change: Array, forecast: Array | None) -> None:
-        """Move the baselines, within their limits."""
+    def _move(self, change: Array, common: float, forecast: Array | None) -> None:
+        """Move the baselines, within their limits, by `common` and what each moves beyond it."""
+        self._apart -= change - common
         if forecast is not None:
             change += forecast
         change *= self._usable
@@ -550,6 +568,16 @@ class _Touches:
         return touched & (units < RELEASED_SHARE * self._peak) & (units < unseen)
 
 
+def _share(conversions: Array | float) -> Array:
+    """Return the weight of a mean of so many conversions in one that is as steady as `CONVERSIONS`.
+
+    Independent means, each of which enters a running mean with the share a, leave a / (2 - a) of
+    their variance.
+    """
+    share: Array = np.minimum(2.0 * conversions / (conversions + CONVERSIONS), 1.0)
+    return share
+
+
 def _median(values: Array) -> float:
     """Return the upper median; numpy's own takes five times as long for so few values."""
     middle = len(values) // 2
@@ -582,8 +610,6 @@ class _ThermalReference:
 
         The temperature stays as it was where a pad that measures it is missing.
         """
-        if dt_s <= 0.0:  # two samples of one time, as after a stall: nothing has changed
-            return np.zeros(len(baseline))
         pads, triangles = self._pads, len(self._pads_of)
         sums = np.bincount(self._triangle[pads], units[pads], minlength=triangles)
         now = (sums / np.maximum(self._pads_of, 1))[self._triangle]

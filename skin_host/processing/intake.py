@@ -166,16 +166,22 @@ class Intake:
             for board in state.rows:
                 self._of_board[board].append(state)
 
-    def use(self, noise: NDArray[np.float64] | None, boards: Mask) -> None:
+    def use(
+        self,
+        noise: NDArray[np.float64] | None,
+        boards: Mask,
+        pressed_units: NDArray[np.float64] | None = None,
+    ) -> None:
         """Use a calibrated noise.
 
         Args:
             noise: float64[n] over the skin in units, NaN where it is not known, or None without a
                 calibration.
             boards: bool[b], the calibrated ones; the others continue unchanged.
+            pressed_units: float64[n], noise as measured under pressure, NaN where it is not known.
         """
         self.judge()
-        before, self.liveness = self.liveness, self._new_liveness(noise)
+        before, self.liveness = self.liveness, self._new_liveness(noise, pressed_units)
         self.liveness.keep(before, ~boards)
         for row in np.flatnonzero(boards).tolist():
             self.veto.pop(row, None)
@@ -416,20 +422,28 @@ class Intake:
             self._felt_before = felt.copy(), found
         return found
 
-    def _new_liveness(self, noise: NDArray[np.float64] | None) -> Liveness:
+    def _new_liveness(
+        self,
+        noise: NDArray[np.float64] | None,
+        pressed_units: NDArray[np.float64] | None = None,
+    ) -> Liveness:
         boards = [self._layout.boards[board] for board in self._boards]
-        of_pads: NDArray[np.float64] | None = None
-        if noise is not None:
-            of_pads = np.where(self.taxels >= 0, noise[self.taxels], 0.0)
+
+        def of_pads(of_taxels: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+            if of_taxels is None:
+                return None
+            return np.where(self.taxels >= 0, of_taxels[self.taxels], 0.0)
+
         return Liveness(
             len(self._encodings),
-            of_pads,
+            of_pads(noise),
             np.array([board.settings.period_ms * 1e-3 for board in boards]),
             Repeats(self._encodings),
             len(boards),
             np.array(
                 [number in board.triangles for board in boards for number in range(TRIANGLES)]
             ),
+            of_pads(pressed_units),
         )
 
     def _new_state(self, index: int, silent_periods: float) -> _PartState:

@@ -22,8 +22,8 @@ Single pads are judged in `stuck`.
 Much of what a step costs is that its code is found cold. So a sweep by which no decision can change
 waits until the second or third one after it, and then they are taken one after the other.
 
-Only conversions count: a chip needs 36.9 ms for its twelve stages (AD7147, decimation 256),
-and a board that sends more often repeats its values.
+Only conversions count (`conversions`): a board that sends more often repeats its values. What a pad
+does in successive conversions may be some sweeps apart then.
 """
 
 import math
@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.bus.compensation import NO_GAIN, THERMAL_TAXEL
+from skin_host.processing.conversions import CONVERSION_S, YOUNG_S
 from skin_host.processing.masks import Mask, all_of, any_of, count_of
 from skin_host.processing.stuck import (
     MOST_RATE,
@@ -49,7 +50,6 @@ Floats = NDArray[np.float64]
 
 PADS = 12
 
-CONVERSION_S = 0.0369
 #: A run of repeats with a probability below 1/odds is not chance.
 TRIANGLE_ODDS = 1e9
 #: However lively it was, a triangle is not called frozen in less than nine conversions (0.45 s at
@@ -73,12 +73,12 @@ USUAL_NOISE_UNITS = 0.5
 NOISY_UNITS = 3.0
 NOISY_SIGMAS = 5.0
 #: A taxel is noisy when its jumps, as multiples of that limit (at most this large), exceed this on
-#: average over all samples; and calm again below. Large jumps are rarer by chance than many.
+#: average over all conversions; and calm again below. Large jumps are rarer by chance than many.
 MOST_JUMP = 2.0
 NOISY_MEAN = 0.5
 CALM_MEAN = 0.1
-NOISE_MEMORY_SAMPLES = 8
-#: A pad has jumped lately while that mean is above this: for some 25 samples.
+NOISE_MEMORY_CONVERSIONS = 8
+#: A pad has jumped lately while that mean is above this: for some 25 conversions.
 LATELY_MEAN = 0.01
 #: So many sweeps may wait where no step is far: a jump takes two far steps, and noise two jumps.
 MOST_WAITING = 2
@@ -87,9 +87,9 @@ MOST_WAITING = 2
 #: jumped lately, or jumps again so soon, is a fault of the pad, not of the bus.
 SPIKE_UNITS = 7.0
 SPIKE_SIGMAS = 8.0
-#: A spike that has not been counted when so many sweeps could not be compared, in a silence or one
-#: here and one there, is over: what is counted is what happens now.
-SPIKE_SWEEPS = 25
+#: A spike that has not been counted when so many conversions could not be compared, in a silence or
+#: one here and one there, is over: what is counted is what happens now.
+SPIKE_CONVERSIONS = 25
 #: Bytes on both sides of a gap of so many sweeps are of one zero, and show whether a chip lives. In
 #: a longer one the board may have restarted.
 FEW_MISSED = 5
@@ -119,6 +119,8 @@ class Liveness:
         repeats: finds which pads send something new; without it, those whose byte changes.
         boards: how many boards.
         fitted: bool[k], triangles that there are, all by default; nothing of others is received.
+        pressed_units: float64[k, 12], noise as measured under pressure, NaN where it is not known.
+            Real pads jump more then, and do not count as noisy for that.
 
     Attributes:
         frozen: bool[k], triangles that repeat their bytes for longer than chance explains.
@@ -131,9 +133,9 @@ class Liveness:
         lifeless: bool[k, 12], doubted pads whose bytes show nothing of the skin, or None if none
             are: not those that are only noisy.
         spikes: int64[k, 12], how often each pad, alone in its triangle, was off for one sweep and
-            back in the next, and did not jump in some 25 sweeps before and after: a damaged frame
-            does that, a sensor at rest does not. One is counted when that is known, if nothing
-            touched the triangle until then: real pads jump under pressure.
+            back in the next, and did not jump in some 25 conversions before and after: a damaged
+            frame does that, a sensor at rest does not. One is counted when that is known, if
+            nothing touched the triangle until then: real pads jump under pressure.
     """
 
     def __init__(
@@ -144,6 +146,7 @@ class Liveness:
         repeats: Repeats | None = None,
         boards: int = 1,
         fitted: Mask | None = None,
+        pressed_units: Floats | None = None,
     ) -> None:
         shape = (k, PADS)
         self._boards = boards
@@ -173,7 +176,8 @@ class Liveness:
         # Without a calibration, or if a pad was absent from it or its triangle constant, it is not
         # known how much noise is too much.
         known = ~constant[:, None] & measured & calibrated
-        self._jump = np.where(known, np.maximum(NOISY_UNITS, NOISY_SIGMAS * noise_units), np.inf)
+        most = noise_units if pressed_units is None else np.fmax(noise_units, pressed_units)
+        self._jump = np.where(known, np.maximum(NOISY_UNITS, NOISY_SIGMAS * most), np.inf)
         #: Steps are whole units, at most 255.
         self._jump_units = np.minimum(np.floor(self._jump), 255.0).astype(np.uint8)
         self._spike = np.maximum(SPIKE_UNITS, SPIKE_SIGMAS * noise_units)
@@ -181,11 +185,19 @@ class Liveness:
         self._raw = np.zeros(shape, np.uint8)
         self._present = np.zeros(k, np.bool_)
         self._all_present = False
-        #: The step to the last bytes; if nothing needed it yet, the bytes before them.
-        self._step = np.zeros(shape, np.int16)
-        self._earlier = np.zeros(shape, np.uint8)
-        self._owes_step = False
+        # A step may be followed by the next one after so many sweeps of repeats.
+        sweeps = np.ceil(YOUNG_S / period_s).clip(1, 255).astype(np.uint8)
+        self._step_sweeps = np.repeat(sweeps, PADS).reshape(shape)
+        self._most_step_sweeps = int(sweeps.max(initial=1))
+        #: The last far step of each pad: for how many sweeps it still counts, its size and whether
+        #: it went up; and for how many sweeps any counts at most.
+        self._step_left, self._step_size = (np.zeros(shape, np.uint8) for _ in range(2))
+        self._step_up = np.zeros(shape, np.bool_)
+        self._any_step_left = 0
         self._jumping = np.zeros(shape)
+        forget = np.repeat(self._share / NOISE_MEMORY_CONVERSIONS, PADS)
+        self._jumping_kept: Floats = 1.0 - forget.reshape(shape)
+        self._spike_sweeps: Floats = SPIKE_CONVERSIONS / self._share
         self._any_jumping = False
         #: Pads with a spike that are not known yet to stay calm.
         self._spiked = np.zeros(shape, np.bool_)
@@ -210,10 +222,6 @@ class Liveness:
         self._now_alive = np.zeros(k, np.bool_)
         self._size, self._least = (np.zeros(shape, np.uint8) for _ in range(2))
         self._far = np.zeros(shape, np.bool_)
-        #: Which pads' last step was far, if that is known.
-        self._was_far = np.zeros(shape, np.bool_)
-        self._knows_far = False
-        self._both_far = np.zeros(shape, np.bool_)
         self._to_show = np.where(constant, PROBATION_CHANGES, FIRST_CHANGES) * fitted
         self.frozen: Mask = np.zeros(k, np.bool_)
         self.unproven: Mask = self._to_show > 0
@@ -285,8 +293,7 @@ class Liveness:
         """
         if self.doubted is not None or self._any_jumping or not self._all_present:
             return 0
-        calm = self._knows_far and not any_of(self._was_far)
-        room = min(MOST_WAITING if calm else 1, self._pads.steps_without_decision)
+        room = min(1 if self._any_step_left else MOST_WAITING, self._pads.steps_without_decision)
         if room > 0 and self._any_surprise:
             most = float((self._surprise + room * self._expected).max())
             return room if most < math.log(TRIANGLE_ODDS) else 0
@@ -324,7 +331,6 @@ class Liveness:
             within &= compared[:, None]
         self._pads.step(raw, changed, within, self.unproven, felt, came)
         if whole:
-            self._raw, self._earlier = self._earlier, self._raw
             self._raw[:] = raw
         else:
             np.copyto(self._raw, raw, where=present[:, None])
@@ -358,11 +364,9 @@ class Liveness:
         before them.
         """
         self.catch_up()
-        self._settle_step()
-        self._knows_far = False
-        triangles = len(self._step) // self._boards
+        triangles = len(self._raw) // self._boards
         mine = slice(triangles * board, triangles * (board + 1))
-        self._step[mine] = 0
+        self._step_left[mine] = 0
         self._uncompared[mine] += missed
         if missed > FEW_MISSED:
             self._present[mine] = False
@@ -376,8 +380,9 @@ class Liveness:
         Of the other boards, which were calibrated, triangles and pads that had to show that they
         live still have to: a calibration goes on with what was known of those that did not.
         """
-        self._settle()
-        before._settle()
+        for one in (self, before):
+            one.catch_up()
+            one._pads.settle()
         self.spikes = before.spikes
         rows = np.repeat(boards, len(self.frozen) // len(boards))
         constant = self._constant & ~rows
@@ -389,6 +394,7 @@ class Liveness:
                     chosen = boards if len(array) == len(boards) else rows
                     array[chosen] = getattr(its, name)[chosen]
         self._repeats.keep(before._repeats, rows)
+        self._any_step_left = self._most_step_sweeps
         self._any_jumping = any_of(self._jumping > 0.0)
         self._any_noisy = any_of(self.noisy)
         # Those that live have shown it to the predecessor.
@@ -403,18 +409,6 @@ class Liveness:
         self._until_learning = 0
         self._pads.keep_stuck(before._pads)
         self._doubt()
-
-    def _settle(self) -> None:
-        """Compute what was left until somebody needs it."""
-        self.catch_up()
-        self._pads.settle()
-        self._knows_far = False
-        self._settle_step()
-
-    def _settle_step(self) -> None:
-        if self._owes_step:
-            self._owes_step = False
-            np.subtract(self._raw, self._earlier, out=self._step, dtype=np.int16)
 
     def _what_is_felt(self, touched: Mask) -> TouchedPads:
         """Return the consequences of which pads are touched; mostly those of the last sweep."""
@@ -477,60 +471,80 @@ class Liveness:
     def _note_jumps(
         self, raw: NDArray[np.uint8], changed: Mask, compared: Mask, whole: bool
     ) -> None:
-        """A step up followed by a step down is noise; a touch goes in one direction at a time."""
+        """A step up followed by a step down is noise; a touch goes in one direction at a time.
+
+        What lies between are repeats, or what the board takes off as its temperature pad moves.
+        """
         size = np.maximum(raw, self._raw, out=self._size)
         size -= np.minimum(raw, self._raw, out=self._least)
         far = np.greater(size, self._jump_units, out=self._far)
         if not whole:
             far &= changed
-        if whole:
-            # A jump takes two far steps.
-            knew, self._knows_far = self._knows_far, True
-            self._far, self._was_far = self._was_far, far
-            if not any_of(far) or (
-                knew and not any_of(np.logical_and(far, self._far, out=self._both_far))
-            ):
-                self._owes_step = True
-                if self._any_jumping:
-                    self._jumping -= self._jumping / NOISE_MEMORY_SAMPLES
-                    self._note_noise()
-                return
-        else:
-            self._knows_far = False
-        self._settle_step()
-        step = np.subtract(raw, self._raw, dtype=np.int16)
-        if not whole:
-            step *= changed
         if self._any_over_gap:
-            step[self._over_gap] = 0
-        jump = far & (np.abs(self._step) > self._jump_units) & ((step ^ self._step) < 0)
-        if not self._any_jumping and not any_of(jump):
-            np.copyto(self._step, step, where=compared[:, None])
-            return
-        both = np.minimum(np.abs(step), np.abs(self._step))
-        spike = jump & (both > self._spike) & (np.abs(step + self._step) <= self._jump_units)
+            far[self._over_gap] = False
+        any_far = any_of(far)
+        jump: Mask | None = None
+        if any_far:
+            up = raw > self._raw
+            if self._any_step_left:
+                jump = far & (self._step_left > 0) & (up ^ self._step_up)
+        here = None if whole else compared
+        if jump is not None and any_of(jump):
+            self._count_jumps(jump, size, here)
+        elif self._any_jumping:
+            self._note_noise(here)
+        if self._any_step_left:
+            counts = self._step_left > 0
+            if whole:
+                self._step_left -= counts
+                self._any_step_left -= 1
+            else:
+                self._step_left -= counts & compared[:, None]
+                self._any_step_left = int(self._step_left.max())
+        if any_far:
+            self._any_step_left = self._most_step_sweeps
+            np.copyto(self._step_left, self._step_sweeps, where=far)
+            np.copyto(self._step_size, size, where=far)
+            np.copyto(self._step_up, up, where=far)
+
+    def _count_jumps(self, jump: Mask, size: NDArray[np.uint8], compared: Mask | None) -> None:
+        """Take far steps, bool[k, 12], of so many units each, that went back from a far one."""
+        both = np.minimum(size, self._step_size)
+        # What goes on for longer than one sweep is no damaged frame.
+        spike = jump & (both > self._spike) & (self._step_left == self._step_sweeps)
+        # The sizes differ by what is left of the two steps.
+        spike &= np.maximum(size, self._step_size) - both <= self._jump_units
         spike &= self._jumping < LATELY_MEAN
         self._spiked &= ~jump
         alone = count_of(spike) == 1
         self._spiked |= spike & alone[:, None]
         self._uncompared[alone] = 0
-        np.copyto(self._step, step, where=compared[:, None])
-        jumped = jump * np.minimum(both / self._jump, MOST_JUMP)
-        self._jumping += compared[:, None] * (jumped - self._jumping) / NOISE_MEMORY_SAMPLES
-        self._note_noise()
+        jumped: Floats = np.minimum(both / self._jump, MOST_JUMP)
+        jumped *= jump
+        self._note_noise(compared, jumped)
 
     def _note_spikes(self, touched: Mask | None) -> None:
         """Count the spikes of pads that have stayed calm since, and forget those of touched
         triangles, and of what was not received too often to know that soon.
         """
-        self._spiked &= (self._uncompared < SPIKE_SWEEPS)[:, None]
+        self._spiked &= (self._uncompared < self._spike_sweeps)[:, None]
         if touched is not None:
             self._spiked &= (count_of(touched) == 0)[:, None]
         calm = self._spiked & (self._jumping < LATELY_MEAN)
         self.spikes += calm
         self._spiked ^= calm
 
-    def _note_noise(self) -> None:
+    def _note_noise(self, compared: Mask | None, jumped: Floats | None = None) -> None:
+        """Take the jumps of a sweep, as multiples of the limit, in the mean over conversions.
+
+        Args:
+            compared: bool[k], triangles of the sweep; None if all.
+            jumped: float64[k, 12], if there are any.
+        """
+        kept = self._jumping_kept
+        self._jumping *= kept if compared is None else np.where(compared[:, None], kept, 1.0)
+        if jumped is not None:
+            self._jumping += jumped / NOISE_MEMORY_CONVERSIONS
         self._jumping[self._jumping < 1e-3] = 0.0
         self._any_jumping = any_of(self._jumping > 0.0)
         self.noisy = self._jumping > np.where(self.noisy, CALM_MEAN, NOISY_MEAN)

@@ -2,7 +2,8 @@
 
 The work per sweep is small: a parabola per taxel, or its own table, converts its byte into
 pressure. Everything slow - relaxation, drift, and with them the parabola and the byte from which
-on a taxel may be touched - is updated once a window (1 s by default) from the means of that time.
+on a taxel may be touched - is updated once a window from the means of that time: drift once a
+second, relaxation as often as the configuration wants it.
 A sweep in which no byte comes near its limit, and no taxel has evidence of an earlier one, is
 recognised as untouched by one comparison of bytes.
 """
@@ -17,6 +18,7 @@ from skin_host.config.relaxation import RelaxationSettings
 from skin_host.config.settings import Processing
 from skin_host.layout import Layout, PadKind, PartLayout
 from skin_host.processing.calibration import Calibration
+from skin_host.processing.conversions import CONVERSION_S
 from skin_host.processing.curves import (
     Curve,
     Curves,
@@ -37,7 +39,7 @@ from skin_host.processing.touch import Levels, Residuals, TouchDetector, levels
 #: A longer step is a gap or a jump of the clock. The foam's model is advanced by it, under the
 #: readings after it; nothing else depends on its length.
 LONGEST_STEP_S = 1.0
-#: Baselines move this often if the relaxation model needs every sample.
+#: Baselines move this often.
 WINDOW_S = 1.0
 #: If the pressures of an untouched part are not subscribed, they are computed once in this time.
 IDLE_UPDATE_S = 0.2
@@ -95,6 +97,7 @@ class Pipeline:
         baseline: float64[n], activation of the untouched taxels in units, drift included.
         relaxation_kpa: float32[n], pressure that the foam has lost by now.
         enter: float64[n], the threshold of touch, in units, see `touch.Levels`.
+        measurements: int64[n], in which a touch is decided, see `touch.Levels`.
         unreached: bool[n], taxels that are not used because no reading of them is a touch.
         flat: bool[n], those of them whose curve of pressure does not rise with each unit.
     """
@@ -105,6 +108,7 @@ class Pipeline:
         self.relaxation_kpa = np.zeros(layout.n_taxels, np.float32)
         rules = _Rules.of(layout, settings, calibration)
         self.enter = rules.levels.enter
+        self.measurements = rules.levels.measurements(settings.touch.votes_of_3)
         self.unreached, self.flat = rules.unreached, rules.unreached & ~rules.curve.sound
         self._parts = [_PartPipeline(self, layout, part, rules) for part in layout.parts]
 
@@ -129,6 +133,7 @@ class Pipeline:
         np.copyto(self.baseline, calibration.baseline, where=zeroed)
         rules = _Rules.of(self._layout, settings, calibration)
         self.enter = rules.levels.enter
+        self.measurements = rules.levels.measurements(settings.touch.votes_of_3)
         self.unreached, self.flat = rules.unreached, rules.unreached & ~rules.curve.sound
         for part in self._parts:
             part.renew(rules, zeroed)
@@ -197,7 +202,9 @@ class Pipeline:
         return self._parts[part_index].seq
 
     def decides_kpa(self, part_index: int) -> float:
-        """Return the pressure that every usable taxel of a part detects within a second."""
+        """Return the pressure of which every usable taxel of a part detects nearly every press
+        within a second, see `Levels.decides_surely`.
+        """
         return self._parts[part_index].decides_kpa
 
     def frozen(self, part_index: int) -> Mask:
@@ -252,10 +259,12 @@ class _Rules(NamedTuple):
             Levels(
                 np.where(usable, found.enter[mine], np.inf),
                 np.where(usable, found.leave[mine], np.inf),
+                np.where(usable, found.whole[mine], np.inf),
                 found.span[mine],
                 found.hold[mine],
                 found.fall[mine],
                 found.votes[mine],
+                found.spread[mine],
             ),
         )
 
@@ -263,6 +272,35 @@ class _Rules(NamedTuple):
 def unreached(layout: Layout, settings: Processing, calibration: Calibration) -> Mask:
     """Return taxels bool[n] of which no reading would be a touch, see `Pipeline.unreached`."""
     return _Rules.of(layout, settings, calibration).unreached
+
+
+class _Window:
+    """Sums over the samples of a time, of m taxels.
+
+    Attributes:
+        sum_kpa: float32[m], of the pressures without the relaxation.
+        samples: how many they are.
+        skipped: sweeps that no sample stands for.
+        elapsed_s: how long they all took.
+    """
+
+    def __init__(self, m: int) -> None:
+        self.sum_kpa = np.zeros(m, np.float32)
+        self.clear()
+
+    def clear(self) -> None:
+        """Begin the next."""
+        self.sum_kpa.fill(0.0)
+        self.samples = 0
+        self.skipped = 0
+        self.elapsed_s = 0.0
+
+    def add(self, piece: "_Window") -> None:
+        """Add what followed."""
+        np.add(self.sum_kpa, piece.sum_kpa, out=self.sum_kpa)
+        self.samples += piece.samples
+        self.skipped += piece.skipped
+        self.elapsed_s += piece.elapsed_s
 
 
 class _PartPipeline:
@@ -290,6 +328,9 @@ class _PartPipeline:
         self._near = np.empty(m, np.bool_)
         self._was_touched = np.zeros(m, np.bool_)
 
+        # The samples of a part are as seldom as its slowest board's sweeps.
+        periods_ms = [layout.boards[board].settings.period_ms for board in part.boards]
+        self._interval_s = max(max(periods_ms) * 1e-3, CONVERSION_S)
         rules = rules.part(mine)
         self._set_model(rules)
         self.drift = BaselineTracker(
@@ -308,14 +349,13 @@ class _PartPipeline:
         self._row = list(self._rows)
         self._laid = 0
         self._part_kpa = np.empty(m, np.float32)
-        self._sum_kpa = np.zeros(m, np.float32)
-        self._samples = 0
-        #: Skipped sweeps of the window that no sample stands for.
-        self._skipped = 0
-        #: Those since the last sample, and how long they took.
+        #: The windows of the baselines and of the relaxation, and what is in neither yet: it ends
+        #: with the one that ends first.
+        self._drifting, self._relaxing, self._piece = (_Window(m) for _ in range(3))
+        #: Skipped sweeps since the last sample, how long they took, and the sums of their bytes.
         self._unseen = 0
         self._unseen_s = 0.0
-        self._since_window_s = 0.0
+        self._unseen_raw = np.zeros(m, np.int32)
         self._noted = self._nowhere
         #: How many sweeps of the window lacked each taxel.
         self._lacking = np.zeros(m, np.int32)
@@ -356,14 +396,16 @@ class _PartPipeline:
             self._reader = Parabolas(curve, usable)
         self._beyond_units = np.where(usable, curve.beyond_units, np.inf).astype(np.float32)
         self._units_per_kpa = np.where(usable, 1.0 / np.maximum(curve.linear, 1e-9), 0.0)
+        self._kpa_per_unit = np.where(usable, curve.linear, 0.0)
         self._enter = np.where(usable, rules.levels.enter, 0.0)
         self._enter_kpa = curve.kpa(self._enter)
         # The reading of a single measurement that counts in full.
-        whole = self._enter + rules.settings.touch.hysteresis_units / 2
+        whole = np.where(usable, rules.levels.whole, 0.0)
         firm = curve.kpa(whole + rules.levels.fall)
         on = np.where(usable, curve.kpa(whole), np.inf)
         self._residuals.configure(on, firm, rules.levels.votes)
-        decides = curve.kpa(np.where(usable, rules.levels.decides, 0.0))
+        decides = rules.levels.decides_surely(self._interval_s, rules.settings.touch.votes_of_3)
+        decides = curve.kpa(np.where(usable, decides, 0.0))
         self.decides_kpa = float(decides.max(initial=0.0))
         self._always_valid = _constant(usable.copy())
         self._always_bytes = self._always_valid.tobytes()
@@ -381,7 +423,9 @@ class _PartPipeline:
         self._relaxation: Model | None = None
         self._own: OwnCurves | None = None
         self._every_sample = False
-        self._window_s = WINDOW_S
+        self._update_s = WINDOW_S
+        #: How long the present piece of a window is at least.
+        self._piece_s = WINDOW_S
         if rules.curves is not None:
             smoothing_s = rules.settings.pressure.smoothing_s
             self._own = OwnCurves(rules.curve, rules.curves, self._mine, smoothing_s)
@@ -400,7 +444,8 @@ class _PartPipeline:
             dtype=np.float32 if windowed else np.float64,
         )
         if windowed:
-            self._window_s = chosen.update_s
+            self._update_s = chosen.update_s
+            self._piece_s = min(WINDOW_S, self._update_s)
 
     def step(
         self, raw: NDArray[np.uint8], present: Mask, t_ns: int, pressures: bool
@@ -419,9 +464,10 @@ class _PartPipeline:
         touched = self._nowhere if idle else self._decide(valid, dt_s)
         quiet = touched is self._nowhere and not self._residuals.any and not self._every_sample
         if quiet and not pressures and not self._due(dt_s):
-            self._since_window_s += dt_s
+            self._piece.elapsed_s += dt_s
             self._unseen_s += dt_s
             self._unseen += 1
+            np.add(self._unseen_raw, self._last_raw, out=self._unseen_raw)
             return self._frame(t_ns, raw, valid, self._zeros, self._nowhere, self._nowhere, False)
         self._since_glance_s = 0.0
         cut_off = 255 in self._last_raw.tobytes()
@@ -464,12 +510,15 @@ class _PartPipeline:
         self._relaxation_kpa[taxels] = 0.0
         self._residuals.reset(taxels)
         self._rows[:, taxels] = 0.0
-        self._sum_kpa[taxels] = 0.0
+        for window in (self._piece, self._drifting, self._relaxing):
+            window.sum_kpa[taxels] = 0.0
         self._was_touched[taxels] = False
         self._noted = self._nowhere
 
     def _begin_anew(self, taxels: Mask) -> None:
         self._last_raw = np.where(taxels, self._untouched_raw(), self._last_raw)
+        unseen_raw = np.multiply(self._last_raw, self._unseen, dtype=np.int32)
+        np.copyto(self._unseen_raw, unseen_raw, where=taxels)
         self._detector.reset(taxels)
 
     def _frame(
@@ -517,8 +566,7 @@ class _PartPipeline:
         self._detector.lose(self._detector.touched)
         if self._relaxation is None:
             return
-        if self._samples:
-            self._end_window()
+        self._end_piece(early=True)
         momentary = self._part_kpa
         self._reader.kpa(self._last_raw, momentary)
         beyond = self._beyond(cut_off=True)
@@ -535,7 +583,7 @@ class _PartPipeline:
         """Whether a quiet sweep is computed anyway: for the means, and at their end."""
         self._since_glance_s += dt_s
         return (
-            self._since_glance_s >= IDLE_UPDATE_S or self._since_window_s + dt_s >= self._window_s
+            self._since_glance_s >= IDLE_UPDATE_S or self._piece.elapsed_s + dt_s >= self._piece_s
         )
 
     def _receive(self, raw: NDArray[np.uint8], present: Mask) -> Mask:
@@ -628,35 +676,70 @@ class _PartPipeline:
     def _gather(self, corrected: Floats, touched: Mask, dt_s: float, quiet: bool) -> None:
         """Add the sample to the window's means; at its end update the slow state.
 
-        A quiet sample also stands for the sweeps that were skipped before it. What was skipped
-        before a touch was none, and counts as relaxed.
+        With a quiet sample the sweeps that were skipped before it are added: from it they differ by
+        bytes near zero, where the curve is straight. What was skipped before a touch was none, and
+        counts as relaxed.
         """
+        piece = self._piece
         if self._unseen:
             if quiet:
-                self._sum_kpa += corrected * np.float32(self._unseen)
-                self._samples += self._unseen
+                beyond_units = np.multiply(self._last_raw, self._unseen, dtype=np.int32)
+                beyond_units -= self._unseen_raw
+                piece.sum_kpa += corrected * np.float32(self._unseen)
+                piece.sum_kpa += beyond_units * self._kpa_per_unit
+                piece.samples += self._unseen
             else:
-                self._skipped += self._unseen
-            self._unseen, self._unseen_s = 0, 0.0
+                piece.skipped += self._unseen
+            self._forget_unseen()
         self._laid += 1
         if self._laid == ROWS:
             self._fold()
-        self._samples += 1
-        self._since_window_s += dt_s
+        piece.samples += 1
+        piece.elapsed_s += dt_s
         if touched is not self._noted:
             np.logical_or(self._was_touched, touched, out=self._was_touched)
             self._noted = touched
-        if self._since_window_s >= self._window_s:
-            self._end_window()
+        if piece.elapsed_s >= self._piece_s:
+            self._end_piece()
 
-    def _end_window(self) -> None:
-        """Update the slow state from the means of the window."""
-        self._fold()
-        self._skipped += self._unseen
+    def _forget_unseen(self) -> None:
         self._unseen, self._unseen_s = 0, 0.0
-        mean_kpa = np.divide(self._sum_kpa, self._samples, dtype=np.float64)
+        self._unseen_raw.fill(0)
+
+    def _end_piece(self, early: bool = False) -> None:
+        """Update the slow state from the means of the windows that have ended, or end `early`."""
+        self._fold()
+        piece, drifting, relaxing = self._piece, self._drifting, self._relaxing
+        piece.skipped += self._unseen
+        self._forget_unseen()
+        drifting.add(piece)
+        relaxing.add(piece)
+        piece.clear()
+        if drifting.samples and (early or drifting.elapsed_s >= WINDOW_S):
+            self._follow_drift(drifting)
+            drifting.clear()
+        if relaxing.samples and (early or relaxing.elapsed_s >= self._update_s):
+            if self._relaxation is not None and not self._every_sample:
+                # Within the window it was constant, and skipped sweeps were relaxed.
+                momentary = self._part_kpa
+                scale = 1.0 / (relaxing.samples + relaxing.skipped)
+                np.multiply(relaxing.sum_kpa, scale, out=momentary)
+                np.add(momentary, self._relaxation_kpa, out=momentary)
+                np.fmax(momentary, self._zeros, out=momentary)
+                self._relaxation.step(momentary, relaxing.elapsed_s, self._relaxation_kpa)
+            relaxing.clear()
+        self._renew_limits()
+        if not drifting.samples:
+            self._was_touched.fill(False)
+            self._noted = self._nowhere
+        self._piece_s = min(WINDOW_S - drifting.elapsed_s, self._update_s - relaxing.elapsed_s)
+
+    def _follow_drift(self, window: _Window) -> None:
+        """Move the baselines by the means of a window."""
+        elapsed_s = window.elapsed_s
+        mean_kpa = np.divide(window.sum_kpa, window.samples, dtype=np.float64)
         if self._own is not None:
-            self._own.end_window(self._since_window_s, self._relaxation_kpa)
+            self._own.end_window(elapsed_s, self._relaxation_kpa)
         units = self._units(mean_kpa)
         relaxed_units = np.multiply(self._relaxation_kpa, self._units_per_kpa, dtype=np.float64)
         pressed = self._was_touched & self._usable
@@ -666,33 +749,30 @@ class _PartPipeline:
             relaxed_units[pressed] = momentary_units - units[pressed]
         if self._has_thermal:
             np.subtract(self._offset, self._last_raw, out=units, where=self._thermal)
-        if self._relaxation is not None and not self._every_sample:
-            # Within the window the relaxation was constant, and skipped sweeps were relaxed.
-            momentary = self._part_kpa
-            np.multiply(self._sum_kpa, 1.0 / (self._samples + self._skipped), out=momentary)
-            np.add(momentary, self._relaxation_kpa, out=momentary)
-            np.fmax(momentary, self._zeros, out=momentary)
-            self._relaxation.step(momentary, self._since_window_s, self._relaxation_kpa)
         before = self.drift.baseline.copy()
         # A frame is lost now and then; a mean of more repeated readings than others shows nothing.
-        missing = 2 * self._lacking > self._samples + self._skipped
-        ghosts = self.drift.step(
-            units, self._was_touched, missing, self._since_window_s, relaxed_units
-        )
+        sweeps = window.samples + window.skipped
+        touched, missing = self._was_touched, 2 * self._lacking > sweeps
+        conversions = self._conversions(window)
+        ghosts = self.drift.step(units, touched, missing, elapsed_s, relaxed_units, conversions)
         if self._own is not None:
-            touched, elapsed_s = self._was_touched, self._since_window_s
             ghosts = self._own.hold_rises(self.drift, before, touched, elapsed_s, ghosts)
         if ghosts is not None:
             self._detector.reset(ghosts)
-        self._residuals.fade(self._since_window_s)
-        self._renew_limits()
-        self._sum_kpa.fill(0.0)
-        self._samples = 0
-        self._skipped = 0
-        self._since_window_s = 0.0
-        self._was_touched.fill(False)
-        self._noted = self._nowhere
+        self._residuals.fade(elapsed_s)
         self._lacking.fill(0)
+
+    def _conversions(self, window: _Window) -> NDArray[np.float64]:
+        """Return how many independent measurements are in the mean of each taxel [m].
+
+        A reading that was not received is the last one again. Where the share p is lost by chance,
+        the mean is as noisy as that of the share (1 - p) / (1 + p) of the sweeps.
+        """
+        sweeps = window.samples + window.skipped
+        new = min(window.samples, window.elapsed_s / CONVERSION_S)
+        share = np.maximum(sweeps - self._lacking, 0) / (sweeps + self._lacking)
+        conversions: NDArray[np.float64] = new * share
+        return conversions
 
     def _units(self, kpa: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return mean activations [m] in units; the bend of the curve matters only far from
@@ -718,7 +798,7 @@ class _PartPipeline:
         np.add.reduce(self._rows[: self._laid], axis=0, out=self._part_kpa)
         if self._own is not None and self._laid:
             self._own.fold(self._rows[: self._laid], self._part_kpa, self._relaxation_kpa)
-        np.add(self._sum_kpa, self._part_kpa, out=self._sum_kpa)
+        np.add(self._piece.sum_kpa, self._part_kpa, out=self._piece.sum_kpa)
         self._laid = 0
 
     def _renew_limits(self) -> None:

@@ -30,6 +30,9 @@ ODDS = 1e9
 OVERSHOOT_DEVIATIONS = 1.166
 #: A noisy taxel is given the threshold at which it decides on the smallest press in this time.
 DECIDE_S = 1.0
+#: A press on which a taxel surely decides in time is so many standard deviations above one on which
+#: it does so in the mean: 98 of 100 draws of noise are less.
+SURE_DEVIATIONS = 2.0
 #: A touch accumulates at most this many spans of evidence. Fewer make noisy taxels flicker, more
 #: make them release late.
 HOLD_SPANS = 1.5
@@ -83,23 +86,52 @@ class Levels(NamedTuple):
     Attributes:
         enter: a lasting reading above this becomes a touch.
         leave: a lasting reading below this ends it.
+        whole: a single measurement above this counts in full.
         span: evidence that makes a touch.
         hold: the most evidence of a touch, which must be gone at its end.
         fall: readings that are this much lower, `votes` times in a row, are not noise.
         votes: int64[n], measurements that a press of twice the threshold takes.
+        spread: standard deviation of a measurement.
     """
 
     enter: Floats
     leave: Floats
+    whole: Floats
     span: Floats
     hold: Floats
     fall: Floats
     votes: NDArray[np.int64]
+    spread: Floats
 
     @property
     def decides(self) -> Floats:
-        """Return the activation [n] that becomes a touch within `DECIDE_S`."""
+        """Return the activation [n] that becomes a touch within `DECIDE_S` in the mean, if each
+        conversion is sent: what noise costs.
+        """
         return self.enter + self.span * CONVERSION_S / DECIDE_S
+
+    def decides_surely(self, interval_s: Floats | float, votes: int) -> Floats:
+        """Return the activation [n] of which nearly every press becomes a touch within `DECIDE_S`,
+        or in the least number of measurements, if those take longer.
+
+        Args:
+            interval_s: float64[n], time between measurements.
+            votes: least number of measurements for a touch.
+        """
+        measurements = np.maximum(np.floor(DECIDE_S / np.asarray(interval_s) + 1e-6), votes)
+        # No measurement counts for more than one vote: that much cannot be made up for.
+        free = measurements - votes + 1
+        noise = SURE_DEVIATIONS * self.spread / np.sqrt(free)
+        return np.asarray(self.enter + self.span / measurements + noise, np.float64)
+
+    def measurements(self, votes: int) -> NDArray[np.int64]:
+        """Return the measurements [n] that a press of twice the threshold takes, and one more for
+        their noise.
+
+        Args:
+            votes: least number of measurements for a touch.
+        """
+        return np.maximum(np.ceil(self.span / self.enter), votes).astype(np.int64) + 1
 
 
 def levels(above: Floats, spread: Floats, settings: TouchSettings) -> Levels:
@@ -130,7 +162,8 @@ def levels(above: Floats, spread: Floats, settings: TouchSettings) -> Levels:
     hold = np.maximum(span, np.minimum(2 * (span - band), HOLD_SPANS * span))
     votes = np.clip(np.ceil(span / enter), 2, RELEASE_MEASUREMENTS)
     fall = FALL_DEVIATIONS * spread * np.sqrt(2 / votes)
-    return Levels(enter, leave, span, hold, fall, votes.astype(np.int64))
+    whole = enter + band / 2
+    return Levels(enter, leave, whole, span, hold, fall, votes.astype(np.int64), spread)
 
 
 def _span(enter: Floats, spread: Floats) -> Floats:

@@ -117,7 +117,7 @@ class CanLog:
         self.frames = 0
         self._path = path
         with writing(path):
-            self._draft = Draft(path)
+            self._draft = Draft(path, new=True)
             self._draft.begin()
             if suffix == CANDUMP_SUFFIX:
                 self._file: _Candump | _PythonCan = _Candump(self._draft.path)

@@ -1,6 +1,7 @@
 """Fits parameters to recordings: the foam's relaxation, and the pressure curve of each taxel.
 
-The recording begins with some seconds of untouched skin, which serve as its calibration.
+The recording begins with some seconds of untouched skin, which serve as its calibration. Curves and
+gains are those of the boards that were pressed in it: limbs are fitted one after the other.
 """
 
 import math
@@ -8,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,22 +19,28 @@ from skin_host.config.settings import Settings
 from skin_host.errors import LogError, RequestError
 from skin_host.files import write_document
 from skin_host.layout import Layout, PadKind
+from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration, Verdict, with_curves, with_gains
 from skin_host.processing.core import Engine
-from skin_host.processing.curves import Curves
+from skin_host.processing.curves import Curves, CurveVerdict, TableCurve, common_curve
 from skin_host.processing.fitting.course import (
+    LONGEST_LAG_S,
+    PRESSED_QUANTILES,
     Course,
     GainFit,
     activations,
     find_lag,
     fit_course,
     fit_gains,
+    following,
     median_of_moving,
+    moves,
 )
 from skin_host.processing.fitting.hold import Fit, HoldRecord, fit, merge
 from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.relaxation import make_model, parameters_of
 from skin_host.recording.load_table import LoadTable, check_course, check_covers, on_clock_of
+from skin_host.recording.plausibility import check_ratio, describe_ratio
 from skin_host.recording.replay import calibrate_from_log, steps
 
 Floats = NDArray[np.float64]
@@ -47,8 +54,11 @@ PRESSED_QUANTILE = 0.95
 #: A hold has at least this pressure, for at least this share of its time.
 LEAST_KPA = 10.0
 HELD_SHARE = 0.98
-#: A fit that leaves this share of the hold's level as its error describes another hold.
-FITTED_SHARE = 0.5
+#: A fit that leaves this share of the hold's level as its error, and this pressure, describes
+#: another hold. Foam loses some tens of percent of a hold; what loses more has another pressure.
+FITTED_SHARE = 0.1
+FITTED_KPA = 2.0
+MOST_TAKEN = 0.6
 #: Pressure moves if it changes by more than this share of the hold's from one sample to the next.
 MOVING_SHARE = 0.1
 #: A plateau of known pressure lasts at least this long, and is steady to this share of itself.
@@ -58,6 +68,11 @@ STEADY_KPA = 3.5
 #: Less than this, or than this share of the earlier press, is the residual of that press.
 PRESSED_KPA = 4.0
 IMPRINT_SHARE = 0.07
+#: A board is pressed if at least this share of its usable pads are. Of fewer, as at the edge of a
+#: bag of air on its neighbour, the pressure is not known.
+PRESSED_SHARE = 0.25
+#: Levels belong to a recording if at least this share of the pads of pressed boards can be fitted.
+LEAST_FITTED = 0.5
 #: Recordings have times in microseconds.
 LEAST_STEP_NS = 1000
 #: A recording lasts at most so many times as long as the samples that were received.
@@ -93,6 +108,26 @@ class Samples:
         """Activations above the baseline of some samples and taxels."""
         units: Floats = self.zero[taxels] - self.raw[rows, taxels]
         return units
+
+
+Found = TypeVar("Found", Curves, GainFit)
+
+
+@dataclass(frozen=True)
+class Fitted(Generic[Found]):
+    """A calibration with what a recording under known pressure has shown, and that alone.
+
+    Attributes:
+        calibration: that of the recording where boards were pressed; elsewhere the one before.
+        found: what was fitted, only to the pads of boards that were pressed.
+        pressed: bool[n], the pads that were received of these boards.
+        ratio: known pressures over those of the common curve, of the median pad.
+    """
+
+    calibration: Calibration
+    found: Found
+    pressed: Mask
+    ratio: float
 
 
 def read_samples(
@@ -195,12 +230,16 @@ def hold_record(
         )
     pressure = np.full(len(momentary), np.nan)
     pressure[release:] = 0.0
+    lag_s = 0.0
     if weight_kpa is not None:
         pressure[start:release] = weight_kpa
     elif load is not None:
         check_course(load)
         load = on_clock_of(load, samples.start_s)
-        now_s = samples.start_s + np.arange(len(momentary)) * samples.dt_s
+        now_s: Floats = samples.start_s + samples.dt_s * np.arange(len(momentary), dtype=np.float64)
+        above: Floats = momentary - 0.5 * float(strongest[chosen].mean())
+        lag_s = _edge_lag(above, now_s, start, release, load)
+        load = load._replace(time_s=load.time_s - lag_s)
         check_covers(load, float(now_s[start]), float(now_s[release]), "hold")
         inside = (now_s >= load.time_s[0]) & (now_s <= load.time_s[-1])
         pressure = np.where(inside, np.interp(now_s, load.time_s, load.kpa), pressure)
@@ -213,7 +252,48 @@ def hold_record(
     half = 0.5 * np.array([[-1.0], [1.0]])
     low, high = curve.part(chosen).kpa(held_units + half)
     unit_rms_kpa = float(np.mean(high - low) / np.sqrt(12.0 * np.count_nonzero(chosen)))
-    return replace(record, unit_rms_kpa=unit_rms_kpa)
+    return replace(record, unit_rms_kpa=unit_rms_kpa, lag_s=lag_s)
+
+
+def _edge_lag(above: Floats, now_s: Floats, start: int, release: int, load: LoadTable) -> float:
+    """Return by how many seconds a table's clock is ahead, from press and release.
+
+    Creep makes a held reading follow its pressure late, which a fit of the whole course would take
+    for a lag; at half of the level both pass within the time of the movement. A slow press is
+    passed too early by one of them, and its release too late by the same: their mean is right.
+
+    Args:
+        above: reading above half of its level [t].
+        now_s: float64[t], of the samples.
+        start, release: the first sample of the press, and of the release.
+        load: on the recording's clock as far as it is known.
+
+    Returns:
+        0 if the table has neither press nor release within `LONGEST_LAG_S` of them.
+    """
+    step_s = float(now_s[1] - now_s[0])
+    around_s = np.arange(now_s[0] - LONGEST_LAG_S, now_s[-1] + LONGEST_LAG_S, step_s)
+    kpa = np.interp(around_s, load.time_s, load.kpa)
+    level_kpa = kpa - 0.5 * float(np.quantile(kpa, PRESSED_QUANTILE))
+    found = []
+    for sign, reading in ((1.0, start), (-1.0, release)):
+        rising = sign * level_kpa > 0.0
+        edges = np.flatnonzero(rising[1:] & ~rising[:-1]) + 1
+        if reading == 0 or not len(edges):
+            continue
+        reading_s = _passed_s(above, now_s, reading)
+        table_s = np.array([_passed_s(level_kpa, around_s, edge) for edge in edges.tolist()])
+        nearest_s = float(table_s[int(np.argmin(np.abs(table_s - reading_s)))]) - reading_s
+        if abs(nearest_s) <= LONGEST_LAG_S:
+            found.append(nearest_s)
+    return round(float(np.mean(found)), 3) if found else 0.0
+
+
+def _passed_s(values: Floats, time_s: Floats, row: int) -> float:
+    """Return when values [t] pass 0 between the row before and this one."""
+    before, here = float(values[row - 1]), float(values[row])
+    share = before / (before - here) if before != here else 1.0
+    return float(time_s[row - 1] + min(max(share, 0.0), 1.0) * (time_s[row] - time_s[row - 1]))
 
 
 def fit_relaxation(record: HoldRecord, models: Sequence[str]) -> list[Fit]:
@@ -251,17 +331,27 @@ def save_relaxation(path: Path, found: Fit, settings: Settings, record: HoldReco
 
 
 def fit_pressures(
-    samples: Samples, settings: Settings, layout: Layout, levels_kpa: list[float]
-) -> tuple[Calibration, GainFit]:
+    samples: Samples,
+    settings: Settings,
+    layout: Layout,
+    levels_kpa: list[float],
+    before: Calibration | None = None,
+) -> Fitted[GainFit]:
     """Fit gain and bend of every taxel to plateaus of known uniform pressure, in their order.
 
+    Boards that are not pressed keep what they have in the calibration `before`.
+
     Raises:
-        RequestError: another number of plateaus than of levels was found.
+        RequestError: another number of plateaus than of levels was found, nothing is pressed, or
+            the levels are not those of the plateaus in kPa.
     """
     pressure = settings.processing.pressure
     unit_ff = layout.unit_ff / layout.sensitivity
     curve = PressureCurve(unit_ff, 1.0, pressure.a_kpa_per_ff2, pressure.b_kpa_per_ff)
-    typical = _typical_kpa(samples, curve, settings)
+    everyone = np.ones_like(samples.usable)
+    moving = moves(samples.units(slice(None), everyone), samples.dt_s, PRESSED_QUANTILES)
+    boards = _pressed_boards(moving, samples, layout)
+    typical = _typical_kpa(samples, curve, settings, moving & samples.usable & boards)
     found = plateaus(typical, samples.dt_s)
     if len(found) != len(levels_kpa):
         seen = ", ".join(
@@ -271,14 +361,27 @@ def fit_pressures(
             f"plateaus of pressure in the recording: {len(found)} ({seen or 'none'}), "
             f"levels given: {len(levels_kpa)}; wanted one level for each, in their order"
         )
-    everyone = np.ones_like(samples.usable)
     linear, square = [], []
     for part, kept in zip(found, _kept_shares(samples, curve, settings, found), strict=True):
         ff = samples.units(part, everyone).mean(axis=0) * unit_ff
         linear.append(kept * pressure.b_kpa_per_ff * ff)
         square.append(kept * pressure.a_kpa_per_ff2 * ff**2)
-    result = fit_gains(np.array(levels_kpa), np.array(linear), np.array(square), samples.usable)
-    return with_gains(samples.calibration, result.gain, result.bend), result
+    usable = samples.usable & boards
+    common = (np.array(linear) + np.array(square))[:, usable & moving]
+    level = np.array(levels_kpa)[:, np.newaxis]
+    ratio = float(np.median(np.sum(common * level, axis=0) / np.sum(common**2, axis=0)))
+    check_ratio(ratio)
+    result = fit_gains(np.array(levels_kpa), np.array(linear), np.array(square), usable)
+    pads = int(np.count_nonzero(usable & (layout.pad_kind == PadKind.PRESSURE)))
+    if result.fitted.sum() < LEAST_FITTED * pads:
+        raise RequestError(
+            f"{result.fitted.sum()} of {pads} pads of the pressed boards can be fitted, wanted at "
+            f"least {LEAST_FITTED:.0%}; {describe_ratio(ratio)}"
+        )
+    pressed = samples.received & boards
+    curves = None if before is None else _without(before.curves, pressed)
+    calibration = _renewed(samples, before, pressed, result.gain, result.bend, curves)
+    return Fitted(calibration, result, pressed, ratio)
 
 
 def fit_curves(
@@ -286,14 +389,18 @@ def fit_curves(
     settings: Settings,
     layout: Layout,
     load: LoadTable,
-) -> tuple[Calibration, Curves]:
+    before: Calibration | None = None,
+) -> Fitted[Curves]:
     """Fit a curve to every pad, and the foam's memory, from any course of known pressure.
+
+    Boards that are not pressed keep what they have in the calibration `before`. If curves are among
+    it, the foam's memory stays as well, because it belongs to them.
 
     `load` is the pressure on all pads alike.
 
     Raises:
-        RequestError: the table is no course of pressure, not of this recording, or nothing is
-            pressed.
+        RequestError: the table is no course of pressure, not of this recording or in another unit,
+            or nothing is pressed.
     """
     check_course(load)
     path, time_s, kpa = load = on_clock_of(load, samples.start_s)
@@ -306,11 +413,108 @@ def fit_curves(
     try:
         lag_s = find_lag(median_of_moving(units[:, pads], samples.dt_s), now_s, (time_s, kpa))
         pressure = np.interp(now_s + lag_s, time_s, kpa)
-        course = replace(course, pressure_kpa=pressure, lag_s=lag_s)
-        curves = fit_course(course, settings.processing.pressure.smoothing_s)
+        boards = _pressed_boards(following(units, pressure, samples.dt_s), samples, layout)
+        pressed = samples.received & boards
+        kept = None if before is None else _without(before.curves, pressed)
+        memory = kept.memory if kept is not None and kept.own.any() else None
+        course = replace(course, there=pads & boards, pressure_kpa=pressure, lag_s=lag_s)
+        curves = fit_course(course, settings.processing.pressure.smoothing_s, memory)
+        ratio = _over_common(curves, settings, layout)
+        check_ratio(ratio)
     except RequestError as error:
         raise RequestError(f"{path}: {error}") from None
-    return with_curves(samples.calibration, curves), curves
+    one = np.ones(layout.n_taxels)
+    joined = curves if kept is None else _joined(kept, curves, pressed)
+    return Fitted(_renewed(samples, before, pressed, one, one, joined), curves, pressed, ratio)
+
+
+def _over_common(curves: Curves, settings: Settings, layout: Layout) -> float:
+    """Return pressures over those of the common curve, of the median pad at its highest reading.
+
+    Raises:
+        RequestError: no pad has a curve.
+    """
+    own = curves.own
+    if not own.any():
+        raise RequestError(
+            "no pad is good: the pressures that they report differ too much from the known ones; "
+            "is it the pressure of this recording?"
+        )
+    end = curves.beyond_units[own]
+    common = common_curve(layout, settings.processing.pressure).part(own)
+    return float(np.median(TableCurve(curves.kpa[own], end).kpa(end) / common.kpa(end)))
+
+
+def _pressed_boards(pressed: Mask, samples: Samples, layout: Layout) -> Mask:
+    """Return the taxels [n] of each board of each part of which enough pads are pressed, bool[n].
+
+    Raises:
+        RequestError: there is none.
+    """
+    pads = samples.usable & (layout.pad_kind == PadKind.PRESSURE)
+    found: Mask = np.zeros_like(pads)
+    most = 0.0
+    for part in layout.parts:
+        for board in part.boards:
+            mine = layout.taxels_of([board])
+            mine[: part.start] = mine[part.stop :] = False
+            share = float(pressed[mine & pads].mean()) if np.any(mine & pads) else 0.0
+            most = max(most, share)
+            if share >= PRESSED_SHARE:
+                found |= mine
+    if not found.any():
+        raise RequestError(
+            f"no board is pressed: at most {most:.0%} of a board's pads follow the pressure; "
+            "wanted all pads of a board under the same pressure"
+        )
+    return found
+
+
+def _renewed(
+    samples: Samples,
+    before: Calibration | None,
+    pressed: Mask,
+    gain: Floats,
+    bend: Floats,
+    curves: Curves | None,
+) -> Calibration:
+    """Return the calibration of a recording where pads were pressed, elsewhere the one before."""
+    base = samples.calibration
+    if before is not None:
+        # Its curves would judge the new zeros, and are replaced.
+        base = calibrations.merge(replace(before, curves=None), base, pressed)
+    gained = with_gains(
+        base, np.where(pressed, gain, base.gain), np.where(pressed, bend, base.bend)
+    )
+    return with_curves(gained, curves)
+
+
+def _without(curves: Curves | None, taxels: Mask) -> Curves | None:
+    """Return curves with nothing known of some taxels; None if nothing is known of others."""
+    if curves is None:
+        return None
+    left = replace(
+        curves,
+        beyond_units=np.where(taxels, np.inf, curves.beyond_units),
+        error_kpa=np.where(taxels, np.nan, curves.error_kpa),
+        verdict=np.where(taxels, CurveVerdict.UNKNOWN, curves.verdict).astype(np.uint8),
+    )
+    return left if np.any(left.verdict != CurveVerdict.UNKNOWN) else None
+
+
+def _joined(kept: Curves, new: Curves, taxels: Mask) -> Curves:
+    """Return the new curves of some taxels, and those of the others that are kept."""
+    highest_kpa = max(kept.highest_kpa, new.highest_kpa) if kept.own.any() else new.highest_kpa
+    return Curves(
+        np.where(taxels[:, np.newaxis], new.kpa, kept.kpa),
+        np.where(taxels, new.beyond_units, kept.beyond_units),
+        np.where(taxels, new.noise_units, kept.noise_units),
+        np.where(taxels, new.error_kpa, kept.error_kpa),
+        np.where(taxels, new.verdict, kept.verdict),
+        highest_kpa,
+        new.lag_s,
+        new.memory,
+    )
 
 
 def plateaus(pressure_kpa: Floats, dt_s: float) -> list[slice]:
@@ -344,12 +548,14 @@ def plateaus(pressure_kpa: Floats, dt_s: float) -> list[slice]:
     return [slice(begin + round(SETTLING_SHARE * (end - begin)), end) for begin, end in pieces]
 
 
-def _typical_kpa(samples: Samples, curve: PressureCurve, settings: Settings) -> Floats:
-    """Return the pressure [t] on the median taxel, corrected for relaxation."""
-    curve = curve.part(samples.usable)
+def _typical_kpa(
+    samples: Samples, curve: PressureCurve, settings: Settings, pressed: Mask
+) -> Floats:
+    """Return the pressure [t] on the median of the pressed taxels, corrected for relaxation."""
+    curve = curve.part(pressed)
     blocks = [slice(row, row + 1000) for row in range(0, len(samples.raw), 1000)]
     momentary = np.concatenate(
-        [np.median(curve.kpa(samples.units(block, samples.usable)), axis=1) for block in blocks]
+        [np.median(curve.kpa(samples.units(block, pressed)), axis=1) for block in blocks]
     )
     chosen = settings.processing.relaxation
     model = make_model(chosen.model, 1, parameters_of(chosen))
@@ -383,19 +589,23 @@ def _kept_shares(
 
 
 def _check_fit(found: Fit, record: HoldRecord) -> None:
+    hold_kpa = record.pressure_kpa[: record.released]
+    if np.isfinite(hold_kpa).any():
+        check_ratio(float(np.nanmedian(hold_kpa)) / record.level_kpa)
     errors_kpa = found.rms_hold_kpa, found.rms_rest_kpa
     worst_kpa = max((kpa for kpa in errors_kpa if not math.isnan(kpa)), default=0.0)
-    most_kpa = FITTED_SHARE * record.level_kpa
+    most_kpa = max(FITTED_SHARE * record.level_kpa, FITTED_KPA)
     if worst_kpa >= most_kpa:
         raise RequestError(
             f"{found.model} fits a hold at {record.level_kpa:.0f} kPa to {worst_kpa:.3g} kPa RMS; "
-            f"wanted less than {most_kpa:.3g}: is the pressure that of this hold, in kPa?"
+            f"wanted less than {most_kpa:.3g}: is the pressure that of this hold, in kPa, and "
+            "processing.pressure the curve of this foam?"
         )
     taken = max(math.fsum(found.parameters.beta), math.fsum(found.parameters.beta_unload))
-    if taken >= 1.0:
+    if taken >= MOST_TAKEN:
         raise RequestError(
-            f"{found.model} takes {taken:.0%} of a hold's pressure away; wanted less than 100%: is "
-            "the pressure that of this hold, in kPa?"
+            f"{found.model} takes {taken:.0%} of a hold's pressure away; wanted less than "
+            f"{MOST_TAKEN:.0%}: is the pressure that of this hold, in kPa?"
         )
 
 

@@ -112,7 +112,7 @@ class Recorder:
         self.discarded = 0
         self._path = path
         with writing(path):
-            self._draft = Draft(path)
+            self._draft = Draft(path, new=True)
             self._draft.begin()
             self._file: IO[bytes] = self._draft.path.open("wb")
         self._writer = mcap_writer.Writer(self._file)

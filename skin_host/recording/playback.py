@@ -30,7 +30,7 @@ from skin_host.mqtt.topics import OFFLINE
 from skin_host.processing.core import Engine, Output
 from skin_host.recording.capture import message_at
 from skin_host.recording.mcap import read_messages_of, robot_at
-from skin_host.recording.replay import contacts_of, read_buses
+from skin_host.recording.replay import contacts_of, read_buses, timed
 
 LONGEST_PAUSE_S = 600.0
 RETAINED = ("status", "info", "contact", "health")
@@ -300,10 +300,9 @@ async def play_processed(
             fingertips.end(last_ns)
 
         try:
-            async for bus, batch in paced(read_buses(log, settings), _last_ns, speed):
-                last_ns = int(batch.t_ns[-1])
-                n += await publish(engine.feed(bus, batch))
-            n += await publish(engine.flush())
+            async for t_ns, output in paced(timed(log, engine), lambda one: one[0], speed):
+                last_ns = t_ns
+                n += await publish(output)
         finally:
             end()
     counters = publisher.counters

@@ -32,6 +32,7 @@ from skin_host.processing.calibration.file import load_calibration
 from skin_host.processing.core import Engine, Output, Step
 from skin_host.recording import is_mcap
 from skin_host.recording.lines import LineWriter, health_line
+from skin_host.recording.turns import fed
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -177,11 +178,11 @@ def contacts_of(engine: Engine) -> dict[int, PartContact]:
     """
     layout = engine.layout
     contacts = {part: PartContact(layout, part) for part in engine.parts}
-    usable = engine.usable()
-    if usable is not None:
+    decides = engine.measurements()
+    if decides is not None:
         for index, contact in contacts.items():
             part = layout.parts[index]
-            contact.use(usable[part.start : part.stop])
+            contact.use(decides[part.start : part.stop])
     return contacts
 
 
@@ -191,27 +192,39 @@ def replay(log: Path, engine: Engine) -> Iterator[Output]:
     Raises:
         LogError: the recording cannot be read, or ends with damage.
     """
-    if len(engine.settings.buses) == 1 and engine.fingertips is None:
-        for bus, batch in read_buses(log, engine.settings, LONG_WINDOW_NS):
-            yield from engine.feed_long(bus, batch)
-    else:
-        for bus, batch in read_buses(log, engine.settings):
-            if engine.fingertips is not None:
-                # What came before this batch has been fed. Nothing else ends the contact of a
-                # fingertip that is silent.
-                yield engine.expire(int(batch.t_ns[0]))
-            yield engine.feed(bus, batch)
-    yield engine.flush()
+    for _, output in timed(log, engine, LONG_WINDOW_NS):
+        yield output
+
+
+def timed(log: Path, engine: Engine, window_ns: int = WINDOW_NS) -> Iterator[tuple[int, Output]]:
+    """Yield the results of a recording as a daemon's, each with the time at which it has it.
+
+    Args:
+        log: the recording.
+        engine: processes it, and has been fed nothing yet.
+        window_ns: read so much of a skin on one bus, without fingertips, at a time.
+
+    Raises:
+        LogError: the recording cannot be read, or ends with damage.
+    """
+    merged = len(engine.settings.buses) == 1
+    if not merged or engine.fingertips is not None:
+        window_ns = WINDOW_NS
+    batches = read_buses(log, engine.settings, window_ns)
+    # The frames of one bus come in their order, those of several bus by bus in each window.
+    yield from fed(batches, engine, 0 if merged else WINDOW_NS)
 
 
 def steps(log: Path, engine: Engine) -> Iterator[Step]:
-    """Yield the samples of parts in a recording, in their order.
+    """Yield the samples of parts in a recording, in their order, without the reports of silence.
 
     Raises:
         LogError: see `replay`.
     """
     for output in replay(log, engine):
-        yield from output.steps
+        for step in output.steps:
+            if step.frame.raw.any():
+                yield step
 
 
 @dataclass(frozen=True, slots=True)

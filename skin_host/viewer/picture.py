@@ -6,12 +6,13 @@ yet; frames that it was too slow for are skipped.
 A frame goes to a page as bytes, little endian: kind 1 (u8), flags (u8, bit 0: raw values
 follow), number of the part (u16), number of taxels n (u32), version of the layout (u32),
 sequence number (u32, its low bits), time (f64, s), frames received and missed since the
-server was started (u32 each); then pressure in kPa (f32[n]), bits (u8[n]: 1 valid, 2 beyond
-range), and raw values (u8[n]). Everything else is JSON.
+server was started (u32 each), how long ago it was received (f32, s); then pressure in kPa
+(f32[n]), bits (u8[n]: 1 valid, 2 beyond range), and raw values (u8[n]). Everything else is JSON.
 """
 
 import struct
-from collections import Counter
+from collections import Counter, defaultdict
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,14 +21,13 @@ import numpy as np
 from msgspec import Struct
 
 from skin_host.client import Contact, Frame, Health, NodeInfo, Touch
-from skin_host.client.presence import too_many
 
 FRAME = 1
 HAS_RAW = 1
 VALID, BEYOND_RANGE = 1, 2
-_HEAD = struct.Struct("<BBHIIIdII")
+_HEAD = struct.Struct("<BBHIIIdIIf")
 _U32 = 2**32
-#: Of a part; of more the oldest are forgotten.
+#: Of a part; of more the newest are shown.
 MAX_CONTACTS = 200
 #: A frame has a number of 16 bits for its part. No robot has as many.
 MAX_PARTS = 2**16
@@ -53,17 +53,12 @@ class PartView:
     node: str
     n_taxels: int
     frame: Frame | None = None
+    #: When that was received.
+    frame_s: float = 0.0
     received: int = 0
     missed: int = 0
-    contacts: dict[int, Touch] = field(default_factory=dict)
-    health: dict[str, Any] | None = None
+    contacts: list[Touch] = field(default_factory=list)
     changed: Counter[str] = field(default_factory=Counter)
-
-    def forget_contacts(self) -> None:
-        """Forget its contacts, whose ends may have been missed."""
-        if self.contacts:
-            self.contacts.clear()
-            self.changed["contacts"] += 1
 
 
 @dataclass(slots=True)
@@ -76,7 +71,7 @@ class Cursor:
 
 
 class Picture:
-    """State of the robot's skin.
+    """State of the robot's skin. Times are those of one clock that is never set, in s.
 
     Attributes:
         parts: by name, in the order in which they are drawn.
@@ -90,15 +85,14 @@ class Picture:
         self._status: dict[str, Any] = {}
         self._status_changed = 0
         self._layout = b""
+        #: By part, also of parts that no node has named yet: a state is sent only when it changes.
+        self._states: dict[str, Contact] = {}
+        self._health: dict[str, tuple[dict[str, Any], float]] = {}
 
     def take_nodes(self, robot: str, nodes: dict[str, tuple[bool | None, NodeInfo | None]]) -> None:
         """Take the present nodes: whether each is online, and its description."""
         if self._nodes == nodes:
             return
-        gone = [name for name, (online, _) in nodes.items() if not online]
-        for part in self.parts.values():
-            if part.node in gone:
-                part.forget_contacts()
         told = {name: info for name, (_, info) in nodes.items() if info is not None}
         if told != {name: info for name, (_, info) in self._nodes.items() if info is not None}:
             self._lay_out(robot, told)
@@ -111,47 +105,44 @@ class Picture:
             self._status = status
             self._status_changed += 1
 
-    def take_frame(self, frame: Frame) -> None:
+    def take_frame(self, frame: Frame, now_s: float) -> None:
         part = self.parts.get(frame.part)
         if part is not None and len(frame.pressure_kpa) == part.n_taxels:
-            part.frame = frame
+            part.frame, part.frame_s = frame, now_s
             part.received += 1
             part.missed += frame.missed
             part.changed["frame"] += 1
 
-    def take_touch(self, touch: Touch) -> None:
-        part = self.parts.get(touch.part)
-        if part is None:
-            return
-        if touch.missed:
-            part.contacts.clear()  # the missed events may include an end
-        if touch.event == "end":
-            part.contacts.pop(touch.id, None)
-        else:
-            part.contacts[touch.id] = touch
+    def take_touches(self, touches: Iterable[Touch]) -> None:
+        """Take what touches the skin at present, of all parts, oldest first."""
+        found: defaultdict[str, list[Touch]] = defaultdict(list)
+        for touch in touches:
+            found[touch.part].append(touch)
+        for name, part in self.parts.items():
             # Whoever may publish could go on for ever.
-            while too_many(part.contacts.values(), MAX_CONTACTS):
-                del part.contacts[next(iter(part.contacts))]
-        part.changed["contacts"] += 1
+            contacts = found[name][-MAX_CONTACTS:]
+            if contacts != part.contacts:
+                part.contacts = contacts
+                part.changed["contacts"] += 1
 
     def take_contact(self, contact: Contact) -> None:
-        """Take the contact state of a part; without a touch it has no contacts."""
-        part = self.parts.get(contact.part)
-        if part is not None and not contact.touched:
-            part.forget_contacts()
+        """Take the contact state of a part."""
+        self._states[contact.part] = contact
+        if contact.part in self.parts:
+            self.parts[contact.part].changed["contacts"] += 1
 
-    def take_health(self, health: Health) -> None:
-        part = self.parts.get(health.part)
-        if part is not None:
-            part.health = dict(health.record)
-            part.changed["health"] += 1
+    def take_health(self, health: Health, now_s: float) -> None:
+        self._health[health.part] = dict(health.record), now_s
+        if health.part in self.parts:
+            self.parts[health.part].changed["health"] += 1
 
-    def forget_contacts(self) -> None:
-        """Forget all contacts, which are uncertain after a broken connection."""
-        for part in self.parts.values():
-            part.forget_contacts()
+    def lose(self) -> None:
+        """Note that nothing is received any more: what touches the skin is not known."""
+        for name in self._states:
+            self.take_contact(Contact(name, "UNKNOWN", "disconnected"))
+        self.take_touches(())
 
-    def news(self, cursor: Cursor) -> list[bytes | str]:
+    def news(self, cursor: Cursor, now_s: float) -> list[bytes | str]:
         """Return the messages that a page has not had (text is JSON), and advance its cursor."""
         news: list[bytes | str] = []
         if cursor.layout != self.version and self._layout:
@@ -164,11 +155,12 @@ class Picture:
         for name, part in self.parts.items():
             had = cursor.parts.get(name)
             if part.frame is not None and (had is None or had["frame"] != part.changed["frame"]):
-                news.append(self._frame_bytes(part, part.frame))
+                news.append(self._frame_bytes(part, part.frame, now_s))
             if had is None or had["contacts"] != part.changed["contacts"]:
-                news.append(_contacts_text(name, part))
-            if part.health is not None and (had is None or had["health"] != part.changed["health"]):
-                news.append(_health_text(name, part.health))
+                news.append(_contacts_text(name, part, self._states.get(name)))
+            if name in self._health and (had is None or had["health"] != part.changed["health"]):
+                record, at_s = self._health[name]
+                news.append(_health_text(name, record, now_s - at_s))
             if had != part.changed or had is None:
                 cursor.parts[name] = part.changed.copy()
         return news
@@ -214,7 +206,7 @@ class Picture:
             }
         )
 
-    def _frame_bytes(self, part: PartView, frame: Frame) -> bytes:
+    def _frame_bytes(self, part: PartView, frame: Frame, now_s: float) -> bytes:
         bits = frame.valid * np.uint8(VALID) | frame.beyond_range * np.uint8(BEYOND_RANGE)
         head = _HEAD.pack(
             FRAME,
@@ -226,13 +218,16 @@ class Picture:
             frame.t_ns * 1e-9,
             part.received % _U32,
             part.missed % _U32,
+            now_s - part.frame_s,
         )
         raw = b"" if frame.raw is None else frame.raw.tobytes()
         pressure = frame.pressure_kpa.astype("<f4").tobytes()
         return head + pressure + bits.astype(np.uint8).tobytes() + raw
 
 
-def _contacts_text(name: str, part: PartView) -> str:
+def _contacts_text(name: str, part: PartView, contact: Contact | None) -> str:
+    """Return what touches a part, and its contact state; nothing is known of one without."""
+    state, why = (None, None) if contact is None else (contact.state, contact.why)
     contacts = [
         {
             "id": touch.id,
@@ -242,9 +237,11 @@ def _contacts_text(name: str, part: PartView) -> str:
             "peak_kpa": touch.peak_kpa,
             "area_mm2": touch.area_mm2,
         }
-        for touch in part.contacts.values()
+        # Of what is not received any more, nobody knows whether it ended.
+        for touch in (part.contacts if why in (None, "not_felt") else ())
     ]
-    return _json({"type": "contacts", "part": name, "contacts": contacts})
+    message = {"type": "contacts", "part": name, "state": state, "why": why}
+    return _json(message | {"contacts": contacts})
 
 
 #: Text for states that are not faults themselves.
@@ -272,14 +269,14 @@ class _Record(Struct):
     triangles: list[_Triangle] = []
 
 
-def _health_text(name: str, record: dict[str, Any]) -> str:
+def _health_text(name: str, record: dict[str, Any], age_s: float) -> str:
     try:
         known = msgspec.convert(record, _Record)
     except msgspec.ValidationError as error:
         known = _Record(sentences=[f"This health record cannot be read: {error}."])
     said = [STATES[known.state]] if known.state in STATES else []
     message = msgspec.to_builtins(known) | {"sentences": said + known.sentences}
-    return _json({"type": "health", "part": name} | message)
+    return _json({"type": "health", "part": name, "age_s": round(age_s, 3)} | message)
 
 
 def _json(message: dict[str, Any]) -> str:

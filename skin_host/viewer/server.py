@@ -6,6 +6,7 @@ listens on this machine only, and it takes requests from its own page only.
 
 import asyncio
 import contextlib
+import errno
 import logging
 import os
 import socket
@@ -143,7 +144,7 @@ class Viewer:
         """Serve for as long as the block lasts; yields the URL. Port 0 is any free one.
 
         Raises:
-            SkinError: the port is not available.
+            SkinError: the address or the port is not available.
         """
         # It logs every file that it serves as a rejected connection ...
         logger = logging.getLogger("websockets.server")
@@ -160,11 +161,9 @@ class Viewer:
                 server_header=None,
                 create_connection=_Visit,
             )
-        except (OSError, OverflowError) as error:
-            number = error.errno if isinstance(error, OSError) else None
-            why = os.strerror(number) if number else str(error)
+        except (OSError, OverflowError, UnicodeError) as error:
             raise SkinError(
-                f"the page cannot be served on {host}:{port}: {why}; choose another port"
+                f"the page cannot be served on {host}:{port}: {_why_not(error)}"
             ) from None
         async with server:
             listening = asyncio.create_task(self._listen(), name="viewer")
@@ -180,7 +179,7 @@ class Viewer:
         """Serve until `stop` is set; `ready` is called with the URL.
 
         Raises:
-            SkinError: the port is not available.
+            SkinError: the address or the port is not available.
             RequestError: it is not clear which robot is meant.
         """
         async with self.serving(host, port) as url:
@@ -231,14 +230,13 @@ class Viewer:
 
     async def _tell(self, page: ServerConnection) -> None:
         cursor = Cursor()
-        now_s = asyncio.get_running_loop().time
-        due_s = now_s()
+        due_s = _now_s()
         while True:
             # Sending waits for a slow page; frames that arrive meanwhile are skipped.
-            for message in self._picture.news(cursor):
+            for message in self._picture.news(cursor, _now_s()):
                 await page.send(message)
-            due_s = max(due_s + TICK_S, now_s())
-            await asyncio.sleep(due_s - now_s())
+            due_s = max(due_s + TICK_S, _now_s())
+            await asyncio.sleep(due_s - _now_s())
 
     async def _take_wish(self, page: ServerConnection, message: bytes) -> None:
         answer: dict[str, Any] = {"type": "answer"}
@@ -282,10 +280,10 @@ class Viewer:
                     self._client = client
                     await cancel(waiting)
                     picture = self._picture
-                    group.create_task(_pass_on(client.frames(), picture.take_frame))
-                    group.create_task(_pass_on(client.touches(), picture.take_touch))
+                    group.create_task(_pass_on(client.frames(), _timed(picture.take_frame)))
                     group.create_task(_pass_on(client.contacts(), picture.take_contact))
-                    group.create_task(_pass_on(client.health(), picture.take_health))
+                    group.create_task(_pass_on(client.health(), _timed(picture.take_health)))
+                    group.create_task(self._follow(client))
                     group.create_task(self._watch(client))
             except* SkinError as errors:
                 said, self._why = self._why, str(errors.exceptions[0])
@@ -299,6 +297,7 @@ class Viewer:
             finally:
                 self._client = None
                 await cancel(waiting)
+            self._picture.lose()
             self._take_status(connected=False)
             await asyncio.sleep(RETRY_S)
 
@@ -310,13 +309,15 @@ class Viewer:
                 self._take_status(connected=False)
             await asyncio.sleep(NODES_S)
 
+    async def _follow(self, client: SkinClient) -> None:
+        """Follow what touches the skin. The client knows which contacts last."""
+        while True:
+            self._picture.take_touches(client.present())
+            await asyncio.sleep(TICK_S)
+
     async def _watch(self, client: SkinClient) -> None:
         """Watch the nodes and the connection."""
-        connections = client.connections
         while True:
-            if client.connections != connections:
-                connections = client.connections
-                self._picture.forget_contacts()
             nodes = {name: (node.online, node.info) for name, node in client.nodes.items()}
             self._picture.take_nodes(client.robot, nodes)
             self._why = f"no broker at {client.where}: {client.last_error or 'trying again'}"
@@ -339,6 +340,18 @@ def _own_names() -> set[str]:
     name = socket.gethostname().lower()
     short = name.partition(".")[0]
     return {name, short, f"{short}.local"}
+
+
+def _why_not(error: Exception) -> str:
+    """Return why an address cannot be served, and what mends it."""
+    if isinstance(error, socket.gaierror | UnicodeError):
+        why = error.strerror if isinstance(error, OSError) else "no name of a computer"
+        return f"{why}; choose an address of this machine with --host"
+    if not isinstance(error, OSError) or error.errno is None:
+        return f"{error}; choose another port"
+    if error.errno == errno.EADDRNOTAVAIL:
+        return "no address of this machine; choose one with --host"
+    return f"{os.strerror(error.errno)}; choose another port"
 
 
 def _close_with(page: ServerConnection, telling: "asyncio.Task[None]") -> None:
@@ -365,6 +378,15 @@ async def _messages(page: ServerConnection) -> AsyncIterator[bytes]:
 async def _pass_on(stream: Stream[T], take: Callable[[T], None]) -> None:
     async for item in stream:
         take(item)
+
+
+def _timed(take: Callable[[T, float], None]) -> Callable[[T], None]:
+    """Return what takes an item as received now."""
+    return lambda item: take(item, _now_s())
+
+
+def _now_s() -> float:
+    return asyncio.get_running_loop().time()
 
 
 def _is_no_idle_visit(record: logging.LogRecord) -> bool:

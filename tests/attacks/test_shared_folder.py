@@ -35,15 +35,26 @@ def test_a_link_under_the_known_interim_name_is_not_followed(tmp_path: Path) -> 
 
 
 def test_of_two_that_write_a_file_at_once_the_last_one_is_whole(tmp_path: Path) -> None:
+    path = tmp_path / "x.txt"
+    with whole_file(path) as one, whole_file(path) as other:
+        one.write_text("one\n" * 100)
+        other.write_text("other\n")
+    assert path.read_text() == "one\n" * 100
+    assert [file.name for file in tmp_path.iterdir()] == ["x.txt"]
+
+
+def test_of_two_recordings_of_a_name_the_first_to_end_is_whole_and_the_other_keeps_its_own(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "x.log"
-    with CanLog(path) as one, CanLog(path) as other:
-        for _ in range(100):
-            one.put("can0", FRAMES)
-        other.put("can1", FRAMES)
-    lines = path.read_text().splitlines()
-    assert len(lines) == 100
-    assert all(" can0 " in line for line in lines)
-    assert [file.name for file in tmp_path.iterdir()] == ["x.log"]
+    with pytest.raises(SkinError, match="another file got this name"), CanLog(path) as one:
+        with CanLog(path) as other:
+            for _ in range(100):
+                one.put("can0", FRAMES)
+            other.put("can1", FRAMES)
+    kept = {file.name == "x.log": file.read_text().splitlines() for file in tmp_path.iterdir()}
+    assert {is_named: len(lines) for is_named, lines in kept.items()} == {True: 1, False: 100}
+    assert all(" can0 " in line for line in kept[False])
 
 
 @pytest.fixture

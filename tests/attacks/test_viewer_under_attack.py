@@ -151,10 +151,10 @@ async def test_a_message_that_cannot_be_shown_leaves_no_page_as_it_was(
     """A page that gets nothing new shows what was true once."""
     take, monkeys = Picture.take_frame, [1]
 
-    def fail_once(picture: Picture, frame: Frame) -> None:
+    def fail_once(picture: Picture, frame: Frame, now_s: float) -> None:
         if monkeys:
             raise ZeroDivisionError(monkeys.pop())
-        take(picture, frame)
+        take(picture, frame, now_s)
 
     monkeypatch.setattr(Picture, "take_frame", fail_once)
     monkeypatch.setattr("skin_host.viewer.server.RETRY_S", 0.1)
@@ -195,5 +195,5 @@ def test_more_parts_than_frames_can_name_are_not_shown(monkeypatch: pytest.Monke
     picture = Picture()
     picture.take_nodes("robot", {"main": (True, pictures.info({f"p{n}": 1 for n in range(9)}))})
     assert list(picture.parts) == ["p0", "p1", "p2"]
-    picture.take_frame(pictures.frame("p5", [1.0]))
-    assert picture.news(Cursor())
+    picture.take_frame(pictures.frame("p5", [1.0]), pictures.NOW_S)
+    assert picture.news(Cursor(), pictures.NOW_S)

@@ -103,18 +103,79 @@ async def test_touches_of_one_part_are_heard_alone(mosquitto: Mosquitto) -> None
         assert [t.part for t in await take(everywhere, 4)] == ["arm", "palm", "arm", "palm"]
 
 
-async def test_state_is_known_at_once_also_to_who_asks_later(mosquitto: Mosquitto) -> None:
+async def test_state_is_known_with_the_next_health_and_then_to_who_asks_later(
+    mosquitto: Mosquitto,
+) -> None:
     async with publishing(mosquitto) as publisher:
         publisher.put_contact("palm", "ON")
         publisher.put_health("palm", {"rate_hz": 20.0})
         await until(lambda: publisher.counters.retained_sent >= 3)
-        async with hearing(mosquitto) as skin:
+        async with hearing(mosquitto, stale_s=10 * PATIENCE_S) as skin:
             first, health = skin.contacts(), skin.health()
-            assert await take(first, 1) == [Contact("palm", "ON")]
             (seen,) = await take(health, 1)
-            assert (seen.part, seen.record["rate_hz"]) == ("palm", 20.0)
-            second = skin.contacts("palm")
+            assert (seen.part, seen.record["rate_hz"], seen.stored) == ("palm", 20.0, True)
+            publisher.put_health("palm", {"rate_hz": 21.0})
+            (seen,) = await take(health, 1)
+            assert (seen.part, seen.record["rate_hz"], seen.stored) == ("palm", 21.0, False)
+            assert await take(first, 1) == [Contact("palm", "ON")]
+            second, later = skin.contacts("palm"), skin.health()
             assert await take(second, 1) == [Contact("palm", "ON")]
+            assert (await take(later, 1))[0].stored
+
+
+async def stored(broker: Mosquitto, **messages: bytes) -> None:
+    """Leave retained messages of a part at the broker, as somebody who is not a node."""
+    async with aiomqtt.Client(broker.host, broker.port) as stranger:
+        await stranger.publish("skin/robot/nodes/main/status", b"online", qos=1, retain=True)
+        for kind, payload in messages.items():
+            await stranger.publish(f"skin/robot/palm/{kind}", payload, qos=1, retain=True)
+
+
+async def test_what_the_broker_kept_of_a_robot_that_is_switched_off_is_not_known(
+    mosquitto: Mosquitto,
+) -> None:
+    """After a power cut the broker has the last states, and nobody that corrects them."""
+    await stored(mosquitto, contact=b"OFF", health=json.encode({"schema": "skin.health/1"}))
+    async with hearing(mosquitto, stale_s=0.3) as skin:
+        contacts = skin.contacts("palm")
+        assert await take(contacts, 1) == [Contact("palm", "UNKNOWN", "stale")]
+
+
+async def test_a_state_that_somebody_deletes_is_not_known(mosquitto: Mosquitto) -> None:
+    """That health is deleted, too, is no sign of the part's life."""
+    async with publishing(mosquitto) as publisher, hearing(mosquitto) as skin:
+        contacts = skin.contacts("palm")
+        await skin.ready()
+        publisher.put_contact("palm", "OFF")
+        assert await take(contacts, 1) == [Contact("palm", "OFF")]
+        alive_s = skin._presence._parts["palm"].alive_s
+        await stored(mosquitto, health=b"", contact=b"")
+        assert await take(contacts, 1) == [Contact("palm", "UNKNOWN", "stale")]
+        assert skin._presence._parts["palm"].alive_s == alive_s
+        mosquitto.kill()
+        assert await take(contacts, 1) == [Contact("palm", "UNKNOWN", "disconnected")]
+
+
+async def test_a_stream_that_ends_takes_nothing_from_the_others(mosquitto: Mosquitto) -> None:
+    """What is known of a part stays while somebody follows it, by whichever topic."""
+    long_s = 10 * PATIENCE_S
+    async with publishing(mosquitto) as publisher, hearing(mosquitto, stale_s=long_s) as skin:
+        palm, foot = skin.contacts("palm"), skin.contacts("foot")
+        await skin.ready()
+        for part in ("palm", "foot"):
+            publisher.put_contact(part, "OFF")
+        await take(palm, 1)
+        assert await take(foot, 1) == [Contact("foot", "OFF")]
+        everywhere = skin.contacts()
+        assert {one.part for one in await take(everywhere, 2)} == {"palm", "foot"}
+        await skin.ready()  # the topic of all replaces those of two
+        assert {one.part for one in skin._presence.reported()} == {"palm", "foot"}
+        del everywhere, palm
+        skin._ask_again()
+        await until(lambda: "skin/robot/+/contact" not in skin._links[0]._subscribed)
+        assert [one.part for one in skin._presence.reported()] == ["foot"]
+        mosquitto.kill()
+        assert await take(foot, 1) == [Contact("foot", "UNKNOWN", "disconnected")]
 
 
 async def test_a_client_hears_what_was_said_while_its_link_was_cut(

@@ -110,6 +110,8 @@ async def test_what_the_broker_that_failed_still_holds_is_history(
             await until(lambda: b"offline" in old.payloads("status"))
         async with hearing(brokers) as skin:
             contacts = skin.contacts()
+            await skin.ready()
+            publisher.put_health("palm", {"state": "ok", "rate_hz": 20.0})  # it lives
             while (await take(contacts, 1))[0] != Contact("palm", "UNKNOWN", "not_felt"):
                 pass
             await until(lambda: skin.nodes["main"].online)

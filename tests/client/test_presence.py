@@ -145,11 +145,11 @@ def test_no_message_looks_later_than_it_is(
 def test_a_node_that_stops_takes_its_parts_with_it() -> None:
     presence = Presence(stale_s=3.0)
     presence.take_info("arm", ["palm"])
-    presence.take_node("arm", True)
+    presence.take_node("arm", True, 0.0)
     presence.take_state("palm", "OFF", 0.0)
     presence.take_state("foot", "OFF", 0.0)
     presence.changes(0.0)
-    presence.take_node("arm", False)
+    presence.take_node("arm", False, 0.0)
     assert presence.changes(0.1) == [Contact("palm", "UNKNOWN", "offline")]
 
 
@@ -162,7 +162,7 @@ def test_a_last_will_says_nothing_of_a_node_that_may_be_at_another_broker() -> N
         newness = newest.take("status", "main", stamp)
         if newness is not False:
             said = is_online(payload, stamp, is_only_broker=False)
-            presence.take_node("main", said, broker, again=newness is None)
+            presence.take_node("main", said, 26.0, broker, again=newness is None)
 
     take(ONLINE, Stamp(100, 0), 0)
     presence.take_state("palm", "OFF", 0.0)
@@ -192,7 +192,7 @@ def test_with_one_broker_the_last_will_is_believed() -> None:
 def test_a_node_whose_parts_all_fall_silent_or_come_late_is_not_said_to_be_online() -> None:
     presence = Presence(stale_s=3.0)
     presence.take_info("main", ["palm", "foot"])
-    presence.take_node("main", True)
+    presence.take_node("main", True, 0.0)
     presence.take_touch(seen("begin"), 0.0)
     assert presence.online("main", 60.0)  # who does not follow states cannot tell
     presence.take_state("palm", "OFF", 60.0, sent_s=60.0)
@@ -211,14 +211,14 @@ def test_a_node_whose_parts_all_fall_silent_or_come_late_is_not_said_to_be_onlin
 
 def test_a_node_is_unknown_when_no_broker_is_left_that_named_its_status() -> None:
     presence = Presence(stale_s=3.0)
-    presence.take_node("main", True, 0)
-    presence.take_node("main", True, 1, again=True)
+    presence.take_node("main", True, 0.0, 0)
+    presence.take_node("main", True, 0.0, 1, again=True)
     presence.take_loss(0)
     assert presence.online("main", 0.0)
     assert presence.brokers("main") == {1}
     presence.take_loss(1)
     assert presence.online("main", 0.0) is None
-    presence.take_node("main", True, 0, again=True)
+    presence.take_node("main", True, 0.0, 0, again=True)
     assert presence.online("main", 0.0)
     assert presence.online("arm", 0.0) is None
 
@@ -290,19 +290,142 @@ def test_a_part_that_is_not_felt_is_unknown_though_its_node_lives() -> None:
     assert presence.contact("palm", 3.1) == Contact("palm", "UNKNOWN", "stale")
 
 
-def test_a_state_that_was_deleted_or_forgotten_is_told_no_more() -> None:
+def test_a_part_that_is_not_followed_any_more_is_forgotten() -> None:
     presence = Presence(stale_s=3.0)
-    presence.take_state("foot", None, 0.0)
     for part in ("palm", "foot"):
         presence.take_state(part, "OFF", 0.0)
     assert presence.changes(0.0) == presence.reported()
-    assert [one.part for one in presence.reported()] == ["palm", "foot"]
-    presence.take_state("palm", None, 1.0)
+    presence.forget("palm")
     assert presence.contact("palm", 1.0) is None
     assert [one.part for one in presence.reported()] == ["foot"]
-    presence.forget()
-    assert presence.reported() == []
-    assert presence.contact("foot", 1.0) is None
+
+
+def test_a_state_that_is_deleted_is_unknown_and_so_is_each_loss_after_it() -> None:
+    """Whoever clears retained messages must not make a motor move for ever."""
+    presence = Presence(stale_s=3.0)
+    presence.take_info("arm", ["palm"])
+    presence.take_node("arm", True, 0.0)
+    presence.take_state("foot", None, 0.0)
+    presence.take_state("palm", "OFF", 0.0)
+    assert presence.changes(0.0) == [Contact("palm", "OFF")]
+    presence.take_state("palm", None, 1.0)
+    assert presence.changes(1.0) == [Contact("palm", "UNKNOWN", "stale")]
+    presence.take_sign("palm", 2.0)
+    assert presence.changes(2.0) == []
+    presence.take_node("arm", False, 3.0)
+    assert presence.changes(3.0) == [Contact("palm", "UNKNOWN", "offline")]
+    presence.take_loss()
+    assert presence.changes(4.0) == [Contact("palm", "UNKNOWN", "disconnected")]
+    presence.take_node("arm", True, 5.0)
+    presence.take_state("palm", "ON", 5.0)
+    assert presence.changes(5.0) == [Contact("palm", "ON")]
+
+
+STEPS = st.lists(
+    st.one_of(
+        st.tuples(st.just("state"), st.sampled_from(["ON", "OFF", "UNKNOWN", None]), st.booleans()),
+        st.tuples(st.just("node"), st.sampled_from([True, False, None]), st.none()),
+        st.tuples(st.sampled_from(["sign", "touch", "loss"]), st.none(), st.none()),
+        st.tuples(st.just("pass"), st.sampled_from([0.5, 1.0, 3.5]), st.none()),
+    ),
+    max_size=30,
+)
+
+
+@given(STEPS)
+def test_once_a_state_was_reported_no_loss_is_kept_quiet(steps: list[tuple[str, Any, Any]]) -> None:
+    """Whatever was received, deleted and lost before: the last report is never out of date."""
+    presence, now_s = Presence(stale_s=3.0), 0.0
+    presence.take_info("arm", ["palm"])
+    presence.take_node("arm", True, now_s)
+    last: Contact | None = None
+    live_s = -10.0  # when something came that was not stored, over this connection and node
+    state: str | None = None
+    online: bool | None = True
+    for what, value, stored in [*steps, ("loss", None, None)]:
+        match what:
+            case "state":
+                presence.take_state("palm", value, now_s, stored=stored)
+                state = value
+                live_s = live_s if stored or value is None else now_s
+            case "node":
+                presence.take_node("arm", value, now_s)
+                live_s = -10.0 if value and not online else live_s
+                online = value
+            case "sign":
+                presence.take_sign("palm", now_s)
+                live_s = now_s
+            case "touch":
+                presence.take_touch(seen("begin"), now_s)
+                live_s = now_s
+            case "loss":
+                presence.take_loss()
+                state, live_s, online = None, -10.0, None
+            case "pass":
+                now_s += value
+        for contact in presence.changes(now_s):
+            assert contact != last
+            last = contact
+        is_known = state in ("ON", "OFF") and online is True and now_s - live_s <= 3.0
+        if is_known and last is not None:
+            assert last == Contact("palm", state)  # type: ignore[arg-type]
+        elif last is not None:
+            assert last.state == "UNKNOWN"
+            assert presence.reported() == [last]
+
+
+def test_what_the_broker_kept_is_not_known_until_something_comes() -> None:
+    """After a power cut the broker has what was true before, and no node that could correct it."""
+    presence = Presence(stale_s=3.0)
+    presence.take_info("arm", ["palm", "foot"])
+    presence.take_node("arm", True, 0.0)
+    for part in ("palm", "foot"):
+        presence.take_state(part, "OFF", 0.0, stored=True)
+    assert presence.changes(0.0) == []
+    assert presence.online("arm", 0.0) is None
+    presence.take_sign("palm", 0.9)
+    assert presence.changes(0.9) == [Contact("palm", "OFF")]
+    assert presence.online("arm", 0.9)
+    assert presence.changes(3.1) == [Contact("foot", "UNKNOWN", "stale")]
+
+
+def test_a_node_that_is_online_again_publishes_its_states_again() -> None:
+    """Between its status and those, what it published before it was restarted is not known."""
+    presence = Presence(stale_s=3.0)
+    presence.take_info("arm", ["palm"])
+    presence.take_node("arm", True, 0.0)
+    presence.take_state("palm", "OFF", 0.0)
+    assert presence.changes(0.0) == [Contact("palm", "OFF")]
+    presence.take_node("arm", False, 1.0)
+    assert presence.changes(1.0) == [Contact("palm", "UNKNOWN", "offline")]
+    presence.take_node("arm", True, 2.0)
+    assert presence.changes(2.0) == []
+    presence.take_state("palm", "ON", 2.1)
+    assert presence.changes(2.1) == [Contact("palm", "ON")]
+
+
+def test_after_a_lost_broker_what_it_kept_is_not_known_either() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_state("palm", "OFF", 0.0)
+    assert presence.changes(0.0) == [Contact("palm", "OFF")]
+    presence.take_loss()
+    presence.take_state("palm", "OFF", 1.0, stored=True)
+    assert presence.changes(1.0) == [Contact("palm", "UNKNOWN", "stale")]
+    presence.take_sign("palm", 1.5)
+    assert presence.changes(1.5) == [Contact("palm", "OFF")]
+    presence.take_loss()
+    assert presence.changes(2.0) == [Contact("palm", "UNKNOWN", "disconnected")]
+    presence.take_state("palm", "OFF", 2.5, stored=True)
+    assert presence.changes(2.5) == []
+    assert presence.changes(6.0) == [Contact("palm", "UNKNOWN", "stale")]
+
+
+def test_touches_of_the_run_before_have_ended_with_it() -> None:
+    presence = Presence(stale_s=3.0)
+    presence.take_touch(seen("begin", 3), 0.0, run=1)
+    presence.take_touch(seen("begin", 1), 0.5, run=2)
+    presence.take_touch(seen("begin", 2), 0.5)  # of which run is not known
+    assert [one.id for one in presence.touches("palm", 0.5)] == [1, 2]
 
 
 def test_a_state_is_known_while_a_broker_is_left_that_told_it() -> None:
@@ -323,8 +446,8 @@ def test_a_state_is_known_while_a_broker_is_left_that_told_it() -> None:
 
 def test_a_status_of_one_broker_replaces_that_of_another() -> None:
     presence = Presence(stale_s=3.0)
-    presence.take_node("main", True, 0)
-    presence.take_node("main", True, 1)
+    presence.take_node("main", True, 0.0, 0)
+    presence.take_node("main", True, 0.0, 1)
     assert presence.brokers("main") == {1}
     assert presence.brokers("arm") == set()
     presence.take_loss(0)
@@ -371,6 +494,7 @@ async def test_what_the_broker_kept_of_a_node_that_is_offline_is_never_off(
 async def test_a_lost_broker_makes_everything_unknown(mosquitto: Mosquitto, how: str) -> None:
     async with publishing(mosquitto) as publisher, hearing(mosquitto, stale_s=1.0) as skin:
         contacts = skin.contacts()
+        await skin.ready()
         await announced(publisher)
         assert await take(contacts, 1) == [Contact("left_hand", "OFF")]
         mosquitto.kill() if how == "kill" else mosquitto.freeze()
@@ -395,9 +519,11 @@ async def test_callbacks_for_what_is_unknown(mosquitto: Mosquitto) -> None:
     unknown: list[Contact] = []
 
     def use() -> SkinCallbacks:
-        skin = SkinCallbacks(f"mqtt://{mosquitto.host}:{mosquitto.port}", robot="robot")
+        url = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+        skin = SkinCallbacks(url, robot="robot", stale_s=10 * PATIENCE_S)
         skin.__enter__()
         skin.on_unknown(unknown.append)
+        skin.ready()
         return skin
 
     async with publishing(mosquitto) as publisher:
@@ -413,21 +539,21 @@ async def test_callbacks_for_what_is_unknown(mosquitto: Mosquitto) -> None:
 def test_the_parts_are_known_when_all_nodes_have_named_theirs_and_one_is_online() -> None:
     presence = Presence(stale_s=3.0)
     assert presence.named() is None
-    presence.take_node("main", online=True)
+    presence.take_node("main", online=True, now_s=0.0)
     assert presence.named() is None
     presence.take_info("main", ["palm"])
     assert presence.named() == {"palm"}
-    presence.take_node("arm", online=True, parts={"upper"})
+    presence.take_node("arm", online=True, now_s=0.0, parts={"upper"})
     assert presence.named() is None  # its info may name more
     presence.take_info("arm", ["lower"])
     assert presence.named() == {"palm", "upper", "lower"}
     # A node that has stopped may start again.
-    presence.take_node("arm", online=False, parts={"upper"})
+    presence.take_node("arm", online=False, now_s=0.0, parts={"upper"})
     assert presence.named() == {"palm", "upper", "lower"}
     # Without a node that is online nobody knows with what the robot will start.
-    presence.take_node("main", online=False)
+    presence.take_node("main", online=False, now_s=0.0)
     assert presence.named() is None
-    presence.take_node("main", online=True)
+    presence.take_node("main", online=True, now_s=0.0)
     presence.take_loss()
     assert presence.named() is None
 
@@ -496,7 +622,7 @@ async def test_what_anybody_names_steers_no_terminal_and_is_cut(mosquitto: Mosqu
     presence_names = {"\x1b[2J": None} | {f"part{n:04}": None for n in range(1000)}
     async with hearing(mosquitto) as skin:
         await skin.ready()
-        skin._presence.take_node("main", online=True)
+        skin._presence.take_node("main", online=True, now_s=0.0)
         skin._presence.take_info("main", presence_names)
         stream = skin.touches("absent")
         skin._check_parts(asyncio.get_running_loop().time() + NAMED_S + 1.0)

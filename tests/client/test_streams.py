@@ -1,9 +1,14 @@
 """A stream says what it did not hear."""
 
+from typing import Any
+
 import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skin_host.client.heard import Contact
+from skin_host.client.heard import Contact, Health
 from skin_host.client.streams import HELD, HELD_TAXELS, Stream
 from skin_host.fingertip.events import Over
 from skin_host.mqtt.messages import Frame
@@ -119,6 +124,39 @@ async def test_events_that_are_not_counted_are_all_heard() -> None:
     stream.put(uncounted)
     stream.put(uncounted)
     assert await heard(stream) == [(0, 0), (0, 0)]
+
+
+@pytest.mark.parametrize("kind", ["contact", "health"])
+async def test_a_slow_reader_gets_the_newest_state_of_each_part(kind: Any) -> None:
+    """However often that of another part changes meanwhile."""
+    stream: Stream[Contact | Health] = Stream(None, kind)
+
+    def state(part: str, number: int) -> Contact | Health:
+        if kind == "health":
+            return Health(part, {"rate_hz": float(number)})
+        return Contact(part, ("OFF", "ON")[number % 2])
+
+    last = {}
+    for part, number in [("palm", 0), ("palm", 1), *(("foot", n) for n in range(2 * HELD[kind]))]:
+        last[part] = state(part, number)
+        stream.put(last[part])
+    assert len(stream._items) == HELD[kind]
+    stream.close()
+    items = [item async for item in stream]
+    assert {item.part: item for item in items} == last
+    assert [item.part for item in items].index("palm") == 0  # in the order in which they came
+
+
+@given(st.lists(st.sampled_from("abcdef"), max_size=60))
+def test_the_newest_state_of_each_part_is_held_while_there_is_room(parts: list[str]) -> None:
+    stream: Stream[Health] = Stream(None, "health")
+    stream._most = 6
+    last = {}
+    for number, part in enumerate(parts):
+        last[part] = Health(part, {"rate_hz": float(number)})
+        stream.put(last[part])
+        assert len(stream._items) <= 6
+    assert {item.part: item for item in stream._items} == last
 
 
 async def test_states_pass_as_they_are() -> None:

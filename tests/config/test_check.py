@@ -64,6 +64,26 @@ def test_a_period_shorter_than_the_chips_conversion_is_warned_of() -> None:
     assert warning.startswith("boards.mtb1.period_ms: 20; the chips need 36.86 ms")
 
 
+@pytest.mark.parametrize(("fast_ms", "slow_ms", "warns"), [(50, 99, False), (50, 100, True)])
+@pytest.mark.parametrize("slow_first", [False, True])
+def test_a_part_of_a_fast_board_and_a_slow_one_is_warned_of(
+    fast_ms: int, slow_ms: int, warns: bool, slow_first: bool
+) -> None:
+    periods = (slow_ms, fast_ms) if slow_first else (fast_ms, slow_ms)
+    names = {fast_ms: "quick", slow_ms: "slow"}
+    boards: dict[str, dict[str, object]] = {
+        names[period]: {"bus": "can0", "address": i, "skin_type": 2, "period_ms": period}
+        for i, period in enumerate(periods, 1)
+    }
+    patches = [{"board": name, "triangles": "0-3"} for name in boards]
+    warnings = described(boards, {"arm": {"patches": patches}})["warnings"]
+    (*_, last) = ["", *(one for one in warnings if "period_ms" in one)]
+    assert bool(last) is warns
+    if warns:
+        assert last.startswith("parts.arm: board quick sends every 50 ms and slow every 100 ms; ")
+        assert last.endswith("wanted like period_ms, or two parts")
+
+
 def test_a_thermometer_that_feels_pressure_is_warned_of() -> None:
     (warning,) = full_boards(1, skin_type=8)["warnings"]
     assert warning.startswith("boards.mtb1.skin_type: 8 takes pad 6 as a thermometer")

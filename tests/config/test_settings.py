@@ -164,7 +164,7 @@ REACHED = "the force that is measured in every direction, by full_scale and matr
             f"{TOP}\n[processing.relaxation]\nupdate_s = 0.05",
             (
                 "processing.relaxation: `update_s`: 0.05; wanted 0, or 0.2 to 5 s: means of fewer "
-                "sweeps hardly show drift"
+                "sweeps are mostly noise"
             ),
         ),
         (

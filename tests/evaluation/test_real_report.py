@@ -218,9 +218,14 @@ def test_recordings_that_are_not_there_are_said_to_be_absent(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(real, "RECORDINGS", tmp_path / "nowhere")
-    assert main(["report", "--real"]) == 0
-    assert "no recordings of real skin here" in capsys.readouterr().out
-    document = real.run(quick=False, output=None)
+    for options in ([], ["--json"]):
+        assert main(["report", "--real", *options]) == 2
+        told = capsys.readouterr()
+        assert told.out == ""
+        (line,) = told.err.splitlines()
+        assert "no recordings of real skin here; --recordings names a folder" in line
+    # The whole report has more to say, and names them as absent.
+    document = real.run(quick=False, output=None, may_be_absent=True)
     assert document["real"] == []
     assert "absent" in page.real_skin(document).text[0]
     assert main(["report", "--real", "--recordings", str(tmp_path)]) == 2

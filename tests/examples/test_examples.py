@@ -14,16 +14,19 @@ from itertools import count, repeat
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 
+from skin_host import client
 from skin_host.client import session
 from skin_host.config.settings import Mqtt, load
 from skin_host.layout import build_layout
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
 from skin_host.processing.pipeline import PressureFrame
+from skin_host.tasks import cancel
 from tests.support import ros
 from tests.support.broker import Mosquitto
 from tests.support.said import touch_event
@@ -44,6 +47,22 @@ async def node(broker: Mosquitto) -> AsyncIterator[Publisher]:
     async with Publisher(Mqtt(host=broker.host, port=broker.port), "demo", "main") as publisher:
         publisher.put_info(node_info(layout, "main", version="1", configuration="x"))
         yield publisher
+
+
+@asynccontextmanager
+async def living(publisher: Publisher, part: str) -> AsyncIterator[None]:
+    """Its health comes again and again: what the broker has stored shows nothing of now."""
+
+    async def live() -> None:
+        for number in count():
+            publisher.put_health(part, {"age_ms": float(number)})
+            await asyncio.sleep(0.1)
+
+    task = asyncio.create_task(live())
+    try:
+        yield
+    finally:
+        await cancel(task)
 
 
 async def test_a_client_prints_a_touch(mosquitto: Mosquitto) -> None:
@@ -80,6 +99,24 @@ def test_an_example_without_what_it_needs_ends_with_one_line(words: list[str], s
     assert ended.returncode == 1
     (line,) = ended.stderr.splitlines()
     assert said in line
+
+
+@pytest.mark.parametrize("words", [["stop_on_touch.py", "left_hand"], ["gripper.py"]])
+def test_an_example_that_is_interrupted_ends_without_a_traceback(
+    words: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And stops its motors."""
+
+    class Interrupted:
+        def __init__(self, *_: object, **__: object) -> None:
+            raise KeyboardInterrupt
+
+    emulator = MagicMock()
+    monkeypatch.setattr(client, "SkinCallbacks", Interrupted)
+    monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: emulator)
+    monkeypatch.setattr(sys, "argv", words)
+    runpy.run_path(str(EXAMPLES / words[0]), run_name="__main__")
+    assert emulator.terminate.called == (words[0] == "gripper.py")
 
 
 async def said_to_ros(
@@ -171,7 +208,7 @@ async def test_the_motor_stops_for_what_is_touched_and_for_what_is_not_known(
     assert program.stdout is not None and program.stdin is not None
     said = []
     async with asyncio.timeout(PATIENCE_S):
-        async with node(mosquitto) as publisher:
+        async with node(mosquitto) as publisher, living(publisher, "left_hand"):
             for state in ("OFF", "ON", "OFF", "UNKNOWN", "OFF"):
                 publisher.put_contact("left_hand", state)
                 if not said:

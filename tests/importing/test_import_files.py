@@ -574,7 +574,9 @@ UNPRINTABLE = ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 
 @given(
-    channel=st.text(st.characters(codec="utf-8", exclude_categories=UNPRINTABLE), max_size=20),
+    channel=st.text(
+        st.characters(codec="utf-8", exclude_categories=UNPRINTABLE), min_size=1, max_size=20
+    ),
     turn=st.floats(-LARGEST, LARGEST),
     option=st.one_of(
         st.booleans(),

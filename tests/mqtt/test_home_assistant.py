@@ -91,6 +91,7 @@ def test_a_problem_is_announced_as_documented(told: dict[str, Any]) -> None:
         "json_attributes_topic": "skin/demo/left_forearm/health",
         "json_attributes_template": "{{ {'state': value_json.state, "
         "'sentences': value_json.sentences} | tojson }}",
+        "expire_after": 10,
         "qos": 1,
         "availability": [{"topic": "skin/demo/nodes/main/status"}],
         "device": {

@@ -722,3 +722,77 @@ def test_a_small_change_that_all_readings_share_is_followed_at_once_and_only_onc
     track = tracker()
     follow(track, np.full(N, 0.02))
     assert track.baseline == pytest.approx(np.full(N, 0.02))
+
+
+@pytest.mark.parametrize("conversions", [2.5, 5.0, 10.0, 20.0])
+@pytest.mark.parametrize("rate", [0.05, 0.1, -0.2])
+def test_drift_of_all_is_followed_however_few_conversions_are_in_a_mean(conversions, rate):
+    track = tracker()
+    rng = np.random.default_rng(7)
+    true = 0.0
+    for _ in range(150):
+        true += rate
+        units = true - track.baseline + rng.normal(0.0, 1.0 / np.sqrt(conversions), N)
+        track.step(units, NOBODY, NOBODY, 1.0, 0.0, conversions)
+        assert np.median(np.abs(true - track.baseline)) < 1.2
+
+
+@pytest.mark.parametrize("conversions", [5.0, 10.0, 20.0])
+def test_a_load_that_grows_unevenly_is_no_drift_however_few_conversions_are_in_a_mean(conversions):
+    """Noise makes nothing alike that is not: it is taken out of the means, not let through."""
+    track = tracker()
+    rates = np.linspace(0.0, 0.5, N)
+    taken = []
+    for second in range(60):
+        load = np.minimum(rates * second, 20.0 * rates)
+        before = track.baseline.copy()
+        track.step(load - track.baseline, NOBODY, NOBODY, 1.0, 0.0, conversions)
+        taken.append(np.median(track.baseline - before))
+    # What differs at once by the tolerance shows in a mean as long as twenty conversions take.
+    assert sum(taken[: 3 + int(20.0 / conversions)]) < 3.0
+    assert max(taken[30:]) < 0.11
+
+
+def test_a_taxel_that_was_not_received_is_alike_by_what_it_read_before():
+    """Its mean shows nothing; a few conversions after it show little."""
+    track = tracker()
+    rng = np.random.default_rng(2)
+    true = 0.0
+    for second in range(100):
+        true += 0.2
+        lost = rng.random(N) < 0.3
+        conversions = np.where(lost, 0.0, 5.0)
+        units = np.where(lost, 30.0, true - track.baseline + rng.normal(0.0, 0.4, N))
+        track.step(units, NOBODY, lost, 1.0, 0.0, conversions)
+        assert np.median(np.abs(true - track.baseline)) < 0.9, second
+
+
+def test_drift_goes_on_after_a_window_in_which_noise_made_taxels_differ():
+    track = tracker()
+    true = 0.0
+    for second in range(40):
+        true += 0.35
+        noise = 3.0 * (np.arange(N) % 2) if second % 5 == 4 else 0.0
+        track.step(true + noise - track.baseline, NOBODY, NOBODY, 1.0)
+    assert true - track.baseline.max() < 0.8
+
+
+@pytest.mark.parametrize(("units", "followed"), [(0.75, True), (1.1, False)])
+def test_a_load_of_the_whole_part_above_what_two_windows_of_drift_are_is_not_followed(
+    units, followed
+):
+    track = tracker()
+    for _ in range(20):
+        track.step(units - track.baseline, NOBODY, NOBODY, 1.0)
+    assert bool(track.baseline.min() > 0.7) is followed
+    assert followed or track.baseline.max() < 0.25
+
+
+def test_a_window_of_no_time_changes_nothing():
+    track = let_go()
+    before = track.baseline.copy()
+    with np.errstate(all="raise"):
+        assert track.step(np.full(N, 1.0), NOBODY, NOBODY, 0.0) is None
+        for _ in range(10):
+            hold(track, 2.6)
+    assert track.baseline == pytest.approx(before, abs=0.1)

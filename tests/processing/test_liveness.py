@@ -298,6 +298,29 @@ def test_six_extremes_of_the_noise_of_a_working_pad_are_chance() -> None:
         assert not liveness.noisy.any()
 
 
+@pytest.mark.parametrize("period_s", [0.0125, 0.0204, PERIOD_S])
+def test_a_pad_is_noisy_beyond_its_noise_under_pressure_where_that_was_measured(
+    period_s: float,
+) -> None:
+    """Pads of real skin jump by some units when they are pressed, and not when they rest."""
+    pressed = np.full((K, 12), np.nan)
+    pressed[:, :6] = 3.0
+    liveness = Liveness(K, np.full((K, 12), 0.4), period_s, pressed_units=pressed)
+    rng = np.random.default_rng(5)
+    raw, conversions = np.zeros((K, 12), np.uint8), -1
+    for sweep in range(round(3.0 / period_s)):
+        if int(sweep * period_s / CONVERSION_S) != conversions:
+            conversions = int(sweep * period_s / CONVERSION_S)
+            raw = noisy_bytes(rng, 0.4, np.full((K, 12), 200.0))
+            if conversions % 2:
+                raw[0] -= 12
+                raw[1] -= 40
+        liveness.step(raw, HERE, NO)
+    assert not liveness.noisy[2:].any()
+    assert liveness.noisy[0].tolist() == [False] * 6 + [True] * 6
+    assert liveness.noisy[1].all()
+
+
 @pytest.mark.parametrize(("units", "spikes"), [(5, 0), (7, 0), (8, 1), (200, 1)])
 def test_one_sweep_off_by_more_than_seven_units_and_back_is_a_spike(
     units: int, spikes: int
@@ -728,6 +751,131 @@ def test_steps_of_four_units_up_and_down_are_noise_at_the_fourth() -> None:
     assert found == [False] * 5 + [True] * 2
 
 
+def repeated(conversions: list[np.ndarray], period_s: float) -> list[np.ndarray]:
+    """The sweeps of a board whose chips convert once in `CONVERSION_S`, from the middle of one."""
+    end_s = len(conversions) * CONVERSION_S
+    times_s = np.arange(0.4 * period_s, end_s, period_s)
+    return [conversions[int(time_s / CONVERSION_S)] for time_s in times_s]
+
+
+@pytest.mark.parametrize("period_ms", [10, 12, 18, 20, 25, 36, 40, 50])
+@pytest.mark.parametrize("units", [20, 120])
+def test_a_pad_that_jumps_is_noisy_however_often_its_board_sends_it(
+    period_ms: int, units: int
+) -> None:
+    rng = np.random.default_rng(period_ms)
+    centre = np.full((K, 12), 240.3)
+    liveness = Liveness(K, np.full((K, 12), 0.5), period_ms * 1e-3)
+    conversions = []
+    for _ in range(round(20.0 / CONVERSION_S)):
+        raw = noisy_bytes(rng, 0.5, centre)
+        raw[1, 4] -= units * int(rng.integers(2))
+        conversions.append(raw)
+    noisy = []
+    for raw in repeated(conversions, period_ms * 1e-3):
+        liveness.step(raw, HERE, NO)
+        noisy.append(bool(liveness.noisy[1, 4]))
+        assert np.count_nonzero(liveness.noisy) <= noisy[-1]
+    assert noisy.index(True) * period_ms < 2000
+    # Where a conversion lasts longer than a period, all of it is seen.
+    assert np.mean(noisy) > 0.7
+    assert not liveness.spikes.any()
+    for raw in repeated([noisy_bytes(rng, 0.5, centre) for _ in range(40)], period_ms * 1e-3):
+        liveness.step(raw, HERE, NO)
+    assert liveness.doubted is None
+
+
+@given(st.integers(10, 50), st.integers(3, 8), st.floats(0.0, 1.2), st.integers(0, 2**32 - 1))
+@settings(max_examples=40, deadline=None)
+def test_presses_and_noise_are_no_jumps_however_often_a_board_sends_them(
+    period_ms: int, conversions_each: int, sigma: float, seed: int
+) -> None:
+    """A press of three conversions and more, 0.11 s, is two sweeps of the slowest of them."""
+    rng = np.random.default_rng(seed)
+    centre = np.full((K, 12), 240.3)
+    liveness = Liveness(K, np.full((K, 12), max(sigma, 0.4)), period_ms * 1e-3)
+    conversions = []
+    for number in range(300):
+        pressed = centre.copy()
+        pressed[:2] -= 100 * (number // conversions_each % 2)
+        conversions.append(noisy_bytes(rng, sigma, pressed))
+    for raw in repeated(conversions, period_ms * 1e-3):
+        liveness.step(raw, HERE, NO)
+        assert not liveness.noisy.any()
+    assert not liveness.spikes.any()
+
+
+@pytest.mark.parametrize("period_ms", [10, 20, 25])
+def test_a_temperature_pad_that_jumps_is_noisy_between_the_repeats_of_other_pads(
+    period_ms: int,
+) -> None:
+    """What is taken off the other pads moves them in sweeps in which they are not converted."""
+    rng = np.random.default_rng(3)
+    repeats = Repeats([Encoding(GAIN, 2, 240, truncates=False)] * K)
+    liveness = Liveness(K, np.full((K, 12), 0.6), period_ms * 1e-3, repeats)
+    jumps: list[np.ndarray] = []
+    for _ in range(80):
+        raw = noisy_bytes(rng, 0.5, np.full((K, 12), 240.3))
+        raw[2, THERMAL_TAXEL] -= 30 * (len(jumps) % 2)
+        raw[1, 4] -= 30 * (len(jumps) % 2)
+        jumps.append(raw)
+    for number, sent in enumerate(repeated(jumps, period_ms * 1e-3)):
+        raw = sent.copy()
+        raw[1, 4] += number % 2
+        liveness.step(raw, HERE, NO)
+    assert np.argwhere(liveness.noisy).tolist() == [[1, 4], [2, THERMAL_TAXEL]]
+    assert liveness.doubted is not None
+    assert liveness.doubted[2].tolist() == (repeats.compensated[2] | liveness.noisy[2]).tolist()
+
+
+@pytest.mark.parametrize(("sweeps", "spikes"), [(1, 1), (2, 0), (4, 0)])
+def test_a_byte_of_a_fast_board_is_damaged_for_one_sweep_and_a_pad_jumps_for_longer(
+    sweeps: int, spikes: int
+) -> None:
+    liveness = Liveness(K, np.full((K, 12), 0.4), 0.01)
+    for number in range(300):
+        raw = np.full((K, 12), 240, np.uint8)
+        raw[1, 4] -= 30 * (10 <= number < 10 + sweeps)
+        liveness.step(raw, HERE, NO)
+        # It takes some 25 conversions to know that the pad does not jump.
+        assert number > 80 or not liveness.spikes.any()
+    assert liveness.spikes.sum() == spikes
+
+
+@pytest.mark.parametrize(("left_out", "noisy"), [(None, True), ("gap", False), ("lost", True)])
+def test_a_step_before_a_gap_and_one_after_it_are_no_jump_of_a_fast_board(
+    left_out: str | None, noisy: bool
+) -> None:
+    """Of a triangle that one sweep lacked nothing else happened meanwhile."""
+    liveness = Liveness(K, np.full((K, 12), 0.4), 0.01)
+    for number in range(200):
+        raw = np.full((K, 12), 240, np.uint8)
+        raw[1, 4] -= 30 * (number // 4 % 2)
+        here = HERE.copy()
+        if number % 4 == 2:
+            if left_out == "gap":
+                liveness.note_gap(0, 1)
+            here[1] = left_out != "lost"
+        liveness.step(raw, here, NO)
+    assert bool(liveness.noisy[1, 4]) is noisy
+
+
+def test_a_fast_board_and_a_slow_one_are_each_judged_by_their_own_conversions() -> None:
+    rng = np.random.default_rng(3)
+    centre = np.full((K, 12), 240.3)
+    liveness = Liveness(K, np.full((K, 12), 0.5), np.array([0.0125, 0.05]), boards=2)
+    for number in range(400):
+        came = np.array([True, number % 4 == 3])
+        if number % 4 == 0:
+            # Up and down again in two sweeps of the slow board is a press.
+            raws = [noisy_bytes(rng, 0.4, centre) for _ in range(4)]
+        raw = raws[0].copy()
+        raw[0, 4] -= 30 * (number // 3 % 2)
+        raw[3, 4] -= 30 * (number // 8 % 2)
+        liveness.step(raw, np.repeat(came, K // 2), NO, came=came)
+    assert np.argwhere(liveness.noisy).tolist() == [[0, 4]]
+
+
 def test_a_triangle_of_which_little_came_or_that_is_touched_teaches_no_rate() -> None:
     rng = np.random.default_rng(3)
     centre = np.full((K, 12), 240.3)
@@ -787,7 +935,8 @@ def test_sweeps_that_wait_change_no_decision_and_nothing_that_is_learnt(
     k, boards = 6, 2
     sigma = rng.uniform(0.15, 1.2, (k, 12))
     centre = rng.uniform(235.0, 250.0, (k, 12))
-    waits, takes = (Liveness(k, sigma, 0.05, boards=boards) for _ in range(2))
+    period_s = data.draw(st.sampled_from([0.0125, 0.05]))
+    waits, takes = (Liveness(k, sigma, period_s, boards=boards) for _ in range(2))
     takes._room_left = lambda: 0  # type: ignore[method-assign]
     stuck, wild = np.zeros((k, 12), np.bool_), np.zeros((k, 12), np.bool_)
     dead = np.zeros(k, np.bool_)

@@ -674,6 +674,103 @@ def test_zeros_move_alike_whether_pressures_are_subscribed_or_not(units):
     assert unwatched == pytest.approx(watched, abs=0.05)
 
 
+def test_zeros_move_alike_with_noise_whether_pressures_are_subscribed_or_not():
+    """Of sweeps that are not computed each byte counts, not one for all."""
+    rigs = [Rig(1, 0.5, hz=50.0) for _ in range(2)]
+    for sweep in range(50 * 60):
+        for rig, pressures in zip(rigs, (True, False), strict=True):
+            rig.t_ns += 20_000_000
+            raw = rig.read(0.02 * sweep / 50.0)
+            rig.pipeline.step(0, raw, rig._present, rig.t_ns, pressures)
+    watched, unwatched = (rig.pipeline.baseline for rig in rigs)
+    assert unwatched == pytest.approx(watched, abs=0.02)
+
+
+def test_what_was_read_against_an_old_zero_does_not_count_against_the_new_one():
+    rigs = [Rig(1, 0.0, hz=50.0) for _ in range(2)]
+    for rig, pressures in zip(rigs, (True, False), strict=True):
+        for sweep in range(200):
+            rig.t_ns += 20_000_000
+            if sweep == 105:
+                rig._resting -= np.float32(20.0)
+                rig.pipeline.set_zero(np.arange(rig.n, dtype=np.int32), rig.true_baseline)
+            frame = rig.pipeline.step(0, rig.read(0.0), rig._present, rig.t_ns, pressures)
+            assert not frame.touched.any()
+    watched, unwatched = (rig.pipeline.baseline for rig in rigs)
+    assert unwatched == pytest.approx(watched, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("hz", "rate", "update_s", "pressures", "loss"),
+    [
+        (10.0, 0.2, 1.0, True, 0.0),
+        (4.8, 0.1, 1.0, True, 0.0),
+        (20.0, 0.1, 1.0, False, 0.0),
+        (4.8, 0.1, 1.0, False, 0.0),
+        (20.0, 0.1, 0.2, True, 0.0),
+        (20.0, 0.1, 0.5, False, 0.0),
+        (20.0, 0.3, 5.0, True, 0.0),
+        (20.0, 0.1, 1.0, True, 0.3),
+        (10.0, 0.1, 0.3, False, 0.4),
+    ],
+)
+def test_a_skin_that_grows_warm_is_untouched_at_every_rate_of_its_boards(
+    hz: float, rate: float, update_s: float, pressures: bool, loss: float
+) -> None:
+    """Means of few sweeps are noisy, so that pads of drifting skin seem to move apart."""
+    processing = {"relaxation": {"update_s": update_s}}
+    rig = Rig(1, None, hz=hz, seed=0, calibrate_s=10.0, processing=processing)
+    rng = np.random.default_rng(5)
+    for sweep in range(round(60.0 * hz)):
+        rig.t_ns += rig._dt_ns
+        drifted = rate * min(sweep / hz, 8.0 / rate)
+        present = np.repeat(rng.random(rig.n // 12) >= loss, 12)
+        raw = np.where(present, rig.read(drifted), 0).astype(np.uint8)
+        frame = rig.pipeline.step(0, raw, present, rig.t_ns, pressures)
+        assert not frame.touched.any()
+    behind = rig.true_baseline + drifted - rig.pipeline.baseline
+    assert np.median(np.abs(behind)) < 0.5
+
+
+@pytest.mark.parametrize("pressures", [True, False])
+@pytest.mark.parametrize("hz", [5.0, 10.0, 20.0])
+@pytest.mark.parametrize("units", [3.0, 8.0])
+def test_a_steady_press_of_a_whole_part_is_no_drift_at_any_rate(
+    units: float, hz: float, pressures: bool
+) -> None:
+    rig = Rig(1, None, hz=hz, seed=1, calibrate_s=10.0, processing=NO_RELAXATION)
+    for _ in range(round(60.0 * hz)):
+        rig.t_ns += rig._dt_ns
+        frame = rig.pipeline.step(0, rig.read(units), rig._present, rig.t_ns, pressures)
+    # A slow rise of 0.01 units/s is followed.
+    assert np.median(rig.pipeline.baseline - rig.true_baseline) < 0.7
+    assert frame.touched.mean() > 0.8
+
+
+@pytest.mark.parametrize("update_s", [0.2, 0.7, 3.0])
+def test_how_often_states_are_updated_hardly_changes_what_the_foam_keeps(
+    update_s: float,
+) -> None:
+    rigs = [
+        Rig(1, 0.0, processing={"relaxation": {"update_s": seconds}}) for seconds in (0.0, update_s)
+    ]
+    for units, seconds in ((25.0, 30), (0.0, 15), (12.0, 15)):
+        for rig in rigs:
+            press(rig, units, 25 * seconds)
+        each, some = (rig.pipeline.relaxation_kpa[:6] for rig in rigs)
+        assert some == pytest.approx(each, abs=0.3 + 0.3 * update_s)
+
+
+def test_a_first_sample_before_a_gap_is_survived():
+    rig = Rig(1, 0.0)
+    with np.errstate(divide="raise", invalid="raise"):
+        press(rig, 20.0, 1)
+        rig.t_ns += 3_600_000_000_000
+        frames = press(rig, 0.0, 50)
+    assert not frames[-1].touched.any()
+    assert rig.pipeline.baseline == pytest.approx(rig.true_baseline, abs=0.5)
+
+
 @pytest.mark.parametrize("shift_units", [20.0, -12.0])
 def test_drift_is_limited_from_the_zero_that_a_board_has(shift_units: float):
     """Held near the zero before, all of a board would read pressed, or nothing."""

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skin_host.config.settings import TouchSettings
+from skin_host.processing.conversions import CONVERSION_S
 from skin_host.processing.touch import LOST_S, Levels, Residuals, TouchDetector, levels
 
 REST = 200
@@ -16,7 +17,8 @@ def levels_of(enter, leave, span, hold):
     """Levels of taxels without noise."""
     enter, leave, span, hold = (np.atleast_1d(value) for value in (enter, leave, span, hold))
     nothing = np.zeros(len(enter))
-    return Levels(enter, leave, span, hold, nothing, nothing.astype(np.int64) + 2)
+    votes = nothing.astype(np.int64) + 2
+    return Levels(enter, leave, enter, span, hold, nothing, votes, nothing)
 
 
 #: Two measurements of 2 units begin a touch, two of 1.5 end it.
@@ -368,6 +370,7 @@ def test_a_taxel_without_noise_has_the_thresholds_of_its_settings() -> None:
     # Half a unit less than the margin, and as much more as the percentile of a byte may be.
     assert found.enter == pytest.approx(np.array([2.0, 2.5, 2.5]))
     assert found.leave == pytest.approx(found.enter)
+    assert found.whole == pytest.approx(found.enter + 0.5)
     assert found.span == pytest.approx(np.ones(3))
     assert found.hold == pytest.approx(found.span)
     assert found.fall == pytest.approx(np.zeros(3))
@@ -395,6 +398,46 @@ def test_the_least_threshold_and_the_hysteresis_bound_each_other() -> None:
     least = TouchSettings(margin_units=0.2, hysteresis_units=5.0, minimum_threshold_units=0.8)
     found = levels(np.zeros(1), np.zeros(1), least)
     assert (found.enter[0], found.span[0]) == pytest.approx((0.4, 0.8))
+    # A measurement that counts in full is no firmer press than the margin and what bounds it.
+    assert found.whole[0] == pytest.approx(0.8)
+
+
+@pytest.mark.parametrize("interval_s", [CONVERSION_S, 0.05, 0.1, 0.209])
+@pytest.mark.parametrize("spread", [0.3, 1.0, 2.0, 4.5])
+@pytest.mark.parametrize("votes", [2, 3])
+def test_nearly_every_press_of_what_a_taxel_surely_decides_on_is_decided_in_a_second(
+    interval_s: float, spread: float, votes: int
+) -> None:
+    """And of what it decides on in the mean, at the pace of conversions, not."""
+    n = 1000
+    rng = np.random.default_rng(3)
+    found = levels(np.full(n, 0.5), np.full(n, spread), TouchSettings())
+    press = found.decides_surely(interval_s, votes)
+    detector = TouchDetector(found, votes)
+    rest = np.full(n, 200.3)
+    detector.renew(rest)
+    for _ in range(40):
+        raw = np.rint(rest + spread * rng.standard_normal(n)).astype(np.uint8)
+        detector.step(raw, interval_s)
+    in_time = np.zeros(n, np.bool_)
+    for _ in range(int(1.0 / interval_s + 1e-6)):
+        raw = np.rint(rest - press + spread * rng.standard_normal(n)).astype(np.uint8)
+        in_time |= detector.step(raw, interval_s)
+    assert in_time.mean() > 0.94
+
+
+def test_a_press_takes_its_votes_where_a_second_has_fewer_measurements() -> None:
+    found = levels(np.zeros(1), np.array([0.5]), TouchSettings())
+    assert np.isfinite(found.decides_surely(0.209, 8)).all()
+    assert found.decides_surely(0.209, 8) == pytest.approx(found.decides_surely(0.125, 8))
+
+
+@pytest.mark.parametrize(("votes", "expected"), [(2, [3, 3, 6, 27]), (3, [4, 4, 6, 27])])
+def test_a_noisy_taxel_takes_more_measurements_for_a_decision(
+    votes: int, expected: list[int]
+) -> None:
+    found = levels(np.full(4, 0.5), np.array([0.1, 0.5, 1.2, 8.0]), TouchSettings())
+    assert found.measurements(votes).tolist() == expected
 
 
 @given(st.floats(0.0, 0.6), st.floats(0.01, 8.0), st.floats(1.01, 3.0))

@@ -73,7 +73,7 @@ def test_a_recording_that_is_ended_gets_its_name(tmp_path: Path, number: signal.
         assert "end with Ctrl-C" in running.stderr.readline()
         running.send_signal(number)
         said, _ = running.communicate(timeout=PATIENCE_S)
-    assert running.returncode == 0
+    assert running.returncode == 1  # nothing comes on that bus
     assert said.startswith(f"{path}: ")
     assert list(read_messages_of(path)) == []
     assert {one.name for one in tmp_path.iterdir()} == {"skin.toml", "a.mcap"}
@@ -91,5 +91,5 @@ def test_a_recording_under_nohup_goes_on_when_its_terminal_is_closed(tmp_path: P
             running.wait(0.5)
         running.send_signal(signal.SIGTERM)
         running.communicate(timeout=PATIENCE_S)
-    assert running.returncode == 0
+    assert running.returncode == 1  # nothing comes on that bus
     assert path.exists()

@@ -1,5 +1,6 @@
 """A recording with force/torque frames through `skin replay`: touches and slips in their order."""
 
+import asyncio
 import json
 from pathlib import Path
 
@@ -10,7 +11,16 @@ from emulator.robot import Robot
 from skin_host.bus.strain import start_frames
 from skin_host.cli import main
 from skin_host.config.settings import load
-from skin_host.layout import build_layout
+from skin_host.layout import build_layout, load_skin
+from skin_host.mqtt.address import Broker
+from skin_host.processing.core import Engine
+from skin_host.processing.events import Touch
+from skin_host.recording.capture import capture_broker
+from skin_host.recording.mcap import Recorder, read_messages_of, recorded_topics
+from skin_host.recording.playback import play_processed
+from skin_host.recording.replay import calibrate_from_log, replay
+from tests.support.broker import Mosquitto
+from tests.support.waiting import until
 
 CONFIG = Path(__file__).parents[2] / "config"
 
@@ -60,24 +70,65 @@ def test_a_replay_tells_what_the_fingertips_felt_and_tells_it_again(
     assert "age_ms" not in health["index"]
 
 
-def test_a_contact_whose_samples_stop_in_a_recording_ends_as_lost(
-    recording: Path, tmp_path: Path
-) -> None:
-    """As with the daemon; the other boards go on."""
-    lines = recording.read_text().splitlines(keepends=True)
-    output = tmp_path / "out.jsonl"
-    command = ["--config", str(CONFIG / "fingertips.toml"), "--calibrate-seconds", "5"]
-    assert main(["replay", str(recording), *command, "--output", str(output)]) == 0
-    found = [json.loads(line) for line in output.read_text().splitlines()]
-    touches = [one for one in found if one["type"] == "touch" and one["part"] == "index"]
-    cut_ns = touches[0]["t_ns"] + 300_000_000
+def cut(recording: Path, folder: Path) -> tuple[Path, int]:
+    """The same without what the index's board sends from 0.3 s of its first touch on, and when that
+    is.
+    """
+    settings, layout = load_skin(CONFIG / "fingertips.toml")
+    found = calibrate_from_log(recording, settings, layout, 5.0)
+    engine = Engine(settings, layout, list(range(len(layout.parts))), found)
+    begun = (
+        event
+        for output in replay(recording, engine)
+        for event in output.events
+        if isinstance(event, Touch) and event.part == "index"
+    )
+    cut_ns = next(begun).t_ns + 300_000_000
 
     def came(line: str) -> bool:
         seconds, micros = line[1 : line.index(")")].split(".")
         return int(seconds) * 10**9 + int(micros) * 1000 < cut_ns
 
-    log = tmp_path / "stops.log"
+    log = folder / "stops.log"
+    lines = recording.read_text().splitlines(keepends=True)
     log.write_text("".join(line for line in lines if came(line) or " can0 31" not in line))
+    return log, cut_ns
+
+
+async def test_it_ends_so_at_a_broker_too(
+    recording: Path, tmp_path: Path, mosquitto: Mosquitto
+) -> None:
+    log, cut_ns = cut(recording, tmp_path)
+    settings, layout = load_skin(CONFIG / "fingertips.toml")
+    found = calibrate_from_log(log, settings, layout, 5.0)
+    engine = Engine(settings, layout, list(range(len(layout.parts))), found)
+    there, stop = Broker(mosquitto.host, mosquitto.port), asyncio.Event()
+    path = tmp_path / "a.mcap"
+    with Recorder(path) as recorder:
+        last = recorded_topics("skin", settings.robot)[-1]
+        capturing = asyncio.create_task(
+            capture_broker(recorder, there, "skin", settings.robot, stop)
+        )
+        await until(lambda: mosquitto.subscriptions(last) > 0)
+        await play_processed(log, engine, settings, there, speed=20)
+        await until(lambda: recorder.messages.get("status") == 2)
+        stop.set()
+        await capturing
+    messages = list(read_messages_of(path))
+    touches = [json.loads(one.payload) for one in messages if one.topic.endswith("/index/touch")]
+    assert (touches[-1]["event"], touches[-1]["reason"]) == ("end", "lost")
+    assert 0 < touches[-1]["t_ns"] - cut_ns < 1_000_000_000
+    states = [one.payload for one in messages if one.topic.endswith("/index/contact")]
+    assert states[-1] == b"UNKNOWN"
+
+
+def test_a_contact_whose_samples_stop_in_a_recording_ends_as_lost(
+    recording: Path, tmp_path: Path
+) -> None:
+    """As with the daemon; the other boards go on."""
+    output = tmp_path / "out.jsonl"
+    command = ["--config", str(CONFIG / "fingertips.toml"), "--calibrate-seconds", "5"]
+    log, cut_ns = cut(recording, tmp_path)
     assert main(["replay", str(log), *command, "--output", str(output)]) == 0
     found = [json.loads(line) for line in output.read_text().splitlines()]
     touches = [one for one in found if one["type"] == "touch" and one["part"] == "index"]

@@ -310,12 +310,80 @@ def test_a_load_cell_is_used_whichever_clock_its_table_has_and_however_early_it_
     )
 
 
+@pytest.mark.parametrize("ahead_s", [2.0, -5.0, 20.0])
+def test_the_lag_of_the_tables_clock_is_found_from_press_and_release(
+    bench, hold, tmp_path, capsys, ahead_s
+):
+    log, own = hold
+    time_s, kpa = np.loadtxt(own, delimiter=",").T
+    table = tmp_path / "cell.csv"
+    np.savetxt(table, np.column_stack([time_s + 1.7e9 + ahead_s, kpa]), "%.3f", ",")
+    found = []
+    for load_cell in (own, table):
+        arguments = ("--relaxation", log, "--load", load_cell, "--json")
+        status, said = run(capsys, "calibrate", bench, *arguments)
+        assert status == 0
+        found.append(json.loads(said.out))
+    exact, late = found
+    assert late["lag_s"] - exact["lag_s"] == pytest.approx(ahead_s, abs=0.02)
+    assert abs(exact["lag_s"]) < 1.0 / HZ
+    for one, other in zip(exact["fits"], late["fits"], strict=True):
+        assert other["rms_hold_kpa"] == pytest.approx(one["rms_hold_kpa"], abs=0.05)
+
+
+def test_people_read_the_lag_of_the_tables_clock(bench, hold, capsys):
+    log, own = hold
+    status, said = run(capsys, "calibrate", bench, "--relaxation", log, "--load", own)
+    assert status == 0
+    assert "the table's clock is +0." in said.out or "the table's clock is -0." in said.out
+
+
+@pytest.mark.parametrize(
+    ("kpa", "message"),
+    [(6.0, "are they in N/cm2"), (24.0, "wanted less than 60%"), (85.0, "kPa RMS; wanted less")],
+)
+def test_a_weight_that_did_not_lie_on_the_skin_is_refused(bench, hold, capsys, kpa, message):
+    log, _ = hold
+    status, said = run(capsys, "calibrate", bench, "--relaxation", log, "--weight-kpa", kpa)
+    assert (status, said.out) == (2, "")
+    assert message in said.err
+    assert said.err.count("\n") == 1
+    assert not bench.with_suffix(".relaxation.json").exists()
+
+
+def test_a_relaxation_file_of_a_newer_version_is_left_as_it_is(bench, hold, capsys):
+    log, _ = hold
+    kept = bench.with_suffix(".relaxation.json")
+    kept.write_text('{"schema": "skin.relaxation/2", "x": 1}')
+    status, said = run(capsys, "calibrate", bench, "--relaxation", log, "--weight-kpa", 50)
+    assert status == 2
+    assert f"mv {kept} {kept}.newer" in said.err
+    assert kept.read_text() == '{"schema": "skin.relaxation/2", "x": 1}'
+
+
 def in_pascal(time_s, kpa):
     return time_s, 1000.0 * kpa
 
 
 def in_tens_of_pascal(time_s, kpa):
     return time_s, 100.0 * kpa
+
+
+def in_millibar(time_s, kpa):
+    return time_s, 10.0 * kpa
+
+
+def in_newton_per_cm2(time_s, kpa):
+    # Not quite: a tenth of it would span too little for any pressure.
+    return time_s, 0.2 * kpa
+
+
+def of_a_stronger_hold(time_s, kpa):
+    return time_s, 1.4 * kpa
+
+
+def of_a_weaker_hold(time_s, kpa):
+    return time_s, 0.45 * kpa
 
 
 def fading_away(time_s, kpa):
@@ -335,8 +403,12 @@ def of_half_the_hold(time_s, kpa):
     [
         (in_pascal, "are they in Pa?"),
         (in_bar, "are they in bar"),
-        (in_tens_of_pascal, "kPa RMS; wanted less than 28"),
-        (fading_away, "of a hold's pressure away; wanted less than 100%"),
+        (in_tens_of_pascal, "times those of the configured curve"),
+        (in_millibar, "are they in mbar"),
+        (in_newton_per_cm2, "are they in N/cm2"),
+        (of_a_stronger_hold, "kPa RMS; wanted less than 5."),
+        (of_a_weaker_hold, "of a hold's pressure away; wanted less than 60%"),
+        (fading_away, "of a hold's pressure away; wanted less than 60%"),
         (of_another_time, "pressure of the same time"),
         (after_the_hold, "pressure of the same time"),
         (of_half_the_hold, "of the hold's"),

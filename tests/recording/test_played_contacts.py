@@ -20,10 +20,15 @@ def test_a_taxel_without_a_zero_keeps_no_contact_unknown() -> None:
     engine = Engine(load(CONFIG), LAYOUT, [PART], replace(known, verdict=verdict))
     contact = contacts_of(engine)[PART]
     blind = slice(3, 4)
-    states = [contact.step(frame(n, blind=blind), []) for n in range(4)]
+    period_ns = 50_000_000
+    decides = engine.measurements()
+    assert decides is not None
+    assert decides[taxel] == 0
+    enough = int(decides.max())
+    states = [contact.step(frame(n * period_ns, blind=blind), []) for n in range(enough)]
     assert states[-1] == "OFF"
-    contact.step(frame(5, [4], blind=blind), [begin([3, 4])])
+    contact.step(frame(100 * period_ns, [4], blind=blind), [begin([3, 4])])
     lost = [begin([3, 4]).ended(2, 2, "lost")]
-    states = [contact.step(frame(6, blind=blind), lost)]
-    states += [contact.step(frame(7 + n, blind=blind), []) for n in range(4)]
+    states = [contact.step(frame(101 * period_ns, blind=blind), lost)]
+    states += [contact.step(frame((102 + n) * period_ns, blind=blind), []) for n in range(enough)]
     assert (states[0], states[-1]) == ("UNKNOWN", "OFF")

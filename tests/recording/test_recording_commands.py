@@ -139,12 +139,18 @@ def test_a_dbc_is_printed_or_written(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.parametrize("name", ["a.log", "a.mcap"])
-def test_a_recording_of_a_bus_on_which_nothing_came_says_so(
+def test_a_recording_of_a_bus_on_which_nothing_came_has_failed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:
     config = str(CONFIG.parent / "demo.toml")
-    assert main(["record", str(tmp_path / name), "--config", config, "--seconds", "0.1"]) == 0
-    assert f"no CAN frame came on the buses of {config}" in capsys.readouterr().err
+    file = str(tmp_path / name)
+    assert main(["record", file, "--config", config, "--seconds", "0.1", "--json"]) == 1
+    told = capsys.readouterr()
+    (line,) = told.err.splitlines()
+    assert f"no CAN frame came on the buses of {config}" in line
+    # What there is of it is kept, and said.
+    assert json.loads(told.out)["file"] == file
+    assert Path(file).exists()
 
 
 async def test_a_robot_is_recorded_until_ctrl_c_and_played_again(

@@ -147,10 +147,9 @@ def test_can_frames_come_back_as_they_were(
 
 def test_a_recording_that_is_being_made_has_not_its_name_yet(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    path.write_bytes(b"an older one")
     recorder = Recorder(path)
     recorder.say(f"{TOPIC}/contact", 1, b"ON")
-    assert path.read_bytes() == b"an older one"
+    assert not path.exists()
     recorder.close()
     assert [said.payload for said in read_messages_of(path)] == [b"ON"]
     assert [file.name for file in tmp_path.iterdir()] == ["a.mcap"]

@@ -54,12 +54,14 @@ CHANCE = Bound(
 )
 CALM = Bound(
     "two pads of some 5 events a second within ten seconds, where nothing is touched, and some 25 "
-    "sweeps in which they do not jump again (`LATELY_MEAN`)",
+    "conversions in which they do not jump again (`LATELY_MEAN`)",
     3.8,
     3.8,
 )
 JUMPS = Bound(
-    "jumps in 8 samples on the average (`NOISE_MEMORY_SAMPLES`), by chance up to 2 s", 2.0, 2.0
+    "jumps in 8 conversions on the average (`NOISE_MEMORY_CONVERSIONS`), by chance up to 2 s",
+    2.0,
+    2.0,
 )
 RUN = Bound(
     "repeats with odds of one in 10^11 (`ODDS`), twice as many in the first minutes; six times as "

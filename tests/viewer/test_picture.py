@@ -5,10 +5,13 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import pytest
 
 from skin_host.client import Contact, Frame, Health, NodeInfo, PartInfo, Touch
 from skin_host.mqtt.info import FingertipInfo, TriangleInfo
 from skin_host.viewer.picture import Cursor, Picture
+
+NOW_S = 100.0
 
 
 def info(parts: dict[str, int], node: str = "main") -> NodeInfo:
@@ -80,19 +83,19 @@ def contact_ids(news: list[bytes | str]) -> list[int]:
 
 def test_a_new_page_is_told_everything_once() -> None:
     skin = picture()
-    skin.take_frame(frame("palm", [1, 2, 3]))
-    skin.take_health(Health("palm", {"state": "ok"}))
+    skin.take_frame(frame("palm", [1, 2, 3]), NOW_S)
+    skin.take_health(Health("palm", {"state": "ok"}), NOW_S)
     cursor = Cursor()
-    news = skin.news(cursor)
+    news = skin.news(cursor, NOW_S)
     assert texts(news).keys() == {"layout", "status", "contacts", "health"}
     assert sum(isinstance(message, bytes) for message in news) == 1
-    assert skin.news(cursor) == []
+    assert skin.news(cursor, NOW_S) == []
 
 
 def test_a_frame_is_bytes_in_the_documented_order() -> None:
     skin = picture({"arm": 2, "palm": 3})
     cursor = Cursor()
-    skin.news(cursor)
+    skin.news(cursor, NOW_S)
     skin.take_frame(
         frame(
             "palm",
@@ -101,25 +104,26 @@ def test_a_frame_is_bytes_in_the_documented_order() -> None:
             valid=np.array([True, False, True]),
             beyond_range=np.array([False, False, True]),
             missed=4,
-        )
+        ),
+        NOW_S,
     )
-    (message,) = skin.news(cursor)
+    (message,) = skin.news(cursor, NOW_S + 1.5)
     assert isinstance(message, bytes)
-    kind, flags, part, n, version, seq, t_s, received, missed = struct.unpack(
-        "<BBHIIIdII", message[:32]
+    kind, flags, part, n, version, seq, t_s, received, missed, age_s = struct.unpack(
+        "<BBHIIIdIIf", message[:36]
     )
     assert (kind, flags, part, n, version, seq, t_s) == (1, 0, 1, 3, skin.version, 7, 2.0)
-    assert (received, missed) == (1, 4)
-    assert np.frombuffer(message[32:44], "<f4").tolist() == [1.5, 0, 99]
-    assert list(message[44:]) == [1, 0, 3]
+    assert (received, missed, age_s) == (1, 4, 1.5)
+    assert np.frombuffer(message[36:48], "<f4").tolist() == [1.5, 0, 99]
+    assert list(message[48:]) == [1, 0, 3]
 
 
 def test_raw_values_follow_when_they_came() -> None:
     skin = picture()
     cursor = Cursor()
-    skin.news(cursor)
-    skin.take_frame(frame("palm", [0, 0, 0], raw=np.array([240, 200, 0], np.uint8)))
-    (message,) = skin.news(cursor)
+    skin.news(cursor, NOW_S)
+    skin.take_frame(frame("palm", [0, 0, 0], raw=np.array([240, 200, 0], np.uint8)), NOW_S)
+    (message,) = skin.news(cursor, NOW_S)
     assert isinstance(message, bytes)
     assert message[1] == 1
     assert list(message[-3:]) == [240, 200, 0]
@@ -128,57 +132,102 @@ def test_raw_values_follow_when_they_came() -> None:
 def test_a_slow_page_is_told_the_newest_frame_alone() -> None:
     skin = picture()
     cursor = Cursor()
-    skin.news(cursor)
+    skin.news(cursor, NOW_S)
     for seq in range(5):
-        skin.take_frame(frame("palm", [seq, 0, 0], seq=seq))
-    (message,) = skin.news(cursor)
+        skin.take_frame(frame("palm", [seq, 0, 0], seq=seq), NOW_S)
+    (message,) = skin.news(cursor, NOW_S)
     assert isinstance(message, bytes)
-    assert np.frombuffer(message[32:36], "<f4")[0] == 4
+    assert np.frombuffer(message[36:40], "<f4")[0] == 4
 
 
 def test_a_frame_of_another_length_or_part_is_not_drawn() -> None:
     skin = picture()
     cursor = Cursor()
-    skin.news(cursor)
-    skin.take_frame(frame("palm", [1, 2]))
-    skin.take_frame(frame("sole", [1, 2, 3]))
-    assert skin.news(cursor) == []
+    skin.news(cursor, NOW_S)
+    skin.take_frame(frame("palm", [1, 2]), NOW_S)
+    skin.take_frame(frame("sole", [1, 2, 3]), NOW_S)
+    assert skin.news(cursor, NOW_S) == []
 
 
-def test_contacts_live_from_begin_to_end() -> None:
+def test_contacts_are_those_that_the_client_knows() -> None:
     skin = picture()
     cursor = Cursor()
-    skin.take_touch(touch("begin", 1))
-    skin.take_touch(touch("begin", 2))
-    skin.take_touch(touch("move", 1))
-    assert contact_ids(skin.news(cursor)) == [1, 2]
-    skin.take_touch(touch("end", 1))
-    assert contact_ids(skin.news(cursor)) == [2]
+    first, second = touch("begin", 1), touch("begin", 2)
+    skin.take_touches([first, second])
+    assert contact_ids(skin.news(cursor, NOW_S)) == [1, 2]
+    skin.take_touches([first, second])
+    assert skin.news(cursor, NOW_S) == []
+    skin.take_touches([second])
+    assert contact_ids(skin.news(cursor, NOW_S)) == [2]
 
 
-def test_a_contact_whose_end_was_missed_does_not_stay() -> None:
-    for lose in (
-        lambda skin: skin.take_touch(touch("begin", 9, missed=2)),
-        lambda skin: skin.take_contact(Contact("palm", "OFF")),
-        lambda skin: skin.forget_contacts(),
-        lambda skin: skin.take_nodes("test", {"main": (False, info({"palm": 3}))}),
+def test_pages_get_the_contact_state_of_each_part_and_why_it_is_not_known() -> None:
+    skin = picture()
+    cursor = Cursor()
+    before = texts(skin.news(cursor, NOW_S))["contacts"]
+    assert (before["state"], before["why"]) == (None, None)
+    for contact in (
+        Contact("palm", "OFF"),
+        Contact("palm", "UNKNOWN", "not_felt"),
+        Contact("palm", "ON"),
+        Contact("palm", "UNKNOWN", "offline"),
     ):
-        skin = picture()
-        cursor = Cursor()
-        skin.take_touch(touch("begin", 1))
-        assert contact_ids(skin.news(cursor)) == [1]
-        lose(skin)
-        assert 1 not in contact_ids(skin.news(cursor))
+        skin.take_contact(contact)
+        sent = texts(skin.news(cursor, NOW_S))["contacts"]
+        assert (sent["state"], sent["why"]) == (contact.state, contact.why)
+
+
+def test_a_state_and_a_health_record_wait_for_the_description_of_their_part() -> None:
+    """Those of a node that has stopped are sent once."""
+    skin = Picture()
+    skin.take_contact(Contact("palm", "UNKNOWN", "offline"))
+    skin.take_health(Health("palm", {"state": "ok", "valid_taxels": 3}), NOW_S)
+    skin.take_nodes("test", {"main": (False, info({"palm": 3}))})
+    sent = texts(skin.news(Cursor(), NOW_S + 30.0))
+    assert (sent["contacts"]["state"], sent["contacts"]["why"]) == ("UNKNOWN", "offline")
+    assert (sent["health"]["valid_taxels"], sent["health"]["age_s"]) == (3, 30.0)
+
+
+@pytest.mark.parametrize("why", ["stale", "offline", "disconnected"])
+def test_contacts_of_what_is_not_received_any_more_are_not_shown(why: Any) -> None:
+    skin = picture()
+    cursor = Cursor()
+    skin.take_contact(Contact("palm", "ON"))
+    skin.take_touches([touch("begin", 1)])
+    assert contact_ids(skin.news(cursor, NOW_S)) == [1]
+    skin.take_contact(Contact("palm", "UNKNOWN", why))
+    assert contact_ids(skin.news(cursor, NOW_S)) == []
+
+
+def test_after_the_client_has_ended_nothing_is_known() -> None:
+    skin = picture()
+    cursor = Cursor()
+    skin.take_contact(Contact("palm", "ON"))
+    skin.take_touches([touch("begin", 1)])
+    skin.lose()
+    sent = texts(skin.news(cursor, NOW_S))["contacts"]
+    assert (sent["state"], sent["why"], sent["contacts"]) == ("UNKNOWN", "disconnected", [])
+
+
+def test_a_page_that_opens_later_gets_what_is_old_with_its_age() -> None:
+    skin = picture()
+    skin.take_frame(frame("palm", [1, 2, 3]), NOW_S)
+    skin.take_health(Health("palm", {"state": "ok"}), NOW_S + 1.0)
+    for cursor, age_s in ((Cursor(), 0.0), (Cursor(), 30.0)):
+        news = skin.news(cursor, NOW_S + 1.0 + age_s)
+        (bytes_,) = [message for message in news if isinstance(message, bytes)]
+        assert struct.unpack_from("<f", bytes_, 32) == (1.0 + age_s,)
+        assert texts(news)["health"]["age_s"] == age_s
 
 
 def test_a_changed_layout_is_told_with_all_that_is_known() -> None:
     skin = picture()
     cursor = Cursor()
-    skin.take_frame(frame("palm", [1, 2, 3]))
-    skin.news(cursor)
+    skin.take_frame(frame("palm", [1, 2, 3]), NOW_S)
+    skin.news(cursor, NOW_S)
     both = {"main": (True, info({"palm": 3})), "legs": (True, info({"foot": 2}, "legs"))}
     skin.take_nodes("test", both)
-    news = skin.news(cursor)
+    news = skin.news(cursor, NOW_S)
     layout = texts(news)["layout"]
     assert [(part["name"], part["node"]) for part in layout["parts"]] == [
         ("palm", "main"),
@@ -186,14 +235,14 @@ def test_a_changed_layout_is_told_with_all_that_is_known() -> None:
     ]
     assert sum(isinstance(message, bytes) for message in news) == 1
     skin.take_nodes("test", both)
-    assert skin.news(cursor) == []
+    assert skin.news(cursor, NOW_S) == []
 
 
 def test_health_is_told_in_sentences() -> None:
     skin = picture()
     record = {"state": "not calibrated", "sentences": ["bus can0 is down"], "valid_taxels": 3}
-    skin.take_health(Health("palm", record))
-    health = texts(skin.news(Cursor()))["health"]
+    skin.take_health(Health("palm", record), NOW_S)
+    health = texts(skin.news(Cursor(), NOW_S))["health"]
     assert health["sentences"] == [
         "Not calibrated: leave the skin untouched and calibrate.",
         "bus can0 is down",
@@ -204,8 +253,8 @@ def test_health_is_told_in_sentences() -> None:
 def test_a_health_record_of_any_form_is_survived() -> None:
     skin = picture()
     for record in ({}, {"state": 3, "sentences": "x"}, {"state": ["a"], "triangles": None}):
-        skin.take_health(Health("palm", record))
-        health = texts(skin.news(Cursor()))["health"]
+        skin.take_health(Health("palm", record), NOW_S)
+        health = texts(skin.news(Cursor(), NOW_S))["health"]
         assert health["part"] == "palm"
         assert isinstance(health["triangles"], list)
 
@@ -213,10 +262,10 @@ def test_a_health_record_of_any_form_is_survived() -> None:
 def test_nodes_that_go_offline_are_told() -> None:
     skin = picture()
     cursor = Cursor()
-    assert texts(skin.news(cursor))["status"]["nodes"] == {"main": True}
+    assert texts(skin.news(cursor, NOW_S))["status"]["nodes"] == {"main": True}
     skin.take_nodes("test", {"main": (False, info({"palm": 3}))})
     skin.take_status({"connected": True})
-    assert texts(skin.news(cursor))["status"]["nodes"] == {"main": False}
+    assert texts(skin.news(cursor, NOW_S))["status"]["nodes"] == {"main": False}
 
 
 def test_a_fingertip_without_skin_is_told_with_its_contacts_and_health() -> None:
@@ -224,10 +273,11 @@ def test_a_fingertip_without_skin_is_told_with_its_contacts_and_health() -> None
     other = msgspec.structs.replace(info({"back": 2}, "two"), fingertips={"tip": tip})
     skin = picture()
     skin.take_nodes("test", {"two": (True, other), "main": (True, info({"palm": 3}))})
-    skin.take_touch(msgspec.structs.replace(touch("begin", 4, "tip"), taxels=[], peak_kpa=None))
-    skin.take_health(Health("tip", {"state": "saturated", "rate_hz": 333.0}))
-    skin.take_frame(frame("palm", [1, 2, 3]))
-    news = skin.news(Cursor())
+    skin.take_touches([msgspec.structs.replace(touch("begin", 4, "tip"), taxels=[], peak_kpa=None)])
+    skin.take_contact(Contact("tip", "ON"))
+    skin.take_health(Health("tip", {"state": "saturated", "rate_hz": 333.0}), NOW_S)
+    skin.take_frame(frame("palm", [1, 2, 3]), NOW_S)
+    news = skin.news(Cursor(), NOW_S)
     parts = texts(news)["layout"]["parts"]
     assert [part["name"] for part in parts] == ["back", "palm", "tip"]
     assert (parts[2]["fingertip"], parts[2]["pads"]) == (True, [])
@@ -237,9 +287,11 @@ def test_a_fingertip_without_skin_is_told_with_its_contacts_and_health() -> None
         if message["type"] == "contacts" and message["part"] == "tip"
     ]
     assert [(contact["id"], contact["peak_kpa"]) for contact in told["contacts"]] == [(4, None)]
+    assert told["state"] == "ON"
     assert texts(news)["health"] == {
         "type": "health",
         "part": "tip",
+        "age_s": 0.0,
         "state": "saturated",
         "sentences": [],
         "rate_hz": 333.0,

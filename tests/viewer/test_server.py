@@ -5,7 +5,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from socket import gethostname
 from typing import Any
@@ -24,12 +24,14 @@ from skin_host.layout import Layout, build_layout
 from skin_host.mqtt.commands import Handler
 from skin_host.mqtt.info import node_info
 from skin_host.mqtt.publisher import Publisher
+from skin_host.processing.events import Touch
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.recording import capture
 from skin_host.recording.mcap import read_messages_of
 from skin_host.viewer import server
 from skin_host.viewer.server import Viewer
 from tests.support.broker import Mosquitto, free_port
+from tests.support.said import touch_event
 from tests.support.waiting import PATIENCE_S, until
 
 PAGE = Path(server.__file__).parent / "page"
@@ -204,6 +206,27 @@ async def test_a_port_that_is_taken_is_told_in_one_line() -> None:
                 pass
 
 
+@pytest.mark.parametrize(
+    ("host", "port", "why"),
+    [
+        ("192.0.2.1", 8080, "no address of this machine; choose one with --host"),
+        ("fe80::1%nowhere", 8080, "; choose an address of this machine with --host"),
+        ("a..b", 8080, "; choose an address of this machine with --host"),
+        ("127.0.0.1", 70_000, "; choose another port"),
+    ],
+)
+async def test_an_address_that_cannot_be_served_is_told_with_what_mends_it(
+    host: str, port: int, why: str
+) -> None:
+    with pytest.raises(SkinError) as refusal:
+        async with Viewer(nowhere(), robot="demo").serving(host, port):
+            pass
+    told = str(refusal.value)
+    assert told.startswith(f"the page cannot be served on {host}:{port}: ")
+    assert why in told
+    assert ("--host" in told) != ("another port" in told)
+
+
 async def test_the_page_is_told_what_the_broker_tells(mosquitto: Mosquitto) -> None:
     layout = skin()
     broker = f"mqtt://{mosquitto.host}:{mosquitto.port}"
@@ -224,7 +247,7 @@ async def test_the_page_is_told_what_the_broker_tells(mosquitto: Mosquitto) -> N
                 continue
             break
         n = layout.part("left_hand").n_taxels
-        assert np.frombuffer(message, "<f4", n, 32)[5] == 12.5
+        assert np.frombuffer(message, "<f4", n, 36)[5] == 12.5
         publisher.put_health("left_hand", {"part": "left_hand", "state": "ok"})
         assert (await heard(socket, of_type("health")))["state"] == "ok"
 
@@ -425,3 +448,68 @@ async def test_who_waits_for_a_robot_is_told_what_to_start_and_the_log_once(
         async with node(mosquitto, skin()):
             await heard(socket, of_type("layout"))
     assert caplog.text.count("is `skin run` running?") == 1
+
+
+async def test_a_page_that_opens_late_gets_what_is_old_with_its_age(
+    mosquitto: Mosquitto, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    layout = skin()
+    later_s = [0.0]
+    monkeypatch.setattr(server, "_now_s", lambda: asyncio.get_running_loop().time() + later_s[0])
+    broker = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    async with Viewer(broker, robot="demo").serving(port=0) as url, page(url) as socket:
+        async with node(mosquitto, layout) as publisher:
+            await heard(socket, of_type("layout"))
+            publisher.put_health("left_hand", {"part": "left_hand", "state": "ok"})
+            assert (await heard(socket, of_type("health")))["age_s"] < 30.0
+            publisher.put_frame(pressed(layout, 1))
+            assert age_s(await heard(socket, lambda m: isinstance(m, bytes))) < 30.0
+        later_s[0] = 30.0
+        async with page(url) as late:
+            assert age_s(await heard(late, lambda m: isinstance(m, bytes))) >= 30.0
+        async with page(url) as late:
+            assert (await heard(late, of_type("health")))["age_s"] >= 30.0
+
+
+def age_s(frame: bytes) -> float:
+    return float(np.frombuffer(frame, "<f4", 1, 32)[0])
+
+
+def of_hand(wanted: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda m: of_type("contacts")(m) and m["part"] == "left_hand" and wanted(m)
+
+
+def touched(number: int) -> Touch:
+    return touch_event(
+        "begin",
+        *(number, 1, time.time_ns(), "left_hand", [5], [0.0, 0.0, 0.0], None, 20.0, 12.5, 12.5),
+        *(0.25,),
+    )
+
+
+async def test_a_page_gets_why_a_part_is_not_known_and_no_contact_of_a_run_before(
+    mosquitto: Mosquitto,
+) -> None:
+    layout = skin()
+    broker = f"mqtt://{mosquitto.host}:{mosquitto.port}"
+    async with Viewer(broker, robot="demo").serving(port=0) as url, page(url) as socket:
+        with suppress(ConnectionError):
+            async with node(mosquitto, layout) as publisher:
+                await heard(socket, of_type("layout"))
+                publisher.put_contact("left_hand", "UNKNOWN")
+                await heard(socket, of_hand(lambda m: m["why"] == "not_felt"))
+                publisher.put_contact("left_hand", "ON")
+                publisher.put_touch(touched(3))
+                seen = await heard(socket, of_hand(lambda m: m["contacts"] and m["state"] == "ON"))
+                assert [one["id"] for one in seen["contacts"]] == [3]
+                assert publisher._connection is not None
+                publisher._closing.set()  # it does not come back
+                publisher._connection.cut()
+                raise ConnectionError
+        seen = await heard(socket, of_hand(lambda m: m["why"] == "offline"))
+        assert (seen["state"], seen["contacts"]) == ("UNKNOWN", [])
+        async with node(mosquitto, layout) as publisher:
+            publisher.put_contact("left_hand", "ON")
+            publisher.put_touch(touched(1))
+            seen = await heard(socket, of_hand(lambda m: 1 in [one["id"] for one in m["contacts"]]))
+            assert [one["id"] for one in seen["contacts"]] == [1]

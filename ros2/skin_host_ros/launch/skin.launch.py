@@ -16,6 +16,8 @@ def generate_launch_description() -> LaunchDescription:
                 package="skin_host_ros",
                 executable="skin",
                 name="skin",
+                respawn=True,  # it ends where no broker or no robot is found
+                respawn_delay=2.0,
                 parameters=[
                     {"broker": LaunchConfiguration("broker"), "robot": LaunchConfiguration("robot")}
                 ],

@@ -5,6 +5,7 @@
 
 import importlib
 import json
+import sys
 import time
 from array import array
 from collections.abc import Sequence
@@ -49,7 +50,8 @@ class SkinNode(Node):
         robot = self.declare_parameter("robot", "").value or None
         self._messages = Messages(message_class, message_array, lambda level: bytes([level]))
         self._states: dict[str, Contact] = {}
-        self._touches: dict[str, dict[int, Touch]] = {}
+        #: By part: the contacts that were published last, as touches.
+        self._shown: dict[str, list[Touch]] = {}
         self._publisher = cache(self._new_publisher)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", RELIABLE)
         self.skin = SkinCallbacks(url, robot=robot)
@@ -81,32 +83,37 @@ class SkinNode(Node):
             points.publish(self._messages.cloud(frame, shape))
 
     def _on_touch(self, touch: Touch) -> None:
-        there = self._touches.setdefault(touch.part, {})
-        if touch.missed:
-            there.clear()  # an end may be among what was missed
-        if touch.event == "end":
-            there.pop(touch.id, None)
-        else:
-            there[touch.id] = touch
         self._publish_contacts(touch.part, touch.t_ns)
 
     def _on_contact(self, contact: Contact) -> None:
         self._states[contact.part] = contact
-        if not contact.touched:
-            self._touches.pop(contact.part, None)
         self._publish_contacts(contact.part, time.time_ns())
 
+    def _known_touches(self, part: str) -> list[Touch]:
+        """What touches a part. Of one that is not received nothing is known, nor what it does."""
+        known = self._states.get(part)
+        if known is not None and known.why not in (None, "not_felt"):
+            return []
+        return [touch for touch in self.skin.present() if touch.part == part]
+
     def _publish_contacts(self, part: str, t_ns: int) -> None:
-        touches = list(self._touches.get(part, {}).values())
+        touches = self._shown[part] = self._known_touches(part)
+        known = self._states.get(part)
         # A touch may come before the state that it makes.
-        known = self._states.get(part, Contact(part, "UNKNOWN", "stale"))
-        state = Contact(part, "ON") if touches and known.state == "OFF" else known
+        if touches and (known is None or known.state == "OFF"):
+            known = Contact(part, "ON")
+        state = known or Contact(part, "UNKNOWN", "stale")
         contacts = self._messages.contacts(state, touches, t_ns)
         self._publisher(ContactArray, f"{part}/contacts", RELIABLE).publish(contacts)
         wrench = self._messages.wrench(part, touches, t_ns)
         self._publisher(WrenchStamped, f"{part}/wrench", RELIABLE).publish(wrench)
 
     def _on_health(self, health: Health) -> None:
+        if health.stored:
+            return  # it may be from any time, and shows nothing of now
+        # A contact whose end was lost goes without a message.
+        if self._known_touches(health.part) != self._shown.get(health.part, []):
+            self._publish_contacts(health.part, time.time_ns())
         one = self._messages.diagnostics({health.part: health}, time.time_ns())
         self._diagnostics.publish(one)
 
@@ -126,15 +133,19 @@ class SkinNode(Node):
 
 
 def main() -> None:
-    """Run until ROS shuts down."""
+    """Run until ROS shuts down, or there is no broker or robot: the launch file tries again."""
     rclpy.init()
-    node = SkinNode()
-    executor = MultiThreadedExecutor()  # a calibration takes seconds
-    executor.add_node(node)
     try:
-        with node.skin:
-            node.follow()
-            executor.spin()
+        node = SkinNode()
+        executor = MultiThreadedExecutor()  # a calibration takes seconds
+        executor.add_node(node)
+        try:
+            with node.skin:
+                node.follow()
+                executor.spin()
+        finally:
+            node.destroy_node()
+    except SkinError as error:
+        sys.exit(f"skin: {error}")
     finally:
-        node.destroy_node()
         rclpy.try_shutdown()

@@ -1,5 +1,6 @@
 """The file that keeps a calibration: JSON, schema skin.calibration/1."""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
@@ -37,6 +38,8 @@ _BOUNDS = {
     "gain": (0.01, 100.0),
     "bend": (0.01, 100.0),
 }
+#: A curve reaches at least this much where it was measured; a pad with less would feel nothing.
+LEAST_REACH_KPA = 2.0
 #: Loads (N, N m), pressures (kPa) and numbers derived from them.
 MOST = 1e6
 _Label = Annotated[str, msgspec.Meta(max_length=64, pattern=r"^[ -~]*(?!\n)$")]
@@ -273,6 +276,11 @@ def _curves_of(
     lengths_agree = len(content.radius_kpa) == len(content.weight)
     if not lengths_agree or not np.all((memory > 0.0) & (memory <= MOST)):
         raise refused("curves: wanted as many radii as weights, all positive")
+    if (taken := math.fsum(content.weight)) >= 1.0:
+        raise refused(
+            f"curves.weight: they sum to {taken:g}; wanted less than 1, or little is left of a "
+            "press"
+        )
     if content.units != KNOTS_UNITS.tolist() or not 0.0 < content.highest_kpa <= MOST:
         raise refused("curves.units: not the activations that this version knows")
     n = layout.n_taxels
@@ -300,6 +308,14 @@ def _curves_of(
             elif verdict[taxel] == CurveVerdict.GOOD:
                 raise refused(f"{where}.kpa: a good taxel without a curve")
         beyond[mine] = [np.inf if units is None else units for units in stored.beyond_units]
+        for taxel in np.flatnonzero(verdict[mine] == CurveVerdict.GOOD).tolist():
+            own = kpa[part.start + taxel]
+            reach_kpa = np.interp(beyond[part.start + taxel], KNOTS_UNITS, own) - own[0]
+            if not reach_kpa >= LEAST_REACH_KPA:
+                raise refused(
+                    f"{where}.kpa: the curve of taxel {taxel} reaches {reach_kpa:g} kPa; wanted "
+                    f"{LEAST_REACH_KPA:g} or more"
+                )
         error[mine] = [np.nan if kpa is None else kpa for kpa in stored.error_kpa]
         noise[mine] = stored.noise_units
     wild = not np.all((noise >= 0.0) & (noise <= SCALE_UNITS))

@@ -41,6 +41,8 @@ NOISE_BLOCK_S = 2.0
 NOISE_QUANTILE = 0.9
 #: Less than this is no response, and with less correlation a pad does not follow.
 LEAST_UNITS = 3.0
+#: Quantiles of a pad's activations that represent rest and press.
+PRESSED_QUANTILES = (0.02, 0.98)
 LEAST_CORRELATION = 0.8
 #: If the pads' median correlates less than this with the table, the table does not belong to the
 #: recording.
@@ -111,12 +113,13 @@ class Course:
     lag_s: float = 0.0
 
 
-def fit_course(course: Course, smoothing_s: float) -> Curves:
+def fit_course(course: Course, smoothing_s: float, memory: Memory | None = None) -> Curves:
     """Find the curve of each pad, the foam's memory, and a verdict on each pad.
 
     Args:
         course: a recording and its pressure.
         smoothing_s: of the filter that will be applied to the pads.
+        memory: of the foam, where it is known already; None: it is fitted.
 
     Raises:
         RequestError: no pad follows the pressure.
@@ -126,7 +129,7 @@ def fit_course(course: Course, smoothing_s: float) -> Curves:
     noise = _noise(units, course.dt_s)
     verdict = np.full(n, CurveVerdict.UNKNOWN, np.uint8)
     pressure = course.pressure_kpa
-    follows = _follows(units, pressure, course.dt_s)
+    follows = following(units, pressure, course.dt_s)
     verdict[course.there] = CurveVerdict.DEAD
     verdict[course.there & follows] = CurveVerdict.GOOD
     jumps = _jumps(units, pressure, noise, course.dt_s)
@@ -141,7 +144,8 @@ def fit_course(course: Course, smoothing_s: float) -> Curves:
     weight = _weight(pressure, course.dt_s)[thin]
     # What is smoothed lags behind by up to the filter's limit, as the foam does by its memory.
     median = np.median(units[:, good], axis=1)
-    memory = _fit_memory(median[thin], pressure[thin], weight, highest_kpa)
+    if memory is None:
+        memory = _fit_memory(median[thin], pressure[thin], weight, highest_kpa)
     loading = _loading_kpa(pressure, memory)[thin]
     kpa = np.zeros((n, len(KNOTS_UNITS)))
     beyond = np.full(n, np.inf)
@@ -248,9 +252,7 @@ def median_of_moving(units: Floats, dt_s: float) -> Floats:
     Raises:
         RequestError: none does.
     """
-    blocks = _block_means(units, max(round(BLOCK_S / dt_s), 1))
-    low, high = np.quantile(blocks, (0.05, 0.95), axis=0)
-    moving = high - low > LEAST_UNITS
+    moving = moves(units, dt_s, (0.05, 0.95))
     if not moving.any():
         raise RequestError(
             "nothing is pressed in the recording: no pad's reading changes by "
@@ -258,6 +260,14 @@ def median_of_moving(units: Floats, dt_s: float) -> Floats:
         )
     median: Floats = np.median(units[:, moving], axis=1)
     return median
+
+
+def moves(units: Floats, dt_s: float, between: tuple[float, float]) -> Mask:
+    """Return which pads [n] have activations [t, n] that differ between these two quantiles."""
+    blocks = _block_means(units, max(round(BLOCK_S / dt_s), 1))
+    low, high = np.quantile(blocks, between, axis=0)
+    moving: Mask = high - low > LEAST_UNITS
+    return moving
 
 
 def _hinges(units: Floats) -> Floats:
@@ -293,14 +303,14 @@ def _noise(units: Floats, dt_s: float) -> Floats:
     return noise
 
 
-def _follows(units: Floats, pressure: Floats, dt_s: float) -> Mask:
+def following(units: Floats, pressure: Floats, dt_s: float) -> Mask:
+    """Return which pads [n] have activations [t, n] that follow a pressure [t]."""
     length = max(round(BLOCK_S / dt_s), 1)
     blocks, mean = _block_means(units, length), _block_means(pressure[:, np.newaxis], length)
-    low, high = np.quantile(blocks, (0.02, 0.98), axis=0)
     centred, course = blocks - blocks.mean(axis=0), mean - mean.mean()
     power = np.sqrt(np.sum(centred**2, axis=0) * np.sum(course**2))
     correlation = np.sum(centred * course, axis=0) / np.where(power > 0.0, power, 1.0)
-    follows: Mask = (high - low > LEAST_UNITS) & (correlation > LEAST_CORRELATION)
+    follows: Mask = moves(units, dt_s, PRESSED_QUANTILES) & (correlation > LEAST_CORRELATION)
     return follows
 
 

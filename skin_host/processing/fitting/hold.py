@@ -46,6 +46,7 @@ class HoldRecord:
         released: index of the first step after the release.
         unit_rms_kpa: error from readings in whole units at the hold's level, if no noise blurs
             them; 0 for exact readings.
+        lag_s: by how much the clock of the table of pressures was found to be ahead.
     """
 
     dt_s: Floats
@@ -53,6 +54,7 @@ class HoldRecord:
     pressure_kpa: Floats
     released: int
     unit_rms_kpa: float = 0.0
+    lag_s: float = 0.0
 
     @property
     def hold_s(self) -> float:

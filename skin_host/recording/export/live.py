@@ -136,7 +136,7 @@ async def foxglove(host: str, port: int | None) -> AsyncIterator[tuple[str, Show
     try:
         server = sdk.start_server(name="skin-host", host=host, port=wanted, context=context)
     except (RuntimeError, OSError) as error:
-        raise SkinError(f"{host}:{wanted}: {error}; choose another port with --port") from None
+        raise SkinError(f"{host}:{wanted}: {error}; choose another --host or --port") from None
     try:
         yield f"ws://{host}:{server.port} in Foxglove", lambda scene: _Foxglove(sdk, context, scene)
     finally:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skin_host.client.streams import Repeats
+from skin_host.client.streams import SentTwice
 from skin_host.config.settings import Settings, skin_hash
 from skin_host.errors import LogError, RequestError
 from skin_host.fingertip.events import FingertipEvent, Over, Slip
@@ -166,7 +166,7 @@ def read_messages(recording: Path) -> Series:
     robots: set[str] = set()
     parts: dict[str, _Growing] = {}
     found = Series({}, [], {})
-    repeats = Repeats()
+    repeats = SentTwice()
     health: dict[str, HealthLine] = {}
     contacts: dict[str, ContactLine] = {}
     for said in read_messages_of(recording):
@@ -238,11 +238,13 @@ def read_frames(log: Path, settings: Settings, layout: Layout, calibration: Cali
     last_ns: int | None = None
     for output in replay(log, engine):
         watch.note(output)
-        times_ns = [step.frame.t_ns for step in output.steps] + [t_ns for _, t_ns in output.samples]
-        last_ns = max(times_ns, default=last_ns)
+        times_ns = [step.frame.t_ns for step in output.steps if step.frame.raw.any()]
+        last_ns = max(times_ns + [t_ns for _, t_ns in output.samples], default=last_ns)
         for step in output.steps:
             frame = step.frame
-            parts[frame.part].add(frame)
+            # Of a part that has not been received yet there are only reports of its silence.
+            if parts[frame.part].seq or frame.raw.any():
+                parts[frame.part].add(frame)
             state = contacts[step.part].step(frame, step.events)
             if states.get(step.part) != state:
                 states[step.part] = state

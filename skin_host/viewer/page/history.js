@@ -39,7 +39,7 @@ export class History {
     this.fine = new Ring(FINE_SLOTS, n);
     this.low = new Ring(COARSE_SLOTS, n);
     this.high = new Ring(COARSE_SLOTS, n);
-    this.bucket = -1;
+    this.bucket = null;
     this.row = 0;
   }
 

@@ -2,9 +2,9 @@
 import { calibrated } from "./calibrated.js";
 import { DASHES, paper, ramp, shareOf, theme } from "./colours.js";
 import { SkinMap } from "./map.js";
-import { put, showContacts, showHealth, showParts } from "./panels.js";
+import { isLeast, put, showContacts, showHealth, showParts } from "./panels.js";
 import { Store } from "./store.js";
-import { HAS_PLOTS, lineColour, Plot, roundTicks, valueAt } from "./strip.js";
+import { HAS_PLOTS, lineColour, nearest, Plot, roundTicks } from "./strip.js";
 
 const $ = (id) => document.getElementById(id);
 const MOST_CHOSEN = 6;
@@ -70,7 +70,7 @@ function take(data) {
   } else if (message.type === "status") store.status = message;
   else if (message.type === "contacts") {
     const part = store.part(message.part);
-    if (part) part.takeContacts(message.contacts, performance.now());
+    if (part) part.takeContacts(message, performance.now());
   } else if (message.type === "health") store.takeHealth(message, performance.now());
   else if (message.type === "answer") answered(message);
 }
@@ -382,7 +382,7 @@ function showPlots(nowMs) {
   force.show(forces, endMs, seconds);
   const atMs = agoMs === null ? null : endMs - agoMs;
   const reachMs = Math.max(700, seconds * 10);
-  const at = (course) => valueAt(course, atMs, reachMs);
+  const at = (course) => nearest(course, atMs, reachMs);
   $("at").hidden = atMs === null && heldMs === null && HAS_PLOTS;
   const words = [heldMs === null ? "" : `held ${((nowMs - heldMs) / 1000).toFixed(0)} s ago`, atMs === null ? "" : `at −${(agoMs / 1000).toFixed(agoMs < 100000 ? 1 : 0)} s`];
   put($("at"), HAS_PLOTS ? words.filter(Boolean).join(", ") : "There are no plots: this installation lacks uPlot. Install it again where npm or PyPI can be reached.");
@@ -390,7 +390,7 @@ function showPlots(nowMs) {
     const text = $("chosen").children[i]?.querySelector("span");
     const of = store.part(part);
     if (!text || !of) return;
-    const seen = atMs === null ? null : at(chosen[i].course);
+    const seen = atMs === null ? null : at(chosen[i].course)?.[1] ?? null;
     const then = seen === null ? "–" : map.raw ? `${signed(-Math.round(seen))} units` : `${seen.toFixed(1)} kPa`;
     put(text, `${part} ${taxel}: ${atMs === null ? value(of, taxel) : then}`);
   });
@@ -405,8 +405,11 @@ function showPlots(nowMs) {
     }));
   }
   forces.forEach(({ name, course }, i) => {
-    const seen = atMs === null ? course.at(-1)?.[1] ?? null : at(course);
-    put(list.children[i].lastChild, `${name}: ${seen === null ? "–" : `${seen.toFixed(2)} N`}`);
+    const [, seen, isLeastThen] = (atMs === null ? course.at(-1) : at(course)) ?? [];
+    const isTotal = name === "total";
+    const least = isTotal && (atMs === null && heldMs === null ? isLeast(shownParts(), nowMs) : isLeastThen);
+    const none = isTotal ? "not known" : "–";
+    put(list.children[i].lastChild, `${name}: ${Number.isFinite(seen) ? `${least ? "≥ " : ""}${seen.toFixed(2)} N` : none}`);
   });
 }
 
@@ -418,12 +421,14 @@ function forceLines(seconds, fromMs, endMs) {
     if (courses.length === 1) return courses[0];
     // One course for all parts: each part's force counts until it says another.
     const events = courses.flatMap((course, k) => course.map(([t, value]) => [t, k, value])).sort((a, b) => a[0] - b[0]);
-    const now = new Array(courses.length).fill(0);
-    let sum = 0;
+    // Nothing is known of a part before it says so; with others, a sum is the least that there is.
+    const now = new Array(courses.length).fill(null);
+    let [sum, unknown] = [0, courses.length];
     return events.map(([t, k, value]) => {
-      sum += value - now[k];
+      sum = Math.max(0, sum + (value ?? 0) - (now[k] ?? 0));
+      unknown += (value === null) - (now[k] === null);
       now[k] = value;
-      return [t, Math.max(0, sum)];
+      return [t, unknown && sum < 1e-9 ? null : sum, unknown > 0];
     });
   });
   const lines = [{ name: "total", course: total, colour: look.text, dash: [] }];
@@ -471,6 +476,7 @@ function frame(nowMs) {
     showHealth($("health"), $("shared"), shownParts(), nowMs);
     if (nowMs - plottedMs > PLOT_MS) {
       plottedMs = nowMs;
+      for (const part of store.parts) part.rememberForces(nowMs);
       showPlots(nowMs);
     }
     showRecording();

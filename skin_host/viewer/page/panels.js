@@ -35,14 +35,38 @@ export function showParts(nav, store, shown, nowMs, pick) {
   });
 }
 
+/** Names of some parts, or how many there are where they are many. */
+function named(parts) {
+  return parts.length > MANY ? `${parts.length} parts` : parts.map((part) => part.name).join(", ");
+}
+
+/** In words what touches no row of the table shows; nothing touches only what is known to be untouched. */
+function untouched(parts, touched, nowMs) {
+  const groups = new Map();
+  for (const part of parts) {
+    const why = part.unknown(nowMs);
+    if (why !== null) groups.set(why, [...groups.get(why) ?? [], part]);
+  }
+  const said = [...groups].map(([why, those]) => `Not known of ${named(those)}: ${why}.`);
+  const known = parts.filter((part) => part.unknown(nowMs) === null && !touched.includes(part));
+  const on = known.filter((part) => part.state === "ON");
+  if (on.length) said.push(`Touched: ${named(on)}; where is not known yet.`);
+  const off = known.filter((part) => part.state === "OFF");
+  if (!touched.length && !on.length && off.length) said.push(`Nothing touches ${groups.size ? named(off) : "the skin"}.`);
+  return said.join(" ");
+}
+
+/** Whether there may be more contacts of these parts than are known. */
+export function isLeast(parts, nowMs) { return parts.some((part) => part.force(nowMs) === null || part.unknown(nowMs) !== null); }
+
 /** Contacts of the parts that are shown, with their sum; the pointer and a click mark one. */
 export function showContacts(table, hint, parts, map, nowMs, point, select) {
-  const live = parts.filter((part) => !part.stale(nowMs));
-  const rows = live.flatMap((part) => part.contacts.map((contact) => [part.name, contact]));
+  const touched = parts.filter((part) => !part.stale(nowMs) && part.contacts.length);
+  const rows = touched.flatMap((part) => part.contacts.map((contact) => [part.name, contact]));
   const body = table.tBodies[0];
   table.hidden = !rows.length;
-  hint.hidden = rows.length > 0;
-  put(hint, live.length ? "Nothing touches the skin." : "Not known: no data.");
+  put(hint, untouched(parts, touched, nowMs));
+  hint.hidden = !hint.textContent;
   keep(body, rows.length, () => {
     const row = document.createElement("tr");
     row.tabIndex = 0;
@@ -69,7 +93,7 @@ export function showContacts(table, hint, parts, map, nowMs, point, select) {
     cells.forEach((text, k) => put(row.children[k], text));
   });
   const total = rows.reduce((sum, [, contact]) => sum + contact.force_n, 0);
-  put(table.tFoot.rows[0].cells[2], told(total, 2, "N"));
+  put(table.tFoot.rows[0].cells[2], `${isLeast(parts, nowMs) ? "≥ " : ""}${told(total, 2, "N")}`);
   table.tFoot.hidden = rows.length < 2;
 }
 
@@ -83,6 +107,9 @@ function stateOf(part, nowMs) {
   return part.stale(nowMs) ? "stale" : part.health?.state ?? "ok";
 }
 
+/** Whether what was known of a part is over: its data came, and come no more. */
+function isOver(part, nowMs) { return part.heardMs !== null && part.stale(nowMs); }
+
 /** Sentences that more than one part has, but for its own name: [sentence, how many]. */
 function sharedSentences(parts) {
   const counts = new Map();
@@ -95,7 +122,7 @@ function sharedSentences(parts) {
 export function showHealth(box, list, parts, nowMs) {
   if (!parts.length) return;
   if (box.querySelector(".hint")) box.replaceChildren();
-  const shared = sharedSentences(parts);
+  const shared = sharedSentences(parts.filter((part) => !isOver(part, nowMs)));
   keep(list, shared.length, () => document.createElement("li")).forEach((item, i) => put(item, `${shared[i][0]} (${shared[i][1]} parts)`));
   list.hidden = !shared.length;
   const once = new Set(shared.map(([says]) => says));
@@ -135,7 +162,8 @@ export function showHealth(box, list, parts, nowMs) {
 function rates(parts, nowMs) {
   const sum = (of) => parts.reduce((all, part) => all + of(part), 0);
   const taxels = sum((part) => part.health?.taxels ?? part.n);
-  const valid = sum((part) => part.health?.valid_taxels ?? 0);
+  const known = parts.map((part) => part.valids(nowMs));
+  const valid = known.includes(null) ? "?" : known.reduce((all, n) => all + n, 0);
   return `${sum((part) => part.rate(nowMs)).toFixed(0)} frames/s, ${valid} of ${taxels} taxels valid`;
 }
 
@@ -165,13 +193,23 @@ function fill(article, part, once, nowMs) {
   article.dataset.part = part.name;
   put2(head.firstChild, part.name);
   put(head.lastChild, stateOf(part, nowMs));
-  const valid = part.health?.valid_taxels;
-  const taxels = valid === undefined ? `${part.n} taxels` : `${valid} of ${part.health.taxels} taxels valid`;
+  const taxels = `${part.valids(nowMs) ?? "?"} of ${part.health?.taxels ?? part.n} taxels valid`;
   const frames = `${part.rate(nowMs).toFixed(1)} frames/s, ${part.missed} missed, ${taxels}`;
-  put(rates, part.fingertip ? `${told(part.health?.rate_hz, 0, "samples/s")} of force and torque` : frames);
-  const said = [...(stale && part.heardMs !== null ? [`${part.fingertip ? "Nothing" : "No frame"} for ${((nowMs - part.heardMs) / 1000).toFixed(0)} s.`] : []), ...(part.health?.sentences ?? []).filter((says) => !once.has(says))];
+  put(rates, part.fingertip ? `${told(stale ? null : part.health?.rate_hz, 0, "samples/s")} of force and torque` : frames);
+  const sentences = (part.health?.sentences ?? []).filter((says) => isOver(part, nowMs) || !once.has(says));
+  const said = [...ages(part, nowMs, sentences.length ? "; before that:" : "."), ...sentences];
   keep(list, said.length, () => document.createElement("li")).forEach((item, k) => put(item, said[k]));
   list.hidden = !said.length;
+}
+
+/** What has stopped to come, and since when. */
+function ages(part, nowMs, end) {
+  const since = (ms) => `for ${((nowMs - ms) / 1000).toFixed(0)} s${end}`;
+  if (isOver(part, nowMs)) {
+    const isLate = part.why === "stale" && nowMs - part.heardMs < 1000;
+    return [isLate ? "What comes is too late to be true." : `${part.fingertip ? "Nothing" : "No frame"} ${since(part.heardMs)}`];
+  }
+  return part.heardMs !== null && part.isHealthOld(nowMs) ? [`No health ${since(part.healthMs)}`] : [];
 }
 
 /** A number with its unit; where there is no skin there is no pressure and no area. */

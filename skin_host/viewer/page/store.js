@@ -1,9 +1,20 @@
 // What the server has told: parts, their last values, and their past.
 import { Course, History, LONGEST_S } from "./history.js";
 
-const HEAD = 32;
+const HEAD = 36;
 const VALID = 1;
 const BEYOND = 2;
+/** Health comes once a second; what is older than this does not count as known. */
+const HEALTH_MS = 5000;
+/** Why a contact state is not known, as the client of the broker gives it. */
+const WHY = {
+  not_felt: "not all is felt",
+  stale: "nothing comes in time",
+  offline: "the node is offline",
+  disconnected: "there is no connection",
+};
+/** States of health in which a part feels nothing; they are the reason, too. */
+const NOT_IN_USE = ["not calibrated", "disabled"];
 
 export class Part {
   constructor(info) {
@@ -26,21 +37,39 @@ export class Part {
     this.missed = 0;
     this.arrivals = [];
     this.contacts = [];
+    this.state = null; // whether anything touches it: ON, OFF, UNKNOWN; null: that has not come
+    this.why = null; // why it is UNKNOWN
     this.forces = new Course(); // of all contacts together
     this.forceOf = new Map(); // of each contact by its id
     this.noLoad = this.triangles.length ? Float32Array.from({ length: this.n }, (_, i) => this.triangleOf(i)?.no_load ?? 240) : new Float32Array(this.n);
     this.health = null;
+    this.healthMs = null;
     this.past = new History(this.n);
     this.pastRaw = null;
   }
 
-  takeContacts(contacts, nowMs) {
-    this.contacts = contacts;
+  takeContacts({ contacts, state, why }, nowMs) {
+    [this.contacts, this.state, this.why] = [contacts, state, why];
     this.rememberForces(nowMs);
   }
 
+  /** Why it is not known whether anything touches it; null: it is known. */
+  unknown(nowMs) {
+    const unused = NOT_IN_USE.find((state) => state === this.health?.state);
+    if (this.gone) return WHY[this.why];
+    if (this.stale(nowMs)) return this.heardMs === null ? unused ?? "nothing has come" : "nothing comes any more";
+    if (this.state === null) return "no contact state has come";
+    return this.state === "UNKNOWN" ? unused ?? WHY[this.why] : null;
+  }
+
+  /** Force of all its contacts; null where it is not known whether there are any. */
+  force(nowMs) {
+    if (this.stale(nowMs) || (!this.contacts.length && this.state !== "OFF")) return null;
+    return this.contacts.reduce((sum, contact) => sum + contact.force_n, 0);
+  }
+
   rememberForces(nowMs) {
-    this.forces.add(nowMs, this.contacts.reduce((sum, contact) => sum + contact.force_n, 0));
+    this.forces.add(nowMs, this.force(nowMs));
     for (const contact of this.contacts) {
       if (!this.forceOf.has(contact.id)) this.forceOf.set(contact.id, new Course());
       this.forceOf.get(contact.id).add(nowMs, contact.force_n);
@@ -52,9 +81,12 @@ export class Part {
   beyond(i) { return (this.bits[i] & BEYOND) !== 0; }
   triangleOf(i) { return this.triangles[Math.floor(i / 12)]; }
 
+  /** Whether its node has stopped, or all comes too late to be true. */
+  get gone() { return this.why === "offline" || this.why === "stale"; }
+
   /** Whether the data have stopped: longer than five periods, at least a second. */
   stale(nowMs) {
-    return this.heardMs === null || nowMs - this.heardMs > Math.max(1000, 5 * this.periodMs);
+    return this.gone || this.heardMs === null || nowMs - this.heardMs > Math.max(1000, 5 * this.periodMs);
   }
 
   take(view, nowMs) {
@@ -66,15 +98,26 @@ export class Part {
     this.pressure.set(new Float32Array(view.buffer, start, n));
     this.bits.set(new Uint8Array(view.buffer, start + 4 * n, n));
     this.raw = hasRaw ? new Uint8Array(view.buffer, start + 5 * n, n).slice() : null;
-    this.heardMs = nowMs;
+    const before = this.heardMs;
+    this.hear(nowMs - 1000 * view.getFloat32(32, true));
     // By the robot's clock: what a busy browser takes all at once did not come so fast.
     const sentMs = view.getFloat64(16, true) * 1000;
     if (sentMs < this.arrivals.at(-1)?.[0]) this.arrivals = [];
     this.arrivals.push([sentMs, this.received]);
     while (this.arrivals.length > 2 && sentMs - this.arrivals[0][0] > 2000) this.arrivals.shift();
-    this.remember(nowMs);
+    // A page that connects again gets the last frame again.
+    if (this.heardMs !== before) this.remember(this.heardMs);
     this.rememberForces(nowMs);
   }
+
+  hear(atMs) { this.heardMs = Math.max(this.heardMs ?? -Infinity, atMs); }
+
+  /** How many of its taxels are valid; null: not known, or not any more. */
+  valids(nowMs) {
+    return this.stale(nowMs) || this.isHealthOld(nowMs) ? null : this.health?.valid_taxels ?? null;
+  }
+
+  isHealthOld(nowMs) { return this.health !== null && nowMs - this.healthMs > HEALTH_MS; }
 
   remember(nowMs) {
     this.past.add(nowMs, this.pressure.map((value, i) => (this.bits[i] & VALID ? value : NaN)));
@@ -119,7 +162,7 @@ export class Store {
       const before = old.get(part.name);
       // A new calibration gives a new layout of the same taxels: their past stays.
       if (before && before.n === part.n) {
-        for (const key of ["pressure", "bits", "raw", "heardMs", "received", "missed", "arrivals", "contacts", "forces", "forceOf", "health", "faults", "past", "pastRaw"]) part[key] = before[key];
+        for (const key of ["pressure", "bits", "raw", "heardMs", "received", "missed", "arrivals", "contacts", "state", "why", "forces", "forceOf", "health", "healthMs", "faults", "past", "pastRaw"]) part[key] = before[key];
       }
       return part;
     });
@@ -136,7 +179,8 @@ export class Store {
     const part = this.part(message.part);
     if (!part) return;
     part.health = message;
-    if (part.fingertip) { part.heardMs = nowMs; part.rememberForces(nowMs); }
+    part.healthMs = nowMs - 1000 * message.age_s;
+    if (part.fingertip) { part.hear(part.healthMs); part.rememberForces(nowMs); }
     part.faults = new Set((message.triangles ?? []).map((t) => `${t.board}/${t.triangle}`));
   }
 }

@@ -96,13 +96,13 @@ export class Plot {
   }
 }
 
-/** The value of a line at a time: that of its nearest point, null where nothing is near. */
-export function valueAt(course, t, reachMs) {
+/** The point of a line that is nearest to a time and has a value, null where none is near. */
+export function nearest(course, t, reachMs) {
   let best = null;
-  for (const [time, value] of course) {
-    if (value !== null && (best === null || Math.abs(time - t) <= Math.abs(best[0] - t))) best = [time, value];
+  for (const point of course) {
+    if (point[1] !== null && (best === null || Math.abs(point[0] - t) <= Math.abs(best[0] - t))) best = point;
   }
-  return best && Math.abs(best[0] - t) <= reachMs ? best[1] : null;
+  return best && Math.abs(best[0] - t) <= reachMs ? best : null;
 }
 
 /** The next round number, whose half is round too. */

@@ -223,3 +223,31 @@ def test_damaged_curves_are_refused(untouched, tmp_path, old, new, message):
     path.write_text(text[:at] + text[at:].replace(old, new, 1))
     with pytest.raises(CalibrationError, match=message):
         load_calibration(path, LAYOUT, "abc")
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda c: c["parts"]["skin"]["kpa"].__setitem__(3, [0.0] * len(KNOTS_UNITS)), "taxel 3"),
+        (
+            lambda c: c["parts"]["skin"]["kpa"].__setitem__(
+                5, np.linspace(0.0, 2.0, len(KNOTS_UNITS)).tolist()
+            ),
+            "taxel 5",
+        ),
+        (lambda c: c["parts"]["skin"]["beyond_units"].__setitem__(7, 1e-3), "taxel 7"),
+        (lambda c: c.update(radius_kpa=[1.0, 5.0], weight=[0.9, 0.9]), "sum to 1.8"),
+        (lambda c: c.update(radius_kpa=[1.0], weight=[1.0]), "sum to 1;"),
+    ],
+)
+def test_curves_with_which_a_good_pad_would_feel_nothing_are_refused(
+    untouched, tmp_path, damage, message
+):
+    path = tmp_path / "calibration.json"
+    save_calibration(path, calibration.with_curves(untouched, own_curves()), LAYOUT)
+    document = json.loads(path.read_text())
+    damage(document["curves"])
+    damaged(document, path)
+    with pytest.raises(CalibrationError, match=message) as caught:
+        load_calibration(path, LAYOUT, "abc")
+    assert "skin calibrate CONFIG" in str(caught.value)

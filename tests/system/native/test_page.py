@@ -1,5 +1,7 @@
 """The live page in a real browser, from presses on emulated foam to what a person sees."""
 
+import json
+import re
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -70,6 +72,46 @@ MANY_PARTS = """(() => {
     const before = draws();
     return new Promise(done => setTimeout(() => done(draws() > before), 600));
 })()"""
+#: What a server would send of two parts with one taxel each and of a fingertip.
+SERVER = """(() => {
+    const part = (name, more = {}) => ({
+        name, node: "main", period_ms: 50, pads: ["pressure"], position_m: [[0, 0, 0]],
+        normal: [[0, 0, 1]], radius_mm: [2], area_mm2: [20], triangles: [
+            { board: "b", number: 0, kind: "x", first: 0, no_load: 240,
+              outline_m: [[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0]] },
+        ], ...more,
+    });
+    const bare = { fingertip: true, period_ms: 1000, pads: [], position_m: [], normal: [],
+                   radius_mm: [], area_mm2: [], triangles: [] };
+    const socket = window.sockets.at(-1);
+    const say = (type, message) => socket.onmessage({ data: JSON.stringify({ type, ...message }) });
+    window.contacts = (part, state, why = null, contacts = []) =>
+        say("contacts", { part, state, why, contacts });
+    window.health = (part, age_s) => say("health", {
+        part, age_s, state: "ok", sentences: [], rate_hz: 50, taxels: 1, valid_taxels: 1,
+        triangles: [],
+    });
+    let seq = 0;
+    window.pressed = (number, age_s) => {
+        const view = new DataView(new ArrayBuffer(41));
+        view.setUint8(0, 1);
+        view.setUint16(2, number, true);
+        view.setUint32(4, 1, true);
+        view.setUint32(8, 9, true);
+        view.setUint32(12, ++seq, true);
+        view.setFloat64(16, seq / 20, true);
+        view.setFloat32(32, age_s, true);
+        view.setUint8(40, 1);
+        socket.onmessage({ data: view.buffer });
+    };
+    say("layout", { version: 9, robot: "three", nodes: {},
+                    parts: [part("palm"), part("wrist"), part("tip", bare)] });
+    return true;
+})()"""
+TOUCHING = """document.getElementById("no-contacts").hidden
+    ? "" : document.getElementById("no-contacts").textContent"""
+TOTAL = 'document.querySelector("#forces span").textContent'
+HEALTH = 'document.getElementById("health").innerText'
 WATCH_SOCKETS = """
     window.sockets = [];
     window.WebSocket = class extends WebSocket {
@@ -261,6 +303,73 @@ async def test_stopped_data_are_called_stale_and_everything_comes_back(
         mosquitto.start()
         await seen.until(f"{LIVE} && !({STALE})")
         await seen.until(f"({CONTACTS}).length")
+
+
+async def test_nothing_touches_only_what_is_known_to_be_untouched(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    async with viewing(mosquitto, "nobody", tmp_path / "p", watch=WATCH_SOCKETS) as seen:
+        await seen.until("window.sockets.at(-1)?.readyState === 1")
+        await seen.run(SERVER)
+
+        async def shows(text: str, total: str) -> None:
+            await seen.until(f"{TOUCHING} === {json.dumps(text)} && {TOTAL} === 'total: {total}'")
+
+        # Frames and health come; no state does.
+        await seen.run("setInterval(() => { pressed(0, 0); pressed(1, 0); health('tip', 0); }, 50)")
+        state = "Not known of palm, wrist, tip: no contact state has come."
+        await shows(state, "not known")
+        await seen.run("contacts('palm', 'OFF'); contacts('wrist', 'OFF'); contacts('tip', 'OFF')")
+        await shows("Nothing touches the skin.", "0.00 N")
+        # A dead board, a fingertip without a zero: of others it is known.
+        unknown = "Not known of wrist: not all is felt."
+        await seen.run("contacts('wrist', 'UNKNOWN', 'not_felt')")
+        await shows(f"{unknown} Nothing touches palm, tip.", "not known")
+        await seen.run("contacts('wrist', 'OFF'); contacts('tip', 'UNKNOWN', 'not_felt')")
+        await shows("Not known of tip: not all is felt. Nothing touches palm, wrist.", "not known")
+        await seen.run("contacts('tip', 'OFF'); contacts('wrist', 'UNKNOWN', 'not_felt')")
+        one = "{ id: 4, taxels: [0], centroid_m: null, force_n: 1.5, peak_kpa: 9, area_mm2: 20 }"
+        await seen.run(f"contacts('palm', 'ON', null, [{one}])")
+        await shows(unknown, "≥ 1.50 N")
+        await seen.run("contacts('palm', 'OFF')")
+        await seen.run("contacts('wrist', 'ON')")
+        await shows("Touched: wrist; where is not known yet.", "not known")
+        await seen.run(
+            "for (const one of ['palm', 'wrist', 'tip']) contacts(one, 'UNKNOWN', 'offline')"
+        )
+        await shows("Not known of palm, wrist, tip: the node is offline.", "not known")
+        assert await seen.run(CONTACTS) == []
+
+
+async def test_what_is_old_when_the_page_opens_is_not_shown_as_present(
+    mosquitto: Mosquitto, tmp_path: Path
+) -> None:
+    async with viewing(mosquitto, "nobody", tmp_path / "p", watch=WATCH_SOCKETS) as seen:
+        await seen.until("window.sockets.at(-1)?.readyState === 1")
+        await seen.run(SERVER)
+        # In the first picture that is drawn of it.
+        palm, wrist, tip = await seen.run("""(() => {
+            pressed(0, 3000); health('palm', 3000); health('tip', 3000);
+            pressed(1, 0); health('wrist', 0);
+            for (const one of ['palm', 'wrist', 'tip']) contacts(one, 'OFF');
+            return new Promise(done => requestAnimationFrame(() => setTimeout(() => done(
+                ['palm', 'wrist', 'tip'].map(part => document.querySelector(
+                    `#health article[data-part="${part}"]`).innerText),
+            ))));
+        })()""")
+        assert re.search("No frame for 300[0-9] s", palm)
+        assert "? of 1 taxels valid" in palm
+        assert "1 of 1 taxels valid" in wrist
+        assert re.search("Nothing for 300[0-9] s", tip)
+        assert "– of force and torque" in tip
+        old = "Not known of palm, tip: nothing comes any more. Nothing touches wrist."
+        await seen.run("setInterval(() => { pressed(1, 0); health('wrist', 0); }, 50)")
+        await seen.until(f"{TOUCHING} === {json.dumps(old)}")
+        labels = await seen.run("window.labels.map(([text]) => text)")
+        assert any(re.fullmatch("palm: stale, 300[0-9] s", one) for one in labels)
+        # The same frame again, as after a new connection, is as old as it was.
+        await seen.run("pressed(0, 3001)")
+        await seen.until(f"/No frame for 30[0-9][0-9] s/.test({HEALTH})")
 
 
 async def test_the_skin_can_be_calibrated_from_the_page(robot: Stack, tmp_path: Path) -> None:

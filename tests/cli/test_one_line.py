@@ -1,0 +1,71 @@
+"""What cannot be done is one line on stderr: what, where, and what mends it."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from skin_host.cli import main
+
+
+@pytest.fixture
+def group(tmp_path: Path) -> list[str]:
+    """A bus of this process with nobody on it."""
+    return ["--interface", "virtual", "--channel", tmp_path.name]
+
+
+@pytest.mark.parametrize("more", [[], ["--json"]])
+def test_a_scan_that_nobody_answers_has_failed(
+    group: list[str], more: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["scan", *group, *more]) == 1
+    told = capsys.readouterr()
+    (line,) = told.err.splitlines()
+    assert line.startswith(f"skin scan: {group[-1]}: nobody answered")
+    assert "powered" in line
+    assert (json.loads(told.out) if more else told.out) == ({"boards": []} if more else "")
+
+
+@pytest.mark.parametrize("options", [["--channel", ""], ["--interface", ""]])
+@pytest.mark.parametrize("command", [["scan"], ["emulate", "a.toml"]])
+def test_an_empty_name_is_refused(
+    command: list[str], options: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        main([*command, *options])
+    assert end.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"argument {options[0]}: seen '', wanted a name" in line
+
+
+def test_a_bus_without_a_channel_is_found_by_the_check(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "a.toml"
+    config.write_text('robot = "a"\n[buses.can0]\nchannel = ""\n')
+    assert main(["check", str(config)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "buses.can0.channel" in line
+
+
+@pytest.mark.parametrize(
+    ("kind", "why"),
+    [
+        ("skinspec", "a.xml:1: not valid XML from here: syntax error"),
+        ("skingui", "contains no unit"),
+        ("positions", "no rows x y z nx ny nz"),
+    ],
+)
+def test_an_import_that_fails_names_its_reason_alone(
+    kind: str, why: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "a.xml"
+    file.write_text("this is no device file\n")
+    output = tmp_path / "b.toml"
+    assert main(["import", kind, str(file), "--output", str(output)]) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    (line,) = told.err.splitlines()
+    assert line.startswith("skin import: ")
+    assert why in line
+    assert not output.exists()

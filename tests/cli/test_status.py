@@ -1,0 +1,79 @@
+"""`skin status` and `skin listen` where the broker has what a robot published that is gone now."""
+
+import asyncio
+import json
+from pathlib import Path
+from typing import Any
+
+import aiomqtt
+import pytest
+
+from skin_host.cli import main, watch
+from skin_host.config.settings import load
+from skin_host.layout import build_layout
+from skin_host.mqtt.info import encode_info, node_info
+from tests.support.broker import Mosquitto
+from tests.support.waiting import until
+
+CONFIG = Path(__file__).parents[2] / "config" / "demo.toml"
+WELL = {"state": "ok", "taxels": 104, "valid_taxels": 104, "rate_hz": 20.0}
+INFO = node_info(build_layout(load(CONFIG), CONFIG.parent), "main", version="1", configuration="x")
+
+
+async def left(broker: Mosquitto) -> None:
+    """Leave at a broker what it has stored of a robot over a power cut."""
+    async with aiomqtt.Client(broker.host, broker.port) as stranger:
+
+        async def keep(topic: str, payload: bytes) -> None:
+            await stranger.publish(f"skin/demo/{topic}", payload, qos=1, retain=True)
+
+        await keep("nodes/main/status", b"online")
+        await keep("nodes/main/info", encode_info(INFO))
+        for part in INFO.parts:
+            await keep(f"{part}/contact", b"OFF")
+            await keep(f"{part}/health", json.dumps({"schema": "skin.health/1"} | WELL).encode())
+
+
+def status(broker: Mosquitto) -> "asyncio.Task[int]":
+    words = ["status", "--json", "--broker", f"mqtt://{broker.host}:{broker.port}"]
+    return asyncio.create_task(asyncio.to_thread(main, words))
+
+
+async def test_a_robot_that_is_switched_off_is_not_well(
+    mosquitto: Mosquitto, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(watch, "LIVE_S", 0.3)
+    await left(mosquitto)
+    assert await status(mosquitto) == 1
+    records: dict[str, Any] = json.loads(capsys.readouterr().out)
+    assert {part: one["state"] for part, one in records.items()} == dict.fromkeys(
+        INFO.parts, "not received"
+    )
+    assert records["left_hand"]["sentences"] == [
+        "nothing came of it for 0.3 s: is `skin run` running at node main?"
+    ]
+    assert (records["left_hand"]["taxels"], records["left_hand"]["valid_taxels"]) == (104, 0)
+
+
+async def test_who_listens_to_a_robot_that_is_switched_off_learns_it(
+    mosquitto: Mosquitto, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    await left(mosquitto)
+    monkeypatch.setattr(watch, "SETTLED_S", 0.3)
+    words = ["listen", "--count", "1", "--broker", f"mqtt://{mosquitto.host}:{mosquitto.port}"]
+    listening = asyncio.create_task(asyncio.to_thread(main, words))
+    said = ""
+
+    def told() -> bool:
+        nonlocal said
+        said += capsys.readouterr().err
+        return "waiting" in said
+
+    await until(told)
+    assert said == 'warning: nothing comes from robot "demo": is `skin run` running?; waiting\n'
+    topic = "skin/demo/left_hand/over"
+    event = {"schema": "skin.over/1", "event": "begin", "id": 1, "t_ns": 1, "count": 1}
+    event |= {"part": "left_hand", "force_n": 10.0}
+    async with aiomqtt.Client(mosquitto.host, mosquitto.port) as stranger:
+        await stranger.publish(topic, json.dumps(event).encode(), qos=1)
+    assert await listening == 0
