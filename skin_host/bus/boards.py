@@ -43,7 +43,7 @@ from skin_host.bus.commands import (
     TxMode,
     command_frame,
 )
-from skin_host.bus.ledger import WRONG_PERIOD, BoardLedger
+from skin_host.bus.ledger import BoardLedger
 from skin_host.bus.opening import open_port
 from skin_host.bus.wire import BROADCAST_ADDRESS, find_skin_frames
 from skin_host.clock import SYSTEM, Clock
@@ -265,9 +265,7 @@ class Boards:
 
     def _is_in_use(self, record: BoardRecord) -> bool:
         """Whether a board sends as one that an earlier start of the daemon has set up."""
-        seen_ns = self._ledger.regular_period_ns(record.row)
-        period_ns = record.layout.settings.period_ms * 1e6
-        return seen_ns is not None and abs(seen_ns - period_ns) <= WRONG_PERIOD * period_ns
+        return self._ledger.keeps_period(record.row) is True
 
     def awaits(self, address: int) -> bool:
         """Whether a board has sent nothing yet because it has not had its time for that: it is
@@ -383,11 +381,9 @@ class Boards:
             wrong = "was reset while it was set up"
         elif self._ledger.missing(record.row):
             wrong = "does not send all of its triangles"
-        else:
-            period_ms = record.layout.settings.period_ms
-            seen_ns = self._ledger.regular_period_ns(record.row)
-            if seen_ns is not None and abs(seen_ns * 1e-6 - period_ms) > WRONG_PERIOD * period_ms:
-                wrong = f"sends every {seen_ns / 1e6:.0f} ms, not {period_ms} ms"
+        elif self._ledger.keeps_period(record.row) is False:
+            seen_ms = (self._ledger.regular_period_ns(record.row) or 0.0) / 1e6
+            wrong = f"sends every {seen_ms:.0f} ms, not {record.layout.settings.period_ms} ms"
         if wrong and not record.wrong:
             record.wrong_since_ns = now_ns
         record.wrong = wrong

@@ -311,6 +311,13 @@ class BoardLedger:
         spread_ns = intervals[-1 - fifth] - intervals[fifth]
         return usual_ns if spread_ns < UNEVEN * usual_ns else None
 
+    def keeps_period(self, row: int) -> bool | None:
+        """Return whether a board sends in its configured period, within `WRONG_PERIOD`; None where
+        `regular_period_ns` is not known.
+        """
+        seen_ns, period_ns = self.regular_period_ns(row), float(self._period_ns[row])
+        return None if seen_ns is None else abs(seen_ns - period_ns) <= WRONG_PERIOD * period_ns
+
     def _note_crowd(self, row: int, sweep: Sweep) -> None:
         """Decide whether two boards send at an address.
 

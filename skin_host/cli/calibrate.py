@@ -4,7 +4,8 @@ Recordings give the foam's relaxation and the pressure curve of each taxel.
 """
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from skin_host.processing.calibration import Calibration
     from skin_host.processing.calibration.outcome import Outcome, TriangleVerdict
     from skin_host.processing.curves import Curves
+    from skin_host.processing.fitting.course import GainFit
     from skin_host.processing.fitting.hold import Fit, HoldRecord
     from skin_host.recording import fitting
 
@@ -291,6 +293,8 @@ def _relaxation(arguments: argparse.Namespace) -> int:
 def _pressure(arguments: argparse.Namespace) -> int:
     from skin_host.config.settings import skin_hash
     from skin_host.processing.calibration.file import find_calibration
+    from skin_host.recording import fitting
+    from skin_host.recording.load_table import check_course, read_table
 
     if (arguments.load is None) == (not arguments.levels):
         raise RequestError(
@@ -300,24 +304,31 @@ def _pressure(arguments: argparse.Namespace) -> int:
     settings, layout = load_skin(arguments.config)
     path = _calibration_path(arguments, settings)
     before = find_calibration(path, layout, skin_hash(settings))
-    fit = _course if arguments.load is not None else _levels
-    return fit(arguments, settings, layout, path, before)
-
-
-def _levels(
-    arguments: argparse.Namespace,
-    settings: "Settings",
-    layout: "Layout",
-    path: Path,
-    before: "Calibration | None",
-) -> int:
-    from skin_host.recording import fitting
-
+    load = None if arguments.load is None else read_table(arguments.load)
+    if load is not None:
+        check_course(load)
     samples = _read_samples(arguments.pressure, settings, layout, arguments.seconds, before)
-    fitted = fitting.fit_pressures(samples, settings, layout, arguments.levels, before)
+    fitted: fitting.Fitted[Any]
+    show_fit: Callable[[dict[str, list[int]]], None]
+    if load is None:
+        fitted = gains = fitting.fit_pressures(samples, settings, layout, arguments.levels, before)
+        show_fit = partial(_show_levels, arguments, path, samples, gains)
+    else:
+        fitted = curves = fitting.fit_curves(samples, settings, layout, load, before)
+        show_fit = partial(_show_course, arguments, path, layout, curves)
+    _keep(arguments, path, fitted.calibration, layout)
+    show_fit(_kept(fitted, samples, layout, arguments.pressure, path, before))
+    return 0
+
+
+def _show_levels(
+    arguments: argparse.Namespace,
+    path: Path,
+    samples: "fitting.Samples",
+    fitted: "fitting.Fitted[GainFit]",
+    kept: dict[str, list[int]],
+) -> None:
     found, fit = fitted.calibration, fitted.found
-    _keep(arguments, path, found, layout)
-    kept = _kept(fitted, samples, layout, arguments.pressure, path, before)
     counts = {
         "fitted": int(fit.fitted.sum()),
         "bent": int(fit.bent.sum()),
@@ -335,7 +346,7 @@ def _levels(
                 "kept": kept,
             }
         )
-        return 0
+        return
     gains = fit.gain[fit.fitted]
     print(
         f"{counts['fitted']} taxels fitted, {counts['bent']} of them with their own bend, "
@@ -346,30 +357,22 @@ def _levels(
         f"error {fit.rms_before_kpa:.2f} -> {fit.rms_after_kpa:.2f} kPa RMS"
     )
     print(f"calibration {found.id} kept in {path}")
-    return 0
 
 
-def _course(
+def _show_course(
     arguments: argparse.Namespace,
-    settings: "Settings",
-    layout: "Layout",
     path: Path,
-    before: "Calibration | None",
-) -> int:
+    layout: "Layout",
+    fitted: "fitting.Fitted[Curves]",
+    kept: dict[str, list[int]],
+) -> None:
     import numpy as np
 
     from skin_host.health.diagnosis import named
     from skin_host.processing.curves import CurveVerdict
     from skin_host.recording import fitting
-    from skin_host.recording.load_table import check_course, read_table
 
-    load = read_table(arguments.load)
-    check_course(load)
-    samples = _read_samples(arguments.pressure, settings, layout, arguments.seconds, before)
-    fitted = fitting.fit_curves(samples, settings, layout, load, before)
     found, curves = fitted.calibration, fitted.found
-    _keep(arguments, path, found, layout)
-    kept = _kept(fitted, samples, layout, arguments.pressure, path, before)
     verdicts = curve_verdicts(curves, layout)
     counts = {
         verdict.name.lower(): sum(len(taxels[verdict.name.lower()]) for taxels in verdicts.values())
@@ -408,7 +411,7 @@ def _course(
                 "kept": kept,
             }
         )
-        return 0
+        return
     plays = ", ".join(
         f"{weight:.2f} within {radius:.0f} kPa"
         for radius, weight in zip(curves.memory.radius_kpa, curves.memory.weight, strict=True)
@@ -424,7 +427,6 @@ def _course(
             if name not in ("good", "unknown") and numbers:
                 print(f"{part}: {name}: {named(numbers)}")
     print(f"calibration {found.id} kept in {path}")
-    return 0
 
 
 def _kept(

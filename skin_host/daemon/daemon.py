@@ -30,7 +30,7 @@ from skin_host.health.diagnosis import named
 from skin_host.layout import Layout, PadKind, build_layout, parts_of
 from skin_host.mqtt.commands import ENDING
 from skin_host.mqtt.connection import connect
-from skin_host.mqtt.contact import PartContact
+from skin_host.mqtt.contact import PartContact, use_measurements
 from skin_host.mqtt.info import CalibrationInfo, NodeInfo, node_info
 from skin_host.mqtt.publisher import Connect, Publisher
 from skin_host.processing import calibration as calibrations
@@ -145,7 +145,7 @@ class Daemon:
         )
         self._put_info(self._info())
         self._contacts = {i: PartContact(layout, i) for i in self.engine.parts}
-        self._use_usable()
+        use_measurements(self._contacts, self.engine)
         for i in self.engine.parts:
             # The state that the broker retained from an earlier start is no longer known.
             self.publisher.put_contact(layout.parts[i].name, "UNKNOWN")
@@ -259,7 +259,7 @@ class Daemon:
                 log.warning("%s of %s: calibrated without damaged bytes", named(taxels), name)
             doubted = self.engine.zeros.at_risk(touched=False)
             self.engine.use(found, boards)
-            self._use_usable()
+            use_measurements(self._contacts, self.engine)
             if known is not None and boards is not None:
                 # The other boards keep their zeros, whichever of the two a start finds.
                 await self._kept()
@@ -396,15 +396,7 @@ class Daemon:
         self.settings, self.layout, self.engine = settings, layout, engine
         self.link.use(engine)
         self.health.use(engine)
-        self._use_usable()
-
-    def _use_usable(self) -> None:
-        """Let contacts wait only for taxels that can be valid again, until these have decided."""
-        decides = self.engine.measurements()
-        if decides is not None:
-            for index, contact in self._contacts.items():
-                part = self.layout.parts[index]
-                contact.use(decides[part.start : part.stop])
+        use_measurements(self._contacts, self.engine)
 
     def _doubt_contacts(self, taxels: NDArray[np.bool_], parts: list[int]) -> None:
         """Something may touch these taxels of some parts, bool[n], whose zero is not known."""
@@ -451,7 +443,7 @@ class Daemon:
                 # Something may press a pad whose zero was not found, did before it was held, or
                 # was zeroed away and has shown that when it lifted.
                 self._zero_changes = self.engine.zeros.changes
-                self._use_usable()
+                use_measurements(self._contacts, self.engine)
                 self._doubt_contacts(self.engine.zeros.may_be_touched(), self.engine.parts)
             # Touches leave before the frames are encoded, and each with its part's contact: that is
             # ON in a touch only, also where several frames of a part were read together.

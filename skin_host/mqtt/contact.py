@@ -1,7 +1,8 @@
 """Contact state of a part, which fails safe. Pure: takes frames and events, returns the state."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,9 @@ from skin_host.processing.conversions import CONVERSION_S
 from skin_host.processing.events import Touch
 from skin_host.processing.masks import all_of, any_of
 from skin_host.processing.pipeline import PressureFrame
+
+if TYPE_CHECKING:
+    from skin_host.processing.core import Engine
 
 #: Without a calibration, a place that was not valid counts as untouched after so many measurements.
 SURE_MEASUREMENTS = 4
@@ -133,3 +137,14 @@ class PartContact:
         self._unsure[:] = self._triangle_decides
         self._is_unsure = True
         return "UNKNOWN"
+
+
+def use_measurements(contacts: Mapping[int, PartContact], engine: "Engine") -> None:
+    """Let the contacts of parts, by index, wait only for taxels that can be valid by the engine's
+    calibration, if it has one, until these have decided.
+    """
+    decides = engine.measurements()
+    if decides is not None:
+        for index, contact in contacts.items():
+            part = engine.layout.parts[index]
+            contact.use(decides[part.start : part.stop])

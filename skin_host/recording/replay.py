@@ -24,7 +24,7 @@ from skin_host.files import whole_file
 from skin_host.health import HealthWatch
 from skin_host.health.diagnosis import named_by_part
 from skin_host.layout import Layout, load_skin
-from skin_host.mqtt.contact import PartContact
+from skin_host.mqtt.contact import PartContact, use_measurements
 from skin_host.processing import calibration as calibrations
 from skin_host.processing.calibration import Calibration, Verdict, by_part
 from skin_host.processing.calibration.calibrator import NOISE_SAMPLES
@@ -176,13 +176,8 @@ def contacts_of(engine: Engine) -> dict[int, PartContact]:
 
     They wait only for taxels that can be valid.
     """
-    layout = engine.layout
-    contacts = {part: PartContact(layout, part) for part in engine.parts}
-    decides = engine.measurements()
-    if decides is not None:
-        for index, contact in contacts.items():
-            part = layout.parts[index]
-            contact.use(decides[part.start : part.stop])
+    contacts = {part: PartContact(engine.layout, part) for part in engine.parts}
+    use_measurements(contacts, engine)
     return contacts
 
 

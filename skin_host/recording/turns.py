@@ -21,7 +21,7 @@ from skin_host.bus.commands import (
     TactileSetup2,
     parse_command,
 )
-from skin_host.bus.ledger import LONGEST_DISORDER_NS, WRONG_PERIOD
+from skin_host.bus.ledger import LONGEST_DISORDER_NS
 from skin_host.bus.wire import (
     BROADCAST_ADDRESS,
     HOST_ADDRESS,
@@ -164,10 +164,9 @@ class _Turns:
             if own.bus != bus or address not in (own.address, BROADCAST_ADDRESS):
                 continue
             row = ledger.row[board]
-            seen_ns, period_ns = ledger.regular_period_ns(row), own.period_ms * 1e6
             # Before its first set-up it may send by settings of its own, which read as touches.
-            in_use = seen_ns is not None and abs(seen_ns - period_ns) <= WRONG_PERIOD * period_ns
-            engine.zeros.rezero(board, board in self._set_up or in_use)
+            in_use = board in self._set_up or ledger.keeps_period(row) is True
+            engine.zeros.rezero(board, in_use)
             ledger.set_up(row)
             self._set_up.add(board)
 
