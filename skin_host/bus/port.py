@@ -10,7 +10,7 @@ import asyncio
 import errno
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -115,6 +115,8 @@ class Port(ABC):
         capacity: most frames of one read.
         stamps_late: time stamps may be those of reading or of another process, so a busy computer
             moves them; the kernel's are not.
+        on_sent: called with the identifier and the data of each frame that was sent: a bus does not
+            return them to the port that sent them.
     """
 
     capacity: int
@@ -128,6 +130,7 @@ class Port(ABC):
         self.channel = settings.channel
         self.state = LinkState.GONE if bus is None else LinkState.UP
         self.counters = PortCounters()
+        self.on_sent: Callable[[int, bytes], None] = lambda *_: None
         self._settings = settings
         self._bus: can.BusABC | None = bus
         self._send_lock = asyncio.Lock()
@@ -183,6 +186,7 @@ class Port(ABC):
                     self.counters.send_retries += 1
                     await self._clock.sleep(_SEND_RETRY_S)
                 self.counters.sent += 1
+                self.on_sent(identifier, data)
                 await self._clock.sleep(gap_s)
 
     def close(self) -> None:

@@ -234,6 +234,20 @@ def in_slices(batches: list[tuple[str, FrameBatch]], slice_ns: int) -> list[tupl
     return [(bus, piece) for _, bus, piece in sorted(slices, key=lambda one: one[0])]
 
 
+def merged(batch: FrameBatch, sent: FrameBatch) -> FrameBatch:
+    """Return the frames of two batches of a bus, each of the second before the first frame of the
+    first that is newer.
+    """
+    at = np.searchsorted(np.maximum.accumulate(batch.t_ns), sent.t_ns, "right")
+    return FrameBatch(
+        np.insert(batch.id, at, sent.id),
+        np.insert(batch.dlc, at, sent.dlc),
+        np.insert(batch.data, at, sent.data, axis=0),
+        np.insert(batch.t_ns, at, sent.t_ns),
+        batch.dropped,
+    )
+
+
 def _rising(t_ns: NDArray[np.int64]) -> bool:
     return bool((t_ns[1:] >= t_ns[:-1]).all())
 

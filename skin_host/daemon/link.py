@@ -5,6 +5,7 @@ import contextlib
 import logging
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from functools import partial
 from itertools import chain
 from typing import Protocol
 
@@ -15,7 +16,7 @@ from skin_host.bus.boards import Boards
 from skin_host.bus.opening import open_port
 from skin_host.bus.port import Port
 from skin_host.bus.wake import LONGEST_NS, WakeUp
-from skin_host.bus.wire import NS_PER_S, FrameBatch, in_slices
+from skin_host.bus.wire import NS_PER_S, FrameBatch, in_slices, merged
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Bus, Receive
 from skin_host.errors import BusError, SkinError
@@ -127,11 +128,14 @@ class Link:
         #: How many sweeps of each board had been received when a turn was last held up.
         self._sweeps_then = engine.ledger.sweeps.copy()
         self._longest_pause_ns = 0
+        #: Identifier, data and time of each frame that was sent since the last turn, by bus.
+        self._sent: dict[str, list[tuple[int, bytes, int]]] = {}
         #: Reads the buses and passes the results on, once `read` does that.
         self._work: Callable[[], None] = lambda: None
         try:
             for bus in engine.assemblers:
                 port = open_port(bus, settings.buses[bus], settings.receive, wait=wait, clock=clock)
+                port.on_sent = partial(self._note_sent, bus)
                 self.ports[bus] = port
                 mine = [
                     (i, layout.boards[i])
@@ -182,7 +186,7 @@ class Link:
 
         Args:
             deliver: called after each batch, and several times a second.
-            record: called with each received batch.
+            record: called with what was received, and sent, in the order of time.
             together: block in which each turn delivers; at its end the results leave.
         """
 
@@ -226,8 +230,11 @@ class Link:
                 read_ns = min(read_ns, int(batch.t_ns[-1]))
             batches.append((bus, batch))
         self._note_clock()
-        for bus, batch in in_slices(batches, self._slice_ns):
+        slices = in_slices(batches, self._slice_ns)
+        recorded = in_slices(self._with_sent(batches), self._slice_ns) if self._sent else slices
+        for bus, batch in recorded:
             record(bus, batch)
+        for bus, batch in slices:
             output = self._engine.feed(bus, batch)
             if output.answers:
                 self._note_answers(bus, output.answers)
@@ -246,6 +253,18 @@ class Link:
             output = self._engine.expire(read_ns)
             self._note(output)
             deliver(output)
+
+    def _note_sent(self, bus: str, identifier: int, data: bytes) -> None:
+        self._sent.setdefault(bus, []).append((identifier, data, self._clock.now_ns()))
+
+    def _with_sent(self, batches: list[tuple[str, FrameBatch]]) -> list[tuple[str, FrameBatch]]:
+        """Return the batches of a turn together with what was sent since the turn before."""
+        sent = {bus: FrameBatch.of(frames) for bus, frames in self._sent.items()}
+        self._sent.clear()
+        both = [
+            (bus, merged(batch, sent.pop(bus)) if bus in sent else batch) for bus, batch in batches
+        ]
+        return [*both, *sent.items()]
 
     async def catch_up(self) -> None:
         """Wait until `read` has read what came before now, and then a sweep of every board, or for

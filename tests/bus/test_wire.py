@@ -135,3 +135,20 @@ def test_what_is_encoded_is_decoded(board, values, status):
 def test_every_frame_of_garbage_is_counted_once(ids, dlc, data):
     frames = wire.find_skin_frames(FrameBatch(ids, dlc, data, np.zeros(20, np.int64)))
     assert len(frames.row) + frames.wrong_header + frames.short + frames.other == 20
+
+
+@given(
+    received=st.lists(st.integers(0, 50)),
+    sent=st.lists(st.integers(0, 50), min_size=1).map(sorted),
+)
+def test_what_was_sent_comes_between_what_was_received_by_time(
+    received: list[int], sent: list[int]
+) -> None:
+    both = wire.merged(
+        FrameBatch.of([(1, bytes(8), t_ns) for t_ns in received]),
+        FrameBatch.of([(2, bytes(8), t_ns) for t_ns in sent]),
+    )
+    assert both.t_ns[both.id == 1].tolist() == received
+    assert both.t_ns[both.id == 2].tolist() == sent
+    if received == sorted(received):
+        assert both.rising

@@ -108,6 +108,8 @@ RESTS_AGAIN_S = 20.0
 KEEP_ALIVE_S = 10.0
 #: While it lasts, the chip that it names does not measure.
 SILENCING = {"chip_gone"}
+#: A pad may have moved less than most, so it may repeat itself so often before it is surely stuck.
+LEAST_REPEATS = 400
 #: Nothing but the chip that it names sends what is wrong.
 ALONE = {"no_acknowledge"}
 _BROKER = {"broker_away", "touches_dropped", "broker_refuses", "node_name_taken", "broker_rejects"}
@@ -374,7 +376,7 @@ def _longest_chance_s(world: World, board: str, triangle: int, pad: int) -> floa
     if calibration is not None:
         noise_units = min(noise_units, float(calibration.noise[taxel]))
     rate = rate_in_run(np.array([noise_units]))
-    conversions = float(longest_run(rate, CALIBRATED_SAMPLES, ODDS)[0])
+    conversions = max(float(longest_run(rate, CALIBRATED_SAMPLES, ODDS)[0]), LEAST_REPEATS)
     period_ms = world.settings.boards[board].period_ms
     return conversions * max(period_ms * 1e-3, CONVERSION_S)
 

@@ -28,6 +28,7 @@ pytestmark = pytest.mark.long
 
 DEMO = configuration("demo.toml")
 SMALL = Path(__file__).with_name("small.toml")
+RATES = Path(__file__).with_name("rates.toml")
 #: Simulated time of each fixed seed: one storm and its calm.
 SECONDS = 30.0
 #: Seeds that once broke a promise stay: 4 touches that nothing presses; 5 touches without an end;
@@ -43,6 +44,7 @@ SECONDS = 30.0
 FIXED = [
     *((DEMO, seed) for seed in (1, 27, 33, 41)),
     (configuration("icub_2011_arm.toml"), 4004),
+    (RATES, 1),
     *((SMALL, seed) for seed in (4, 5, 6, 8, 9, 10, 11, 21, 23, 24, 27, 33, 35, 63, 143, 147, 278)),
 ]
 
