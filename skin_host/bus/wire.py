@@ -205,7 +205,9 @@ class RecordBatch(FrameBatch):
         return Records(self._octets, _RECORD, _HEAD)
 
 
-def in_slices(batches: list[tuple[str, FrameBatch]], slice_ns: int) -> list[tuple[str, FrameBatch]]:
+def in_slices(
+    batches: list[tuple[str, FrameBatch]], slice_ns: int, *, alone: bool = False
+) -> list[tuple[str, FrameBatch]]:
     """Cut what was read of several buses in one turn into slices of time, the frames of a slice bus
     by bus.
 
@@ -215,8 +217,10 @@ def in_slices(batches: list[tuple[str, FrameBatch]], slice_ns: int) -> list[tupl
 
     The order of a bus's frames is kept. Where its clock was set back by more than a slice, what
     follows is in slices of its own, after all those before.
+
+    A batch of a single bus is cut if `alone` is set.
     """
-    if len(batches) < 2 or all(
+    if (len(batches) < 2 and not alone) or all(
         abs(batch.t_ns[-1] - batch.t_ns[0]) < slice_ns for _, batch in batches if len(batch)
     ):
         return [(bus, batch) for bus, batch in batches if len(batch)]

@@ -516,7 +516,7 @@ def _read_samples(
     if before is not None:
         verdict = np.where(samples.received, zero.verdict, np.uint8(Verdict.OK))
         zero = replace(zero, verdict=verdict)
-    for doubt in doubts(zero, layout):
+    for doubt in doubts(zero, settings, layout):
         warn(f"{log}: {doubt}")
     return samples
 

@@ -53,7 +53,11 @@ def add_commands(commands: Commands) -> None:
         type=Path,
         help="candump, ASC, BLF, MCAP, ... recording; several are processed side by side",
     )
-    replay.add_argument("--config", type=Path, help="configuration file (TOML)")
+    replay.add_argument(
+        "--config",
+        type=Path,
+        help="configuration file (TOML); needed, but to play the messages of an .mcap to a broker",
+    )
     replay.add_argument(
         "--output", default="-", help="file of JSON lines, - is stdout; of several LOGs, a folder"
     )

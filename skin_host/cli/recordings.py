@@ -192,7 +192,7 @@ def _calibration(
     found = calibration_for(
         log, settings, layout, arguments.calibration, arguments.calibrate_seconds
     )
-    for doubt in doubts(found, layout):
+    for doubt in doubts(found, settings, layout):
         warn(f"{log}: {doubt}")
     return found
 

@@ -349,6 +349,14 @@ class FingertipEngine:
             self._note_touch(state)
         return events
 
+    def assume_scales(self) -> None:
+        """Use the full scales of the boards of which the zeros are, where no others are known: a
+        recording may have begun after boards were queried.
+        """
+        for state in self.tips.values():
+            if state.assembler is None and state.zero_scale is not None:
+                self._assemble(state, state.zero_scale)
+
     def _step(self, state: TipState, wrench: Wrench) -> list[FingertipEvent]:
         events: list[FingertipEvent] = []
         load = state.agreement.take(wrench)

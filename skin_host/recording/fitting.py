@@ -164,7 +164,7 @@ def read_samples(
     step_ns = round(min(float(np.median(mine)) for mine in steps_ns))
     if (back_ns := min(int(mine.min()) for mine in steps_ns)) < 0:
         raise LogError(
-            f"{log}: its time goes back by {-back_ns / 1e9:.0f} s: the clock was set; {WANTED}"
+            f"{log}: its time goes back by {-back_ns / 1e9:g} s: the clock was set; {WANTED}"
         )
     if step_ns < LEAST_STEP_NS:
         raise LogError(f"{log}: its time stands still; {WANTED}")

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from skin_host.bus.logs import WINDOW_NS, name_in, read_channels
-from skin_host.bus.wire import FrameBatch
+from skin_host.bus.wire import FrameBatch, in_slices
 from skin_host.config.settings import Settings, skin_hash
 from skin_host.errors import LogError, RequestError, SkinError, required
 from skin_host.files import whole_file
@@ -54,7 +54,7 @@ def read_buses(
     channel. With several, channels go by name, or by the number that the format has in its place;
     others are ignored.
 
-    A batch of a recording that is no MCAP spans `window_ns` at most.
+    A batch spans `window_ns` at most, but for damaged time stamps.
 
     Raises:
         LogError: see `logs.read_channels`; or several buses, and none of their channels in it.
@@ -63,7 +63,7 @@ def read_buses(
     if is_mcap(log):
         from skin_host.recording.mcap import read_can
 
-        channels = read_can(log)
+        channels = _in_windows(read_can(log), window_ns)
     else:
         channels = read_channels(log, window_ns, merged=merged)
     if merged:
@@ -86,6 +86,37 @@ def read_buses(
             f"{log}: its channels are {', '.join(sorted(seen)) or 'unnamed'}; "
             f"the configuration's are {', '.join(bus.channel for bus in settings.buses.values())}"
         )
+
+
+def _in_windows(
+    channels: Iterator[tuple[str, FrameBatch]], window_ns: int
+) -> Iterator[tuple[str, FrameBatch]]:
+    """Cut batches that are longer than a window, as a recorder has them that was held up; those of
+    other channels that follow cover the same time.
+
+    Raises:
+        LogError: the recording ends with damage; everything before it has then been yielded.
+    """
+    group: dict[str, FrameBatch] = {}
+    begin_ns = end_ns = 0
+    damage: LogError | None = None
+    try:
+        for channel, batch in channels:
+            if not len(batch):
+                continue
+            first_ns, last_ns = int(batch.t_ns.min()), int(batch.t_ns.max())
+            is_apart = first_ns > end_ns + window_ns or last_ns < begin_ns - window_ns
+            if group and (channel in group or is_apart):
+                yield from in_slices(list(group.items()), window_ns, alone=True)
+                group.clear()
+            begin_ns = min(begin_ns, first_ns) if group else first_ns
+            end_ns = max(end_ns, last_ns) if group else last_ns
+            group[channel] = batch
+    except LogError as error:
+        damage = error
+    yield from in_slices(list(group.items()), window_ns, alone=True)
+    if damage is not None:
+        raise damage
 
 
 def calibration_for(
@@ -137,9 +168,17 @@ def calibrate_from_log(
     return engine.end_calibration(time)
 
 
-def doubts(calibration: Calibration, layout: Layout) -> list[str]:
+def doubts(calibration: Calibration, settings: Settings, layout: Layout) -> list[str]:
     """Return what is in doubt of the zeros with which a recording is processed, a sentence each."""
     found = []
+    for name, fingertip in settings.fingertips.items():
+        zero = calibration.zeros.get(name)
+        if fingertip.full_scale is None and (zero is None or zero.full_scale is None):
+            found.append(
+                f"the full scales of {name} are unknown, so its samples are left out until the "
+                "recording has its board's answers to a query, and a zero; wanted "
+                f"fingertips.{name}.full_scale, or the calibration file of its daemon"
+            )
     if touched := by_part(calibration.verdict == Verdict.TOUCHED, layout):
         state = (
             "was touched while its zero was taken, and reads"
@@ -205,6 +244,8 @@ def timed(log: Path, engine: Engine, window_ns: int = WINDOW_NS) -> Iterator[tup
     merged = len(engine.settings.buses) == 1
     if not merged or engine.fingertips is not None:
         window_ns = WINDOW_NS
+    if engine.fingertips is not None:
+        engine.fingertips.assume_scales()
     batches = read_buses(log, engine.settings, window_ns)
     # The frames of one bus come in their order, those of several bus by bus in each window.
     yield from fed(batches, engine, 0 if merged else WINDOW_NS)
@@ -285,7 +326,7 @@ def process(
     """
     settings, layout = load_skin(task.config)
     found = calibration_for(task.log, settings, layout, task.calibration, task.calibrate_seconds)
-    for doubt in doubts(found, layout):
+    for doubt in doubts(found, settings, layout):
         warn(doubt)
     engine = Engine(settings, layout, list(range(len(layout.parts))), found)
     if task.output is None:

@@ -80,7 +80,7 @@ def test_what_is_stated_of_one_pad_is_stated_of_one(config: Path, tmp_path: Path
     settings, layout = load_skin(config)
     log = write_log(tmp_path / "a.log", 140, lambda period: PADS[:1] if 30 < period < 60 else ())
     touched = calibrate_from_log(log, settings, layout, 5.0)
-    (line,) = doubts(touched, layout)
+    (line,) = doubts(touched, settings, layout)
     assert line.startswith(
         "taxel 5 of arm was touched while its zero was taken, and reads too little; wanted"
     )
@@ -94,7 +94,7 @@ def test_what_is_stated_of_one_pad_is_stated_of_one(config: Path, tmp_path: Path
         verdict = np.zeros_like(touched.verdict)
         for taxel, found in verdicts.items():
             verdict[taxel] = found
-        assert doubts(replace(touched, verdict=verdict), layout) == [line]
+        assert doubts(replace(touched, verdict=verdict), settings, layout) == [line]
 
 
 def test_untouched_skin_gives_no_warning(

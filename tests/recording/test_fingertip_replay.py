@@ -13,6 +13,7 @@ from skin_host.cli import main
 from skin_host.config.settings import load
 from skin_host.layout import build_layout, load_skin
 from skin_host.mqtt.address import Broker
+from skin_host.processing.calibration.file import save_calibration
 from skin_host.processing.core import Engine
 from skin_host.processing.events import Touch
 from skin_host.recording.capture import capture_broker
@@ -93,6 +94,37 @@ def cut(recording: Path, folder: Path) -> tuple[Path, int]:
     lines = recording.read_text().splitlines(keepends=True)
     log.write_text("".join(line for line in lines if came(line) or " can0 31" not in line))
     return log, cut_ns
+
+
+def test_a_recording_that_begins_after_the_boards_were_queried_is_read_by_the_calibration(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = CONFIG / "fingertips.toml"
+    settings, layout = load_skin(config)
+    found = calibrate_from_log(recording, settings, layout, 5.0)
+    begin_s = 1_763_700_005
+    log, known = tmp_path / "late.log", tmp_path / "calibration.json"
+    lines = recording.read_text().splitlines(keepends=True)
+    log.write_text("".join(line for line in lines if int(line[1:].split(".")[0]) >= begin_s))
+    save_calibration(known, found, layout)
+
+    def events_of(path: Path, *options: str) -> list[tuple[str, str, int]]:
+        output = tmp_path / "a.jsonl"
+        replaying = ["replay", str(path), "--config", str(config), "--output", str(output)]
+        assert main([*replaying, *options]) == 0
+        lines = [json.loads(line) for line in output.read_text().splitlines()]
+        return [
+            (one["part"], one["event"], one["t_ns"])
+            for one in lines
+            if one["type"] in ("touch", "slip") and one["part"] == "index"
+        ]
+
+    late = events_of(log, "--calibration", str(known))
+    assert "full scales" not in capsys.readouterr().err
+    assert late == events_of(recording, "--calibration", str(known))
+    assert late[0][1] == "begin"
+    assert events_of(log, "--calibrate-seconds", "1") == []
+    assert "the full scales of index are unknown" in capsys.readouterr().err
 
 
 async def test_it_ends_so_at_a_broker_too(

@@ -77,7 +77,7 @@ class _Grid:
             steps_ns = np.diff(part.t_ns)
             if (back := np.flatnonzero(steps_ns < 0)).size:
                 raise RequestError(
-                    f"{output}: {part.name}: its time goes back by {-steps_ns[back[0]] / 1e9:.0f} "
+                    f"{output}: {part.name}: its time goes back by {-steps_ns[back[0]] / 1e9:g} "
                     f"s at frame {back[0] + 1}; a data set has rising times"
                 )
         leader = max(parts, key=lambda part: len(part.seq))
