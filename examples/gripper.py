@@ -4,6 +4,7 @@ It moves a simulated gripper, whose daemon (`skin run config/gripper.toml`) publ
 broker. Each finger stops by itself when its skin is touched, or when that is not known.
 """
 
+import signal
 import subprocess
 import sys
 import threading
@@ -43,6 +44,8 @@ class Gripper:
 
 def main(url: str = "mqtt://localhost", config: str = str(CONFIG)) -> None:
     """Close both fingers on what is between them."""
+    for number in (signal.SIGTERM, signal.SIGHUP):  # else nothing would end the emulator
+        signal.signal(number, lambda number, _: sys.exit(128 + number))
     gripper = Gripper(Path(config))
     touched = {finger: threading.Event() for finger in FINGERS}
 

@@ -1,5 +1,6 @@
 """Stop when a part is touched, or may be. `python examples/stop_on_touch.py PART [URL]`."""
 
+import signal
 import sys
 
 from skin_host.client import Contact, SkinCallbacks, SkinError
@@ -13,8 +14,10 @@ def on_contact(contact: Contact) -> None:
         print("move", flush=True)
 
 
-if len(sys.argv) < 2:
+if len(sys.argv) < 2 or "/" in sys.argv[1]:  # which a URL has, and the name of no part
     sys.exit("which part? python examples/stop_on_touch.py PART [URL]")
+for ends in (signal.SIGTERM, signal.SIGHUP):  # else the motor would not be stopped then
+    signal.signal(ends, lambda number, _: sys.exit(128 + number))
 print("stop", "until something is known", flush=True)
 try:
     with SkinCallbacks(*sys.argv[2:]) as skin:

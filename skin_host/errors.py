@@ -6,6 +6,7 @@
     |  |- CalibrationError    a calibration file that is damaged or of another skin
     |  |  |- OtherSkinError   the latter
     |  |- NewerFileError      a file that a newer version has written
+    |  |- OtherRobotError     a file that a node of another robot has written
     |  |- LogError            a recording that cannot be read
     |- StateError             right, but not now: nothing was done (exit status 1)
     |  |- BusyFileError       a file that another program is writing at this moment
@@ -48,6 +49,10 @@ class OtherSkinError(CalibrationError):
 
 class NewerFileError(RequestError):
     """A file of the state directory that a newer version has written. It is not changed."""
+
+
+class OtherRobotError(RequestError):
+    """A file of the state directory that a node of another robot has written. It is not changed."""
 
 
 class StateError(SkinError):

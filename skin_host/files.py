@@ -18,7 +18,13 @@ from typing import IO, Protocol, TypeVar
 
 import msgspec
 
-from skin_host.errors import BusyFileError, NewerFileError, RequestError, SkinError
+from skin_host.errors import (
+    BusyFileError,
+    NewerFileError,
+    OtherRobotError,
+    RequestError,
+    SkinError,
+)
 from skin_host.untrusted import from_json
 
 log = logging.getLogger(__name__)
@@ -45,6 +51,7 @@ _PIECE_BYTES = 1 << 20
 
 class _Head(msgspec.Struct):
     schema: str = ""
+    robot: str = ""
 
 
 def read_whole(path: Path, most_bytes: int = MAX_DOCUMENT_BYTES) -> bytes:
@@ -200,13 +207,41 @@ def refuse_newer(path: Path, schema: str, what: str) -> None:
         NewerFileError: `path` is such a file.
         BusyFileError: another program is writing it.
     """
-    try:
-        if not path.is_file():
-            return
-        data = read_whole(path)
-    except OSError:
+    data = _what_there_is(path)
+    if data is not None:
+        _refuse_newer(path, data, schema, what)
+
+
+def refuse_other_robot(path: Path, robot: str, what: str) -> None:
+    """Protect a file that a node of another robot keeps: a state directory gives two of them the
+    same name where `a` has a node `b-c`, and `a-b` a node `c`.
+
+    Files of older versions that do not name their robot are everybody's.
+
+    Raises:
+        OtherRobotError: `path` is such a file.
+        BusyFileError: another program is writing it.
+    """
+    data = _what_there_is(path)
+    if data is None:
         return
-    _refuse_newer(path, data, schema, what)
+    try:
+        seen = from_json(data, _Head).robot
+    except msgspec.DecodeError:
+        return  # damaged, which others report
+    if seen not in ("", robot):
+        raise OtherRobotError(
+            f'{path}: the {what} file of robot "{seen[:64]}", this is robot "{robot}"; give each '
+            "robot a folder of its own: service.state_directory"
+        )
+
+
+def _what_there_is(path: Path) -> bytes | None:
+    """Return the content of a regular file; None if there is none that can be read."""
+    try:
+        return read_whole(path) if path.is_file() else None
+    except OSError:
+        return None
 
 
 def _refuse_newer(path: Path, data: bytes, schema: str, what: str) -> None:
@@ -228,12 +263,26 @@ def _newer(path: Path, what: str, why: str) -> NewerFileError:
 
 
 def set_aside(path: Path) -> None:
-    """Give a damaged file another name, so that nothing overwrites it."""
+    """Give a damaged file a second name, under which its content outlives its replacement.
+
+    The first name stays until then: whatever start comes before finds that the file is damaged.
+    """
+    import filecmp
+
     from skin_host.clock import SYSTEM
 
-    aside = path.with_name(f"{path.name}.damaged-{SYSTEM.today():%Y%m%dT%H%M%SZ}")
+    mark = f"{path.name}.damaged-"
+    aside = path.with_name(f"{mark}{SYSTEM.today():%Y%m%dT%H%M%SZ}")
     try:
-        os.replace(path, aside)
+        if not path.is_file():
+            return  # a folder, a pipe: nothing is lost
+        asides = [one for one in path.parent.iterdir() if one.name.startswith(mark)]
+        if any(filecmp.cmp(path, one, shallow=False) for one in asides):
+            return  # by an earlier start
+        try:
+            os.link(path, aside)
+        except OSError:  # a kind of disk without links
+            _replace(aside, read_whole(path))
     except OSError as error:
         log.error("%s: damaged, and cannot be set aside: %s", path, error.strerror)
     else:

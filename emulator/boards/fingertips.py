@@ -47,6 +47,19 @@ _NOTHING = np.zeros(6)
 _NOTHING.flags.writeable = False
 #: N and N m of the channels of a board that the configuration leaves open.
 FULL_SCALE = (50.0, 50.0, 50.0, 1.0, 1.0, 1.0)
+#: Directions in which a place of each shape is reached from its middle, and where places are.
+TOWARDS = {
+    "sphere": (0.0, 0.0, 1.0),
+    "ellipsoid": (0.0, 0.0, 1.0),
+    "plane": (0.0, 0.0, 1.0),
+    "cylinder": (1.0, 0.0, 0.0),
+}
+_WANTED = {
+    "sphere": "a place inside it",
+    "ellipsoid": "a place inside it",
+    "plane": "a place within its reach_mm",
+    "cylinder": "a place inside it, within its half_length_mm, and a direction that is not along z",
+}
 #: Unloaded boards read up to this share of their full scale.
 OFFSET_SHARE = 0.01
 #: Mass of the object that the probe pulls.
@@ -501,8 +514,8 @@ class _Load:
 def place_on(tip: Fingertip, probe: Probe) -> tuple[Floats, Floats]:
     """Where a probe presses on a bare fingertip: point (mm) and outward normal, float64[3].
 
-    The ray from the place's offset (x, y, z in the fingertip's frame) `towards` leaves the
-    body there.
+    The ray from the place's offset (x, y, z in the fingertip's frame) `towards`, by default as in
+    `TOWARDS`, leaves the body there.
 
     Raises:
         ConfigurationError: it does not, or the place names what a fingertip does not have.
@@ -511,13 +524,17 @@ def place_on(tip: Fingertip, probe: Probe) -> tuple[Floats, Floats]:
     if at.taxel is not None or at.triangle is not None:
         raise ConfigurationError("at: a fingertip without skin has no taxels and no triangles")
     origin = np.array([at.x_mm, at.y_mm, at.z_mm])
-    size = float(np.linalg.norm(at.towards))
+    towards = np.array(at.towards or TOWARDS[tip.shape])
+    size = float(np.linalg.norm(towards))
     if size == 0.0:
         raise ConfigurationError("at.towards: is no direction")
-    ray = np.array(at.towards) / size
-    point = _crossing(tip, origin, ray)
+    point = _crossing(tip, origin, towards / size)
     if point is None:
-        raise ConfigurationError("at: from there the fingertip is not reached")
+        seen = [", ".join(f"{value:g}" for value in vector) for vector in (origin, towards)]
+        raise ConfigurationError(
+            f'at: the {tip.shape} "{probe.part}" is not reached from {seen[0]} mm in the direction '
+            f"{seen[1]}; wanted {_WANTED[tip.shape]}"
+        )
     if tip.shape == "plane":
         return point, np.array([0.0, 0.0, 1.0])
     gradient = _weight(tip) * point

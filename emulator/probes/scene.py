@@ -57,9 +57,10 @@ class Place(_Table):
     taxel: Annotated[int, Meta(ge=0)] | None = None
     x_mm: float = 0.0
     y_mm: float = 0.0
-    #: On fingertips without skin: from the offset in this direction the place is reached.
+    #: On fingertips without skin: from the offset in this direction the place is reached; by
+    #: default along z, on a cylinder along x.
     z_mm: float = 0.0
-    towards: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    towards: tuple[float, float, float] | None = None
 
 
 class Probe(_Table):

@@ -163,7 +163,7 @@ class Boards:
             raise
 
     async def _bring_up(self, listen: bool) -> None:
-        if listen:
+        if listen and self.records:  # a bus may have fingertips only
             await self._listen()
         for record in self.records.values():
             record.asked += 1

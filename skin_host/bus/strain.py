@@ -163,12 +163,14 @@ class StrainCounters:
     Attributes:
         samples: pairs found.
         lone: frames whose other half did not arrive in time.
+        late: of these, those whose other half came next, but later.
         saturated: samples with a saturated channel.
         wrong_length: frames that were neither force nor torque.
     """
 
     samples: int = 0
     lone: int = 0
+    late: int = 0
     saturated: int = 0
     wrong_length: int = 0
 
@@ -255,6 +257,7 @@ class WrenchAssembler:
             in_order = waited and before.kind == self._first
             if in_order and passed_ns <= self._pair_ns and not owed:
                 return self._joined(before, half)
+            self.counters.late += 2 * (in_order and passed_ns > self._pair_ns)
         elif before is not None and waited:
             self._owed_ns = before.t_ns
         self.counters.lone += waited

@@ -5,6 +5,7 @@ Recordings give the foam's relaxation and the pressure curve of each taxel.
 
 import argparse
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -26,7 +27,7 @@ from skin_host.cli.common import (
 )
 from skin_host.cli.options import add_rules
 from skin_host.config.relaxation import FITTED
-from skin_host.errors import RequestError, visible
+from skin_host.errors import OtherSkinError, RequestError, visible
 
 if TYPE_CHECKING:
     from skin_host.config.settings import Settings
@@ -134,6 +135,7 @@ def _calibrate(arguments: argparse.Namespace) -> int:
 
     from skin_host.client.serving import served_by_daemon
     from skin_host.daemon.calibrate import take_calibration
+    from skin_host.daemon.memory import remembered
     from skin_host.layout import parts_of
     from skin_host.processing.calibration.file import with_gains_of
     from skin_host.processing.calibration.outcome import outcome
@@ -156,10 +158,15 @@ def _calibrate(arguments: argparse.Namespace) -> int:
             "calibrating beside it "
             "would zero its boards; ask it with `skin command calibrate`, or stop it"
         )
+    touched: dict[str, list[int]] = {}
+    with suppress(OtherSkinError):
+        touched = remembered(settings, layout, arguments.node).zeros.touched
     progress = Progress("calibrating, keep the skin untouched")
     try:
         found = asyncio.run(
-            take_calibration(settings, layout, parts, arguments.seconds, progress.update)
+            take_calibration(
+                settings, layout, parts, arguments.seconds, progress.update, touched=touched
+            )
         )
     finally:
         progress.close()
@@ -210,13 +217,16 @@ def _calibration_path(arguments: argparse.Namespace, settings: "Settings") -> Pa
 
     Raises:
         NewerFileError: a newer version has written what is there.
+        OtherRobotError: it is another robot's.
     """
     from skin_host.daemon.calibrate import calibration_path
-    from skin_host.files import refuse_newer
+    from skin_host.files import refuse_newer, refuse_other_robot
     from skin_host.processing.calibration.file import SCHEMA
 
     path: Path = arguments.output or calibration_path(settings, arguments.node)
     refuse_newer(path, SCHEMA, "calibration")
+    if arguments.output is None:
+        refuse_other_robot(path, settings.robot, "calibration")
     return path
 
 

@@ -35,7 +35,6 @@ from skin_host.cli.options import add_rules
 from skin_host.daemon import service
 from skin_host.errors import (
     BrokerError,
-    OtherSkinError,
     RequestError,
     SkinError,
     nearest,
@@ -47,6 +46,7 @@ if TYPE_CHECKING:
     from skin_host.client import SkinClient
     from skin_host.config.settings import Settings
     from skin_host.daemon.daemon import Daemon
+    from skin_host.layout import Layout
 
 log = logging.getLogger(__name__)
 
@@ -191,8 +191,8 @@ def _run_node(arguments: argparse.Namespace) -> int:
     import asyncio
 
     from skin_host.config.settings import Settings
-    from skin_host.daemon.calibrate import stored_calibration
     from skin_host.daemon.daemon import Daemon
+    from skin_host.daemon.memory import remembered
     from skin_host.daemon.workers import share_name, share_of
     from skin_host.layout import build_layout
     from skin_host.processes import end_with_parent
@@ -200,8 +200,8 @@ def _run_node(arguments: argparse.Namespace) -> int:
     set_up_logging(arguments.verbose)
     settings, layout = load_skin(arguments.config)
     if arguments.workers is not None:
-        return _run_workers(arguments, settings)
-    nodes = [arguments.node]
+        return _run_workers(arguments, settings, layout)
+    node = arguments.node
 
     def ours(settings: Settings) -> Settings:
         """A configuration as this process has it: of one share, or as it is."""
@@ -211,31 +211,23 @@ def _run_node(arguments: argparse.Namespace) -> int:
 
     if arguments.share is not None:
         end_with_parent()
-        nodes.insert(0, share_name(arguments.node, arguments.share[0]))
+        node = share_name(arguments.node, arguments.share[0])
         settings = ours(settings)
         layout = build_layout(settings, arguments.config.parent)
-    calibration = None
-    try:
-        for node in nodes:  # a share without one has that of the whole
-            calibration = calibration or stored_calibration(settings, layout, node)
-    except OtherSkinError:
-        if not arguments.calibrate:
-            raise
-    if arguments.calibrate:
-        calibration = None  # gains come from the file later
-
+    # Of a new calibration, gains come from the file later.
+    memory = remembered(settings, layout, node, arguments.node, take_new=arguments.calibrate)
     warn_of_virtual(settings)
 
     async def work(stop: asyncio.Event) -> None:
         daemon = Daemon(
             settings,
             layout,
-            nodes[0],
-            calibration,
-            arguments.config.parent,
+            node,
+            folder=arguments.config.parent,
             configuration=arguments.config,
             share=ours,
             log_lines_lost=stderr.lines_lost,
+            memory=memory,
         )
         reload_on_hangup(daemon)
         if arguments.share is None:
@@ -259,11 +251,12 @@ def _show_running(settings: "Settings") -> None:
         log.warning("%s: cannot be written: %s", runtime / RUNNING, error.strerror)
 
 
-def _run_workers(arguments: argparse.Namespace, settings: "Settings") -> int:
+def _run_workers(arguments: argparse.Namespace, settings: "Settings", layout: "Layout") -> int:
     import asyncio
 
     from skin_host.daemon import workers
-    from skin_host.daemon.workers import share_name, share_out
+    from skin_host.daemon.memory import hand_over
+    from skin_host.daemon.workers import share_name, share_of, share_out
 
     node, n = arguments.node, arguments.workers
     shares = share_out(settings, node, n)
@@ -271,16 +264,19 @@ def _run_workers(arguments: argparse.Namespace, settings: "Settings") -> int:
         raise RequestError(f'{arguments.config}: no part belongs to node "{node}"')
     if len(shares) < n:
         log.info("workers: %d; the buses cannot be shared among more", len(shares))
+    numbers = {share_name(node, number): number for number in range(1, len(shares) + 1)}
+    of_shares = {name: share_of(settings, node, one, len(shares)) for name, one in numbers.items()}
+    hand_over(settings, layout, node, of_shares)
     _show_running(settings)
     options = ["--calibrate"] * arguments.calibrate + ["--verbose"] * arguments.verbose
     if arguments.duration is not None:
         options += ["--duration", str(arguments.duration)]
     commands = {
-        share_name(node, number): [
+        name: [
             *("run", str(arguments.config), "--node", node),
             *("--share", f"{number}/{len(shares)}", *options),
         ]
-        for number in range(1, len(shares) + 1)
+        for name, number in numbers.items()
     }
     return asyncio.run(workers.run(commands))
 

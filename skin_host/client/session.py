@@ -133,7 +133,9 @@ class SkinClient:
         RequestError: the robot has no part of this name, and had none since the stream was opened.
             All nodes have named their parts for `NAMED_S`, and one of them is online; those of a
             node that is offline are known from what the broker keeps. A part of a node that starts
-            later still is received by who reads on.
+            later still is received by who reads on. Or nothing of this kind comes of the part: of a
+            fingertip on a force/torque board no frames, nor of a part whose configuration has
+            `frames = false`; of a part of skin no slips and no excesses.
     """
 
     def __init__(
@@ -500,13 +502,49 @@ class SkinClient:
         )
 
     def _check_parts(self, now_s: float) -> None:
-        """Fail the streams of parts that the robot does not have, and never had."""
+        """Fail the streams of parts that the robot does not have, and never had, and those of what
+        its parts do not publish.
+        """
         names = self._presence.named() or ()
         for stream in self._streams:
             stream.is_judged |= stream.part in names
             missing = None if stream.is_judged else self._missing(stream.part, now_s)
-            if missing is not None:
-                stream.fail(missing)
+            why = missing or self._unpublished(stream)
+            if why is not None:
+                stream.fail(why)
+
+    def _unpublished(self, stream: Stream[Any]) -> str | None:
+        """Return why a part that is known publishes nothing of what a stream is of; None: it does,
+        or may.
+        """
+        part = stream.part
+        if part is None or not set(stream.kinds) <= {"frame", "slip", "over"}:
+            return None
+        infos = [node.info for node in self.nodes.values() if node.info is not None]
+        skins = [info.parts[part] for info in infos if part in info.parts]
+        tips = {name: tip for info in infos for name, tip in info.fingertips.items()}
+        here = f'robot "{self.robot}", part "{visible(part, 64)}"'
+        if "frame" not in stream.kinds:
+            if not skins or part in tips:
+                return None
+            covered = [name for name, tip in tips.items() if tip.array == part]
+            wanted = " or ".join(f'"{visible(name, 64)}"' for name in covered[:MOST_NAMED])
+            return (
+                f"{here}: skin has no slips and no excesses; wanted a fingertip on a force/torque "
+                f"board{wanted and f', {wanted}'}"
+            )
+        if skins:
+            if any(skin.frames for skin in skins):
+                return None
+            return f"{here}: publishes no frames: its configuration has `frames = false`"
+        if part not in tips:
+            return None
+        array = tips[part].array
+        wanted = "a part of skin" if array is None else f'"{visible(array, 64)}", its skin'
+        return (
+            f"{here}: a fingertip on a force/torque board has no taxels and no frames; wanted "
+            f"{wanted}"
+        )
 
     async def _only_node(self) -> str:
         await self._until(lambda: self.connected)

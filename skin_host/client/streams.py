@@ -84,7 +84,8 @@ class Stream(AsyncIterator[T], Generic[T]):
     """Items of some kinds from the request on; made by `SkinClient`, ends with it.
 
     Raises (on reading, once):
-        RequestError: the robot has no part of this name, see `SkinClient`.
+        RequestError: the robot has no part of this name, or nothing of this kind comes of it, see
+            `SkinClient`.
         BrokerError: a broker does not let us subscribe to a topic that is needed.
 
     Raises (on reading):
@@ -99,6 +100,7 @@ class Stream(AsyncIterator[T], Generic[T]):
         #: Whether it is known that there is such a part, or was reported that there is none.
         self.is_judged = part is None
         self._failure: str | None = None
+        self._failed: set[str] = set()
         #: Topics that a broker refused, and the errors that were not raised yet.
         self._refused: set[str] = set()
         self._refusals: deque[SkinError] = deque()
@@ -144,9 +146,12 @@ class Stream(AsyncIterator[T], Generic[T]):
         self._wake.set()
 
     def fail(self, why: str) -> None:
-        """Let the reader get a RequestError: nothing will come, as far as is known."""
-        self.is_judged, self._failure = True, why
-        self._wake.set()
+        """Let the reader get a RequestError, once: nothing will come, as far as is known."""
+        self.is_judged = True
+        if why not in self._failed:
+            self._failed.add(why)
+            self._failure = why
+            self._wake.set()
 
     def refuse(self, topic: str, error: SkinError) -> None:
         """Let the reader get an error, once: messages of this topic cannot come."""

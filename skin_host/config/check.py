@@ -10,11 +10,19 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skin_host.bus.compensation import THERMAL_TAXEL, thermal_gains
-from skin_host.config.settings import Settings, format_triangles, skin_hash
+from skin_host.config.settings import Settings, format_triangles, parse_triangles, skin_hash
 from skin_host.errors import nearest, visible
-from skin_host.layout import TAXELS_PER_TRIANGLE, BoardLayout, Layout, PadKind, TriangleLayout
+from skin_host.layout import (
+    TAXELS_PER_TRIANGLE,
+    BoardLayout,
+    Layout,
+    PadKind,
+    TriangleLayout,
+    builtin_kinds,
+)
 
 #: Bits of a standard frame of eight bytes with its interframe space: without stuff bits, and with
 #: the most possible.
@@ -26,6 +34,13 @@ WRENCH_BITS = (2 * 95, 2 * 115)
 WARN_LOAD = 0.8
 #: Twelve stages at decimation 256 take the chip this long (AD7147; MTB3's timer constants).
 CONVERSION_MS = 36.86
+#: Pads of a unit whose distance is more times the pitch of their kind, or less than this share of
+#: it, are in another unit of length.
+UNLIKE_PITCHES = 3.0
+#: What positions seem to be, by the factor that they are too large.
+_LENGTHS = {1000.0: "mm", 100.0: "cm", 0.001: "metres divided by 1000"}
+#: Pads at this multiple of the least distance face the same way, even on a fingertip.
+NEXT_PITCHES = 1.2
 #: Taxels of a part that are closer than this are at the same place.
 SAME_PLACE_M = 1e-4
 #: Boards of a part whose periods differ by this factor are better in two parts.
@@ -37,6 +52,7 @@ _OF_BOARDS = ("bus", "address", "model", "skin_type", "period_ms")
 _OF_FINGERTIPS = ("node", "bus", "address", "period_ms", "shape", "array")
 
 
+Floats = NDArray[np.float64]
 #: As `skin check --json` prints them.
 Record = dict[str, Any]
 
@@ -73,6 +89,7 @@ def describe(settings: Settings, layout: Layout) -> Record:
             *_interface_warnings(buses),
             *_board_warnings(layout),
             *_part_warnings(layout),
+            *_position_warnings(settings, layout),
         ],
     }
 
@@ -242,6 +259,66 @@ def _part_warnings(layout: Layout) -> list[str]:
                 "contacts there cannot be distinguished"
             )
     return warnings
+
+
+def _position_warnings(settings: Settings, layout: Layout) -> list[str]:
+    """Look at files of positions: are they in m, and do normals point out of the skin?"""
+    kinds = builtin_kinds() | settings.kinds
+    warnings = []
+    taxel = 0
+    for name, part in settings.parts.items():
+        for number, patch in enumerate(part.patches):
+            start = taxel
+            taxel += TAXELS_PER_TRIANGLE * len(parse_triangles(patch.triangles))
+            if patch.positions is None:
+                continue
+            where = f"parts.{name}.patches[{number}].positions"
+            n_pads = len(kinds[patch.kind].pads_mm)
+            units = [_unit(layout, first, n_pads) for first in range(start, taxel, n_pads)]
+            units = [(apart, normal) for apart, normal in units if len(apart) > 1]
+            if not units:
+                continue
+            apart_mm = float(np.median(np.concatenate([apart.min(axis=1) for apart, _ in units])))
+            pitch_mm = kinds[patch.kind].pitch_mm
+            if not 1.0 / UNLIKE_PITCHES <= apart_mm / pitch_mm <= UNLIKE_PITCHES:
+                warnings.append(
+                    f"{where}: pads lie {apart_mm:.3g} mm apart, those of {patch.kind} "
+                    f"{pitch_mm:g} mm; wanted metres{_looks_like(apart_mm / pitch_mm)}"
+                )
+            facing = sum(map(_n_facing_away, units))
+            if facing:
+                warnings.append(
+                    f"{where}: {facing} pad(s) face the other way than a pad next to them, and "
+                    "make no contact with it; wanted normals that point out of the skin"
+                )
+    return warnings
+
+
+def _unit(layout: Layout, first: int, n_pads: int) -> tuple[Floats, Floats]:
+    """Return of the k pressure pads of a unit the distances, mm [k, k], and normals [k, 3].
+
+    A pad is infinitely far from itself.
+    """
+    pads = first + np.flatnonzero(layout.pad_kind[first : first + n_pads] == PadKind.PRESSURE)
+    position_mm = 1e3 * layout.position_m[pads]
+    apart_mm = np.linalg.norm(position_mm[:, None] - position_mm[None], axis=2)
+    np.fill_diagonal(apart_mm, np.inf)
+    return apart_mm, layout.normal[pads]
+
+
+def _n_facing_away(unit: tuple[Floats, Floats]) -> int:
+    """Count the pads of a unit that have one next to them whose normal is opposed."""
+    apart_mm, normal = unit
+    near = apart_mm <= NEXT_PITCHES * apart_mm.min(axis=1, keepdims=True)
+    return int((near & (normal @ normal.T < 0.0)).any(axis=1).sum())
+
+
+def _looks_like(ratio: float) -> str:
+    """Return what positions seem to be in whose pads are so many times too far apart."""
+    for factor, name in _LENGTHS.items():
+        if 0.5 < ratio / factor < 2.0:
+            return f": these look like {name}"
+    return ""
 
 
 #: Tables for people: what their rows are, and the keys of a record that are shown.

@@ -3,8 +3,9 @@
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +14,9 @@ from skin_host.bus.wire import TRIANGLES, StatusError
 from skin_host.clock import SYSTEM, Clock
 from skin_host.config.settings import Settings, format_triangles, skin_hash
 from skin_host.daemon.link import Link
-from skin_host.daemon.state import can_be_read, kept_path
+from skin_host.daemon.state import can_be_read, kept_path, taxels_of
 from skin_host.errors import CalibrationError, OtherSkinError, SkinError
-from skin_host.files import set_aside
+from skin_host.files import refuse_other_robot, set_aside
 from skin_host.health.diagnosis import named_by_part
 from skin_host.layout import Layout
 from skin_host.processing.calibration import Calibration
@@ -41,14 +42,25 @@ async def take_calibration(
     seconds: float,
     progress: Callable[[float], None],
     clock: Clock = SYSTEM,
+    touched: Mapping[str, list[int]] = MappingProxyType({}),
 ) -> Calibration:
     """Bring up the boards of some parts and calibrate them.
+
+    Args:
+        settings, layout: of the robot.
+        parts: indices of those parts.
+        seconds: how long to look at least.
+        progress: is called with the share that has been collected.
+        clock: for waiting.
+        touched: numbers of taxels by part that were touched when a daemon ended: the set-up may
+            hide that.
 
     Raises:
         BusError: a bus cannot be opened.
         SkinError: no board sent a sweep, or none with a usable sample.
     """
     engine = Engine(settings, layout, parts)
+    engine.zeros.expect_touched(taxels_of(layout, touched))
     link = Link(engine, clock=clock)
     tasks = [
         asyncio.create_task(link.read(lambda _: None)),
@@ -184,13 +196,15 @@ def stored_calibration(settings: Settings, layout: Layout, node: str) -> Calibra
     one, which is set aside.
 
     Raises:
-        OtherSkinError: it belongs to another configuration or robot.
+        OtherSkinError: it belongs to another configuration.
+        OtherRobotError: it is another robot's.
         NewerFileError: a newer version has written it.
         BusyFileError: another program is writing it.
     """
     path = calibration_path(settings, node)
     if not can_be_read(path, "a new one is taken"):
         return None
+    refuse_other_robot(path, layout.robot, "calibration")
     try:
         return load_calibration(path, layout, skin_hash(settings))
     except OtherSkinError:

@@ -4,7 +4,7 @@ import asyncio
 import logging
 import os
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -19,22 +19,24 @@ from skin_host.config.settings import Settings, load, needs_restart, skin_hash
 from skin_host.daemon import metrics, service
 from skin_host.daemon.calibrate import collect
 from skin_host.daemon.control import Control
+from skin_host.daemon.lasting import LastingTouches
 from skin_host.daemon.link import Link, OpenPort
-from skin_host.daemon.state import NodeState, Thresholds, Zeros, kept_path, load_kept
+from skin_host.daemon.memory import NodeMemory, remembered_with
+from skin_host.daemon.state import NodeState, Thresholds, Zeros, kept_path, taxels_of
 from skin_host.errors import ConfigurationError, RequestError, SkinError, StateError
-from skin_host.files import write_document
+from skin_host.files import refuse_other_robot, write_document
 from skin_host.fingertip.health import FingertipRecord
 from skin_host.fingertip.service import FingertipPublisher
 from skin_host.health import FaultLog, HealthWatch, Record
 from skin_host.health.diagnosis import named
-from skin_host.layout import Layout, PadKind, build_layout, parts_of
+from skin_host.layout import Layout, build_layout, parts_of
 from skin_host.mqtt.commands import ENDING
 from skin_host.mqtt.connection import connect
 from skin_host.mqtt.contact import PartContact, use_measurements
 from skin_host.mqtt.info import CalibrationInfo, NodeInfo, node_info
 from skin_host.mqtt.publisher import Connect, Publisher
 from skin_host.processing import calibration as calibrations
-from skin_host.processing.calibration import Calibration, by_part
+from skin_host.processing.calibration import Calibration, Verdict, by_part
 from skin_host.processing.calibration.file import find_calibration, save_calibration
 from skin_host.processing.calibration.run import SHORTEST_S
 from skin_host.processing.core import Engine, Output
@@ -74,6 +76,8 @@ class Daemon:
         share: makes of a configuration that was read again the one of this daemon, see
             `workers.share_of`.
         log_lines_lost: how many lines of the log nobody could read so far.
+        memory: what the node remembers, with its calibration in place of the other one; by default
+            what its own files hold besides that.
 
     Attributes:
         settings, layout: in use, with the changes that operators made.
@@ -84,6 +88,8 @@ class Daemon:
     Raises:
         ConfigurationError: no part belongs to this node, or python-can does not know the kind
             of a bus.
+        OtherRobotError, NewerFileError, BusyFileError: files of the state directory cannot be used,
+            see `memory.remembered`.
     """
 
     def __init__(
@@ -99,6 +105,7 @@ class Daemon:
         connect: Connect = connect,
         share: Callable[[Settings], Settings] = lambda settings: settings,
         log_lines_lost: Callable[[], int] = lambda: 0,
+        memory: NodeMemory | None = None,
     ) -> None:
         self.clock = clock
         self._log_lines_lost = log_lines_lost
@@ -107,7 +114,8 @@ class Daemon:
         self.layout = layout
         self._node = node
         self._configuration = configuration
-        state = load_kept(self._path("state"), NodeState)
+        memory = memory or remembered_with(settings, layout, node, calibration)
+        calibration, state = memory.calibration, memory.state
         self._configured = settings
         self.thresholds = state.thresholds
         self.settings = settings = state.thresholds.over_settings(settings)
@@ -116,21 +124,17 @@ class Daemon:
             i for i in self.engine.parts if layout.parts[i].name in state.disabled
         }
         self.engine.touch_only = _touch_only(settings, layout, self.engine.parts)
-        had_zeros = os.path.lexists(self._path("zeros"))
-        self._zeros = load_kept(self._path("zeros"), Zeros)
+        self._zeros = memory.zeros
         doubted = np.zeros(layout.n_taxels, np.bool_)
+        touched = taxels_of(layout, self._zeros.touched)
+        self.engine.zeros.expect_touched(touched)
+        self._touches = LastingTouches(_boards_of(layout), touched)
         if calibration is not None:
-            if self._zeros.are_of(calibration.id):
-                self._use_baselines()
-                doubted = _taxels(layout, self._zeros.unknown)
-            elif self._zeros.calibration and not self._zeros.are_older_than(calibration.time):
-                doubted = _taxels(layout, self._zeros.unknown)
-            elif had_zeros and not self._zeros.calibration:
-                # It could not be read: any of them may have been touched when their zero was taken.
-                doubted = layout.pad_kind == PadKind.PRESSURE
+            self._use_baselines()
+            doubted = taxels_of(layout, self._zeros.unknown)
             self.engine.zeros.doubt(doubted)
         # Whatever calibration is in use: it is the chip's fault.
-        self.engine.expect_stuck(_taxels(layout, self._zeros.stuck))
+        self.engine.expect_stuck(taxels_of(layout, self._zeros.stuck))
         self.engine.zeros.hold(self.engine.boards)
         self.health = HealthWatch(self.engine)
         self.control = Control(self)
@@ -149,10 +153,10 @@ class Daemon:
         for i in self.engine.parts:
             # The state that the broker retained from an earlier start is no longer known.
             self.publisher.put_contact(layout.parts[i].name, "UNKNOWN")
-        self._doubt_contacts(doubted, self.engine.parts)
+        self._doubt_contacts(doubted | touched, self.engine.parts)
         self.fingertips = FingertipPublisher(self.engine.fingertips, self.publisher)
         self.link = Link(self.engine, wait=True, open_port=open_port, clock=clock)
-        self.unkept: dict[str, str] = {}
+        self.unkept = dict(memory.unkept)
         #: Files of this node that were found or written.
         self._files = {what for what in _KEPT if os.access(self._path(what), os.F_OK)}
         self._calibration_lock = asyncio.Lock()
@@ -233,6 +237,7 @@ class Daemon:
         Raises:
             StateError: another one is being taken, or another program is writing the file.
             NewerFileError: a newer version has written it.
+            OtherRobotError: it is another robot's.
             SkinError: no data came.
         """
         if self._calibration_lock.locked():
@@ -240,6 +245,7 @@ class Daemon:
         async with self._calibration_lock:
             # Gains and curves are the file's: another program may have fitted them meanwhile.
             path = self._path("calibration")
+            await self.clock.in_thread(refuse_other_robot, path, self.layout.robot, "calibration")
             before = await self.clock.in_thread(
                 find_calibration, path, self.layout, self.engine.configuration
             )
@@ -258,7 +264,17 @@ class Daemon:
             for name, taxels in calibrations.damaged(found, self.layout).items():
                 log.warning("%s of %s: calibrated without damaged bytes", named(taxels), name)
             doubted = self.engine.zeros.at_risk(touched=False)
+            measured = self.layout.taxels_of(self.engine.boards if boards is None else boards)
+            hidden = self.engine.zeros.pressed() & measured & (found.verdict == Verdict.TOUCHED)
+            for name, taxels in by_part(hidden, self.layout).items():
+                log.warning(
+                    "%s of %s: touched when the board was zeroed, and nothing has shown that this "
+                    "is over",
+                    named(taxels),
+                    name,
+                )
             self.engine.use(found, boards)
+            self._touches.calibrated(measured)
             use_measurements(self._contacts, self.engine)
             if known is not None and boards is not None:
                 # The other boards keep their zeros, whichever of the two a start finds.
@@ -374,7 +390,8 @@ class Daemon:
             OSError: it cannot be written.
         """
         try:
-            write_document(self._path("state"), state)
+            named = msgspec.structs.replace(state, robot=self.layout.robot)
+            write_document(self._path("state"), named)
         except OSError as error:
             self._note_unkept("state", error)
             raise
@@ -479,12 +496,13 @@ class Daemon:
             self.link.supervise()
             engine = self.engine
             stuck_before, stuck = stuck, engine.intake.liveness.stuck.tobytes()
-            if zeroed != engine.zeros.changes or stuck != stuck_before:
-                zeroed = engine.zeros.changes
-                # At once: what was pressed then, and what is stuck, must be doubted after a crash,
-                # too.
-                self._begin_to_keep_zeros()
             now_s = self.clock.monotonic_s()
+            touches_changed = self._note_touches(now_s)
+            if touches_changed or zeroed != engine.zeros.changes or stuck != stuck_before:
+                zeroed = engine.zeros.changes
+                # At once: what was pressed then, what lasts, and what is stuck, must be doubted
+                # after a crash, too.
+                self._begin_to_keep_zeros()
             link = self.link
             self.health.tick(link.read_ns, link.ports, link.boards, link.longest_pause_ns())
             told = self.fingertips.publish_health(self.link.read_ns)
@@ -522,6 +540,14 @@ class Daemon:
             (tuple(output.withheld), tuple(output.unsubscribed)),
             (output.name_taken, tuple(self.unkept)),
         )
+
+    def _note_touches(self, now_s: float) -> bool:
+        """Note which touches last; return whether that has changed."""
+        engine = self.engine
+        if not (engine.ledger.any_silent or self._touches.is_due(now_s)):
+            return False
+        silent = [board for board in engine.boards if engine.ledger.silent_ns(board)]
+        return self._touches.look(engine.zeros.touched(), engine.layout.taxels_of(silent), now_s)
 
     def _under_way(self) -> asyncio.Task[None] | None:
         """Return the task that is writing the zeros; None if none is."""
@@ -587,6 +613,8 @@ class Daemon:
         if doubted is not None:
             at_risk |= doubted
         unknown, stuck = self._numbers(at_risk), self._numbers(engine.stuck())
+        lasting = engine.zeros.touched() if touched else self._touches.kept
+        pressed = self._numbers(engine.zeros.pressed() | lasting)
         baselines, n_found = self._zeros.baselines, engine.zeros.found
         calibrated = bool(baselines) and self._zeros.calibration != found.id
         if touched or calibrated or n_found != self._zeros_kept:
@@ -595,13 +623,18 @@ class Daemon:
             calibration=found.id,
             before="" if before is None else before.id,
             unknown=unknown,
+            touched=pressed,
             stuck=stuck,
             baselines=baselines,
             written=self._zeros.written,
+            robot=self._zeros.robot,
+            parts=self._zeros.parts,
         )
         # The end does not leave it to a write that may not have ended.
         is_open = "zeros" in self.unkept or (touched and self._under_way() is not None)
-        is_empty = not (unknown or stuck or baselines or self._zeros.unknown or self._zeros.stuck)
+        was = self._zeros
+        is_empty = not (unknown or pressed or stuck or baselines)
+        is_empty &= not (was.unknown or was.touched or was.stuck)
         is_news = zeros != self._zeros and not is_empty
         if not (is_news or is_open):
             self._zeros_kept = n_found
@@ -706,6 +739,7 @@ class Daemon:
             frame_hz=self.settings.mqtt.frame_hz,
             calibration=info,
             commands=self.settings.mqtt.commands,
+            parts=self.settings.parts,
             fingertips=self.settings.fingertips,
         )
 
@@ -714,14 +748,9 @@ class Daemon:
         return kept_path(self.settings, self._node, what)
 
 
-def _taxels(layout: Layout, numbers: Mapping[str, list[int]]) -> NDArray[np.bool_]:
-    """Return as bool[n] the taxels that are named by part, as far as this skin has them."""
-    found = np.zeros(layout.n_taxels, np.bool_)
-    for part in layout.parts:
-        for taxel in numbers.get(part.name, ()):
-            if 0 <= taxel < part.n_taxels:
-                found[part.start + taxel] = True
-    return found
+def _boards_of(layout: Layout) -> NDArray[np.int64]:
+    """Return the board of each taxel, int64[n]."""
+    return np.array([triangle.board for triangle in layout.triangles], np.int64)[layout.triangle_of]
 
 
 def _touch_only(settings: Settings, layout: Layout, parts: list[int]) -> set[int]:

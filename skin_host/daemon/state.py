@@ -7,17 +7,21 @@ and reported, so that the service can always start.
 
 import logging
 import os
+from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, TypeVar
 
 import msgspec
+import numpy as np
 from msgspec import Meta, Struct, field
+from numpy.typing import NDArray
 
 from skin_host.config.fields import Name
 from skin_host.config.settings import Settings, TouchSettings, changed
 from skin_host.daemon import service
-from skin_host.files import read_document, set_aside, why_unreadable
+from skin_host.files import read_document, refuse_other_robot, set_aside, why_unreadable
+from skin_host.layout import Layout
 
 log = logging.getLogger(__name__)
 
@@ -47,6 +51,7 @@ class NodeState(Struct, forbid_unknown_fields=True):
     WITHOUT: ClassVar = "starting without it"
 
     schema: str = "skin.state/1"
+    robot: str = ""
     disabled: list[Name] = []
     thresholds: Thresholds = field(default_factory=Thresholds)
 
@@ -65,11 +70,17 @@ class Zeros(Struct, forbid_unknown_fields=True):
             file has its name, a start finds that one.
         unknown: numbers of taxels by part whose zero is not known, or will not be after the next
             start.
+        touched: numbers of taxels by part that something touches, or touched when their board was
+            received last or zeroed, and whose release nothing has shown since. A board that still
+            sends with the zero that it had shows at a start whether it is touched. One that was
+            reset meanwhile, as by a power failure, does not: then their zero is not known.
         stuck: numbers of taxels by part whose pads are stuck. They take as long to be found again
             as the first time.
         baselines: by part, activation of each untouched taxel in units, as found after the last
             set-up, or as it had drifted by the end. Empty: the calibration's.
         written: when that was so, ISO 8601 in UTC.
+        robot: whose they are; empty, as in files of older versions: of whoever finds them.
+        parts: names of the parts and fingertips that the node had; None in files of older versions.
     """
 
     WITHOUT: ClassVar = (
@@ -81,9 +92,12 @@ class Zeros(Struct, forbid_unknown_fields=True):
     calibration: str = ""
     before: str = ""
     unknown: dict[Name, list[int]] = {}
+    touched: dict[Name, list[int]] = {}
     stuck: dict[Name, list[int]] = {}
     baselines: dict[Name, list[Annotated[float, Meta(ge=-255, le=255)]]] = {}
     written: Annotated[str, Meta(max_length=64)] = ""
+    robot: str = ""
+    parts: list[Name] | None = None
 
     def are_of(self, calibration: str) -> bool:
         """Return whether these zeros hold with the calibration of this id."""
@@ -98,6 +112,16 @@ class Zeros(Struct, forbid_unknown_fields=True):
             return datetime.fromisoformat(self.written) < datetime.fromisoformat(time)
         except (ValueError, TypeError):  # no times, or one without its zone
             return False
+
+
+def taxels_of(layout: Layout, numbers: Mapping[str, list[int]]) -> NDArray[np.bool_]:
+    """Return as bool[n] the taxels that are named by part, as far as this skin has them."""
+    found = np.zeros(layout.n_taxels, np.bool_)
+    for part in layout.parts:
+        for taxel in numbers.get(part.name, ()):
+            if 0 <= taxel < part.n_taxels:
+                found[part.start + taxel] = True
+    return found
 
 
 Kept = TypeVar("Kept", NodeState, Zeros)
@@ -123,19 +147,32 @@ def can_be_read(path: Path, without: str) -> bool:
     return os.access(path, os.F_OK)
 
 
-def load_kept(path: Path, kind: type[Kept]) -> Kept:
+def is_there(path: Path) -> bool:
+    """Return whether there is a file, or may be one that cannot be looked at."""
+    return os.path.lexists(path) or why_unreadable(path) is not None
+
+
+def load_kept(path: Path, kind: type[Kept], robot: str = "") -> Kept:
     """Read what a node keeps.
 
     A missing or unreadable file gives an unchanged one; so does a damaged one, which is set aside.
 
+    Args:
+        path: of the file.
+        kind: what it holds.
+        robot: whose file it is to be; that of any if empty.
+
     Raises:
         NewerFileError: a newer version has written it.
         BusyFileError: another program is writing it.
+        OtherRobotError: it is another robot's.
     """
     unchanged = kind()
     if not can_be_read(path, kind.WITHOUT):
         return unchanged
     what = unchanged.schema.removeprefix("skin.").partition("/")[0]
+    if robot:
+        refuse_other_robot(path, robot, what)
     try:
         return read_document(path, kind, unchanged.schema, what, ValueError)
     except ValueError as error:

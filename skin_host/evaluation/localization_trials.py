@@ -11,7 +11,13 @@ from emulator.probes.foam import Drive, Foam, FoamLayer
 from emulator.probes.pads import UNIT_FF, Disc, Pads
 from emulator.probes.viscoelastic import FoamTruth
 from skin_host.layout import builtin_kinds
-from skin_host.processing.localization import Localizer, Method, make_localizer, separate
+from skin_host.processing.localization import (
+    PROBES_MM,
+    Localizer,
+    Method,
+    make_localizer,
+    separate,
+)
 
 Floats = NDArray[np.float64]
 
@@ -128,14 +134,13 @@ def localizer_for(method: Method, probe_mm: float | None, noise_units: float = 0
     """A localiser of the patch; `probe_mm` None leaves the template's sizes open."""
     centre = triangle_patch()
     n = len(centre)
-    sizes = {} if probe_mm is None else {"probe_mm": probe_mm}
     return make_localizer(
         method,
         1e-3 * np.column_stack([centre, np.zeros(n)]),
         np.tile([0.0, 0.0, 1.0], (n, 1)),
         np.full(n, RADIUS_MM),
+        probe_mm=PROBES_MM if probe_mm is None else probe_mm,
         noise_units=float(np.hypot(noise_units, 1.0 / np.sqrt(12.0))),
-        **sizes,
     )
 
 

@@ -57,16 +57,17 @@ class FingertipHealth:
         self._engine = engine
         self._windows = {name: Window(RATE_NS) for name in engine.tips}
         self._gained: dict[str, dict[str, float]] = {}
-        self._lossy_ns: dict[str, int] = {}
+        #: When frames were lone last, and whether they were only late.
+        self._lossy: dict[str, tuple[int, bool]] = {}
 
     def tick(self, now_ns: int) -> None:
         """Read the counters; to be called several times a second."""
         for name, state in self._engine.tips.items():
-            lone = 0 if state.assembler is None else state.assembler.counters.lone
-            totals = {"samples": state.samples, "lone": lone}
+            counters = _counters(state)
+            totals = {key: getattr(counters, key) for key in ("samples", "lone", "late")}
             gained = self._gained[name] = self._windows[name].note(now_ns, totals)
             if gained["lone"] >= max(FEW_LONE, LONE_SHARE * gained["samples"]):
-                self._lossy_ns[name] = now_ns
+                self._lossy[name] = now_ns, gained["late"] == gained["lone"]
 
     def records(self, now_ns: int | None) -> dict[str, FingertipRecord]:
         """Return the record of each fingertip; without a time (a replay) without ages."""
@@ -74,7 +75,7 @@ class FingertipHealth:
 
     def _record(self, state: TipState, now_ns: int | None) -> FingertipRecord:
         assembler, table = state.assembler, state.settings
-        counters = StrainCounters() if assembler is None else assembler.counters
+        counters = _counters(state)
         faults = list(self._faults(state, now_ns))
         gained = self._gained.get(state.name)
         rate_hz = gained["samples"] / gained["seconds"] if gained and gained["seconds"] else 0.0
@@ -167,19 +168,29 @@ class FingertipHealth:
             return
         if state.saturated_ns and abs(now_ns - state.saturated_ns) < HOLD_NS:
             yield fault("saturated", f"{here} is saturated: the load is beyond its range")
-        lossy_ns = self._lossy_ns.get(name)
-        if lossy_ns is not None and abs(now_ns - lossy_ns) < HOLD_NS and not state.incomplete:
-            yield fault(
-                "loses_frames",
-                f"{here}: force comes without torque, or the reverse: frames are lost or late; "
-                "the bus is overloaded or badly terminated",
-            )
+        lossy_ns, is_late = self._lossy.get(name, (now_ns - HOLD_NS, False))
+        if abs(now_ns - lossy_ns) < HOLD_NS and not state.incomplete:
+            yield fault("loses_frames", f"{here}: {_LATE if is_late else _LOST}")
         if self._engine.touched_for_ns(state) > self._engine.held_report_ns:
             yield fault(
                 "held",
                 f"{name} has been touched for so long that its zero is uncertain; calibrate it "
                 "unloaded",
             )
+
+
+_LOST = (
+    "force comes without torque, or the reverse: frames are lost or late; the bus is overloaded or "
+    "badly terminated"
+)
+_LATE = (
+    "force and torque come so far apart that they may be of different samples; the bus is "
+    "overloaded, or a computer that sends its frames or passes them on is busy"
+)
+
+
+def _counters(state: TipState) -> StrainCounters:
+    return StrainCounters() if state.assembler is None else state.assembler.counters
 
 
 def _incomplete(state: TipState) -> str:

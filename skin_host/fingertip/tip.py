@@ -96,7 +96,7 @@ def locate_with_skin(
         surface_sd_mm=SURFACE_SD_MM,
     )[0]
     point, normal = contact.point_mm[0], contact.normal[0]
-    if felt is not None and felt.centroid_m is not None and felt.sigma_m:
+    if felt is not None and felt.centroid_m is not None and felt.sigma_m is not None:
         along = np.eye(3) - np.outer(normal, normal)
         covariance = along @ covariance @ along
         # A radial standard error covers two directions.
@@ -436,6 +436,7 @@ class Tip:
             mean_kpa=None if skin is None else skin.mean_kpa,
             force_n=normal_n,
             sigma_m=None if place is None else 1e-3 * place.sigma_mm,
+            partial=skin is not None and skin.partial,
             load=Load(verdict, force_n, torque_nm, shear, self.flag_names),
         )
 
@@ -451,6 +452,8 @@ class Tip:
         if not 0 <= now.t_ns - said.t_ns < ALIVE_NS:
             return True
         if (now.load.verdict, now.load.flags) != (said.load.verdict, said.load.flags):
+            return True
+        if now.partial is not said.partial:
             return True
         change_n = math.dist(now.load.force_n, said.load.force_n)
         if change_n > max(0.25 * self.threshold_n, PRESSED_SHARE * math.hypot(*said.load.force_n)):

@@ -258,15 +258,18 @@ class Describer:
 
     def _far(self, board: int, raw: NDArray[np.uint8]) -> Mask:
         """Return pads bool[16, 12] of a board's last sweep that are far out of range, but for those
-        that what pressed as it took its zero explains, which is reported as `board_in_doubt`: they
-        read far below zero pressure, not above.
+        that are pressed, and those that what pressed as it took its zero explains, which is
+        reported as `board_in_doubt`: they read far below zero pressure, not above.
 
         Args:
             board: of the layout.
             raw: uint8[16, 12], of that sweep.
         """
-        far: Mask = self._engine.ledger.far[self._engine.ledger.row[board]]
+        row = self._engine.ledger.row[board]
+        far: Mask = self._engine.ledger.far[row]
         found: Mask = far & ~(self._engine.zeros.in_doubt(board) & (raw == 255))
+        if any_of(found):
+            found &= ~self._engine.intake.far_presses.pressed(row)
         return found
 
     def _taxel_faults(self, part: int, pressure: NDArray[np.bool_]) -> dict[str, list[int]]:

@@ -129,6 +129,8 @@ def diagnose(record: Record, lost_lately: Collection[str] = ()) -> list[FoundFau
     faults += _output(record.get("output"), lost_lately)
     for what, why in record.get("unkept", {}).items():
         sentence = f"{what} in use but not kept: {why}; lost at a restart"
+        if what == "zeros":
+            sentence += ": what is pressed would look untouched; calibrate after the restart"
         faults.append(FoundFault("state_not_kept", what, sentence))
     return faults
 

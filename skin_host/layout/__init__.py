@@ -104,6 +104,7 @@ class Layout:
         area_mm2: float64[n], the skin that a pad stands for, see `geometry.shares_mm2`: force is
             the sum of pressure times this. 0 for thermal pads.
         radius_mm: float64[n], of the pad itself.
+        pitch_mm: float64[n], distance of the pads of its kind, as `kinds.toml` has it.
         pad_kind: uint8[n], see `PadKind`.
         unit_ff: float64[n], capacitance of one unit of the transmitted byte.
         sensitivity: float64[n], capacitance of the pad over that of the pad that equation (1)
@@ -122,6 +123,7 @@ class Layout:
     normal: Floats
     area_mm2: Floats
     radius_mm: Floats
+    pitch_mm: Floats
     pad_kind: NDArray[np.uint8]
     unit_ff: Floats
     sensitivity: Floats
@@ -251,9 +253,8 @@ def build_layout(settings: Settings, folder: Path) -> Layout:
     arrays: dict[str, Any] = {
         name: np.concatenate([getattr(column, name) for column in columns]) for name in _ARRAYS
     }
-    pitch_mm = arrays.pop("pitch_mm")
     neighbour_start, neighbour = _neighbours(
-        arrays["position_m"], arrays["normal"], pitch_mm, parts
+        arrays["position_m"], arrays["normal"], arrays["pitch_mm"], parts
     )
     return Layout(
         robot=settings.robot,

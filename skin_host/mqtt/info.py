@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from skin_host.config.fingertips import Fingertip
+    from skin_host.config.settings import Part
     from skin_host.layout import Layout, PartLayout
 
 INFO_SCHEMA: Final = "skin.info/1"
@@ -71,7 +72,7 @@ class TriangleInfo(Struct, frozen=True):
     no_load: int | None = None
 
 
-class PartInfo(Struct, frozen=True):
+class PartInfo(Struct, frozen=True, omit_defaults=True):
     """A part. Lists have one entry a taxel, in the order of the values of a frame.
 
     Attributes:
@@ -79,6 +80,7 @@ class PartInfo(Struct, frozen=True):
         pads: `pressure` or `thermal`; thermal pads are never valid in frames.
         position_m, normal: in the part's own frame.
         radius_mm, area_mm2: of the pad; of the skin that it answers for.
+        frames: whether its frames are published.
     """
 
     period_ms: int
@@ -88,6 +90,7 @@ class PartInfo(Struct, frozen=True):
     radius_mm: list[float]
     area_mm2: list[float]
     triangles: list[TriangleInfo]
+    frames: bool = True
 
 
 class FingertipInfo(Struct, frozen=True):
@@ -154,11 +157,16 @@ def node_info(
     frame_hz: float = 0.0,
     calibration: CalibrationInfo | None = None,
     commands: bool = True,
+    parts: Mapping[str, "Part"] | None = None,
     fingertips: Mapping[str, "Fingertip"] | None = None,
 ) -> NodeInfo:
-    """Describe the parts of `layout`, and of `fingertips` those, that belong to `node`."""
-    parts = {
-        part.name: _part_info(layout, number, part)
+    """Describe the parts of `layout`, and of `fingertips` those, that belong to `node`.
+
+    Of parts that are not among `parts` frames are published.
+    """
+    silent = {name for name, part in (parts or {}).items() if not part.frames}
+    described = {
+        part.name: _part_info(layout, number, part, frames=part.name not in silent)
         for number, part in enumerate(layout.parts)
         if part.node == node
     }
@@ -171,7 +179,7 @@ def node_info(
         frame_hz=frame_hz,
         calibration=calibration,
         commands=commands,
-        parts=parts,
+        parts=described,
         fingertips={
             name: _fingertip_info(tip)
             for name, tip in (fingertips or {}).items()
@@ -244,7 +252,7 @@ def decode_info(payload: bytes) -> NodeInfo:
     return info
 
 
-def _part_info(layout: "Layout", number: int, part: "PartLayout") -> PartInfo:
+def _part_info(layout: "Layout", number: int, part: "PartLayout", *, frames: bool) -> PartInfo:
     from skin_host.layout import PadKind
 
     mine = slice(part.start, part.stop)
@@ -268,6 +276,7 @@ def _part_info(layout: "Layout", number: int, part: "PartLayout") -> PartInfo:
             for triangle in layout.triangles
             if triangle.part == number
         ],
+        frames=frames,
     )
 
 

@@ -22,6 +22,7 @@ from skin_host.processing.intake import Intake, below_zero, lifted
 from skin_host.processing.liveness import PADS
 from skin_host.processing.masks import Mask, any_of
 from skin_host.processing.pipeline import Pipeline, PressureFrame
+from skin_host.processing.pressed_zero import PressedZero
 from skin_host.processing.rezero import (
     BELOW_SWEEPS,
     END,
@@ -114,6 +115,11 @@ class BoardZeros:
         #: Whether each taxel was touched when it was last valid. A board that restarts in a touch
         #: is silent before it is zeroed: its touches have ended as lost, and may still be there.
         self._last_touched = np.zeros(layout.n_taxels, np.bool_)
+        #: Taxels that were touched when an earlier start of the daemon ended, until their board is
+        #: zeroed by this one.
+        self._touched_before = np.zeros(layout.n_taxels, np.bool_)
+        #: Boards of which taxels were pressed when they were zeroed.
+        self._pressed: dict[int, PressedZero] = {}
         #: By part: which of its taxels were touched and valid in its last frame.
         self._noted: dict[int, tuple[Mask, Mask]] = {}
         #: Boards that were zeroed since they were held: until then what came before is under way.
@@ -131,6 +137,7 @@ class BoardZeros:
         self._jumped_ns = before._jumped_ns
         self._touched = before._touched
         self._last_touched = before._last_touched
+        self._touched_before, self._pressed = before._touched_before, before._pressed
         self._releasing = before._releasing
 
     def adopt(self, calibration: Calibration, pipeline: Pipeline) -> None:
@@ -144,9 +151,11 @@ class BoardZeros:
             self._silent_zeros.pop(board, None)
             self._glimpses.pop(board, None)
             self._at_end.pop(board, None)
+            self._pressed.pop(board, None)
         self.release(boards)
         zeroed = self._layout.taxels_of(boards)
         self._last_touched[zeroed] = self._touched[zeroed]
+        self._touched_before[zeroed] = False
 
     def note(self, sweep: Sweep, row: int, silent_ns: int) -> None:
         """Take in a sweep of a board.
@@ -169,6 +178,10 @@ class BoardZeros:
             self._note_below_zero(sweep, row)
         if END_BYTE in sweep.raw.tobytes() or sweep.board in self._at_end:
             self._note_at_end(sweep, row)
+        if self._pressed:
+            pressed_zero = self._pressed.get(sweep.board)
+            if pressed_zero is not None:
+                self._note_lifted(sweep, row, pressed_zero)
         if self.rezeros:
             rezero = self.rezeros.get(sweep.board)
             if rezero is not None:
@@ -231,6 +244,15 @@ class BoardZeros:
             beyond_range=frame.beyond_range & fit,
         )
 
+    def expect_touched(self, taxels: Mask) -> None:
+        """Something touched these taxels, bool[n], when an earlier start of the daemon ended.
+
+        A board that still sends shows whether it does so now. If none comes before it is zeroed,
+        their zero is in doubt from then on. Nothing has been fed yet.
+        """
+        self._touched_before |= taxels
+        self._last_touched |= taxels
+
     def rezero(self, board: int, believed: bool = True) -> int:
         """Find the new untouched readings after a board was zeroed.
 
@@ -241,7 +263,8 @@ class BoardZeros:
         Args:
             board: its index.
             believed: whether touches just before are real. Touches of a board that was not set up,
-                by this start of the daemon or an earlier one, are not.
+                by this start of the daemon or an earlier one, are not, but for those that an
+                earlier start has left.
 
         Returns:
             How many taxels were touched.
@@ -250,15 +273,17 @@ class BoardZeros:
         self._silent_zeros.pop(board, None)
         self._releasing.add(board)
         self._on_rezero(board, believed)
-        if self._calibration is None:
-            return 0
         before = self.rezeros.get(board)
         fitted = taxels >= 0
+        touched = fitted & self._touched_before[taxels]
         if believed:
-            touched = fitted & (self._last_touched[taxels] | self._glimpsed(board))
-        else:
-            touched = np.zeros_like(fitted)
-            self._last_touched[taxels[fitted]] = False
+            touched &= self._undecided(board)
+            touched |= fitted & (self._last_touched[taxels] | self._glimpsed(board))
+        self._last_touched[taxels[fitted]] = touched[fitted]
+        self._touched_before[taxels[fitted]] = False
+        self._note_pressed(board, touched)
+        if self._calibration is None:
+            return 0
         self._glimpses.pop(board, None)
         self._at_end.pop(board, None)
         if before is not None:
@@ -291,11 +316,27 @@ class BoardZeros:
         """Return taxels bool[n] whose zero will not be known; with `touched`, also those which are
         touched: after another zero, theirs would not be.
         """
-        found = self._last_touched.copy() if touched else np.zeros_like(self._touched)
-        for board in self._glimpses if touched else ():
-            found[self._of(board)[self._glimpsed(board)]] = True
+        found = self.touched() if touched else np.zeros_like(self._touched)
         for board, rezero in self.rezeros.items():
             found[self._of(board).ravel()[rezero.unknown]] = True
+        return found
+
+    def touched(self) -> Mask:
+        """Return taxels bool[n] that something touches, or did when it was last known."""
+        found: Mask = self._last_touched | self._touched_before
+        for board in self._glimpses:
+            found[self._of(board)[self._glimpsed(board)]] = True
+        return found
+
+    def pressed(self) -> Mask:
+        """Return taxels bool[n] that something pressed when their zero was taken or observed, and
+        whose release nothing has shown since.
+        """
+        found = np.zeros_like(self._touched)
+        for board, pressed_zero in self._pressed.items():
+            found[self._of(board).ravel()[pressed_zero.pressed]] = True
+        for board, rezero in self.rezeros.items():
+            found[self._of(board).ravel()[rezero.moved]] = True
         return found
 
     def may_be_touched(self) -> Mask:
@@ -364,6 +405,42 @@ class BoardZeros:
 
     def _of(self, board: int) -> NDArray[np.int32]:
         return self._layout.boards[board].taxel_index
+
+    def _undecided(self, board: int) -> Mask:
+        """Return taxels bool[16, 12] of which a board has not sent enough since the start to decide
+        whether something touches them.
+        """
+        taxels = self._of(board)
+        if self._pipeline is None:
+            return np.ones(taxels.shape, np.bool_)
+        repeats = repeats_of(self._layout.boards[board].settings.period_ms * 1e-3)
+        sent = self._ledger.sweeps[self._ledger.row[board]] / repeats
+        undecided: Mask = self._pipeline.measurements[taxels] > sent
+        return undecided
+
+    def _note_pressed(self, board: int, touched: Mask) -> None:
+        """A board is zeroed: what touches it, bool[16, 12], is in its zero, and so is what pressed
+        it before and has not lifted.
+        """
+        pressed = touched.ravel().copy()
+        before = self._pressed.pop(board, None)
+        if before is not None:
+            pressed |= before.pressed
+        if not any_of(pressed):
+            return
+        own = self._layout.boards[board].settings
+        noise = np.ones(pressed.size)
+        if self._calibration is not None:
+            noise = self._calibration.noise[self._of(board).ravel()]
+        repeats = repeats_of(own.period_ms * 1e-3)
+        self._pressed[board] = PressedZero(pressed, float(own.no_load), noise, repeats)
+
+    def _note_lifted(self, sweep: Sweep, row: int, pressed_zero: PressedZero) -> None:
+        """See what of that which pressed a board when it was zeroed has lifted."""
+        ledger = self._ledger
+        here = (ledger.error[row] == 0) & ledger.present[row] & ~lifted(sweep.raw, ledger.far[row])
+        if pressed_zero.step(sweep.raw.ravel(), np.repeat(here, PADS)):
+            self._last_touched[self._of(sweep.board).ravel()[pressed_zero.lifted]] = False
 
     def _note_twice(self, sweep: Sweep, row: int) -> None:
         """Two boards send at an address: what both send is the zero of neither."""

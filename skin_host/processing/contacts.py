@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate, chain, pairwise
-from statistics import median
 from typing import NamedTuple
 
 import numpy as np
@@ -93,18 +92,21 @@ class ContactTracker:
         if before is not None and before._near.is_same(near):
             near = before._near
         self._near: _Near = near
-        self._neighbours, self._patches, self._pitch_m = near.lists, near.patches, near.pitch_m
+        self._neighbours, self._patches = near.lists, near.patches
+        self._pitch_m = near.usual_pitch_m
         self._position_m = layout.position_m[mine]
         self._normal = layout.normal[mine]
         self._area_mm2 = layout.area_mm2[mine]
         self._shortest_ns = int(1e9 / settings.processing.touch.move_hz)
         self._places: _Places | None = None
         if settings.parts[part.name].localization != "centroid":
-            self._places = _Places(layout, part_index, settings)
+            self._places = _Places(layout, part_index, settings, near.pitch_m)
         self._contacts: dict[int, _Contact] = {} if before is None else before._contacts
         self._next_id: int = 1 if before is None else before._next_id
         self._elapsed_ns: int = 0 if before is None else before._elapsed_ns
         self._held: _Held = _Held(part.n_taxels) if before is None else before._held
+        self._former: _Former = _Former(part.n_taxels) if before is None else before._former
+        self._unfelt = _Unfelt.of(np.ones(part.n_taxels, np.bool_), near, None)
         self._known = _Grouping.of([], [], _Homes({}, 0), self._area_mm2, self._position_m)
         self._seen: bytes | None = None
 
@@ -114,6 +116,8 @@ class ContactTracker:
             self._held.forget()
             return []
         felt = self._held.complete(frame)
+        if self._former.names:
+            self._former.step(felt, frame.valid)
         found = self._grouping(felt, frame.valid)
         known = set(found.names)
         events = [
@@ -122,6 +126,26 @@ class ContactTracker:
             if name not in known
         ]
         return events + self._reported(found, felt, frame.valid)
+
+    def note_former(self, former: "Decision", now: "Decision") -> None:
+        """Note how the touches that there are were decided, if it is another way from now on.
+
+        A contact that ends although it would still be a touch has been stopped, not released.
+
+        Args:
+            former: how a touch ended.
+            now: how one begins from now on. What it finds is its own.
+        """
+        self._former.begin(self._taxels_of_contacts(), former, now)
+
+    def note_zeroed(self, taxels: Mask) -> None:
+        """Note that what some taxels [m] read now has become their zero, whatever presses them."""
+        self._former.zero(self._taxels_of_contacts(), taxels)
+
+    def _taxels_of_contacts(self) -> dict[int, list[int]]:
+        return {
+            name: [*contact.taxels, *contact.unseen] for name, contact in self._contacts.items()
+        }
 
     def end_all(self, seq: int, t_ns: int) -> list[Touch]:
         """End every contact, because no data of the part will come for a while."""
@@ -318,6 +342,13 @@ class ContactTracker:
         is_received = [True] * len(starts)
         if not all_of(received):
             is_received = np.logical_or.reduceat(received.take(order), starts).tolist()
+        unfelt = self._unfelt = _Unfelt.of(felt.valid, self._near, self._unfelt)
+        is_beside = [False] * len(starts)
+        if unfelt.any:
+            is_beside = np.logical_or.reduceat(unfelt.beside.take(order), starts).tolist()
+        is_beyond = [False] * len(starts)
+        if any_of(felt.beyond_range):
+            is_beyond = np.logical_or.reduceat(felt.beyond_range.take(order), starts).tolist()
         totals = total.tolist()
         now_ns = felt.elapsed_ns
         fading = math.exp((self._elapsed_ns - now_ns) / FADES_NS)
@@ -354,10 +385,18 @@ class ContactTracker:
                     centroid = x / whole, y / whole, z / whole
                     # Noise adds little to the uncertainty from the coarse pads.
                     sigma = GEOMETRY_PITCHES * self._pitch_m / math.sqrt(len(index))
-            if before is not None and not _worth_reporting(
-                before, silent_ns, index, peak, centroid
+            unseen: frozenset[int] = frozenset() if known is None else known.unseen
+            partial = is_beside[number] or bool(unseen)
+            if (
+                before is not None
+                and before.partial is partial
+                and before.beyond >= is_beyond[number]
+                and not _worth_reporting(before, silent_ns, index, peak, centroid)
             ):
                 continue
+            if partial and not kept and centroid is not None and sigma is not None:
+                away_m = self._unfelt_m(found, number, unseen, centroid, peak, totals[number])
+                sigma = math.hypot(sigma, away_m)
             normal = before.normal if before is not None and kept else None
             if not kept and totals[number] > 0.0:
                 span = found.spans[number]
@@ -377,6 +416,8 @@ class ContactTracker:
                 mean_kpa=totals[number] / area_mm2,
                 force_n=totals[number] * 1e-3,  # kPa mm2 is mN
                 sigma_m=sigma,
+                partial=partial,
+                beyond=is_beyond[number],
             )
             events.append(event)
             if known is None:
@@ -385,6 +426,49 @@ class ContactTracker:
             else:
                 known.said, known.said_ns = event, now_ns
         return events
+
+    def _unfelt_m(
+        self,
+        found: "_Grouping",
+        number: int,
+        unseen: frozenset[int],
+        place_m: Vector,
+        peak_kpa: float,
+        total_mn: float,
+    ) -> float:
+        """How far from its place a contact may be because of pads that are not valid, m.
+
+        That is how far they would move its centroid if they felt its peak, on as much skin as the
+        contact is felt on. Nothing is known of them, so this is how uncertain the place is.
+
+        Args:
+            found: the contacts of the frame, and which of them this one is.
+            unseen: taxels that it had before they were not received.
+            place_m: where it is felt.
+            peak_kpa, total_mn: its peak pressure, and its force.
+        """
+        unfelt = self._unfelt.pads
+        ring: set[int] = set(unseen) | {
+            other
+            for taxel in found.taxels[number]
+            for other in self._neighbours[taxel]
+            if unfelt[other]
+        }
+        reached = set(ring)
+        area_mm2 = self._area_mm2[list(ring)].sum()
+        while ring and area_mm2 < found.area_mm2[number]:
+            ring = {
+                other
+                for taxel in ring
+                for other in self._neighbours[taxel]
+                if unfelt[other] and other not in reached
+            }
+            reached |= ring
+            area_mm2 += self._area_mm2[list(ring)].sum()
+        pads = sorted(reached)
+        weight = peak_kpa * self._area_mm2[pads]
+        moment = weight @ (self._position_m[pads] - place_m)
+        return float(np.linalg.norm(moment) / (total_mn + weight.sum()))
 
     def _mean_normal(self, weight: Floats, taxels: NDArray[np.intp], total: float) -> Vector | None:
         direction = weight @ self._normal[taxels]
@@ -396,14 +480,107 @@ class ContactTracker:
 
     def _reason(self, name: int, felt: PressureFrame, received: Mask) -> Reason:
         """A contact is released only if each of its taxels is valid and untouched, or in another
-        contact.
+        contact; and by the rules by which it was found, if those are others now.
         """
         contact = self._contacts[name]
-        mine = [*contact.taxels, *contact.unseen]
-        return "released" if all_of(received[mine] | felt.touched[mine]) else "lost"
+        mine = np.array([*contact.taxels, *contact.unseen], np.intp)
+        if not all_of(received[mine] | felt.touched[mine]):
+            return "lost"
+        if name in self._former.names and self._former.keeps(mine[~felt.touched[mine]]):
+            return "stopped"
+        return "released"
 
     def _closed(self, name: int, seq: int, t_ns: int, reason: Reason) -> Touch:
+        self._former.names.discard(name)
         return self._contacts.pop(name).said.ended(seq, t_ns, reason)
+
+
+class Decision(NamedTuple):
+    """How touches begin or end: by the sum of what is above a level, see `touch.TouchDetector`.
+
+    Attributes:
+        level_kpa: float64[m], what lasts above this is a touch, below it none.
+        evidence_kpa: float64[m], the sum that makes a touch, or that one has at most.
+        votes: least number of measurements in which it is reached, or lost.
+    """
+
+    level_kpa: Floats
+    evidence_kpa: Floats
+    votes: int
+
+    def added(self, evidence_kpa: Floats, pressure_kpa: NDArray[np.float32]) -> Floats:
+        """Return the evidence [m] after another measurement [m]."""
+        vote_kpa = self.evidence_kpa / self.votes
+        gain = np.clip(pressure_kpa - self.level_kpa, -vote_kpa, vote_kpa)
+        return np.clip(evidence_kpa + gain, 0.0, self.evidence_kpa)
+
+
+class _Former:
+    """Whether contacts would still be touches by the decision by which they were found.
+
+    Another decision, or a new zero, ends touches that last. The former decision is continued on
+    the pressures of the taxels that were touched then, until the present one finds them, too.
+
+    Args:
+        m: taxels of the part.
+
+    Attributes:
+        names: of the contacts that it was for and that have not ended.
+    """
+
+    def __init__(self, m: int) -> None:
+        self.names: set[int] = set()
+        nothing = np.zeros(m)
+        self._former = self._now = Decision(nothing, nothing, 1)
+        #: What keeps each taxel touched by the former decision, and what the present one has found.
+        self._kept_kpa, self._found_kpa = nothing, nothing
+        self._zeroed: Mask = np.zeros(m, np.bool_)
+
+    def _note(self, contacts: dict[int, list[int]]) -> Mask:
+        """Note the contacts, and return their taxels [m]; forget those of earlier ones."""
+        self.names = set(contacts)
+        touched = np.zeros(len(self._zeroed), np.bool_)
+        for taxels in contacts.values():
+            touched[taxels] = True
+        self._zeroed &= touched
+        self._kept_kpa = np.where(touched, self._kept_kpa, 0.0)
+        return touched
+
+    def begin(self, contacts: dict[int, list[int]], former: Decision, now: Decision) -> None:
+        """Continue a decision that is in use no longer, see `ContactTracker.note_former`.
+
+        Args:
+            contacts: the taxels of each by its name.
+            former, now: the two decisions.
+        """
+        touched = self._note(contacts)
+        # Of several that followed each other, that which keeps a touch for longest.
+        level_kpa = np.where(
+            self._kept_kpa > 0.0,
+            np.fmin(self._former.level_kpa, former.level_kpa),
+            former.level_kpa,
+        )
+        self._former, self._now = former._replace(level_kpa=level_kpa), now
+        self._kept_kpa = np.where(touched, former.evidence_kpa, 0.0)
+        self._found_kpa = np.zeros(len(touched))
+
+    def zero(self, contacts: dict[int, list[int]], taxels: Mask) -> None:
+        """Some taxels [m] have a new zero: nothing shows any more what they felt."""
+        self._zeroed |= self._note(contacts) & taxels
+
+    def step(self, frame: PressureFrame, received: Mask) -> None:
+        """Take in a frame, and which of its taxels [m] were received."""
+        kept = self._former.added(self._kept_kpa, frame.pressure_kpa)
+        found = self._now.added(self._found_kpa, frame.pressure_kpa)
+        self._found_kpa = np.where(received, found, self._found_kpa)
+        over = (kept <= 0.0) | (found >= self._now.evidence_kpa)
+        self._kept_kpa = np.where(received, np.where(over, 0.0, kept), self._kept_kpa)
+        # A touch of now was found since the zero.
+        self._zeroed &= ~frame.touched
+
+    def keeps(self, taxels: NDArray[np.intp]) -> bool:
+        """Return whether any of some taxels would still be touched."""
+        return any_of((self._kept_kpa[taxels] > 0.0) | self._zeroed[taxels])
 
 
 class _Held:
@@ -419,6 +596,7 @@ class _Held:
     def __init__(self, n: int) -> None:
         self._pressure_kpa = np.zeros(n, np.float32)
         self._touched: Mask = np.zeros(n, np.bool_)
+        self._beyond: Mask = np.zeros(n, np.bool_)
         self._received_ns = np.full(n, -LOST_NS, np.int64)
         self._last: PressureFrame | None = None
         #: From when on none is held.
@@ -437,6 +615,7 @@ class _Held:
             if any_of(gone):
                 np.copyto(self._pressure_kpa, last.pressure_kpa, where=gone)
                 np.copyto(self._touched, last.touched, where=gone)
+                np.copyto(self._beyond, last.beyond_range, where=gone)
                 self._received_ns[gone] = last.elapsed_ns
                 self._until_ns = last.elapsed_ns + LOST_NS
         if now_ns >= self._until_ns:
@@ -449,6 +628,7 @@ class _Held:
             pressure_kpa=np.where(held, self._pressure_kpa, frame.pressure_kpa),
             touched=frame.touched | (held & self._touched),
             valid=frame.valid | held,
+            beyond_range=frame.beyond_range | (held & self._beyond),
         )
 
     def forget(self) -> None:
@@ -457,6 +637,33 @@ class _Held:
         if self._until_ns:
             self._received_ns.fill(-LOST_NS)
             self._until_ns = 0
+
+
+class _Unfelt(NamedTuple):
+    """Pads of a part that measure pressure and are not valid.
+
+    Attributes:
+        valid: the mask of the frame, as bytes.
+        any: whether there are any.
+        pads: bool[m], which ones.
+        beside: bool[m], which taxels are next to one.
+    """
+
+    valid: bytes
+    any: bool
+    pads: Mask
+    beside: Mask
+
+    @classmethod
+    def of(cls, valid: Mask, near: "_Near", last: "_Unfelt | None") -> "_Unfelt":
+        """Return those of a frame; mostly they are those of the last one."""
+        seen = valid.tobytes()
+        if last is not None and last.valid == seen:
+            return last
+        pads = near.pads & ~valid
+        beside = np.zeros(len(pads), np.bool_)
+        beside[near.taxel[pads[near.neighbour]]] = True
+        return cls(seen, any_of(pads), pads, beside)
 
 
 class _Homes:
@@ -593,7 +800,9 @@ class _Places:
     other sizes, shifts and strengths then read alike where they are covered alike.
     """
 
-    def __init__(self, layout: Layout, part_index: int, settings: Settings) -> None:
+    def __init__(
+        self, layout: Layout, part_index: int, settings: Settings, pitch_m: Floats
+    ) -> None:
         part = layout.parts[part_index]
         chosen = settings.parts[part.name]
         mine = slice(part.start, part.stop)
@@ -603,6 +812,7 @@ class _Places:
             layout.normal[mine],
             layout.radius_mm[mine],
             probe_mm=chosen.probe_mm,
+            pitch_m=pitch_m,
         )
         pads = layout.pad_kind[mine] == PadKind.PRESSURE
         unit_ff = (layout.unit_ff[mine] / layout.sensitivity[mine])[pads]
@@ -651,6 +861,8 @@ class _Near:
     Attributes:
         start, neighbour: as in `Layout`, of the part alone.
         position_m: [m, 3].
+        pads: bool[m], which ones measure pressure.
+        radius_m, kind_pitch_m: [m], of the pads, and their distance in a unit of their kind.
     """
 
     def __init__(
@@ -658,22 +870,38 @@ class _Near:
         start: NDArray[np.int32],
         neighbour: NDArray[np.int32],
         position_m: Floats,
+        pads: Mask,
+        radius_m: Floats,
+        kind_pitch_m: Floats,
     ) -> None:
         self.start = start
         self.neighbour = neighbour
         self.position_m = position_m
+        self.pads = pads
+        self.radius_m = radius_m
+        self.kind_pitch_m = kind_pitch_m
 
     @classmethod
     def of(cls, layout: Layout, mine: slice) -> "_Near":
         start = layout.neighbour_start[mine.start : mine.stop + 1]
         neighbour = layout.neighbour[start[0] : start[-1]] - np.int32(mine.start)
-        return cls(start - start[0], neighbour, layout.position_m[mine])
+        return cls(
+            start - start[0],
+            neighbour,
+            layout.position_m[mine],
+            layout.pad_kind[mine] == PadKind.PRESSURE,
+            1e-3 * layout.radius_mm[mine],
+            1e-3 * layout.pitch_mm[mine],
+        )
 
     def is_same(self, other: "_Near") -> bool:
         return (
             np.array_equal(self.start, other.start)
             and np.array_equal(self.neighbour, other.neighbour)
             and np.array_equal(self.position_m, other.position_m, equal_nan=True)
+            and np.array_equal(self.pads, other.pads)
+            and np.array_equal(self.radius_m, other.radius_m)
+            and np.array_equal(self.kind_pitch_m, other.kind_pitch_m)
         )
 
     @cached_property
@@ -687,13 +915,26 @@ class _Near:
         return Patches(self.lists)
 
     @cached_property
-    def pitch_m(self) -> float:
-        """Median distance of taxels to their nearest neighbour; 0 where none has any."""
+    def taxel(self) -> NDArray[np.intp]:
+        """Whose neighbour each of `neighbour` is."""
         count = np.diff(self.start)
-        if not count.any():
-            return 0.0
-        taxel = np.repeat(np.arange(len(count)), count)
-        steps = self.position_m[self.neighbour] - self.position_m[taxel]
-        apart_m = np.linalg.norm(steps, axis=1)
-        nearest_m = np.minimum.reduceat(apart_m, self.start[:-1][count > 0])
-        return float(median(nearest_m.tolist()))
+        return np.repeat(np.arange(len(count)), count)
+
+    @cached_property
+    def pitch_m(self) -> Floats:
+        """Distance [m] of each taxel to the nearest pad that measures pressure.
+
+        Where none is next to it, or one closer than pads can lie to each other, it is that of its
+        kind: places that are wrong must not seem precise.
+        """
+        steps = self.position_m[self.neighbour] - self.position_m[self.taxel]
+        apart_m = np.where(self.pads[self.neighbour], np.linalg.norm(steps, axis=1), np.inf)
+        nearest_m = np.full(len(self.pads), np.inf)
+        np.minimum.at(nearest_m, self.taxel, apart_m)
+        is_known = (nearest_m >= self.radius_m) & np.isfinite(nearest_m)
+        return np.where(is_known, nearest_m, self.kind_pitch_m)
+
+    @cached_property
+    def usual_pitch_m(self) -> float:
+        """The median of those of all pads that measure pressure."""
+        return float(np.median(self.pitch_m[self.pads]))

@@ -21,12 +21,13 @@ from skin_host.processing.board_zeros import BoardZeros
 from skin_host.processing.calibration import Calibration, Verdict, with_zeros
 from skin_host.processing.calibration.calibrator import KNOWN_SAMPLES, Calibrator, Known
 from skin_host.processing.calibration.run import CalibrationRun
-from skin_host.processing.contacts import ContactTracker
+from skin_host.processing.contacts import ContactTracker, Decision
 from skin_host.processing.events import Touch
 from skin_host.processing.intake import Intake, PartSample
 from skin_host.processing.masks import Mask
 from skin_host.processing.pipeline import Pipeline, PressureFrame, unreached
 from skin_host.processing.pressure import PressureCurve, vertex
+from skin_host.processing.touch import Levels
 
 if TYPE_CHECKING:
     from skin_host.fingertip.engine import FingertipEngine
@@ -180,7 +181,35 @@ class Engine:
         self.calibration = after.calibration
         self._pipeline = after._pipeline
         if self.calibration is not None:
+            former = None if self._pipeline is None else self._pipeline.levels
             self._renew_pipeline(np.zeros(self.layout.n_taxels, np.bool_))
+            if former is not None:
+                self._note_former(former, after.settings.processing.touch.votes_of_3)
+
+    def _note_former(self, former: Levels, votes: int) -> None:
+        """Note how the touches were decided that there are now, if it is another way from now on.
+
+        Args:
+            former: the levels of all taxels before.
+            votes: least number of measurements for a touch before.
+        """
+        assert self._pipeline is not None
+        levels = self._pipeline.levels
+        if votes == self.settings.processing.touch.votes_of_3 and all(
+            np.array_equal(now, before)
+            for now, before in ((levels.leave, former.leave), (levels.hold, former.hold))
+        ):
+            return
+        kpa, votes_now = self._pipeline.kpa, self.settings.processing.touch.votes_of_3
+        leave_kpa, enter_kpa = kpa(former.leave), kpa(levels.enter)
+        hold_kpa = kpa(former.leave + former.hold) - leave_kpa
+        span_kpa = kpa(levels.enter + levels.span) - enter_kpa
+        for part in self.parts:
+            mine = slice(self.layout.parts[part].start, self.layout.parts[part].stop)
+            self._trackers[part].note_former(
+                Decision(leave_kpa[mine], hold_kpa[mine], votes),
+                Decision(enter_kpa[mine], span_kpa[mine], votes_now),
+            )
 
     @property
     def pipeline(self) -> Pipeline | None:
@@ -208,7 +237,11 @@ class Engine:
         if self.fingertips is not None and boards == self.boards:
             self._ended += self.fingertips.use(calibration.zeros)
         self.zeros.calibrated(boards)
-        self._renew_pipeline(self.layout.taxels_of(boards))
+        zeroed = self.layout.taxels_of(boards)
+        self._renew_pipeline(zeroed)
+        for part in self.parts:
+            mine = slice(self.layout.parts[part].start, self.layout.parts[part].stop)
+            self._trackers[part].note_zeroed(zeroed[mine])
         run = self._run
         if run is not None and run.is_over:
             self._run = None
@@ -273,7 +306,7 @@ class Engine:
             time: now, ISO 8601 in UTC.
         """
         assert self._run is not None
-        finish = self._run.end(self.configuration, time, self._known())
+        finish = self._run.end(self.configuration, time, self._known(), self.zeros.pressed())
         zeros = None if self.fingertips is None else self.fingertips.end_zero()
 
         def compute() -> Calibration:

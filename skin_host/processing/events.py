@@ -62,7 +62,12 @@ class Touch(
         centroid_m, normal: in the part's frame; None where the place is not known. An end has the
             last place of the contact; its pressures are 0.
         area_mm2, peak_kpa, mean_kpa: None on a fingertip without skin.
-        sigma_m: radial standard error of `centroid_m`, in the skin; None where it is not known.
+        sigma_m: radial standard error of `centroid_m`, in the skin, never 0; None where it is not
+            known.
+        partial: whether pads of the contact, or next to it, are not valid: more of it may be there
+            than is felt.
+        beyond: whether any of its pads is pressed beyond its calibrated range: pressures and force
+            are estimates, and bounds from below where readings are cut off.
         reason: why it ended, only with an end.
         load: only of fingertips on force/torque boards.
         missed: of a received event: so many of its part were lost just before it.
@@ -83,6 +88,8 @@ class Touch(
     force_n: float
     #: Written even where it is None: only a plain default is left out.
     sigma_m: Annotated[float, Meta(ge=0)] | None = field(default_factory=lambda: None)
+    partial: bool = False
+    beyond: bool = False
     reason: Reason | None = None
     load: Load | None = None
     missed: int = 0
@@ -98,6 +105,7 @@ class Touch(
             peak_kpa=nothing_kpa,
             mean_kpa=nothing_kpa,
             force_n=0.0,
+            beyond=False,
             reason=reason,
         )
 
@@ -112,8 +120,13 @@ class Touch(
             peak_kpa=None if self.peak_kpa is None else round(self.peak_kpa, KPA_DECIMALS),
             mean_kpa=None if self.mean_kpa is None else round(self.mean_kpa, KPA_DECIMALS),
             force_n=round(self.force_n, N_DECIMALS),
-            sigma_m=None if self.sigma_m is None else round(self.sigma_m, M_DECIMALS),
+            sigma_m=None if self.sigma_m is None else _not_certain(self.sigma_m),
         )
+
+
+def _not_certain(sigma_m: float) -> float:
+    """Round a standard error, to no less than the last decimal."""
+    return round(max(sigma_m, 10.0**-M_DECIMALS), M_DECIMALS)
 
 
 def _rounded(vector: Vector | None, decimals: int) -> Vector | None:

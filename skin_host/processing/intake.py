@@ -4,9 +4,9 @@ Several boards, each with its own clock, may belong to one part. A sample of the
 every living board has sent a sweep, or when one sends its second: no board waits for a dead one.
 Values that were not received, or are not valid, are not present.
 
-A value is valid when its triangle was received, its chip answers (status words), it is not at a
-rail that pressing cannot reach, its chip lives (`liveness`), the zero of its board is known, and no
-second board sends at its address.
+A value is valid when its triangle was received, its chip answers (status words), it is not far out
+of range, or is so because it is pressed (`far_presses`), its chip lives (`liveness`), the zero of
+its board is known, and no second board sends at its address.
 
 Deciding whether a chip lives takes more computing time than everything else of a sample, and does
 not depend on one sweep. So a sweep affects that decision only from the next sweep on. It is made
@@ -24,6 +24,7 @@ from skin_host.bus.compensation import thermal_gains
 from skin_host.bus.ledger import BoardLedger
 from skin_host.bus.wire import TAXELS, TRIANGLES
 from skin_host.layout import Layout
+from skin_host.processing.far_presses import FarPresses
 from skin_host.processing.liveness import PADS, Liveness
 from skin_host.processing.masks import Mask, any_of, count_of
 from skin_host.processing.stuck import Encoding, Repeats
@@ -48,7 +49,8 @@ class PartSample(NamedTuple):
         raw: uint8[m], 0 where nothing was received.
         present: bool[m], the value was received and is valid.
         received: bool[m], the same without regard to a veto of the host, and to noise, which a
-            calibration measures: values that a new calibration may use.
+            calibration measures, and without what is far out of range: values that a new
+            calibration may use.
         t_ns: time of the last CAN frame in it.
     """
 
@@ -108,6 +110,7 @@ class Intake:
         veto: bool[16, 12] by row of the board: taxels that are invalid for a reason that the
             bytes do not show.
         touched: bool[16, 12] by row of the board: pads that are touched, where any is.
+        far_presses: which of the pads that are far out of range are pressed.
     """
 
     def __init__(
@@ -125,6 +128,7 @@ class Intake:
         self._unpressable = np.array([unpressable(layout, board, full_ff) for board in boards])
         self.veto: dict[int, Mask] = {}
         self.touched: dict[int, Mask] = {}
+        self.far_presses = FarPresses(layout, boards)
         n = len(boards)
         # The last sweep of each board, by its row.
         shape = (n, TRIANGLES * TAXELS)
@@ -185,6 +189,7 @@ class Intake:
         self.liveness.keep(before, ~boards)
         for row in np.flatnonzero(boards).tolist():
             self.veto.pop(row, None)
+            self.far_presses.forget(row)
 
     def go_on(self, before: "Intake") -> None:
         """Take over the state of a predecessor for the same boards."""
@@ -193,6 +198,7 @@ class Intake:
         self.liveness = before.liveness
         self.veto = before.veto
         self.touched = before.touched
+        self.far_presses = before.far_presses
         self._raw, self._bytes = before._raw, before._bytes
         self._present, self._received = before._present, before._received
         self._masks, self._usual, self._here = before._masks, before._usual, before._here
@@ -302,12 +308,18 @@ class Intake:
             # what is a zero.
             self._here[row] = False
             self._usual[row] = None
+            self.far_presses.forget(row)
             masks = self._nothing
         elif ledger.flagged[row]:
-            here = self._flagged(row, sweep.raw)
+            pressed = self._pressed_far(row, sweep)
+            here = self._flagged(row, sweep.raw, pressed)
             # A copy: it may be judged after the ledger has noted the next sweep.
             self._erring[row] = ledger.error[row].copy()
             masks = self._without_doubt(row, here[:, None] & ~ledger.far[row])
+            if any_of(pressed):
+                pressed &= here[:, None]
+                masks = masks[0] | self._without_doubt(row, pressed)[0], masks[1]
+                masks[0].flags.writeable = False
             before = self._last[row]
             # The same arrays as before are known to be the same further on.
             if before is not None and all(map(np.array_equal, before, masks)):
@@ -317,6 +329,8 @@ class Intake:
             self._here[row] = here
             self._usual[row] = None
         else:
+            if self.far_presses.watches(row):
+                self._pressed_far(row, sweep)
             # Most sweeps have nothing but the triangles of the one before.
             key = self._doubts_of(row)
             usual = self._usual[row]
@@ -329,8 +343,11 @@ class Intake:
             masks = usual[2]
         self._waiting[row] = True
         self._n_waiting += 1
-        if row in self.touched:
-            self._felt[row] = self.touched[row]
+        touched = self.touched.get(row)
+        if touched is not None:
+            self._felt[row] = touched
+        if row not in ledger.twice:
+            self.far_presses.note(row, sweep, touched, ledger.now_ns)
         veto = self.veto.get(row)
         if veto is None:
             return masks
@@ -362,15 +379,31 @@ class Intake:
         present.flags.writeable = received.flags.writeable = False
         return (present, present) if np.array_equal(present, received) else (present, received)
 
-    def _flagged(self, row: int, raw: NDArray[np.uint8]) -> Mask:
+    def _pressed_far(self, row: int, sweep: Sweep) -> Mask:
+        """Return pads bool[16, 12] of a sweep that are pressed far out of their range."""
+        ledger, doubted = self._ledger, self.liveness.doubted
+        trusted = np.repeat(~lifted(sweep.raw, ledger.far[row])[:, None], PADS, axis=1)
+        if doubted is not None:
+            trusted &= ~doubted[TRIANGLES * row : TRIANGLES * (row + 1)]
+        return self.far_presses.step(
+            row,
+            sweep,
+            ledger.far[row],
+            trusted,
+            self.veto.get(row),
+            self.touched.get(row),
+            ledger.now_ns,
+        )
+
+    def _flagged(self, row: int, raw: NDArray[np.uint8], pressed: Mask) -> Mask:
         """Return triangles bool[16] of a sweep with status words that were received, answer, and
-        are in their range.
+        are in their range but for the pads bool[16, 12] that are pressed beyond it.
         """
         ledger = self._ledger
         far = ledger.far[row]
         here: Mask = ledger.present[row] & (ledger.error[row] == 0) & ~lifted(raw, far)
         if any_of(self._unpressable[row]):
-            here &= ~(self._unpressable[row] & (count_of(far) >= FAR_PADS))
+            here &= ~(self._unpressable[row] & (count_of(far & ~pressed) >= FAR_PADS))
         return here
 
     @property

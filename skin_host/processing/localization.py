@@ -103,6 +103,7 @@ class TemplateLocalizer:
         radius_mm: float64[n], of the pads.
         probe_mm: diameter of the touching object; several to leave the size open.
         noise_units: standard deviation of an untouched reading, rounding included.
+        pitch_m: float64[n], see `make_localizer`.
     """
 
     def __init__(
@@ -113,6 +114,7 @@ class TemplateLocalizer:
         probe_mm: float | Sequence[float] = 10.0,
         *,
         noise_units: float = 0.5,
+        pitch_m: Floats | None = None,
     ) -> None:
         self._position_m = position_m
         self._normal = normal
@@ -127,7 +129,7 @@ class TemplateLocalizer:
                 np.linalg.norm(position_m - here, axis=1) > widest_m for here in position_m
             )
         ]
-        self._centroid = CentroidLocalizer(position_m, noise_units=noise_units)
+        self._centroid = CentroidLocalizer(position_m, noise_units=noise_units, pitch_m=pitch_m)
         #: Those laid down earlier come first.
         self._tables: dict[int, _Table] = {}
         self._tables_bytes = 0
@@ -177,6 +179,9 @@ class TemplateLocalizer:
             # A pattern that does not change with the place cannot be refined.
             if refined is not None and refined[2] < variance_mm2 + table.step_mm**2:
                 x, y, variance_mm2 = refined
+            else:
+                # The place lies somewhere in the cell of its candidate.
+                variance_mm2 = max(variance_mm2, table.step_mm**2 / 6.0)
         place_mm = np.array((1.0, x, y)) @ table.frame
         return Location(1e-3 * place_mm, 1e-3 * math.sqrt(variance_mm2 * misfit))
 
@@ -315,6 +320,7 @@ def make_localizer(
     *,
     probe_mm: float | Sequence[float] = PROBES_MM,
     noise_units: float = 0.5,
+    pitch_m: Floats | None = None,
 ) -> Localizer:
     """Make the localiser of one part.
 
@@ -325,17 +331,25 @@ def make_localizer(
         radius_mm: float64[n], of the pads.
         probe_mm: for `template`, diameter of what touches; several to leave it open.
         noise_units: standard deviation of an untouched reading, rounding included.
+        pitch_m: float64[n], distance of the pads around each; by default that to the nearest.
     """
     match method:
         case "centroid":
-            return CentroidLocalizer(position_m, noise_units=noise_units)
+            return CentroidLocalizer(position_m, noise_units=noise_units, pitch_m=pitch_m)
         case "half_maximum":
-            return CentroidLocalizer(position_m, noise_units=noise_units, share=0.5)
+            return CentroidLocalizer(
+                position_m, noise_units=noise_units, share=0.5, pitch_m=pitch_m
+            )
         case "peak":
-            return PeakLocalizer(position_m, normal, noise_units=noise_units)
+            return PeakLocalizer(position_m, normal, noise_units=noise_units, pitch_m=pitch_m)
         case "template":
             return TemplateLocalizer(
-                position_m, normal, radius_mm, probe_mm, noise_units=noise_units
+                position_m,
+                normal,
+                radius_mm,
+                probe_mm,
+                noise_units=noise_units,
+                pitch_m=pitch_m,
             )
     assert_never(method)
 

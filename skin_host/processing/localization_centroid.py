@@ -45,11 +45,18 @@ class CentroidLocalizer:
     threshold centroid.
     """
 
-    def __init__(self, position_m: Floats, *, noise_units: float = 0.5, share: float = 0.0) -> None:
+    def __init__(
+        self,
+        position_m: Floats,
+        *,
+        noise_units: float = 0.5,
+        share: float = 0.0,
+        pitch_m: Floats | None = None,
+    ) -> None:
         self._position_m = position_m
         self._noise_units = noise_units
         self._share = share
-        self._pitch_m = nearest_distance(position_m)
+        self._pitch_m = nearest_distance(position_m) if pitch_m is None else pitch_m
 
     def locate(self, taxels: Indices, units: Floats, usable: Mask) -> Location | None:
         taxels = taxels[usable[taxels]]
@@ -80,12 +87,21 @@ class PeakLocalizer:
     is no top within a pitch of the strongest, the threshold centroid is used.
     """
 
-    def __init__(self, position_m: Floats, normal: Floats, *, noise_units: float = 0.5) -> None:
+    def __init__(
+        self,
+        position_m: Floats,
+        normal: Floats,
+        *,
+        noise_units: float = 0.5,
+        pitch_m: Floats | None = None,
+    ) -> None:
         self._position_m = position_m
         self._normal = normal
         self._noise_units = noise_units
-        self._pitch_m = nearest_distance(position_m)
-        self._fallback = CentroidLocalizer(position_m, noise_units=noise_units, share=0.5)
+        self._pitch_m = nearest_distance(position_m) if pitch_m is None else pitch_m
+        self._fallback = CentroidLocalizer(
+            position_m, noise_units=noise_units, share=0.5, pitch_m=self._pitch_m
+        )
         self._fits: dict[int, tuple[Indices, Floats | None, Floats]] = {}
 
     def locate(self, taxels: Indices, units: Floats, usable: Mask) -> Location | None:

@@ -106,7 +106,7 @@ class Pipeline:
         self._layout = layout
         self.baseline = calibration.baseline.copy()
         self.relaxation_kpa = np.zeros(layout.n_taxels, np.float32)
-        rules = _Rules.of(layout, settings, calibration)
+        self._rules = rules = _Rules.of(layout, settings, calibration)
         self.enter = rules.levels.enter
         self.measurements = rules.levels.measurements(settings.touch.votes_of_3)
         self.unreached, self.flat = rules.unreached, rules.unreached & ~rules.curve.sound
@@ -131,7 +131,7 @@ class Pipeline:
         """
         self._layout = layout or self._layout
         np.copyto(self.baseline, calibration.baseline, where=zeroed)
-        rules = _Rules.of(self._layout, settings, calibration)
+        self._rules = rules = _Rules.of(self._layout, settings, calibration)
         self.enter = rules.levels.enter
         self.measurements = rules.levels.measurements(settings.touch.votes_of_3)
         self.unreached, self.flat = rules.unreached, rules.unreached & ~rules.curve.sound
@@ -196,6 +196,15 @@ class Pipeline:
         anew[taxels] = True
         for part in self._parts:
             part.begin_anew(anew)
+
+    @property
+    def levels(self) -> Levels:
+        """Where the taxels [n] begin and end to be touched, in units."""
+        return self._rules.levels
+
+    def kpa(self, units: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return activations [n] as pressures, kPa."""
+        return np.asarray(self._rules.curve.kpa(units), np.float64)
 
     def seq(self, part_index: int) -> int:
         """Return the number of the part's next frame."""
@@ -403,7 +412,7 @@ class _PartPipeline:
         whole = np.where(usable, rules.levels.whole, 0.0)
         firm = curve.kpa(whole + rules.levels.fall)
         on = np.where(usable, curve.kpa(whole), np.inf)
-        self._residuals.configure(on, firm, rules.levels.votes)
+        self._residuals.configure(on, firm, rules.levels.votes, rules.curves is not None)
         decides = rules.levels.decides_surely(self._interval_s, rules.settings.touch.votes_of_3)
         decides = curve.kpa(np.where(usable, decides, 0.0))
         self.decides_kpa = float(decides.max(initial=0.0))
@@ -454,7 +463,9 @@ class _PartPipeline:
         raw = raw.copy()
         own = self._own
         if own is not None:
-            present = own.without_rails(raw, present, self._offset)
+            felt, lost = self._detector.touched, self._detector.lost
+            felt = felt if lost is None else felt | lost
+            present = own.without_rails(raw, present, self._offset, self._last_raw, felt)
         valid = self._receive(raw, present)
         if gap_s > 0.0:
             self._bridge(gap_s)

@@ -55,7 +55,8 @@ RESIDUAL_S = 5.0
 NEGLIGIBLE_KPA = 1e-20
 #: Where the model of the foam is not fitted, more remains, for longer: what is felt when a firm
 #: press falls, up to this share of it, and the time in which that falls to 1/e. On the emulated
-#: foam, 10 s of 70 kPa leave up to 5 % for 15 s.
+#: foam, 10 s of 70 kPa leave up to 5 % for 15 s. The threshold of coarse units is larger; in fine
+#: ones, a reading that is no more than this share and noise shows no press.
 LARGEST_SHARE = 0.06
 LEFT_S = 30.0
 #: Beyond the calibrated range a pressure is an estimate, and so is the relaxation derived from it:
@@ -75,6 +76,9 @@ LEAST_RESIDUAL = 0.05
 MEAN_SHARE = 0.25
 #: A repeated fall by this many standard deviations of a measurement is not noise.
 FALL_DEVIATIONS = 4.0
+#: The mean of as many measurements as end a press differs by less than this share of that: by three
+#: of its own standard deviations.
+MEAN_NOISE_SHARE = 3.0 / (math.sqrt(2.0) * FALL_DEVIATIONS)
 #: Nor is a rise of the mean by so many of its own, which are those of a measurement times the root
 #: of `MEAN_SHARE` / (2 - `MEAN_SHARE`).
 RISE_DEVIATIONS = 5.0
@@ -359,7 +363,13 @@ class Residuals:
     drift, and then it lasts. While that decision holds on to a residual it is no new evidence, nor
     is it when it has lost it and finds it again: a taxel is touched again when its mean rises
     further than noise carries it. Beyond the calibrated range the model of the foam may lack some
-    of the relaxation, so a harder press ends at a higher residual, which remains for longer.
+    of the relaxation, so a harder press ends at a higher residual, which remains for longer; and
+    where none was fitted, more is left of any.
+
+    A firm press has fallen when as many measurements in a row as a decision takes were below the
+    bar. Where no model was fitted, what is left comes close to it, and noise carries some across:
+    then those below must outnumber those above by as many, also of one that comes down slowly; as
+    many more are needed after one that has stayed above the bar.
 
     Attributes:
         any: whether any is reported.
@@ -380,14 +390,22 @@ class Residuals:
         self._left_s = np.full(n, LEFT_S, np.float32)
         self._lacking_share = np.zeros(n, np.float32)
         self._lacking = np.zeros(n, np.float32)
-        #: For how many measurements it has fallen, and their sum.
+        #: Up to which share of it is left because no model was fitted; and what noise adds to the
+        #: mean of as many measurements as end a press.
+        self._unfitted_share = np.float32(0.0)
+        self._mean_noise = np.zeros(n, np.float32)
+        #: Which reported taxels were pressed firmly not long ago; how many more measurements were
+        #: below the bar than above it; and number and sum of all since the first was below.
+        self._firm = np.zeros(n, np.bool_)
         self._fallen = np.zeros(n, np.int64)
+        self._fallen_number = np.zeros(n, np.int64)
         self._fallen_sum = np.zeros(n, np.float32)
-        #: What noise adds to the mean at most; and which taxels have fallen to their residual and
-        #: are still touched by the decision before.
+        #: What noise adds to a measurement at most, and to the mean; and which taxels have fallen
+        #: to their residual and are still touched by the decision before.
+        self._outlier = np.zeros(n, np.float32)
         self._rise = np.zeros(n, np.float32)
         self._held = np.zeros(n, np.bool_)
-        #: Whether any reported taxel has fallen in its last measurement.
+        #: Whether any of `_fallen` is not 0.
         self._any_fallen = False
         self._reported: Mask = np.zeros(n, dtype=np.bool_)
         self._seen = self._reported
@@ -396,21 +414,27 @@ class Residuals:
         self.any = False
         self._undecided = False
 
-    def configure(self, on: Array, firm: Array, votes: NDArray[np.int64]) -> None:
+    def configure(
+        self, on: Array, firm: Array, votes: NDArray[np.int64], fitted: bool = True
+    ) -> None:
         """Use other rules from now on.
 
         Args:
             on: float[n], activations that count in full, in kPa.
             firm: float[n], activations that noise does not take below `on`.
-            votes: int[n], measurements in a row that end a firm press.
+            votes: int[n], measurements that end a firm press.
+            fitted: whether the model of the foam was fitted to the pads.
         """
         np.copyto(self._on, on, casting="same_kind")
         with np.errstate(invalid="ignore"):  # both are infinite where nothing is touched
-            np.copyto(self._firmer, np.fmax(firm - on, on), casting="same_kind")
+            fall = firm - on
+        np.copyto(self._firmer, np.fmax(fall, on), casting="same_kind")
+        np.copyto(self._mean_noise, np.fmin(fall * MEAN_NOISE_SHARE, on), casting="same_kind")
         self._votes = votes
+        self._unfitted_share = np.float32(0.0 if fitted else LARGEST_SHARE)
+        np.copyto(self._outlier, self._firmer * np.sqrt(votes / 2), casting="same_kind")
         own = RISE_DEVIATIONS * math.sqrt(MEAN_SHARE / (2.0 - MEAN_SHARE))
-        rise = self._firmer * np.sqrt(votes / 2) * (own / FALL_DEVIATIONS)
-        np.copyto(self._rise, rise, casting="same_kind")
+        np.multiply(self._outlier, own / FALL_DEVIATIONS, out=self._rise)
 
     def step(
         self,
@@ -455,16 +479,23 @@ class Residuals:
         np.minimum(self._left_s, np.float32(LONGEST_LEFT_S), out=self._left_s)
 
     def _begin_and_end(self, touched: Mask, signal: Array, lost: Mask | None) -> None:
-        # A sample is noisy: a taxel's signal is its fading mean since it was touched.
         known = touched & self._seen
-        felt = self._felt + np.where(known, MEAN_SHARE, 1.0) * (signal - self._felt)
-        np.copyto(self._felt, felt, where=~self._reported, casting="same_kind")
         self._seen = touched
         self._note_left(np.flatnonzero(self._reported & ~touched))
         left = np.fmax(RESIDUAL_SHARE * self._pressed, self._left)
+        unfitted = self._unfitted_share * self._hardest
+        floor = self._mean_noise + unfitted
+        bar = np.fmax(self._on + left, floor)
+        negligible = LEAST_RESIDUAL * self._on
+        # A sample is noisy: a taxel's signal is its fading mean since it was touched. The first one
+        # is high if noise on top of what is left made it a touch.
+        chance = (unfitted >= negligible) & (signal < bar + self._outlier)
+        first = np.where(chance, np.fmin(signal, self._on), signal)
+        felt = np.where(known, self._felt + MEAN_SHARE * (signal - self._felt), first)
+        np.copyto(self._felt, felt, where=~self._reported, casting="same_kind")
         self._held &= touched if lost is None else touched | lost
-        enough = (left < LEAST_RESIDUAL * self._on) & ~self._held
-        enough |= self._felt >= self._on + left + np.where(self._held, self._rise, 0.0)
+        enough = (left < negligible) & (floor <= self._on) & ~self._held
+        enough |= self._felt >= bar + np.where(self._held, self._rise, 0.0)
         self._report(touched & (self._reported | enough))
         self._undecided = not np.array_equal(self._reported, touched)
 
@@ -489,36 +520,46 @@ class Residuals:
         now, felt = signal[which], self._felt[which]
         pressed = np.fmax(self._pressed[which], now)
         self._pressed[which] = pressed
-        self._hardest[which] = np.fmax(self._hardest[which], now)
+        self._hardest[which] = hardest = np.fmax(self._hardest[which], now)
         # What earlier presses have left is left after this one, too.
         left = np.fmax(RESIDUAL_SHARE * pressed + self._lacking[which], self._left[which])
-        bar = self._on[which] + left
-        fallen = (now < bar) & (felt >= bar + self._firmer[which])
-        if not self._any_fallen and not any_of(fallen):
-            mean = felt + MEAN_SHARE * (now - felt)
-            if repeated is not None:
-                np.copyto(mean, felt, where=repeated[which])
-            self._felt[which] = mean
+        bar = np.fmax(
+            self._on[which] + left, self._mean_noise[which] + self._unfitted_share * hardest
+        )
+        needed = bar + self._firmer[which]
+        firmly = felt >= needed
+        before, votes = self._fallen[which], self._votes[which]
+        # What a fitted model leaves goes before a press that is eased slowly has come down to it.
+        recent = hardest >= needed if self._unfitted_share else before > 0
+        firm = firmly | (self._firm[which] & recent)
+        self._firm[which] = firm
+        again = None if repeated is None else repeated[which]
+        mean = felt + MEAN_SHARE * (now - felt)
+        self._felt[which] = mean if again is None else np.where(again, felt, mean)
+        far = now >= bar + self._outlier[which]
+        if not self._any_fallen and not any_of(firm & ~far):
             return
-        counts = np.where(fallen, self._fallen[which] + 1, 0)
-        sums = np.where(fallen, self._fallen_sum[which] + now, 0.0)
-        # The earlier mean is kept while the fall is observed.
-        felt = np.where(fallen, felt, felt + MEAN_SHARE * (now - felt))
-        if repeated is not None:
-            again = repeated[which]
-            counts = np.where(again, self._fallen[which], counts)
+        # A fitted model leaves so little that what is above the bar is pressed.
+        missed = np.where(far, np.minimum(before, 1), before) - 1 if self._unfitted_share else 0
+        counts = np.where(now < bar, before + 1, missed)
+        counts = np.where(firm, np.maximum(counts, np.where(firmly, 0, -votes)), 0)
+        begins = before <= 0
+        numbers = np.where(begins, 1, self._fallen_number[which] + 1)
+        sums = np.where(begins, now, self._fallen_sum[which] + now)
+        if again is not None:
+            counts = np.where(again, before, counts)
+            numbers = np.where(again, self._fallen_number[which], numbers)
             sums = np.where(again, self._fallen_sum[which], sums)
-            felt = np.where(again, self._felt[which], felt)
         self._fallen[which] = counts
+        self._fallen_number[which] = numbers
         self._fallen_sum[which] = sums
-        self._any_fallen = any_of(counts > 0)
-        self._felt[which] = felt
-        ended = np.flatnonzero(counts >= self._votes[which])
+        self._any_fallen = any_of(counts != 0)
+        ended = np.flatnonzero(counts >= votes)
         if len(ended):
             if not isinstance(which, slice):
                 ended = which[ended]
             # The last of them may be low by noise.
-            left = self._fallen_sum[ended] / self._fallen[ended]
+            left = self._fallen_sum[ended] / self._fallen_number[ended]
             self._felt[ended] = left
             self._held[ended] = True
             most = LARGEST_SHARE * self._pressed[ended] + self._lacking[ended]
@@ -531,8 +572,8 @@ class Residuals:
     def _report(self, reported: Mask) -> None:
         if not np.array_equal(reported, self._reported):
             began = reported & ~self._reported
+            self._firm[began] = False
             self._fallen[began] = 0
-            self._fallen_sum[began] = 0.0
             self._reported = reported
             found = np.flatnonzero(reported)
             self._which = found if len(found) < len(reported) else slice(None)

@@ -39,6 +39,7 @@ from skin_host.processing.fitting.course import (
 from skin_host.processing.fitting.hold import Fit, HoldRecord, fit, merge
 from skin_host.processing.pressure import PressureCurve
 from skin_host.processing.relaxation import make_model, parameters_of
+from skin_host.recording import seconds as in_seconds
 from skin_host.recording.load_table import LoadTable, check_course, check_covers, on_clock_of
 from skin_host.recording.plausibility import check_ratio, describe_ratio
 from skin_host.recording.replay import calibrate_from_log, steps
@@ -164,7 +165,7 @@ def read_samples(
     step_ns = round(min(float(np.median(mine)) for mine in steps_ns))
     if (back_ns := min(int(mine.min()) for mine in steps_ns)) < 0:
         raise LogError(
-            f"{log}: its time goes back by {-back_ns / 1e9:g} s: the clock was set; {WANTED}"
+            f"{log}: its time goes back by {in_seconds(-back_ns)}: the clock was set; {WANTED}"
         )
     if step_ns < LEAST_STEP_NS:
         raise LogError(f"{log}: its time stands still; {WANTED}")

@@ -270,6 +270,7 @@ async def play_processed(
                 encoding=settings.mqtt.encoding,
                 frame_hz=settings.mqtt.frame_hz,
                 commands=False,
+                parts=settings.parts,
                 fingertips=settings.fingertips,
             )
         )

@@ -2,6 +2,7 @@
 
 import contextlib
 import itertools
+import math
 import time
 import tracemalloc
 
@@ -9,6 +10,7 @@ import can
 import pytest
 
 from skin_host.bus.adapters import CAPACITY, AdapterPort, nanoseconds
+from skin_host.bus.multicast import MulticastBus
 from skin_host.bus.opening import open_bus, open_port
 from skin_host.bus.port import LinkState, Port
 from skin_host.clock import SteppedClock
@@ -221,6 +223,8 @@ def test_buses_by_multicast_do_not_hear_each_other():
         {"arbitration_id": 2**63},
         {"arbitration_id": "x"},
         {"is_extended_id": [0] * 100},
+        {"timestamp": "now"},
+        {"timestamp": [0.0] * 100},
         {"channel": None, "data": None},
     ],
 )
@@ -247,6 +251,47 @@ def test_a_datagram_that_is_no_frame_costs_its_own_size_alone(changes: dict[str,
     assert port.counters.damaged == 1
     near.shutdown()
     port.close()
+
+
+@pytest.mark.parametrize(
+    ("sent", "times_s"),
+    [
+        ([-0.4, -0.39987, -0.2], [-0.4, -0.39987, -0.2]),  # of an emulator that was held up
+        ([0.0, -2.0, 3600.0, -1e9, math.nan, math.inf, -math.inf, None], [0.0] * 8),  # other clocks
+        ([-2.0, -0.5, 0.0], [0.0] * 3),  # of those, some seem to be of just now
+        ([-0.3, -0.4, -0.1], [-0.3, -0.3, -0.1]),  # of two senders
+    ],
+)
+def test_a_frame_over_multicast_has_its_senders_time_if_that_was_just_now(
+    sent: list[float | None], times_s: list[float]
+) -> None:
+    msgpack = pytest.importorskip("msgpack")
+    now_s = 1_700_000_000.0
+    with open_bus("a", Bus(interface="udp_multicast", channel="239.74.163.205")) as bus:
+        assert isinstance(bus, MulticastBus)
+        datagrams = [
+            msgpack.packb(FRAME | {"timestamp": None if one is None else now_s + one})
+            for one in sent
+        ]
+        bus._multicast.recv = lambda _: (datagrams.pop(0), ("", 0), now_s)
+        found = [bus._recv_internal(0)[0] for _ in sent]
+    assert [one.timestamp - now_s for one in found if one is not None] == pytest.approx(
+        times_s, abs=1e-6
+    )
+
+
+def test_a_clock_that_is_set_back_is_followed_over_multicast() -> None:
+    msgpack = pytest.importorskip("msgpack")
+    with open_bus("a", Bus(interface="udp_multicast", channel="239.74.163.206")) as bus:
+        assert isinstance(bus, MulticastBus)
+        arrivals_s = [1000.0, 1001.0, 500.0, 501.0]
+        received = iter(
+            (msgpack.packb(FRAME | {"timestamp": at_s - 0.25}), ("", 0), at_s)
+            for at_s in arrivals_s
+        )
+        bus._multicast.recv = lambda _: next(received)
+        found = [bus._recv_internal(0)[0] for _ in arrivals_s]
+    assert [one.timestamp for one in found if one is not None] == [999.75, 1000.75, 500.0, 500.75]
 
 
 def test_fd_frames_over_multicast_hold_up_no_others():

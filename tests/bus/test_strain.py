@@ -125,7 +125,16 @@ def test_a_lost_half_never_joins_two_samples():
     )
     assert [s.force_n[0] / s.torque_nm[0] for s in samples] == [2000 / 40, 2000 / 40]
     assert assembler.counters.samples == 2
-    assert assembler.counters.lone == 2
+    assert (assembler.counters.lone, assembler.counters.late) == (2, 2)
+
+
+@pytest.mark.parametrize("lost", ["f", "t"])
+def test_halves_whose_other_half_was_lost_are_not_late(lost):
+    assembler = WrenchAssembler(13, 10, SCALE)
+    frames = [(10 * i + 0.1 * k, kind, i) for i in range(9) for k, kind in enumerate("ft")]
+    del frames[8 + "ft".index(lost)]
+    assert len(samples_of(assembler, stream(*frames))) == 8
+    assert (assembler.counters.lone, assembler.counters.late) == (1, 0)
 
 
 LATE_MS = st.floats(0.1, 9.6)
@@ -168,7 +177,7 @@ def test_a_late_half_ends_its_sample_and_begins_no_other(order):
     samples = samples_of(assembler, stream(*frames))
     numbers = [round(sample.force_n[0] / SCALE[0] * 0x8000) for sample in samples]
     assert numbers == [i for i in range(80) if i not in late]
-    assert assembler.counters.lone == 2 * len(late)
+    assert assembler.counters.lone == assembler.counters.late == 2 * len(late)
 
 
 @pytest.mark.parametrize("order", ["ft", "tf"])

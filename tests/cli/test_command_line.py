@@ -185,7 +185,7 @@ def test_a_status_without_broker_waits_for_none(capsys):
 
 @pytest.mark.parametrize(("options", "status"), [([], 0), (["--strict"], 1)])
 def test_a_calibration_of_touched_skin_is_a_warning(options, status, tmp_path, monkeypatch, capsys):
-    async def touched(settings, layout, *_):
+    async def touched(settings, layout, *_, **__):
         calibrator = Calibrator(layout)
         raw = np.full(layout.parts[0].n_taxels, 240, np.uint8)
         for sweep in range(100):
@@ -307,5 +307,5 @@ def test_a_kept_calibration_of_another_skin_stops_the_daemon_before_it_begins(tm
     content += '"configuration":"0","parts":{}}'
     kept.write_text(content)
     result = skin("run", str(DEMO), XDG_STATE_HOME=str(tmp_path))
-    refused(result, 2, str(kept), "skin calibrate")
+    refused(result, 2, str(kept), 'robot "other"', "service.state_directory")
     assert kept.read_text() == content

@@ -1,6 +1,7 @@
 """The demo's scene, worked out without a clock: what is pressed is told, and nothing else."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from msgspec.structs import replace
@@ -9,7 +10,7 @@ from emulator.probes.scene import Scene
 from emulator.probes.scene import load as load_scene
 from emulator.robot import Robot
 from skin_host import demo
-from skin_host.config.settings import load
+from skin_host.config.settings import changed, load
 from skin_host.layout import build_layout
 from skin_host.processing.core import Engine
 from tests.support.fault_bench import FaultBench
@@ -102,3 +103,28 @@ def test_pads_that_are_refused_are_as_bad_in_the_emulator(seed: int) -> None:
     assert (rms_units[refused] > 2).all()
     named = {where for record in bench.records.values() for where in record["taxel_verdicts"]}
     assert named <= {"noisy", "out_of_range"}
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        {"shape": "sphere", "radius_mm": 8.0},
+        {"shape": "ellipsoid", "semi_axes_mm": (8.0, 8.0, 12.0)},
+        {"shape": "plane", "reach_mm": 10.0},
+        {"shape": "cylinder", "radius_mm": 8.0},
+        {"shape": "cylinder", "radius_mm": 8.0, "half_length_mm": 10.0},
+    ],
+)
+def test_a_bare_fingertip_of_any_shape_is_pressed(shape: dict[str, Any]) -> None:
+    settings = load(CONFIG / "fingertips.toml")
+    index = replace(settings.fingertips["index"], radius_mm=None)
+    settings = changed(settings, {"fingertips.index": replace(index, **shape)})
+    layout = build_layout(settings, CONFIG)
+    scene = demo.presses(settings, layout)
+    robot = Robot(settings, layout, scene)
+    robot.bring_up()
+    [probe] = [one for one in scene.probe if one.part == "index"]
+    while robot.t_ns < (probe.start_s + 1.0) * 1e9:
+        robot.step(0.1)
+    [press] = robot.fingertips.lately["index"][-1].presses
+    assert press.normal_n == pytest.approx(2.0)

@@ -4,7 +4,7 @@ import asyncio
 import math
 import socket
 import threading
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,7 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
 from skin_host.client import CommandError, Contact, SkinCallbacks, SkinClient
-from skin_host.config.settings import Mqtt, load
+from skin_host.config.settings import Mqtt, changed, load
 from skin_host.errors import BrokerError, RequestError, SkinError, StateError
 from skin_host.layout import build_layout
 from skin_host.mqtt.info import node_info
@@ -276,6 +276,43 @@ async def test_nodes_say_what_they_are_and_whether_they_live(mosquitto: Mosquitt
             assert list(info["main"].parts) == ["left_hand", "left_forearm"]
             assert skin.nodes["main"].online
         await until(lambda: skin.nodes["main"].online is False)
+
+
+@pytest.mark.parametrize(
+    ("ask", "part", "why"),
+    [
+        (SkinClient.frames, "index", "has no taxels and no frames; wanted a part of skin"),
+        (SkinClient.frames, "thumb", 'no frames; wanted "thumb_skin", its skin'),
+        (SkinClient.frames, "thumb_skin", "no frames: its configuration has `frames = false`"),
+        (SkinClient.slips, "thumb_skin", 'wanted a fingertip on a .* board, "thumb"$'),
+        (SkinClient.overs, "thumb_skin", "skin has no slips and no excesses"),
+    ],
+)
+async def test_a_stream_of_what_a_part_does_not_publish_is_refused(
+    ask: Callable[[SkinClient, str], Any], part: str, why: str, mosquitto: Mosquitto
+) -> None:
+    """Once: a configuration may be changed, and who reads on receives what comes then."""
+    fingertips = CONFIG.with_name("fingertips.toml")
+    settings = changed(load(fingertips), {"parts.thumb_skin.frames": False})
+    info = node_info(
+        build_layout(settings, fingertips.parent),
+        "main",
+        version="1",
+        configuration="x",
+        parts=settings.parts,
+        fingertips=settings.fingertips,
+    )
+    async with hearing(mosquitto) as skin, publishing(mosquitto) as publisher:
+        stream = ask(skin, part)
+        others = [skin.frames(), skin.slips("thumb"), skin.events("thumb_skin")]
+        publisher.put_info(info)
+        with pytest.raises(RequestError, match=f'robot "robot", part "{part}": .*{why}'):
+            await take(stream, 1)
+        skin._check_parts(asyncio.get_running_loop().time())
+        assert not any(one._failure for one in [stream, *others])
+        if ask is SkinClient.frames:
+            publisher.put_frame(frame(1, part))
+            assert (await take(stream, 1))[0].seq == 1
 
 
 async def test_info_is_of_all_nodes_that_are_online(mosquitto: Mosquitto) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from skin_host.config import check
 from skin_host.config.settings import Settings
-from skin_host.layout import build_layout
+from skin_host.layout import build_layout, builtin_kinds
 
 
 def described(
@@ -116,7 +116,7 @@ def test_an_unused_bus_and_a_board_of_two_daemons_are_warned_of() -> None:
 
 def test_taxels_at_one_place_and_taxels_alone_are_warned_of(tmp_path: Path) -> None:
     rows = np.zeros((12, 6))
-    rows[2:, 0] = np.arange(1, 11)
+    rows[2:, 0] = 1e-2 * np.arange(1, 11)
     np.savetxt(tmp_path / "arm.txt", rows)
     description = described(
         {"mtb": {"bus": "can0", "address": 1, "skin_type": 2}},
@@ -127,6 +127,63 @@ def test_taxels_at_one_place_and_taxels_alone_are_warned_of(tmp_path: Path) -> N
         "parts.arm: 10 taxel(s) have no neighbour",
         "parts.arm: 1 taxel(s) lie where another one lies",
     ]
+
+
+def positions_warnings(
+    tmp_path: Path, scale: float = 1.0, normals: np.ndarray | None = None, kind: str = "triangle"
+) -> list[str]:
+    """What is warned of two triangles whose file has these lengths and normals."""
+    pads_mm = np.array(builtin_kinds()[kind].pads_mm)
+    rows = np.zeros((24, 6))
+    rows[:, :2] = scale * 1e-3 * np.concatenate([pads_mm, np.add(pads_mm, [40.0, 0.0])])
+    rows[:, 3:] = [0.0, 0.0, 1.0] if normals is None else normals
+    np.savetxt(tmp_path / "arm.txt", rows)
+    patch = {"board": "mtb", "triangles": "0-1", "positions": "arm.txt", "kind": kind}
+    boards: dict[str, dict[str, object]] = {"mtb": {"bus": "can0", "address": 1, "skin_type": 2}}
+    warnings = described(boards, {"arm": {"patches": [patch]}}, folder=tmp_path)["warnings"]
+    return [one for one in warnings if "positions" in one]
+
+
+@pytest.mark.parametrize(
+    ("scale", "meant"),
+    [
+        (1000.0, "wanted metres: these look like mm"),
+        (100.0, "wanted metres: these look like cm"),
+        (0.001, "wanted metres: these look like metres divided by 1000"),
+        (20.0, "wanted metres"),
+        (0.0, "wanted metres"),
+    ],
+)
+def test_a_file_of_positions_that_are_not_in_metres_is_warned_of(
+    tmp_path: Path, scale: float, meant: str
+) -> None:
+    (warning,) = positions_warnings(tmp_path, scale)
+    assert warning.startswith("parts.arm.patches[0].positions: pads lie ")
+    assert warning.endswith(f" mm apart, those of triangle 5 mm; {meant}")
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("kind", ["triangle", "triangle_10pad", "fingertip"])
+def test_a_file_of_positions_in_metres_is_not_warned_of(
+    tmp_path: Path, scale: float, kind: str
+) -> None:
+    assert positions_warnings(tmp_path, scale, kind=kind) == []
+
+
+def test_pads_that_face_the_other_way_than_their_neighbours_are_warned_of(tmp_path: Path) -> None:
+    normals = np.tile([0.0, 0.0, 1.0], (24, 1))
+    normals[::2, 2] = -1.0
+    (warning,) = positions_warnings(tmp_path, normals=normals)
+    assert warning == (
+        "parts.arm.patches[0].positions: 24 pad(s) face the other way than a pad next to them, and "
+        "make no contact with it; wanted normals that point out of the skin"
+    )
+    # A unit may lie on the other side of a part, and be bent.
+    normals[:] = [0.0, 0.0, 1.0]
+    normals[12:] = [0.0, 0.0, -1.0]
+    assert positions_warnings(tmp_path, normals=normals) == []
+    normals[:, 0] = np.linspace(-2.0, 2.0, 24)
+    assert positions_warnings(tmp_path, normals=normals) == []
 
 
 def test_the_table_holds_totals_and_warnings() -> None:

@@ -19,7 +19,7 @@ from skin_host.daemon import metrics
 from skin_host.daemon.calibrate import calibration_path, stored_calibration
 from skin_host.daemon.daemon import Daemon
 from skin_host.daemon.state import NodeState, Zeros, load_kept
-from skin_host.errors import NewerFileError, OtherSkinError
+from skin_host.errors import NewerFileError, OtherRobotError
 from skin_host.files import write_document
 from skin_host.layout import PadKind, build_layout
 from skin_host.mqtt.publisher import Publisher
@@ -53,12 +53,19 @@ def test_a_state_of_a_newer_version_is_refused_and_left_as_it_is(
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[" * 100_000, b'{"schema":"x"}', b"\xff" * 10])
-def test_a_damaged_state_is_set_aside(tmp_path: Path, content: bytes) -> None:
+def test_a_damaged_state_is_set_aside_once_and_stays_until_it_is_replaced(
+    tmp_path: Path, content: bytes
+) -> None:
+    """Otherwise the start after one that failed would find nothing damaged."""
     path = tmp_path / "state.json"
     path.write_bytes(content)
-    assert load_kept(path, NodeState) == NodeState()
-    (aside,) = tmp_path.iterdir()
+    for _ in range(3):
+        assert load_kept(path, NodeState) == NodeState()
+    first, aside = sorted(tmp_path.iterdir())
+    assert first == path
     assert aside.name.startswith("state.json.damaged-")
+    assert path.read_bytes() == aside.read_bytes() == content
+    write_document(path, NodeState())
     assert aside.read_bytes() == content
 
 
@@ -85,7 +92,7 @@ def test_a_calibration_of_another_robot_is_refused(kept: tuple[Any, Any, Path]) 
     settings, layout, path = kept
     assert stored_calibration(settings, layout, "main") is not None
     path.write_text(path.read_text().replace('"robot": "demo"', '"robot": "other"'))
-    with pytest.raises(OtherSkinError, match=r'of robot "other", this is .* of robot "demo"'):
+    with pytest.raises(OtherRobotError, match=r'of robot "other", this is robot "demo"; give each'):
         stored_calibration(settings, layout, "main")
 
 
@@ -104,9 +111,10 @@ def test_a_calibration_of_a_newer_version_is_refused_and_a_damaged_one_set_aside
         assert path.read_text() == newer
     path.write_text(whole[:1000])
     assert stored_calibration(settings, layout, "main") is None
-    (aside,) = path.parent.iterdir()
+    first, aside = sorted(path.parent.iterdir())
+    assert first == path
     assert ".damaged-" in aside.name
-    assert aside.read_text() == whole[:1000]
+    assert path.read_text() == aside.read_text() == whole[:1000]
 
 
 @pytest.mark.parametrize("command", ["run", "calibrate"])

@@ -9,6 +9,7 @@ import msgspec
 import pytest
 from msgspec import Struct
 
+from skin_host.config.fields import Name
 from skin_host.config.settings import Settings
 from tests.support.pages import PAGES
 
@@ -73,3 +74,22 @@ def true_default(field: msgspec.structs.FieldInfo) -> Any:
     if field.default_factory is not msgspec.NODEFAULT:
         return field.default_factory()
     return field.default
+
+
+def test_the_characters_of_a_name_are_told() -> None:
+    [(most, told)] = re.findall(r"has 1 to (\d+) of the characters (.*?), as topics", PAGE, re.S)
+    permitted = re.compile("[" + "".join(re.findall(r"`(.*?)`", told)).replace("-_", "_-") + "]")
+
+    def is_name(text: str) -> bool:
+        try:
+            return msgspec.convert(text, Name) == text
+        except msgspec.ValidationError:
+            return False
+
+    assert all(is_name(sign) == bool(permitted.fullmatch(sign)) for sign in map(chr, range(0x300)))
+    assert [is_name("a" * n) for n in (0, 1, int(most), int(most) + 1)] == [
+        False,
+        True,
+        True,
+        False,
+    ]

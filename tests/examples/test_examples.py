@@ -3,11 +3,12 @@
 import asyncio
 import math
 import runpy
+import signal
 import subprocess
 import sys
 import threading
 from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager
+from contextlib import AbstractContextManager, asynccontextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
 from itertools import count, repeat
@@ -88,6 +89,7 @@ async def test_a_client_prints_a_touch(mosquitto: Mosquitto) -> None:
     [
         (["client.py", "http://x"], "the URL of the broker"),
         (["stop_on_touch.py"], "which part?"),
+        (["stop_on_touch.py", "mqtt://localhost:1"], "which part?"),
         (["stop_on_touch.py", "left_hand", "http://x"], "the URL of the broker"),
     ],
 )
@@ -101,22 +103,51 @@ def test_an_example_without_what_it_needs_ends_with_one_line(words: list[str], s
     assert said in line
 
 
-@pytest.mark.parametrize("words", [["stop_on_touch.py", "left_hand"], ["gripper.py"]])
-def test_an_example_that_is_interrupted_ends_without_a_traceback(
-    words: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """And stops its motors."""
+@pytest.fixture
+def handlers() -> Iterator[None]:
+    """An example that runs in this process handles its signals, as one that a shell has started:
+    none is blocked or ignored.
+    """
+    numbers = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+    before = {number: signal.getsignal(number) for number in numbers}
+    blocked = signal.pthread_sigmask(signal.SIG_UNBLOCK, numbers)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+    signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
-    class Interrupted:
+
+@pytest.mark.usefixtures("handlers")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("words", [["stop_on_touch.py", "left_hand"], ["gripper.py"]])
+def test_an_example_that_is_ended_ends_without_a_traceback(
+    words: list[str],
+    number: signal.Signals,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """And stops its motors, and what it has started."""
+
+    class Ended:
         def __init__(self, *_: object, **__: object) -> None:
-            raise KeyboardInterrupt
+            assert signal.getsignal(number) != signal.SIG_DFL
+            signal.raise_signal(number)
 
     emulator = MagicMock()
-    monkeypatch.setattr(client, "SkinCallbacks", Interrupted)
+    monkeypatch.setattr(client, "SkinCallbacks", Ended)
     monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: emulator)
     monkeypatch.setattr(sys, "argv", words)
-    runpy.run_path(str(EXAMPLES / words[0]), run_name="__main__")
-    assert emulator.terminate.called == (words[0] == "gripper.py")
+    ended: AbstractContextManager[object] = pytest.raises(SystemExit)
+    if number == signal.SIGINT:
+        ended = nullcontext()
+    with ended:
+        runpy.run_path(str(EXAMPLES / words[0]), run_name="__main__")
+    if words[0] == "gripper.py":
+        assert emulator.terminate.called
+        assert emulator.wait.called
+    else:
+        assert capsys.readouterr().out.splitlines()[-1] == "stop the program ends"
 
 
 async def said_to_ros(
@@ -176,6 +207,7 @@ async def test_a_wrong_part_stops_the_motor_and_is_named(
     monkeypatch.setattr(session, "NAMED_S", 0.0)
     url = f"mqtt://{mosquitto.host}:{mosquitto.port}"
     monkeypatch.setattr(sys, "argv", ["stop_on_touch.py", "left_hnd", url])
+    monkeypatch.setattr(signal, "signal", MagicMock())  # this is not the main thread
     ended = threading.Event()
     monkeypatch.setattr(sys, "stdin", SimpleNamespace(read=partial(ended.wait, PATIENCE_S)))
     missing = 'robot "demo" has no part "left_hnd"; there are: left_forearm, left_hand'

@@ -337,7 +337,11 @@ async def test_a_board_that_does_not_tell_its_full_scales_is_not_configured() ->
     assert "not_configured" not in bench.codes()
 
 
-async def test_lost_frames_are_told_until_none_is_lost() -> None:
+@pytest.mark.parametrize(
+    ("late", "sentence"),
+    [(0, "frames are lost or late"), (48, "frames are lost or late"), (50, "come so far apart")],
+)
+async def test_lost_frames_are_told_until_none_is_lost(late: int, sentence: str) -> None:
     bench = Bench()
     await bench.boards.bring_up()
     await bench.calibrate()
@@ -345,8 +349,10 @@ async def test_lost_frames_are_told_until_none_is_lost() -> None:
     assembler = bench.tips.tips["index"].assembler
     assert assembler is not None
     assembler.counters.lone += 50
+    assembler.counters.late += late
     await bench.run(0.1)
     assert bench.codes() == ["loses_frames"]
+    assert sentence in bench.record()["sentences"][0]
     await bench.run(6.0)
     assert bench.codes() == []
 

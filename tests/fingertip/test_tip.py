@@ -1,10 +1,12 @@
 """One fingertip from samples of force and torque to contacts, slips and excess."""
 
 import math
+from itertools import groupby
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from skin_host.bus.strain import Wrench
 from skin_host.config.fingertips import Fingertip
@@ -386,6 +388,17 @@ def test_skin_and_force_together_are_better_than_either() -> None:
     rms = [math.sqrt(np.mean(np.square(errors))) for errors in (by_force, by_skin, joined)]
     assert rms[2] < 0.85 * min(rms[:2])
     assert 0.8 < rms[2] / np.mean(said) < 1.25
+
+
+def test_a_contact_of_skin_beside_pads_that_are_not_valid_is_partial_on_the_fingertip_too() -> None:
+    bench = Bench(shape="plane", radius_mm=None)
+    felt = skin_contact(1, [0, 0, 0], 0.5)
+    partial = []
+    for marked in (False, True, False):
+        bench.tip.note_skin([replace(felt, partial=marked)], bench.t_ns)
+        told = touches(bench.hold(10, [0, 0, 0], [0, 0, -1.0]))
+        partial += [event.partial for event in told]
+    assert [one for one, _ in groupby(partial)] == [False, True, False]
 
 
 def test_skin_that_feels_two_contacts_tells_force_and_torque_that_they_are_several() -> None:

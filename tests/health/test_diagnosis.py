@@ -105,6 +105,9 @@ def test_what_could_not_be_kept_is_named_with_the_reason(calibrated: FaultBench)
     assert fault.where == "calibration"
     assert "disk full" in fault.sentence
     assert "lost at a restart" in fault.sentence
+    assert "calibrate" not in fault.sentence
+    of_zeros = found(calibrated, unkept={"zeros": "disk full"})["state_not_kept"]
+    assert of_zeros.sentence.endswith("look untouched; calibrate after the restart")
 
 
 def test_a_part_that_is_disabled_has_no_other_faults_of_its_own(calibrated: FaultBench) -> None:

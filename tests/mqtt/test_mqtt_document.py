@@ -32,7 +32,7 @@ def test_the_touch_of_the_document_has_exactly_the_keys_of_a_touch() -> None:
     assert touch.count == 52
     keys = list(msgspec.json.decode(EXAMPLES["skin.touch/1"]))
     whole = ["schema", *Touch.__struct_fields__]
-    assert [*keys, "reason", "load", "missed"] == whole
+    assert [*keys, "partial", "beyond", "reason", "load", "missed"] == whole
 
 
 def test_slips_and_excess_of_the_document_have_exactly_their_keys() -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skin_host.config.settings import load, skin_hash
+from skin_host.config.settings import changed, load, skin_hash
 from skin_host.layout import build_layout
 from skin_host.mqtt.info import CalibrationInfo, decode_info, encode_info, node_info
 from skin_host.mqtt.payload import MessageError
@@ -37,6 +37,22 @@ def test_info_describes_every_taxel_of_every_part_of_the_node() -> None:
         assert [triangle.first for triangle in info.triangles] == sorted(
             triangle.first for triangle in info.triangles
         )
+
+
+def test_info_names_the_parts_whose_frames_are_not_published() -> None:
+    settings = load(CONFIG)
+    settings = changed(settings, {"parts.left_hand.frames": False})
+    layout = build_layout(settings, CONFIG.parent)
+    payload = encode_info(
+        node_info(layout, "main", version="1", configuration="x", parts=settings.parts)
+    )
+    parts = decode_info(payload).parts
+    assert {name: part.frames for name, part in parts.items()} == {
+        "left_hand": False,
+        "left_forearm": True,
+    }
+    # Those of earlier versions, which publish frames of all, have no such key.
+    assert payload.count(b'"frames":') == 1
 
 
 def test_a_node_without_parts_says_so() -> None:

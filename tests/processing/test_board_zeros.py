@@ -11,6 +11,7 @@ from skin_host.config.settings import load
 from skin_host.daemon.daemon import Daemon
 from skin_host.health import HealthWatch
 from skin_host.layout import build_layout
+from skin_host.processing.calibration import Verdict
 from skin_host.processing.core import Engine, Output, Step
 from skin_host.processing.pipeline import PressureFrame
 from skin_host.processing.silent_zero import SWEEPS
@@ -715,3 +716,96 @@ def test_a_pad_in_doubt_keeps_the_baseline_that_it_had(worn: tuple[Hand, list[St
     assert pipeline.baseline[3] == pytest.approx(before[3], abs=0.3)
     rests = hand.rest_units[0, [0, 1, 2, 4, 5, 6]]
     assert pipeline.baseline[[0, 1, 2, 4, 5, 6]] == pytest.approx(rests, abs=0.8)
+
+
+def expecting(pad: int) -> tuple["Hand", np.ndarray]:
+    """A daemon has started: a pad was touched when the one before was killed."""
+    hand = Hand()
+    touched = np.zeros(hand.engine.layout.n_taxels, np.bool_)
+    touched[hand.engine.layout.boards[0].taxel_index[hand._board.triangles[0], pad]] = True
+    hand.engine.zeros.expect_touched(touched)
+    return hand, touched
+
+
+@pytest.mark.parametrize("believed", [False, True])
+def test_what_was_touched_before_a_start_is_in_doubt_if_its_board_sends_nothing(
+    believed: bool,
+) -> None:
+    """It was reset: its next zero has in it what presses still."""
+    hand, touched = expecting(3)
+    hand.engine.ledger.sweeps[0] = 0
+    assert (hand.engine.zeros.touched() == touched).all()
+    hand.engine.zeros.rezero(0, believed)
+    hand.send(60)
+    assert hand.in_doubt == [3]
+    assert (hand.engine.zeros.pressed() == touched).all()
+
+
+def test_what_was_touched_before_a_start_is_not_by_what_its_board_sends_since() -> None:
+    hand, _ = expecting(3)
+    hand.send(20)
+    hand.engine.zeros.rezero(0)
+    hand.send(60)
+    assert hand.in_doubt == []
+    assert not hand.engine.zeros.touched().any()
+
+
+def test_readings_of_a_board_that_was_reset_do_not_show_that_a_touch_is_over() -> None:
+    hand, _ = expecting(3)
+    hand.send(20)
+    hand.engine.zeros.rezero(0, believed=False)
+    hand.send(60)
+    assert hand.in_doubt == [3]
+
+
+def verdict_of(hand: Hand, pad: int) -> Verdict:
+    calibration = hand.engine.calibration
+    assert calibration is not None
+    taxel = hand.engine.layout.boards[0].taxel_index[hand._board.triangles[0], pad]
+    return Verdict(calibration.verdict[taxel])
+
+
+def zeroed_while_pressed(below: int = 0) -> Hand:
+    """A board was zeroed in a press of its pad 3, which lifts by so many units in the end."""
+    hand = Hand()
+    hand.send(10, p3=200)
+    hand.engine.zeros.rezero(0)
+    hand.send(60)
+    hand.send(10, p3=NO_LOAD + below)
+    assert hand.in_doubt == [3]
+    return hand
+
+
+def test_a_pad_that_is_calibrated_in_the_press_of_its_zero_was_touched() -> None:
+    """Its readings cannot show that, so nobody would know that something presses it."""
+    hand = zeroed_while_pressed()
+    hand.calibrate()
+    assert verdict_of(hand, 3) == Verdict.TOUCHED
+    assert verdict_of(hand, 4) == Verdict.OK
+    # Nothing shows any more that it is pressed, and it need not be.
+    hand.calibrate()
+    assert verdict_of(hand, 3) == Verdict.OK
+
+
+@pytest.mark.parametrize("below", [4, 15])
+@pytest.mark.parametrize("set_up", [False, True])
+def test_a_pad_that_has_lifted_since_its_zero_is_calibrated_at_rest(
+    below: int, set_up: bool
+) -> None:
+    hand = zeroed_while_pressed(below)
+    if set_up:
+        hand.engine.zeros.rezero(0)
+        hand.send(60)
+        assert hand.in_doubt == [3]
+        below = 0
+    hand.calibrate(p3=NO_LOAD + min(below, 14))
+    assert verdict_of(hand, 3) == Verdict.OK
+
+
+def test_a_pad_that_is_pressed_again_when_its_board_is_set_up_is_calibrated_in_that() -> None:
+    hand = zeroed_while_pressed(10)
+    hand.send(10)  # as far as before
+    hand.engine.zeros.rezero(0)
+    hand.send(60)
+    hand.calibrate()
+    assert verdict_of(hand, 3) == Verdict.TOUCHED

@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 
 from skin_host.config.settings import Settings
 from skin_host.evaluation.rig import Rig, flat_skin
-from skin_host.layout import build_layout
+from skin_host.layout import PadKind, build_layout
 from skin_host.processing.contacts import (
     ALIVE_NS,
     LOST_NS,
@@ -17,6 +18,7 @@ from skin_host.processing.contacts import (
     PARTED_NS,
     ContactTracker,
 )
+from skin_host.processing.localization_centroid import GEOMETRY_PITCHES, nearest_distance
 from skin_host.processing.pipeline import PressureFrame
 
 SETTINGS, LAYOUT = flat_skin(1)
@@ -354,7 +356,9 @@ def test_what_was_felt_before_all_contacts_were_ended_is_forgotten():
     skin.show(WIDE, kpa=60.0)
     skin.tracker.end_all(0, 0)
     (begun,) = skin.show({0}, lost=SECOND)
-    assert (begun.taxels, begun.peak_kpa) == ([0], 20.0)
+    assert (begun.taxels, begun.peak_kpa, begun.partial) == ([0], 20.0, True)
+    (moved,) = skin.show({0})
+    assert (moved.taxels, moved.peak_kpa, moved.partial) == ([0], 20.0, False)
     assert skin.show({0}) == []
 
 
@@ -540,10 +544,92 @@ def test_the_uncertainty_of_a_place_grows_with_the_distance_of_taxels_wherever_t
     assert event.sigma_m == pytest.approx(2.0 * usual.sigma_m)
 
 
-def test_the_place_of_a_pad_without_neighbours_is_as_certain_as_the_pad():
+def test_the_place_of_a_pad_without_neighbours_is_as_certain_as_that_of_a_pad_of_its_kind():
     alone = replace(LAYOUT, neighbour_start=np.zeros_like(LAYOUT.neighbour_start))
-    (event,) = Skin(alone).show({0})
-    assert event.sigma_m == 0.0
+    (event,), (usual,) = Skin(alone).show({0}), Skin().show({0})
+    assert event.sigma_m == pytest.approx(usual.sigma_m, rel=1e-3)
+
+
+def test_pads_that_lie_on_each_other_are_not_certain_of_their_place():
+    """Duplicates in a file of positions, or one in millimetres read as micrometres."""
+    twice = LAYOUT.position_m.copy()
+    twice[1::2] = twice[::2]
+    (usual,) = Skin().show(HERE)
+    for position_m in (twice, 1e-3 * LAYOUT.position_m, np.zeros_like(twice)):
+        (event,) = Skin(replace(LAYOUT, position_m=position_m)).show(HERE)
+        assert event.sigma_m >= 0.99 * usual.sigma_m
+
+
+def test_pads_that_feel_temperature_make_no_place_more_certain():
+    skin = {
+        "robot": "ten",
+        "buses": {"can0": {}},
+        "boards": {"b": {"bus": "can0", "address": 1}},
+        "parts": {
+            "skin": {"patches": [{"board": "b", "triangles": "0-15", "kind": "triangle_10pad"}]}
+        },
+    }
+    layout = build_layout(msgspec.convert(skin, Settings), Path())
+    (event,) = Skin(layout).show({0})
+    pads_m = layout.position_m[layout.pad_kind == PadKind.PRESSURE]
+    pitch_m = np.median(nearest_distance(pads_m))
+    assert pitch_m > 1.2 * np.median(nearest_distance(layout.position_m))
+    assert event.sigma_m == pytest.approx(GEOMETRY_PITCHES * pitch_m, rel=1e-3)
+
+
+def test_a_contact_beside_pads_that_are_not_valid_is_partial_and_less_certain_of_its_place():
+    beside = _beside(HERE)
+    (whole,), (far,) = Skin().show(HERE), Skin().show(HERE, lost=THERE)
+    assert (whole.partial, far.partial) == (False, False)
+    assert (whole.centroid_m, whole.sigma_m) == (far.centroid_m, far.sigma_m)
+    (event,) = Skin().show(HERE, lost=beside)
+    assert event.partial
+    assert (event.centroid_m, event.force_n) == (whole.centroid_m, whole.force_n)
+    # Where the contact would be if the same pressure were on those pads, too.
+    (more,) = Skin().show(HERE | beside)
+    away_m = math.dist(more.centroid_m, event.centroid_m)
+    assert away_m > 1e-3
+    assert event.sigma_m >= 0.99 * math.hypot(whole.sigma_m, away_m)
+
+
+def test_pads_that_feel_temperature_and_never_pressure_make_no_contact_partial():
+    kind = LAYOUT.pad_kind.copy()
+    kind[[6, 10]] = PadKind.THERMAL
+    (event,) = Skin(replace(LAYOUT, pad_kind=kind)).show(HERE - {6, 10}, lost={6, 10})
+    assert not event.partial
+
+
+def test_a_contact_that_loses_a_part_of_itself_is_partial_until_that_is_valid_again():
+    skin = Skin()
+    skin.show(HERE)
+    lost = {taxel for taxel in HERE if LAYOUT.position_m[taxel, 0] > LAYOUT.position_m[5, 0]}
+    assert 0 < len(lost) < len(HERE)
+    partial = []
+    for _ in range(2 * LOST_NS // SWEEP_NS):
+        partial += [event.partial for event in skin.show(HERE, lost=lost)]
+    assert set(partial) == {True}
+    moved = skin.show(HERE)[-1]
+    assert (moved.taxels, moved.partial) == (sorted(HERE), False)
+
+
+def test_the_first_and_the_last_pad_beside_a_contact_that_is_not_valid_are_reported():
+    """Nothing of the contact itself has changed then."""
+    skin = Skin()
+    reported = []
+    for number in range(150):
+        lost = _beside(HERE) if 40 <= number < 100 else ()
+        reported += [(number, event.partial) for event in skin.show(HERE, lost=lost)]
+    gone = 40 + LOST_NS // SWEEP_NS
+    first, back = reported.index((gone - 1, True)), reported.index((100, False))
+    assert {partial for _, partial in reported[first:back]} == {True}
+    assert {partial for _, partial in reported[:first] + reported[back:]} == {False}
+
+
+def _beside(taxels):
+    """The neighbours of some taxels that are none of them."""
+    start = LAYOUT.neighbour_start
+    near = [LAYOUT.neighbour[start[taxel] : start[taxel + 1]].tolist() for taxel in taxels]
+    return set().union(*near) - set(taxels)
 
 
 @pytest.mark.parametrize(("kpa", "moves"), [(19.5, False), (17.0, True)])

@@ -137,6 +137,28 @@ def test_the_error_told_is_of_the_size_of_the_error_made(configured, method):
     assert 0.4 < ratio < 2.5
 
 
+@pytest.mark.parametrize("method", get_args(Method))
+@pytest.mark.parametrize("diameter_mm", [6.0, 20.0])
+def test_beside_a_triangle_that_is_not_valid_the_error_told_is_that_of_what_is_not_felt(
+    configured, method, diameter_mm
+):
+    settings, layout = configured(f'localization = "{method}"')
+    tracker = ContactTracker(layout, 0, settings)
+    palm = PressedPalm(layout)
+    lost = list(range(60, 72))
+    middle = palm.centre_mm[lost].mean(axis=0)
+    made, told = [], []
+    for _ in range(60):
+        place = middle + palm.rng.uniform(-14.0, 14.0, 2)
+        events = first_events(tracker, palm.press((place, 1.0), diameter_mm=diameter_mm, lost=lost))
+        if len(events) == 1 and events[0].partial:
+            assert events[0].sigma_m is not None
+            made.append(off_mm(events[0], place))
+            told.append(1e3 * events[0].sigma_m)
+    assert len(made) > 20
+    assert np.sqrt(np.mean(np.square(made))) < np.sqrt(np.mean(np.square(told)))
+
+
 def test_one_size_of_probe_may_be_named(configured):
     settings, layout = configured('localization = "template"\nprobe_mm = [10]')
     tracker = ContactTracker(layout, 0, settings)

@@ -36,6 +36,19 @@ def test_a_published_event_is_numbered_and_rounded() -> None:
     assert (event.force_n, event.sigma_m) == (1.2346, 1.234568)
 
 
+@pytest.mark.parametrize("sigma_m", [0.0, 1e-300, 4e-7])
+def test_no_place_is_published_as_certain(sigma_m: float) -> None:
+    assert make_event(sigma_m=sigma_m).published(1).sigma_m == 1e-6
+
+
+def test_only_a_partial_contact_is_marked() -> None:
+    assert "partial" not in msgspec.to_builtins(make_event())
+    partial = make_event(partial=True)
+    assert msgspec.to_builtins(partial.published(1))["partial"] is True
+    assert partial.ended(9, 9).partial and read(partial=True).partial
+    assert not read().partial
+
+
 def test_what_is_not_known_stays_unknown_when_it_is_published() -> None:
     unknown = dict.fromkeys(
         ("centroid_m", "normal", "area_mm2", "peak_kpa", "mean_kpa", "sigma_m"), None

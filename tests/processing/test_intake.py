@@ -422,6 +422,74 @@ def test_a_torn_pad_does_not_silence_the_pressed_ones_beside_it():
     assert not sample.present[: 16 * 12].reshape(16, 12)[:, :4].any()
 
 
+def both(turn: int, pads: int, byte: int, status: int = 0) -> list[Sweep]:
+    """Sweeps in which the first pads of a triangle have this byte, and marked ones the last."""
+    outer, inner = (sweep(board, turn * PERIOD, fill=239 + turn % 2) for board in (OUTER, INNER))
+    outer.raw[1, :pads] = byte
+    outer.raw[1, np.arange(12)[status >> np.arange(4, 16) & 1 == 1]] = 0
+    outer.status[1] = status
+    return [outer, inner]
+
+
+def pressed_far(pads: int, status: int) -> tuple[Joined, PartSample]:
+    """Pads of a triangle go far out of range, the first ones having been pressed."""
+    parts = intake()
+    touched = np.zeros((16, 12), np.bool_)
+    touched[1, :pads] = True
+    for turn, byte in enumerate((150, 60, 0, 0), start=1):
+        parts.feed(both(turn, pads, byte))
+        parts.engine.intake.touched[0] = touched
+    for turn in range(5, 20):
+        (sample,) = parts.feed(both(turn, pads, 0, status))
+    return parts, sample
+
+
+@pytest.mark.parametrize("pads", [1, 4, 8, 12])
+def test_pads_that_are_pressed_far_out_of_range_are_valid_and_of_no_calibration(pads: int) -> None:
+    """However many they are: a chip is dead whose other pads are far."""
+    parts, sample = pressed_far(pads, far(pads))
+    assert sample.present.all()
+    assert np.flatnonzero(~sample.received).tolist() == list(range(12, 12 + pads))
+    assert parts.engine.intake.takes(0, 1)
+
+
+def test_pads_that_went_far_at_once_are_not_valid_beside_those_that_are_pressed_there() -> None:
+    _, sample = pressed_far(4, far(12))
+    assert np.flatnonzero(~sample.present).tolist() == list(range(12, 24))
+
+
+def test_what_is_pressed_far_goes_on_with_changed_settings_and_not_after_a_calibration() -> None:
+    parts, _ = pressed_far(2, far(2))
+    configuration, layout = skin()
+    parts.engine = Engine(configuration, layout, [1], after=parts.engine)
+    (sample,) = parts.feed(both(20, 2, 0, far(2)))
+    assert sample.present.all()
+    parts.engine.intake.use(np.full(layout.n_taxels, 0.5), np.ones(2, np.bool_))
+    for turn in range(21, 40):
+        (sample,) = parts.feed(both(turn, 2, 0, far(2)))
+        assert np.flatnonzero(~sample.present).tolist() == [12, 13]
+
+
+def test_what_two_boards_at_one_address_send_is_no_press() -> None:
+    parts, _ = pressed_far(2, far(2))
+    parts.engine.ledger.twice = {0: 0}
+    parts.feed(both(20, 2, 0, far(2)))
+    parts.engine.ledger.twice = {}
+    for turn in range(21, 40):
+        (sample,) = parts.feed(both(turn, 2, 0, far(2)))
+    assert np.flatnonzero(~sample.present).tolist() == [12, 13]
+
+
+def test_what_is_pressed_far_is_so_after_a_sweep_that_lacks_its_triangle() -> None:
+    """And has no marks therefore."""
+    parts, _ = pressed_far(2, far(2))
+    outer, inner = both(20, 12, 0)
+    (sample,) = parts.feed([outer._replace(present=outer.present & ~2), inner])
+    assert np.flatnonzero(~sample.present).tolist() == list(range(12, 24))
+    (sample,) = parts.feed(both(21, 2, 0, far(2)))
+    assert sample.present.all()
+
+
 def test_a_gap_before_a_sweep_is_no_gap_before_the_one_that_is_not_judged_yet():
     """A board that sends twice in the turn of another: its first sweep still waits."""
     parts = intake()

@@ -49,6 +49,12 @@ NEIGHBOURS = [
 ]
 
 
+LOCALIZERS = {
+    method: make_localizer(method, POSITION_M, NORMAL, np.full(len(PADS_MM), RADIUS_MM))
+    for method in METHODS
+}
+
+
 class PressedFoam:
     """What pads under a pressed foam read. It sums over points of each pad, not lenses.
 
@@ -353,3 +359,28 @@ def test_covered_shares_agree_with_counted_points():
         share = covered_share(place[None], np.zeros((1, 2)), np.array([radius]), probe)
         counted = (np.hypot(*(radius * grid - place).T) <= probe / 2).mean()
         assert share[0, 0] == pytest.approx(counted, abs=0.004)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@given(seed=st.integers(0, 10_000))
+def test_no_contact_is_located_with_certainty_whatever_its_pads_read(method, seed):
+    """Of one candidate place that fits far better than all others, the template knows the cell."""
+    rng = np.random.default_rng(seed)
+    centre = rng.integers(len(PADS_MM))
+    touched = np.unique([centre, *rng.permutation(NEIGHBOURS[centre])[: rng.integers(0, 5)]])
+    units = np.zeros(len(PADS_MM))
+    units[touched] = rng.uniform(2.0, 240.0, len(touched))
+    usable = rng.random(len(PADS_MM)) > rng.uniform(0.0, 0.5)
+    usable[centre] = True
+    found = LOCALIZERS[method].locate(touched, units, usable)
+    assert found.sigma_m > 1e-6
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_pads_at_one_place_are_located_as_pads_of_their_pitch_are(method):
+    n = 12
+    localizer = make_localizer(
+        method, np.zeros((n, 3)), NORMAL[:n], np.full(n, RADIUS_MM), pitch_m=np.full(n, 5e-3)
+    )
+    found = localizer.locate(np.arange(3), np.full(n, 50.0), np.ones(n, bool))
+    assert found.sigma_m > 1e-4

@@ -48,6 +48,43 @@ def test_a_byte_at_an_end_of_the_scale_is_no_reading_of_a_pad_with_its_own_curve
     assert sent(rig, rig.read(0.0)).valid.all()
 
 
+def press_to_the_end(rig, units):
+    """Press pads to so many units, and then as far as makes them send 0; return the frames."""
+    hold(rig, units / 2, 10)
+    hold(rig, units, 10)
+    raw = rig.read(0.0)
+    raw[PRESSED] = 0
+    return [sent(rig, raw) for _ in range(100)]
+
+
+def test_a_press_to_the_end_of_the_scale_stays_one_with_an_own_curve():
+    frames = press_to_the_end(own(), 200.0)
+    for frame in frames:
+        assert frame.valid.all()
+        assert frame.touched.tolist() == PRESSED.tolist()
+        assert frame.beyond_range.tolist() == PRESSED.tolist()
+    assert (frames[-1].pressure_kpa[PRESSED] > frames[0].pressure_kpa[PRESSED] * 0.99).all()
+
+
+def test_a_contact_that_breaks_in_a_light_press_is_no_reading():
+    frames = press_to_the_end(own(), 60.0)
+    for frame in frames:
+        assert frame.valid.tolist() == (~PRESSED).tolist()
+    assert not frames[-1].touched.any()
+
+
+def test_a_press_at_the_end_of_the_scale_stays_one_over_a_gap():
+    rig = own()
+    press_to_the_end(rig, 200.0)
+    rig.t_ns += 5_000_000_000
+    raw = rig.read(0.0)
+    raw[PRESSED] = 0
+    frames = [sent(rig, raw) for _ in range(10)]
+    assert all(frame.valid.all() for frame in frames)
+    assert frames[-1].touched.tolist() == PRESSED.tolist()
+    assert sent(rig, rig.read(0.0)).valid.all()
+
+
 def test_a_pad_that_rests_near_the_end_of_the_scale_may_send_its_last_byte():
     rig = own()
     near = np.arange(12, dtype=np.int32)

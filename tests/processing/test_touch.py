@@ -815,3 +815,151 @@ def test_a_press_is_felt_as_firm_while_another_seems_to_fall_again_and_again() -
     ]:
         reported = residuals.step(both, np.array([unsteady, reading]))
     assert reported.tolist() == [True, False]
+
+
+def fine_residuals(fitted: bool = True) -> tuple[Residuals, float, float, int]:
+    """A taxel of 1.85 kPa of noise and a threshold of 1.7 kPa, as units of shift 0 have; with its
+    threshold, its noise and its votes.
+    """
+    noise_kpa, on_kpa, votes = 1.85, 1.7, 14
+    residuals = Residuals(1)
+    fall = 4.0 * noise_kpa * math.sqrt(2.0 / votes)
+    residuals.configure(
+        np.array([on_kpa]), np.array([on_kpa + fall]), np.array([votes]), fitted=fitted
+    )
+    return residuals, on_kpa, noise_kpa, votes
+
+
+def measured(residuals: Residuals, pressures: list[float], noise_kpa: float, seed: int) -> list:
+    """What is reported of a taxel that the decision before takes for touched, with noise."""
+    rng, on = np.random.default_rng(seed), np.array([True])
+    reported = []
+    for kpa in pressures:
+        signal = np.array([kpa + noise_kpa * rng.standard_normal()])
+        reported.append(bool(residuals.step(on, signal)[0]))
+        residuals.fade(SWEEP_S)
+    return reported
+
+
+@given(seed=st.integers(0, 2**32 - 1), falls_in=st.sampled_from([1, 20, 75]))
+@settings(deadline=None, max_examples=50)
+def test_noise_across_the_threshold_does_not_keep_a_press_that_has_fallen(
+    seed: int, falls_in: int
+) -> None:
+    """The rest is a deviation of the noise below the threshold: of fourteen measurements in a row
+    one is nearly always above it. The press may also fall slowly.
+    """
+    residuals, _, noise_kpa, votes = fine_residuals(fitted=False)
+    press = [60.0] * 50 + np.linspace(60.0, 1.2, falls_in).tolist()
+    reported = measured(residuals, press + [1.2] * 100, noise_kpa, seed)
+    assert reported[49]
+    assert not any(reported[-100 + 5 * votes :])
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(deadline=None, max_examples=20)
+def test_a_press_above_what_is_left_is_one_touch_however_noise_takes_it_below(seed: int) -> None:
+    residuals, _, noise_kpa, _ = fine_residuals()
+    # At first 3.5 kPa are the threshold.
+    assert all(measured(residuals, [60.0] * 50 + [6.0] * 500, noise_kpa, seed)[1:])
+
+
+def counted(readings: list[float], votes: int, *, fitted: bool = True) -> list[bool]:
+    """What is reported after a press of 100, which ends below 5, or below 8 if no model of the foam
+    was fitted.
+    """
+    residuals, on = Residuals(1), np.array([True])
+    residuals.configure(ON, FIRM, np.array([votes]), fitted=fitted)
+    return [
+        bool(residuals.step(on, np.array([reading]))[0]) for reading in [100.0] * 20 + readings
+    ][20:]
+
+
+def test_a_press_ends_when_so_many_more_of_its_measurements_are_below_than_above() -> None:
+    assert counted([3.0, 3.0, 9.0, 3.0, 3.0], votes=3, fitted=False) == flags(1, 1, 1, 1, 0)
+    # What no noise explains is a press.
+    pressed = [3.0, 3.0, 50.0, 3.0, 3.0, 3.0]
+    assert counted(pressed, votes=3, fitted=False) == flags(1, 1, 1, 1, 1, 0)
+    assert counted([50.0, 3.0, 3.0, 3.0], votes=3, fitted=False) == flags(1, 1, 1, 0)
+
+
+def test_where_a_model_was_fitted_so_many_in_a_row_end_a_press() -> None:
+    assert counted([3.0, 3.0, 6.0, 3.0, 3.0, 3.0], votes=3) == flags(1, 1, 1, 1, 1, 0)
+
+
+def test_a_press_that_has_stayed_above_what_it_leaves_has_as_many_to_lose_first() -> None:
+    """Without a fitted model, what reads less than 8 after a press of 100 may be left of it."""
+    for stays in (30, 60):
+        residuals, on = Residuals(1), np.array([True])
+        residuals.configure(ON, FIRM, np.array([3]), fitted=False)
+        reported = [
+            bool(residuals.step(on, np.array([reading]))[0])
+            for reading in [100.0] * 20 + [9.0] * stays + [7.0] * 6
+        ]
+        assert reported[20:] == [True] * (stays + 5) + [False]
+
+
+def test_where_a_model_was_fitted_a_press_that_is_eased_slowly_goes_on() -> None:
+    assert all(counted([6.0] * 30 + [4.0] * 30, votes=3))
+
+
+def test_a_measurement_that_is_sent_again_is_not_counted() -> None:
+    residuals, on, again = residuals_of(3), np.array([True]), np.array([True])
+    for reading in [100.0] * 20 + [3.0, 3.0]:
+        residuals.step(on, np.array([reading]))
+    for reading in (3.0, 6.0, 50.0):
+        assert residuals.step(on, np.array([reading]), again)[0]
+    assert not residuals.step(on, np.array([3.0]))[0]
+    # The mean of the three: 2 more and 3.3, the rise that noise explains, are a touch again.
+    for reading, wanted in ((7.1, False), (7.5, True)):
+        for _ in range(60):
+            reported = residuals.step(on, np.array([reading]))
+        assert bool(reported[0]) is wanted
+
+
+def test_a_soft_touch_outlasts_what_a_firm_press_before_it_has_left() -> None:
+    """The press of 100 is no more than one that noise takes to the threshold, 6, after 84 s."""
+    for wait_s, wanted in ((80.0, False), (90.0, True)):
+        residuals, on = Residuals(1), np.array([True])
+        residuals.configure(ON, FIRM, np.array([5]), fitted=False)
+        for reading in [100.0] * 20 + [8.5] * 20:
+            residuals.step(on, np.array([reading]))
+        residuals.fade(wait_s)
+        for _ in range(40):
+            reported = residuals.step(on, np.array([1.9]))
+        assert bool(reported[0]) is wanted
+
+
+@pytest.mark.parametrize("fitted", [False, True])
+def test_where_no_model_was_fitted_six_hundredths_of_a_press_and_noise_are_no_press(
+    fitted: bool,
+) -> None:
+    """2 kPa of noise and 6 of 100, instead of the threshold of 2 and 3 of 100."""
+    for rest, unfitted in ((7.9, False), (8.1, True)):
+        residuals, on = Residuals(1), np.array([True])
+        residuals.configure(ON, FIRM, np.array([2]), fitted=fitted)
+        for reading in [100.0] * 20 + [rest] * 10:
+            reported = residuals.step(on, np.array([reading]))
+        assert bool(reported[0]) is (fitted or unfitted)
+        # It lifts and comes again.
+        residuals.step(np.array([False]), np.zeros(1))
+        for _ in range(40):
+            reported = residuals.step(on.copy(), np.array([rest]))
+        assert bool(reported[0]) is (fitted or unfitted)
+
+
+def test_a_high_reading_that_began_a_touch_on_what_is_left_does_not_prove_it() -> None:
+    """Noise begins it with a high one; a press has a high mean, or one that noise has not."""
+    for readings, wanted in (
+        ([9.5, 5.0, 5.0], False),
+        ([9.5] * 12, True),
+        ([30.0], True),
+    ):
+        residuals, on, off = Residuals(1), np.array([True]), np.array([False])
+        residuals.configure(ON, FIRM, np.array([2]), fitted=False)
+        for reading in [100.0] * 20 + [3.0] * 4:
+            residuals.step(on, np.array([reading]))
+        residuals.step(off, np.zeros(1))
+        assert (
+            any(residuals.step(on.copy(), np.array([reading]))[0] for reading in readings) is wanted
+        )

@@ -27,7 +27,8 @@ class Verdict(IntEnum):
 
     NOISY decides slowly, and on more pressure than others (`levels`). SATURATES rests so near 0
     that a press is cut off before its pressure curve ends. TOUCHED was touched for a part of the
-    calibration, or for all of it. TOO_NOISY is not used: no realistic press would be detected.
+    calibration, or for all of it, or when its board was zeroed, as far as known. TOO_NOISY is not
+    used: no realistic press would be detected.
     """
 
     OK = 0

@@ -12,6 +12,9 @@ BLOCK = 4
 MOST_BLOCKS = 128
 #: This many means are joined to measure how long noise lasts.
 JOINED = 4
+#: Means within so many standard errors of the largest are of the same reading. The largest of them
+#: is 1 to 2.5 above it by chance, and hardly one is further below it than that.
+SAME_ERRORS = 4.0
 
 
 class BlockMeans:
@@ -76,6 +79,18 @@ class BlockMeans:
     def highest(self) -> Floats:
         """Largest mean [n]; 0 where there is none."""
         found: Floats = self._begun.max(axis=1, where=self._full, initial=0.0)
+        return found
+
+    def rest(self, error: Floats) -> Floats:
+        """Return the mean [n] of the means that differ from the largest by no more than noise; 0
+        where there is none.
+
+        Args:
+            error: float64[n], standard error of a mean.
+        """
+        same = self._full & (self._begun >= (self.highest - SAME_ERRORS * error)[:, None])
+        total = self._begun.sum(axis=1, where=same)
+        found: Floats = total / np.maximum(np.count_nonzero(same, axis=1), 1)
         return found
 
     @property

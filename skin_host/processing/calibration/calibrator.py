@@ -176,7 +176,13 @@ class Calibrator:
         self._times_off[taxels] = 0
         self._off = [one.of(~np.isin(one.taxel, taxels)) for one in self._off]
 
-    def finish(self, configuration: str, time: str, known: Known | None = None) -> Calibration:
+    def finish(
+        self,
+        configuration: str,
+        time: str,
+        known: Known | None = None,
+        pressed: Mask | None = None,
+    ) -> Calibration:
         """Return the calibration from the added sweeps.
 
         Args:
@@ -184,6 +190,8 @@ class Calibrator:
             time: when it was taken, ISO 8601 in UTC.
             known: of this skin from before. A taxel of which too little was received goes on with
                 it, and noise is not lowered by few samples.
+            pressed: bool[n], taxels that were pressed when their board was zeroed, and whose
+                release nothing has shown since: their readings cannot show that they are touched.
         """
         damaged = self._leave_out_damage()
         counts, received = self._counts, self._received
@@ -210,8 +218,9 @@ class Calibrator:
             error = np.where(before.usable, np.fmax(error, expected), error)
         touched = self._touched(variance, repeats, error)
         steady_noise = steady * np.sqrt(course.length * samples / np.maximum(received, 1))
-        # The lowest activation is the best estimate of the untouched one.
-        baseline = np.where(touched, no_load - course.highest, baseline)
+        # The lowest activation is the untouched one. The lowest mean alone would be too low by what
+        # noise took it down: the fewer measurements a mean has, the more.
+        baseline = np.where(touched, no_load - course.rest(error), baseline)
         percentile = np.where(touched, baseline + 1.645 * steady_noise, percentile)
         noise = np.where(touched, steady_noise, noise)
         upward = np.where(touched, noise**2, _upward_variance(counts, variance, self._touch))
@@ -235,6 +244,8 @@ class Calibrator:
         verdict[cut_off] = Verdict.SATURATES
         out = ends > SATURATED_SHARE * samples
         verdict[touched | self._pressed(baseline, counts, ~out)] = Verdict.TOUCHED
+        if pressed is not None:
+            verdict[pressed] = Verdict.TOUCHED
         verdict[touch.decides > USELESS_MARGINS * margin] = Verdict.TOO_NOISY
         verdict[out] = Verdict.OUT_OF_RANGE
         verdict[(counts[:, 0] == samples) | (counts[:, 255] == samples)] = Verdict.STUCK

@@ -92,11 +92,13 @@ class CalibrationRun:
         if not self.is_over:
             self._calibrator.forget(np.flatnonzero(taxels))
 
-    def end(self, configuration: str, time: str, known: Known | None) -> Callable[[], Calibration]:
+    def end(
+        self, configuration: str, time: str, known: Known | None, pressed: Mask | None = None
+    ) -> Callable[[], Calibration]:
         """Stop collecting; return what computes the calibration, see `Calibrator.finish`."""
         self.is_over = True
         calibrator = self._calibrator
-        return lambda: calibrator.finish(configuration, time, known)
+        return lambda: calibrator.finish(configuration, time, known, pressed)
 
     def _sent(self, sample: PartSample) -> list[int]:
         """Return the boards of which a sample has any value."""

@@ -117,6 +117,8 @@ TABLES = (
             _column("mean_kpa", "number", "kPa"),
             _column("force_n", "number", "N"),
             _column("sigma_m", "number", "m"),
+            _column("partial", "integer")._replace(of=lambda touch: int(touch.partial)),
+            _column("beyond", "integer")._replace(of=lambda touch: int(touch.beyond)),
             _column("taxels", "numbers"),
             _of_load("verdict", "text"),
             _of_load("force_n", "vector", "N"),

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from skin_host.errors import RequestError, required
 from skin_host.files import write_together
+from skin_host.recording import seconds
 from skin_host.recording.export.series import PartSeries, Series
 
 VERSION = "v2.1"
@@ -77,8 +78,8 @@ class _Grid:
             steps_ns = np.diff(part.t_ns)
             if (back := np.flatnonzero(steps_ns < 0)).size:
                 raise RequestError(
-                    f"{output}: {part.name}: its time goes back by {-steps_ns[back[0]] / 1e9:g} "
-                    f"s at frame {back[0] + 1}; a data set has rising times"
+                    f"{output}: {part.name}: its time goes back by {seconds(-steps_ns[back[0]])} "
+                    f"at frame {back[0] + 1}; a data set has rising times"
                 )
         leader = max(parts, key=lambda part: len(part.seq))
         period_ns = _period_ns(leader)

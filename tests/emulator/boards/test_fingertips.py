@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from emulator.boards.fingertips import place_on
+from emulator.boards.fingertips import TOWARDS, place_on
 from emulator.faults import parse
 from emulator.probes.held_objects import HeldObjects
 from emulator.probes.scene import Fault, Place, Probe, Scene
@@ -285,7 +285,7 @@ def test_a_fault_names_a_board_that_can_have_it(line: str, said: str) -> None:
         ),
         (
             {"part": "index", "force_n": [[0, 1], [1, 1]], "at": {"x_mm": 20}},
-            "probe[0].at: from there the fingertip is not reached",
+            'probe[0].at: the sphere "index" is not reached from 20, 0, 0 mm in the direction 0, ',
         ),
         ({"part": "ring", "force_n": [[0, 1], [1, 1]]}, "probe[0].part"),
         (
@@ -338,8 +338,27 @@ def test_a_place_beyond_the_end_of_a_fingertip_is_refused(
     if reached:
         place_on(tip, probe)
         return
-    with pytest.raises(ConfigurationError, match="at: from there the fingertip is not reached"):
+    with pytest.raises(ConfigurationError, match=r'at: the .* "index" is not reached from'):
         place_on(tip, probe)
+
+
+SHAPES: dict[str, dict[str, Any]] = {
+    "sphere": {"shape": "sphere", "radius_mm": 8},
+    "ellipsoid": {"shape": "ellipsoid", "semi_axes_mm": (8, 8, 12)},
+    "plane": {"shape": "plane"},
+    "small plane": {"shape": "plane", "reach_mm": 10},
+    "cylinder": {"shape": "cylinder", "radius_mm": 8},
+    "short cylinder": {"shape": "cylinder", "radius_mm": 8, "half_length_mm": 10},
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_a_probe_without_a_place_presses_a_fingertip_of_any_shape(shape: dict[str, Any]) -> None:
+    """As those of `skin demo` and `skin simulate` do."""
+    tip = msgspec.convert({"address": 1, "bus": "can0", "sensor_mm": [0, 0, 0], **shape}, Fingertip)
+    point_mm, normal = place_on(tip, Probe(part="index", force_n=[(0, 1)]))
+    assert normal.tolist() == list(TOWARDS[tip.shape])
+    assert point_mm == pytest.approx(normal * point_mm.max())
 
 
 def test_a_probe_can_slide_to_the_edge_of_its_fingertip() -> None:

@@ -7,13 +7,16 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from emulator.probes.scene import Scene
 from skin_host.bus.strain import Wrench
 from skin_host.cli.common import load_skin
+from skin_host.config.settings import changed
 from skin_host.demo import configuration
 from skin_host.evaluation.simulate.promises import Promises
 from skin_host.evaluation.simulate.run import RunResult, simulate, simulate_all
@@ -68,6 +71,25 @@ def test_the_zero_of_noisy_pads_is_known_before_they_are_valid_after_a_set_up() 
     settings, layout = load_skin(icub)
     result = simulate(settings, layout, icub, 1, 72.0, until_s=31.0)
     assert result.broken is None, "\n".join([*result.last, result.broken])
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        {"shape": "ellipsoid", "semi_axes_mm": (12.0, 12.0, 15.0)},
+        {"shape": "plane", "reach_mm": 10.0},
+        {"shape": "cylinder", "radius_mm": 13.0},
+        {"shape": "cylinder", "radius_mm": 13.0, "half_length_mm": 10.0},
+    ],
+)
+def test_every_shape_of_a_bare_fingertip_is_pressed(shape: dict[str, Any]) -> None:
+    path = configuration("fingertips.toml")
+    settings, layout = load_skin(path)
+    index = structs.replace(settings.fingertips["index"], radius_mm=None)
+    settings = changed(settings, {"fingertips.index": structs.replace(index, **shape)})
+    result = simulate(settings, layout, path, 3, SECONDS, until_s=11.0)
+    assert result.broken is None, "\n".join([*result.last, result.broken])
+    assert result.touches
 
 
 def test_a_fingertip_that_does_not_feel_what_presses_it_breaks_a_promise(

@@ -84,6 +84,19 @@ def test_a_touch_during_calibration_is_named_and_left_out_of_the_baseline(first,
     assert found.noise[7] < 1.0
 
 
+@pytest.mark.parametrize(
+    ("sd", "sweeps"), [(0.4, 25), (0.7, 25), (0.7, 125), (1.5, 50), (1.5, 400)]
+)
+def test_the_zero_of_a_touched_taxel_is_not_the_lowest_that_its_noise_went(sd, sweeps):
+    """In the mean over pads, however few measurements an untouched mean has."""
+    rng = np.random.default_rng(21)
+    untouched = noisy(rng, sweeps, sd, level=240.0)
+    pressed = noisy(rng, sweeps, sd, level=200.0)
+    found = calibrated(np.concatenate([untouched, pressed]))
+    assert np.all(found.verdict == Verdict.TOUCHED)
+    assert abs(np.mean(found.baseline)) < 0.25 * sd
+
+
 def as_sent(conversions, period_s):
     """Sweeps of conversions [c, N] of 36.9 ms, and their times: each is sent until the next."""
     times_s = np.arange(0.0, len(conversions) * 0.0369, period_s)
