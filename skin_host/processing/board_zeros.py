@@ -278,10 +278,13 @@ class BoardZeros:
         touched = fitted & self._touched_before[taxels]
         if believed:
             touched &= self._undecided(board)
-            touched |= fitted & (self._last_touched[taxels] | self._glimpsed(board))
+            touched |= fitted & self._last_touched[taxels]
         self._last_touched[taxels[fitted]] = touched[fitted]
         self._touched_before[taxels[fitted]] = False
+        # A glimpse may be noise: a doubt, but nothing that must be shown to have lifted.
         self._note_pressed(board, touched)
+        if believed:
+            touched |= fitted & self._glimpsed(board)
         if self._calibration is None:
             return 0
         self._glimpses.pop(board, None)
@@ -317,6 +320,8 @@ class BoardZeros:
         touched: after another zero, theirs would not be.
         """
         found = self.touched() if touched else np.zeros_like(self._touched)
+        for board in self._glimpses if touched else ():
+            found[self._of(board)[self._glimpsed(board)]] = True
         for board, rezero in self.rezeros.items():
             found[self._of(board).ravel()[rezero.unknown]] = True
         return found
@@ -324,8 +329,6 @@ class BoardZeros:
     def touched(self) -> Mask:
         """Return taxels bool[n] that something touches, or did when it was last known."""
         found: Mask = self._last_touched | self._touched_before
-        for board in self._glimpses:
-            found[self._of(board)[self._glimpsed(board)]] = True
         return found
 
     def pressed(self) -> Mask:

@@ -65,6 +65,17 @@ def test_every_promise_holds_through_a_storm(config: Path, seed: int) -> None:
     assert result.touches
 
 
+@pytest.mark.long
+def test_what_an_old_zero_shows_of_boards_whose_new_one_was_not_found_is_no_false_report() -> None:
+    """`kaspar.toml` 801: a daemon was killed 5 s after it had set the boards up, and the next one
+    took noise for touches.
+    """
+    config = configuration("kaspar.toml")
+    settings, layout = load_skin(config)
+    result = simulate(settings, layout, config, 801, 108.0)
+    assert result.broken is None, "\n".join([*result.last, result.broken])
+
+
 def test_the_zero_of_noisy_pads_is_known_before_they_are_valid_after_a_set_up() -> None:
     """One second of noise left 1.4 units of error: a touch of 5 kPa that nothing caused."""
     icub = configuration("icub.toml")

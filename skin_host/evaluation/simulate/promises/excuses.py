@@ -26,7 +26,10 @@ class Excuses:
             address.
         blind_since: since when each triangle has had no chip (ns).
         touched_ns: when each taxel was last pressed [n].
-        calibrated_touched_ns: when a calibration may last have seen each taxel pressed [n].
+        zeroed_touched: taxels bool[n] that may have been pressed when their board was zeroed, until
+            a calibration at rest.
+        calibrated_touched_ns: when a calibration may last have seen each taxel pressed, or known
+            that it was when its board was zeroed [n].
     """
 
     def __init__(self, world: World) -> None:
@@ -37,6 +40,7 @@ class Excuses:
         self.known_twice: list[Trouble] = []
         self.blind_since: dict[Triangle, int] = {}
         self.touched_ns = np.full(n, LONG_AGO_NS, np.int64)
+        self.zeroed_touched = np.zeros(n, np.bool_)
         self.calibrated_touched_ns = np.full(n, LONG_AGO_NS, np.int64)
         self._spoiled_until_ns = np.full(n, LONG_AGO_NS, np.int64)
 
@@ -100,15 +104,23 @@ class Excuses:
         """A calibration goes on: touched taxels are calibrated anyway, with that verdict."""
         now_ns = self._now_ns()
         self.exempt |= (true_kpa > TOUCHING_KPA) | self.spoiled()
-        relaxing = now_ns - self.touched_ns < RELAXED_NS
-        self.calibrated_touched_ns[self.exempt | relaxing] = now_ns
+        self.calibrated_touched_ns[self._lately_touched() | self.zeroed_touched] = now_ns
+
+    def note_zeroed(self, taxels: NDArray[np.int32]) -> None:
+        """A board with these taxels was zeroed: what the daemon felt on them is in their zero."""
+        self.zeroed_touched[taxels] |= (self._lately_touched() | self.spoiled())[taxels]
 
     def calibrated_at_rest(self) -> None:
         """A calibration of the whole untouched skin was taken."""
         long_ago = self.calibrated_touched_ns < self._now_ns() - RESTING_NS
         self.calibrated_touched_ns[long_ago] = LONG_AGO_NS
         self.exempt[:] = False
+        self.zeroed_touched[:] = False
         self._spoiled_until_ns[:] = LONG_AGO_NS
+
+    def _lately_touched(self) -> Mask:
+        lately: Mask = self.exempt | (self._now_ns() - self.touched_ns < RELAXED_NS)
+        return lately
 
     def _recover(self, trouble: Trouble) -> None:
         assert trouble.spoils is not None

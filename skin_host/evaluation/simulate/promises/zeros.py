@@ -45,6 +45,9 @@ class ZeroCheck:
         self._bases = [board.base.copy() for board in world.robot.boards.values()]
         #: By board: the time of the first sweep that its zero was observed in, and when that was.
         self._observed: dict[int, tuple[int | None, int]] = {}
+        #: The daemon's present life, and boards whose zero it has not found yet.
+        self._life: Life | None = None
+        self._unfound: set[int] = set()
 
     def note_taken(
         self, true_kpa: NDArray[np.float64], felt_ns: NDArray[np.int64], *, alone: bool
@@ -97,12 +100,19 @@ class ZeroCheck:
         self._pressed_ns[(pressed & ~self._pressed) | (firmly & ~self._firmly)] = now_ns
         self._pressed, self._firmly = pressed, firmly
         layout = self._world.layout
+        if life is not self._life:
+            # What these send is measured by the zero before, so that they may look touched.
+            for board in self._unfound:
+                taxels = layout.boards[board].taxel_index
+                self._excuses.zeroed_touched[taxels[taxels >= 0]] = True
+            self._life, self._unfound = life, set()
         for board, rezero in life.daemon.engine.zeros.rezeros.items():
             taxels = layout.boards[board].taxel_index
             taxels = taxels[taxels >= 0]
             before = self._rezeros.get(board)
             if before is not rezero:
                 self._rezeros[board] = rezero
+                self._excuses.note_zeroed(taxels)
                 own = layout.boards[board].settings
                 boards = life.daemon.link.boards[own.bus]
                 record = boards.records[own.address]
@@ -116,6 +126,10 @@ class ZeroCheck:
                     self._unfelt_ns[taxels] = np.minimum(self._unfelt_ns[taxels], since_ns)
             if rezero._since_ns != self._observed.get(board, (None, 0))[0]:
                 self._observed[board] = rezero._since_ns, now_ns
+            if rezero.settled(wall_ns):
+                self._unfound.discard(board)
+            else:
+                self._unfound.add(board)
             # Whatever begins to press while the zero is observed, or later, is felt.
             finds = np.ones(len(taxels), np.bool_)
             if rezero.settled(wall_ns):
