@@ -18,7 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.bus.assembler import NO_STATUS, Sweep
-from skin_host.bus.wire import TAXELS, TRIANGLES, out_of_range, status_error
+from skin_host.bus.wire import (
+    TAXELS,
+    TRIANGLE_BITS,
+    TRIANGLES,
+    out_of_range,
+    status_error,
+    triangles_in,
+)
 from skin_host.layout import BoardLayout
 
 Mask = NDArray[np.bool_]
@@ -55,7 +62,6 @@ ALONE_NS = 1_000_000_000
 #: frames are lost. Of one that sends far too often nearly all do.
 APART_SHARE = 0.7
 LEAST_APART_SHARE = 0.4
-_BITS = np.arange(TRIANGLES)
 _NO_STATUS = bytes(2 * TRIANGLES)
 
 
@@ -193,11 +199,11 @@ class BoardLedger:
             self._note_crowd(row, sweep)
         if sweep.present != self._present[row]:
             self._present[row] = sweep.present
-            self.present[row] = sweep.present >> _BITS & 1
+            self.present[row] = triangles_in(sweep.present)
         complete = not self._enabled[row] & ~sweep.present
         if not (complete and self._complete[row]):
             self._complete[row] = complete
-            enabled = self._enabled[row] >> _BITS & 1
+            enabled = triangles_in(self._enabled[row])
             self.absent[row] = (self.absent[row] + enabled) * ~self.present[row]
         # Comparing bytes costs a tenth of numpy's `any`.
         flagged = sweep.status is not NO_STATUS and sweep.status.tobytes() != _NO_STATUS
@@ -289,7 +295,7 @@ class BoardLedger:
         """
         if self._complete[row] or self._since_set_up[row] < MISSING_SWEEPS:
             return 0
-        return int((self.absent[row] >= MISSING_SWEEPS) @ (1 << _BITS))
+        return int((self.absent[row] >= MISSING_SWEEPS) @ (1 << TRIANGLE_BITS))
 
     def intervals_ns(self, row: int) -> NDArray[np.int64]:
         """Return the last intervals int64[up to 16] between a board's sweeps, the oldest first."""

@@ -30,6 +30,7 @@ HOST_ADDRESS = 0
 BROADCAST_ADDRESS = 15
 TAXELS = 12
 TRIANGLES = 16
+TRIANGLE_BITS = np.arange(TRIANGLES)
 HEADER_A = 0x40
 HEADER_B = 0xC0
 VALUES_A = 7
@@ -250,6 +251,12 @@ def merged(batch: FrameBatch, sent: FrameBatch) -> FrameBatch:
         np.insert(batch.t_ns, at, sent.t_ns),
         batch.dropped,
     )
+
+
+def triangles_in(mask: int) -> NDArray[np.bool_]:
+    """Return bool[16], the triangles whose bits a mask has."""
+    found: NDArray[np.bool_] = (mask >> TRIANGLE_BITS & 1).astype(np.bool_)
+    return found
 
 
 def _rising(t_ns: NDArray[np.int64]) -> bool:

@@ -25,7 +25,8 @@ from skin_host.layout import TAXELS_PER_TRIANGLE, PadKind
 from skin_host.processing.calibration import Calibration, Verdict
 from skin_host.processing.calibration.calibrator import USUAL_SHIFT
 from skin_host.processing.core import Engine
-from skin_host.processing.intake import FAR_PADS, lifted
+from skin_host.processing.far_presses import FAR_PADS
+from skin_host.processing.intake import lifted
 from skin_host.processing.masks import Mask, any_of
 
 if TYPE_CHECKING:

@@ -194,13 +194,13 @@ class Engine:
             votes: least number of measurements for a touch before.
         """
         assert self._pipeline is not None
-        levels = self._pipeline.levels
-        if votes == self.settings.processing.touch.votes_of_3 and all(
+        levels, votes_now = self._pipeline.levels, self.settings.processing.touch.votes_of_3
+        if votes == votes_now and all(
             np.array_equal(now, before)
             for now, before in ((levels.leave, former.leave), (levels.hold, former.hold))
         ):
             return
-        kpa, votes_now = self._pipeline.kpa, self.settings.processing.touch.votes_of_3
+        kpa = self._pipeline.kpa
         leave_kpa, enter_kpa = kpa(former.leave), kpa(levels.enter)
         hold_kpa = kpa(former.leave + former.hold) - leave_kpa
         span_kpa = kpa(levels.enter + levels.span) - enter_kpa

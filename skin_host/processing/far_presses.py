@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.bus.assembler import Sweep
-from skin_host.bus.wire import TAXELS, TRIANGLES, out_of_range, status_error
+from skin_host.bus.wire import TAXELS, TRIANGLES, out_of_range, status_error, triangles_in
 from skin_host.layout import Layout
 from skin_host.processing.masks import Mask, any_of, count_of
 
@@ -44,10 +44,9 @@ DECIDED_SWEEPS = 4
 #: less than the other it is pressed firmly.
 HALF = 0.5
 FIRM = 0.75
-#: So many pads that go far at once, none of them pressed by half before, are those of a dead chip.
-DEAD_PADS = 7
-
-_BITS = np.arange(TRIANGLES)
+#: So many pads of a chip that are far are no accident: if they go far at once, none of them pressed
+#: by half before, it is dead.
+FAR_PADS = 7
 
 
 class _Past(NamedTuple):
@@ -167,7 +166,7 @@ class FarPresses:
             if not any_of(far):
                 return _no_pads()
             known = self._known[row] = _Far(np.full(TRIANGLES, now_ns))
-        came = (sweep.present >> _BITS & 1).astype(np.bool_)
+        came = triangles_in(sweep.present)
         erring = came & (status_error(sweep.status) != 0)
         answered = came & ~erring
         stale = came & (now_ns - known.came_ns > self._kept_ns[row])
@@ -205,7 +204,7 @@ class FarPresses:
         felt |= touched
         by_half = before <= HALF * self._no_load[row]
         grown = new & seen & felt & by_half
-        sudden = count_of(new & ~grown) >= DEAD_PADS
+        sudden = count_of(new & ~grown) >= FAR_PADS
         known.open |= new & seen
         known.grown |= grown
         known.touched |= new & seen & (felt | by_half)
@@ -227,7 +226,7 @@ class FarPresses:
                 break
             if past.touched is not None:
                 touched |= past.touched
-            came = left & (past.sweep.present >> _BITS & 1).astype(np.bool_)
+            came = left & triangles_in(past.sweep.present)
             left &= ~came
             status = past.sweep.status
             raw[came] = past.sweep.raw[came]

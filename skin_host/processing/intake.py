@@ -24,7 +24,7 @@ from skin_host.bus.compensation import thermal_gains
 from skin_host.bus.ledger import BoardLedger
 from skin_host.bus.wire import TAXELS, TRIANGLES
 from skin_host.layout import Layout
-from skin_host.processing.far_presses import FarPresses
+from skin_host.processing.far_presses import FAR_PADS, FarPresses
 from skin_host.processing.liveness import PADS, Liveness
 from skin_host.processing.masks import Mask, any_of, count_of
 from skin_host.processing.stuck import Encoding, Repeats
@@ -35,9 +35,8 @@ APART_PERIODS = 2
 SILENCE_REPEAT_NS = 1_000_000_000
 #: This many pads far below zero pressure are not an accident.
 LIFTED_PADS = 2
-#: One such pad is enough while this many pads are far out of range. This many far pads are enough
+#: One such pad is enough while `FAR_PADS` pads are far out of range. That many far pads are enough
 #: alone where "far" is more than this multiple of the capacitance at which the pressure curve ends.
-FAR_PADS = 7
 FAR_SHARE = 1.5
 
 
