@@ -96,8 +96,10 @@ class BoardZeros:
         self.changes = 0
         self.rezeros: dict[int, Rezero] = {}
         self.held: Mask | None = None
-        #: Boards that were silent and may have zeroed themselves meanwhile.
+        #: Boards that were silent and may have been zeroed meanwhile.
         self._silent_zeros: dict[int, SilentZero] = {}
+        #: Boards that have neither sent nor been zeroed since they were held.
+        self._awaited: set[int] = set()
         #: Boards of which taxels are not valid, or were not just now, as their zero is sought.
         self._glimpses: dict[int, _Glimpse] = {}
         #: Triangles bool[16] of a board whose chips did not answer when they were last received,
@@ -131,6 +133,7 @@ class BoardZeros:
         self.found, self.changes = before.found, before.changes
         self.rezeros, self.held = before.rezeros, before.held
         self._silent_zeros = before._silent_zeros
+        self._awaited = before._awaited
         self._glimpses = before._glimpses
         self._unanswered = before._unanswered
         self._below, self._at_end = before._below, before._at_end
@@ -168,7 +171,10 @@ class BoardZeros:
         """
         ledger = self._ledger
         if silent_ns:
-            self._note_return(sweep, silent_ns)
+            self._note_return(sweep, silent_ns * 1e-9)
+        elif self._awaited and sweep.board in self._awaited:
+            self._awaited.discard(sweep.board)
+            self._note_return(sweep, math.inf)
         if ledger.flagged[row] or self._unanswered:
             self._note_unanswered(sweep, row)
         if row in ledger.twice:
@@ -218,9 +224,11 @@ class BoardZeros:
         """Report no taxel of some boards as valid until they are zeroed and their zero is found.
 
         Their zero may be another than the calibration's: since that was taken, an earlier start of
-        the daemon may have zeroed them. What seems to touch them is noted all the same.
+        the daemon may have zeroed them, or they themselves. What seems to touch them is noted all
+        the same, unless their first readings show that.
         """
         self._releasing.difference_update(boards)
+        self._awaited.update(boards)
         held = self._layout.taxels_of(boards)
         self.held = held if self.held is None else self.held | held
 
@@ -270,7 +278,10 @@ class BoardZeros:
             How many taxels were touched.
         """
         taxels = self._of(board)
-        self._silent_zeros.pop(board, None)
+        silent_zero = self._silent_zeros.pop(board, None)
+        if silent_zero is not None and silent_zero.at_start and silent_zero.was_zeroed:
+            self._judge_again(board)
+        self._awaited.discard(board)
         self._releasing.add(board)
         self._on_rezero(board, believed)
         before = self.rezeros.get(board)
@@ -480,14 +491,19 @@ class BoardZeros:
         elif is_over or (is_missing and not was_missing):
             self.rezero(sweep.board)
 
-    def _note_return(self, sweep: Sweep, silent_ns: int) -> None:
-        """A board sends again: for half a second, see whether it zeroed itself meanwhile."""
+    def _note_return(self, sweep: Sweep, silent_s: float) -> None:
+        """A board sends again: for half a second, see whether it was zeroed meanwhile.
+
+        Args:
+            sweep: its first.
+            silent_s: for how long it was not received; infinite at a start.
+        """
         rezero = self.rezeros.get(sweep.board)
         if rezero is not None:
             rezero.restart(sweep.t_ns)
         # What was set up since it was received last has a new zero, and one that is still sought
-        # is that of the board as it is now.
-        sought = rezero is not None and rezero.seeks_all
+        # is that of the board as it is now. At a start, one is sought of pads in doubt only.
+        sought = rezero is not None and rezero.seeks_all and math.isfinite(silent_s)
         if self._pipeline is None or self._calibration is None or sought:
             return
         taxels = self._of(sweep.board).ravel()
@@ -505,8 +521,20 @@ class BoardZeros:
             known,
             float(own.no_load),
             own.period_ms * 1e-3,
-            silent_ns * 1e-9,
+            silent_s,
         )
+
+    def _judge_again(self, board: int) -> None:
+        """A board was zeroed before a start, so that what seemed to touch it since was judged by
+        another zero. It does so only if it reads more than it may untouched with either.
+        """
+        taxels, row = self._of(board), self._ledger.row[board]
+        sweep = self._ledger.last[row]
+        reads = self._glimpsed(board)
+        if sweep is not None:
+            reads |= self._ledger.far[row] & (sweep.raw != END)
+        touched = (self._last_touched[taxels] & reads) | self._touched_before[taxels]
+        self._last_touched[taxels[taxels >= 0]] = touched[taxels >= 0]
 
     def _find_silent_zero(self, sweep: Sweep, row: int, silent_zero: SilentZero) -> None:
         if silent_zero.decided:
@@ -516,13 +544,18 @@ class BoardZeros:
         ledger = self._ledger
         here = np.repeat(ledger.present[row] & (ledger.error[row] == 0), PADS)
         zeroed = silent_zero.step(sweep.raw.ravel(), here & ~ledger.far[row].ravel(), sweep.t_ns)
-        if zeroed is None:
-            self._intake.veto[row] = np.ones((TRIANGLES, PADS), np.bool_)
-            return
         if zeroed:
+            if silent_zero.at_start:
+                self._judge_again(sweep.board)
             # What was read since is of the new zero.
             self._glimpses.pop(sweep.board, None)
+            del self._silent_zeros[sweep.board]
             self.rezero(sweep.board)
+            return
+        if silent_zero.at_start:
+            return
+        if zeroed is None:
+            self._intake.veto[row] = np.ones((TRIANGLES, PADS), np.bool_)
             return
         rezero = self.rezeros.get(sweep.board)
         if rezero is None:

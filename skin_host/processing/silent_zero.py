@@ -1,4 +1,4 @@
-"""Decides whether a board zeroed itself while it was not received.
+"""Decides whether a board was zeroed while it was not received.
 
 A board zeroes itself after five readings without acknowledge, which its status words report
 (icub-firmware, mtb3/main_V3.c). Nobody learns of it while its bus is away, and then its
@@ -8,6 +8,9 @@ untouched pad, but for the noise of one reading, and without a zero each reads i
 So the first sweeps after a silence are compared with both, over all pads that nothing touched. Both
 allow for what moves all pads together, as temperature does, and for pads that are pressed or fail.
 Where both fit alike, the baselines are near zero and nothing depends on the answer.
+
+After a start of the daemon nobody knows how long it was not received: a moment, or a winter. Both
+are tried then.
 
 What waited on the way, as behind a node that keeps the bus busy, comes at once afterwards and may
 be from before the zero: such sweeps are not compared.
@@ -62,10 +65,11 @@ class SilentZero:
         known: bool[n], usable taxels that were untouched, and whose baseline was known.
         no_load: the byte of an untouched pad just after a zero.
         period_s: how often the board sends.
-        silent_s: for how long it was not received.
+        silent_s: for how long it was not received; infinite at a start, where nobody knows.
 
     Attributes:
         silent_s: as given.
+        at_start: whether it is infinite.
     """
 
     def __init__(
@@ -83,11 +87,12 @@ class SilentZero:
         self._spread = spread
         self._known = known
         self.silent_s = silent_s
+        self.at_start = math.isinf(silent_s)
         self._no_load = no_load
         self._period_s = period_s
         drifted = min(SLOW_UNITS_PER_S * silent_s, MOST_COMMON_UNITS)
-        self._common_units = math.hypot(COMMON_UNITS, drifted)
-        self._own_units = math.hypot(OWN_UNITS, APART_SHARE * drifted)
+        #: What all pads may have drifted by together, in units; each is as probable.
+        self._drifted_units = [0.0, drifted] if self.at_start else [drifted]
         self._sum = np.zeros(len(known))
         self._count = np.zeros(len(known), np.int64)
         self._sweeps = 0
@@ -119,6 +124,11 @@ class SilentZero:
         self._sweeps += 1
         if self._sweeps < SWEEPS:
             return None
+        return self.was_zeroed
+
+    @property
+    def was_zeroed(self) -> bool:
+        """Return whether what came so far shows that the board was zeroed."""
         return self.evidence() > math.log(ODDS)
 
     def evidence(self) -> float:
@@ -131,17 +141,29 @@ class SilentZero:
         # Readings within one conversion repeat it; slower ones are each their own.
         independent = count * min(1.0, self._period_s / CONVERSION_S)
         share = 1.0 / np.maximum(independent, 1.0) + CONVERSION_S / BASELINE_S
-        variance = np.square(self._spread[seen]) * share + self._own_units**2
+        variance = np.square(self._spread[seen]) * share
         # A zero is a single reading: its noise is in all that follow.
         zeroed = self._log_likelihood(mean, variance + np.square(self._noise[seen]))
         return zeroed - self._log_likelihood(mean - baseline, variance)
 
     def _log_likelihood(self, residual: Floats, variance: Floats) -> float:
-        """Return the logarithm of the likelihood of residuals [n], whatever moved them together."""
-        most = COMMON_SIGMAS * self._common_units
-        common = np.arange(-most, most + STEP_UNITS, STEP_UNITS)
-        apart = residual - common[:, None]
-        density = np.exp(-0.5 * apart**2 / variance) / np.sqrt(2.0 * np.pi * variance)
-        mixed = (1.0 - ELSEWHERE_SHARE) * density + ELSEWHERE_SHARE / RANGE_UNITS
-        of_common = np.log(mixed).sum(axis=1) - 0.5 * np.square(common / self._common_units)
-        return float(np.logaddexp.reduce(of_common))
+        """Return the logarithm of the likelihood of residuals [n], whatever the pads drifted by."""
+        return float(
+            np.logaddexp.reduce([_of_drift(residual, variance, d) for d in self._drifted_units])
+        )
+
+
+def _of_drift(residual: Floats, variance: Floats, drifted_units: float) -> float:
+    """Return the logarithm of the likelihood of residuals [n] after a drift of about so many units,
+    whatever moved them together.
+    """
+    common_units = math.hypot(COMMON_UNITS, drifted_units)
+    variance = variance + OWN_UNITS**2 + (APART_SHARE * drifted_units) ** 2
+    most = COMMON_SIGMAS * common_units
+    common = np.arange(-most, most + STEP_UNITS, STEP_UNITS)
+    apart = residual - common[:, None]
+    density = np.exp(-0.5 * apart**2 / variance) / np.sqrt(2.0 * np.pi * variance)
+    mixed = (1.0 - ELSEWHERE_SHARE) * density + ELSEWHERE_SHARE / RANGE_UNITS
+    of_common = np.log(mixed).sum(axis=1) - 0.5 * np.square(common / common_units)
+    # Wider drifts have more values, each less probable.
+    return float(np.logaddexp.reduce(of_common)) - math.log(common_units)

@@ -27,13 +27,15 @@ FAR_BELOW = 255
 class Hand:
     """An engine with a calibrated board, which sends what it is asked to."""
 
-    def __init__(self, rest_seed: int | None = None) -> None:
+    def __init__(self, rest_seed: int | None = None, noise_units: int = 1) -> None:
         settings = load(CONFIG)
         layout = build_layout(settings, CONFIG.parent)
         self.engine = Engine(settings, layout, [layout.parts.index(layout.part("left_hand"))])
         self._board = layout.boards[0]
         self._rng = np.random.default_rng(1)
         self._t_ns = 1_000_000_000
+        #: Pads are off by up to so much in each reading.
+        self._noise_units = noise_units
         #: What each pad rests at, away from its board's zero: the noise of one reading.
         self.rest_units = np.zeros((len(self._board.triangles), 12), np.int64)
         #: What the pads of a second board at its address rest at, which sends 13 ms after each.
@@ -70,7 +72,8 @@ class Hand:
 
     def _send(self, t_ns: int, rest_units: np.ndarray, pads: dict[str, int]) -> None:
         triangles = np.array(self._board.triangles)
-        values = self._rng.integers(NO_LOAD - 1, NO_LOAD + 2, (len(triangles), 12))
+        most = self._noise_units
+        values = self._rng.integers(NO_LOAD - most, NO_LOAD + most + 1, (len(triangles), 12))
         values -= rest_units
         status = np.zeros(len(triangles), np.uint16)
         status[-1] = self.error
@@ -99,10 +102,10 @@ class Hand:
         """Send nothing for so many periods, which nobody notices before the next sweep."""
         self._t_ns += sweeps * PERIOD_NS
 
-    def rests_elsewhere(self, seed: int) -> None:
-        """It was zeroed, by one reading."""
+    def rests_elsewhere(self, seed: int, most: int = 3) -> None:
+        """It was zeroed, by one reading, which was off by `most` units at most."""
         rng = np.random.default_rng(seed)
-        self.rest_units = rng.integers(-3, 4, self.rest_units.shape)
+        self.rest_units = rng.integers(-most, most + 1, self.rest_units.shape)
 
     @property
     def in_doubt(self) -> list[int]:
@@ -363,7 +366,7 @@ def valid_share(step: Step) -> float:
 def expect_new_zeros(hand: Hand, steps: list[Step], times: int = 1) -> None:
     """Its pads rest elsewhere now: none is touched by that, and nearly all are valid in the end."""
     steps.clear()
-    hand.send(80)
+    hand.send(140)
     assert not any(step.frame.touched.any() for step in steps)
     assert valid_share(steps[-1]) > 0.8
     assert hand.engine.ledger.rezeros.tolist() == [times]
@@ -809,3 +812,61 @@ def test_a_pad_that_is_pressed_again_when_its_board_is_set_up_is_calibrated_in_t
     hand.send(60)
     hand.calibrate()
     assert verdict_of(hand, 3) == Verdict.TOUCHED
+
+
+def restarted(rests: Callable[[Hand], None], sweeps: int, **pads: int) -> Hand:
+    """A daemon has started while a board sends, with the zero that the one before knew or with
+    another one; after some sweeps the board is set up, which zeroes it.
+    """
+    hand = started(rests)
+    hand.send(sweeps, **pads)
+    hand.engine.zeros.rezero(0)
+    hand.rests_elsewhere(seed=3, most=1)
+    hand.send(120)
+    return hand
+
+
+def started(rests: Callable[[Hand], None]) -> Hand:
+    """A daemon has started, and nothing has been received yet."""
+    hand = Hand(rest_seed=1, noise_units=3)
+    before = hand.engine
+    hand.engine = Engine(before.settings, before.layout, before.parts, before.calibration)
+    hand.engine.zeros.hold([0])
+    rests(hand)
+    return hand
+
+
+def zeroed_meanwhile(hand: Hand) -> None:
+    """No daemon knows that zero: none ran, or the one before was killed before it found it."""
+    hand.rests_elsewhere(seed=2)
+
+
+def keeps_zero(hand: Hand) -> None:
+    """Nothing has changed."""
+
+
+@pytest.mark.parametrize("sweeps", [6, 12, 20])
+def test_a_zero_that_no_daemon_knows_touches_nothing_at_a_start(sweeps: int) -> None:
+    hand = restarted(zeroed_meanwhile, sweeps)
+    assert not hand.engine.zeros.pressed().any()
+    assert not hand.engine.zeros.at_risk(touched=True).any()
+
+
+@pytest.mark.parametrize("rests", [keeps_zero, zeroed_meanwhile])
+@pytest.mark.parametrize("sweeps", [12, 20])
+def test_what_presses_at_a_start_is_in_doubt_and_known_as_pressed(
+    rests: Callable[[Hand], None], sweeps: int
+) -> None:
+    hand = restarted(rests, sweeps, p3=200)
+    assert hand.in_doubt == [3]
+    assert np.flatnonzero(hand.engine.zeros.pressed()).tolist() == [3]
+
+
+def test_a_board_that_is_not_set_up_at_a_start_gets_the_zero_that_it_has() -> None:
+    """Its bus takes no commands."""
+    hand = started(zeroed_meanwhile)
+    hand.send(12)
+    hand.engine.zeros.release([0])
+    steps: list[Step] = []
+    hand.deliver = lambda output: steps.extend(output.steps)
+    expect_new_zeros(hand, steps)

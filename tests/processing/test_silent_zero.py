@@ -1,5 +1,7 @@
 """Readings after a silence show whether the board zeroed itself meanwhile."""
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -90,6 +92,29 @@ def test_a_long_silence_in_which_it_became_warmer_is_no_zero(
 ) -> None:
     found, _ = Skin(seed).evidence(False, common_units=common_units, own_units=2.0, silent_s=600.0)
     assert found is False
+
+
+def at_start(seed: int, zeroed: bool, common_units: float, own_units: float) -> bool | None:
+    """Return what is decided where nobody knows how long the board was not received."""
+    return Skin(seed).evidence(
+        zeroed, common_units=common_units, own_units=own_units, silent_s=math.inf
+    )[0]
+
+
+@given(SEEDS, st.floats(-6.0, 6.0), st.floats(0.0, 2.0))
+def test_no_drift_is_taken_for_a_zero_at_a_start(
+    seed: int, common_units: float, own_units: float
+) -> None:
+    assert at_start(seed, False, common_units, own_units) is False
+
+
+@given(SEEDS, COMMON)
+def test_a_zero_of_a_moment_ago_is_recognised_at_a_start(seed: int, common_units: float) -> None:
+    assert at_start(seed, True, common_units, own_units=0.3) is True
+
+
+def test_few_zeros_before_a_winter_are_missed_at_a_start() -> None:
+    assert np.mean([at_start(seed, True, 6.0, 2.0) is True for seed in range(200)]) > 0.8
 
 
 def quiet(seed: int, zeroed: bool) -> bool | None:
