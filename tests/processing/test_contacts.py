@@ -11,13 +11,8 @@ from hypothesis import strategies as st
 from skin_host.config.settings import Settings
 from skin_host.evaluation.rig import Rig, flat_skin
 from skin_host.layout import PadKind, build_layout
-from skin_host.processing.contacts import (
-    ALIVE_NS,
-    LOST_NS,
-    MERGED_NS,
-    PARTED_NS,
-    ContactTracker,
-)
+from skin_host.processing.contacts import ALIVE_NS, LOST_NS, ContactTracker
+from skin_host.processing.contacts.tracker import MERGED_NS, PARTED_NS
 from skin_host.processing.localization_centroid import GEOMETRY_PITCHES, nearest_distance
 from skin_host.processing.pipeline import PressureFrame
 

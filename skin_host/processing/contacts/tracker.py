@@ -1,25 +1,21 @@
-"""Groups touched taxels into contacts and follows the contacts over time."""
+"""Follows the contacts of a part from frame to frame, and reports what changes."""
 
 import math
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
-from itertools import accumulate, chain, pairwise
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skin_host.config.settings import Settings
-from skin_host.layout import Layout, PadKind
+from skin_host.layout import Layout
+from skin_host.processing.contacts.former import Decision, Former
+from skin_host.processing.contacts.grouping import Contact, Grouping, Homes
+from skin_host.processing.contacts.held import Held
+from skin_host.processing.contacts.neighbours import Near, Unfelt
+from skin_host.processing.contacts.places import Places
 from skin_host.processing.events import Reason, Touch, Vector
-from skin_host.processing.localization import Localizer, make_localizer, separate
 from skin_host.processing.localization_centroid import GEOMETRY_PITCHES
 from skin_host.processing.masks import Mask, all_of, any_of
-from skin_host.processing.patches import Patches
 from skin_host.processing.pipeline import PressureFrame
-from skin_host.processing.pressure import PressureCurve
 
 Floats = NDArray[np.float64]
 
@@ -41,26 +37,6 @@ PIECE_SHARE = 0.2
 FADES_NS = 10_000_000_000
 #: Contacts that have grown together become one after this time: a taxel between two may flicker.
 MERGED_NS = 1_000_000_000
-#: A taxel that is not received for less than this time counts as it was last received.
-LOST_NS = 500_000_000
-
-
-@dataclass(slots=True)
-class _Contact:
-    taxels: frozenset[int]
-    #: The same in rising order, intp.
-    order: NDArray[np.intp]
-    said: Touch
-    #: When that was. All times here are those of `PressureFrame.elapsed_ns`.
-    said_ns: int
-    #: The recent highest pressure.
-    firm_kpa: float
-    #: Taxels that it lost when they were not received for long: they may still be touched.
-    unseen: frozenset[int] = frozenset()
-    #: Since when it has been in pieces.
-    parted_ns: int | None = None
-    #: Since when it has been connected with another contact.
-    merged_ns: int | None = None
 
 
 class ContactTracker:
@@ -88,26 +64,26 @@ class ContactTracker:
         part = layout.parts[part_index]
         mine = slice(part.start, part.stop)
         self._name = part.name
-        near = _Near.of(layout, mine)
+        near = Near.of(layout, mine)
         if before is not None and before._near.is_same(near):
             near = before._near
-        self._near: _Near = near
+        self._near: Near = near
         self._neighbours, self._patches = near.lists, near.patches
         self._pitch_m = near.usual_pitch_m
         self._position_m = layout.position_m[mine]
         self._normal = layout.normal[mine]
         self._area_mm2 = layout.area_mm2[mine]
         self._shortest_ns = int(1e9 / settings.processing.touch.move_hz)
-        self._places: _Places | None = None
+        self._places: Places | None = None
         if settings.parts[part.name].localization != "centroid":
-            self._places = _Places(layout, part_index, settings, near.pitch_m)
-        self._contacts: dict[int, _Contact] = {} if before is None else before._contacts
+            self._places = Places(layout, part_index, settings, near.pitch_m)
+        self._contacts: dict[int, Contact] = {} if before is None else before._contacts
         self._next_id: int = 1 if before is None else before._next_id
         self._elapsed_ns: int = 0 if before is None else before._elapsed_ns
-        self._held: _Held = _Held(part.n_taxels) if before is None else before._held
-        self._former: _Former = _Former(part.n_taxels) if before is None else before._former
-        self._unfelt = _Unfelt.of(np.ones(part.n_taxels, np.bool_), near, None)
-        self._known = _Grouping.of([], [], _Homes({}, 0), self._area_mm2, self._position_m)
+        self._held: Held = Held(part.n_taxels) if before is None else before._held
+        self._former: Former = Former(part.n_taxels) if before is None else before._former
+        self._unfelt = Unfelt.of(np.ones(part.n_taxels, np.bool_), near, None)
+        self._known = Grouping.of([], [], Homes({}, 0), self._area_mm2, self._position_m)
         self._seen: bytes | None = None
 
     def step(self, frame: PressureFrame) -> list[Touch]:
@@ -153,11 +129,11 @@ class ContactTracker:
         self._held.forget()
         return [self._closed(name, seq, t_ns, "stopped") for name in list(self._contacts)]
 
-    def _grouping(self, felt: PressureFrame, received: Mask) -> "_Grouping":
+    def _grouping(self, felt: PressureFrame, received: Mask) -> "Grouping":
         """Return the contacts of this frame, or those of the last frame if nothing has changed.
 
         Args:
-            felt: the frame, see `_Held.complete`.
+            felt: the frame, see `Held.complete`.
             received: bool[m], which taxels are valid without being held.
         """
         seen = felt.touched.tobytes()
@@ -169,13 +145,13 @@ class ContactTracker:
         groups = self._joined(groups, felt)
         if self._places is not None:
             groups = self._places.look(felt, groups, self._neighbours)
-        home = _Homes(self._contacts, len(self._neighbours))
+        home = Homes(self._contacts, len(self._neighbours))
         if len(groups) == 1:
             home.note(groups[0], touched)
         groups = self._kept_apart(groups, home, felt.elapsed_ns)
         groups = self._kept_whole(groups, home, felt, received)
         names = self._identify(groups, home)
-        self._known = _Grouping.of(names, groups, home, self._area_mm2, self._position_m)
+        self._known = Grouping.of(names, groups, home, self._area_mm2, self._position_m)
         # Whether contacts are kept together or apart, or are split by pressure, can change with any
         # frame.
         self._seen = seen if as_before and self._places is None else None
@@ -222,7 +198,7 @@ class ContactTracker:
         return reached
 
     def _kept_apart(
-        self, groups: list[frozenset[int]], home: "_Homes", elapsed_ns: int
+        self, groups: list[frozenset[int]], home: "Homes", elapsed_ns: int
     ) -> list[frozenset[int]]:
         """Return the groups, with contacts kept apart that have only just grown together.
 
@@ -253,7 +229,7 @@ class ContactTracker:
     def _kept_whole(
         self,
         groups: list[frozenset[int]],
-        home: "_Homes",
+        home: "Homes",
         felt: PressureFrame,
         received: Mask,
     ) -> list[frozenset[int]]:
@@ -299,7 +275,7 @@ class ContactTracker:
                 kept += [*strong[:-1], strong[-1].union(*(set(parts) - set(strong)))]
         return sorted(kept, key=min) if len(kept) > 1 else kept
 
-    def _identify(self, groups: list[frozenset[int]], home: "_Homes") -> list[int]:
+    def _identify(self, groups: list[frozenset[int]], home: "Homes") -> list[int]:
         """Give each group the name of the contact that it continues, or a new one.
 
         The largest overlap decides; among equal ones the older contact. A group next to the place
@@ -326,7 +302,7 @@ class ContactTracker:
                 self._next_id += 1
         return [names[number] for number in range(len(groups))]
 
-    def _reported(self, found: "_Grouping", felt: PressureFrame, received: Mask) -> list[Touch]:
+    def _reported(self, found: "Grouping", felt: PressureFrame, received: Mask) -> list[Touch]:
         """Return the events of the contacts of a frame, and update the contacts.
 
         A contact of which nothing was received is not reported.
@@ -342,7 +318,7 @@ class ContactTracker:
         is_received = [True] * len(starts)
         if not all_of(received):
             is_received = np.logical_or.reduceat(received.take(order), starts).tolist()
-        unfelt = self._unfelt = _Unfelt.of(felt.valid, self._near, self._unfelt)
+        unfelt = self._unfelt = Unfelt.of(felt.valid, self._near, self._unfelt)
         is_beside = [False] * len(starts)
         if unfelt.any:
             is_beside = np.logical_or.reduceat(unfelt.beside.take(order), starts).tolist()
@@ -422,14 +398,14 @@ class ContactTracker:
             events.append(event)
             if known is None:
                 own = found.order[found.spans[number]]
-                self._contacts[name] = _Contact(taxels, own, event, now_ns, peak)
+                self._contacts[name] = Contact(taxels, own, event, now_ns, peak)
             else:
                 known.said, known.said_ns = event, now_ns
         return events
 
     def _unfelt_m(
         self,
-        found: "_Grouping",
+        found: "Grouping",
         number: int,
         unseen: frozenset[int],
         place_m: Vector,
@@ -495,290 +471,6 @@ class ContactTracker:
         return self._contacts.pop(name).said.ended(seq, t_ns, reason)
 
 
-class Decision(NamedTuple):
-    """How touches begin or end: by the sum of what is above a level, see `touch.TouchDetector`.
-
-    Attributes:
-        level_kpa: float64[m], what lasts above this is a touch, below it none.
-        evidence_kpa: float64[m], the sum that makes a touch, or that one has at most.
-        votes: least number of measurements in which it is reached, or lost.
-    """
-
-    level_kpa: Floats
-    evidence_kpa: Floats
-    votes: int
-
-    def added(self, evidence_kpa: Floats, pressure_kpa: NDArray[np.float32]) -> Floats:
-        """Return the evidence [m] after another measurement [m]."""
-        vote_kpa = self.evidence_kpa / self.votes
-        gain = np.clip(pressure_kpa - self.level_kpa, -vote_kpa, vote_kpa)
-        return np.clip(evidence_kpa + gain, 0.0, self.evidence_kpa)
-
-
-class _Former:
-    """Whether contacts would still be touches by the decision by which they were found.
-
-    Another decision, or a new zero, ends touches that last. The former decision is continued on
-    the pressures of the taxels that were touched then, until the present one finds them, too.
-
-    Args:
-        m: taxels of the part.
-
-    Attributes:
-        names: of the contacts that it was for and that have not ended.
-    """
-
-    def __init__(self, m: int) -> None:
-        self.names: set[int] = set()
-        nothing = np.zeros(m)
-        self._former = self._now = Decision(nothing, nothing, 1)
-        #: What keeps each taxel touched by the former decision, and what the present one has found.
-        self._kept_kpa, self._found_kpa = nothing, nothing
-        self._zeroed: Mask = np.zeros(m, np.bool_)
-
-    def _note(self, contacts: dict[int, list[int]]) -> Mask:
-        """Note the contacts, and return their taxels [m]; forget those of earlier ones."""
-        self.names = set(contacts)
-        touched = np.zeros(len(self._zeroed), np.bool_)
-        for taxels in contacts.values():
-            touched[taxels] = True
-        self._zeroed &= touched
-        self._kept_kpa = np.where(touched, self._kept_kpa, 0.0)
-        return touched
-
-    def begin(self, contacts: dict[int, list[int]], former: Decision, now: Decision) -> None:
-        """Continue a decision that is in use no longer, see `ContactTracker.note_former`.
-
-        Args:
-            contacts: the taxels of each by its name.
-            former, now: the two decisions.
-        """
-        touched = self._note(contacts)
-        # Of several that followed each other, that which keeps a touch for longest.
-        level_kpa = np.where(
-            self._kept_kpa > 0.0,
-            np.fmin(self._former.level_kpa, former.level_kpa),
-            former.level_kpa,
-        )
-        self._former, self._now = former._replace(level_kpa=level_kpa), now
-        self._kept_kpa = np.where(touched, former.evidence_kpa, 0.0)
-        self._found_kpa = np.zeros(len(touched))
-
-    def zero(self, contacts: dict[int, list[int]], taxels: Mask) -> None:
-        """Some taxels [m] have a new zero: nothing shows any more what they felt."""
-        self._zeroed |= self._note(contacts) & taxels
-
-    def step(self, frame: PressureFrame, received: Mask) -> None:
-        """Take in a frame, and which of its taxels [m] were received."""
-        kept = self._former.added(self._kept_kpa, frame.pressure_kpa)
-        found = self._now.added(self._found_kpa, frame.pressure_kpa)
-        self._found_kpa = np.where(received, found, self._found_kpa)
-        over = (kept <= 0.0) | (found >= self._now.evidence_kpa)
-        self._kept_kpa = np.where(received, np.where(over, 0.0, kept), self._kept_kpa)
-        # A touch of now was found since the zero.
-        self._zeroed &= ~frame.touched
-
-    def keeps(self, taxels: NDArray[np.intp]) -> bool:
-        """Return whether any of some taxels would still be touched."""
-        return any_of((self._kept_kpa[taxels] > 0.0) | self._zeroed[taxels])
-
-
-class _Held:
-    """What the taxels of a part last felt, for as long as lost frames do not end a touch.
-
-    It is needed while there are contacts. Frames are not written to, so the last one is kept as it
-    is; a taxel is copied from it when it is not received any more.
-
-    Args:
-        n: taxels of the part.
-    """
-
-    def __init__(self, n: int) -> None:
-        self._pressure_kpa = np.zeros(n, np.float32)
-        self._touched: Mask = np.zeros(n, np.bool_)
-        self._beyond: Mask = np.zeros(n, np.bool_)
-        self._received_ns = np.full(n, -LOST_NS, np.int64)
-        self._last: PressureFrame | None = None
-        #: From when on none is held.
-        self._until_ns = 0
-
-    def complete(self, frame: PressureFrame) -> PressureFrame:
-        """Return the frame with taxels that are not received as they last were.
-
-        In it a taxel is valid, touched and has its pressure until it has not been received for
-        `LOST_NS`. If there is none such it is the frame itself.
-        """
-        last, self._last = self._last, frame
-        now_ns = frame.elapsed_ns
-        if last is not None and last.valid is not frame.valid:
-            gone = last.valid & ~frame.valid
-            if any_of(gone):
-                np.copyto(self._pressure_kpa, last.pressure_kpa, where=gone)
-                np.copyto(self._touched, last.touched, where=gone)
-                np.copyto(self._beyond, last.beyond_range, where=gone)
-                self._received_ns[gone] = last.elapsed_ns
-                self._until_ns = last.elapsed_ns + LOST_NS
-        if now_ns >= self._until_ns:
-            return frame
-        held = ~frame.valid & (now_ns - self._received_ns < LOST_NS)
-        if not any_of(held):
-            return frame
-        return replace(
-            frame,
-            pressure_kpa=np.where(held, self._pressure_kpa, frame.pressure_kpa),
-            touched=frame.touched | (held & self._touched),
-            valid=frame.valid | held,
-            beyond_range=frame.beyond_range | (held & self._beyond),
-        )
-
-    def forget(self) -> None:
-        """Hold nothing of earlier frames."""
-        self._last = None
-        if self._until_ns:
-            self._received_ns.fill(-LOST_NS)
-            self._until_ns = 0
-
-
-class _Unfelt(NamedTuple):
-    """Pads of a part that measure pressure and are not valid.
-
-    Attributes:
-        valid: the mask of the frame, as bytes.
-        any: whether there are any.
-        pads: bool[m], which ones.
-        beside: bool[m], which taxels are next to one.
-    """
-
-    valid: bytes
-    any: bool
-    pads: Mask
-    beside: Mask
-
-    @classmethod
-    def of(cls, valid: Mask, near: "_Near", last: "_Unfelt | None") -> "_Unfelt":
-        """Return those of a frame; mostly they are those of the last one."""
-        seen = valid.tobytes()
-        if last is not None and last.valid == seen:
-            return last
-        pads = near.pads & ~valid
-        beside = np.zeros(len(pads), np.bool_)
-        beside[near.taxel[pads[near.neighbour]]] = True
-        return cls(seen, any_of(pads), pads, beside)
-
-
-class _Homes:
-    """Which contact each taxel of a part was in.
-
-    Args:
-        contacts: by their names, which are above 0.
-        n: taxels of the part.
-    """
-
-    #: A group of more is taken as an array.
-    _MANY = 48
-
-    def __init__(self, contacts: dict[int, _Contact], n: int) -> None:
-        self._names = np.zeros(n, np.int64)
-        for name, contact in contacts.items():
-            self._names[contact.order] = name
-        self._listed: list[int] = self._names.tolist()
-        self._orders: dict[frozenset[int], NDArray[np.intp]] = {}
-        self._overlaps: dict[frozenset[int], list[tuple[int, int]]] = {}
-
-    def overlaps(self, group: frozenset[int]) -> list[tuple[int, int]]:
-        """Contacts that a group shares taxels with, and how many.
-
-        Those with most come first; of equal ones that with the lowest taxel.
-        """
-        found = self._overlaps.get(group)
-        if found is None:
-            found = self._overlaps[group] = self._overlaps_of(group)
-        return found
-
-    def _overlaps_of(self, group: frozenset[int]) -> list[tuple[int, int]]:
-        if len(group) <= self._MANY:
-            names = [name for one in group if (name := self._listed[one])]
-            if not names or names.count(names[0]) == len(names):
-                return [(names[0], len(names))] if names else []
-            names = [name for one in sorted(group) if (name := self._listed[one])]
-            return Counter(names).most_common()
-        found = self._names[self._order(group)]
-        found = found[found > 0]
-        if len(found) and (found == found[0]).all():
-            return [(int(found[0]), len(found))]
-        names_found, first, counts = np.unique(found, return_index=True, return_counts=True)
-        ranked = np.lexsort((first, -counts))
-        return list(zip(names_found[ranked].tolist(), counts[ranked].tolist(), strict=True))
-
-    def sorted(self, group: frozenset[int]) -> list[int]:
-        """The taxels of a group in rising order."""
-        if len(group) <= self._MANY:
-            return sorted(group)
-        taxels: list[int] = self._order(group).tolist()
-        return taxels
-
-    def note(self, group: frozenset[int], order: NDArray[np.intp]) -> None:
-        """Take the taxels of a group in rising order, which are known already."""
-        self._orders[group] = order
-
-    def order(self, groups: list[frozenset[int]]) -> NDArray[np.intp]:
-        """The taxels of groups, one group after the other."""
-        if len(groups) == 1:
-            return self._order(groups[0])
-        return np.fromiter(chain.from_iterable(map(self.sorted, groups)), np.intp)
-
-    def _order(self, group: frozenset[int]) -> NDArray[np.intp]:
-        order = self._orders.get(group)
-        if order is None:
-            order = self._orders[group] = np.fromiter(group, np.intp, len(group))
-            order.sort()
-        return order
-
-
-class _Grouping(NamedTuple):
-    """The k contacts of a frame, as lists and as flat arrays.
-
-    Attributes:
-        names: of the contacts.
-        groups: the taxels of each.
-        taxels: the same, in order.
-        order, starts: intp, all taxels contact by contact, and the index of the first of each.
-        spans: which of `order` are of each contact.
-        share_mm2, position_m: of the taxels in this order: skin that they stand for, and
-            position [.., 3].
-        area_mm2: of each contact.
-    """
-
-    names: list[int]
-    groups: list[frozenset[int]]
-    taxels: list[list[int]]
-    order: NDArray[np.intp]
-    starts: NDArray[np.intp]
-    spans: list[slice]
-    share_mm2: Floats
-    position_m: Floats
-    area_mm2: list[float]
-
-    @classmethod
-    def of(
-        cls,
-        names: list[int],
-        groups: list[frozenset[int]],
-        home: "_Homes",
-        area_mm2: Floats,
-        position_m: Floats,
-    ) -> "_Grouping":
-        taxels = [home.sorted(group) for group in groups]
-        order = home.order(groups)
-        ends = list(accumulate(map(len, taxels)))
-        begins = [0, *ends[:-1]] if ends else []
-        starts = np.array(begins, np.intp)
-        spans = list(map(slice, begins, ends))
-        share_mm2 = area_mm2[order]
-        areas = np.add.reduceat(share_mm2, starts).tolist() if ends else []
-        return cls(names, groups, taxels, order, starts, spans, share_mm2, position_m[order], areas)
-
-
 def _worth_reporting(
     said: Touch, silent_ns: int, taxels: list[int], peak_kpa: float, centroid_m: Vector | None
 ) -> bool:
@@ -791,150 +483,3 @@ def _worth_reporting(
     if centroid_m is None or said.centroid_m is None:
         return centroid_m is not said.centroid_m
     return math.dist(centroid_m, said.centroid_m) > MOVED_M
-
-
-class _Places:
-    """Separates and locates the contacts of one part with its configured method.
-
-    Pressures are converted back into activations of one standard pad, the part's median: pads of
-    other sizes, shifts and strengths then read alike where they are covered alike.
-    """
-
-    def __init__(
-        self, layout: Layout, part_index: int, settings: Settings, pitch_m: Floats
-    ) -> None:
-        part = layout.parts[part_index]
-        chosen = settings.parts[part.name]
-        mine = slice(part.start, part.stop)
-        self._localizer: Localizer = make_localizer(
-            chosen.localization,
-            layout.position_m[mine],
-            layout.normal[mine],
-            layout.radius_mm[mine],
-            probe_mm=chosen.probe_mm,
-            pitch_m=pitch_m,
-        )
-        pads = layout.pad_kind[mine] == PadKind.PRESSURE
-        unit_ff = (layout.unit_ff[mine] / layout.sensitivity[mine])[pads]
-        pressure = settings.processing.pressure
-        self._curve = PressureCurve(
-            np.median(unit_ff) if len(unit_ff) else 1.0,
-            a=pressure.a_kpa_per_ff2,
-            b=pressure.b_kpa_per_ff,
-        )
-        self._units: Floats = np.zeros(part.n_taxels)
-        self._believed: Mask = np.zeros(part.n_taxels, np.bool_)
-        self._free: Mask = np.zeros(part.n_taxels, np.bool_)
-
-    def look(
-        self,
-        frame: PressureFrame,
-        patches: list[frozenset[int]],
-        neighbours: Sequence[Sequence[int]],
-    ) -> list[frozenset[int]]:
-        """Take in a frame and its connected patches; return its contacts."""
-        self._units = self._curve.units(frame.pressure_kpa)
-        self._free = frame.valid.copy()
-        contacts = []
-        for patch in patches:
-            taxels = sorted(patch)
-            self._free[taxels] = False
-            contacts += [frozenset(g) for g in separate(taxels, self._units, neighbours)]
-        self._believed = frame.valid
-        return contacts
-
-    def locate(self, taxels: list[int]) -> tuple[Vector | None, float | None]:
-        """Position in the part's frame and its standard error, m, of one of the contacts."""
-        index = np.array(taxels, np.intp)
-        usable = self._free.copy()
-        usable[index] = self._believed[index]
-        location = self._localizer.locate(index, self._units, usable)
-        if location is None:
-            return None, None
-        x, y, z = location.position_m.tolist()
-        return (x, y, z), location.sigma_m
-
-
-class _Near:
-    """Which taxels of a part are next to each other: what takes long to make is made when needed.
-
-    Attributes:
-        start, neighbour: as in `Layout`, of the part alone.
-        position_m: [m, 3].
-        pads: bool[m], which ones measure pressure.
-        radius_m, kind_pitch_m: [m], of the pads, and their distance in a unit of their kind.
-    """
-
-    def __init__(
-        self,
-        start: NDArray[np.int32],
-        neighbour: NDArray[np.int32],
-        position_m: Floats,
-        pads: Mask,
-        radius_m: Floats,
-        kind_pitch_m: Floats,
-    ) -> None:
-        self.start = start
-        self.neighbour = neighbour
-        self.position_m = position_m
-        self.pads = pads
-        self.radius_m = radius_m
-        self.kind_pitch_m = kind_pitch_m
-
-    @classmethod
-    def of(cls, layout: Layout, mine: slice) -> "_Near":
-        start = layout.neighbour_start[mine.start : mine.stop + 1]
-        neighbour = layout.neighbour[start[0] : start[-1]] - np.int32(mine.start)
-        return cls(
-            start - start[0],
-            neighbour,
-            layout.position_m[mine],
-            layout.pad_kind[mine] == PadKind.PRESSURE,
-            1e-3 * layout.radius_mm[mine],
-            1e-3 * layout.pitch_mm[mine],
-        )
-
-    def is_same(self, other: "_Near") -> bool:
-        return (
-            np.array_equal(self.start, other.start)
-            and np.array_equal(self.neighbour, other.neighbour)
-            and np.array_equal(self.position_m, other.position_m, equal_nan=True)
-            and np.array_equal(self.pads, other.pads)
-            and np.array_equal(self.radius_m, other.radius_m)
-            and np.array_equal(self.kind_pitch_m, other.kind_pitch_m)
-        )
-
-    @cached_property
-    def lists(self) -> list[list[int]]:
-        """The neighbours of each taxel."""
-        flat = self.neighbour.tolist()
-        return [flat[begin:end] for begin, end in pairwise(self.start.tolist())]
-
-    @cached_property
-    def patches(self) -> Patches:
-        return Patches(self.lists)
-
-    @cached_property
-    def taxel(self) -> NDArray[np.intp]:
-        """Whose neighbour each of `neighbour` is."""
-        count = np.diff(self.start)
-        return np.repeat(np.arange(len(count)), count)
-
-    @cached_property
-    def pitch_m(self) -> Floats:
-        """Distance [m] of each taxel to the nearest pad that measures pressure.
-
-        Where none is next to it, or one closer than pads can lie to each other, it is that of its
-        kind: places that are wrong must not seem precise.
-        """
-        steps = self.position_m[self.neighbour] - self.position_m[self.taxel]
-        apart_m = np.where(self.pads[self.neighbour], np.linalg.norm(steps, axis=1), np.inf)
-        nearest_m = np.full(len(self.pads), np.inf)
-        np.minimum.at(nearest_m, self.taxel, apart_m)
-        is_known = (nearest_m >= self.radius_m) & np.isfinite(nearest_m)
-        return np.where(is_known, nearest_m, self.kind_pitch_m)
-
-    @cached_property
-    def usual_pitch_m(self) -> float:
-        """The median of those of all pads that measure pressure."""
-        return float(np.median(self.pitch_m[self.pads]))
