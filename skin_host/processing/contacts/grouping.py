@@ -20,7 +20,7 @@ class Contact:
     Attributes:
         taxels: those of it.
         order: the same in rising order, intp.
-        said, said_ns: what was reported of it last, and when.
+        reported, reported_ns: what was reported of it last, and when.
         firm_kpa: the recent highest pressure.
         unseen: taxels that it lost when they were not received for long: they may still be touched.
         parted_ns: since when it has been in pieces.
@@ -29,8 +29,8 @@ class Contact:
 
     taxels: frozenset[int]
     order: NDArray[np.intp]
-    said: Touch
-    said_ns: int
+    reported: Touch
+    reported_ns: int
     firm_kpa: float
     unseen: frozenset[int] = frozenset()
     parted_ns: int | None = None

@@ -341,9 +341,9 @@ class ContactTracker:
                         one for one in gone if not received[one] and not felt.touched[one]
                     )
                     known.taxels, known.order = taxels, found.order[found.spans[number]]
-                before = known.said
+                before = known.reported
                 known.firm_kpa = max(peaks[number], known.firm_kpa * fading)
-                silent_ns = now_ns - known.said_ns
+                silent_ns = now_ns - known.reported_ns
                 if not is_received[number] or silent_ns < self._shortest_ns:
                     continue
             peak = peaks[number]
@@ -400,7 +400,7 @@ class ContactTracker:
                 own = found.order[found.spans[number]]
                 self._contacts[name] = Contact(taxels, own, event, now_ns, peak)
             else:
-                known.said, known.said_ns = event, now_ns
+                known.reported, known.reported_ns = event, now_ns
         return events
 
     def _unfelt_m(
@@ -468,18 +468,18 @@ class ContactTracker:
 
     def _closed(self, name: int, seq: int, t_ns: int, reason: Reason) -> Touch:
         self._former.names.discard(name)
-        return self._contacts.pop(name).said.ended(seq, t_ns, reason)
+        return self._contacts.pop(name).reported.ended(seq, t_ns, reason)
 
 
 def _worth_reporting(
-    said: Touch, silent_ns: int, taxels: list[int], peak_kpa: float, centroid_m: Vector | None
+    reported: Touch, silent_ns: int, taxels: list[int], peak_kpa: float, centroid_m: Vector | None
 ) -> bool:
     """Return whether a contact has changed since its last event, or its next event is due."""
-    if taxels != said.taxels or silent_ns >= ALIVE_NS:
+    if taxels != reported.taxels or silent_ns >= ALIVE_NS:
         return True
-    said_kpa = said.peak_kpa or 0.0
-    if abs(peak_kpa - said_kpa) > max(PRESSED_KPA, PRESSED_SHARE * said_kpa):
+    reported_kpa = reported.peak_kpa or 0.0
+    if abs(peak_kpa - reported_kpa) > max(PRESSED_KPA, PRESSED_SHARE * reported_kpa):
         return True
-    if centroid_m is None or said.centroid_m is None:
-        return centroid_m is not said.centroid_m
-    return math.dist(centroid_m, said.centroid_m) > MOVED_M
+    if centroid_m is None or reported.centroid_m is None:
+        return centroid_m is not reported.centroid_m
+    return math.dist(centroid_m, reported.centroid_m) > MOVED_M
