@@ -200,17 +200,18 @@ class BoardZeros:
             self._note_glimpse(sweep, row)
 
     def note_frame(self, index: int, frame: PressureFrame) -> None:
-        """Pass the touched pads to the liveness decision, but only when they change."""
+        """Pass the pressed pads to the liveness decision, but only when they change."""
+        felt = frame.touched if frame.felt is None else frame.felt
         noted = self._noted.get(index)
-        if noted is not None and noted[0] is frame.touched and noted[1] is frame.valid:
+        if noted is not None and noted[0] is felt and noted[1] is frame.valid:
             return
-        self._noted[index] = frame.touched, frame.valid
+        self._noted[index] = felt, frame.valid
         part = self._layout.parts[index]
         touched = self._touched[part.start : part.stop]
-        np.copyto(self._last_touched[part.start : part.stop], frame.touched, where=frame.valid)
-        if touched.tobytes() == frame.touched.tobytes():
+        np.copyto(self._last_touched[part.start : part.stop], felt, where=frame.valid)
+        if touched.tobytes() == felt.tobytes():
             return
-        touched[:] = frame.touched
+        touched[:] = felt
         for board in part.boards:
             taxels = self._of(board)
             pads = self._touched[taxels] & (taxels >= 0)
@@ -341,6 +342,11 @@ class BoardZeros:
         """Return taxels bool[n] that something touches, or did when it was last known."""
         found: Mask = self._last_touched | self._touched_before
         return found
+
+    @property
+    def felt(self) -> Mask:
+        """Return taxels bool[n] that something touches by the last frames of their parts."""
+        return self._touched
 
     def pressed(self) -> Mask:
         """Return taxels bool[n] that something pressed when their zero was taken or observed, and

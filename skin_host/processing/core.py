@@ -306,7 +306,8 @@ class Engine:
             time: now, ISO 8601 in UTC.
         """
         assert self._run is not None
-        finish = self._run.end(self.configuration, time, self._known(), self.zeros.pressed())
+        pressed = self.zeros.pressed() | self.zeros.felt
+        finish = self._run.end(self.configuration, time, self._known(), pressed)
         zeros = None if self.fingertips is None else self.fingertips.end_zero()
 
         def compute() -> Calibration:

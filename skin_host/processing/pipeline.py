@@ -34,7 +34,8 @@ from skin_host.processing.masks import Mask, any_of
 from skin_host.processing.own_curves import OwnCurves
 from skin_host.processing.relaxation import OWN_MEANS, make_model, parameters_of
 from skin_host.processing.relaxation import Relaxation as Model
-from skin_host.processing.touch import Levels, Residuals, TouchDetector, levels
+from skin_host.processing.touch import Levels, felt_by, levels
+from skin_host.processing.touch_decision import TouchDecision
 
 #: A longer step is a gap or a jump of the clock. The foam's model is advanced by it, under the
 #: readings after it; nothing else depends on its length.
@@ -71,6 +72,8 @@ class PressureFrame:
         computed: False if pressures were not requested and nothing touches: they are 0.
         elapsed_ns: time that passed for the part since its first sweep. What waits or times out
             counts by this: `t_ns` can be set, forward or back.
+        felt: bool, taxels that something presses, though it may be too little to be called a touch;
+            None: those that are touched.
     """
 
     part: str
@@ -83,6 +86,7 @@ class PressureFrame:
     beyond_range: Mask
     computed: bool = True
     elapsed_ns: int = 0
+    felt: Mask | None = None
 
 
 class Pipeline:
@@ -96,7 +100,7 @@ class Pipeline:
     Attributes:
         baseline: float64[n], activation of the untouched taxels in units, drift included.
         relaxation_kpa: float32[n], pressure that the foam has lost by now.
-        enter: float64[n], the threshold of touch, in units, see `touch.Levels`.
+        enter: float64[n], the threshold by which a press is known, in units, see `touch.felt_by`.
         measurements: int64[n], in which a touch is decided, see `touch.Levels`.
         unreached: bool[n], taxels that are not used because no reading of them is a touch.
         flat: bool[n], those of them whose curve of pressure does not rise with each unit.
@@ -107,8 +111,8 @@ class Pipeline:
         self.baseline = calibration.baseline.copy()
         self.relaxation_kpa = np.zeros(layout.n_taxels, np.float32)
         self._rules = rules = _Rules.of(layout, settings, calibration)
-        self.enter = rules.levels.enter
-        self.measurements = rules.levels.measurements(settings.touch.votes_of_3)
+        self.enter = rules.felt.enter
+        self.measurements = rules.measurements()
         self.unreached, self.flat = rules.unreached, rules.unreached & ~rules.curve.sound
         self._parts = [_PartPipeline(self, layout, part, rules) for part in layout.parts]
 
@@ -132,8 +136,8 @@ class Pipeline:
         self._layout = layout or self._layout
         np.copyto(self.baseline, calibration.baseline, where=zeroed)
         self._rules = rules = _Rules.of(self._layout, settings, calibration)
-        self.enter = rules.levels.enter
-        self.measurements = rules.levels.measurements(settings.touch.votes_of_3)
+        self.enter = rules.felt.enter
+        self.measurements = rules.measurements()
         self.unreached, self.flat = rules.unreached, rules.unreached & ~rules.curve.sound
         for part in self._parts:
             part.renew(rules, zeroed)
@@ -226,7 +230,12 @@ class Pipeline:
 
 
 class _Rules(NamedTuple):
-    """Values derived from settings and calibration, over the whole skin."""
+    """Values derived from settings and calibration, over the whole skin.
+
+    Attributes:
+        levels: what is called a touch.
+        felt: by which a press is known; the same ones if none are lower.
+    """
 
     settings: Processing
     usable: Mask
@@ -234,6 +243,7 @@ class _Rules(NamedTuple):
     curve: Curve
     curves: Curves | None
     levels: Levels
+    felt: Levels
 
     @classmethod
     def of(cls, layout: Layout, settings: Processing, calibration: Calibration) -> "_Rules":
@@ -247,25 +257,32 @@ class _Rules(NamedTuple):
             # Some seconds at rest show less noise than a whole recording under pressure.
             spread = np.where(curves.own, np.fmax(spread, curves.noise_units), spread)
         known = np.isfinite(above) & np.isfinite(spread)
-        found = levels(np.where(known, above, 0.0), np.where(known, spread, 0.0), settings.touch)
+        above, spread = np.where(known, above, 0.0), np.where(known, spread, 0.0)
+        found = felt = levels(above, spread, settings.touch)
+        finest = felt_by(settings.touch)
+        if finest != settings.touch:
+            felt = levels(above, spread, finest)
         # A reading ends at 0: a larger threshold would leave a pressed taxel untouched. So would a
         # curve that does not rise, and a noise that is no number.
         reached = found.decides <= layout.no_load - calibration.baseline
         reached &= known & curve.sound
         unreached = usable & ~reached
-        return cls(settings, usable & ~unreached, unreached, curve, curves, found)
+        return cls(settings, usable & ~unreached, unreached, curve, curves, found, felt)
+
+    def measurements(self) -> NDArray[np.int64]:
+        """Return in how many measurements both are decided [n]."""
+        votes = self.settings.touch.votes_of_3
+        found = self.levels.measurements(votes)
+        return (
+            found if self.felt is self.levels else np.maximum(found, self.felt.measurements(votes))
+        )
 
     def part(self, mine: slice) -> "_Rules":
         """Return those of some of the taxels; unusable taxels are never touched."""
         usable = self.usable[mine]
-        found = self.levels
-        return _Rules(
-            self.settings,
-            usable,
-            self.unreached[mine],
-            self.curve.part(mine),
-            self.curves,
-            Levels(
+
+        def of(found: Levels) -> Levels:
+            return Levels(
                 np.where(usable, found.enter[mine], np.inf),
                 np.where(usable, found.leave[mine], np.inf),
                 np.where(usable, found.whole[mine], np.inf),
@@ -274,7 +291,17 @@ class _Rules(NamedTuple):
                 found.fall[mine],
                 found.votes[mine],
                 found.spread[mine],
-            ),
+            )
+
+        called = of(self.levels)
+        return _Rules(
+            self.settings,
+            usable,
+            self.unreached[mine],
+            self.curve.part(mine),
+            self.curves,
+            called,
+            called if self.felt is self.levels else of(self.felt),
         )
 
 
@@ -349,8 +376,9 @@ class _PartPipeline:
             self._thermal,
             rules.settings.drift,
         )
-        self._detector = TouchDetector(rules.levels, rules.settings.touch.votes_of_3)
-        self._residuals = Residuals(m)
+        #: What presses, and what of that is called a touch; mostly they are one.
+        self._felt = self._called = TouchDecision(rules.felt, rules.settings.touch.votes_of_3)
+        self._decide_by(rules)
         self._adopt(rules)
         self._last_raw = self._untouched_raw()
 
@@ -384,7 +412,7 @@ class _PartPipeline:
             self._set_model(rules)
         elif self._own is not None:
             self._own.use(rules.settings.pressure.smoothing_s)
-        self._detector.configure(rules.levels, rules.settings.touch.votes_of_3)
+        self._decide_by(rules)
         self.drift.renew(rules.usable, zeroed, rules.settings.drift)
         if any_of(zeroed):
             if self._own is not None:
@@ -392,6 +420,21 @@ class _PartPipeline:
             self._forget(zeroed)
         self._adopt(rules)
         self._begin_anew(zeroed)
+
+    def _decide_by(self, rules: _Rules) -> None:
+        """Use the levels of these rules from now on."""
+        votes = rules.settings.touch.votes_of_3
+        if rules.felt is rules.levels:
+            self._called = self._felt
+        elif self._called is self._felt:
+            self._called = self._felt.copy()
+        self._felt.use(rules.felt, votes)
+        if self._called is not self._felt:
+            self._called.use(rules.levels, votes)
+        self._decisions = [self._felt]
+        if self._called is not self._felt:
+            self._decisions.append(self._called)
+        self._nothing = [self._nowhere] * len(self._decisions)
 
     def _adopt(self, rules: _Rules) -> None:
         """Compute what each sweep needs from the rules."""
@@ -406,13 +449,8 @@ class _PartPipeline:
         self._beyond_units = np.where(usable, curve.beyond_units, np.inf).astype(np.float32)
         self._units_per_kpa = np.where(usable, 1.0 / np.maximum(curve.linear, 1e-9), 0.0)
         self._kpa_per_unit = np.where(usable, curve.linear, 0.0)
-        self._enter = np.where(usable, rules.levels.enter, 0.0)
-        self._enter_kpa = curve.kpa(self._enter)
-        # The reading of a single measurement that counts in full.
-        whole = np.where(usable, rules.levels.whole, 0.0)
-        firm = curve.kpa(whole + rules.levels.fall)
-        on = np.where(usable, curve.kpa(whole), np.inf)
-        self._residuals.configure(on, firm, rules.levels.votes, rules.curves is not None)
+        for decision, found in zip(self._decisions, (rules.felt, rules.levels), strict=False):
+            decision.adopt(found, curve, usable, rules.curves is not None)
         decides = rules.levels.decides_surely(self._interval_s, rules.settings.touch.votes_of_3)
         decides = curve.kpa(np.where(usable, decides, 0.0))
         self.decides_kpa = float(decides.max(initial=0.0))
@@ -463,7 +501,7 @@ class _PartPipeline:
         raw = raw.copy()
         own = self._own
         if own is not None:
-            felt, lost = self._detector.touched, self._detector.lost
+            felt, lost = self._felt.detector.touched, self._felt.detector.lost
             felt = felt if lost is None else felt | lost
             present = own.without_rails(raw, present, self._offset, self._last_raw, felt)
         valid = self._receive(raw, present)
@@ -471,9 +509,13 @@ class _PartPipeline:
             self._bridge(gap_s)
         if own is not None and own.erratic.any:
             valid = valid & ~own.erratic.pads
-        idle = self._detector.is_idle(self._last_raw)
-        touched = self._nowhere if idle else self._decide(valid, dt_s)
-        quiet = touched is self._nowhere and not self._residuals.any and not self._every_sample
+        idle = self._felt.detector.is_idle(self._last_raw)
+        if self._called is not self._felt:
+            idle = self._called.detector.is_idle(self._last_raw) and idle
+        decided = self._nothing if idle else self._decide(valid, dt_s)
+        pressed, touched = decided[0], decided[-1]
+        quiet = pressed is touched is self._nowhere and not self._every_sample
+        quiet = quiet and not (self._felt.residuals.any or self._called.residuals.any)
         if quiet and not pressures and not self._due(dt_s):
             self._piece.elapsed_s += dt_s
             self._unseen_s += dt_s
@@ -483,21 +525,26 @@ class _PartPipeline:
         self._since_glance_s = 0.0
         cut_off = 255 in self._last_raw.tobytes()
         beyond = self._beyond(cut_off) if cut_off or not (idle and quiet) else self._nowhere
-        corrected, pressure = self._pressures(beyond, touched, self._unseen_s + dt_s)
-        self._gather(corrected, touched, dt_s, quiet)
+        corrected, pressure = self._pressures(beyond, pressed, self._unseen_s + dt_s)
+        self._gather(corrected, pressed, dt_s, quiet)
         if not quiet:
-            repeated = None if idle else self._detector.repeated
-            residuals = self._residuals
-            if beyond is not self._nowhere:
-                residuals.press_beyond(beyond & touched, self._last_raw == 0, dt_s)
-            touched = residuals.step(
-                touched, corrected, repeated, self._detector.lost, self._relaxation_kpa
-            )
+            relaxation_kpa = self._relaxation_kpa
+            found = []
+            for one, its in zip(self._decisions, decided, strict=True):
+                if beyond is not self._nowhere:
+                    one.residuals.press_beyond(beyond & its, self._last_raw == 0, dt_s)
+                found.append(one.report(its, corrected, relaxation_kpa, idle))
+            pressed, touched = found[0], found[-1]
         if valid is not self._always_valid:
             pressure = np.where(valid, pressure, self._zeros)
+            is_one = pressed is touched
             touched = touched if touched is self._nowhere else touched & valid
+            pressed = touched if is_one else pressed & valid
             beyond = beyond if beyond is self._nowhere else beyond & valid
-        return self._frame(t_ns, raw, valid, pressure, touched, beyond, True)
+        frame = self._frame(t_ns, raw, valid, pressure, touched, beyond, True)
+        if pressed is not touched:
+            frame.felt = pressed
+        return frame
 
     def clock_set(self, step_ns: int) -> None:
         """See `Pipeline.clock_set`."""
@@ -519,7 +566,8 @@ class _PartPipeline:
             if model is not None:
                 model.reset(taxels)
         self._relaxation_kpa[taxels] = 0.0
-        self._residuals.reset(taxels)
+        for decision in self._decisions:
+            decision.residuals.reset(taxels)
         self._rows[:, taxels] = 0.0
         for window in (self._piece, self._drifting, self._relaxing):
             window.sum_kpa[taxels] = 0.0
@@ -530,7 +578,8 @@ class _PartPipeline:
         self._last_raw = np.where(taxels, self._untouched_raw(), self._last_raw)
         unseen_raw = np.multiply(self._last_raw, self._unseen, dtype=np.int32)
         np.copyto(self._unseen_raw, unseen_raw, where=taxels)
-        self._detector.reset(taxels)
+        for decision in self._decisions:
+            decision.detector.reset(taxels)
 
     def _frame(
         self,
@@ -572,9 +621,10 @@ class _PartPipeline:
 
     def _bridge(self, gap_s: float) -> None:
         """Advance the foam's model through a gap, under the readings after it."""
-        self._residuals.fade(gap_s)
         self.drift.pass_gap(gap_s)
-        self._detector.lose(self._detector.touched)
+        for decision in self._decisions:
+            decision.residuals.fade(gap_s)
+            decision.detector.lose(decision.detector.touched)
         if self._relaxation is None:
             return
         self._end_piece(early=True)
@@ -619,11 +669,14 @@ class _PartPipeline:
     def _untouched_raw(self) -> NDArray[np.uint8]:
         return np.rint(np.clip(self._offset, 0.0, 255.0)).astype(np.uint8)
 
-    def _decide(self, valid: Mask, dt_s: float) -> Mask:
-        """Return which taxels are touched, `_nowhere` if none is."""
+    def _decide(self, valid: Mask, dt_s: float) -> list[Mask]:
+        """Return which taxels each decision finds touched, `_nowhere` if none."""
         unheard = None if valid is self._always_valid else ~valid
-        touched = self._detector.step(self._last_raw, dt_s, unheard)
-        return touched if self._detector.any else self._nowhere
+        found = []
+        for decision in self._decisions:
+            touched = decision.detector.step(self._last_raw, dt_s, unheard)
+            found.append(touched if decision.detector.any else self._nowhere)
+        return found
 
     def _beyond(self, cut_off: bool) -> Mask:
         """Return which taxels read more than their calibrated range, or an end of the scale.
@@ -769,8 +822,10 @@ class _PartPipeline:
         if self._own is not None:
             ghosts = self._own.hold_rises(self.drift, before, touched, elapsed_s, ghosts)
         if ghosts is not None:
-            self._detector.reset(ghosts)
-        self._residuals.fade(elapsed_s)
+            for decision in self._decisions:
+                decision.detector.reset(ghosts)
+        for decision in self._decisions:
+            decision.residuals.fade(elapsed_s)
         self._lacking.fill(0)
 
     def _conversions(self, window: _Window) -> NDArray[np.float64]:
@@ -821,15 +876,9 @@ class _PartPipeline:
         self._reader.renew(offset, self._was_touched)
         if self._relaxation is not None and not self._every_sample:
             self._reader.lower(self._relaxation_kpa)
-        # A press must exceed the relaxation of the foam.
-        zero = offset
         relaxed = self._relaxation_kpa > RELAXED_KPA
-        if any_of(relaxed):
-            zero = offset.copy()
-            needed_kpa = self._enter_kpa[relaxed] + self._relaxation_kpa[relaxed]
-            needed = self._curve.part(relaxed).units(needed_kpa)
-            zero[relaxed] -= needed - self._enter[relaxed]
-        self._detector.renew(zero)
+        for decision in self._decisions:
+            decision.renew(offset, self._relaxation_kpa, relaxed)
         # At 0 the reading is cut off in any case.
         _as_bytes(np.fmax(np.ceil(offset - self._beyond_units), 1.0), self._beyond_raw)
         self._most_beyond_raw = int(self._beyond_raw.max(initial=0))

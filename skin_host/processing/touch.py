@@ -13,6 +13,7 @@ a noisy one an average over as many as its noise requires, and a firm press alwa
 import math
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -180,6 +181,22 @@ def _span(enter: Floats, spread: Floats) -> Floats:
     drift = enter / deviation
     bound = np.log(ODDS * np.maximum(2 * drift**2, 1.0)) / (2 * drift)
     return deviation * (bound - OVERSHOOT_DEVIATIONS)
+
+
+def felt_by(settings: TouchSettings) -> TouchSettings:
+    """Return the settings by which a press is known, whatever is to be called a touch.
+
+    Larger thresholds are asked for where only firm presses matter. A lighter one presses all the
+    same: baselines must not follow it, and a zero that is taken under it is none.
+    """
+    usual = TouchSettings()
+    return msgspec.structs.replace(
+        settings,
+        margin_units=min(settings.margin_units, usual.margin_units),
+        minimum_threshold_units=min(
+            settings.minimum_threshold_units, usual.minimum_threshold_units
+        ),
+    )
 
 
 class TouchDetector:

@@ -3,11 +3,12 @@
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
 from skin_host.bus.wire import FrameBatch, StatusError, encode_sweep
-from skin_host.config.settings import load
+from skin_host.config.settings import TouchSettings, changed, load
 from skin_host.daemon.daemon import Daemon
 from skin_host.health import HealthWatch
 from skin_host.layout import build_layout
@@ -870,3 +871,81 @@ def test_a_board_that_is_not_set_up_at_a_start_gets_the_zero_that_it_has() -> No
     steps: list[Step] = []
     hand.deliver = lambda output: steps.extend(output.steps)
     expect_new_zeros(hand, steps)
+
+
+#: Eight units press the pad by more than drift or noise, and are less than an operator's margin.
+LIGHT = NO_LOAD - 8
+
+
+def press_lightly(hand: Hand, sweeps: int) -> None:
+    """Press its pad 3; what reads the same all the time would be stuck."""
+    for sweep in range(sweeps):
+        hand.send(1, p3=LIGHT + sweep % 2)
+
+
+def calibrate_pressed(hand: Hand) -> None:
+    hand.engine.begin_calibration(2.0)
+    press_lightly(hand, 50)
+    hand.engine.use(hand.engine.end_calibration("2026-01-01T00:00:00+00:00"))
+
+
+def asked_for_firm_presses() -> Hand:
+    """An operator wants only firm presses to be touches."""
+    hand = Hand()
+    before = hand.engine
+    touch = msgspec.structs.replace(before.settings.processing.touch, margin_units=20.0)
+    settings = changed(before.settings, {"processing.touch": touch})
+    hand.engine = Engine(settings, before.layout, before.parts, after=before)
+    return hand
+
+
+def test_a_press_that_is_called_no_touch_is_in_doubt_after_a_zero_under_it() -> None:
+    hand = asked_for_firm_presses()
+    steps: list[Step] = []
+    hand.deliver = lambda output: steps.extend(output.steps)
+    press_lightly(hand, 20)
+    assert not any(step.frame.touched.any() for step in steps)
+    assert hand.engine.zeros.at_risk(touched=True).sum() == 1
+    assert hand.engine.zeros.rezero(0) == 1
+    hand.send(60, p3=NO_LOAD)
+    assert hand.in_doubt == [3]
+
+
+def test_no_baseline_follows_a_press_that_is_called_no_touch() -> None:
+    def reads(hand: Hand) -> float:
+        frames: list[PressureFrame] = []
+        hand.deliver = lambda output: frames.extend(output.frames)
+        press_lightly(hand, 600)
+        return float(np.mean([frame.pressure_kpa[3] for frame in frames[-20:]]))
+
+    assert reads(asked_for_firm_presses()) == pytest.approx(reads(Hand()), rel=0.02)
+
+
+@pytest.mark.parametrize("make", [Hand, asked_for_firm_presses])
+def test_a_pad_that_is_calibrated_in_a_press_that_is_felt_was_touched(
+    make: Callable[[], Hand],
+) -> None:
+    """Its readings alone would not show it: so light a press may be a board's zero."""
+    hand = make()
+    press_lightly(hand, 20)
+    calibrate_pressed(hand)
+    assert verdict_of(hand, 3) == Verdict.TOUCHED
+    assert verdict_of(hand, 4) == Verdict.OK
+    # It reads as if untouched now, and nothing shows that it is not.
+    press_lightly(hand, 20)
+    calibrate_pressed(hand)
+    assert verdict_of(hand, 3) == Verdict.OK
+
+
+def test_what_is_called_a_touch_is_so_as_soon_as_that_is_asked_for_again() -> None:
+    hand = asked_for_firm_presses()
+    steps: list[Step] = []
+    hand.deliver = lambda output: steps.extend(output.steps)
+    press_lightly(hand, 40)
+    assert not any(step.frame.touched.any() for step in steps)
+    asked = hand.engine
+    settings = changed(asked.settings, {"processing.touch": TouchSettings()})
+    hand.engine = Engine(settings, asked.layout, asked.parts, after=asked)
+    press_lightly(hand, 10)
+    assert np.flatnonzero(steps[-1].frame.touched).tolist() == [3]
+    assert steps[-1].frame.felt is None

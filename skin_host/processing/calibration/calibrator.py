@@ -190,8 +190,9 @@ class Calibrator:
             time: when it was taken, ISO 8601 in UTC.
             known: of this skin from before. A taxel of which too little was received goes on with
                 it, and noise is not lowered by few samples.
-            pressed: bool[n], taxels that were pressed when their board was zeroed, and whose
-                release nothing has shown since: their readings cannot show that they are touched.
+            pressed: bool[n], taxels that are touched by what is known from before, or were pressed
+                when their board was zeroed, and whose release nothing has shown since: their
+                readings alone cannot show that they are touched.
         """
         damaged = self._leave_out_damage()
         counts, received = self._counts, self._received

@@ -9,6 +9,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
+from skin_host.config.settings import TouchSettings
 from skin_host.evaluation.simulate.promises.limits import (
     CALIBRATED_KPA,
     DECIDES_DEVIATIONS,
@@ -45,6 +46,7 @@ class Truth:
         reads: bool[n], pads whose readings are pressures: without its cover skin feels earthed
             objects, and how near they are rather than how hard they press.
         decides_kpa: float64[n], what pressure is a touch within a second on fresh foam.
+        felt_kpa: float64[n], what pressure is known by then, however little is called a touch.
     """
 
     def __init__(self, world: World) -> None:
@@ -62,7 +64,9 @@ class Truth:
         covered = [np.full(part.n_taxels, part.covered) for part in layout.parts]
         self.reads: Mask = np.concatenate(covered) & ~thermal
         self._margin_units = world.settings.processing.touch.margin_units
-        self.decides_kpa = self._decides_kpa()
+        self.decides_kpa = self._decides_kpa(self._margin_units)
+        usual = min(self._margin_units, TouchSettings().margin_units)
+        self.felt_kpa = self._decides_kpa(usual)
         self.kpa: Floats = np.zeros(layout.n_taxels)
         self.hardest_kpa: Floats = np.zeros(layout.n_taxels)
         self._bins: deque[tuple[int, Floats, Floats]] = deque(maxlen=BINS)
@@ -96,7 +100,7 @@ class Truth:
         another one was asked for later may have been lost.
         """
         self._margin_units = max(self._margin_units, units)
-        self.decides_kpa = self._decides_kpa()
+        self.decides_kpa = self._decides_kpa(self._margin_units)
 
     def recover(self, taxels: Mask) -> None:
         """The foam of some pads bool[n] has recovered."""
@@ -132,8 +136,8 @@ class Truth:
         firm: Mask = self.least_kpa(since_ns) > firm_kpa
         return firm
 
-    def _decides_kpa(self) -> Floats:
-        certain = (self._margin_units + DECIDES_UNITS) * self.unit_kpa
+    def _decides_kpa(self, margin_units: float) -> Floats:
+        certain = (margin_units + DECIDES_UNITS) * self.unit_kpa
         return certain + DECIDES_DEVIATIONS * self.noise_kpa
 
     def _lately(self, since_ns: int) -> list[tuple[int, Floats, Floats]]:

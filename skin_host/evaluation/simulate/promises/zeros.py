@@ -143,5 +143,5 @@ class ZeroCheck:
             if rezero.begun:
                 unfelt &= self._pressed_ns[taxels] <= self._observed[board][1]
             if finds.any():
-                unfelt |= pressed[taxels] & (true_kpa < self._truth.decides_kpa)[taxels]
+                unfelt |= pressed[taxels] & (true_kpa < self._truth.felt_kpa)[taxels]
             self._excuses.exempt[taxels] |= finds & (unfelt | spoiled[taxels])
